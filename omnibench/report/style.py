@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import math
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
@@ -81,6 +82,16 @@ def colours(wanted: Mapping[str, str | None]) -> dict[str, tuple[str, Dash]]:
 def text(words: str) -> str:
     """Words escaped for a plot, since Plotly interprets some HTML; lines stay lines."""
     return html.escape(words, quote=False).replace("\n", "<br>")
+
+
+def wrapped(words: str, most: int = 24) -> str:
+    """A label in lines of at most ``most`` characters, so that it leaves the plot its width."""
+    lines = [""]
+    for part in re.findall(rf"[^\s_/-]{{0,{most - 1}}}[\s_/-]|[^\s_/-]{{1,{most}}}", words):
+        if len(lines[-1]) + len(part.rstrip()) > most:
+            lines.append("")
+        lines[-1] += part
+    return "\n".join(line.rstrip() for line in lines)
 
 
 def plot(*traces: go.Scatter, x_title: str | None = None, y_title: str | None = None, **layout: Any) -> go.Figure:

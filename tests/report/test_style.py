@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from omnibench.report.blocks import LegendItem
-from omnibench.report.style import PALETTE, REFERENCE, THEORETICAL, colours, logarithmic, plan, plot, text
+from omnibench.report.style import PALETTE, REFERENCE, THEORETICAL, colours, logarithmic, plan, plot, text, wrapped
 from omnibench.report.traces import path
 
 
@@ -66,6 +66,12 @@ def test_a_path_far_from_the_origin_is_drawn_from_a_round_value_that_its_axis_an
         assert figure.layout.yaxis.title.text == "y − 4,600,000 (m)"
         assert figure.layout.xaxis.range == (-1.0, 2.0)
         assert "y − 4,600,000 = %{y:.3f} m" in figure.data[0].hovertemplate
+
+
+def test_long_labels_break_after_their_words_and_within_a_word_that_is_too_long() -> None:
+    assert wrapped("held-out: square_a90_turn+360_v0.2_r0.8x1") == "held-out: square_a90_\nturn+360_v0.2_r0.8x1"
+    assert wrapped("abcdefgh", 3) == "abc\ndef\ngh"
+    assert wrapped("design values") == "design values"
 
 
 def test_a_path_near_the_origin_is_drawn_as_it_is() -> None:

@@ -14,10 +14,10 @@ from omnibench.compare.result import THEORETICAL_NAME
 from omnibench.fit.uncertainty.ratio_intervals import Interval
 from omnibench.report.blocks import Figure, FigureGrid, LegendItem
 from omnibench.report.numbers import fixed
-from omnibench.report.style import INK, PALETTE, QUIET, plot, text
+from omnibench.report.style import INK, PALETTE, QUIET, plot, text, wrapped
 from omnibench.report.traces import joined, line, marks
 
-_ROW = 25  # px of an entry
+_ROW, _LINE = 11, 14  # px of an entry, and of each line of its label
 _BEST = LegendItem("best", "best, and level with it", PALETTE[0])
 _OTHER = LegendItem("other", "differs by more than chance", PALETTE[1])
 _OPEN = LegendItem("open", "not known whether it differs", QUIET)
@@ -45,7 +45,8 @@ def entry_chart(view: DatasetView) -> FigureGrid | None:
     figure = plot(*traces, x_title=f"cost of the {split} runs")
     reach = max(max(each.cost.known or (each.cost.value,)) for each in lines)
     figure.update_xaxes(range=[0.0, 1.04 * reach])
-    names = [text(each.label) for each in lines]
+    names = [text(wrapped(each.label)) for each in lines]
+    height = 70 + (_ROW + _LINE * max(1 + name.count("<br>") for name in names)) * len(lines)
     ends = {"range": [len(lines) - 0.4, -0.6], "tickvals": list(range(len(lines))), "ticktext": names}
     figure.update_yaxes(**ends, ticks="", tickfont_color=INK, showgrid=False)
     words = ", ".join(f"{each.label} {fixed(each.cost.value, decimals)}" for each in lines)
@@ -55,9 +56,7 @@ def entry_chart(view: DatasetView) -> FigureGrid | None:
         "judged from paired differences, which is finer. An entry stands with its run of median training cost."
         + _without(view)
     )
-    return FigureGrid(
-        (Figure(title, figure, f"{title}: {words}", 70 + _ROW * len(lines)),), tuple(items), 1, caption, "all-entries"
-    )
+    return FigureGrid((Figure(title, figure, f"{title}: {words}", height),), tuple(items), 1, caption, "all-entries")
 
 
 def _lines(view: DatasetView) -> list[_Line]:

@@ -27,7 +27,7 @@ from omnibench.report.blocks import (
 )
 from omnibench.report.motions import MOST_MOTIONS, Motion, direction_of, motion_items, motion_of, moves
 from omnibench.report.numbers import fixed
-from omnibench.report.style import INK, plot, text
+from omnibench.report.style import INK, plot, text, wrapped
 from omnibench.report.traces import coordinates
 from omnibench.robot.kinematics import Array
 
@@ -228,7 +228,7 @@ def _box_plots(view: DatasetView, best: EntryStatistics, typical: ScoredRun) -> 
         figures,
         tuple(styles),
         1,
-        "Every point is a trajectory; the box holds the middle half, its line is the median.",
+        "Every point is a trajectory; the rectangle holds the middle half, its line is the median.",
     )
 
 
@@ -243,7 +243,7 @@ def _groups(view: DatasetView, split: Split) -> list[str]:
 def _box_figure(groups: Sequence[str], quantity: _Quantity, styles: Sequence[LegendItem]) -> go.Figure:
     traces = [
         go.Box(
-            y=[text(group) for group in groups],
+            y=[text(wrapped(group)) for group in groups],
             x=coordinates(values),
             orientation="h",
             boxpoints="all",

@@ -14,7 +14,7 @@ from omnibench.discover.report.residuals import NORMAL_95, CommandResidual, Resi
 from omnibench.report.blocks import Block, Figure, FigureGrid, LegendItem, Paragraph
 from omnibench.report.motions import MOST_MOTIONS, direction_of, motion_items, motion_of, moves
 from omnibench.report.numbers import fixed
-from omnibench.report.style import INK, QUIET, plot, text
+from omnibench.report.style import INK, QUIET, plot, text, wrapped
 from omnibench.report.traces import area, coordinates, line, marks
 
 _ROWS = 16  # commands listed, at most; only the drawing hangs on it
@@ -120,7 +120,7 @@ def _rows(commands: Sequence[CommandResidual], styles: Sequence[ModelStyle]) -> 
                 f"Final residual {name}" if axis < 2 else "Final heading residual",
                 _row_plot(shown, styles, axis, factor, unit),
                 f"Mean final residual of each command, {name}, in {unit}",
-                90 + 22 * len(shown),
+                90 + 30 * len(shown),
             )
         )
     words = f"The {len(shown)} commands of {len(commands)} with the largest residuals for their noise. "
@@ -134,7 +134,7 @@ def _rows(commands: Sequence[CommandResidual], styles: Sequence[ModelStyle]) -> 
 def _row_plot(
     commands: Sequence[CommandResidual], styles: Sequence[ModelStyle], axis: int, factor: float, unit: str
 ) -> go.Figure:
-    names = [each.name for each in commands]
+    names = [wrapped(each.name) for each in commands]
     half = NORMAL_95 * factor * np.array([each.error[axis] for each in commands])
     traces: list[go.Bar | go.Scatter] = [
         go.Bar(

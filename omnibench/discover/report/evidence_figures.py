@@ -24,10 +24,11 @@ from omnibench.discover.report.wording import (
 from omnibench.discover.result import Candidate, Discovery, Gap, Hidden, Step
 from omnibench.report.blocks import Figure, FigureGrid, LegendItem
 from omnibench.report.numbers import decimals_for, fixed
-from omnibench.report.style import INK, QUIET, logarithmic, plot, text
+from omnibench.report.style import INK, QUIET, logarithmic, plot, text, wrapped
 from omnibench.report.traces import coordinates, marks
 
 EvidenceFigure = Callable[[Discovery], FigureGrid | None]
+_NAME = 20  # characters of a line of an effect's name
 _CANDIDATES = 8  # shown of each step, at most; only the drawing hangs on it
 _CHOSEN, _UNCHOSEN = LegendItem("chosen", "added", AFTER), LegendItem("other", "not added", "#b9c0c8")
 _FLOOR = LegendItem("floor", "floor", FLOOR)
@@ -81,7 +82,7 @@ def _is_step(discovery: Discovery, number: int, candidate: Candidate) -> bool:
 def _candidate_bars(shown: Sequence[Candidate], chosen: str | None) -> go.Figure:
     bars = [
         _Bar(
-            _folded(each.name),
+            wrapped(each.name, _NAME),
             0.0,
             each.chi_square,
             f"{weight_in_words(each.weight)}, {each.degrees_of_freedom} df",
@@ -171,7 +172,7 @@ def _waterfall(steps: Sequence[Step], values: Sequence[float], floor: float | No
     for step, (before, after) in zip(steps[1:], pairwise(values), strict=True):
         item = _GAINED if after <= before else _LOST
         label = fixed(after - before, decimals, signed=True)
-        bars.append(_Bar(_folded(f"+ {added(step)}"), min(before, after), max(before, after), label, item))
+        bars.append(_Bar(wrapped(f"+ {added(step)}", _NAME), min(before, after), max(before, after), label, item))
     bars.append(_Bar("extended model", 0.0, values[-1], fixed(values[-1], decimals), _RESULT))
     figure = _bars(bars, title, 1.25)
     if floor is not None:
@@ -232,7 +233,7 @@ def hidden_grid(hidden: Sequence[Hidden]) -> FigureGrid | None:
     shown = [each for each in reversed(worst_of_each(hidden)) if each.plausible > 0 and each.limit > 0]
     if not shown:
         return None
-    names = [f"{each.name}: {each.parameter}" for each in shown]
+    names = [wrapped(f"{each.name}: {each.parameter}") for each in shown]
     traces = []
     for item, values, words in (
         (_LIMIT, [each.limit for each in shown], "at most"),
@@ -261,15 +262,6 @@ def hidden_grid(hidden: Sequence[Hidden]) -> FigureGrid | None:
         "range, 100 %. Of an effect whose dot is left of it, the data tell more than what is plausible anyway; an "
         "effect whose dot is right of it could hide at a plausible size.",
     )
-
-
-def _folded(name: str) -> str:
-    """A long name on two lines."""
-    if len(name) < 16 or "_" not in name:
-        return name
-    cuts = [index for index, letter in enumerate(name) if letter == "_"]
-    cut = min(cuts, key=lambda index: abs(index - len(name) / 2))
-    return f"{name[: cut + 1]}\n{name[cut + 1 :]}"
 
 
 # Figures of the report, by the part that shows them: a figure that is added here is shown.
