@@ -41,8 +41,13 @@ _WORDS: tuple[tuple[str, str, str], ...] = (
     ("residual", r"residuals?", "reference minus odometry"),
     (
         "noise floor",
-        r"(?<!free )(?<!on the )(?<!over the )floor",
+        r"(?<!free )(?<!on the )(?<!over the )(?<!patch of the )floor",
         "the error that repetitions of one command leave to any model",
+    ),
+    (
+        "whitened χ²",
+        r"whitened χ²",
+        "squared residuals over their noise: about 1 for each where only noise is left",
     ),
     (
         "weight",
@@ -50,6 +55,13 @@ _WORDS: tuple[tuple[str, str, str], ...] = (
         "the probability that this name, and no other that was tried, is right",
     ),
     ("baseline", r"baseline", "the runs as they were recorded or planned, which the choice is compared with"),
+    (
+        "information",
+        r"information(?= per)",
+        "how well all elements of the matrix become known together; twice the runs give twice as much",
+    ),
+    ("D-optimum", r"D-optim(?:um|al)", "the runs that give the most information for their number"),
+    ("Cramér-Rao bound", r"Cramér-Rao bound", "the smallest standard deviation that any fit can have"),
     ("bound", r"the bound(?= that no design)", "what no choice of commands can exceed"),
     ("covariance", r"covariances?", "how uncertain a pose is, and in which direction"),
     ("NEES", r"NEES", "squared error over the stated uncertainty; 3 where that is right"),

@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import math
+import re
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from omnibench.robot.calibration import Noise
 
 NOTHING = "–"
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -82,7 +87,33 @@ def span(low: float, high: float, decimals: int, signed: bool = False) -> str:
     return f"{fixed(low, decimals, signed)} to {fixed(high, decimals, signed)}"
 
 
-def listing(names: list[str], limit: int = 8) -> str:
+def with_unit(number: str, unit: str) -> str:
+    """A number with its unit; the degree sign follows without a space."""
+    return f"{number}{unit}" if unit.startswith("°") else f"{number} {unit}".rstrip()
+
+
+def typeset(sentence: str) -> str:
+    """A sentence of the terminal as reports write it, with arrows, minus signs and degree signs."""
+    return re.sub(r"(?<=\d) deg\b", "°", re.sub(r"(?<![\w.])-(?=\d)", "−", sentence.replace(" -> ", " → ")))
+
+
+def noise_in_words(noise: Noise) -> tuple[str, str]:
+    """The noise of positions and of headings in words, without components that are zero."""
+    kinds = (("white", ""), ("walk", "/√s"), ("bias of a run", ""))
+    position = (noise.pose_position, noise.walk_position, noise.bias_position)
+    heading = (noise.pose_heading, noise.walk_heading, noise.bias_heading)
+    shown = []
+    for values, factor, unit in ((position, 1e3, " mm"), (heading, math.degrees(1.0), "°")):
+        parts = [
+            f"{kind} {significant(factor * value, 2)}{unit}{per}"
+            for (kind, per), value in zip(kinds, values, strict=True)
+            if value > 0
+        ]
+        shown.append(", ".join(parts) or "none")
+    return shown[0], shown[1]
+
+
+def listing(names: list[str], limit: int = 8, last: str = "and") -> str:
     """Names as ``a, b and c``; those beyond ``limit`` are counted."""
     shown = names[:limit] + ([f"{len(names) - limit} more"] if len(names) > limit else [])
-    return " and ".join([", ".join(shown[:-1]), shown[-1]] if len(shown) > 1 else shown)
+    return f" {last} ".join([", ".join(shown[:-1]), shown[-1]] if len(shown) > 1 else shown)

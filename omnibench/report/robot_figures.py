@@ -19,7 +19,7 @@ _WIDTH = 0.15  # of a drawn wheel, as a share of its radius (chosen: the data do
 _REACH = 1.95  # half of the picture, in distances from the centre to the farthest wheel
 _DIRECTION = -30  # degrees: of the command that is drawn, between axes and wheels (chosen)
 _FRAME = LegendItem("frame", "the robot's frame", INK)
-_ROLLING = LegendItem("rolling", "where a positive rate drives the robot at a wheel", PALETTE[0])
+_ROLLING = LegendItem("rolling", "direction of a positive wheel rate", PALETTE[0])
 _COMMAND = LegendItem("command", "motion command (v, α, ω)", PALETTE[2])
 DESIGN = LegendItem("design", "design values", THEORETICAL)
 

@@ -76,7 +76,8 @@ def test_a_robot_on_two_wheels_is_not_asked_to_go_sideways() -> None:
 
 
 def test_motions_that_are_missing_on_both_sides_are_named_once() -> None:
-    assert "on the spot, " in f"{missing_in_words(driven_motions(driving(OMNI, (0.2, 0.0, 0.0)), OMNI))}, "
+    missing = missing_in_words(driven_motions(driving(OMNI, (0.2, 0.0, 0.0)), OMNI))
+    assert missing == "in curves to the left, in curves to the right, on the spot, backward or sideways"
 
 
 @pytest.fixture(scope="module")
@@ -105,8 +106,9 @@ def test_the_report_says_what_was_driven_and_what_it_determines(report: Page) ->
 
 def test_every_parameter_has_its_precision(recorded: Dataset, report: Page) -> None:
     found = inspect_dataset(recorded).identifiability.parameters
-    told = [row[3] == "told" for row in report.tables["What these runs tell of the wheels"][1:]]
-    assert told == [parameter.told for parameter in found]
+    rows = report.tables["Wheels, as these runs determine them"][1:]
+    assert [row[3] == "determined" for row in rows] == [parameter.told for parameter in found]
+    assert {row[1][-1] for row in rows} == {"m", "°"}
 
 
 def test_the_paths_stand_in_the_first_900_pixels(file: Path) -> None:

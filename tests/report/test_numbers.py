@@ -18,6 +18,8 @@ from omnibench.report.numbers import (
     round_down,
     seconds,
     significant,
+    typeset,
+    with_unit,
 )
 from omnibench.words import noun_for, plural
 
@@ -82,6 +84,16 @@ def test_a_listing_ends_with_and_and_counts_what_it_leaves_out() -> None:
     assert listing(["a"]) == "a"
     assert listing(["a", "b", "c"]) == "a, b and c"
     assert listing(["a", "b", "c", "d"], limit=2) == "a, b and 2 more"
+    assert listing(["a", "b", "c"], last="or") == "a, b or c"
+
+
+def test_sentences_of_the_terminal_get_arrows_minus_and_degree_signs() -> None:
+    words = "held out: 52 mm -> 14 mm, 4.4 deg -> 1.0 deg (95 % interval -3.2 to 7.3 %); run-01, turn-360"
+    assert typeset(words) == "held out: 52 mm → 14 mm, 4.4° → 1.0° (95 % interval −3.2 to 7.3 %); run-01, turn-360"
+
+
+def test_the_degree_sign_alone_follows_without_a_space() -> None:
+    assert [with_unit("3", unit) for unit in ("mm", "°", "°/s", "")] == ["3 mm", "3°", "3°/s", "3"]
 
 
 def test_plurals_are_english() -> None:

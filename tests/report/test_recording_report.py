@@ -87,6 +87,7 @@ def test_what_was_not_recorded_is_told_so(made: Sample, tmp_path: Path) -> None:
     for name in ("Motion command", "Target wheel rates", "Wheel angles", "LIDAR scans"):
         assert told.row(CONTENTS, name)[1] == "not recorded"
     assert told.row(CONTENTS, "Reference poses")[3] == "without covariances"
+    assert told.row(CONTENTS, "Reference poses")[0].endswith("(x, y, θ)")  # no LIDAR made them
 
 
 def test_a_recording_without_scans_targets_and_commands_still_has_its_pictures(made: Sample, tmp_path: Path) -> None:

@@ -12,7 +12,6 @@ from rich.console import Console
 
 from omnibench.cli.terminal.console import print_ending
 from omnibench.cli.terminal.tables import print_table
-from omnibench.discover.report.wording import noise_in_words
 from omnibench.errors import ConfigError
 from omnibench.fit.bounds.stamp_sums import QUADRATURE
 from omnibench.fit.calibrate import CalibrationRun
@@ -22,6 +21,7 @@ from omnibench.fit.geometry import WheelGeometry
 from omnibench.fit.uncertainty.bootstrap import ElementIntervals
 from omnibench.fit.uncertainty.physical import ParameterEstimate
 from omnibench.report.blocks import Cell, Column, Row, Table
+from omnibench.report.numbers import noise_in_words
 from omnibench.robot.calibration import Calibration, HeldOutVerdict
 from omnibench.robot.export.formats import export_calibration
 from omnibench.robot.kinematics import Robot

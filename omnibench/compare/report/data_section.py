@@ -18,7 +18,7 @@ def data_section(view: DatasetView) -> Section:
     durations = np.array([trajectory.end for trajectory in trajectories])
     commands = {trajectory.command for trajectory in trajectories} - {None}
     sessions = {trajectory.session for trajectory in trajectories} - {None}
-    split_sizes = [f"{count(len(dataset.split(split)))} for {SPLIT_NAMES[split]}" for split in SPLITS]
+    split_sizes = [f"{count(len(dataset.split(split)))} {SPLIT_NAMES[split]}" for split in SPLITS]
     wheels = [_wheel(wheel) for wheel in dataset.robot.wheels]
     facts = [
         Fact("Data set", dataset.name, "simulated" if dataset.simulated else ""),

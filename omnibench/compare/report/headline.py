@@ -20,7 +20,7 @@ from omnibench.compare.report.wording import (
 from omnibench.compare.result import THEORETICAL_NAME, EntryStatistics
 from omnibench.fit.evaluate import positions_and_headings
 from omnibench.report.blocks import Block, Callout, Fact, FigureGrid, LegendItem, Paragraph, Section, answer_section
-from omnibench.report.numbers import fixed, listing, percent, span
+from omnibench.report.numbers import fixed, listing, percent, span, typeset
 from omnibench.report.path_pictures import CALIBRATED, paths_before_after
 from omnibench.words import plural
 
@@ -61,7 +61,8 @@ def _held_out(view: DatasetView) -> tuple[Block, ...]:
         return sessions
     verdict = view.held_out.verdict
     manner: Literal["plain", "warning"] = "plain" if verdict.verdict == "better" else "warning"
-    return (Callout(f"{view.held_out.label}, {verdict.sentence}", (verdict.detail,), manner), *sessions)
+    words = typeset(f"{view.held_out.label}, {verdict.sentence}")
+    return (Callout(words, (typeset(verdict.detail),), manner), *sessions)
 
 
 def _no_winner(view: DatasetView, best: EntryStatistics | None) -> str:
@@ -131,7 +132,7 @@ def _standing_at_length(view: DatasetView, best: EntryStatistics) -> str:
     basis = f"The intervals: {view.units[view.scored].words}."
     if len(view.calibrated) > 1 and view.undecided:
         return f"{best.label} has the lowest training cost. {basis}"
-    level = [entry.label for entry in view.level]
+    level = ["the design values" if entry.calibrator == THEORETICAL_NAME else entry.label for entry in view.level]
     if len(level) < 2:
         return basis
     return (

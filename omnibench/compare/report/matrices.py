@@ -102,7 +102,7 @@ def _element_table(view: DatasetView) -> Table:
     held = any(run.record.held for entry, run in view.calibrated if entry.parameterisation == "matrix")
     return Table(
         "Inverse kinematic matrices M⁻¹",
-        (Column("Entry", numeric=False), *_element_columns(view, with_units=True)),
+        (Column("Entry", numeric=False), *map(Column, _element_names(view), _element_units(view))),
         tuple(rows),
         f"Columns of each row in the order of the {'wheels' if drive.direct else 'drive signals'}: "
         f"{', '.join(drive.names)}. "
@@ -122,7 +122,8 @@ def _difference_table(view: DatasetView, against: str | None) -> Table:
         matrix = run.matrix if project is None else reference + (run.matrix - reference) @ project
         share = differences(matrix, reference).ravel()
         moved = (matrix - reference).ravel()
-        cells = tuple(_difference_cell(float(s), float(d)) for s, d in zip(share, moved, strict=True))
+        columns = zip(share, moved, _element_units(view), strict=True)
+        cells = [_difference_cell(float(s), float(d), unit) for s, d, unit in columns]
         rows.append(Row.of(entry_cell(view, entry), *cells))
     name = "the design values" if against is None else against
     note = "Element by element, as a share of the value compared with; where that is 0, the change itself is given."
@@ -132,15 +133,15 @@ def _difference_table(view: DatasetView, against: str | None) -> Table:
         note += f" Compared on the span of {what} that the data drive; across it the matrix is not determined."
     return Table(
         f"Differences from {name}",
-        (Column("Entry", numeric=False), *_element_columns(view, with_units=False)),
+        (Column("Entry", numeric=False), *map(Column, _element_names(view))),
         tuple(rows),
         note,
     )
 
 
-def _difference_cell(share: float, moved: float) -> Cell:
+def _difference_cell(share: float, moved: float, unit: str) -> Cell:
     if math.isnan(share):
-        return Cell("0" if abs(moved) < 1e-15 else significant(moved, 2, signed=True), "reference is 0")
+        return Cell("0" if abs(moved) < 1e-15 else significant(moved, 2, signed=True), unit)
     return Cell(f"{fixed(100 * share, 3, signed=True)} %")
 
 
@@ -157,9 +158,8 @@ def _element_names(view: DatasetView) -> list[str]:
     return [f"m{row}{column}" for row in (1, 2, 3) for column in range(1, len(view.dataset.robot.drive.names) + 1)]
 
 
-def _element_columns(view: DatasetView, with_units: bool) -> tuple[Column, ...]:
-    units = {"1": "m/rad", "2": "m/rad", "3": "rad/rad"} if with_units else dict.fromkeys("123", "")
-    return tuple(Column(name, units[name[1]]) for name in _element_names(view))
+def _element_units(view: DatasetView) -> list[str]:
+    return ["rad/rad" if name.startswith("m3") else "m/rad" for name in _element_names(view)]
 
 
 def _shown(value: float, unit: str) -> str:

@@ -213,7 +213,7 @@ def _circumstance_table(view: DatasetView) -> Table:
     systematic, _ = _parts(view.design_errors[split], runs)
     boxes = {entry.box for entry, _ in view.calibrated if entry.parameterisation == "matrix"}
     rows = [
-        Row.of("Data", Cell(origin, f"{plural(len(runs), 'run')} for {SPLIT_NAMES[split]}"), NOTHING),
+        Row.of("Data", Cell(origin, plural(len(runs), f"{SPLIT_NAMES[split]} run")), NOTHING),
         Row.of("Distance of a run, mean", f"{fixed(float(np.mean([_length(run) for run in runs])), 2)} m", _UNKNOWN),
         Row.of("Miss of a command's mean end by the design values", fixed(systematic, 4), _UNKNOWN),
         *_scatter_rows(view, runs),

@@ -47,9 +47,10 @@ def path_figures(design: Design) -> FigureGrid:
         )
         for of_set in design.sets
     )
+    drawn = {trace.legendgroup for figure in figures for trace in figure.plot.data}
     return FigureGrid(
         figures,
-        (_LEFT, _STRAIGHT, _RIGHT, _UNUSED),
+        tuple(item for item in (_LEFT, _STRAIGHT, _RIGHT, _UNUSED) if item.key in drawn),
         2 if len(figures) > 1 else 1,
         "All paths start at the origin, heading along x, and end at the dot. The more often a command is driven, the "
         "wider its line (and its number stands at its end). Turns on the spot are arcs about the origin.",

@@ -29,7 +29,7 @@ from omnibench.report.blocks import (
     answer_section,
     simulated_badge,
 )
-from omnibench.report.numbers import listing, percent, significant
+from omnibench.report.numbers import listing, noise_in_words, percent
 from omnibench.words import plural
 
 
@@ -91,8 +91,12 @@ def _answer(design: Design) -> Section:
                 "" if effort is None else f"{duration_in_words(effort.seconds)} of driving",
             ),
         ]
+    plans = []
+    if not design.recorded:
+        title = "What to drive" + " of {}" * (len(design.sets) > 1)
+        plans = [Callout(title.format(of_set.name), plan_in_words(design, of_set)) for of_set in design.sets]
     notes = Callout("Before you rely on it", design.notes)
-    return answer_section(headline(design), tiles, path_figures(design), notes)
+    return answer_section(headline(design), tiles, path_figures(design), *plans, notes)
 
 
 def _commands(design: Design) -> tuple[Block, ...]:
@@ -103,29 +107,18 @@ def _commands(design: Design) -> tuple[Block, ...]:
             chosen_table(design, of_set),
             Paragraph(motions_in_words(of_set)),
         ]
-        if not design.recorded:
-            blocks.append(Callout("What to drive", tuple(plan_in_words(design, of_set))))
         equal = f"{of_set.name} equals the baseline with {equal_in_words(design, of_set, design.use)}"
         blocks.append(Paragraph(f"{equal}, calibrated from {USE_IN_WORDS[design.use]}.", "note"))
     return tuple(blocks)
 
 
 def _basis(design: Design) -> tuple[Block, ...]:
-    noise = design.noise
-    per_root = "per √s"
+    position, heading = noise_in_words(design.noise)
     facts = (
         Fact("Source", design.source),
         Fact("Candidates and noise", origin_in_words(design)),
-        Fact(
-            "Noise of positions",
-            f"white {_small(noise.pose_position)} m, walk {_small(noise.walk_position)} m {per_root}, "
-            f"bias {_small(noise.bias_position)} m",
-        ),
-        Fact(
-            "Noise of headings",
-            f"white {_small(noise.pose_heading)} rad, walk {_small(noise.walk_heading)} rad {per_root}, "
-            f"bias {_small(noise.bias_heading)} rad",
-        ),
+        Fact("Noise of positions", position),
+        Fact("Noise of headings", heading),
         Fact("Robot", design.robot),
         Fact("Elements determined", f"{design.parameters} of the inverse kinematic matrix"),
         Fact("Odometry", "exact arcs" if design.integration == "arc" else "Euler steps, Eq. (1)"),
@@ -137,7 +130,3 @@ def _basis(design: Design) -> tuple[Block, ...]:
         ),
     )
     return (Facts(facts), Details(f"All candidates ({len(design.candidates)})", (candidate_table(design),)))
-
-
-def _small(value: float) -> str:
-    return significant(value, 2)

@@ -43,17 +43,17 @@ def _way_in_words(direction: float) -> str:
     return words.get(degrees, f"at {fixed(min(degrees, 360 - degrees), 0)}° to the {side} of forward,")
 
 
-def plan_in_words(design: Design, of_set: SetDesign) -> list[str]:
+def plan_in_words(design: Design, of_set: SetDesign) -> tuple[str, ...]:
     """What to drive of a set, a line for each chosen command, with how often."""
-    return [
+    return tuple(
         f"{drive_in_words(design.candidate(chosen.command))}, {plural(chosen.runs, 'time')}" for chosen in of_set.chosen
-    ]
+    )
 
 
 def motions_in_words(of_set: SetDesign) -> str:
     """Precision of odometry that the chosen runs promise, in words."""
     left = [
-        f"{significant(each.position_mm, 2)} mm and {significant(each.heading_deg, 2)} deg after {each.motion}"
+        f"{significant(each.position_mm, 2)} mm and {significant(each.heading_deg, 2)}° after {each.motion}"
         for each in of_set.step.motions
     ]
     return f"Calibrated from these runs, the matrix leaves an error of {listing(left)} (standard deviations)."

@@ -133,7 +133,7 @@ def _worth_a_row(of_set: SetDesign) -> list[Step]:
 
 
 def _precision_columns(design: Design, first: Column) -> tuple[Column, ...]:
-    physical = [Column(*kind, priority=1) for kind in (("Radius", "%"), ("Distance", "%"), ("Angle", "deg"))]
+    physical = [Column(*kind, priority=1) for kind in (("Radius", "%"), ("Distance", "%"), ("Angle", "°"))]
     return (
         first,
         Column("Runs"),

@@ -31,7 +31,6 @@ from omnibench.discover.report.wording import (
     gap_decimals,
     gap_in_words,
     held_out_in_words,
-    noise_in_words,
     verdict_at_length,
     verdict_in_words,
     weight_in_words,
@@ -53,7 +52,7 @@ from omnibench.report.blocks import (
     answer_section,
     simulated_badge,
 )
-from omnibench.report.numbers import count, fixed, listing
+from omnibench.report.numbers import count, fixed, listing, noise_in_words, typeset
 from omnibench.report.path_pictures import DESIGN_ITEM, paths_before_after
 from omnibench.robot.model import OdometryModel
 from omnibench.words import plural
@@ -89,9 +88,9 @@ def _answer(discovery: Discovery) -> Section:
         answer_in_words(discovery),
         tuple(_tiles(discovery)),
         _picture(discovery),
-        Paragraph(discovery.headline),
+        Paragraph(typeset(discovery.headline)),
         Callout("Motions that the training runs never had", new_motions, "warning"),
-        Callout("Before you rely on it", discovery.notes),
+        Callout("Before you rely on it", tuple(map(typeset, discovery.notes))),
     )
 
 

@@ -19,8 +19,7 @@ from omnibench.discover.result import (
     Verdict,
 )
 from omnibench.registry import effects
-from omnibench.report.numbers import NOTHING, decimals_for, fixed, listing, percent, significant, span
-from omnibench.robot.calibration import Noise
+from omnibench.report.numbers import NOTHING, decimals_for, fixed, listing, percent, significant, span, with_unit
 from omnibench.robot.effects.effect import Stage
 from omnibench.words import plural
 
@@ -90,11 +89,6 @@ class Reading:
 def reading(unit: str) -> Reading:
     """The way in which a parameter in an SI unit is shown."""
     return Reading(*_READ_AS.get(unit, (1.0, unit.replace("s2", "s²"))))
-
-
-def with_unit(number: str, unit: str) -> str:
-    """A number with its unit; the degree sign follows without a space."""
-    return f"{number}{unit}" if unit.startswith("°") else f"{number} {unit}".rstrip()
 
 
 def value_and_interval(parameter: EstimatedParameter) -> tuple[str, str, str]:
@@ -279,19 +273,3 @@ def data_in_words(discovery: Discovery) -> str:
     kind = "simulated data" if discovery.dataset.simulated else "recorded data"
     runs = plural(len(discovery.trajectories), "training run")
     return f"{discovery.dataset.name} ({kind}): {runs}, {plural(discovery.poses, 'reference pose')}"
-
-
-def noise_in_words(noise: Noise) -> tuple[str, str]:
-    """The noise of positions and of headings in words, without components that are zero."""
-    kinds = (("white", ""), ("walk", "/√s"), ("bias of a run", ""))
-    position = (noise.pose_position, noise.walk_position, noise.bias_position)
-    heading = (noise.pose_heading, noise.walk_heading, noise.bias_heading)
-    shown = []
-    for values, factor, unit in ((position, 1e3, " mm"), (heading, _DEGREES, "°")):
-        parts = [
-            f"{kind} {significant(factor * value, 2)}{unit}{per}"
-            for (kind, per), value in zip(kinds, values, strict=True)
-            if value > 0
-        ]
-        shown.append(", ".join(parts) or "none")
-    return shown[0], shown[1]

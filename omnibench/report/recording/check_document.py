@@ -23,7 +23,7 @@ from omnibench.report.blocks import (
     answer_section,
     simulated_badge,
 )
-from omnibench.report.numbers import fixed
+from omnibench.report.numbers import fixed, typeset
 from omnibench.report.recording.section import path_overview
 from omnibench.report.style import PALETTE, REFERENCE, plot
 from omnibench.report.traces import line
@@ -60,7 +60,7 @@ def check_document(dataset: Dataset, sentence: str, findings: Sequence[Finding],
 
 
 def _gain(gain: str) -> str:
-    return f"What a calibration would gain on runs that it was not fitted to, each in turn; {gain}."
+    return f"What a calibration would gain on runs that it was not fitted to, each in turn; {typeset(gain)}."
 
 
 def _blocks(findings: Sequence[Finding]) -> list[Block]:
@@ -90,6 +90,10 @@ def _clock_picture(robot: Robot, runs: Sequence[Trajectory], clocks: Sequence[Cl
         _rates(robot, run, run.pose_times, span, f"As recorded: {fixed(abs(off), 2)} s apart"),
         _rates(robot, run, clock.corrected(run.pose_times), span, "With matched stamps"),
     )
+    values = [value for figure in figures for trace in figure.plot.data for value in trace.y]
+    margin = 0.05 * (max(values) - min(values))
+    for figure in figures:
+        figure.plot.update_yaxes(range=[min(values) - margin, max(values) + margin])
     caption = f"Rate of turn in run {run.id}, whose stamps are among those that differ most."
     return FigureGrid(figures, (_WHEELS, _REFERENCE), caption=caption, name="clocks")
 

@@ -26,7 +26,7 @@ def contents_table(dataset: Dataset) -> Table:
         *_steering(runs),
         _row("Odometry", "(x, y, θ)", number, "poses", _every(samples, first=0.0), "computed from the wheel rates"),
         _scans(dataset),
-        _reference(runs),
+        _reference(dataset),
     ]
     return Table(
         caption="What was recorded",
@@ -94,14 +94,15 @@ def _scans(dataset: Dataset) -> Row:
     return _row("LIDAR scans", "LIDAR", sum(map(len, times)), "scans", _every(times), remark)
 
 
-def _reference(runs: Sequence[Trajectory]) -> Row:
+def _reference(dataset: Dataset) -> Row:
+    runs = dataset.trajectories
     times = [run.pose_times for run in runs]
     with_covariance = sum(run.pose_covariances is not None for run in runs)
     remark = "with covariances" if with_covariance == len(runs) else "without covariances"
     if 0 < with_covariance < len(runs):
         remark = f"with covariances in {count(with_covariance)} of {count(len(runs))} runs"
-    name = "Reference poses"
-    return _row(name, "(x, y, θ) LIDAR", sum(map(len, times)), "poses", _every(times), remark)
+    symbol = "(x, y, θ)" if dataset.scans is None else "(x, y, θ) LIDAR"
+    return _row("Reference poses", symbol, sum(map(len, times)), "poses", _every(times), remark)
 
 
 def _every(times: Iterable[Array], first: float | None = None) -> str:

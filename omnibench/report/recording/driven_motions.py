@@ -10,7 +10,7 @@ import numpy as np
 from omnibench.data.dataset import Trajectory
 from omnibench.fit.check.motion_kinds import SHARE, motion_kinds, turning
 from omnibench.report.blocks import Cell, Column, Figure, FigureGrid, LegendItem, Row, Table
-from omnibench.report.numbers import NOTHING, fixed, percent, significant
+from omnibench.report.numbers import NOTHING, fixed, listing, percent, significant
 from omnibench.report.recording.scan_points import evenly
 from omnibench.report.style import INK, PALETTE, plot
 from omnibench.report.traces import marks
@@ -50,10 +50,12 @@ def driven_motions(runs: Sequence[Trajectory], robot: Robot) -> list[DrivenMotio
 
 def missing_in_words(motions: Sequence[DrivenMotion]) -> str:
     """The motions that were not driven, in words; empty where none is missing."""
-    names = ", ".join(motion.name for motion in motions if not motion.driven)
-    for both in ("on the spot to the left, on the spot to the right", "sideways to the left, sideways to the right"):
-        names = names.replace(both, both.split(" to")[0])
-    return names.replace("curves to", "in curves to")
+    names = [motion.name.replace("curves to", "in curves to") for motion in motions if not motion.driven]
+    for both in ("on the spot", "sideways"):
+        if {f"{both} to the left", f"{both} to the right"} <= set(names):
+            names[names.index(f"{both} to the left")] = both
+            names.remove(f"{both} to the right")
+    return listing(names, last="or")
 
 
 def _twists(runs: Sequence[Trajectory], robot: Robot) -> tuple[Array, Array]:
@@ -110,7 +112,8 @@ def motion_figures(runs: Sequence[Trajectory], robot: Robot) -> FigureGrid:
     twists = twists[evenly(len(twists), _DRAWN)] if len(twists) else twists
     kinds = motion_kinds(twists, robot)
     left, right = turning(kinds, "left"), turning(kinds, "right")
-    groups = ((_LEFT, left), (_STRAIGHT_ON, ~left & ~right), (_RIGHT, right))
+    of_kinds = ((_LEFT, left), (_STRAIGHT_ON, ~left & ~right), (_RIGHT, right))
+    groups = [(item, chosen) for item, chosen in of_kinds if chosen.any()]
     above, beside = [], []
     for item, chosen in groups:
         ahead, aside, rate = twists[chosen].T

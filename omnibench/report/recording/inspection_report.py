@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from omnibench.data.dataset import Dataset
 from omnibench.fit.inspect import Inspection
+from omnibench.fit.uncertainty.identifiability import UNTOLD
 from omnibench.report.blocks import (
     Callout,
     Document,
@@ -13,7 +14,7 @@ from omnibench.report.blocks import (
     answer_section,
     simulated_badge,
 )
-from omnibench.report.numbers import count, fixed, significant
+from omnibench.report.numbers import count, fixed, listing, significant
 from omnibench.report.recording.contents import contents_table
 from omnibench.report.recording.driven_motions import (
     DrivenMotion,
@@ -106,6 +107,9 @@ def _reference_tile(inspection: Inspection) -> Fact:
 def _identified_in_words(inspection: Inspection) -> list[str]:
     """What the runs determine and what they do not, a sentence each."""
     driven = [each for each in inspection.identifiability.directions if each.state == "driven" and each.motion]
-    motions = dict.fromkeys(each.motion.removesuffix(" on the spot") for each in driven)
-    words = [f"Determined: the columns of the matrix that belong to {', '.join(motions)}."] if driven else []
+    words = []
+    for title, wanted in (("Determined", False), ("Determined in part", True)):
+        some = [each for each in driven if wanted == any(value > UNTOLD for value in each.deviations or ())]
+        motions = list(dict.fromkeys(each.motion.removesuffix(" on the spot") for each in some))
+        words += [f"{title}: the columns of the matrix that belong to {listing(motions)}."] if some else []
     return [*words, *(f"{sentence[:1].upper()}{sentence[1:]}." for sentence in inspection.identifiability.sentences)]

@@ -7,7 +7,7 @@ import math
 from omnibench.fit.inspect import Inspection
 from omnibench.fit.uncertainty.identifiability import ROWS, UNTOLD
 from omnibench.report.blocks import Column, Row, Table
-from omnibench.report.numbers import NOTHING, fixed, significant
+from omnibench.report.numbers import NOTHING, fixed, significant, with_unit
 
 
 def driven_by(inspection: Inspection) -> str:
@@ -31,7 +31,7 @@ def split_table(inspection: Inspection) -> Table:
         Column("commands"),
         Column("repetitions", priority=1),
         Column("sessions"),
-        *(Column(*quantity) for quantity in (("duration", "s"), ("distance", "m"), ("turned", "deg"))),
+        *(Column(*quantity) for quantity in (("duration", "s"), ("distance", "m"), ("turned", "°"))),
     )
     return Table("", columns, tuple(rows))
 
@@ -52,7 +52,7 @@ def identifiability_table(inspection: Inspection) -> Table:
         Column("driven"),
         *(Column(f"row {row}") for row in ROWS),
     )
-    caption = "precision of a calibration from these data, +- % of the row's largest element"
+    caption = "Precision of a calibration from these data, ± % of the row's largest element"
     return Table(caption, columns, tuple(rows))
 
 
@@ -62,15 +62,19 @@ def parameter_table(inspection: Inspection) -> Table:
     for parameter in inspection.identifiability.parameters:
         factor, unit, digits = (math.degrees(1.0), "°", 2) if parameter.unit == "rad" else (1e3, "mm", 1)
         kind, _, wheel = parameter.name.partition("_")
-        known = NOTHING if parameter.deviation is None else f"± {significant(factor * parameter.deviation, 2)} {unit}"
-        design = f"{fixed(factor * parameter.design, digits)} {unit}"
-        told = "told" if parameter.told else "not told by these runs"
-        rows.append(Row.of(f"{kind} of {wheel}" if wheel else kind, design, known, told))
+        known = (
+            NOTHING
+            if parameter.deviation is None
+            else f"± {with_unit(significant(factor * parameter.deviation, 2), unit)}"
+        )
+        design = with_unit(fixed(factor * parameter.design, digits), unit)
+        known_now = "determined" if parameter.told else "not determined"
+        rows.append(Row.of(f"{kind} of {wheel}" if wheel else kind, design, known, known_now))
     columns = (
         Column("Parameter", numeric=False),
         Column("Design"),
         Column("Could be known to"),
-        Column("These runs", numeric=False),
+        Column("By these runs", numeric=False),
     )
     note = "One standard deviation of the best that any calibration from these runs could do (the Cramér-Rao bound)."
-    return Table("What these runs tell of the wheels", columns, tuple(rows), note)
+    return Table("Wheels, as these runs determine them", columns, tuple(rows), note)

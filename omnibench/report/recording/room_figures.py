@@ -104,9 +104,8 @@ def one_run(
         figures.append(Figure("In its room", _map(room), description, 460))
     picks = evenly(len(trajectory.poses), 100)
     poses = [marks(REFERENCE_ITEM, 5, *trajectory.poses[picks, :2].T), *ellipses, _start(trajectory.start)]
-    figures.append(
-        Figure("Close up", _map([*lines, *poses]), "The run's paths close up, with covariance ellipses", 460)
-    )
+    title = "Close up" if figures else "Its path"
+    figures.append(Figure(title, _map([*lines, *poses]), "The run's paths close up, with covariance ellipses", 460))
     items += _room_items(dataset, outlines)
     caption = "Scan points are placed at the reference poses, each ray where the robot was when it was measured." * (
         len(figures) > 1

@@ -97,7 +97,7 @@ class RotationTranslationCoupling(MotionEffect):
 
 @effects.register("quadratic_rotation_slip")
 class QuadraticRotationSlip(MotionEffect):
-    """The faster the robot turns, the more of it is lost: w - k w abs(w)."""
+    """The faster the robot turns, the more of it is lost or gained: w - k w abs(w)."""
 
     stage = "body"
     physics = "The rollers' drag grows with the rate of turn, and the wheels slip against it."

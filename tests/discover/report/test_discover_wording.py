@@ -16,12 +16,12 @@ from omnibench.discover.report.wording import (
     floor_in_words,
     gap_in_words,
     held_out_in_words,
-    noise_in_words,
     reading,
     value_and_interval,
     weight_in_words,
 )
 from omnibench.discover.result import EstimatedParameter, Extrapolation, Gap, Step
+from omnibench.report.numbers import noise_in_words
 from omnibench.robot.calibration import Noise
 
 
