@@ -23,6 +23,7 @@ from omnibench.words import plural
 
 if TYPE_CHECKING:
     from omnibench.fit.check.recording_source import RecordingSource
+    from omnibench.fit.check.result import CheckReport
 
 import_app = typer.Typer()
 
@@ -118,13 +119,15 @@ def import_(
         _refuse_units(read, output)
     dataset = replace(dataset, imported=Imported.of(importer, source, given))
     save_dataset(dataset, output, table_format, overwrite=force)
-    warn(dataset.warnings)
+    report = None if no_check else _checked(read)
+    warn([each for each in dataset.warnings if report is None or not _is_said(each, report.sentence)])
     typer.echo(f"{plural(len(dataset.trajectories), 'trajectory')}: {output}")
     way = " (other: --set validation=PATTERN)" if "validation" in entry.cls.Options.model_fields else ""
     typer.echo(f"{division_in_words(dataset.trajectories, options)}{way}", err=True)
     then: tuple[str, tuple[object, ...]] = ("see what they tell", ("omnibench", "inspect", output))
-    if not no_check:
-        then = _checked(read, output)
+    if report is not None:
+        make_console(error=True).print(f"check: {report.sentence}.", soft_wrap=True)
+        then = _after(report, output)
     print_ending(
         f"{output} holds {plural(len(dataset.trajectories), 'run')} of {dataset.robot.name}", then[0], *then[1]
     )
@@ -134,22 +137,30 @@ def import_(
 def _refuse_units(read: "RecordingSource", output: Path) -> None:
     """DataError: the units of a recording cannot be right by their magnitude; it says what to type."""
     from omnibench.data.checks.finding import FindingWarning
-    from omnibench.fit.check.checking import check_recording
 
     wrong = [warning for warning in read.dataset.warnings if isinstance(warning, FindingWarning) and warning.unit]
     if not wrong:
         return
-    mended = check_recording(read).command
+    mended = _checked(read).command
     way = f"type {mended}, or " if mended else ""
     raise DataError(f"{'; '.join(wrong)}; {output} is not written: {way}--accept-units to write it as it is")
 
 
-def _checked(read: "RecordingSource", output: Path) -> tuple[str, tuple[str | Path, ...]]:
-    """Print the sentence of the check; what to do next, and the words to type for it."""
-    from omnibench.fit.check.checking import check_recording
+def _checked(read: "RecordingSource") -> "CheckReport":
+    from omnibench.fit.check.checking import check_recording  # slow to import, and left out by --no-check
 
-    report = check_recording(read)
-    make_console(error=True).print(f"check: {report.sentence}.", soft_wrap=True)
+    return check_recording(read)
+
+
+def _is_said(warning: str, sentence: str) -> bool:
+    """True for the warning of a finding that the sentence of the check says."""
+    from omnibench.data.checks.finding import FindingWarning
+
+    return isinstance(warning, FindingWarning) and warning.finding.what in sentence
+
+
+def _after(report: "CheckReport", output: Path) -> tuple[str, tuple[str | Path, ...]]:
+    """What to do after an import, and the words to type for it."""
     if report.command:
         return "mend it", tuple(shlex.split(report.command))
     if report.verdict == "ready":
