@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,6 +20,7 @@ from hypothesis import strategies as st
 from wheeled_samples import TRICYCLE
 
 from omnibench import check, save_dataset
+from omnibench.cli.handbook_topics import HANDBOOK
 from omnibench.config import parse_settings
 from omnibench.data.checks.option_words import as_yaml
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
@@ -90,6 +92,18 @@ def kinds(report: CheckReport) -> set[str]:
     return {finding.kind for finding in report.findings}
 
 
+def in_the_faq(report: CheckReport, kind: str) -> bool:
+    """True if a heading of the handbook's FAQ quotes the findings of a kind, in whatever numbers and wheels it is."""
+
+    def plain(text: str) -> str:
+        return re.sub(r"wheel \w+", "wheel W", re.sub(r"\d[\d.]*", "N", text))
+
+    headings = re.findall("^## .*$", (HANDBOOK / "tasks" / "faq.md").read_text("utf-8"), re.MULTILINE)
+    quotes = [plain(quote) for heading in headings for quote in re.findall('"([^"]+)"', heading)]
+    said = [plain(finding.what) for finding in report.findings if finding.kind == kind]
+    return bool(said) and all(any(quote in what for quote in quotes) for what in said)
+
+
 def test_a_sound_recording_is_ready_and_its_calibration_is_needed() -> None:
     report = check(recording())
     assert (report.verdict, kinds(report)) == ("ready", set())
@@ -115,6 +129,7 @@ def test_a_fault_is_found_and_what_is_typed_for_it_mends_it(
     save_dataset(changed(*TYPED[kind]), "log")
     report = check("log")
     assert report.verdict == "fix"
+    assert in_the_faq(report, kind) == (kind in ("wheel_negated", "wheel_scale"))
     (fix,) = {finding.fix for finding in report.findings if finding.kind == kind}
     program, *words = shlex.split(fix)
     assert program == "omnibench"
@@ -190,6 +205,20 @@ def test_a_wheel_that_never_turns_is_dead() -> None:
     report = check(changed(lambda run: replace(run, rates=run.rates * (1, 0))))
     assert report.verdict == "record more"
     assert [(f.kind, f.where) for f in report.findings] == [("wheel_dead", f"wheel {recording().robot.wheel_names[1]}")]
+
+
+def test_poses_of_other_runs_are_not_what_the_wheels_drove() -> None:
+    runs = recording().trajectories
+    others = [replace(run, poses=other.poses) for run, other in zip(runs, (*runs[1:], runs[0]), strict=True)]
+    report = check(make_dataset("base", recording().robot, 0.04, others))
+    assert (report.verdict, kinds(report), report.gain) == ("record more", {"reference_foreign"}, "")
+    assert in_the_faq(report, "reference_foreign")
+
+
+def test_poses_that_end_long_before_the_wheels_are_told() -> None:
+    report = check(changed(lambda run: replace(run, pose_times=run.pose_times / 100)))
+    assert "reference_foreign" in kinds(report)
+    assert "end long before the wheels, as after 0.24 s of 24 s" in report.sentence
 
 
 @pytest.mark.parametrize("driven", [24.0, 3.0])

@@ -45,6 +45,7 @@ Kind = Literal[
     "headings_ambiguous",
     "sample_period",
     "late_reference",
+    "reference_foreign",
 ]
 
 

@@ -21,12 +21,14 @@ from omnibench.data.importers.copied_reference import follows_the_wheels
 from omnibench.data.references.reference_units import odd_references
 from omnibench.fit.check.expected_gain import Gain, expected_gain
 from omnibench.fit.check.fixes import command, with_fixes
+from omnibench.fit.check.foreign_reference import foreign_reference
 from omnibench.fit.check.missing_motions import missing_motions, too_few
 from omnibench.fit.check.recording_source import RecordingSource, of_dataset, read_source, recorded
 from omnibench.fit.check.result import CheckReport, Verdict
 from omnibench.fit.observations.open_in_words import open_sentences
 from omnibench.words import plural
 
+_BENT = ("heading_unit", "time_unit", "steering")  # misreadings that no matrix takes up, as it does others
 _SPOILED = ("reference_frozen", "reference_is_odometry")  # after which the wheels cannot be judged by the reference
 _ORDER = {"error": 0, "warning": 1, "note": 2}
 
@@ -58,21 +60,27 @@ def check_recording(read: RecordingSource) -> CheckReport:
     faults = list(stream_faults(robot, [*aligned, *(run for run in dataset.trajectories if not run.has_poses)]))
     odometry = list(_odometry(dataset, runs))
     spoiled = {finding.kind for finding in (*faults, *odometry)} & set(_SPOILED)
-    explained = search(recorded(replace(dataset, trajectories=tuple(aligned))))
+    seen = recorded(replace(dataset, trajectories=tuple(aligned)))
+    explained = search(seen)
     # A steering or a wheel that never counts is mended by no other reading of it.
     frozen = any(fault.kind in ("steering_frozen", "wheel_dead") and not fault.changes for fault in faults)
     misread = [] if frozen else list(_misreadings(explained)) if explained.told else _warned(dataset)
     if misread:  # wheels that are misread tell no jumps
         faults = [fault for fault in faults if fault.kind != "reference_jump"]
     odd = _odd_references(dataset) if explained.told else []
-    found = [*read.findings, *_noted(dataset), *misread, *odd, *odometry, *faults, *copied_runs(runs)]
-    if not spoiled:
+    wrong = any(finding.severity == "error" for finding in (*odd, *odometry, *faults))
+    bent = any(finding.kind.startswith(_BENT) for finding in misread)
+    foreign = [] if wrong or bent else list(foreign_reference(seen, aligned))
+    if foreign:
+        misread = []
+    found = [*read.findings, *_noted(dataset), *misread, *odd, *foreign, *odometry, *faults, *copied_runs(runs)]
+    if not spoiled and not foreign:
         found += clock_findings(runs, clocks)
     measured = any(run.references is not None for run in dataset.trajectories)
     found += _left_open(dataset) if measured else missing_motions(robot, aligned)
     found += too_few(dataset.trajectories)
     findings = with_fixes(read, sorted(_distinct(found), key=lambda finding: _ORDER[finding.severity]))
-    return _report(read, findings, Gain(None, "") if misread or odd or spoiled else expected_gain(dataset))
+    return _report(read, findings, Gain(None, "") if misread or odd or foreign or spoiled else expected_gain(dataset))
 
 
 def _report(read: RecordingSource, findings: Sequence[Finding], gain: Gain) -> CheckReport:

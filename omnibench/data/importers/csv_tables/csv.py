@@ -120,7 +120,7 @@ class Csv(Importer):
         if not runs and options.start_at_rest and len(_poses_within(recording)) > 1:
             warnings.append(f"{name}: left out: it never stands still before it drives (start_at_rest)")
         elif not runs:
-            raise _apart(recording)
+            raise _apart(recording, options.pose_time_offset)
         return [run.trajectory for run in runs]
 
 
@@ -142,8 +142,8 @@ def _poses_within(recording: RecordedStreams) -> Array:
     return times[(times >= samples.begins[0]) & (times <= samples.ends[-1])]
 
 
-def _apart(recording: RecordedStreams) -> DataError:
-    """The error of wheels and poses that share no time."""
+def _apart(recording: RecordedStreams, offset: float) -> DataError:
+    """The error of wheels and poses that share no time. offset: that was added to the poses' times, s."""
     samples, times = recording.samples, recording.reference.times
     if len(times) < 2 and recording.reference.measured is not None:
         return DataError(
@@ -155,7 +155,8 @@ def _apart(recording: RecordedStreams) -> DataError:
             return DataError(f"{recording.place}: {what}: has one row; two are needed, or the run is no run")
     spans = f"poses {times[0]:.10g} to {times[-1]:.10g} s, wheels {samples.begins[0]:.10g} to {samples.ends[-1]:.10g} s"
     share = (times[-1] - times[0]) / (samples.ends[-1] - samples.begins[0])
-    way = "check time units (--set wheel_time_unit=ms, pose_time_unit=ms), or --set clocks=match for clocks apart"
+    shift = offset + samples.begins[0] - times[0]
+    way = f"of clocks apart that begin together: --set pose_time_offset={shift:.10g} --set clocks=match"
     if share > _FAR:
         way = "the poses' times look like ms: --set pose_time_unit=ms (or us, ns)"
     elif share < 1 / _FAR:
