@@ -66,7 +66,7 @@ def check(
         from omnibench.report.recording.check_document import check_document
         from omnibench.report.render import write_document
 
-        document = check_document(read.dataset, checked.sentence, checked.findings, checked.gain)
+        document = check_document(read.dataset, checked)
         if report is not None:
             write_document(document, report)
             typer.echo(f"report: {report}", err=True)

@@ -26,7 +26,7 @@ from omnibench.fit.check.missing_motions import missing_motions, too_few
 from omnibench.fit.check.recording_source import RecordingSource, of_dataset, read_source, recorded
 from omnibench.fit.check.result import CheckReport, Verdict
 from omnibench.fit.observations.open_in_words import open_sentences
-from omnibench.words import plural
+from omnibench.words import noun_for, plural
 
 _BENT = ("heading_unit", "time_unit", "steering")  # misreadings that no matrix takes up, as it does others
 _SPOILED = ("reference_frozen", "reference_is_odometry")  # after which the wheels cannot be judged by the reference
@@ -80,10 +80,13 @@ def check_recording(read: RecordingSource) -> CheckReport:
     found += _left_open(dataset) if measured else missing_motions(robot, aligned)
     found += too_few(dataset.trajectories)
     findings = with_fixes(read, sorted(_distinct(found), key=lambda finding: _ORDER[finding.severity]))
-    return _report(read, findings, Gain(None, "") if misread or odd or foreign or spoiled else expected_gain(dataset))
+    gain = Gain(None, "") if misread or odd or foreign or spoiled else expected_gain(dataset)
+    return _report(read, findings, gain, clocks)
 
 
-def _report(read: RecordingSource, findings: Sequence[Finding], gain: Gain) -> CheckReport:
+def _report(
+    read: RecordingSource, findings: Sequence[Finding], gain: Gain, clocks: Sequence[ClockMatch | None]
+) -> CheckReport:
     errors = [finding for finding in findings if finding.severity == "error"]
     typed = [finding for finding in errors if finding.changes]
     lacking = [finding for finding in findings if finding.kind in ("motion_missing", "few_runs", "few_repetitions")]
@@ -91,7 +94,8 @@ def _report(read: RecordingSource, findings: Sequence[Finding], gain: Gain) -> C
     name = read.dataset.name
     first = (typed or errors or lacking or list(findings))[:1]
     what = first[0].what if first else ""
-    more = f" (and {plural(len(findings) - 1, 'finding')} more)" if len(findings) > 1 else ""
+    others = len(findings) - 1
+    more = f" (and {others} more {noun_for(others, 'finding')})" if others > 0 else ""
     if verdict == "ready":
         sentence = f"{name} is ready for calibration" + (
             f"; {plural(len(findings), 'remark')} below" if findings else ""
@@ -109,6 +113,7 @@ def _report(read: RecordingSource, findings: Sequence[Finding], gain: Gain) -> C
         sentence=sentence,
         gain=gain.sentence,
         command=command(read, typed),
+        clocks=tuple(clocks),
     )
 
 

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from omnibench.data.checks.clock_findings import clocks_of
 from omnibench.data.checks.finding import Finding
 from omnibench.data.clock_matching import ClockMatch
 from omnibench.data.dataset import Dataset, Trajectory
+from omnibench.fit.check.result import CheckReport
 from omnibench.report.blocks import (
     Block,
     Code,
@@ -37,19 +37,22 @@ _LOOKED_AT = 8  # runs whose clocks are farthest off, of which the one is drawn 
 _WORDS = {"error": "Errors", "warning": "Warnings", "note": "Notes"}
 
 
-def check_document(dataset: Dataset, sentence: str, findings: Sequence[Finding], gain: str) -> Document:
-    """The report as blocks. sentence: the verdict. gain: what a calibration would gain, in words."""
+def check_document(dataset: Dataset, checked: CheckReport) -> Document:
+    """The report on a data set as blocks."""
     runs = [run for run in dataset.trajectories if run.has_poses]
-    clocks = clocks_of(dataset.robot, runs) if runs else []
-    picture = _clock_picture(dataset.robot, runs, clocks) or path_overview(dataset)
-    counts = {severity: sum(each.severity == severity for each in findings) for severity in _WORDS}
+    picture = _clock_picture(dataset.robot, runs, checked.clocks) or path_overview(dataset)
+    counts = {severity: sum(each.severity == severity for each in checked.findings) for severity in _WORDS}
     tiles = [Fact(_WORDS[severity], str(count)) for severity, count in counts.items()]
     tiles.append(Fact("Runs", str(len(dataset.trajectories))))
     sections = [
         answer_section(
-            f"{sentence}.", tiles, picture, *([Paragraph(_gain(gain), "note")] if gain else []), title="Verdict"
+            f"{checked.sentence}.",
+            tiles,
+            picture,
+            *([Paragraph(_gain(checked.gain), "note")] if checked.gain else []),
+            title="Verdict",
         ),
-        Section("findings", "Findings, each with what to type", tuple(_blocks(findings))),
+        Section("findings", "Findings, each with what to type", tuple(_blocks(checked.findings))),
     ]
     return Document(
         title=f"Check: {dataset.name}",
