@@ -110,7 +110,7 @@ class Shown:
         return view.figure(**options)
 
     def _lines(self) -> list[str]:
-        return _screenful(_view(self).lines())
+        return screenful(_view(self).lines())
 
 
 def brief(name: str, values: Iterable[tuple[str | None, Any]]) -> str:
@@ -119,10 +119,10 @@ def brief(name: str, values: Iterable[tuple[str | None, Any]]) -> str:
     line = f"{name}({', '.join(shown)})"
     if len(line) <= _WIDTH:
         return line
-    return "\n".join(_screenful([f"{name}(", *(f"  {each}," for each in shown)], ")"))
+    return "\n".join(screenful([f"{name}(", *(f"  {each}," for each in shown)], ")"))
 
 
-def _screenful(lines: Iterable[str], end: str = "") -> list[str]:
+def screenful(lines: Iterable[str], end: str = "") -> list[str]:
     """At most twenty lines of at most 120 characters."""
     kept = [line if len(line) <= _WIDTH else f"{line[: _WIDTH - 4]} ..." for line in lines]
     last = [end] if end else []

@@ -213,6 +213,7 @@ def test_poses_of_other_runs_are_not_what_the_wheels_drove() -> None:
     report = check(make_dataset("base", recording().robot, 0.04, others))
     assert (report.verdict, kinds(report), report.gain) == ("record more", {"reference_foreign"}, "")
     assert in_the_faq(report, "reference_foreign")
+    assert repr(report).splitlines()[1].startswith("error: the wheels explain ")
 
 
 def test_poses_that_end_long_before_the_wheels_are_told() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from textwrap import wrap
 from typing import Literal
 
 from pydantic import Field
@@ -9,7 +10,9 @@ from pydantic import Field
 from omnibench.config import Model
 from omnibench.data.checks.finding import Finding
 from omnibench.data.clock_matching import ClockMatch
+from omnibench.views import screenful
 
+_WIDTH = 110  # characters of a line of a report at a Python prompt
 Verdict = Literal["ready", "fix", "record more"]
 
 
@@ -29,3 +32,9 @@ class CheckReport(Model):
     gain: str
     command: str = ""
     clocks: tuple[ClockMatch | None, ...] = Field((), exclude=True, repr=False)
+
+    def __repr__(self) -> str:
+        found = [f"{each.severity}: {each.what} [{each.where}]" for each in self.findings]
+        typed = ["its .command mends what can be mended"] if self.command else []
+        said = [f"{self.verdict}: {self.sentence}", *found, *filter(None, [self.gain]), *typed]
+        return "\n".join(screenful([line for text in said for line in wrap(text, _WIDTH, subsequent_indent="    ")]))
