@@ -71,6 +71,10 @@ def save_dataset(
 
     overwrite: replace any data set. DataError when the poses are placeholders, the folder holds something else or (not
     ``overwrite``) another data set, by its name or by being simulated, or the disk refuses.
+
+    >>> save_dataset(dataset, "data/mine")
+    >>> load_dataset("data/mine").hash == dataset.hash
+    True
     """
     require_type(dataset, Dataset, "load_dataset")
     folder = Path(path)

@@ -117,6 +117,10 @@ def calibrate(
 
     Raises UnknownNameError or ConfigError for wrong arguments, DataError for an empty training split, and ConfigError
     when the calibrator gives no answer.
+
+    >>> run = calibrate(dataset, cost="trajectory")
+    >>> run.calibration.matrix_array.shape, run.result.outcome.value  # (3, M), m and rad per rad of wheel
+    ((3, 2), 'converged')
     """
     require_type(dataset, Dataset, "load_dataset")
     for what, value, words in (

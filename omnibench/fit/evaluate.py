@@ -79,6 +79,10 @@ def evaluate(calibration: Calibration, dataset: Dataset) -> Evaluation:
     """Errors of a calibration on every split of a data set.
 
     DataError: the robots' wheels differ, or the recordings lack what an effect of the calibration needs.
+
+    >>> errors = evaluate(calibration, dataset).splits["train"]
+    >>> round(errors.position_mean_m, 3), round(errors.heading_mean_rad, 3)
+    (0.0, 0.0)
     """
     require_type(calibration, Calibration, "read_calibration")
     require_type(dataset, Dataset, "load_dataset")

@@ -272,6 +272,11 @@ def _checked(content: Any, where: str) -> Calibration:
 
 
 def write_calibration(calibration: Calibration, path: Path | str) -> None:
-    """Write a calibration file, whole or not at all. DataError when it cannot be written."""
+    """Write a calibration file, whole or not at all. DataError when it cannot be written.
+
+    >>> write_calibration(calibration, "calibration.yaml")
+    >>> read_calibration("calibration.yaml") == calibration
+    True
+    """
     require_type(calibration, Calibration, "read_calibration")
     write_text(Path(path), to_yaml(calibration))

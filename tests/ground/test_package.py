@@ -7,6 +7,7 @@ import doctest
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -80,6 +81,12 @@ DRIVEN = omnibench.make_dataset(
     wheels={"t": np.arange(1, 51) * 0.02, "omega_l": np.full(50, 4.0), "omega_r": np.full(50, 4.0)},
     poses={"t": [0.0, 1.0], "x": [0.0, 0.2], "y": [0.0, 0.0], "theta": [0.0, 0.0]},
 )
+
+
+@cache
+def calibration() -> omnibench.Calibration:
+    """A calibration for the examples of docstrings, which take it and the data set as given."""
+    return omnibench.calibrate(DRIVEN, "least_squares").calibration
 
 
 @pytest.mark.parametrize(
@@ -164,9 +171,14 @@ def test_the_version_is_that_of_the_installed_package() -> None:
 
 
 @pytest.mark.parametrize("name", omnibench.__all__)
-def test_the_examples_of_a_public_name_give_what_they_show(name: str) -> None:
+def test_the_examples_of_a_public_name_give_what_they_show(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     found = getattr(omnibench, name)
     names = vars(sys.modules[found.__module__]) | {each: getattr(omnibench, each) for each in omnibench.__all__}
-    examples = doctest.DocTestFinder(recurse=False).find(found, name, globs=names)
-    runner = doctest.DocTestRunner()
-    assert sum(runner.run(example).failed for example in examples) == 0
+    names |= {"dataset": DRIVEN, "calibration": calibration()}
+    methods = [found, *(value.__func__ for value in vars(found).values() if isinstance(value, classmethod))]
+    for each in methods if isinstance(found, type) else [found]:
+        for example in doctest.DocTestFinder(recurse=False).find(each, name, globs=names):
+            assert doctest.DocTestRunner().run(example).failed == 0

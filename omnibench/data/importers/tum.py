@@ -46,6 +46,10 @@ def write_tum(file: Path | str, times: ArrayLike, poses: ArrayLike) -> None:
 
     times (K,): s. poses (K, 3): x, y (m) and heading (rad); z is 0. DataError: shapes do not agree, a value is not
     finite, times do not increase, or the disk refuses.
+
+    >>> write_tum("reference.tum", [0.0, 0.1], [[0, 0, 0], [0.02, 0, 0.5]])
+    >>> read_tum("reference.tum").poses.round(6).tolist()
+    [[0.0, 0.0, 0.0], [0.02, 0.0, 0.5]]
     """
     stamps, planar = finite_array("times", times, 1), finite_array("poses", poses, 2)
     if planar.shape != (*stamps.shape, 3):

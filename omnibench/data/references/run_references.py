@@ -65,7 +65,12 @@ class References(Brief):
     def of(
         cls, references: Iterable[Reference], end: float, *, start_known: bool = False, rate_sigma: float = 0.0
     ) -> References:
-        """The measurements of a run that ends after ``end`` s, by their times."""
+        """The measurements of a run that ends after ``end`` s, by their times. ConfigError: one is no Reference.
+
+        >>> tape = Reference("distance", 3.03, 0.003)  # m, driven from the run's start to its end
+        >>> len(References.of([tape], end=10.0))
+        1
+        """
         given = list(references)
         for each in given:
             require_type(each, Reference, "Reference(kind, value, sigma)")
