@@ -115,33 +115,36 @@ def import_(
         options.setdefault("name", folder)
     dataset = import_dataset(importer, source, options)
     read = RecordingSource(dataset, importer, source, given, output)
+    report = None if no_check else _checked(read)
     if not accept_units:
-        _refuse_units(read, output)
+        _refuse_units(read, output, report)
     dataset = replace(dataset, imported=Imported.of(importer, source, given))
     save_dataset(dataset, output, table_format, overwrite=force)
-    report = None if no_check else _checked(read)
     warn([each for each in dataset.warnings if report is None or not _is_said(each, report.sentence)])
     typer.echo(f"{plural(len(dataset.trajectories), 'trajectory')}: {output}")
     way = " (other: --set validation=PATTERN)" if "validation" in entry.cls.Options.model_fields else ""
-    typer.echo(f"{division_in_words(dataset.trajectories, options)}{way}", err=True)
+    divided = f"{division_in_words(dataset.trajectories, options)}{way}"
+    make_console(error=True).print(divided, soft_wrap=True)
     then: tuple[str, tuple[object, ...]] = ("see what they tell", ("omnibench", "inspect", output))
     if report is not None:
         make_console(error=True).print(f"check: {report.sentence}.", soft_wrap=True)
-        then = _after(report, output)
+        then = _after(read, report)
     print_ending(
         f"{output} holds {plural(len(dataset.trajectories), 'run')} of {dataset.robot.name}", then[0], *then[1]
     )
     return None
 
 
-def _refuse_units(read: "RecordingSource", output: Path) -> None:
-    """DataError: the units of a recording cannot be right by their magnitude; it says what to type."""
-    from omnibench.data.checks.finding import FindingWarning
+def _refuse_units(read: "RecordingSource", output: Path, report: "CheckReport | None") -> None:
+    """DataError: the units of a recording cannot be right; it says what to type."""
+    from omnibench.data.checks.finding import UNITS, FindingWarning
 
-    wrong = [warning for warning in read.dataset.warnings if isinstance(warning, FindingWarning) and warning.unit]
+    wrong: list[str] = [each for each in read.dataset.warnings if isinstance(each, FindingWarning) and each.unit]
+    if not wrong and report is not None:
+        wrong = [each.what for each in report.findings if each.kind in UNITS and each.severity == "error"]
     if not wrong:
         return
-    mended = _checked(read).command
+    mended = (report or _checked(read)).command
     way = f"type {mended}, or " if mended else ""
     raise DataError(f"{'; '.join(wrong)}; {output} is not written: {way}--accept-units to write it as it is")
 
@@ -159,13 +162,15 @@ def _is_said(warning: str, sentence: str) -> bool:
     return isinstance(warning, FindingWarning) and warning.finding.what in sentence
 
 
-def _after(report: "CheckReport", output: Path) -> tuple[str, tuple[str | Path, ...]]:
+def _after(read: "RecordingSource", report: "CheckReport") -> tuple[str, tuple[object, ...]]:
     """What to do after an import, and the words to type for it."""
-    if report.command:
-        return "mend it", tuple(shlex.split(report.command))
+    from omnibench.fit.check.checking import mending
+
+    if typed := mending(read, report):
+        return "mend it", tuple(shlex.split(typed))
     if report.verdict == "ready":
-        return "calibrate it", ("omnibench", "calibrate", output, "-o", "calibration.yaml")
-    return "see what is missing", ("omnibench", "check", output)
+        return "calibrate it", ("omnibench", "calibrate", read.folder, "-o", "calibration.yaml")
+    return "see what is missing", ("omnibench", "check", read.folder)
 
 
 def _write_template(

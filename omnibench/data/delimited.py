@@ -249,7 +249,7 @@ def read_text(file: Path) -> str:
     except FileNotFoundError:
         raise DataError(f"{file}: no such file") from None
     except UnicodeDecodeError:
-        raise DataError(f"{file}: is not a text file (UTF-8)") from None
+        raise DataError(f"{file}: is not a text file in UTF-8; save it so (CSV UTF-8), or leave it out") from None
     except OSError as error:
         raise DataError(f"{file}: cannot be read: {error.strerror or error}") from None
 
@@ -319,5 +319,5 @@ def _is_number(name: str, names: Sequence[str]) -> bool:
 
 def _header(file: Path, lines: Sequence[tuple[int, list[str]]], header_lines: int) -> list[str]:
     if len(lines) < header_lines:
-        raise DataError(f"{file}: it has no header with the names of its columns")
+        raise DataError(f"{file}: it has no header with the names of its columns; repair it, or take it out")
     return lines[header_lines - 1][1]

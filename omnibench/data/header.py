@@ -63,7 +63,8 @@ class Header(Model):
 def read_header(folder: Path) -> Header:
     """The dataset.yaml of a data set's folder. DataError: it is none, or it is wrong."""
     if not folder.is_dir():
-        raise DataError(f"{folder}: no such folder; a data set is a folder with dataset.yaml in it")
+        what = "is a file" if folder.exists() else "no such folder"
+        raise DataError(f"{folder}: {what}; a data set is a folder with dataset.yaml in it")
     file = folder / "dataset.yaml"
     if not file.exists():
         raise DataError(f"{file}: no such file, and so {folder} is no data set; `omnibench import` makes one of a log")

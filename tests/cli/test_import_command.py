@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from pathlib import Path
 
 import pytest
@@ -116,6 +117,24 @@ def test_units_that_cannot_be_right_are_refused_with_the_option_to_type(command:
     assert accepted.returncode == 0
     again = command("import", "dataset", filled_in.parent / "raw", "-o", data, "--force", "--set", "heading_unit=deg")
     assert (again.returncode, "warning" in again.stderr) == (0, False)
+
+
+def test_counts_since_the_row_before_that_are_read_as_counters_are_refused_with_the_unit_to_type(
+    command: Command, filled_in: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The template's rates times its period are angles since the row before; as counters no matrix explains them."""
+    for file in filled_in.glob("*_wheels.csv"):
+        head, *rows = file.read_text().splitlines()
+        cells = [[float(cell) for cell in row.split(",")] for row in rows]
+        turned = [f"{t},{0.05 * left},{0.05 * right}" for t, left, right in cells]
+        file.write_text("\n".join([head.replace("omega", "phi"), "0,0,0", *turned]) + "\n")
+    monkeypatch.chdir(filled_in.parent)
+    refused = command("import", "csv", "log", "-o", "data", "--set", "wheel_unit=rad")
+    assert_refused(refused, "increments since the row before (rad/sample); they are read as positions (rad)")
+    assert not Path("data").exists()
+    typed = refused.stderr.partition(": type omnibench ")[2].partition(", or --accept-units")[0]
+    mended = command(*shlex.split(typed))
+    assert (mended.returncode, "check: data is ready" in mended.stderr) == (0, True)
 
 
 def test_a_data_set_keeps_what_was_typed(command: Command, filled_in: Path) -> None:

@@ -17,7 +17,7 @@ from commands import omnibench as command
 from config_robots import experiment
 from hypothesis import example, given
 from hypothesis import strategies as st
-from wheeled_samples import TRICYCLE
+from wheeled_samples import TRICYCLE, driven
 
 from omnibench import check, save_dataset
 from omnibench.cli.handbook_topics import HANDBOOK
@@ -294,6 +294,18 @@ def test_values_are_typed_so_that_they_are_read_as_they_are(names: list[str]) ->
 def test_a_data_set_in_memory_is_to_be_saved_before_its_fix_is_typed() -> None:
     swapped = changed(lambda run: replace(run, rates=run.rates[:, ::-1]))
     assert check(swapped).command.endswith("# after save_dataset(dataset, 'base')")
+
+
+def test_two_units_that_are_wrong_at_once_are_both_typed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    sound = driven(TRICYCLE, 8, 200)
+    runs = [
+        replace(run, steering=np.degrees(run.steering), poses=run.poses * (1, 1, 180 / np.pi))
+        for run in sound.trajectories
+        if run.steering is not None
+    ]
+    save_dataset(make_dataset("trike", TRICYCLE, sound.sample_period, runs), "log")
+    assert {"steering_unit=deg", "heading_unit=deg"} <= set(shlex.split(check("log").command))
 
 
 def test_a_steering_that_is_held_forward_and_backward_is_not_frozen() -> None:

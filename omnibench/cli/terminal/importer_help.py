@@ -83,7 +83,7 @@ def _option(
     key: str, field: FieldInfo, schema: dict[str, Any], definitions: dict[str, Any], width: int
 ) -> Iterator[str]:
     """Key, type and default on a line, and what the option says below."""
-    default = _default(field)
+    default = "   default: as its folder is called" if key == "name" else _default(field)
     kind = ", ".join(dict.fromkeys(_kinds(schema, definitions)))
     yield from textwrap.wrap(f"  {key}  {kind}{default}", width, subsequent_indent=" " * 6, break_on_hyphens=False)
     if field.description:

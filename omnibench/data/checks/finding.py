@@ -48,6 +48,8 @@ Kind = Literal[
     "reference_foreign",
 ]
 
+UNITS: tuple[Kind, ...] = ("wheel_unit", "steering_unit", "heading_unit", "position_unit", "time_unit")
+
 
 class Finding(Model):
     """Something about a recording that a calibration suffers from, or that its user should know.

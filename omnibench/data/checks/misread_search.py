@@ -42,6 +42,9 @@ _SUSPICIOUS, _REMAINS, _BETTER = 7.0, 0.6, 4.0
 _CONTRADICTING, _USUAL = 0.1, 0.04
 _BADLY = 0.25  # share of the way that no matrix explains, from which on a recording is suspicious; untouched ones: 0.08
 _MOST_WEIGHED, _CORRELATED = 60.0, 4.0  # n of Eq. (1) at most, and windows that tell as much as one; chosen
+UNRELATED = (
+    0.5  # share of the way and of the turns that is left where wheels and reference have nothing in common; chosen
+)
 _SIMPLE = 4.5  # cost of wheels' mistakes that are looked for beside one of the reference
 _IN_DEGREES = 8.0  # cost of headings in degrees; less where a run begins beyond a whole turn
 _TURN = 2 * math.pi
@@ -88,7 +91,8 @@ class Recorded:
 class Explained:
     """The best reading: its mistakes, those that fit about as well, and d^2 as recorded and as read so.
 
-    told: False where the reference is too sparse for this search.
+    told: False where the reference is too sparse for this search. unexplained: share of the way or of the turns,
+    whichever is less, that no matrix explains if it is read so.
     """
 
     mistakes: tuple[Misreading, ...]
@@ -96,6 +100,7 @@ class Explained:
     distance: float
     remains: float
     told: bool = True
+    unexplained: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +119,7 @@ class _Scored:
     score: float
     distance: float
     contradiction: float
+    left: float
     mistakes: tuple[Misreading, ...]
 
 
@@ -130,15 +136,16 @@ def search(recording: Recorded) -> Explained:
         return Explained((), (), distance, distance)
     scored = sorted(_scores(some, fit, far), key=lambda each: each.score)
     best, present = scored[0], next(each for each in scored if not each.mistakes)
-    if not best.mistakes or best.score > present.score - _BETTER or not _explains(best, present):
-        return Explained((), (), distance, distance)
+    likely = best.score <= present.score - _BETTER and best.left < UNRELATED and _explains(best, present)
+    if not best.mistakes or not likely:
+        return Explained((), (), distance, distance, unexplained=present.left)
     kinds = {mistake.kind for mistake in best.mistakes}
     alike: dict[frozenset[str], tuple[Misreading, ...]] = {}
     for each in scored[1:]:
         other = frozenset(mistake.kind for mistake in each.mistakes)
         if each.score < best.score + _ALIKE and other != kinds and len(each.mistakes) <= len(best.mistakes):
             alike.setdefault(other, each.mistakes)
-    return Explained(best.mistakes, tuple(alike.values()), distance, best.distance)
+    return Explained(best.mistakes, tuple(alike.values()), distance, best.distance, unexplained=best.left)
 
 
 def _explains(best: _Scored, present: _Scored) -> bool:
@@ -152,7 +159,7 @@ def _scores(recording: Recorded, fit: FreeFit, far: DesignDistance) -> Iterator[
     weight = min(fit.windows / _CORRELATED, _MOST_WEIGHED)
     wheels = [*wheel_transforms(recording.robot), *steering_transforms(recording.robot)]
     for base in bases:
-        cost = base.cost + weight * math.log(max(float(base.fit.left[0]), 1e-9))
+        cost, left = base.cost + weight * math.log(max(float(base.fit.left[0]), 1e-9)), float(base.fit.left.min())
         for transforms in _combined(base, wheels, far.design):
             rows, columns = (np.array([getattr(each, name) for each in transforms]) for name in ("rows", "columns"))
             distances = far.squared(*transformed(base.fit, rows, columns))
@@ -161,7 +168,7 @@ def _scores(recording: Recorded, fit: FreeFit, far: DesignDistance) -> Iterator[
             each = zip(transforms, scores.tolist(), distances.tolist(), against.tolist(), strict=True)
             for transform, score, distance, share in each:
                 mistakes = (*base.mistakes, *transform.mistakes)
-                yield _Scored(score + transform.cost, distance, share, mistakes)
+                yield _Scored(score + transform.cost, distance, share, left, mistakes)
 
 
 def _combined(base: _Base, wheels: Sequence[Transform], design: Array) -> Iterator[list[Transform]]:

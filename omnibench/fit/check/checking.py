@@ -23,6 +23,7 @@ from omnibench.fit.check.expected_gain import Gain, expected_gain
 from omnibench.fit.check.fixes import command, with_fixes
 from omnibench.fit.check.foreign_reference import foreign_reference
 from omnibench.fit.check.missing_motions import missing_motions, too_few
+from omnibench.fit.check.other_readings import read_otherwise
 from omnibench.fit.check.recording_source import RecordingSource, of_dataset, read_source, recorded
 from omnibench.fit.check.result import CheckReport, Verdict
 from omnibench.fit.observations.open_in_words import open_sentences
@@ -64,6 +65,8 @@ def check_recording(read: RecordingSource) -> CheckReport:
     explained = search(seen)
     # A steering or a wheel that never counts is mended by no other reading of it.
     frozen = any(fault.kind in ("steering_frozen", "wheel_dead") and not fault.changes for fault in faults)
+    if not frozen and not spoiled and (otherwise := read_otherwise(read, explained)) is not None:
+        return check_recording(otherwise).model_copy(update={"clocks": tuple(clocks)})
     misread = [] if frozen else list(_misreadings(explained)) if explained.told else _warned(dataset)
     if misread:  # wheels that are misread tell no jumps
         faults = [fault for fault in faults if fault.kind != "reference_jump"]
@@ -82,6 +85,11 @@ def check_recording(read: RecordingSource) -> CheckReport:
     findings = with_fixes(read, sorted(_distinct(found), key=lambda finding: _ORDER[finding.severity]))
     gain = Gain(None, "") if misread or odd or foreign or spoiled else expected_gain(dataset)
     return _report(read, findings, gain, clocks)
+
+
+def mending(read: RecordingSource, report: CheckReport) -> str:
+    """What to type to read a recording again without what its report tells, also after it was written."""
+    return command(read, [finding for finding in report.findings if finding.severity == "error"])
 
 
 def _report(

@@ -53,14 +53,16 @@ def next_command(read: RecordingSource) -> str:
 def _command(read: RecordingSource, changes: Sequence[Mapping[str, Any]]) -> str:
     """The command line; by way of a data set where the importer cannot."""
     try:
-        return _import(read.importer, read.source, _mended(read, read.importer, read.options, changes), _target(read))
+        return _import(
+            read.importer, read.source, mended_options(read, read.importer, read.options, changes), _target(read)
+        )
     except CannotBeTypedError:
         pass
     if read.folder is not None and (read.folder / "dataset.yaml").is_file():
-        return _import("dataset", read.folder, _mended(read, "dataset", {}, changes), _beside(read.folder))
+        return _import("dataset", read.folder, mended_options(read, "dataset", {}, changes), _beside(read.folder))
     first = _target(read)
     given = _import(read.importer, read.source, read.options, first)
-    return f"{given} && {_import('dataset', first, _mended(read, 'dataset', {}, changes), _beside(first))}"
+    return f"{given} && {_import('dataset', first, mended_options(read, 'dataset', {}, changes), _beside(first))}"
 
 
 def _target(read: RecordingSource) -> Path:
@@ -81,7 +83,7 @@ def _import(importer: str, source: Path, options: Mapping[str, Any], output: Pat
     return shlex.join(words)
 
 
-def _mended(
+def mended_options(
     read: RecordingSource, importer: str, given: Mapping[str, Any], changes: Sequence[Mapping[str, Any]]
 ) -> dict[str, Any]:
     """The options with all changes. CannotBeTypedError: the importer lacks one of them."""
@@ -112,6 +114,8 @@ def _with_change(
     elif key == "rate_factors":
         option = "ticks_per_turn" if options.get("ticks_per_turn") else "gear_ratio"
         changed[option] = _one_or_all(_product(options.get(option), value))
+    elif key == "wheel_quantity":
+        changed["wheel_unit"] = value
     elif key == "wheel_unit":
         changed |= _wheel_unit(options, value, len(robot.wheel_names))
     elif key == "steering_order":

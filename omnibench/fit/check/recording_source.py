@@ -112,7 +112,7 @@ def _imported(name: str, source: Path, given: Mapping[str, Any]) -> RecordingSou
 def _by_other_times(name: str, source: Path, given: Mapping[str, Any]) -> RecordingSource | None:
     """The source by the other units of time that make sense; None if none does."""
     for changes in _time_units(name, given):
-        if (mended := _attempt(name, source, {**given, **changes})) is not None:
+        if (mended := attempt(name, source, {**given, **changes})) is not None:
             return RecordingSource(mended, name, source, given, findings=(_time_unit(changes),))
     return None
 
@@ -144,8 +144,8 @@ def _read(name: str, source: Path, given: Mapping[str, Any]) -> Dataset:
     return dataset
 
 
-def _attempt(name: str, source: Path, options: Mapping[str, Any]) -> Dataset | None:
-    """The data set by other units of time, if its times and its motion make sense then."""
+def attempt(name: str, source: Path, options: Mapping[str, Any]) -> Dataset | None:
+    """The data set of a source by other options, if its times and its motion make sense then."""
     try:
         dataset = _read(name, source, options)
     except (DataError, ConfigError):

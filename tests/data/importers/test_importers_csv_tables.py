@@ -141,6 +141,12 @@ def test_a_table_of_runs_must_list_every_run(tmp_path: Path) -> None:
         read(tmp_path)
 
 
+def test_a_misspelt_column_of_the_table_of_runs_is_said(tmp_path: Path) -> None:
+    both(1).write_csv(tmp_path / "drive1.csv")
+    (tmp_path / "runs.csv").write_text("run,comand,driver\ndrive1,curve,me\n")
+    assert read(tmp_path).warnings == (f"{tmp_path}/runs.csv: column 'comand' is not read; did you mean 'command'?",)
+
+
 def test_any_column_is_named_by_a_mapping(tmp_path: Path) -> None:
     made = both(1).rename({"t": "clock", "omega_left": "l", "omega_right": "r", "x": "px", "y": "py", "theta": "h"})
     made.write_csv(tmp_path / "log.csv")

@@ -73,7 +73,7 @@ class Csv(Importer):
         """All runs under ``source``; DataError names the file and the row of what is wrong."""
         options, warnings = self.options, list[str]()
         recordings = read_recordings(find_tables(source, options, warnings), options, warnings)
-        attributes = read_run_attributes(source, options)
+        attributes = read_run_attributes(source, options, warnings)
         check_names(attributes, [recording.name for recording in recordings], warnings)
         recordings = by_one_clock(recordings, options, warnings)
         runs = [run for recording in recordings for run in self._runs(recording, attributes, warnings)]

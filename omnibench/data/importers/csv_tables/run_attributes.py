@@ -29,7 +29,7 @@ class RunAttributes:
     started_at: float | None = None
 
 
-def read_run_attributes(source: Path, options: CsvOptions) -> dict[str, RunAttributes]:
+def read_run_attributes(source: Path, options: CsvOptions, warnings: list[str]) -> dict[str, RunAttributes]:
     """The attributes of each run by its name; empty without a table of runs. DataError names the row of a flaw."""
     file = options.runs_table or _beside(source)
     if file is None:
@@ -38,6 +38,10 @@ def read_run_attributes(source: Path, options: CsvOptions) -> dict[str, RunAttri
     named = run_column(options, table)
     if named is None:
         raise DataError(f"{file}: column 'run' is missing; found: {', '.join(table.names)}; --set run_column=NAME")
+    known = [key for key in (*_TEXTS, *_NUMBERS) if key not in table.names]
+    others = [name for name in table.names if name not in (named, *_TEXTS, *_NUMBERS)]
+    alike = {name: hint.strip() for name in others if (hint := nearest(name, known))}
+    warnings.extend(f"{file}: column {name!r} is not read; {hint}" for name, hint in alike.items())
     texts = {key: table.texts(key) for key in _TEXTS if key in table.names}
     numbers = {key: table.numbers([key])[:, 0] for key in _NUMBERS if key in table.names}
     attributes: dict[str, RunAttributes] = {}

@@ -103,7 +103,7 @@ def _of_runs(table: CellTable, time: str) -> str:
         cells = table.texts(name)
         if [row for row in range(1, len(cells)) if cells[row] != cells[row - 1]] == anew:
             return f"; does {name} name the run of each row? --set {quote(f'run_column={as_yaml(name)}')}"
-    return "; in a table of several runs a column names that of each row: --set run_column=NAME"
+    return "; repair the row, or, in a table of several runs, name the column of runs: --set run_column=NAME"
 
 
 def _filled(table: CellTable, names: Sequence[str]) -> NDArray[np.intp]:
