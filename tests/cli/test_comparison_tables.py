@@ -71,7 +71,7 @@ def test_the_final_errors_are_in_millimetres_and_degrees(result: ComparisonResul
 
 def test_a_practically_equal_entry_is_marked(result: ComparisonResult) -> None:
     found = table(printed(result, 240), "Entries over their seeds")
-    assert found["again"][-1] == "practically equal"
+    assert found["again"][-1] == "not told apart"
     assert found["theoretical"][-2].startswith("+")
     assert found["theoretical"][-1] == "worse"
     assert found["closed_form"][-1].startswith("best")

@@ -66,7 +66,7 @@ def entry_table(view: DatasetView) -> Table:
         f"box, minus one; {NOTHING} where it has no answer or leaves no error. Proven: what share of the "
         "cost any optimiser could still save in that box, at most. "
         f"Difference: paired by {view.units[view.scored].name}, with its 95 % interval, "
-        f"{interval_basis(view, view.scored)}. Practically equal: that interval contains zero, "
+        f"{interval_basis(view, view.scored)}. Not told apart: that interval contains zero, "
         "or the difference is below a tenth of the standard error of the best entry's cost; undecided: there is no "
         "interval. Best: the lowest training cost of the entries that are not known to differ from the one of lowest "
         f"{SPLIT_NAMES[view.scored]} cost.{_held_in_words(view)}",
@@ -159,8 +159,10 @@ def _verdict(view: DatasetView, entry: EntryStatistics) -> Cell:
         return Cell("lowest training cost" if view.undecided else "best", level_in_words(view))
     if entry.practically_equal is None or entry.difference is None:
         return Cell("undecided", interval_basis(view, view.scored))
-    if entry.practically_equal:
-        return Cell("practically equal")
+    if entry in view.level:
+        return Cell("not told apart")
+    if entry.practically_equal:  # the design values, as the headline has them
+        return Cell("worse", "by its share of the cost")
     if entry.difference.value > 0:
         return Cell("worse")
     return Cell("lower cost here", "higher training cost")
