@@ -64,7 +64,7 @@ def inspect(
         return print_ending(
             f"{dataset} hardly tells {' or '.join(missing)}", "read what to drive", "omnibench", "guide", "driving"
         )
-    told = f"{dataset} drives all motions of the robot"
+    told = f"{dataset} determines {'all' if not inspection.identifiability.sentences else 'most'} of the matrix"
     return print_ending(told, "calibrate it", "omnibench", "calibrate", dataset, "-o", "calibration.yaml")
 
 

@@ -48,10 +48,10 @@ def paths_before_after(runs: Sequence[Trajectory], models: Models, which: str) -
     figures.append(_all_ends(runs, ends, models, which))
     names = listing([item.label for item, _ in models])
     caption = f"{choice} Circle: start; dots: ends. In the titles: mean distance of the end from the reference's, and "
-    caption += f"turn between them, by {names}, in this order."
+    caption += f"turn between them, by {names}{', in this order' * (len(models) > 1)}."
     columns: Literal[1, 2, 3] = 3 if len(figures) == 3 else 2 if len(figures) == 2 else 1
     items = (REFERENCE_ITEM, *(item for item, _ in models))
-    return FigureGrid(tuple(figures), items, columns, caption, "paths-before-after")
+    return FigureGrid(tuple(figures), items, columns, caption.strip(), "paths-before-after")
 
 
 def _final_errors(model: OdometryModel, runs: Sequence[Trajectory]) -> Array:
@@ -79,7 +79,7 @@ def _typical(runs: Sequence[Trajectory], ends: Sequence[Array]) -> tuple[dict[st
     kinds = {kind: like for kind, like in kinds_of(runs).items() if kind != ON_THE_SPOT}
     if len(kinds) < _PATHS:
         chosen = spread([run for run in runs if np.ptp(run.poses[:, :2], axis=0).max() > _LEAST_WINDOW] or runs, _PATHS)
-        return motion_titles(chosen), f"{plural(len(chosen), 'run')} of different motions." if chosen else ""
+        return motion_titles(chosen), f"{plural(len(chosen), 'run')} of different motions." if len(chosen) > 1 else ""
     medians = {kind: _median(like, gain_of) for kind, like in kinds.items()}
     largest = sorted(medians, key=lambda kind: gain_of[medians[kind].id], reverse=True)[:_PATHS]
     words = "Of each kind of motion the run whose error falls by the median of its kind."

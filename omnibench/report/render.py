@@ -10,7 +10,7 @@ from typing import Any
 
 import plotly.graph_objects as go
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
-from markupsafe import Markup
+from markupsafe import Markup, escape
 from plotly.offline import get_plotlyjs
 
 from omnibench.environment import package_versions
@@ -55,12 +55,18 @@ def _environment(glossary: Glossary) -> Environment:
         lstrip_blocks=True,
     )
     environment.filters["explained"] = glossary.marked
+    environment.filters["breakable"] = _breakable
     environment.globals["new_terms"] = glossary.fresh
     environment.filters["plot_json"] = _plot_json
     environment.filters["script_json"] = _json
     environment.globals["plotly_js"] = Markup(get_plotlyjs())
     environment.globals["source"] = lambda name: Markup(_source(environment, name))
     return environment
+
+
+def _breakable(words: str) -> Markup:
+    """Words that may break after an underscore, too: long names must not widen a table beyond a phone or paper."""
+    return Markup(escape(words).replace("_", Markup("_<wbr>")))
 
 
 def _source(environment: Environment, name: str) -> str:

@@ -47,17 +47,17 @@ def motion_system(robot: Robot) -> tuple[Figure, list[LegendItem]]:
     direction = math.radians(_DIRECTION)
     tip = 0.62 * size * _along(direction)[None]
     traces += arrows(_COMMAND, np.zeros((1, 2)), _up(tip), [f"α = {_DIRECTION}°"])
-    turning = _arc(0.3 * size, direction, direction + math.radians(110))
+    turning = _arc(0.3 * size, direction, direction + math.radians(80))
     traces.append(line(_COMMAND, 1.6, *_up(turning).T))
     traces += arrows(_COMMAND, _up(turning[-2:-1]), _up(turning[-1:]), ["ω"])
     labels = [
-        _label(0.64 * size * np.array([1.0, 0.0]), "X<sub>R</sub>", INK),
-        _label(0.64 * size * np.array([0.0, 1.0]), "Y<sub>R</sub>", INK),
+        _label(size * np.array([0.56, -0.12]), "X<sub>R</sub>", INK),
+        _label(size * np.array([0.13, 0.56]), "Y<sub>R</sub>", INK),
         _label(1.22 * tip[0], "v, α", _COMMAND.colour),
         _label(turning[-1] * 1.3, "ω", _COMMAND.colour),
     ]
     for wheel, start, way in zip(robot.measured, starts, ways, strict=True):
-        labels.append(_label(start + 0.3 * size * way, f"V<sub>{text(wheel.name)}</sub>", _ROLLING.colour))
+        labels.append(_label(start + 0.36 * size * way, f"V<sub>{text(wheel.name)}</sub>", _ROLLING.colour))
     for wheel in robot.wheels:
         behind = (wheel.radius + 0.1 * size) * _along(wheel.rolling)  # beside the rectangle, which names would cross
         labels.append(_label(np.array(wheel.position) - behind, text(wheel.name), INK))

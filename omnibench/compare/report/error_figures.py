@@ -9,7 +9,7 @@ import numpy as np
 import plotly.graph_objects as go
 
 from omnibench.compare.report.view import SPLIT_NAMES, THEORETICAL_STYLE, DatasetView
-from omnibench.compare.report.wording import entry_cell, position_unit
+from omnibench.compare.report.wording import entry_cell, mean_and_worst, position_unit
 from omnibench.compare.result import EntryStatistics, ScoredRun
 from omnibench.data.dataset import Split, Trajectory
 from omnibench.fit.evaluate import positions_and_headings
@@ -53,12 +53,12 @@ def final_error_table(view: DatasetView, split: Split) -> Table:
         after = view.errors(run, split)
         if after is not None:
             errors.append((entry, after))
-    factor, unit, decimals = position_unit(*(float(positions_and_headings(rows)[0].mean()) for _, rows in errors))
+    factor, unit, decimals = position_unit(*(mean_and_worst(positions_and_headings(rows)[0])[0] for _, rows in errors))
     rows = []
     for entry_or_none, of_entry in errors:
         positions, headings = positions_and_headings(of_entry)
-        cells = [fixed(factor * value, decimals) for value in (positions.mean(), positions.max())]
-        cells += [fixed(np.degrees(value), 2) for value in (headings.mean(), headings.max())]
+        cells = [fixed(factor * value, decimals) for value in mean_and_worst(positions)]
+        cells += [fixed(np.degrees(value), 2) for value in mean_and_worst(headings)]
         is_best = entry_or_none is not None and entry_or_none.is_best
         rows.append(Row.of(entry_cell(view, entry_or_none), *cells, role="best" if is_best else "plain"))
     return Table(
@@ -83,7 +83,7 @@ def _figures(view: DatasetView) -> tuple[Block, ...]:
     if after is None:
         return ()
     trajectories = view.dataset.split(view.scored)
-    if _is_flower(trajectories):
+    if _is_flower(trajectories) and np.isfinite(after).all():
         return _flower_blocks(view, trajectories, after, best.label)
     return (_box_plots(view, best, best.typical),)
 
@@ -99,13 +99,15 @@ class _Quantity:
     decimals: int
 
 
-def _quantities(before: Array, after: Array) -> tuple[_Quantity, _Quantity]:
+def _quantities(before: Array, after: Array) -> list[_Quantity]:
+    """The kinds of errors that are known of some runs."""
     (p0, h0), (p1, h1) = positions_and_headings(before), positions_and_headings(after)
-    factor, unit, decimals = position_unit(float(p0.mean()), float(p1.mean()))
-    return (
+    factor, unit, decimals = position_unit(mean_and_worst(p0)[0], mean_and_worst(p1)[0])
+    both = (
         _Quantity("position error", unit, factor * p0, factor * p1, decimals),
         _Quantity("heading error", "°", np.degrees(h0), np.degrees(h1), 2),
     )
+    return [quantity for quantity in both if np.isfinite(quantity.before).any()]
 
 
 def _is_flower(trajectories: Sequence[Trajectory]) -> bool:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from typing import Literal
-
-import numpy as np
 
 from omnibench.compare.report.entry_chart import entry_chart
 from omnibench.compare.report.view import SPLIT_NAMES, THEORETICAL_STYLE, DatasetView
@@ -14,13 +14,14 @@ from omnibench.compare.report.wording import (
     difference_in_words,
     improvement_in_words,
     interval_in_words,
+    mean_and_worst,
     on_bounds,
     position_unit,
 )
 from omnibench.compare.result import THEORETICAL_NAME, EntryStatistics
 from omnibench.fit.evaluate import positions_and_headings
 from omnibench.report.blocks import Block, Callout, Fact, FigureGrid, LegendItem, Paragraph, Section, answer_section
-from omnibench.report.numbers import fixed, listing, percent, span, typeset
+from omnibench.report.numbers import fixed, listing, percent, span, typeset, with_unit
 from omnibench.report.path_pictures import CALIBRATED, paths_before_after
 from omnibench.words import plural
 
@@ -83,11 +84,11 @@ def _verdict(view: DatasetView, best: EntryStatistics) -> str:
     errors = _errors(view, best)
     words = f"On the {runs}, "
     if errors is not None:
-        (before, turned_before), (after, turned_after) = errors
-        words += (
-            f"the odometry calibrated by {best.label} ends {after} and {turned_after} from the reference, where the "
-            f"design values end {before} and {turned_before} off"
-        )
+        before, after = errors
+        ends = f"ends {after} from the reference, where the design values end {before} off"
+        if view.without_poses:
+            ends = f"misses the references by {after}, where the design values miss them by {before}"
+        words += f"the odometry calibrated by {best.label} {ends}"
     else:
         words += f"{best.label} has the best calibration"
     interval = best.improvement(split)
@@ -99,18 +100,30 @@ def _verdict(view: DatasetView, best: EntryStatistics) -> str:
     return f"{words}. {_standing(view, best)}."
 
 
-def _errors(view: DatasetView, best: EntryStatistics) -> tuple[tuple[str, str], tuple[str, str]] | None:
-    """Mean final errors in words, position and heading, by the design values and by the best entry."""
+def _errors(view: DatasetView, best: EntryStatistics) -> tuple[str, str] | None:
+    """Mean final errors in words, by the design values and by the best entry: position and heading, where known."""
+    parts = list(_changes(view, best))
+    if not parts:
+        return None
+    before, after = zip(*(words for words, _ in parts), strict=True)
+    return " and ".join(before), " and ".join(after)
+
+
+def _changes(view: DatasetView, best: EntryStatistics) -> Iterator[tuple[tuple[str, str], str]]:
+    """Mean errors of positions, then of headings, before and after calibration, and the worst one after, in words."""
     after = None if best.typical is None else view.errors(best.typical, view.scored)
     if after is None:
-        return None
+        return
     (p0, h0), (p1, h1) = positions_and_headings(view.design_errors[view.scored]), positions_and_headings(after)
-    factor, unit, digits = position_unit(float(p0.mean()), float(p1.mean()))
-    before, now = (
-        (f"{fixed(factor * p.mean(), digits)} {unit}", f"{fixed(np.degrees(h.mean()), 2)}°")
-        for p, h in ((p0, h0), (p1, h1))
-    )
-    return before, now
+    factor, unit, digits = position_unit(mean_and_worst(p0)[0], mean_and_worst(p1)[0])
+    for was, now, scale, decimals, of_scale in (
+        (p0, p1, factor, digits, unit),
+        (h0, h1, math.degrees(1.0), 2, "°"),
+    ):
+        (mean, worst), (before, _) = mean_and_worst(now), mean_and_worst(was)
+        old, new, most = (with_unit(fixed(scale * value, decimals), of_scale) for value in (before, mean, worst))
+        if not math.isnan(mean):
+            yield (old, new), most
 
 
 def _standing(view: DatasetView, best: EntryStatistics) -> str:
@@ -150,22 +163,13 @@ def _tiles(view: DatasetView, best: EntryStatistics) -> tuple[Fact, ...]:
     split, decimals = view.scored, cost_decimals(view)
     reached, before = best.cost(split), view.theoretical_cost(split)
     tiles = []
-    after = None if best.typical is None else view.errors(best.typical, split)
-    if after is not None:
-        (p0, h0), (p1, h1) = positions_and_headings(view.design_errors[split]), positions_and_headings(after)
-        factor, unit, digits = position_unit(float(p0.mean()), float(p1.mean()))
-        tiles += [
-            Fact(
-                "Final position error, mean",
-                f"{fixed(factor * p0.mean(), digits)} → {fixed(factor * p1.mean(), digits)} {unit}",
-                f"worst {fixed(factor * p1.max(), digits)} {unit}",
-            ),
-            Fact(
-                "Final heading error, mean",
-                f"{fixed(np.degrees(h0.mean()), 2)}° → {fixed(np.degrees(h1.mean()), 2)}°",
-                f"worst {fixed(np.degrees(h1.max()), 2)}°",
-            ),
-        ]
+    for (old, new), worst in _changes(view, best):
+        kind = "heading" if worst.endswith("°") else "position"
+        name = f"Final {kind} error, mean"
+        if view.without_poses:
+            name = f"Error of {'angles' if kind == 'heading' else 'lengths and places'}, mean"
+        shared = old if kind == "heading" else old.rpartition(" ")[0]
+        tiles.append(Fact(name, f"{shared} → {new}", f"worst {worst}"))
     if reached is not None:
         tiles.append(
             Fact(

@@ -17,8 +17,8 @@ from omnibench.words import plural
 # Middles of the boxes in units of the picture: two columns, which a phone and half a sheet of paper can hold.
 _START, _CANDIDATES, _ODOMETRY, _COST = (1.0, 3.0), (1.0, 2.0), (1.0, 1.0), (1.0, 0.0)
 _STOP, _NEXT = (0.0, 0.0), (0.0, 2.0)
-_WIDTH = 142  # px of a box
-_TO_SIDE, _TO_TOP = 80, 32  # px from a box's middle to its edges
+_WIDTH = 148  # px of a box
+_TO_SIDE, _TO_TOP = 83, 32  # px from a box's middle to its edges
 
 
 def search_diagram(view: DatasetView) -> FigureGrid:
@@ -43,7 +43,7 @@ def search_diagram(view: DatasetView) -> FigureGrid:
     words = "Start, candidates, odometry, cost; then stop, or the next candidates"
     paper = "As Fig. 4 of the paper, for every search here. " if view.of_the_paper else ""
     caption = f"{paper}The cost is {cost_in_words(view)}"
-    return FigureGrid((Figure("How a search runs", figure, words, 360),), (), 1, caption)
+    return FigureGrid((Figure("How a search runs", figure, words, 420),), (), 1, caption)
 
 
 def _box(middle: tuple[float, float], words: str) -> dict[str, Any]:

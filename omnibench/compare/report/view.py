@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+
+import numpy as np
 
 from omnibench.compare.config import CompareConfig
 from omnibench.compare.result import (
@@ -14,8 +16,9 @@ from omnibench.compare.result import (
     EntryVerdict,
     ScoredRun,
 )
-from omnibench.data.dataset import SPLITS, Dataset, Split
+from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory
 from omnibench.fit.evaluate import final_errors
+from omnibench.fit.observations.reference_errors import measured_parts
 from omnibench.fit.uncertainty.ratio_intervals import Interval, Units, units_of
 from omnibench.registry import calibrators
 from omnibench.report.blocks import LegendItem
@@ -130,8 +133,13 @@ class DatasetView:
         return self.runs[0].design[split].cost if self.runs and split in self.runs[0].design else None
 
     def errors(self, run: ScoredRun, split: Split) -> Array | None:
-        """Final pose errors (Z, 3) of a run's answer, m, m, rad."""
-        return run.scores[split].errors if split in run.scores else None
+        """Final pose errors (Z, 3) of a run's answer, m, m, rad; NaN where the references do not tell them."""
+        return _told(run.scores[split].errors, self.dataset.split(split)) if split in run.scores else None
+
+    @property
+    def without_poses(self) -> bool:
+        """True if the runs that are scored have distances, turns and the like, and none has poses."""
+        return not any(run.has_poses for run in self.dataset.split(self.scored))
 
     def model(self, matrix: Array) -> OdometryModel:
         """The odometry that the comparison used, with another matrix."""
@@ -162,7 +170,11 @@ def _view(result: ComparisonResult, name: str, styles: Mapping[str, LegendItem])
         warnings=result.warnings,
         styles=styles,
         design_costs=result.design_costs.get(name, {}),
-        design_errors={split: final_errors(design, dataset.split(split)) for split in SPLITS if dataset.split(split)},
+        design_errors={
+            split: _told(final_errors(design, dataset.split(split)), dataset.split(split))
+            for split in SPLITS
+            if dataset.split(split)
+        },
         units={
             split: units_of(dataset.split(split), result.config.bootstrap.unit)
             for split in SPLITS
@@ -171,6 +183,13 @@ def _view(result: ComparisonResult, name: str, styles: Mapping[str, LegendItem])
         held_out=result.held_out.get(name),
         sessions=result.sessions.get(name, ()),
     )
+
+
+def _told(errors: Array, runs: Sequence[Trajectory]) -> Array:
+    """Final errors (Z, 3), NaN for positions and for headings of runs whose references tell no lengths or no angles."""
+    placed, turned = measured_parts(runs)
+    told: Array = np.where(np.column_stack([placed, placed, turned]), errors, np.nan)
+    return told
 
 
 def _styles(result: ComparisonResult) -> dict[str, LegendItem]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from omnibench.compare.plan import UNBOUNDED
 from omnibench.compare.report.view import THEORETICAL_STYLE, DatasetView
 from omnibench.compare.result import THEORETICAL_NAME, EntryStatistics, RunRecord
@@ -10,6 +12,7 @@ from omnibench.fit.uncertainty.ratio_intervals import Interval
 from omnibench.registry import costs
 from omnibench.report.blocks import Cell
 from omnibench.report.numbers import NOTHING, decimals_for, fixed, percent, significant, span
+from omnibench.robot.kinematics import Array
 
 NO_INTERVAL = "no interval"
 
@@ -75,7 +78,13 @@ def cost_decimals(view: DatasetView) -> int:
 
 def position_unit(*errors: float) -> tuple[float, str, int]:
     """Factor from m, unit and decimals in which these errors (m) are shown: mm below a metre."""
-    return (1e3, "mm", 1) if max(errors, default=0.0) < 1.0 else (1.0, "m", 3)
+    return (1.0, "m", 3) if any(error >= 1.0 for error in errors) else (1e3, "mm", 1)
+
+
+def mean_and_worst(values: Array) -> tuple[float, float]:
+    """Mean and largest of the values (n,) that are known; NaN where none is."""
+    known = values[np.isfinite(values)]
+    return (float(known.mean()), float(known.max())) if len(known) else (np.nan, np.nan)
 
 
 def difference_in_words(difference: Interval) -> tuple[str, str]:

@@ -78,15 +78,15 @@ def _answer(design: Design) -> Section:
     tiles = []
     for of_set in design.sets:
         equal = next(equal for equal in of_set.equivalents if equal.use == design.use)
-        effort = equal.effort
+        effort, name = equal.effort, f"{of_set.name}: " * (len(design.sets) > 1)
         tiles += [
             Fact(
-                f"{of_set.name}: chosen",
+                f"{name}chosen" if name else "Chosen",
                 plural(of_set.step.effort.runs, "run"),
                 f"{percent(of_set.step.efficiency, 2)} of the bound; {duration_in_words(of_set.step.effort.seconds)}",
             ),
             Fact(
-                f"{of_set.name}: equal to the baseline's {baseline_runs(design)}",
+                f"{name}{'equal' if name else 'Equal'} to the baseline's {baseline_runs(design)}",
                 "none allowed" if effort is None else plural(effort.runs, "run"),
                 "" if effort is None else f"{duration_in_words(effort.seconds)} of driving",
             ),

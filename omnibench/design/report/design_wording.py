@@ -110,7 +110,7 @@ def headline(design: Design) -> str:
 def _verdict(design: Design, of_set: SetDesign) -> str:
     equal = next(equal for equal in of_set.equivalents if equal.use == design.use)
     runs, chosen = plural(of_set.step.effort.runs, "run"), plural(len(of_set.chosen), "command")
-    words = f"{of_set.name}: drive {runs} of {chosen}; together they give "
+    words = f"{drive(design, of_set)} {runs} of {chosen}; together they give "
     if of_set.reached:
         commands = f"{len(of_set.commands)} {noun_for(len(of_set.commands), 'command')}"
         words += f"as much information per {design.per} as the best design from {commands}, within 1 %"
@@ -121,6 +121,11 @@ def _verdict(design: Design, of_set: SetDesign) -> str:
         runs = count(equal.effort.runs)
         words += f"; {runs} of the best runs {give} as much as the baseline's {baseline_runs(design)}"
     return words + "."
+
+
+def drive(design: Design, of_set: SetDesign) -> str:
+    """``Drive``, with the name of the set where there are several."""
+    return f"{of_set.name}: drive" if len(design.sets) > 1 else "Drive"
 
 
 def least_in_words(least: float) -> str:

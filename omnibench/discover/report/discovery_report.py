@@ -84,11 +84,13 @@ def _folded(key: str, title: str, about: str, blocks: Iterator[Block]) -> Sectio
 def _answer(discovery: Discovery) -> Section:
     """The section with the answer: what was gained and the cause, paths before and after, and the warnings."""
     new_motions = extrapolations_in_words(discovery.extrapolations)
+    answer = typeset(answer_in_words(discovery))
+    headline = typeset(discovery.headline)
     return answer_section(
-        answer_in_words(discovery),
+        answer,
         tuple(_tiles(discovery)),
         _picture(discovery),
-        Paragraph(typeset(discovery.headline)),
+        *([Paragraph(headline)] if headline != answer else []),
         Callout("Motions that the training runs never had", new_motions, "warning"),
         Callout("Before you rely on it", tuple(map(typeset, discovery.notes))),
     )
@@ -114,7 +116,8 @@ def _tiles(discovery: Discovery) -> Iterator[Fact]:
         yield Fact("Final heading error, mean", heading, where)
         yield _gap_fact(discovery, held.eq6, where)
     else:
-        yield _gap_fact(discovery, discovery.gap, f"training runs, {gap_in_words(discovery.gap)}")
+        change = f", {gap_in_words(discovery.gap)}" if discovery.extends else ""
+        yield _gap_fact(discovery, discovery.gap, f"training runs{change}")
     yield Fact("Cause" if discovery.effects else "Verdict", *_cause(discovery))
 
 

@@ -10,8 +10,10 @@ import pytest
 from report_page import Page
 from report_samples import APR02, config, flower, page, run, statistics, usual
 
+from omnibench.compare.plan import load_datasets
 from omnibench.compare.result import ComparisonResult
-from omnibench.data.dataset import make_dataset
+from omnibench.data.dataset import Trajectory, make_dataset
+from omnibench.data.references.run_references import Reference, References
 from omnibench.fit.uncertainty.ratio_intervals import Interval
 from omnibench.robot.kinematics import Robot
 
@@ -139,3 +141,23 @@ def test_commands_driven_once_make_no_such_remark(tmp_path: Path) -> None:
     datasets = {"flower": {"simulate": flower(repetitions=1)}}
     told = page(run(config(datasets=datasets, calibrators=["closed_form"], seeds=[1])), tmp_path)
     assert "commands that were not driven here" not in told.text
+
+
+def test_of_runs_whose_lengths_alone_are_known_no_heading_error_is_stated(tmp_path: Path) -> None:
+    chosen = config(calibrators=["theoretical", "closed_form"], seeds=[1])
+    taped = {name: replace(dataset, trajectories=tuple(map(with_a_tape, dataset.trajectories)))
+             for name, dataset in load_datasets(chosen).items()}  # fmt: skip
+    told = page(run(chosen, taped), tmp_path)
+    answer = told.text[: told.text.index("All entries")]
+    assert "closed_form misses the references by" in answer
+    assert "Error of lengths and places, mean" in answer
+    assert "°" not in answer
+    assert "heading" not in answer
+    assert told.row("Error of the final pose, held-out runs", "closed_form")[3:] == ["–", "–"]
+
+
+def with_a_tape(run_: Trajectory) -> Trajectory:
+    """A run of which only the length of its way is known."""
+    length = float(np.hypot(*np.diff(run_.poses[:, :2], axis=0).T).sum())
+    references = References.of([Reference("distance", length, 0.003)], float(run_.times[-1]))
+    return replace(run_, pose_times=np.zeros(1), poses=np.zeros((1, 3)), references=references)
