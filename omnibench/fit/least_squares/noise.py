@@ -75,6 +75,20 @@ class Whitener:
         white = [self._position.whiten(differences[:, :split]), self._heading.whiten(differences[:, split:])]
         return np.concatenate(white, axis=1).reshape(residuals.shape)
 
+    def transposed(self, white: Array) -> Array:
+        """The transposed whitening of whitened values (K, 3, n): the inverse covariance of differences times these."""
+        parts = [self._position.transposed(white[:, :2]), self._heading.transposed(white[:, 2:])]
+        return np.concatenate(parts, axis=1)
+
+    @property
+    def traces(self) -> Array:
+        """Derivatives (6,) of ``log_determinant`` by the variances white, walk, bias of positions and of headings."""
+        return np.concatenate([2 * self._position.traces(), self._heading.traces()])
+
+    def forms(self, values: Array) -> Array:
+        """Quadratic forms (6,) of values (K, 3, n), summed over n, of the derivatives of the covariance by these."""
+        return np.concatenate([self._position.forms(values[:, :2]), self._heading.forms(values[:, 2:])])
+
     def left_out(self, residuals: Array) -> tuple[Array, Array]:
         """Every error (K, 3) less what the run's others say of it, and the variances (K, 3) of that difference.
 
@@ -134,7 +148,8 @@ class _Factor:
         self, white: float, walk: float, bias: float, steps: Array, extra: tuple[Array, float] | None = None
     ) -> None:
         walked = walk**2 * (steps[1:] if bias else steps)
-        if white**2 + walked.min(initial=np.inf) < LEAST_WHITE**2:
+        self._steps, self._singular = steps, white**2 + walked.min(initial=np.inf) < LEAST_WHITE**2
+        if self._singular:
             white = LEAST_WHITE
         bands = np.empty((2, len(steps)), order="F")
         bands[0] = 2 * white**2 + walk**2 * steps
@@ -156,6 +171,23 @@ class _Factor:
         whitened, _ = dtbtrs(self._factor, differences, uplo="L")
         return whitened
 
+    def transposed(self, white: Array) -> Array:
+        """The inverse covariance of the differences times what was whitened to (K, ...)."""
+        solved, _ = dtbtrs(self._factor, white.reshape(len(white), -1), uplo="L", trans="T")
+        return np.asarray(solved).reshape(white.shape)
+
+    def traces(self) -> Array:
+        """Derivatives (3,) of the log determinant by the variances of white noise, walk and bias."""
+        inner, beside = self._inverse_bands()
+        white = 2 * inner.sum() - inner[0] - 2 * beside.sum()
+        return np.array([0.0 if self._singular else white, self._steps @ inner, inner[0]])
+
+    def forms(self, values: Array) -> Array:
+        """Quadratic forms (3,) of values (K, ...), summed, of the covariance's derivatives by the same variances."""
+        square = np.square(values).reshape(len(values), -1).sum(axis=1)
+        white = np.square(values[:-1] - values[1:]).sum() + square[-1]
+        return np.array([0.0 if self._singular else white, self._steps @ square, square[0]])
+
     def left_out(self, residuals: Array) -> tuple[Array, Array]:
         """Errors (K, n) less what the others say of them, and their variances (K,); see Whitener."""
         solved = self._solved(residuals)
@@ -171,21 +203,21 @@ class _Factor:
 
     def _solved(self, residuals: Array) -> Array:
         """The covariance of the differences, inverted, times the differences of residuals (K, n)."""
-        solved, _ = dtbtrs(self._factor, self.whiten(_differences(residuals)), uplo="L", trans="T")
-        return np.asarray(solved)
+        return self.transposed(self.whiten(_differences(residuals)))
 
     def _inverse_bands(self) -> tuple[Array, Array]:
-        """Diagonal (K,) and upper diagonal (K - 1,) of the inverse of the covariance of the differences.
+        """Diagonal (K,) and upper diagonal (K - 1,) of the inverse of the covariance C of the differences.
 
-        From the last to the first (Takahashi, Fagan and Chin, 8th PICA Conference, 1973).
+        With the pivots p of its factor from the first row on and q from the last, (C^-1)_ii = 1 / (p_i + q_i - C_ii)
+        (Meurant, SIAM J. Matrix Anal. Appl. 13:707, 1992).
         """
         diagonal, below = self._factor
-        inner, beside = diagonal**-2, np.empty(len(diagonal) - 1)
-        for index in range(len(beside) - 1, -1, -1):
-            share = below[index] / diagonal[index]
-            beside[index] = -share * inner[index + 1]
-            inner[index] -= share * beside[index]
-        return inner, beside
+        pivots = np.square(diagonal)
+        on, off = pivots.copy(), diagonal[:-1] * below[:-1]
+        on[1:] += np.square(below[:-1])
+        backward, _ = dpbtrf(np.stack([on[::-1], np.append(off[::-1], 0.0)]), lower=1)
+        inner = 1 / (pivots + np.square(backward[0])[::-1] - on)
+        return inner, -below[:-1] / diagonal[:-1] * inner[1:]
 
 
 def _differences(residuals: Array) -> Array:

@@ -6,6 +6,10 @@ covariance is C, up to a constant
 
     -2 ln L = ln |1 + S N'N S| - (S N'r)' (1 + S N'N S)^-1 (S N'r) + r'r + ln |C|.                        (1)
 
+Its derivative by a variance v of the noise or of a nuisance is, with a = (C + N S S N')^-1 r before whitening,
+
+    d(-2 ln L) / dv = tr((C + N S S N')^-1 dC/dv) - a' dC/dv a,    dC/dv = N_j N_j' for nuisance j.        (2)
+
 A deviation is zero unless a likelihood ratio test rejects that, all components of the noise and the nuisances found
 before being fitted anew. Nuisances and noise resemble each other: an error of the start heading shifts the headings by
 as much, like a bias, and only the path that turns about the start distinguishes it; so does an error of the clock by
@@ -83,29 +87,52 @@ def differences_without_nuisances(fit: TrajectoryFit, kinds: Sequence[int]) -> D
 
 @dataclass(frozen=True, eq=False)
 class SeparateNoise:
-    """A noise without that of nuisances, their deviations (3,), and -2 ln L of both."""
+    """A noise without that of nuisances, their deviations (3,), and -2 ln L of both, Eq. (1).
+
+    slopes (9,): derivatives of -2 ln L by the logarithms of the noise's components and of the deviations.
+    """
 
     noise: Noise
     deviations: Array
     minus_log_likelihood: float
+    slopes: Array
 
     @classmethod
     def of(cls, differences: Differences, noise: Noise, deviations: Array) -> SeparateNoise:
-        """This noise with these deviations, as likely as differences between repetitions make them, Eq. (1)."""
-        known = np.flatnonzero(deviations)
-        sizes = deviations[known]
-        of_noise, of_nuisances = 0.0, 0.0
-        for stamps, values, slopes in differences.by_stamps:
-            whitener, count = Whitener(noise, stamps), values.shape[2]
-            white = whitener(values).reshape(-1, count)
-            of_noise += count * whitener.log_determinant + float(np.square(white).sum())
-            if len(known):
-                columns = whitener(slopes[..., known].reshape(*values.shape[:2], -1)).reshape(len(white), count, -1)
-                inner = np.eye(len(known)) + np.einsum("rnk,rnl->nkl", columns, columns) * np.outer(sizes, sizes)
-                scaled = np.einsum("rnk,rn->nk", columns, white) * sizes
-                of_nuisances += float(np.linalg.slogdet(inner)[1].sum())
-                of_nuisances -= float(np.einsum("nk,nk->", scaled, np.linalg.solve(inner, scaled[..., None])[..., 0]))
-        return cls(noise, deviations, of_noise + of_nuisances)
+        """This noise with these deviations, as likely as differences between repetitions make them."""
+        total, slopes = 0.0, np.zeros(len(_NAMES) + 3)
+        for stamps, values, columns in differences.by_stamps:
+            of_group, of_variances = _likelihood(Whitener(noise, stamps), values, columns, deviations)
+            total += of_group
+            slopes += of_variances
+        components = np.concatenate([[getattr(noise, name) for name in _NAMES], deviations])
+        return cls(noise, deviations, total, 2 * np.square(components) * slopes)
+
+
+def _likelihood(whitener: Whitener, values: Array, columns: Array, deviations: Array) -> tuple[float, Array]:
+    """-2 ln L of differences (K, 3, n), and its derivatives (9,) by the variances; columns (K, 3, n, 3): N."""
+    count, known = values.shape[2], np.flatnonzero(deviations)
+    sizes = deviations[known]
+    white = whitener(np.concatenate([values[..., None], columns[..., known]], axis=3).reshape(*values.shape[:2], -1))
+    of_runs = white.reshape(-1, count, 1 + len(known)).transpose(1, 0, 2)
+    products = of_runs.transpose(0, 2, 1) @ of_runs
+    squares, beside, inner = products[:, 0, 0], products[:, 1:, 0], products[:, 1:, 1:]  # r'r, N'r, N'N
+    lower = np.linalg.cholesky(np.eye(len(known)) + inner * np.outer(sizes, sizes))
+    reduced = np.linalg.solve(lower, sizes[:, None] * np.concatenate([beside[..., None], inner], axis=2))
+    total = count * whitener.log_determinant + squares.sum() - np.square(reduced[..., 0]).sum()
+    total += 2 * np.log(np.diagonal(lower, axis1=1, axis2=2)).sum()
+    # Eq. (2): a, and columns Z such that (C + N S S N')^-1 = C^-1 - Z Z'.
+    solved = whitener.transposed(white).reshape(*values.shape, -1)
+    roots = np.linalg.solve(lower, sizes[:, None] * np.eye(len(known)))
+    removed = np.einsum("ksnj,nij->ksni", solved[..., 1:], roots)
+    remaining = solved[..., 0] - np.einsum("ksni,ni->ksn", removed, reduced[..., 0])
+    forms = whitener.forms(np.concatenate([remaining[..., None], removed], axis=3).reshape(*values.shape[:2], -1))
+    slopes = np.zeros(len(_NAMES) + 3)
+    slopes[: len(_NAMES)] = count * whitener.traces - forms
+    left = beside - np.einsum("nij,ni->nj", reduced[..., 1:], reduced[..., 0])  # N' a
+    of_nuisances = np.diagonal(inner, axis1=1, axis2=2) - np.square(reduced[..., 1:]).sum(axis=1) - np.square(left)
+    slopes[len(_NAMES) + known] = of_nuisances.sum(axis=0)
+    return float(total), slopes
 
 
 def separate_nuisances(
@@ -166,18 +193,19 @@ def _polished(differences: Differences, near: SeparateNoise) -> SeparateNoise:
     for of_one_unit in (start[:3], start[3 : 6 + known[TURN]]):
         np.maximum(of_one_unit, 0.1 * max(of_one_unit.max(), LEAST_WHITE), out=of_one_unit)
 
+    moved = np.concatenate([np.ones(len(_NAMES), dtype=bool), known])
+
     def described(logarithms: Array) -> SeparateNoise:
         values, deviations = start * np.exp(logarithms), np.zeros(3)
         deviations[known] = values[len(_NAMES) :]
         noise = Noise(**dict(zip(_NAMES, map(float, values), strict=False)))
         return SeparateNoise.of(differences, noise, deviations)
 
+    def cost(logarithms: Array) -> tuple[float, Array]:
+        there = described(logarithms)
+        return there.minus_log_likelihood / count, there.slopes[moved] / count
+
     count = sum(difference.values.size for difference in differences.each)
-    answer = minimize(
-        lambda logarithms: described(logarithms).minus_log_likelihood / count,
-        np.zeros(len(start)),
-        method="L-BFGS-B",
-        bounds=[(-5.0, 5.0)] * len(start),
-        options={"eps": 1e-5, "ftol": 1e-10},
-    )
+    bounds = [(-5.0, 5.0)] * len(start)
+    answer = minimize(cost, np.zeros(len(start)), jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-10})
     return described(answer.x)

@@ -10,11 +10,12 @@ import pytest
 from omnibench.data.dataset import Trajectory
 from omnibench.fit.least_squares.nuisance_noise import SeparateNoise, separate_nuisances
 from omnibench.fit.least_squares.nuisances import TURN
-from omnibench.fit.least_squares.repetitions import differences_between_repetitions
+from omnibench.fit.least_squares.repetitions import Differences, differences_between_repetitions
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 
 STAMPS = np.array([1.0, 2.0, 3.0, 4.0])
+COMPONENTS = ("pose_position", "walk_position", "bias_position", "pose_heading", "walk_heading", "bias_heading")
 WHITE = Noise(pose_position=0.01, pose_heading=0.01)
 
 
@@ -47,9 +48,13 @@ def separated(
     runs: list[Trajectory], residuals: list[Array], turning: Array, noise: Noise, kinds: Sequence[int] = (TURN,)
 ) -> SeparateNoise:
     """The noise and the deviations of nuisances, by default of the start headings, begun at a noise without these."""
+    return separate_nuisances(of_pairs(runs, residuals, turning), noise, kinds)
+
+
+def of_pairs(runs: list[Trajectory], residuals: list[Array], turning: Array) -> Differences:
     shifting = np.tile([-1.0, 0.0, 0.0], (4, 1))
     slopes = np.stack([turning, shifting, shifting * STAMPS[:, None]], axis=2)
-    return separate_nuisances(differences_between_repetitions(runs, residuals, [slopes] * len(runs)), noise, kinds)
+    return differences_between_repetitions(runs, residuals, [slopes] * len(runs))
 
 
 def test_white_noise_is_told_from_turned_starts_as_by_the_closed_form() -> None:
@@ -101,3 +106,21 @@ def test_the_level_is_shared_by_the_nuisances_that_are_asked_about() -> None:
     noisy = [runs_with_residuals(0.0, 0.0, seed) for seed in range(40)]
     found = [separated(runs, residuals, turning, WHITE, range(3)) for runs, residuals, turning in noisy]
     assert sum(each.deviations.any() for each in found) < 7
+
+
+@pytest.mark.parametrize("deviations", [(0.0, 0.0, 0.0), (0.02, 0.0, 0.003), (0.03, 0.1, 0.01)])
+def test_the_slopes_of_the_likelihood_are_those_of_its_values(deviations: tuple[float, ...]) -> None:
+    differences = of_pairs(*runs_with_residuals(turned=0.02, biased=0.01, late=0.02))
+    components = np.array([0.01, 0.004, 0.006, 0.012, 0.003, 0.02, *deviations])
+
+    def likelihood(logarithms: Array) -> SeparateNoise:
+        values = components * np.exp(logarithms)
+        return SeparateNoise.of(
+            differences, Noise(**dict(zip(COMPONENTS, values[:6].tolist(), strict=True))), values[6:]
+        )
+
+    steps = 1e-5 * np.eye(9)
+    by_values = [
+        (likelihood(step).minus_log_likelihood - likelihood(-step).minus_log_likelihood) / 2e-5 for step in steps
+    ]
+    assert likelihood(np.zeros(9)).slopes == pytest.approx(by_values, rel=1e-5, abs=1e-4)
