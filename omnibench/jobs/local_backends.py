@@ -167,7 +167,11 @@ def _wait(active: Sequence[_Active], watch: JobWatch[Any]) -> list[_Active]:
     for progress in wait(list(reporting), timeout=_PERIOD):
         assert isinstance(progress, Connection)
         reporting[progress].receive(watch)
-    return [item for item in active if item.future.done()]
+    ended = [item for item in active if item.future.done()]
+    for item in ended:
+        while item.progress is not None and item.progress.poll():  # what it said last
+            item.receive(watch)
+    return ended
 
 
 def _end(title: str) -> None:

@@ -93,5 +93,6 @@ def lines_of(page: Path) -> list[str]:
 def ten_minutes() -> Path:
     """The folder in which a newcomer has typed the README, from its first command to its last."""
     folder = shared_folder() / "newcomer"
+    shutil.rmtree(folder, ignore_errors=True)  # of a try that failed
     folder.mkdir()
     return typed(ROOT / "README.md", folder)

@@ -30,6 +30,11 @@ def shell_commands(markdown: str) -> list[str]:
     return [re.sub(r"\\\n +", "", command).strip() for command in _TYPED.findall(markdown)]
 
 
+def _path() -> str:
+    """PATH with the programs of this environment before all others, as after its activation."""
+    return os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)])
+
+
 @dataclass
 class Terminal:
     """A shell in ``folder``, and other terminals for the commands that run until Ctrl-C.
@@ -39,7 +44,7 @@ class Terminal:
 
     folder: Path
     before: Callable[[str, Path], None] = lambda _command, _folder: None
-    environment: dict[str, str] = field(default_factory=lambda: dict(os.environ))
+    environment: dict[str, str] = field(default_factory=lambda: os.environ | {"PATH": _path()})
     seconds: dict[str, float] = field(default_factory=dict)
     _running: list[tuple[str, subprocess.Popen[str]]] = field(default_factory=list)
 

@@ -331,8 +331,7 @@ def test_a_port_that_is_taken_is_told_in_one_line(tmp_path: Path) -> None:
         router.close()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("command", ["listen", "live"])
+@pytest.mark.parametrize(("command", "number"), [("listen", signal.SIGTERM), ("live", signal.SIGINT)])
 def test_a_signal_ends_the_wait_for_a_router_that_stands_still(tmp_path: Path, command: str, number: int) -> None:
     port = free_port()
     (tmp_path / "node").mkdir()

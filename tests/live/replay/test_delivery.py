@@ -118,10 +118,9 @@ def node(folder: Path, port: int) -> Iterator[Command]:
 
 class TestToANode:
     @pytest.mark.usefixtures("node")
-    @pytest.mark.parametrize("loops", [0, 2])
-    def test_the_tail_is_taken_when_the_session_closes_right_after(self, port: int, loops: int) -> None:
+    def test_the_tail_is_taken_when_the_session_closes_right_after_on_a_busy_machine(self, port: int) -> None:
         session = connected(port)
-        with load(loops):
+        with load(2):
             report = player(session).play()
             session.close()
         with connected(port) as another:

@@ -45,9 +45,9 @@ class TestMissedMessages:
 
     def test_many_that_are_missed_are_counted_at_once(self) -> None:
         missed = MissedMessages()
-        for number in range(1, 50_000_000, 50_000):
+        for number in range(1, 5_000_000, 50_000):
             missed.take(numbered(number))
-        assert missed.count == 999 * 49_999
+        assert missed.count == 99 * 49_999
 
 
 def test_a_flow_adds_to_an_attachment_what_ros_passes_over() -> None:
