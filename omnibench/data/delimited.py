@@ -230,9 +230,12 @@ def not_increasing(values: Array) -> tuple[int, str] | None:
     return int(bad[0]) + 1, f"{what}: {value:.10g} after {before:.10g}"
 
 
-def missing_column(file: Path, column: str, columns: Iterable[str]) -> ColumnError:
-    """The error of a table without a column that it must have."""
+def missing_column(file: Path, column: str, columns: Iterable[str], others: Sequence[str] = ()) -> ColumnError:
+    """The error of a table without a column that it must have, and others."""
     known = ", ".join(filter(None, columns))
+    if others:
+        names = ", ".join(repr(each) for each in (column, *others[:-1]))
+        return ColumnError(f"{file}: columns {names} and {others[-1]!r} are missing; found: {known}")
     return ColumnError(f"{file}: column {column!r} is missing; {nearest(column, columns)}found: {known}")
 
 

@@ -101,7 +101,10 @@ def test_the_angle_of_a_steered_wheel_is_a_column() -> None:
     [
         ({"wheels": wheels(t=np.full(200, 1.0))}, "^wheels, row 2: t is repeated: 1 after 1"),
         ({"wheels": wheels(omega_left=np.r_[5.0, np.nan, np.full(198, 5.0)])}, "^wheels, row 2: omega_left is nan"),
-        ({"wheels": {"t": T, "omega_right": T}}, "^wheels: column 'trajectory' is missing"),
+        (
+            {"wheels": {"t": T, "omega_right": T}},
+            "^wheels: columns 'trajectory' and 'omega_left' are missing",
+        ),
         ({"wheels": wheels() | {"omega_left": ["fast"] * 200}}, "^wheels, row 1: omega_left is 'fast', expected a nu"),
         ({"wheels": wheels(omega_left=np.ones(3))}, "^wheels: column 'omega_left' has 3 rows, 'trajectory' has 200"),
         ({"wheels": wheels(omega_left=np.ones((200, 2)))}, r"^wheels: column 'omega_left' has shape \(200, 2\)"),
@@ -114,6 +117,8 @@ def test_the_angle_of_a_steered_wheel_is_a_column() -> None:
         ({"poses": poses(trajectory=["r1", "r1", "r3", "r3"])}, "^poses, row 3: trajectory r3 is not in trajectories"),
         ({"trajectories": {"trajectory": ["r1", "r2"], "split": ["train", "val"]}}, "^trajectories, row 2: split is"),
         ({"wheels": None}, "wheels is missing: a table with the columns t and omega_<wheel>"),
+        ({"poses": None}, "poses is missing: a table with the columns t, x, y and theta; or references"),
+        ({"sample_period": "20 ms"}, "sample_period is '20 ms', expected a number of seconds"),
     ],
 )
 def test_a_flaw_is_refused_with_its_table_row_and_column(given: dict[str, Any], message: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Real
 from pathlib import Path
 from typing import Any, cast
 
@@ -74,8 +75,15 @@ def make_dataset(
     texts: dict[str, Any] = {"description": description, "source": source, "licence": licence, "simulated": simulated}
     if wheels is None:
         runs = _runs(name, trajectories, poses is not None or references is not None)
+    elif poses is None and references is None:
+        raise DataError(
+            f"data set {name}: poses is missing: a table with the columns t, x, y and theta; or references, with "
+            "distances, turns and the like"
+        )
     else:
         runs = _tables(robot, trajectories, wheels, poses, references).trajectories(robot)
+    if not isinstance(sample_period, Real | None):
+        raise DataError(f"data set {name}: sample_period is {sample_period!r}, expected a number of seconds")
     period = _sample_period(runs) if sample_period is None else sample_period
     return of_trajectories(name, robot, period, runs, scans=scans, **texts)
 

@@ -100,9 +100,8 @@ def checked_table(file: Path, frame: pl.DataFrame, required: Sequence[str]) -> T
 
     file: where it is from; of a frame in memory its name in messages.
     """
-    for column in required:
-        if column not in frame.columns:
-            raise missing_column(file, column, frame.columns)
+    if missing := [column for column in required if column not in frame.columns]:
+        raise missing_column(file, missing[0], frame.columns, missing[1:])
     if frame.is_empty():
         raise DataError(f"{file}: it has no rows")
     table = Table(file, frame)
