@@ -118,7 +118,9 @@ def match_clocks(robot: Robot, runs: Sequence[Streams], search: float = _SEARCH)
         pairs = zip(usable, before, clocks, strict=True)
         if max(each.farthest_step(old[0] - new[0], old[1] - new[1]) for each, old, new in pairs) < _SETTLED:
             break
-    matches = iter([each.match(fitted, clock) for each, clock in zip(usable, clocks, strict=True)])
+    near = [abs(clock[0]) <= search + _WINDOW for clock in clocks]  # of a reference that stands, any clock would do
+    settled = zip(usable, clocks, near, strict=True)
+    matches = iter([each.match(fitted, clock) if within else None for each, clock, within in settled])
     return [None if each is None else next(matches) for each in windows]
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from omnibench.data.checks.finding import Finding, Kind, Severity
 from omnibench.data.checks.misreading import wheels_in_words
@@ -130,36 +129,22 @@ def _moved_about(robot: Robot, run: Trajectory, begin: float, end: float) -> flo
 
 
 def _standing(robot: Robot, runs: Sequence[Trajectory]) -> dict[str, float]:
-    """Seconds in which the reference of a run stands while its wheels drive, by the runs' names."""
+    """Seconds in which the reference of a run stands, without even scattering, while its wheels drive, by run."""
     found = {}
     for run in runs:
-        period = float(np.median(np.diff(run.pose_times)))
-        apart = max(_STANDING, 3 * period)
-        last = np.searchsorted(run.pose_times, run.pose_times + apart)
-        first = np.flatnonzero(last < len(run.pose_times))
-        last = last[first]
-        if not len(first):
-            first, last = np.array([0]), np.array([len(run.pose_times) - 1])
+        changes = np.abs(np.diff(run.poses, axis=0)).max(axis=1) > _SAME
+        edges = np.flatnonzero(np.concatenate([[True], changes, [True]]))  # of stretches of equal poses
+        first, last = edges[:-1], edges[1:] - 1
+        seconds = run.pose_times[last] - run.pose_times[first]
         moved = run.poses[last] - run.poses[first]
         seen = np.hypot(moved[:, 0], moved[:, 1]) + robot.reach * np.abs(moved[:, 2])
         driven = np.interp(run.pose_times, np.append(0.0, run.times), _ways(robot, run))
         wheels = driven[last] - driven[first]
-        still = (seen < _STILL * wheels) & (wheels > _DRIVEN) & _equal(run.poses, first, last)
+        long = seconds >= max(_STANDING, 3 * float(np.median(np.diff(run.pose_times))))
+        still = long & (wheels > _DRIVEN) & (seen < _STILL * wheels)
         if still.any():
-            covered = np.zeros(len(run.pose_times), dtype=bool)
-            for begin, end in zip(first[still], last[still], strict=True):
-                covered[begin : end + 1] = True
-            throughout = _equal(run.poses, np.array([0]), np.array([-1])).all()  # also while the robot is slow or rests
-            covered |= throughout
-            found[run.id] = float((np.diff(run.pose_times) * (covered[1:] & covered[:-1])).sum())
+            found[run.id] = float(seconds[still].sum())
     return found
-
-
-def _equal(poses: Array, first: NDArray[np.intp], last: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """True where the reference does not even scatter between two poses."""
-    changes = np.append(0, np.cumsum(np.abs(np.diff(poses, axis=0)).max(axis=1) > _SAME))
-    same: NDArray[np.bool_] = changes[last] == changes[first]
-    return same
 
 
 def _frozen(runs: Sequence[Trajectory], frozen: dict[str, float]) -> Iterator[Finding]:
