@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from difflib import get_close_matches
-from numbers import Real
+from numbers import Integral, Real
 
 _HOLDERS = ("calibration", "config", "dataset", "robot")  # attributes of results in which another argument lies
 _LONGEST = 2000  # characters of a message; a plug-in's may have millions (chosen: a screen of a terminal)
@@ -60,15 +60,21 @@ def require_type(value: object, kind: type, maker: str) -> None:
 def require_choice(what: str, value: object, words: Iterable[str]) -> None:
     """UnknownNameError: an argument is none of the words that it may be."""
     known = tuple(words)
-    if value not in known:
+    if not isinstance(value, str) or value not in known:
         raise UnknownNameError(what, str(value), known)
 
 
-def require_range(what: str, value: object, least: float, most: float = math.inf) -> None:
-    """ConfigError: an argument is no number from least to most."""
-    if isinstance(value, bool) or not isinstance(value, Real) or not least <= float(value) <= most:
+def require_range(what: str, value: object, least: float, most: float = math.inf, *, whole: bool = False) -> None:
+    """ConfigError: an argument is no number, or no whole number, from least to most."""
+    right_kind = isinstance(value, Integral if whole else Real) and not isinstance(value, bool)
+    try:
+        within = right_kind and least <= float(value) <= most  # type: ignore[arg-type]
+    except OverflowError:
+        within = math.isinf(most)
+    if not within:
+        number = "a whole number, " if whole else ""
         bounds = f"at least {least:g}" if math.isinf(most) else f"from {least:g} to {most:g}"
-        raise ConfigError(f"{what}: must be {bounds} (given: {value!r})")
+        raise ConfigError(f"{what}: must be {number}{bounds} (given: {value!r})")
 
 
 class UnknownNameError(ConfigError):

@@ -371,6 +371,8 @@ def _median(sizes: Array, counted: NDArray[np.bool_]) -> Array:
     ordered = np.sort(np.where(counted, sizes, np.inf), axis=-1)
     count = counted.sum(axis=-1)
     pair = np.stack([np.maximum(count - 1, 0) // 2, np.minimum(count // 2, sizes.shape[-1] - 1)], axis=-1)
+    if not sizes.shape[-1]:
+        return np.zeros(count.shape)
     middle: Array = np.where(count > 0, np.take_along_axis(ordered, pair, axis=-1).mean(axis=-1), 0.0)
     return middle
 

@@ -49,7 +49,7 @@ def design_experiment(
     require_choice("per", per, get_args(Per))
     for name, number in (("runs", runs), ("repetitions", repetitions)):
         if number is not None:
-            require_range(name, number, 1, _MOST_RUNS)
+            require_range(name, number, 1, _MOST_RUNS, whole=True)
     if isinstance(source, CandidatePool):
         pool = source
     else:

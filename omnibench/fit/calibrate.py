@@ -134,9 +134,9 @@ def calibrate(
     ):
         if value is not None:
             require_choice(what, value, get_args(words))
-    require_range("seed", seed, 0)
+    require_range("seed", seed, 0, whole=True)
     if tolerance is not None:
-        require_range("tolerance", tolerance, 1e-6)
+        require_range("tolerance", tolerance, 1e-9)
     budget = Budget() if budget is None else budget
     require_type(budget, Budget, "Budget(evaluations=...)")
     training = training_split(dataset)

@@ -199,7 +199,10 @@ BROKEN: dict[str, tuple[Callable[[pl.DataFrame], pl.DataFrame], str]] = {
     "no stamp": (with_cell(2, "t", None), "row 2: t is missing; remove or repair the row"),
     "stamp not finite": (with_cell(2, "t", math.nan), "row 2: t is (nan|NaN); remove or repair the row"),
     "stamp a word": (with_cell(2, "t", "soon"), "row 2: t is 'soon', expected a number"),
-    "stamp of unix time in ns": (with_cell(4, "t", 1.7e18), r"row 4: t is 1\.7e\+18, .*; check the units"),
+    "stamp of unix time in ns": (
+        with_cell(4, "t", 1.7e18),
+        r"row 4: t is 1\.7e\+18, .*; count the time from the start",
+    ),
     "stamp before the run": (with_cell(1, "t", -0.5), r"row 1: t is -0\.5; it must not be negative"),
     "stamp repeated": (with_cell(3, "t", 0.1), r"row 3: t is repeated: 0\.1 after 0\.1"),
     "time goes back": (with_cell(3, "t", 0.05), r"row 3: t goes backwards: 0\.05 after 0\.1"),

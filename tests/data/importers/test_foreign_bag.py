@@ -34,13 +34,13 @@ def test_every_error_line_names_the_option_that_leads_on(command: Command, tmp_p
     turned = command(*attempt(f"gear_ratio={GEAR}"))
     assert turned.returncode == 0
     assert "begin again after 65536 ticks and were counted on (wraps_at=65536 says so)" in turned.stderr
-    assert "--set wheel_signs=[1,-1,1,-1], times the present ones; rosbag: joint_signs" in turned.stderr
+    assert "--set 'wheel_signs=[1,-1,1,-1]'" in turned.stderr
     right = command(*attempt("joint_signs=[1,-1,1,-1]", "wraps_at=2^16"), "--force")
     assert (right.returncode, "warning" in right.stderr) == (0, False)
     assert right.stdout == "20 trajectories: data\n"
 
     inspected = command("inspect", "data")
-    assert (inspected.returncode, inspected.stderr) == (0, "")
+    assert (inspected.returncode, "warning" in inspected.stderr) == (0, False)
     assert command("calibrate", "data", "-o", "calibration.yaml").returncode == 0
     judged = command("evaluate", "calibration.yaml", "data")
     assert "better than the design" in judged.stdout
