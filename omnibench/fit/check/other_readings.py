@@ -26,7 +26,7 @@ def read_otherwise(read: RecordingSource, explained: Explained) -> RecordingSour
     if {finding.kind for finding in warned} - {mistake.kind for mistake in explained.mistakes}:
         other = _mended(read, warned)
         return None if other is None or _warned(other) or search(recorded(other.dataset)).mistakes else other
-    if explained.unexplained > UNRELATED:
+    if explained.unexplained > UNRELATED and not any(finding.kind == "wheel_unit" for finding in read.findings):
         return next(filter(None, (_mended(read, [finding]) for finding in _other_quantities(read))), None)
     return None
 
@@ -37,13 +37,14 @@ def _warned(read: RecordingSource) -> list[Finding]:
 
 
 def _mended(read: RecordingSource, findings: list[Finding]) -> RecordingSource | None:
-    """The recording read anew without the mistakes of findings; None if it makes no sense then."""
+    """The recording read anew without the mistakes of findings, old and new; None if it makes no sense then."""
+    found = (*read.findings, *findings)
     try:
-        options = mended_options(read, read.importer, read.options, [finding.changes for finding in findings])
+        options = mended_options(read, read.importer, read.options, [finding.changes for finding in found])
     except CannotBeTypedError:
         return None
     dataset = attempt(read.importer, read.source, options)
-    return None if dataset is None else replace(read, dataset=dataset, findings=(*read.findings, *findings))
+    return None if dataset is None else replace(read, dataset=dataset, findings=found)
 
 
 def _other_quantities(read: RecordingSource) -> Iterator[Finding]:
