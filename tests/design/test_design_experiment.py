@@ -350,8 +350,8 @@ def test_recordings_without_noise_are_refused() -> None:
     [
         ({"use": "finals"}, ("unknown use 'finals'; did you mean 'final'?",)),
         ({"per": "hour"}, ("unknown per 'hour'", "metre, run, second")),
-        ({"runs": 0}, ("runs: must be from 1",)),
-        ({"repetitions": -1}, ("repetitions: must be from 1",)),
+        ({"runs": 0}, ("runs: must be a whole number, from 1",)),
+        ({"repetitions": -1}, ("repetitions: must be a whole number, from 1",)),
         ({"runs": 2}, ("star: 2 runs cannot", "from 3 to")),
         ({"runs": 13, "repetitions": 1}, ("star: 13 runs cannot", "to 12 can")),
         ({"dataset": "flower"}, ("--dataset", "small.yaml is none")),
