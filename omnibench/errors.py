@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable
 from difflib import get_close_matches
 from numbers import Integral, Real
+from typing import Any
 
 _HOLDERS = ("calibration", "config", "dataset", "robot")  # attributes of results in which another argument lies
 _LONGEST = 2000  # characters of a message; a plug-in's may have millions (chosen: a screen of a terminal)
@@ -64,14 +65,10 @@ def require_choice(what: str, value: object, words: Iterable[str]) -> None:
         raise UnknownNameError(what, str(value), known)
 
 
-def require_range(what: str, value: object, least: float, most: float = math.inf, *, whole: bool = False) -> None:
+def require_range(what: str, value: Any, least: float, most: float = math.inf, *, whole: bool = False) -> None:
     """ConfigError: an argument is no number, or no whole number, from least to most."""
     right_kind = isinstance(value, Integral if whole else Real) and not isinstance(value, bool)
-    try:
-        within = right_kind and least <= float(value) <= most  # type: ignore[arg-type]
-    except OverflowError:
-        within = math.isinf(most)
-    if not within:
+    if not right_kind or not least <= value <= most:
         number = "a whole number, " if whole else ""
         bounds = f"at least {least:g}" if math.isinf(most) else f"from {least:g} to {most:g}"
         raise ConfigError(f"{what}: must be {number}{bounds} (given: {value!r})")

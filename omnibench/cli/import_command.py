@@ -163,7 +163,7 @@ def _is_said(warning: str, sentence: str) -> bool:
 
 
 def _after(read: "RecordingSource", report: "CheckReport") -> tuple[str, tuple[object, ...]]:
-    """What to do after an import, and the words to type for it."""
+    """The next step after an import, in words, and the command for it."""
     from omnibench.fit.check.checking import mending
 
     if typed := mending(read, report):

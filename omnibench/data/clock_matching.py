@@ -41,7 +41,8 @@ _SEARCH = 2.0  # s: offsets are looked for within this on either side, unless th
 _COARSE = 0.1  # s between the offsets that are tried first, a tenth of the window
 _MOST_BINS = 40_000  # offsets times bins that are looked at together; chosen: some MB
 _HUBER = 1.5  # standard deviations from which on a residual counts less
-_ROUNDS, _STEPS = 30, 4  # of h and s in turns with the clocks, and of Gauss-Newton in each, at most
+_ROUNDS = 30  # at most so many alternations of the fit of h and s with that of the clocks; chosen
+_STEPS = 4  # at most so many Gauss-Newton steps of a clock in each round; chosen
 _SETTLED = 1e-4  # s: steps of the clocks that are shorter change nothing; below _CHORDS
 _FEWEST = 10  # windows of a run, below which its clock is not told; chosen
 _LEAST_DRIFTING = 10.0  # s: the drift of a shorter run is not told apart from its offset; chosen
@@ -118,7 +119,8 @@ def match_clocks(robot: Robot, runs: Sequence[Streams], search: float = _SEARCH)
         pairs = zip(usable, before, clocks, strict=True)
         if max(each.farthest_step(old[0] - new[0], old[1] - new[1]) for each, old, new in pairs) < _SETTLED:
             break
-    near = [abs(clock[0]) <= search + _WINDOW for clock in clocks]  # of a reference that stands, any clock would do
+    # A clock beyond the search is chance: any clock suits a reference that stands still.
+    near = [abs(clock[0]) <= search + _WINDOW for clock in clocks]
     settled = zip(usable, clocks, near, strict=True)
     matches = iter([each.match(fitted, clock) if within else None for each, clock, within in settled])
     return [None if each is None else next(matches) for each in windows]
@@ -247,7 +249,7 @@ class _Windows:
         return residuals, slopes / deviations, weights
 
     def _left(self, fitted: Sequence[Array], columns: Array) -> Array:
-        """What (2, W) the wheels do not explain by changes (W, C) of what they count, rad and m."""
+        """Residuals (2, W), rad and m, of the reference less what changes (W, C) of the wheels' counts explain."""
         told = [columns[:, channel] @ each for channel, each in zip(self.channels(), fitted, strict=True)]
         return self.shown - np.array(told)
 

@@ -169,7 +169,7 @@ def _wait(active: Sequence[_Active], watch: JobWatch[Any]) -> list[_Active]:
         reporting[progress].receive(watch)
     ended = [item for item in active if item.future.done()]
     for item in ended:
-        while item.progress is not None and item.progress.poll():  # what it said last
+        while item.progress is not None and item.progress.poll():  # reports sent before its end
             item.receive(watch)
     return ended
 

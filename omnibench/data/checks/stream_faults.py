@@ -133,7 +133,7 @@ def _standing(robot: Robot, runs: Sequence[Trajectory]) -> dict[str, float]:
     found = {}
     for run in runs:
         changes = np.abs(np.diff(run.poses, axis=0)).max(axis=1) > _SAME
-        edges = np.flatnonzero(np.concatenate([[True], changes, [True]]))  # of stretches of equal poses
+        edges = np.flatnonzero(np.concatenate([[True], changes, [True]]))  # bounds of stretches of equal poses
         first, last = edges[:-1], edges[1:] - 1
         seconds = run.pose_times[last] - run.pose_times[first]
         moved = run.poses[last] - run.poses[first]

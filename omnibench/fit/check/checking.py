@@ -88,7 +88,7 @@ def check_recording(read: RecordingSource) -> CheckReport:
 
 
 def mending(read: RecordingSource, report: CheckReport) -> str:
-    """What to type to read a recording again without what its report tells, also after it was written."""
+    """Command that reads a recording again without the errors of its report, also once a data set is written."""
     return command(read, [finding for finding in report.findings if finding.severity == "error"])
 
 

@@ -28,7 +28,7 @@ _SMALL = 0.1  # share of the cost: a larger gain that is not significant is left
 _ENOUGH = 10  # commands, from which on a gain would have shown if there were one; chosen
 _MOST = 120  # runs that are looked at; chosen: some seconds
 _SPARSE = 1.0  # s between poses, from which on headings do not lie on lines between them; chosen
-_STEPS = 3  # of Gauss-Newton by references: designs are so near that two settle; chosen
+_STEPS = 3  # Gauss-Newton steps by references, chosen: the design is so near that two settle
 
 
 @dataclass(frozen=True)

@@ -106,7 +106,7 @@ def command_names(runs: Sequence[Trajectory]) -> list[str]:
     names = [run.command or "" for run in runs]
     nameless = [index for index, run in enumerate(runs) if run.command is None]
     driven = np.array([_driven(runs[index]) for index in nameless])
-    firsts: list[int] = []  # of the runs that drive alike
+    firsts: list[int] = []  # index of the first run of each group that drives alike
     for row, index in enumerate(nameless):
         alike = np.abs(driven[firsts] - driven[row]).max(axis=1) <= _ALIKE * np.abs(driven[row]).max()
         first = firsts[int(alike.argmax())] if alike.any() else row

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from omnibench.robot.kinematics import Array, Robot
 
-SHARE = 0.02  # of the time in motion, below which a motion was not driven on purpose; chosen: some seconds in a minute
+# Least share of the time in motion that counts as driven on purpose; chosen: about a second in a minute.
+SHARE = 0.02
 TURNING, _STRAIGHT = 0.06, 0.04  # rad/s from which on a robot turns, and up to which it goes straight; chosen
 MOVING = 0.02  # m/s from which on it moves; chosen
 _ON_THE_SPOT = 0.1  # way ahead, as a share of the wheels' way by turning, below which it turns on the spot; chosen

@@ -1,4 +1,4 @@
-"""What the names of columns say: their words, and the units among these with the options that take them."""
+"""Words in the names of columns, and the units among these with the options that take them."""
 
 from __future__ import annotations
 

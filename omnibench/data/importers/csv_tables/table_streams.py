@@ -95,7 +95,7 @@ def _check_clock(table: CellTable, time: str) -> None:
 
 
 def _of_runs(table: CellTable, time: str) -> str:
-    """What to type where times begin anew, as they do in a table of several runs; empty where they do not."""
+    """Hint at run_column where times begin anew, as in a table of several runs; empty where they do not."""
     anew = (np.flatnonzero(np.diff(table.numbers([time])[:, 0]) < 0) + 1).tolist()
     if not anew:
         return ""
