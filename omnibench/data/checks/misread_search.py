@@ -42,9 +42,8 @@ _SUSPICIOUS, _REMAINS, _BETTER = 7.0, 0.6, 4.0
 _CONTRADICTING, _USUAL = 0.1, 0.04
 _BADLY = 0.25  # share of the way that no matrix explains, from which on a recording is suspicious; untouched ones: 0.08
 _MOST_WEIGHED, _CORRELATED = 60.0, 4.0  # n of Eq. (1) at most, and windows that tell as much as one; chosen
-UNRELATED = (
-    0.5  # share of the way and of the turns that is left where wheels and reference have nothing in common; chosen
-)
+# Share of the way and of the turns that is left where wheels and reference have nothing in common; chosen.
+UNRELATED = 0.5
 _SIMPLE = 4.5  # cost of wheels' mistakes that are looked for beside one of the reference
 _IN_DEGREES = 8.0  # cost of headings in degrees; less where a run begins beyond a whole turn
 _TURN = 2 * math.pi
