@@ -14,6 +14,7 @@ from typing import Any, NoReturn
 
 _PACKAGE = os.path.dirname(__file__)
 _INTERRUPTED = 130  # exit code after Ctrl-C; of another signal once it has come
+_BEGINS_ANEW = "interrupted: the same command begins anew"  # where a command keeps nothing on the way
 _COMMANDS = os.path.join(_PACKAGE, "cli")
 
 
@@ -89,7 +90,7 @@ def _run(command: Any) -> None:
     except OmnibenchError as error:
         _fail(_with_notes(f"error: {error}", error), error.exit_code)
     except typer.Abort:
-        _fail("interrupted", _INTERRUPTED)
+        _fail(_BEGINS_ANEW, _INTERRUPTED)
     except BrokenPipeError:
         sys.stderr.close()  # the program that read our output has ended
         sys.exit(1)
@@ -99,7 +100,7 @@ def _run(command: Any) -> None:
         _fail(_with_notes(f"error: {error.filename or 'output'}: {error.strerror or error}", error))
     else:
         if code == 130:  # newer versions of Typer return this after Ctrl-C
-            _fail("interrupted", _INTERRUPTED)
+            _fail(_BEGINS_ANEW, _INTERRUPTED)
         sys.exit(code if isinstance(code, int) else 0)
 
 

@@ -21,7 +21,7 @@ from wheeled_samples import TRICYCLE, driven
 
 from omnibench import check, save_dataset
 from omnibench.cli.handbook_topics import HANDBOOK
-from omnibench.config import parse_settings
+from omnibench.config import parse_settings, to_yaml
 from omnibench.data.checks.option_words import as_yaml
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.references.run_references import Reference, References
@@ -188,17 +188,50 @@ def test_a_misreading_that_few_references_show_is_found_and_mended_as_typed(
     assert check("log_mended").command == ""
 
 
+def as_in_ms(folder: Path) -> None:
+    """Write the stamps of a data set in ms."""
+    for table in ("wheels", "poses"):
+        file = folder / f"{table}.parquet"
+        frame = pl.read_parquet(file)
+        frame.with_columns(t=frame["t"] * 1000).write_parquet(file)
+
+
 def test_a_data_set_in_ms_is_told_and_mended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     save_dataset(recording(), "log")
-    for table in ("wheels", "poses"):
-        file = tmp_path / "log" / f"{table}.parquet"
-        frame = pl.read_parquet(file)
-        frame.with_columns(t=frame["t"] * 1000).write_parquet(file)
+    as_in_ms(tmp_path / "log")
     (finding,) = check("log").findings
     assert finding.kind == "time_unit"
     assert command(*shlex.split(finding.fix)[1:]).returncode == 0
     assert check("log_mended").verdict == "ready"
+
+
+def test_a_log_in_ms_whose_wheels_hold_positions_is_mended_in_both(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    columns = [f"w_{name}" for name in recording().robot.wheel_names]
+    for run in recording().trajectories:
+        turned = dict(zip(columns, np.cumsum(run.rates * 0.04, axis=0).T, strict=True))
+        poses = dict(zip(("x", "y", "theta"), run.poses.T, strict=True))
+        rows = [pl.DataFrame({"t": run.times * 1000, **turned}), pl.DataFrame({"t": run.pose_times * 1000, **poses})]
+        (tmp_path / "log").mkdir(exist_ok=True)
+        pl.concat(rows, how="diagonal").sort("t").write_csv(f"log/{run.command}_{run.id}.csv")
+    (tmp_path / "log" / "robot.yaml").write_text(to_yaml(recording().robot))
+    report = check("log", options={"wheel_columns": columns})
+    assert kinds(report) == {"time_unit", "wheel_unit"}
+    assert command(*shlex.split(report.command)[1:]).returncode == 0
+    assert check("data/log").verdict == "ready"
+
+
+def test_a_gain_that_clocks_hide_is_not_told_in_figures() -> None:
+    def off(run: Trajectory) -> Trajectory:
+        stamps = np.append(0.0, run.pose_times + 1.0)
+        return replace(run, pose_times=stamps[:-20], poses=np.vstack([run.poses[:1], run.poses])[:-20])
+
+    report = check(make_dataset("base", recording().robot, 0.04, [off(run) for run in recording().trajectories[:2]]))
+    assert "clock_offset" in kinds(report)
+    assert (report.needed, "->" in report.gain) == (None, False)
 
 
 def test_a_wheel_that_never_turns_is_dead() -> None:
@@ -294,6 +327,16 @@ def test_values_are_typed_so_that_they_are_read_as_they_are(names: list[str]) ->
 def test_a_data_set_in_memory_is_to_be_saved_before_its_fix_is_typed() -> None:
     swapped = changed(lambda run: replace(run, rates=run.rates[:, ::-1]))
     assert check(swapped).command.endswith("# after save_dataset(dataset, 'base')")
+
+
+def test_a_data_set_in_memory_is_not_read_from_a_folder_that_has_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    positions = changed(lambda run: replace(run, rates=np.cumsum(run.rates * 0.04, axis=0)))
+    alone = check(positions)
+    monkeypatch.chdir(tmp_path)
+    save_dataset(recording(), "base")
+    assert check(positions) == alone
 
 
 def test_two_units_that_are_wrong_at_once_are_both_typed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,7 +6,7 @@ import json
 import os
 import signal
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from timing import PATIENCE
 from omnibench.config import to_yaml
 from omnibench.live.config import LiveConfig, read_live_config
 from omnibench.live.node import LiveNode
-from omnibench.live.wire.messages import JOINT_STATE, JointState
+from omnibench.live.wire.messages import JOINT_STATE, JointState, Odometry
 from omnibench.robot.calibration import Calibration, write_calibration
 
 
@@ -120,6 +120,16 @@ def asked(session: zenoh.Session, selector: str, payload: str | bytes | None = N
 def sent(publisher: zenoh.Publisher, samples: list[JointState]) -> None:
     for sample in samples:
         publisher.put(JOINT_STATE.encode(sample))
+
+
+def sent_one_by_one(publisher: zenoh.Publisher, samples: list[JointState], heard: Sequence[Odometry]) -> None:
+    """Send samples, each once the odometry of the one before was heard.
+
+    In a burst some could be late on a busy machine, and of late ones only the newest has odometry.
+    """
+    for sample in samples:
+        sent(publisher, [sample])
+        until(lambda stamp=sample.stamp: heard and heard[-1].stamp == stamp, "odometry")
 
 
 def as_text(chosen: Calibration) -> str:

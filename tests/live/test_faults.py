@@ -19,7 +19,7 @@ import pytest
 import yaml
 import zenoh
 from drives import SECOND, calibration, drive, slam
-from nodes import Command, as_text, asked, config_of, running, sent, write_node
+from nodes import Command, as_text, asked, config_of, running, sent, sent_one_by_one, write_node
 from sessions import free_port, raw_session, until
 from timing import PATIENCE
 
@@ -136,8 +136,7 @@ def test_a_killed_router_is_found_again_when_it_is_back(tmp_path: Path) -> None:
         robot, listener = client(port), client(port)
         heard = heard_odometry(listener)
         wheels = wheels_of(robot)
-        sent(wheels, path.samples()[:100])
-        until(lambda: len(heard) == 100, "odometry before")
+        sent_one_by_one(wheels, path.samples()[:100], heard)
         router.kill()
         with Command("live", router_config):
             # the robot goes on sending all the time; some samples are lost until all three are connected again
@@ -171,14 +170,12 @@ def test_a_killed_node_goes_on_with_its_pose_and_calibration(tmp_path: Path) -> 
         wheels = wheels_of(session)
         poses = session.declare_publisher("apr/slam_pose")
         assert asked(session, "omnibench/apr/swap", as_text(other))["accepted"]
-        sent(wheels, path.samples()[:150])
-        until(lambda: len(heard) == 150, "odometry before")
+        sent_one_by_one(wheels, path.samples()[:150], heard)
         until(lambda: poses.matching_status.matching, "the node's subscription")
         poses.put(slam(path.stamps[140], [7.0, 8.0, 0.5]))
         until(lambda: asked(session, "omnibench/apr/health")["counts"]["poses"] == 1, "the pose")
         time.sleep(0.15)  # a sample is saved when the last one that was is 0.1 s old, or older
-        sent(wheels, path.samples()[150:200])
-        until(lambda: len(heard) == 200, "odometry before")
+        sent_one_by_one(wheels, path.samples()[150:200], heard)
         saved = tmp_path / "state" / "apr.state.json"
         until(lambda: re.search('"map_pose": ?\\[', saved.read_text(errors="replace")), "the located robot on disk")
         mapped = asked(session, "omnibench/apr/pose")["map"]
@@ -189,8 +186,7 @@ def test_a_killed_node_goes_on_with_its_pose_and_calibration(tmp_path: Path) -> 
         heard_again = heard_odometry(session)
         wheels = wheels_of(session)
         assert asked(session, "omnibench/apr/info")["calibration"] == "synthetic 1.1"
-        sent(wheels, path.samples()[200:])
-        until(lambda: len(heard_again) == 201, "odometry after")
+        sent_one_by_one(wheels, path.samples()[200:], heard_again)
         assert heard_again[0].stamp > heard[-1].stamp
         step = np.linalg.norm(heard_again[0].pose[:2] - heard[-1].pose[:2])
         assert step < 0.02  # m; it went on where it was, and the angles tell what it missed
@@ -209,8 +205,7 @@ def test_a_stopped_node_says_where_it_was_and_goes_on_exactly_there(tmp_path: Pa
         with Command("live", config) as node:
             session = client(port)
             heard = heard_odometry(session)
-            sent(wheels_of(session), path.samples()[first:last])
-            until(lambda heard=heard, count=last - first: len(heard) == count, "odometry")
+            sent_one_by_one(wheels_of(session), path.samples()[first:last], heard)
             session.close()
             _, said = node.stop(signal.SIGTERM)
             assert node.process.returncode == 0
@@ -263,8 +258,7 @@ def test_nonsense_on_any_topic_is_counted_and_the_stream_lives(tmp_path: Path) -
         heard = heard_odometry(session)
         wheels, poses = wheels_of(session), session.declare_publisher("apr/slam_pose")
         until(lambda: poses.matching_status.matching, "the node's subscription")
-        sent(wheels, path.samples())
-        until(lambda: len(heard) == 301, "odometry before")
+        sent_one_by_one(wheels, path.samples(), heard)
         poses.put(slam(path.stamps[-1], [0, 0, 0]))
         until(lambda: node.health("apr").counts["poses"] == 1, "a pose")
         before = np.array(heard[-1].pose)

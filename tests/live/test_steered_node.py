@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import zenoh
 from mcap_recordings import messages_of
-from nodes import asked, config_of, running, sent
+from nodes import asked, config_of, running, sent_one_by_one
 from received_messages import ReceivedMessages
 from sessions import until
 from steered import SWERVE, SteeredDrive, calibration, drive, recording
@@ -39,8 +39,7 @@ def heard(session: zenoh.Session, samples: list[JointState]) -> Array:
     messages = ReceivedMessages(session, base__odom=ODOMETRY)
     wheels = session.declare_publisher("base/joint_states")
     until(lambda: wheels.matching_status.matching, "the node's subscription")
-    sent(wheels, samples)
-    until(lambda: len(messages["base__odom"]) == len(samples), "the last odometry")
+    sent_one_by_one(wheels, samples, messages["base__odom"])
     return np.array([each.pose for each in messages["base__odom"]])
 
 

@@ -77,13 +77,15 @@ def check_recording(read: RecordingSource) -> CheckReport:
     if foreign:
         misread = []
     found = [*read.findings, *_noted(dataset), *misread, *odd, *foreign, *odometry, *faults, *copied_runs(runs)]
-    if not spoiled and not foreign:
-        found += clock_findings(runs, clocks)
+    off = [] if spoiled or foreign else list(clock_findings(runs, clocks))
+    found += off
     measured = any(run.references is not None for run in dataset.trajectories)
     found += _left_open(dataset) if measured else missing_motions(robot, aligned)
     found += too_few(dataset.trajectories)
     findings = with_fixes(read, sorted(_distinct(found), key=lambda finding: _ORDER[finding.severity]))
     gain = Gain(None, "") if misread or odd or foreign or spoiled else expected_gain(dataset)
+    if gain.needed is None and any(finding.severity == "error" for finding in off):
+        gain = Gain(None, "whether a calibration is needed can be told once the clocks are matched")
     return _report(read, findings, gain, clocks)
 
 

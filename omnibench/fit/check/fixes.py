@@ -40,7 +40,7 @@ def command(read: RecordingSource, findings: Sequence[Finding]) -> str:
     if not changes:
         return ""
     typed = _command(read, changes)
-    return typed if read.source.exists() else f"{typed}  # after save_dataset(dataset, {str(read.source)!r})"
+    return typed if read.readable else f"{typed}  # after save_dataset(dataset, {str(read.source)!r})"
 
 
 def next_command(read: RecordingSource) -> str:

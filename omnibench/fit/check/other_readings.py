@@ -8,7 +8,7 @@ from dataclasses import replace
 from omnibench.data.checks.finding import Finding, FindingWarning
 from omnibench.data.checks.misread_search import UNRELATED, Explained, search
 from omnibench.fit.check.fixes import CannotBeTypedError, mended_options
-from omnibench.fit.check.recording_source import RecordingSource, attempt, recorded
+from omnibench.fit.check.recording_source import RecordingSource, attempt, odd_times, other_times, recorded
 
 _QUANTITIES = {"": "positions", "/sample": "increments since the row before", "/s": "rates"}
 
@@ -18,17 +18,26 @@ def read_otherwise(read: RecordingSource, explained: Explained) -> RecordingSour
 
     explained: what the search for misreadings tells of it. Tried are the units that reading it warned of, where the
     search tells something else, and wheels that count positions in the place of rates or increments, and the like,
-    where no matrix explains the motion.
+    where no matrix explains the motion, with other units of time where the times are odd.
     """
-    if not read.source.exists():
+    if not read.readable:
         return None
     warned = _warned(read)
     if {finding.kind for finding in warned} - {mistake.kind for mistake in explained.mistakes}:
         other = _mended(read, warned)
         return None if other is None or _warned(other) or search(recorded(other.dataset)).mistakes else other
-    if explained.unexplained > UNRELATED and not any(finding.kind == "wheel_unit" for finding in read.findings):
-        return next(filter(None, (_mended(read, [finding]) for finding in _other_quantities(read))), None)
+    senseless = explained.unexplained > UNRELATED or (not explained.told and odd_times(read.dataset))
+    if senseless and not any(finding.kind == "wheel_unit" for finding in read.findings):
+        return next(filter(None, (_mended(read, findings) for findings in _other_units(read))), None)
     return None
+
+
+def _other_units(read: RecordingSource) -> Iterator[list[Finding]]:
+    """What would be found if the wheels held another quantity, with times in the unit that is read or in another."""
+    quantities = list(_other_quantities(read))
+    yield from ([quantity] for quantity in quantities)
+    if odd_times(read.dataset):
+        yield from ([time, quantity] for time in other_times(read.importer, read.options) for quantity in quantities)
 
 
 def _warned(read: RecordingSource) -> list[Finding]:

@@ -29,8 +29,8 @@ _EXPLAINED = 0.35  # share of the way that the wheels may leave unexplained with
 class RecordingSource:
     """A data set and how it was read.
 
-    importer, options: by which ``source`` is read again. folder: of the data set, where it is one on disk. findings:
-    what reading showed.
+    importer, options: by which ``source`` is read again. folder: of the data set, where it is one. findings: what
+    reading showed. in_memory: ``source`` is only where the data set would be saved, whatever stands there.
     """
 
     dataset: Dataset
@@ -39,6 +39,12 @@ class RecordingSource:
     options: Mapping[str, Any]
     folder: Path | None = None
     findings: tuple[Finding, ...] = field(default=())
+    in_memory: bool = False
+
+    @property
+    def readable(self) -> bool:
+        """True if the source can be read again."""
+        return not self.in_memory and self.source.exists()
 
 
 def read_source(
@@ -65,7 +71,7 @@ def _of_folder(folder: Path) -> RecordingSource:
         if (mended := _by_other_times("dataset", folder, {})) is None:
             raise
         return replace(mended, folder=folder)
-    mended = _by_other_times("dataset", folder, {}) if _odd_times(dataset) else None
+    mended = _by_other_times("dataset", folder, {}) if odd_times(dataset) else None
     return of_dataset(dataset, folder) if mended is None else replace(mended, folder=folder)
 
 
@@ -74,7 +80,7 @@ def of_dataset(dataset: Dataset, folder: Path | None = None) -> RecordingSource:
     place = folder or Path(dataset.name)
     imported = dataset.imported
     if imported is None or not Path(imported.source).exists():
-        return RecordingSource(dataset, "dataset", place, {}, place)
+        return RecordingSource(dataset, "dataset", place, {}, place, in_memory=folder is None)
     return RecordingSource(dataset, imported.importer, Path(imported.source), imported.options, place)
 
 
@@ -105,15 +111,15 @@ def _imported(name: str, source: Path, given: Mapping[str, Any]) -> RecordingSou
         if (mended := _by_other_times(name, source, given)) is None:
             raise
         return mended
-    mended = _by_other_times(name, source, given) if _odd_times(dataset) else None
+    mended = _by_other_times(name, source, given) if odd_times(dataset) else None
     return mended or RecordingSource(dataset, name, source, given)
 
 
 def _by_other_times(name: str, source: Path, given: Mapping[str, Any]) -> RecordingSource | None:
     """The source by the other units of time that make sense; None if none does."""
-    for changes in _time_units(name, given):
-        if (mended := attempt(name, source, {**given, **changes})) is not None:
-            return RecordingSource(mended, name, source, given, findings=(_time_unit(changes),))
+    for finding in other_times(name, given):
+        if (mended := attempt(name, source, {**given, **finding.changes})) is not None:
+            return RecordingSource(mended, name, source, given, findings=(finding,))
     return None
 
 
@@ -150,7 +156,7 @@ def attempt(name: str, source: Path, options: Mapping[str, Any]) -> Dataset | No
         dataset = _read(name, source, options)
     except (DataError, ConfigError):
         return None
-    if _odd_times(dataset):
+    if odd_times(dataset):
         return None
     fit = recorded(dataset).fit()
     return dataset if fit is not None and fit.left[0] < _EXPLAINED else None
@@ -162,23 +168,24 @@ def recorded(dataset: Dataset) -> Recorded:
     return Recorded(dataset.robot, [run.log(run.pose_times) for run in runs], [run.poses for run in runs])
 
 
-def _odd_times(dataset: Dataset) -> bool:
+def odd_times(dataset: Dataset) -> bool:
+    """True if samples or poses follow each other so slowly, or so fast, that their times are likely in another unit."""
     posed = [run for run in dataset.trajectories if run.has_poses]
     wheels = float(np.median(np.concatenate([np.diff(run.times, prepend=0.0) for run in dataset.trajectories])))
     poses = float(np.median(np.concatenate([np.diff(run.pose_times) for run in posed]))) if posed else 1.0
     return wheels > _SLOWEST or wheels < _FASTEST or poses > _SLOWEST_POSES or poses < _FASTEST
 
 
-def _time_units(name: str, given: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    """Other units of all times, of the poses' and of the wheels'."""
+def other_times(name: str, given: Mapping[str, Any]) -> Iterator[Finding]:
+    """What would be found if all times were in another unit, or the poses', or the wheels'."""
     fields = importers.entry(name).options.model_fields
     wheels, poses = "wheel_time_unit", "pose_time_unit"
     if wheels not in fields or poses not in fields:
         return
     for unit in _UNITS:
-        yield {wheels: unit, poses: unit}
-        yield {poses: unit}
-        yield {wheels: unit, poses: given.get(poses) or "s"}
+        yield _time_unit({wheels: unit, poses: unit})
+        yield _time_unit({poses: unit})
+        yield _time_unit({wheels: unit, poses: given.get(poses) or "s"})
 
 
 def _time_unit(changes: Mapping[str, Any]) -> Finding:

@@ -123,7 +123,9 @@ class Chaos:
         if ending.program == "recorder":
             self._check_recording(ending, full)
         if ending.program == "listener":
-            damaged = [line for line in ending.said.splitlines() if line != "interrupted" and not _is_status(line)]
+            damaged = [
+                line for line in ending.said.splitlines() if not line.startswith("interrupted") and not _is_status(line)
+            ]
             if damaged:
                 self.problem(f"listener says {damaged[0]!r}; {log}")
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import zenoh
 from drives import ORIGIN, SECOND, calibration, drive
-from nodes import Command, as_text, asked, config_of, running, sent, write_node
+from nodes import Command, as_text, asked, config_of, running, sent, sent_one_by_one, write_node
 from received_messages import ReceivedMessages
 from sessions import Loopback, raw_session, until
 from timing import PATIENCE
@@ -154,8 +154,7 @@ def test_more_requests_than_the_server_holds_are_refused_and_the_stream_goes_on(
         until(lambda: wheels.matching_status.matching, "the node's subscription")
         with node.trackers["apr"]._state_lock:  # the query server is held up by the first
             waiting = [session.get("omnibench/apr/health", timeout=PATIENCE) for _ in range(200)]
-            sent(wheels, path.samples())
-            until(lambda: len(received["bob__odom"]) == 101, "the odometry")
+            sent_one_by_one(wheels, path.samples(), received["bob__odom"])
         replies = [reply for each in waiting for reply in each]
     refused = [json.loads(reply.err.payload.to_bytes())["error"] for reply in replies if reply.err is not None]
     assert len(replies) == 200
@@ -263,12 +262,10 @@ def test_a_calibration_that_is_put_runs_from_the_next_sample_on_and_odom_does_no
         received = ReceivedMessages(session, apr__odom=ODOMETRY)
         wheels = session.declare_publisher("apr/joint_states")
         until(lambda: wheels.matching_status.matching, "the node's subscription")
-        sent(wheels, path.samples()[:51])
-        until(lambda: len(received["apr__odom"]) == 51, "the first half")
+        sent_one_by_one(wheels, path.samples()[:51], received["apr__odom"])
         session.put("omnibench/apr/calibration", as_text(other))
         until(lambda: node.health("apr").counts["swaps"] == 1, "the swap")
-        sent(wheels, path.samples()[51:])
-        until(lambda: len(received["apr__odom"]) == 101, "the second half")
+        sent_one_by_one(wheels, path.samples()[51:], received["apr__odom"])
     poses = np.array([each.pose for each in received["apr__odom"]])
     steps = np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1)
     before = np.linalg.norm(np.diff(path.poses[:, :2], axis=0), axis=1)
