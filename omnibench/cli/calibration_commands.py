@@ -131,7 +131,8 @@ def calibrate(
         write_calibration(calibration, output)
     warn([*recordings.warnings, *run.warnings])
     if result.at_bounds:
-        warn([f"on a bound of the box {box!r}: {', '.join(result.at_bounds)}; a wider box may fit better"])
+        when = "" if result.shrinkage is None else " before the answer was shrunk to the design"
+        warn([f"on a bound of the box {box!r}{when}: {', '.join(result.at_bounds)}; a wider box may fit better"])
     if run.untouched:
         warn([f"not fitted, kept at the start value by the box {box!r} or the cost: {', '.join(run.untouched)}"])
     if as_json:
