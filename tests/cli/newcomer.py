@@ -75,10 +75,10 @@ def prepare(command: str, folder: Path) -> None:
             prepared(folder)
 
 
-def typed(page: Path, folder: Path) -> Path:
+def typed(page: Path, folder: Path, before: Callable[[str, Path], None] = prepare) -> Path:
     """Type a page's commands in a folder; the folder in which the reader then is."""
     elsewhere = ELSEWHERE.get(page.stem, {})
-    with terminal(folder, prepare) as typing:
+    with terminal(folder, before) as typing:
         for line in lines_of(page):
             if line not in elsewhere:
                 typing.type(line)
