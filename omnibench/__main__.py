@@ -14,7 +14,7 @@ from typing import Any, NoReturn
 
 _PACKAGE = os.path.dirname(__file__)
 _INTERRUPTED = 130  # exit code after Ctrl-C; of another signal once it has come
-_BEGINS_ANEW = "interrupted: the same command begins anew"  # where a command keeps nothing on the way
+_BEGINS_ANEW = "interrupted; the same command begins anew"  # where a command keeps nothing on the way
 _COMMANDS = os.path.join(_PACKAGE, "cli")
 
 

@@ -199,5 +199,5 @@ def test_ctrl_c_leaves_nothing_half_written(data: Path, tmp_path: Path) -> None:
     finally:
         process.kill()
     assert process.returncode == 130
-    assert told.splitlines()[-1] == "interrupted: the same command begins anew"
+    assert told.splitlines()[-1] == "interrupted; the same command begins anew"
     assert not (tmp_path / "results").exists()
