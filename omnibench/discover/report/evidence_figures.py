@@ -234,7 +234,6 @@ def hidden_grid(hidden: Sequence[Hidden]) -> FigureGrid | None:
     if not shown:
         return None
     names = [wrapped(f"{each.name}: {each.parameter}") for each in shown]
-    row = 34 if any("\n" in name for name in names) else 26  # px, room for a name
     traces = []
     for item, values, words in (
         (_LIMIT, [each.limit for each in shown], "at most"),
@@ -254,7 +253,7 @@ def hidden_grid(hidden: Sequence[Hidden]) -> FigureGrid | None:
                 "What could still hide, as a share of what is plausible",
                 figure,
                 "For each effect that was not found, how large it could be unseen in per cent of its plausible range",
-                90 + row * len(shown),
+                90 + 34 * len(shown),
             ),
         ),
         (_LIMIT, _DETECTABLE),

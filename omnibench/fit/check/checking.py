@@ -83,9 +83,8 @@ def check_recording(read: RecordingSource) -> CheckReport:
     found += _left_open(dataset) if measured else missing_motions(robot, aligned)
     found += too_few(dataset.trajectories)
     findings = with_fixes(read, sorted(_distinct(found), key=lambda finding: _ORDER[finding.severity]))
-    gain = Gain(None, "") if misread or odd or foreign or spoiled else expected_gain(dataset)
-    if gain.needed is None and any(finding.severity == "error" for finding in off):
-        gain = Gain(None, "whether a calibration is needed can be told once the clocks are matched")
+    clocks_agree = not any(finding.severity == "error" for finding in off)
+    gain = Gain(None, "") if misread or odd or foreign or spoiled else expected_gain(dataset, clocks_agree=clocks_agree)
     return _report(read, findings, gain, clocks)
 
 

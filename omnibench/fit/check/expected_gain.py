@@ -39,10 +39,11 @@ class Gain:
     sentence: str
 
 
-def expected_gain(dataset: Dataset) -> Gain:
+def expected_gain(dataset: Dataset, *, clocks_agree: bool = True) -> Gain:
     """Errors at the end of runs that were held out, by the design and by a quick fit to the others.
 
-    Of runs without poses they are those at their references.
+    Of runs without poses they are those at their references. clocks_agree: False where the reference's clock is so far
+    off that a gain which is not significant says nothing.
     """
     robot, every = dataset.robot, dataset.trajectories
     chosen = every[:: -(-len(every) // _MOST)]
@@ -69,6 +70,8 @@ def expected_gain(dataset: Dataset) -> Gain:
     small = verdict.improvement is not None and abs(verdict.improvement) < _SMALL
     if verdict.verdict == "undecided" and small and verdict.units is not None and verdict.units >= _ENOUGH:
         needed = False
+    if needed is None and not clocks_agree:
+        return Gain(None, "whether a calibration is needed can be told once the clocks are matched")
     return Gain(needed, verdict.sentence.replace("held out", "cross-validated", 1))
 
 

@@ -33,11 +33,10 @@ def read_otherwise(read: RecordingSource, explained: Explained) -> RecordingSour
 
 
 def _other_units(read: RecordingSource) -> Iterator[list[Finding]]:
-    """What would be found if the wheels held another quantity, with times in the unit that is read or in another."""
-    quantities = list(_other_quantities(read))
-    yield from ([quantity] for quantity in quantities)
-    if odd_times(read.dataset):
-        yield from ([time, quantity] for time in other_times(read.importer, read.options) for quantity in quantities)
+    """Findings that another quantity of the wheels would mend, each with another unit of times that are odd."""
+    odd = odd_times(read.dataset)
+    times = [[finding] for finding in other_times(read.importer, read.options)] if odd else [[]]
+    return ([*time, quantity] for time in times for quantity in _other_quantities(read))
 
 
 def _warned(read: RecordingSource) -> list[Finding]:

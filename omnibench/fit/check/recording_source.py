@@ -29,8 +29,8 @@ _EXPLAINED = 0.35  # share of the way that the wheels may leave unexplained with
 class RecordingSource:
     """A data set and how it was read.
 
-    importer, options: by which ``source`` is read again. folder: of the data set, where it is one. findings: what
-    reading showed. in_memory: ``source`` is only where the data set would be saved, whatever stands there.
+    importer, options: by which ``source`` is read again. folder: of the data set, where it is one. findings: those
+    of reading it. in_memory: ``source`` is only where the data set would be saved, whatever stands there.
     """
 
     dataset: Dataset
@@ -177,7 +177,7 @@ def odd_times(dataset: Dataset) -> bool:
 
 
 def other_times(name: str, given: Mapping[str, Any]) -> Iterator[Finding]:
-    """What would be found if all times were in another unit, or the poses', or the wheels'."""
+    """Findings that another unit of time would mend: of all times, of the poses' and of the wheels'."""
     fields = importers.entry(name).options.model_fields
     wheels, poses = "wheel_time_unit", "pose_time_unit"
     if wheels not in fields or poses not in fields:
