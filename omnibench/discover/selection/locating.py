@@ -1,0 +1,34 @@
+"""Locating: generic bases and fine structure together, over which the residuals depend on something."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from omnibench.discover.fitting.extend import Extended
+from omnibench.discover.regressors.fine_structure import fine_structure
+from omnibench.discover.regressors.significance import Significance, together
+from omnibench.discover.selection.model_selection import Selection
+from omnibench.discover.selection.screening import Screening, significance_left
+
+
+def with_fine_structure(
+    selection: Selection, baseline: Extended, extended: Extended, rng: np.random.Generator
+) -> Selection:
+    """The selection with fine structure among what the residuals depend on, before any effect and after those chosen.
+
+    baseline: the plain matrix under the noise of the extended model.
+    """
+    before = fine_structure(baseline.fit, rng)
+    after = before if extended is baseline else fine_structure(extended.fit, rng)
+    return replace(selection, where=together(selection.where, before, rng), left=together(selection.left, after, rng))
+
+
+def all_left(
+    extended: Extended, screening: Screening, without: Sequence[str], rng: np.random.Generator
+) -> Significance:
+    """Significance of generic bases and of fine structure beyond all that an extended model holds."""
+    bases = significance_left(extended, screening, without, rng)
+    return together(bases, fine_structure(extended.fit, rng), rng)
