@@ -29,6 +29,7 @@ from omnibench.discover.selection.candidate_groups import check_names
 from omnibench.discover.selection.competing_models import competing_models
 from omnibench.discover.selection.detectability import detectability_of
 from omnibench.discover.selection.extrapolation import extrapolations_of
+from omnibench.discover.selection.fitted_forms import with_fitted_forms
 from omnibench.discover.selection.locating import all_left, with_fine_structure
 from omnibench.discover.selection.model_selection import Selection, select_effects
 from omnibench.discover.selection.motor_effects import select_motor_effects
@@ -66,9 +67,10 @@ def discover_effects(
 
     without: effects that are not to be tried. unknown_term: where no name is sure, close the gap by a term without a
     name, over the covariate that the residuals depend on. calibration: the plain matrix is fitted from this one's
-    matrix on, by default from the robot's design values. The validation split is used when all is decided, and only to say how
-    well the models predict it; but where no session of the training split repeats a command, runs of the validation
-    split that do are used for the noise, and a note says so. watch: told of every step as it begins and ends.
+    matrix on, by default from the robot's design values. The validation split is used when all is decided, and only to
+    say how well the models predict it; but where no session of the training split repeats a command, runs of the
+    validation split that do are used for the noise, and a note says so. watch: told of every step as it begins and
+    ends.
 
     Raises UnknownNameError for a name in ``without`` that is no effect's, DataError for a training split without
     reference poses or another robot's calibration.
@@ -97,8 +99,9 @@ def discover_effects(
         model = _confirm(plain, model, without, rng)
     screening = model.screening
     models = competing_models(plain, model.selection, model.extended)
+    models = with_fitted_forms(plain, screening, models)
     baseline = without_effects(plain, models.used)
-    selection = with_fine_structure(model.selection, baseline, models.used, rng)
+    selection = with_fine_structure(models.selection, baseline, models.used, rng)
 
     progress.begin("looking at the motors")
     motors = select_motor_effects(runs, dataset.robot, without, rng)

@@ -127,6 +127,11 @@ class Given:
         values: Array = covariance @ self.scores[:, list(index)].sum(axis=0)
         return values, covariance
 
+    def only(self, index: Sequence[int]) -> Given:
+        """Some of the columns, in this order."""
+        rows = list(index)
+        return Given(self.information[np.ix_(rows, rows)], self.scores[:, rows], self.total[rows])
+
     def given(self, index: Sequence[int]) -> Given:
         """The Schur complement beyond further columns."""
         return _beyond(self.information, self.scores, self.total, index)
