@@ -14,6 +14,9 @@ from omnibench.discover.selection.competing_models import CompetingModels
 from omnibench.discover.selection.screening import Screening
 from omnibench.fit.least_squares.whitened import given
 
+# Share of a column that must be left beyond the others, as in unknown_term.py: much of a form is another matrix.
+_DETERMINED = 0.01
+
 
 def with_fitted_forms(plain: Fit, screening: Screening, models: CompetingModels) -> CompetingModels:
     """The competing models, the used one with the forms of its effects by which held-out runs gain."""
@@ -34,7 +37,8 @@ def _formed(screening: Screening, chosen: Sequence[Group], position: int) -> Gro
     left, kept = given(screening.data, screening.index_with(chosen)), list[int]()
     columns = np.array(group.forms)
     while len(kept) < len(columns):
-        gains = [0.0 if row in kept else left.chi_square([int(columns[row])]) for row in range(len(columns))]
+        free = np.diag(left.information)[columns] > _DETERMINED * left.total[columns]
+        gains = [left.chi_square([int(column)]) if there else 0.0 for column, there in zip(columns, free, strict=True)]
         best = int(np.argmax(gains))
         if gains[best] <= np.log(len(screening.data.scores)):
             break

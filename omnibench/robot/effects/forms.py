@@ -1,7 +1,7 @@
 """Forms of an effect: its size varies with a covariate, or from wheel to wheel, where the textbook has it constant.
 
 With c the textbook's correction by a parameter, x a covariate scaled to [-1, 1] over the range that was driven and held
-outside, and m_1, m_2 the means of x and x^2 weighted by c^2, the family of the effect is
+outside, and m_1, m_2 the means of x and x^2 weighted by c^2 (of all parameters), the family of the effect is
 
     c (b + b_1 (x - m_1) + b_2 (x^2 - m_2)),                                                                       (1)
 
@@ -28,6 +28,7 @@ from omnibench.robot.signals import Signals
 
 _POWERS = (1, 2)
 _LARGEST = 2.0  # plausible size of a form's parameter, times that of the textbook's
+_TOP = 0.99  # quantile of a covariate up to which its forms vary, so that no single sample stretches them; chosen
 _VARIES = 0.02  # share of its largest value by which a covariate must vary
 _BY_SHOWN = {
     "wheel rate": ("wheel rate",),
@@ -40,6 +41,10 @@ _BY_SHOWN = {
 }
 
 
+def _speed(signals: Signals) -> Array:
+    return np.hypot(signals.twists[:, 0], signals.twists[:, 1])
+
+
 def _total_acceleration(signals: Signals) -> Array:
     forward, left, turn = signals.twists.T
     ahead, aside = signals.accelerations[:, :2].T
@@ -48,9 +53,10 @@ def _total_acceleration(signals: Signals) -> Array:
 
 _COVARIATES: dict[str, Callable[[Signals], Array | None]] = {
     "wheel rate": lambda signals: np.abs(signals.rates),
-    "speed": lambda signals: np.hypot(signals.twists[:, 0], signals.twists[:, 1]),
+    "speed": _speed,
     "turning": lambda signals: np.abs(signals.twists[:, 2]),
     "acceleration": _total_acceleration,
+    "centripetal acceleration": lambda signals: np.abs(signals.twists[:, 2]) * _speed(signals),
     "elapsed time": lambda signals: signals.elapsed,
     "session time": lambda signals: signals.session_time,
     "distance": lambda signals: signals.travelled,
@@ -62,6 +68,7 @@ _IN_WORDS = {
     "speed": "fast driving",
     "turning": "fast turning",
     "acceleration": "large accelerations",
+    "centripetal acceleration": "large centripetal accelerations",
     "elapsed time": "the end of a run",
     "session time": "the end of the session",
     "distance": "the end of the way",
@@ -97,11 +104,11 @@ def forms_of(effect: MotionEffect, signals: Signals, corrections: Mapping[str, A
     scales: dict[str, float] = {}
     weight = np.sum([np.square(each) for each in corrections.values()], axis=0)
     for covariate in form_covariates(effect):
-        values = _COVARIATES[covariate](signals)
+        values = _covariate(covariate, effect, signals)
         if values is None or np.ptp(values) <= _VARIES * np.abs(values).max():
             continue
         of_samples = weight if values.ndim == 2 else weight.sum(axis=1)
-        scale = {"low": float(values.min()), "high": float(values.max())}
+        scale = {"low": float(values.min()), "high": float(np.quantile(values, _TOP))}
         share = _scaled(values, scale["low"], scale["high"])
         total = max(float(of_samples.sum()), 1e-300)
         for power in _POWERS:
@@ -128,7 +135,9 @@ def correction_of(effect: MotionEffect, signals: Signals, values: Values) -> Arr
     correction = effect.correction(signals, textbook)
     for key, weights in _forms_given(values).items():
         changed = {each.name: weights.get(each.name, 0.0) for each in _linear(effect, signals.robot)}
-        correction = correction + effect.correction(signals, textbook | changed) * _profile(key, signals, values)
+        correction = correction + effect.correction(signals, textbook | changed) * _profile(
+            key, effect, signals, values
+        )
     return correction
 
 
@@ -195,7 +204,7 @@ def _forms_given(values: Values) -> dict[str, dict[str, float]]:
     return given
 
 
-def _profile(key: str, signals: Signals, values: Values) -> Array:
+def _profile(key: str, effect: MotionEffect, signals: Signals, values: Values) -> Array:
     """By what the correction is multiplied, (F, 1) or (F, N): x^n - m_n of Eq. (1), or of Eq. (2)."""
     covariate, _, last = key.partition(":")
     if covariate == "wheel":
@@ -203,11 +212,17 @@ def _profile(key: str, signals: Signals, values: Values) -> Array:
         of_wheels = np.array([[1.0 if name == last else 0.0 for name in names]])
         of_wheels[0, -1] = -1.0
         return of_wheels
-    shown = _COVARIATES[covariate](signals)
+    shown = _covariate(covariate, effect, signals)
     assert shown is not None  # it was recorded
     share = _scaled(shown, values[f"{covariate}:low"], values[f"{covariate}:high"])
     profile: Array = share ** int(last) - values[f"{covariate}:mean_{last}"]
     return profile if profile.ndim == 2 else profile[:, None]
+
+
+def _covariate(name: str, effect: MotionEffect, signals: Signals) -> Array | None:
+    """A covariate (F,), or of each wheel (F, N) for an effect of the wheels; None if it was not recorded."""
+    values = _COVARIATES[name](signals)
+    return values.mean(axis=1) if values is not None and values.ndim == 2 and effect.stage != "wheel" else values
 
 
 def _scaled(values: Array, low: float, high: float) -> Array:

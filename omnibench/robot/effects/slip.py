@@ -45,7 +45,7 @@ class CentripetalSlip(MotionEffect):
     physics = "Slip of the wheels grows with the force that keeps the robot on its curve."
     source = f"{_PACEJKA} (side slip in proportion to the force)"
     shows_in = "command"
-    form_covariates = ("acceleration",)
+    form_covariates = ("centripetal acceleration",)
     fixed_parameters = (
         Parameter("k", "s", 0.0, 0.1, "velocity towards the inside of the curve per centripetal acceleration"),
     )
