@@ -30,7 +30,7 @@ from omnibench.discover.selection.competing_models import competing_models
 from omnibench.discover.selection.detectability import detectability_of
 from omnibench.discover.selection.extrapolation import extrapolations_of
 from omnibench.discover.selection.fitted_forms import with_fitted_forms
-from omnibench.discover.selection.locating import all_left, with_fine_structure
+from omnibench.discover.selection.locating import all_left, located
 from omnibench.discover.selection.model_selection import Selection, select_effects
 from omnibench.discover.selection.motor_effects import select_motor_effects
 from omnibench.discover.selection.named_effects import named_effects
@@ -101,7 +101,7 @@ def discover_effects(
     models = competing_models(plain, model.selection, model.extended)
     models = with_fitted_forms(plain, screening, models)
     baseline = without_effects(plain, models.used)
-    selection = with_fine_structure(models.selection, baseline, models.used, rng)
+    selection = located(models.selection, screening, baseline, models.used, without, rng)
 
     progress.begin("looking at the motors")
     motors = select_motor_effects(runs, dataset.robot, without, rng)

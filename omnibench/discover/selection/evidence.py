@@ -94,6 +94,7 @@ _PRIOR = float(np.log(20))  # odds of 1 to 20 that an effect is missing
 _LEFT_RIGHT = 0.04
 # u', when forms may differ a little: the right names of 18 sets of 20 leave nothing, the others 0.006 and 0.016.
 _BEYOND_RIGHT = 0.01
+_FORMS_RIGHT, _BEYOND_FORMS = 0.15, 0.02
 _MOST_ODDS = 10.0  # F_max: below 1 / u, so that what is left beside the names as they are can count for more
 _CANCELLING = 0.45  # share of Eq. (10): 1.0 or more of right pairs, 0.2 to 0.3 of the best wrong ones in 4 sets of 24
 _SURELY = 3.0  # standard errors: a normal number is below minus three of them in one of 740 cases
@@ -195,20 +196,25 @@ def credibility_of(
     left: significance of the bases after the effects. beyond: after the effects in slightly different forms, too.
     """
     energy = max(sets.energy, 1.0)  # no less than the variance of one number, so that a share of it is defined
-    chi_square, scatter = left.surplus_chi_square
-    after = start.given(indices_of(chosen))
-    forms = forms_of(chosen)
-    of_forms = max(after.chi_square(forms) - after.rank(forms), 0.0) if forms else 0.0
-    remaining = max(chi_square, of_forms)
-    of_bases = [(remaining, scatter, _LEFT_RIGHT), (*beyond.surplus_chi_square, _BEYOND_RIGHT)]
+    forms = start.given(indices_of(chosen)).only(forms_of(chosen))
+    every = range(len(forms.total))
+    rank = forms.rank(every)
+    of_forms = max(forms.chi_square(every) - rank, 0.0)
+    whole = energy + of_forms
     odds = _ODDS_OF_ONE if len(chosen) == 1 else _ODDS_OF_TWO / (len(chosen) - 1)
-    for (size, spread, usual), most in zip(of_bases, (np.inf, _MOST_ODDS), strict=True):
-        odds *= min(bayes_factor(size, math.sqrt(spread**2 + 4 * size), energy, usual), most)  # Eq. (6), (9)
+    if rank:
+        odds *= bayes_factor(of_forms, math.sqrt(2 * rank + 4 * of_forms), energy, _FORMS_RIGHT)
+    else:
+        size, spread = left.surplus_chi_square
+        odds *= bayes_factor(size, math.sqrt(spread**2 + 4 * size), energy, _LEFT_RIGHT)
+    beside, scatter = beyond.surplus_chi_square
+    usual = _BEYOND_FORMS if rank else _BEYOND_RIGHT
+    odds *= min(bayes_factor(beside, math.sqrt(scatter**2 + 4 * beside), whole, usual), _MOST_ODDS)  # Eq. (9)
     if (len(chosen) > 1 and joint_share(start, chosen) < _CANCELLING) or _has_wrong_sign(start, chosen):
         odds = min(odds, _IMITATION)  # Eq. (10)
-    beside = beyond.surplus_chi_square[0]
-    discrepancy = float(np.clip(math.sqrt(beside / (beside + energy)), _LEAST_DISCREPANCY, _MOST_DISCREPANCY))
-    return Credibility(remaining / (remaining + energy), odds / (1 + odds), discrepancy)
+    share = beside / (beside + whole)
+    discrepancy = float(np.clip(math.sqrt(share), _LEAST_DISCREPANCY, _MOST_DISCREPANCY))
+    return Credibility(share, odds / (1 + odds), discrepancy)
 
 
 def bayes_factor(left: float, deviation: float, energy: float, usual: float) -> float:

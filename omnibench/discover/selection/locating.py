@@ -14,16 +14,22 @@ from omnibench.discover.selection.model_selection import Selection
 from omnibench.discover.selection.screening import Screening, significance_left
 
 
-def with_fine_structure(
-    selection: Selection, baseline: Extended, extended: Extended, rng: np.random.Generator
+def located(
+    selection: Selection,
+    screening: Screening,
+    baseline: Extended,
+    extended: Extended,
+    without: Sequence[str],
+    rng: np.random.Generator,
 ) -> Selection:
-    """The selection with fine structure among what the residuals depend on, before any effect and after those chosen.
+    """The selection with all that the residuals depend on, before any effect and after those of an extended model.
 
     baseline: the plain matrix under the noise of the extended model.
     """
-    before = fine_structure(baseline.fit, rng)
-    after = before if extended is baseline else fine_structure(extended.fit, rng)
-    return replace(selection, where=together(selection.where, before, rng), left=together(selection.left, after, rng))
+    where = together(selection.where, fine_structure(baseline.fit, rng), rng)
+    return replace(
+        selection, where=where, left=all_left(extended, screening, without, rng) if extended.groups else where
+    )
 
 
 def all_left(
