@@ -88,7 +88,10 @@ def issue_table(results: Sequence[Result]) -> list[Row]:
 def further_table(results: Sequence[Result]) -> list[Row]:
     """Further figures, which the main table does not contain."""
     strong, weak = (of_group(results, "single", level=level) for level in (STRONG, WEAK))
-    null, every = of_group(results, "null"), of_group(results, "single", "null", "pair", "outside", "matched")
+    null, every = (
+        of_group(results, "null"),
+        of_group(results, "single", "null", "pair", "outside", "fine", "matched", "third"),
+    )
     noises = sorted({each.noise for each in null})
     outside = of_group(results, "outside", level=STRONG)
     return [
@@ -96,6 +99,13 @@ def further_table(results: Sequence[Result]) -> list[Row]:
         Row("right name or right class, weak", "", "", rate(weak, right_or_class)),
         Row("right name, strong, matched forms", "", "", rate(of_group(results, "matched", level=STRONG), right)),
         Row("the same, medium, or class", "", "", rate(of_group(results, "matched", level=MEDIUM), right_or_class)),
+        Row(
+            "right name or class, strong, third forms",
+            "",
+            "",
+            rate(of_group(results, "third", level=STRONG), right_or_class),
+        ),
+        Row("the same, medium", "", "", rate(of_group(results, "third", level=MEDIUM), right_or_class)),
         Row("confident wrong name, medium", "", "", rate(of_group(results, "single", level=MEDIUM), _confident_wrong)),
         Row("confident wrong name, weak", "", "", rate(weak, _confident_wrong)),
         Row("unknown, nothing hidden", "", "", rate(null, lambda each: each.verdict == "unknown")),
@@ -105,6 +115,9 @@ def further_table(results: Sequence[Result]) -> list[Row]:
         Row("outside: right covariate in the top two", "", "", rate(outside, lambda each: each.where_right)),
         Row("outside: confident wrong name", "", "", rate(outside, _confident_wrong)),
         Row("outside, fainter: found so", "", "", rate(of_group(results, "outside", level=300.0), _outside)),
+        Row("fine structure, found so", "", "", rate(of_group(results, "fine", level=STRONG), _outside)),
+        Row("fine structure, fainter: found so", "", "", rate(of_group(results, "fine", level=300.0), _outside)),
+        Row("fine structure: confident wrong name", "", "", rate(of_group(results, "fine"), _confident_wrong)),
         Row("error of stated weights, all sets", "", "", weight_error(every)),
         Row("nuisances named", "", "", rate(of_group(results, "nuisance"), _named)),
         Row("actuator effects, right name", "", "", rate(of_group(results, "actuator"), right)),
