@@ -25,7 +25,7 @@ from .signature import Sight
 
 Kind = Literal["single", "pair", "outside", "null", "absorbed", "nuisance", "actuator"]
 FormName = Literal["matched", "blind", "third"]
-LEVELS = {"strong": 1000.0, "medium": 100.0, "weak": 25.0}
+LEVELS = {"strong": 1000.0, "medium": 300.0, "weak": 100.0}
 UNHEARD = {**OUTSIDE, **FINE}
 LARGEST = 3.0  # times the plausible range; what needs more is not reachable
 

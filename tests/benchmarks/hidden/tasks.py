@@ -19,8 +19,7 @@ from .outside import OUTSIDE
 from .pairs import PAIRS
 from .sets import LEVELS, FormName, Kind, make_set
 
-NULLS = 30  # for every seed of the others: 600 with 20 seeds
-FAINT = 300.0  # non-centrality of the second level of what no catalogue has
+NULLS = 60  # for every seed of the others: 1200 with 20 seeds
 Group = Literal[
     "single", "matched", "third", "removed", "pair", "outside", "fine", "null", "absorbed", "nuisance", "actuator"
 ]
@@ -97,7 +96,7 @@ def _of(group: Group, levels: tuple[float, ...]) -> Iterator[tuple[tuple[str, ..
         yield from ((pair, strong) for pair in PAIRS)
     elif group in ("outside", "fine"):
         unheard = OUTSIDE if group == "outside" else FINE
-        yield from (((name,), level) for name in unheard for level in (strong, FAINT))
+        yield from (((name,), level) for name in unheard for level in (strong, LEVELS["medium"]))
     elif group != "null":
         known = {"absorbed": ABSORBED, "nuisance": NUISANCES, "actuator": ACTUATORS}[group]
         yield from (((name,), strong) for name in known)
