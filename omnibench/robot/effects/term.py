@@ -14,6 +14,7 @@ from omnibench.robot.effects.effect import Effect, MotionEffect, Parameter, Valu
 from omnibench.robot.effects.forms import accepts_form
 from omnibench.robot.kinematics import Robot
 
+_SCALES = -1e9, 1e9  # range of the values that scale a form's covariate; chosen
 _FAR_OUTSIDE = 1e3  # multiple of the plausible range beyond which a value is refused; chosen
 
 
@@ -53,7 +54,8 @@ def make_term(
             raise UnknownNameError("parameter", given, known, prefix)
         if not _is_number(value) or not math.isfinite(value):
             raise DataError(f"{prefix}: parameter {given!r} is {value!r}, not a finite number")
-        low, high = _limits(known.get(given))
+        formed = given.partition(":")[0]
+        low, high = _SCALES if ":" in given and formed not in known else _limits(known.get(formed))
         if not low <= value <= high:
             raise DataError(f"{prefix}: parameter {given!r} is {value:g}, not within {low:g} and {high:g}")
     for parameter in known.values():

@@ -101,3 +101,8 @@ def test_a_form_that_the_effect_has_not_is_refused() -> None:
         make_term("centripetal_slip", {"k": 0.05, "k:placing:1": 0.1}, APR_02)
     with pytest.raises(UnknownNameError, match="k:wheel:a"):
         make_term("centripetal_slip", {"k": 0.05, "k:wheel:a": 0.1}, APR_02)
+
+
+def test_scales_may_be_as_large_as_a_session_is_long() -> None:
+    scales = {"session time:low": 0.0, "session time:high": 2e4, "session time:mean_1": 0.0}
+    assert make_term("heading_drift", {"b": 0.001, "b:session time:1": 1e-4} | scales, APR_02).values["b"] == 0.001
