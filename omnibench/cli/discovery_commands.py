@@ -36,8 +36,8 @@ def discover(
     ] = None,
     unknown_term: Annotated[
         bool,
-        typer.Option("--unknown-term", help="If no known effect fits, close the gap with a smooth function instead."),
-    ] = False,
+        typer.Option(help="Where no name is sure, close the gap all the same, by a term without a name."),
+    ] = True,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random numbers.")] = 0,
     figures: Figures = None,
     force: Force = False,

@@ -29,6 +29,8 @@ from omnibench.discover.selection.candidate_groups import check_names
 from omnibench.discover.selection.competing_models import competing_models
 from omnibench.discover.selection.detectability import detectability_of
 from omnibench.discover.selection.extrapolation import extrapolations_of
+from omnibench.discover.selection.fitted_forms import with_fitted_forms
+from omnibench.discover.selection.locating import all_left, located
 from omnibench.discover.selection.model_selection import Selection, select_effects
 from omnibench.discover.selection.motor_effects import select_motor_effects
 from omnibench.discover.selection.named_effects import named_effects
@@ -37,9 +39,8 @@ from omnibench.discover.selection.screening import (
     screen_again,
     screen_extended,
     screen_plain,
-    significance_left,
 )
-from omnibench.discover.selection.unknown_term import add_smooth_term
+from omnibench.discover.selection.unknown_term import add_smooth_terms
 from omnibench.discover.verdict import lacks_a_name, verdict_of
 from omnibench.errors import DataError, require_type
 from omnibench.fit.least_squares.usable_runs import usable_runs
@@ -57,18 +58,19 @@ def discover_effects(
     dataset: Dataset,
     *,
     without: Sequence[str] = (),
-    unknown_term: bool = False,
+    unknown_term: bool = True,
     seed: int = 0,
     watch: Reporter = no_progress,
     calibration: Calibration | None = None,
 ) -> Discovery:
     """Find where the odometry of a data set's training split disagrees with its reference, and which effect is missing.
 
-    without: effects that are not to be tried. unknown_term: where no effect explains what is missing, add a smooth term
-    over the covariate that the residuals depend on. calibration: the plain matrix is fitted from this one's matrix on,
-    by default from the robot's design values. The validation split is used when all is decided, and only to say how
-    well the models predict it; but where no session of the training split repeats a command, runs of the validation
-    split that do are used for the noise, and a note says so. watch: told of every step as it begins and ends.
+    without: effects that are not to be tried. unknown_term: where no name is sure, close the gap by a term without a
+    name, over the covariate that the residuals depend on. calibration: the plain matrix is fitted from this one's
+    matrix on, by default from the robot's design values. The validation split is used when all is decided, and only to
+    say how well the models predict it; but where no session of the training split repeats a command, runs of the
+    validation split that do are used for the noise, and a note says so. watch: told of every step as it begins and
+    ends.
 
     Raises UnknownNameError for a name in ``without`` that is no effect's, DataError for a training split without
     reference poses or another robot's calibration.
@@ -95,8 +97,11 @@ def discover_effects(
     if model.selection.chosen:
         progress.begin("looking again, now that the noise is known better")
         model = _confirm(plain, model, without, rng)
-    screening, selection = model.screening, model.selection
-    models = competing_models(plain, selection, model.extended)
+    screening = model.screening
+    models = competing_models(plain, model.selection, model.extended)
+    models = with_fitted_forms(plain, screening, models)
+    baseline = without_effects(plain, models.used)
+    selection = located(models.selection, screening, baseline, models.used, without, rng)
 
     progress.begin("looking at the motors")
     motors = select_motor_effects(runs, dataset.robot, without, rng)
@@ -107,16 +112,23 @@ def discover_effects(
     folds = random_folds_of_repetitions(runs, rng)
     term_notes: tuple[str, ...] = ()
     if unknown_term and lacks_a_name(verdict):
-        smooth = add_smooth_term(plain, screening, selection, models, folds)
+        progress.begin("closing the gap without a name")
+        smooth = add_smooth_terms(
+            plain,
+            screening,
+            models,
+            selection.left,
+            lambda model: all_left(model, screening, without, rng),
+            folds,
+        )
         if smooth.models is not models:
-            left = significance_left(smooth.models.used, screening, without, rng)
-            dependences = without_smooth_term(dependences, left, screening, selection)
-        models, term_notes = smooth.models, (smooth.note,)
+            dependences = without_smooth_term(dependences, smooth.left, screening, selection)
+            baseline = without_effects(plain, smooth.models.used)
+        models, term_notes = smooth.models, smooth.notes
         effects = named_effects(models, motors)
 
     progress.begin("comparing on runs that were held out")
     extended = models.used
-    baseline = without_effects(plain, extended)
     validation = validation_runs(dataset, extended.fit)
     held_out = compare_held_out(baseline, extended, validation, folds)
     steps = waterfall_steps(plain, baseline, extended, validation)

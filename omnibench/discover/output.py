@@ -34,7 +34,7 @@ class DiscoverOptions(Model):
     dataset: str
     model: str | None = None
     without: tuple[str, ...] = ()
-    unknown_term: bool = False
+    unknown_term: bool = True
     seed: int = 0
     plugins: tuple[str, ...] = ()
 

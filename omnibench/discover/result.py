@@ -52,7 +52,8 @@ class NamedEffect:
 
     weight: probability that this name is right. confusable_with: names that these data cannot tell from it.
     class_weight: probability that this or one of these is right. chi_square: whitened chi-square difference, of
-    degrees_of_freedom parameters. in_doubt: why the name is not sure, or nothing.
+    degrees_of_freedom parameters. in_doubt: why the name is not sure, or nothing. form: how its size varies with a
+    covariate, in words, or that it is the textbook's.
     """
 
     name: str
@@ -66,6 +67,7 @@ class NamedEffect:
     degrees_of_freedom: int
     in_doubt: str
     class_weight: Annotated[float, _NOT_WRITTEN]
+    form: str = ""
 
     @field_serializer("parameters")
     def _by_name(self, parameters: tuple[EstimatedParameter, ...]) -> dict[str, EstimatedParameter]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from omnibench.errors import DataError, PluginError
 from omnibench.robot.effects.effect import MotionEffect, Need
+from omnibench.robot.effects.forms import correction_of
 from omnibench.robot.effects.term import Term
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import WheelLog
@@ -88,7 +89,7 @@ def _correction(term: Term, signals: Signals) -> Array:
     """The correction of one term, its shape checked."""
     effect = term.effect
     assert isinstance(effect, MotionEffect)
-    added = effect.correction(signals, term.values)
+    added = correction_of(effect, signals, term.values)
     shape = signals.rates.shape
     if effect.stage == "body":
         shape = (shape[0], 3)

@@ -1,77 +1,109 @@
-"""Study of ``omnibench discover``: how often it names a hidden effect, on sets made without its code.
+"""The exam of ``omnibench discover``: how often it names a hidden effect, on sets made without its code.
 
-    python tests/benchmarks/discover_study.py --out study.jsonl [--seeds 20] [--only single --only null] [--quick]
+    python tests/benchmarks/discover_study.py --out exam [--seeds 20] [--only single --only null] [--quick] [--table]
 
-One line of JSON a set, added as it comes: run again with the same file, and it goes on where it was. With --table the
-tables are printed from what is there. Seeds from 1000 on are for tuning; those below are the exam.
+Every set is a job in the store --out, under its task and the code that discovers: run again, it goes on where it was,
+and does anew what other code has done. --table prints the tables of what is there; --any-code takes results of other
+code, too, and says so. Seeds from 1000 on are for tuning; those below are the exam.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Iterable, Sequence
+from functools import cache
 from pathlib import Path
 
 from hidden.figures import Row, effect_lines, further_table, issue_table
 from hidden.sets import LEVELS
 from hidden.tasks import GROUPS, Result, Task, carry_out, tasks
 
+import omnibench
+from omnibench.jobs.job import Failure, Job, JobWatch, run_jobs
+from omnibench.jobs.local_backends import local_backend
+from omnibench.jobs.result_store import ResultStore, code_digest, content_key
+from omnibench.progress import Reporter
+
+ROOMS = ("data", "discover", "fit", "robot")  # the code that a result depends on, beside the makers of sets
+
 
 def main() -> None:
     """Make the sets that are missing, then print the tables."""
     arguments = _arguments()
-    results = read_results(arguments.out)
+    store = ResultStore(arguments.out, Result)
+    wanted = _wanted(arguments)
     if not arguments.table:
-        done = {each.task.key for each in results}
-        missing = [task for task in _wanted(arguments) if task.key not in done]
-        results += carry_out_all(missing, arguments.out, arguments.jobs)
-    print_tables([each for each in results if _matches(each.task, arguments.only)])
+        carry_out_all(wanted, store, arguments.jobs)
+    results = every_result(store) if arguments.any_code else results_of(wanted, store)
+    print_tables([each for each in results if _matches(each.task, arguments.only)], other_code=arguments.any_code)
 
 
-def read_results(path: Path) -> list[Result]:
-    """The results of a file, none if it is not there. A last line that was cut off is left out."""
-    if not path.exists():
-        return []
-    lines = path.read_text().split("\n")
-    return [Result.model_validate_json(line) for line in lines[:-1]]
+def carry_out_all(wanted: Sequence[Task], store: ResultStore[Result], workers: int) -> None:
+    """Carry out the tasks that have no result by this code yet."""
+    run_jobs([_job(task) for task in wanted], store, local_backend(workers, ("hidden.tasks",)), _Said(wanted))
 
 
-def carry_out_all(missing: Sequence[Task], path: Path, jobs: int) -> list[Result]:
-    """Carry out tasks and add each result to the file at once."""
-    found = []
-    _end_at_a_whole_line(path)
-    with ProcessPoolExecutor(jobs) as pool, path.open("a") as file:
-        for number, future in enumerate(as_completed([pool.submit(carry_out, task) for task in missing]), 1):
-            result = future.result()
-            file.write(result.model_dump_json() + "\n")
-            file.flush()
-            found.append(result)
-            said = result.judgement.outcome if result.judgement else result.failure
-            print(f"{number}/{len(missing)} {result.task.key}: {said}", flush=True)
-    return found
+def results_of(wanted: Iterable[Task], store: ResultStore[Result]) -> list[Result]:
+    """The results by this code that are there."""
+    found = (store.get(_job(task).key) for task in wanted)
+    return [result for result in found if result is not None]
 
 
-def _end_at_a_whole_line(path: Path) -> None:
-    """Remove a last line that was cut off when a study was stopped."""
-    if path.exists():
-        written = path.read_bytes()
-        with path.open("r+b") as file:
-            file.truncate(written.rfind(b"\n") + 1)
+def every_result(store: ResultStore[Result]) -> list[Result]:
+    """All results that are there, the latest of each task."""
+    latest: dict[str, Result] = {}
+    for file in sorted(store.folder.glob("*.json"), key=lambda path: path.stat().st_mtime):
+        result = store.get(file.stem)
+        if result is not None:
+            latest[result.task.key] = result
+    return list(latest.values())
 
 
-def print_tables(results: Sequence[Result]) -> None:
+def print_tables(results: Sequence[Result], *, other_code: bool = False) -> None:
     """Print the answers for every effect, then the main table, then further figures."""
-    print("Simulated recordings, 180 + 180 runs each. Rates with their 95 % intervals (Wilson).\n")
+    print("Simulated recordings, 180 + 180 runs each. Rates with their 95 % intervals (Wilson).")
+    print("Results of other versions of the code are among them.\n" if other_code else "")
     print("\n".join(effect_lines(results)), "\n")
-    _print_rows("issue 5", issue_table(results))
+    _print_rows("issue 20", issue_table(results))
     _print_rows("beside it", further_table(results))
 
 
+class _Said(JobWatch[Result]):
+    """A line for every set that ends."""
+
+    def __init__(self, wanted: Sequence[Task]) -> None:
+        self._wanted, self._ended = wanted, 0
+
+    def ended(self, number: int, ending: Result | Failure, reused: bool) -> None:
+        self._ended += 1
+        if isinstance(ending, Failure):
+            said = ending.reason
+        else:
+            said = ending.judgement.outcome if ending.judgement else ending.failure
+        if not reused:
+            print(f"{self._ended}/{len(self._wanted)} {self._wanted[number].key}: {said}", flush=True)
+
+
+def _job(task: Task) -> Job[Result]:
+    return Job(content_key({"task": task, "code": _code()}), _carry_out, task)
+
+
+def _carry_out(task: Task, _: Reporter) -> Result:
+    return carry_out(task)
+
+
+@cache
+def _code() -> str:
+    package = Path(omnibench.__file__).parent
+    makers = Path(__file__).parent / "hidden"
+    rooms = (file for room in ROOMS for file in (package / room).rglob("*.py") if "report" not in file.parts)
+    return code_digest(package, rooms) + code_digest(makers, makers.glob("*.py"))
+
+
 def _print_rows(title: str, rows: Sequence[Row]) -> None:
-    print(f"{title:46}{'asked':>9} {'aim':>9}  seen")
+    print(f"{title:62}{'asked':>9} {'aim':>9}  seen")
     for row in rows:
-        print(f"{row.figure:46}{row.least:>9} {row.aim:>9}  {row.seen}")
+        print(f"{row.figure:62}{row.least:>9} {row.aim:>9}  {row.seen}")
     print()
 
 
@@ -87,13 +119,14 @@ def _matches(task: Task, only: Sequence[str]) -> bool:
 
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="file of results, one line of JSON a set")
+    parser.add_argument("--out", type=Path, required=True, help="folder of results, a file a set")
     parser.add_argument("--only", action="append", default=[], metavar="NAME", help=f"{', '.join(GROUPS)} or an effect")
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--levels", nargs="+", choices=list(LEVELS), default=list(LEVELS))
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--table", action="store_true", help="print the tables of what is there")
+    parser.add_argument("--any-code", action="store_true", help="take results of other versions of the code, too")
     parser.add_argument("--quick", action="store_true", help="one seed, strong effects only")
     arguments = parser.parse_args()
     if arguments.quick:

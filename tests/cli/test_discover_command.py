@@ -106,7 +106,7 @@ def test_the_default_folder_has_the_name_of_the_data_and_the_newest_is_linked(co
         "dataset": str(data),
         "model": None,
         "without": ["rotation_translation_coupling"],
-        "unknown_term": False,
+        "unknown_term": True,
         "seed": 3,
         "plugins": [],
     }

@@ -10,7 +10,8 @@ import pytest
 from hidden.absorbed import ABSORBED
 from hidden.disturbances import NULL_KINDS, PLAIN
 from hidden.experiment import DESIGNS, RAMP, ROBOT, SAMPLE, Command, Run, plan, true_matrix
-from hidden.form import Form
+from hidden.fine_structure import FINE
+from hidden.form import Form, Make
 from hidden.forms import FORMS
 from hidden.motion import Correction, Grid
 from hidden.outside import OUTSIDE
@@ -34,8 +35,7 @@ def values_of(form: Form, factor: float = 1.0) -> dict[str, float]:
     return form.scaled(form.direction(np.random.default_rng(3)), factor)
 
 
-def poses_of(grid: Grid, form: Form, values: Mapping[str, float], *, matched: bool = True) -> Array:
-    make = form.matched if matched else form.blind
+def poses_of(grid: Grid, make: Make, values: Mapping[str, float]) -> Array:
     return grid.poses(make(grid, values, np.random.default_rng(4)))
 
 
@@ -77,7 +77,7 @@ def test_a_matched_form_moves_the_robot_as_the_catalogue_says(name: str, grid: G
     values = values_of(form)
     term = make_term(name, values, ROBOT, sessions=("s1", "s2", "s3", "s4"))
     model = OdometryModel(ROBOT, MATRIX, "arc", (term,), SAMPLE)
-    poses = poses_of(grid, form, values)
+    poses = poses_of(grid, form.matched, values)
     odometry = np.concatenate(model.reported([log_of(grid, index, poses) for index in range(len(grid.runs))]))
     effect, difference = (np.abs(poses - other).max() for other in (grid.poses(Correction()), odometry))
     assert effect > 1e-4
@@ -91,15 +91,63 @@ def test_a_blind_form_is_another_than_the_catalogues_and_yet_close(name: str, gr
     correction = form.blind(grid, values, np.random.default_rng(4))
     if correction.chance is not None:  # the difference is jitter
         correction += correction.chance
-    blind, matched = grid.poses(correction), poses_of(grid, form, values)
+    blind, matched = grid.poses(correction), poses_of(grid, form.matched, values)
     still = grid.poses(Correction())
     assert 0.003 < np.linalg.norm(blind - matched) / np.linalg.norm(matched - still) < 0.9
 
 
 @pytest.mark.parametrize("name", FORMS)
+def test_a_third_form_is_not_the_catalogues_and_yet_mostly_like_it(name: str, sight: Sight) -> None:
+    form = FORMS[name]
+    values = values_of(form)
+    signature = sight.of(form.third(sight.grid, values, np.random.default_rng(4)))
+    fitted, left = projected(sight, form, values, signature)
+    assert 0.005 < left / (signature @ signature) < 0.5
+    along = [fitted[key] * values[key] for key in form.plausible if key != "radius_s4"]  # s4 is not driven here
+    assert sum(along) > 0.3 * sum(values[key] ** 2 for key in form.plausible if key != "radius_s4")
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_a_third_form_is_not_the_blind_one(name: str, grid: Grid) -> None:
+    form = FORMS[name]
+    values = values_of(form)
+    corrections = [make(grid, values, np.random.default_rng(4)) for make in (form.third, form.blind)]
+    third, blind = (grid.poses(each if each.chance is None else each + each.chance) for each in corrections)
+    assert np.linalg.norm(third - blind) > 0.02 * np.linalg.norm(third - grid.poses(Correction()))
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_a_third_form_is_the_same_in_finer_steps_and_with_more_runs(name: str, grid: Grid) -> None:
+    form = FORMS[name]
+    values = values_of(form)
+    few = Grid(RUNS[:20], MATRIX, steps=2)
+    coarse, fine = (poses_of(each, form.third, values) for each in (few, grid))
+    effect = coarse - few.poses(Correction())
+    assert np.linalg.norm(coarse - fine[: len(coarse)]) < 0.05 * np.linalg.norm(effect)
+
+
+@pytest.mark.parametrize("name", FORMS)
 def test_an_effect_of_no_size_leaves_every_pose_as_it_is(name: str, grid: Grid) -> None:
-    nothing = values_of(FORMS[name], 0.0)
-    np.testing.assert_array_equal(poses_of(grid, FORMS[name], nothing, matched=False), grid.poses(Correction()))
+    nothing, still = values_of(FORMS[name], 0.0), grid.poses(Correction())
+    for make in (FORMS[name].blind, FORMS[name].third):
+        np.testing.assert_array_equal(poses_of(grid, make, nothing), still)
+
+
+@pytest.mark.parametrize("name", FINE)
+def test_fine_structure_is_beyond_the_matrix_and_no_size_of_it_is_nothing(name: str, sight: Sight) -> None:
+    make, grid = FINE[name].make, sight.grid
+    signature = sight.of(make(grid, {"size": FINE[name].plausible}, np.random.default_rng(4)))
+    assert signature @ signature > 1
+    np.testing.assert_array_equal(poses_of(grid, make, {"size": 0.0}), grid.poses(Correction()))
+
+
+@pytest.mark.parametrize("name", FINE)
+def test_fine_structure_is_the_same_in_finer_steps_and_with_more_runs(name: str, grid: Grid) -> None:
+    make, values = FINE[name].make, {"size": FINE[name].plausible}
+    few = Grid(RUNS[:20], MATRIX, steps=2)
+    coarse, fine = (poses_of(each, make, values) for each in (few, grid))
+    effect = coarse - few.poses(Correction())
+    assert np.linalg.norm(coarse - fine[: len(coarse)]) < 0.05 * np.linalg.norm(effect)
 
 
 @pytest.mark.parametrize("name", ABSORBED)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
-from discover_study import carry_out_all, print_tables, read_results
-from hidden.figures import issue_table, rate, right, right_or_class, weight_error
+from discover_study import every_result, print_tables, results_of
+from hidden.figures import Row, further_table, issue_table, rate, right, right_or_class, weight_error
 from hidden.forms import FORMS
 from hidden.judging import Judgement, Name, ParameterError
 from hidden.tasks import GROUPS, Group, Result, Task, tasks
+
+from omnibench.jobs.result_store import ResultStore
 
 TRUE, OTHER = "heading_drift", "floor_drift"
 
@@ -42,7 +45,11 @@ def result(judgement: Judgement | None, group: Group = "single", seed: int = 0, 
 
 
 def seen(figure: str, *results: Result) -> str:
-    return next(row.seen for row in issue_table(results) if row.figure.startswith(figure))
+    return shown(issue_table, figure, *results)
+
+
+def shown(table: Callable[[Sequence[Result]], list[Row]], figure: str, *results: Result) -> str:
+    return next(row.seen for row in table(results) if row.figure.startswith(figure))
 
 
 @pytest.mark.parametrize(
@@ -70,24 +77,23 @@ def test_a_right_name_beside_a_confident_wrong_one_does_not_count() -> None:
 
 def test_a_failure_of_the_workflow_counts_against_it() -> None:
     assert rate([result(answer((TRUE, 0.99))), result(None)], right).startswith("50.0%")
-    assert seen("wrong name, nothing hidden", result(None, "null")).startswith("100.0%")
+    assert seen("wrong name where nothing is hidden", result(None, "null")).startswith("100.0%")
     assert seen("true effect removed", result(None, "removed")).startswith("100.0%")
 
 
 def test_unknown_is_no_name_where_nothing_is_hidden() -> None:
     unknown, named = (result(answer(*names, verdict=verdict), "null") for names, verdict in NULLS)
-    assert seen("wrong name, nothing hidden", unknown, named).startswith("50.0%")
+    assert seen("wrong name where nothing is hidden", unknown, named).startswith("50.0%")
 
 
 NULLS = (((), "unknown"), (((OTHER, 0.5),), "class"))
 
 
-def test_outside_the_catalogue_the_covariate_must_be_found_too() -> None:
-    found, not_found = (
-        result(answer(verdict="unknown", covariate_found=found), "outside", seed=seed)
-        for seed, found in enumerate((True, False))
+def test_outside_the_catalogue_it_must_be_flagged_with_or_without_a_name() -> None:
+    flagged, not_flagged = (
+        result(answer(verdict=verdict), "fine", seed=seed) for seed, verdict in enumerate(("incomplete", "none"))
     )
-    assert seen("outside the catalogue", found, not_found).startswith("50.0%")
+    assert seen("outside the catalogue", flagged, not_flagged).startswith("50.0%")
 
 
 def test_weights_that_are_what_they_say_have_no_error() -> None:
@@ -103,22 +109,20 @@ def test_parameters_are_compared_by_length_and_by_interval() -> None:
     )
     judgement = answer((TRUE, 0.99)).model_copy(update={"parameters": estimated})
     assert judgement.parameter_error == pytest.approx(0.1)
-    assert seen("coverage", result(judgement)).startswith("50.0%")
+    assert shown(further_table, "coverage", result(judgement)).startswith("50.0%")
 
 
-def test_twenty_seeds_are_twenty_sets_an_effect_and_six_hundred_of_nothing() -> None:
-    every = list(tasks(range(20), (1000.0, 100.0), GROUPS))
+def test_twenty_seeds_are_twenty_sets_an_effect_and_twelve_hundred_of_nothing() -> None:
+    every = list(tasks(range(20), (1000.0, 300.0), GROUPS))
     assert len({task.key for task in every}) == len(every)
-    assert sum(task.group == "null" for task in every) == 600
+    assert sum(task.group == "null" for task in every) == 1200
     assert all(sum(task.effects == (name,) and task.group == "single" for task in every) == 40 for name in FORMS)
 
 
-def test_a_study_goes_on_after_a_line_that_was_cut_off(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    whole = result(answer((TRUE, 0.99)))
-    path = tmp_path / "study.jsonl"
-    path.write_text(whole.model_dump_json() + "\n" + '{"task": {"gro')
-    assert read_results(path) == [whole]
-    assert carry_out_all([], path, 1) == []
-    assert path.read_text() == whole.model_dump_json() + "\n"
-    print_tables(read_results(path))
-    assert "right name, strong" in capsys.readouterr().out
+def test_results_of_other_code_are_told_from_those_of_this(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    whole, store = result(answer((TRUE, 0.99))), ResultStore(tmp_path, Result)
+    store.put("0123456789", whole)
+    assert results_of([whole.task], store) == []
+    assert every_result(store) == [whole]
+    print_tables(every_result(store), other_code=True)
+    assert "of other versions of the code" in capsys.readouterr().out

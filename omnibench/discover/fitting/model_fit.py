@@ -16,7 +16,7 @@ from omnibench.fit.least_squares.nuisances import Nuisances
 from omnibench.fit.least_squares.repetitions import differences_between_repetitions
 from omnibench.fit.least_squares.start_frames import in_start_frames
 from omnibench.fit.least_squares.trajectory_fit import TrajectoryFit
-from omnibench.fit.least_squares.whitened import Whitened
+from omnibench.fit.least_squares.whitened import Whitened, without
 from omnibench.robot.effects.term import Term
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
@@ -71,6 +71,20 @@ class Fit(TrajectoryFit):
         residuals: the fit's nuisance-free ones where none are given.
         """
         return self.linearised(columns, self.weightings, residuals)
+
+    @property
+    def weighted_residuals(self) -> list[Array]:
+        """The inverse covariance of noise and nuisances times the nuisance-free residuals (K, 3), of each run."""
+        deviations, weighted = self.nuisances.deviations[self.nuisances.estimated], []
+        runs = zip(self.nuisance_free_residuals, self.estimated_slopes, self.weightings, strict=True)
+        for residuals, slopes, weigh in runs:
+            white = weigh(residuals)
+            if len(deviations):
+                nuisances = (weigh(slopes) * deviations).reshape(white.size, -1)
+                white = without(without(white.reshape(-1, 1), nuisances), nuisances).reshape(white.shape)
+            of_differences = weigh.transposed(white)
+            weighted.append(-np.diff(of_differences, axis=0, append=0.0))
+        return weighted
 
     def with_likeliest_nuisances(self) -> Fit:
         """The fit with the most likely nuisances for the residuals that its model leaves."""

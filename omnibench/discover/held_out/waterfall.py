@@ -32,14 +32,14 @@ def waterfall_steps(plain: Fit, baseline: Extended, extended: Extended, validati
 
 
 def group_counts(groups: Sequence[Group]) -> list[int]:
-    """The number of groups after each step: named effects come one by one, smooth terms without a name all at once."""
+    """The number of groups after each step: named effects come one by one, terms without a name all at once."""
     named = sum(group.basis is None for group in groups)
     return [*range(1, named + 1), *([len(groups)] if len(groups) > named else [])]
 
 
 def step_name(group: Group) -> str:
     """The name of the step that adds a group."""
-    return group.name if group.basis is None else f"smooth term over {group.basis.covariate} (no name)"
+    return group.name if group.basis is None else f"unnamed, over {group.basis.covariate}"
 
 
 def _step(name: str, fit: Fit, extended: Fit, validation: ValidationRuns) -> Step:

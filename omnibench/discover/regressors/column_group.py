@@ -8,6 +8,7 @@ from typing import Literal
 
 from omnibench.discover.regressors.covariate_bases import Basis
 from omnibench.robot.effects.effect import Effect, Parameter
+from omnibench.robot.effects.forms import Forms
 
 Kind = Literal["matrix", "effect", "covariate"]
 
@@ -16,9 +17,9 @@ Kind = Literal["matrix", "effect", "covariate"]
 class Group:
     """Columns that belong together; ``index`` says which of all columns they are.
 
-    A group of an effect has its linear parameters in the columns' order, the values of its shapes, the number of shapes
-    that are tried, and ``forms``: columns by which its form could differ from the catalogue's. A group of a generic
-    basis has ``basis``.
+    A group of an effect has its linear parameters in the columns' order, the values of its shapes, and the number of
+    shapes that are tried; ``forms`` are the columns of the parameters by which its form can differ from the textbook's,
+    ``family`` these parameters. A group of a generic basis has ``basis``.
     """
 
     kind: Kind
@@ -29,6 +30,7 @@ class Group:
     shapes: Mapping[str, float] = field(default_factory=dict)
     tries: int = 1
     forms: tuple[int, ...] = ()
+    family: Forms | None = None
     basis: Basis | None = None
 
 

@@ -24,6 +24,7 @@ from scipy.sparse import csr_array
 from omnibench.errors import PluginError
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect
+from omnibench.robot.effects.forms import correction_of
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import RunSamples, WheelLog
 from omnibench.robot.path import PathBatch
@@ -310,7 +311,7 @@ def _corrected(effect: MotionEffect, signals: Signals, values: Mapping[str, floa
     width = {"body": 3, "world": 2, "steering": steered}.get(effect.stage, signals.rates.shape[1])
     way_out = f"try omnibench plugin check, or leave it out: --without {effect.name}"
     try:
-        correction = np.asarray(effect.correction(signals, values), dtype=float)
+        correction = np.asarray(correction_of(effect, signals, values), dtype=float)
     except Exception as error:  # a plug-in may raise anything
         said = f"{type(error).__name__}: {error}"
         raise PluginError(f"effect {effect.name!r}: its correction ended in {said}; {way_out}") from error

@@ -34,6 +34,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from omnibench.discover.regressors.column_group import Group, best_shapes
@@ -104,22 +105,52 @@ class Significance:
         return max(self.surplus, 0.0) * scatter, scatter
 
 
+def together(first: Significance, second: Significance | None, rng: np.random.Generator) -> Significance:
+    """Significance of the groups of both, each corrected for all: the largest evidence of a flip is that of either.
+
+    Flips of the two are paired at random, which states the chance too large where they go together.
+    """
+    if second is None:
+        return first
+    surer = second.surplus > first.surplus
+    return Significance(
+        groups=(*first.groups, *second.groups),
+        **{
+            name: np.concatenate([getattr(each, name) for each in (first, second)])
+            for name in ("chi_square", "steady", "rank", "spread", "evidence")
+        },
+        chance=np.sort(np.maximum(first.chance, rng.permutation(second.chance))),
+        surplus=max(first.surplus, second.surplus),
+        surplus_of=second.surplus_of + len(first.groups) if surer else first.surplus_of,
+    )
+
+
 def significance_of(
     data: Whitened, fitted: Sequence[int], groups: Sequence[Group], rng: np.random.Generator
 ) -> Significance:
     """Chi-square differences of groups beyond the columns ``fitted``, and their significance."""
     now = given(data, fitted)
     roots = [now.roots(group.index) for group in groups]
-    rank = np.array([root.shape[1] for root in roots], dtype=float)
-    tries = np.array([group.tries for group in groups], dtype=float)
     scores = [now.scores[:, list(group.index)] @ root for group, root in zip(groups, roots, strict=True)]
-    chi_square = np.array([float(np.square(of_runs.sum(axis=0)).sum()) for of_runs in scores])
-    steady = np.array([_without_any_one(of_runs) for of_runs in scores])
     noise = _noise_scores(data, list(fitted), groups)
     by_chance = [noise.scores[:, list(group.index)] @ root for group, root in zip(groups, roots, strict=True)]
+    return significance_of_scores(groups, scores, by_chance, rng)
+
+
+def significance_of_scores(
+    groups: Sequence[Group], scores: Sequence[Array], by_chance: Sequence[Array], rng: np.random.Generator
+) -> Significance:
+    """Significance of groups by the scores (Z, d) that each has in every run, independent and of unit variance in sum.
+
+    by_chance: scores that stand for noise.
+    """
+    rank = np.array([of_runs.shape[1] for of_runs in scores], dtype=float)
+    tries = np.array([group.tries for group in groups], dtype=float)
+    chi_square = np.array([float(np.square(of_runs.sum(axis=0)).sum()) for of_runs in scores])
+    steady = np.array([_without_any_one(of_runs) for of_runs in scores])
     spread = np.maximum([float(np.square(of_runs).sum()) / max(of_runs.shape[1], 1) for of_runs in by_chance], 1.0)
-    signs = rng.choice([-1.0, 1.0], size=(_FLIPS, len(now.scores)))
-    flipped = np.array([np.square(signs @ of_runs).sum(axis=1) for of_runs in by_chance]).T
+    signs = rng.choice([-1.0, 1.0], size=(_FLIPS, len(by_chance[0]) if by_chance else 0))
+    flipped = _sums_by_group(np.square(signs @ np.concatenate(by_chance, axis=1)), rank.astype(int))
     chance = _evidence(flipped, rank, spread, tries)
     evidence = _evidence(steady[None], rank, spread, tries)[0]
     scatter = np.sqrt(2 * np.maximum(rank, 1.0)) * spread
@@ -137,6 +168,14 @@ def significance_of(
         surplus=float(beyond[best]) - usual,
         surplus_of=best,
     )
+
+
+def _sums_by_group(values: Array, counts: NDArray[np.intp]) -> Array:
+    """Sums (B, G) of values (B, D), of so many columns of each group in turn."""
+    totals = np.cumsum(np.concatenate([np.zeros((len(values), 1)), values], axis=1), axis=1)
+    ends = np.cumsum(counts)
+    sums: Array = totals[:, ends] - totals[:, ends - counts]
+    return sums
 
 
 def _without_any_one(scores: Array) -> float:

@@ -15,6 +15,7 @@ from omnibench.discover.regressors.covariate_bases import generic_bases
 from omnibench.discover.regressors.paths import Paths
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import Effect, MotionEffect, ReferenceEffect
+from omnibench.robot.effects.forms import Forms, forms_of
 from omnibench.robot.kinematics import Array, Robot
 
 # Shapes of an effect: with more of them, one comes near enough to any other form. tests/benchmarks/constants.py varies
@@ -69,9 +70,14 @@ def make_groups(paths: Paths, trajectories: Sequence[Trajectory], without: Seque
         for shape in shapes:
             base = {each.name: 0.0 for each in linear} | shape
             index = add(np.concatenate([paths.of_effect(effect, each.name, base) for each in linear], axis=2))
-            forms = None if len(shapes) > _FEW else _forms(paths, effect, [each.name for each in linear], base)
-            form_index = add(forms) if forms is not None else ()
-            named.append(Group("effect", effect.name, index, effect, linear, shape, len(shapes), form_index))
+            family = None if len(shapes) > _FEW else _family(paths, effect, [each.name for each in linear], base)
+            forms: tuple[int, ...] = ()
+            if family is not None:
+                zero = base | dict.fromkeys((each.name for each in family.parameters), 0.0) | dict(family.scales)
+                forms = add(
+                    np.concatenate([paths.of_effect(effect, each.name, zero) for each in family.parameters], axis=2)
+                )
+            named.append(Group("effect", effect.name, index, effect, linear, shape, len(shapes), forms, family))
     bases = [
         Group("covariate", basis.covariate, add(basis.columns), tries=basis.tries, basis=basis)
         for basis in generic_bases(paths, trajectories)
@@ -109,50 +115,13 @@ def _lacks(effect: Effect, paths: Paths, sessions: tuple[str, ...]) -> Missing |
     return None
 
 
-def _forms(
-    paths: Paths, effect: MotionEffect | ReferenceEffect, names: Sequence[str], values: Mapping[str, float]
-) -> Array | None:
-    """Slopes (S, 3, n) by other forms of an effect: its size varies linearly and quadratically with its covariate.
-
-    None for an effect that has no such covariate.
-    """
-    if isinstance(effect, ReferenceEffect):
+def _family(paths: Paths, effect: Effect, names: Sequence[str], values: Mapping[str, float]) -> Forms | None:
+    """The forms of an effect, which these recordings can tell; None for one that has no others."""
+    if not isinstance(effect, MotionEffect):
         return None
-    share = _covariate(paths, effect)
-    if share is None:
-        return None
-    slopes = []
-    for name in names:
-        change = paths.correction(effect, {**values, name: 1.0})
-        for power in (share, share**2):
-            varied = change * (power if power.ndim == 2 else power[:, None])
-            slopes.append(paths.of_correction(effect, varied))
-    return np.concatenate(slopes, axis=2)
-
-
-def _covariate(paths: Paths, effect: MotionEffect) -> Array | None:
-    """The covariate that the effect shows in, (F,) or of each wheel (F, N), from -1 to 1."""
-    signals = paths.signals
-    if effect.shows_in == "wheel rate" or (effect.stage == "wheel" and effect.shows_in == "command"):
-        return _unit(np.abs(signals.rates))
-    if effect.shows_in == "elapsed time":
-        return _unit(signals.elapsed)
-    if effect.shows_in == "order of runs":
-        return None if signals.session_time is None else _unit(signals.session_time)
-    if effect.shows_in == "acceleration":
-        return _unit(np.hypot(signals.accelerations[:, 0], signals.accelerations[:, 1]))
-    if effect.shows_in == "wheel angle" and signals.wheel_angles is not None:
-        return np.cos(signals.wheel_angles)
-    if effect.shows_in == "steering angle" and signals.steering is not None:
-        return _unit(np.abs(signals.steering).mean(axis=1))
-    if effect.shows_in == "command":
-        return _unit(np.abs(signals.twists[:, 2]) + np.hypot(signals.twists[:, 0], signals.twists[:, 1]))
-    return None
-
-
-def _unit(values: Array) -> Array:
-    low, high = float(values.min()), float(values.max())
-    return (2 * values - low - high) / max(high - low, 1e-12)
+    corrections = {name: paths.correction(effect, {**values, name: 1.0}) for name in names}
+    forms = forms_of(effect, paths.signals, corrections)
+    return forms if forms.parameters else None
 
 
 def check_names(names: Sequence[str]) -> None:

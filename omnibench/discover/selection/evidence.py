@@ -20,6 +20,18 @@ any direction, residuals scatter with variance 1 + delta^2 N beside it, and chi-
 
     Q'(A) = Q(A) / (1 + delta^2 N),    N = max over A of Q(A) - d(A), at least 0.                                  (3)
 
+The discrepancy is estimated from the data: delta^2 is the share of N that generic bases still find beside the chosen
+effects in all their forms, within bounds.
+
+Families. An effect is a family of forms (robot/effects/forms.py). Let z be the m scores of the form columns of a set
+beyond X, independent and divided by the square root of 1 + delta^2 N, their values normal with the variance v beyond
+chance. With the likeliest v the forms raise the evidence, and the more so the less they have to explain:
+
+    ln B_f = sum of (z^2 v / (1 + v) - ln(1 + v)) / 2,    v = max(0, mean z^2 - 1),
+    ln B'(A) = ln B'(A) + ln B_f - max(z'z - m, 0) / (rho N),                                                     (3a)
+
+so that the share of N that forms explain has an exponential distribution with the mean rho.
+
 Prior odds. The odds that an effect is missing are 1 to 20; of its t shapes, if it has several, each is as likely:
 
     ln P(A) = ln B'(A) - sum over A of ln(20 t) + constant.                                                        (4)
@@ -73,12 +85,16 @@ from omnibench.robot.kinematics import Array
 # delta, along the other effect in whose direction the catalogue's form is farthest off: below 0.09 in nine sets of ten,
 # 0.06 in half of them. With 0.2, three of eight others would lose a sure name; with 0.05 none would change.
 DISCREPANCY = 0.1
+_LEAST_DISCREPANCY, _MOST_DISCREPANCY = 0.05, 0.2
+_OFF_FORM = 0.1  # rho
+_REFINED = 40  # sets, those of most evidence in the textbook's forms, whose forms are tried
 _PRIOR = float(np.log(20))  # odds of 1 to 20 that an effect is missing
 # u: mean share of the chi-square that right names leave, three times the 0.013 of strong effects, whose forms show
 # most; the best wrong names leave 0.6 in the mean.
 _LEFT_RIGHT = 0.04
 # u', when forms may differ a little: the right names of 18 sets of 20 leave nothing, the others 0.006 and 0.016.
 _BEYOND_RIGHT = 0.01
+_FORMS_RIGHT, _BEYOND_FORMS = 0.15, 0.02
 _MOST_ODDS = 10.0  # F_max: below 1 / u, so that what is left beside the names as they are can count for more
 _CANCELLING = 0.45  # share of Eq. (10): 1.0 or more of right pairs, 0.2 to 0.3 of the best wrong ones in 4 sets of 24
 _SURELY = 3.0  # standard errors: a normal number is below minus three of them in one of 740 cases
@@ -91,6 +107,11 @@ _WINDOW = 8.0  # standard deviations about what is left that are integrated over
 def indices_of(groups: Sequence[Group]) -> list[int]:
     """The columns of some groups in turn."""
     return [index for group in groups for index in group.index]
+
+
+def forms_of(groups: Sequence[Group]) -> list[int]:
+    """The form columns of some groups in turn."""
+    return [index for group in groups for index in group.forms]
 
 
 def names_of(groups: Sequence[Group]) -> set[str]:
@@ -108,6 +129,23 @@ def log_evidence(chi_square: Array, rank: Array, energy: float, discrepancy: flo
     growth = np.log(np.maximum(trusted / np.maximum(rank, 1), 1.0))
     evidence: Array = (trusted - rank - rank * growth) / 2  # Eq. (2)
     return evidence
+
+
+def form_evidence(now: Given, groups: Sequence[Group], energy: float, discrepancy: float) -> float:
+    """What the forms of a set of effects add to the logarithm of its evidence, Eq. (3a). now: columns beyond others."""
+    forms = forms_of(groups)
+    if not forms:
+        return 0.0
+    index = indices_of(groups)
+    part = now.only([*index, *forms]).given(range(len(index)))
+    rows = range(len(index), len(index) + len(forms))
+    trusted = (part.scores[:, list(rows)].sum(axis=0) @ part.roots(rows)) / math.sqrt(1 + discrepancy**2 * energy)
+    if not len(trusted):
+        return 0.0
+    square = np.square(trusted)
+    variance = max(float(square.mean()) - 1, 0.0)
+    gain = float((square * variance / (1 + variance) - np.log1p(variance)).sum()) / 2
+    return gain - max(float((square - 1).sum()), 0.0) / (_OFF_FORM * max(energy, 1.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,15 +169,23 @@ def effect_sets(start: Given, pool: Sequence[Group], most: int) -> EffectSets:
     rank = np.array([start.rank(indices_of(each)) if each else 0 for each in sets])
     priors = np.array([-sum(_PRIOR + np.log(group.tries) for group in each) for each in sets])
     energy = float(max((chi_square - rank).max(), 0.0))  # Eq. (3)
-    return EffectSets(tuple(sets), log_evidence(chi_square, rank, energy) + priors, energy)  # Eq. (4)
+    evidence = log_evidence(chi_square, rank, energy) + priors  # Eq. (4)
+    for row in np.argsort(-evidence)[:_REFINED]:
+        evidence[row] += form_evidence(start, sets[row], energy, DISCREPANCY)  # Eq. (3a)
+    return EffectSets(tuple(sets), evidence, energy)
 
 
 @dataclass(frozen=True)
 class Credibility:
-    """Probability that chosen names are right. left_share: share of the chi-square that generic bases still find."""
+    """Probability that chosen names are right.
+
+    left_share: share of the chi-square that generic bases or other forms of the effects still find. discrepancy: delta
+    of Eq. (3), estimated from what is left beside all forms.
+    """
 
     left_share: float
     probability: float
+    discrepancy: float
 
 
 def credibility_of(
@@ -150,18 +196,25 @@ def credibility_of(
     left: significance of the bases after the effects. beyond: after the effects in slightly different forms, too.
     """
     energy = max(sets.energy, 1.0)  # no less than the variance of one number, so that a share of it is defined
-    chi_square, scatter = left.surplus_chi_square
-    after = start.given(indices_of(chosen))
-    forms = [index for group in chosen for index in group.forms]
-    of_forms = max(after.chi_square(forms) - after.rank(forms), 0.0) if forms else 0.0
-    remaining = max(chi_square, of_forms)
-    of_bases = [(remaining, scatter, _LEFT_RIGHT), (*beyond.surplus_chi_square, _BEYOND_RIGHT)]
+    forms = start.given(indices_of(chosen)).only(forms_of(chosen))
+    every = range(len(forms.total))
+    rank = forms.rank(every)
+    of_forms = max(forms.chi_square(every) - rank, 0.0)
+    whole = energy + of_forms
     odds = _ODDS_OF_ONE if len(chosen) == 1 else _ODDS_OF_TWO / (len(chosen) - 1)
-    for (size, spread, usual), most in zip(of_bases, (np.inf, _MOST_ODDS), strict=True):
-        odds *= min(bayes_factor(size, math.sqrt(spread**2 + 4 * size), energy, usual), most)  # Eq. (6), (9)
+    if rank:
+        odds *= bayes_factor(of_forms, math.sqrt(2 * rank + 4 * of_forms), energy, _FORMS_RIGHT)
+    else:
+        size, spread = left.surplus_chi_square
+        odds *= bayes_factor(size, math.sqrt(spread**2 + 4 * size), energy, _LEFT_RIGHT)
+    beside, scatter = beyond.surplus_chi_square
+    usual = _BEYOND_FORMS if rank else _BEYOND_RIGHT
+    odds *= min(bayes_factor(beside, math.sqrt(scatter**2 + 4 * beside), whole, usual), _MOST_ODDS)  # Eq. (9)
     if (len(chosen) > 1 and joint_share(start, chosen) < _CANCELLING) or _has_wrong_sign(start, chosen):
         odds = min(odds, _IMITATION)  # Eq. (10)
-    return Credibility(remaining / (remaining + energy), odds / (1 + odds))
+    share = beside / (beside + whole)
+    discrepancy = float(np.clip(math.sqrt(share), _LEAST_DISCREPANCY, _MOST_DISCREPANCY))
+    return Credibility(share, odds / (1 + odds), discrepancy)
 
 
 def bayes_factor(left: float, deviation: float, energy: float, usual: float) -> float:

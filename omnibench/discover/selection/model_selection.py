@@ -17,8 +17,11 @@ import numpy as np
 from omnibench.discover.regressors.column_group import Group, best_shapes
 from omnibench.discover.regressors.significance import Significance, significance_of
 from omnibench.discover.selection.evidence import (
+    DISCREPANCY,
     credibility_of,
     effect_sets,
+    form_evidence,
+    forms_of,
     indices_of,
     log_evidence,
     names_of,
@@ -94,6 +97,7 @@ class _Search:
     left: Significance
     left_share: float
     known: float
+    discrepancy: float
 
 
 def _search(screening: Screening, candidates: Sequence[Group], rng: np.random.Generator) -> _Search:
@@ -103,16 +107,15 @@ def _search(screening: Screening, candidates: Sequence[Group], rng: np.random.Ge
     fitted = screening.index_with(chosen)
     left = significance_of(data, fitted, bases, rng)
     if not chosen:
-        return _Search((), (), pool, steps, left, 0.0, 1.0)
-    forms = [index for group in chosen for index in group.forms]
-    beyond = significance_of(data, [*fitted, *forms], bases, rng)
+        return _Search((), (), pool, steps, left, 0.0, 1.0, DISCREPANCY)
+    beyond = significance_of(data, [*fitted, *forms_of(chosen)], bases, rng)
     sets = effect_sets(start, pool, len(chosen))
     credibility = credibility_of(sets, start, chosen, left, beyond)  # Eq. (9)
-    share, known = credibility.left_share, credibility.probability
+    share, known, discrepancy = credibility.left_share, credibility.probability, credibility.discrepancy
     if known < _CREDIBLE:
         left = significance_of(data, screening.groups.matrix.index, bases, rng)
-        return _Search((), chosen, pool, steps, left, share, known)
-    return _Search(chosen, (), pool, steps, left, share, known)
+        return _Search((), chosen, pool, steps, left, share, known, discrepancy)
+    return _Search(chosen, (), pool, steps, left, share, known, discrepancy)
 
 
 def _forward_selection(
@@ -130,7 +133,7 @@ def _forward_selection(
         others = [group for group in tellable if group.name not in names_of(chosen)]
         if not others or start.scores.shape[0] == 0:
             break
-        step = significance_of(screening.data, screening.index_with(chosen), others, rng)
+        step = significance_of(screening.data, [*screening.index_with(chosen), *forms_of(chosen)], others, rng)
         steps.append(step)
         pool += [step.groups[index] for index in step.best_shapes if step.groups[index] not in pool]
         if step.p_value(step.best) > CHANCE:
@@ -171,7 +174,9 @@ def _within_quantisation(screening: Screening, groups: Sequence[Group]) -> set[s
 def _weighed(start: Given, search: _Search, where: Significance) -> Selection:
     """The selection that a search leads to, with the weights of all names."""
     chosen = tuple(sorted(search.chosen, key=lambda group: -start.chi_square(group.index)))
-    of_positions = [_probabilities(start, search.pool, chosen, position) for position in range(len(chosen))]
+    of_positions = [
+        _probabilities(start, search.pool, chosen, position, search.discrepancy) for position in range(len(chosen))
+    ]
     weights: dict[str, float] = {}
     for probabilities in of_positions:
         for group, probability in probabilities:
@@ -194,18 +199,19 @@ def _weighed(start: Given, search: _Search, where: Significance) -> Selection:
 
 
 def _probabilities(
-    start: Given, pool: Sequence[Group], chosen: Sequence[Group], position: int
+    start: Given, pool: Sequence[Group], chosen: Sequence[Group], position: int, discrepancy: float
 ) -> list[tuple[Group, float]]:
     """Effects that could stand at one position among the chosen ones, the others given, with their probabilities."""
     others = [group for index, group in enumerate(chosen) if index != position]
-    now = start.given(indices_of(others))
+    now = start.given([*indices_of(others), *forms_of(others)])
     further = [group for group in pool if group.name not in names_of(chosen)]
     best = best_shapes(further, [now.chi_square(group.index) for group in further])
     groups = [chosen[position], *(further[index] for index in best)]
     chi_square = np.array([now.chi_square(group.index) for group in groups])
     rank = np.array([now.rank(group.index) for group in groups])
-    evidence = log_evidence(chi_square, rank, float(max((chi_square - rank).max(), 0.0)))  # Eq. (2) and (3)
-    evidence -= [np.log(group.tries) for group in groups]
+    energy = float(max((chi_square - rank).max(), 0.0))
+    evidence = log_evidence(chi_square, rank, energy, discrepancy)  # Eq. (2) and (3)
+    evidence += [form_evidence(now, [group], energy, discrepancy) - np.log(group.tries) for group in groups]
     likely = np.exp(evidence - evidence.max())  # Eq. (5)
     ordered = sorted(zip(groups, likely / likely.sum(), strict=True), key=lambda pair: -pair[1])
     return [(group, float(probability)) for group, probability in ordered]

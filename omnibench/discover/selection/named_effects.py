@@ -13,6 +13,7 @@ from omnibench.discover.result import Candidate, EstimatedParameter, NamedEffect
 from omnibench.discover.selection.competing_models import CompetingModels
 from omnibench.discover.selection.model_selection import SURE, Selection
 from omnibench.discover.selection.motor_effects import MotorEffects
+from omnibench.robot.effects.forms import form_in_words
 from omnibench.robot.kinematics import Array, Robot
 
 
@@ -42,7 +43,7 @@ def _effects(selection: Selection, robot: Robot, values: Array, reach: Array) ->
         group.name: (chi_square, rank)
         for step in selection.steps[::-1]
         for group, chi_square, rank in zip(step.groups, step.chi_square, step.rank, strict=True)
-        if group in selection.chosen
+        if any(group.index[:1] == each.index[:1] for each in selection.chosen)
     }
     doubt = ""
     if not selection.known > SURE:
@@ -61,6 +62,7 @@ def _effects(selection: Selection, robot: Robot, values: Array, reach: Array) ->
                 name=group.name,
                 stage=group.effect.stage,
                 weight=weight,
+                form=form_in_words(_values_of(group, values[rows])),
                 parameters=(*_estimates(group, values[rows], reach[rows]), *_shapes(group, robot)),
                 confusable_with=confusable,
                 physics=group.effect.physics,
@@ -72,6 +74,12 @@ def _effects(selection: Selection, robot: Robot, values: Array, reach: Array) ->
             )
         )
     return tuple(effects)
+
+
+def _values_of(group: Group, values: Array) -> dict[str, float]:
+    """The values of an effect's linear parameters and of its shapes."""
+    names = [parameter.name for parameter in group.parameters]
+    return dict(group.shapes) | dict(zip(names, values.tolist(), strict=True))
 
 
 def _estimates(group: Group, values: Array, margins: Array) -> list[EstimatedParameter]:

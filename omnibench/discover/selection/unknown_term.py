@@ -1,7 +1,7 @@
-"""A smooth term where no effect has a name: functions of the covariate that the residuals depend on most surely.
+"""Terms without a name, where no name is sure: functions of the covariate that the residuals depend on most surely.
 
-They are kept if held-out runs gain by them. With Q the chi-square difference of a basis of d columns beyond those that
-were taken before it, and v what chance makes of Q / d, a further basis is put to them if
+They are kept if held-out commands gain by them. With Q the chi-square difference of a basis of d columns beyond those
+that were taken before it, and v what chance makes of Q / d, a further basis is put to them if
 
     Q > 2 v d                                                                                                       (1)
 
@@ -15,21 +15,22 @@ of these bases, one after another is fitted that lowers the chi-square of Z runs
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
+from omnibench.discover.covariate_dependence import weights_of_covariates
 from omnibench.discover.fitting.extend import Extended, columns_of, extend
 from omnibench.discover.fitting.model_fit import Fit
-from omnibench.discover.held_out.cross_validation import held_out_chi_square, is_gain
-from omnibench.discover.regressors.column_group import Group
+from omnibench.discover.held_out.cross_validation import folds_of_commands, held_out_chi_square, is_gain
+from omnibench.discover.regressors.column_group import Group, best_shapes
 from omnibench.discover.regressors.covariate_bases import Basis
 from omnibench.discover.regressors.significance import Significance
 from omnibench.discover.selection.competing_models import CompetingModels
-from omnibench.discover.selection.model_selection import CHANCE, Selection
+from omnibench.discover.selection.model_selection import CHANCE
 from omnibench.discover.selection.screening import Screening
 from omnibench.fit.least_squares.whitened import Whitened, given
 from omnibench.registry import effects
@@ -39,6 +40,10 @@ from omnibench.robot.kinematics import Array, Robot
 # held-out runs changes only at half the price, where none of the wet patch's counts as closed.
 _GRID = 6  # patches of the map along each side of the area
 _MOST = 5  # bases that are put together, at most
+_FINE = 8  # bases of fine structure, at most: neighbours of the surest are among them
+_FAMILIES = 2  # effects of the catalogue that are tried
+_ROUNDS = 3  # terms that are added one after another, at most: as many as effects are named
+_COVARIATES = 2  # that are tried each time: as many as a headline names
 _PRICE = 2.0  # times v d, Eq. (1)
 _DETERMINED = 0.01  # share of a function that must be left beyond the others: its standard error is 10 times its own
 _LARGEST = 3.0  # times the plausible range: a larger coefficient stands for something else
@@ -46,74 +51,141 @@ _LARGEST = 3.0  # times the plausible range: a larger coefficient stands for som
 
 @dataclass(frozen=True, eq=False)
 class SmoothTerm:
-    """The competing models with a smooth term, or as they were where it is left out, and a note on it."""
+    """The competing models with smooth terms, or as they were where none is added; what is left then; and notes."""
 
     models: CompetingModels
-    note: str
+    left: Significance
+    notes: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """A model with functions, and the chi-square difference (Z,) that they make for each run when it is held out."""
+    """A model with a term over a covariate, and the chi-square difference (Z,) that they make for held-out runs."""
 
+    covariate: str
     terms: tuple[Group, ...]
     used: Extended
     gains: Array
 
+    @property
+    def words(self) -> str:
+        details = dict.fromkeys(term.basis.detail for term in self.terms if term.basis is not None)
+        return f"an unnamed term over {self.covariate} ({'; '.join(details)})"
 
-def add_smooth_term(
-    plain: Fit, screening: Screening, selection: Selection, models: CompetingModels, folds: NDArray[np.intp]
+    @property
+    def gained(self) -> str:
+        mean, error = float(self.gains.mean()), float(self.gains.std()) / np.sqrt(len(self.gains))
+        return f"{mean:.2g} +- {error:.1g} of whitened chi2 a run"
+
+
+def add_smooth_terms(
+    plain: Fit,
+    screening: Screening,
+    models: CompetingModels,
+    left: Significance,
+    looking_again: Callable[[Extended], Significance],
+    folds: NDArray[np.intp],
 ) -> SmoothTerm:
-    """Add smooth functions of the covariate that the residuals depend on most surely to all competing models.
+    """Add terms without a name to all competing models, as long as runs that are held out gain by them.
 
-    The residuals are those after the selected effects, if there are any. Matrix, named effects and functions are fitted
-    together. They stay only if held-out runs gain. All are of one stage, of several stages the one that gains most:
-    what happens at one stage can be imitated at another, badly. folds (Z,): the fold in which each run is held out.
+    A term is a set of smooth functions of a covariate that the residuals depend on most surely, or an effect of the
+    catalogue that explains most and whose name is not sure. left: what the residuals depend on after the effects;
+    looking_again: what they depend on after more. Matrix, named effects and terms are fitted together. Functions of one
+    covariate are of one stage, of several stages that which gains most: what happens at one stage can be imitated at
+    another, badly. folds (Z,): the fold in which each run is held out where no command can be, as a function of the
+    command says nothing of others.
     """
-    stages = surest_bases(screening, selection)
-    if not stages:
-        return SmoothTerm(models, "No smooth term was tried: nothing that is left depends on what a model could use.")
-    covariate = stages[0][0].covariate
-    trials = [trial for bases in stages for trial in _tried(plain, models.used, bases, folds)]
-    if not trials:
-        return SmoothTerm(
-            models, f"No smooth term was added: no function of the {covariate} is plainly there by itself."
-        )
-    best = max(trials, key=lambda trial: float(trial.gains.mean()))
-    details = dict.fromkeys(term.basis.detail for term in best.terms if term.basis is not None)
-    what = f"a smooth term over {covariate} ({'; '.join(details)})"
-    mean, error = float(best.gains.mean()), float(best.gains.std()) / np.sqrt(len(best.gains))
-    gained = f"{mean:.2g} +- {error:.1g} of whitened chi2 a run"
-    if not is_gain(best.gains):
-        return SmoothTerm(models, f"{_capital(what)} was tried and left out: on runs held out it gains {gained}.")
-    others = tuple((weight, extend(plain, [*model.groups, *best.terms])) for weight, model in models.weighted[1:])
-    note = f"The extended model holds {what}, which is no name: on runs held out it gains {gained}."
-    return SmoothTerm(replace(models, used=best.used, weighted=((models.weighted[0][0], best.used), *others)), note)
+    notes: list[str] = []
+    commands = folds_of_commands(plain.runs)
+    for _ in range(_ROUNDS):
+        covariates = _surest_covariates(left)
+        trials = [
+            trial
+            for name in covariates
+            for trial in _trials(plain, screening, models.used, left, name, folds if name == "command" else commands)
+        ]
+        trials += _of_families(plain, screening, models.used, commands) if covariates and not notes else ()
+        best = max(trials, key=lambda trial: float(trial.gains.mean()), default=None)
+        if best is None or not is_gain(best.gains):
+            if not notes:
+                notes.append(_nothing_added(covariates, best))
+            break
+        others = tuple((weight, extend(plain, [*model.groups, *best.terms])) for weight, model in models.weighted[1:])
+        models = replace(models, used=best.used, weighted=((models.weighted[0][0], best.used), *others))
+        notes.append(f"The extended model holds {best.words}: on commands held out it gains {best.gained}.")
+        left = looking_again(best.used)
+    return SmoothTerm(models, left, tuple(notes))
 
 
-def _tried(plain: Fit, base: Extended, bases: Sequence[Basis], folds: NDArray[np.intp]) -> Iterator[_Trial]:
-    """The model with functions of some bases; none where no function gains enough."""
-    terms = chosen_functions(base, list(_groups_of(bases, plain.model.robot)))
-    if terms:
-        used = extend(plain, [*base.groups, *terms])
-        yield _Trial(tuple(terms), used, _held_out_gain(used, len(base.groups), folds))
+def _nothing_added(covariates: Sequence[str], best: _Trial | None) -> str:
+    if not covariates:
+        return "No unnamed term was tried: nothing that is left depends on what a model could use."
+    if best is None:
+        return f"No unnamed term was added: no function of {' or '.join(covariates)} is plainly there by itself."
+    return f"{_capital(best.words)} was tried and left out: on commands held out it gains {best.gained}."
 
 
-def surest_bases(screening: Screening, selection: Selection) -> list[list[Basis]]:
-    """Bases of the most significant covariate that a model can use, those of each stage apart.
+def _surest_covariates(left: Significance) -> list[str]:
+    """The covariates that are most likely what the residuals depend on, if that is no chance."""
+    significant = {
+        group.name for index, group in enumerate(left.groups) if left.p_value(index) < CHANCE and _term_of(group)
+    }
+    weights = weights_of_covariates(left)
+    return sorted(significant, key=lambda name: -weights[name])[:_COVARIATES]
+
+
+def _trials(
+    plain: Fit, screening: Screening, base: Extended, left: Significance, covariate: str, folds: NDArray[np.intp]
+) -> Iterator[_Trial]:
+    """The model with functions of one covariate: those of whole columns, by stage, and those of fine structure."""
+    for bases in surest_bases(screening, base, left, covariate):
+        terms = chosen_functions(base, list(_groups_of(bases, plain.model.robot)))
+        if terms:
+            used = extend(plain, [*base.groups, *terms])
+            yield _Trial(covariate, tuple(terms), used, _held_out_gain(used, len(base.groups), folds))
+
+
+def _of_families(plain: Fit, screening: Screening, base: Extended, folds: NDArray[np.intp]) -> Iterator[_Trial]:
+    """The model with each of the effects that explain most beyond it."""
+    beyond = given(screening.data, screening.index_with(base.groups))
+    names = {group.name for group in base.groups}
+    groups = [group for group in screening.groups.effects if group.name not in names]
+    gains = [beyond.chi_square(group.index) - _PRICE * beyond.rank(group.index) for group in groups]
+    best = best_shapes(groups, gains)
+    for index in sorted(best, key=lambda row: -gains[row])[:_FAMILIES]:
+        group, effect = groups[index], groups[index].effect
+        if effect is not None and gains[index] > 0:
+            basis = Basis(effect.shows_in, effect.stage, f"as {group.name} would be", np.zeros((0, 3, 0)))
+            used = extend(plain, [*base.groups, replace(group, basis=basis)])
+            yield _Trial(effect.shows_in, (used.groups[-1],), used, _held_out_gain(used, len(base.groups), folds))
+
+
+def surest_bases(screening: Screening, base: Extended, left: Significance, covariate: str) -> list[list[Basis]]:
+    """Bases of a covariate that a model can use, those of each stage apart, and those of fine structure.
 
     Each gains beyond those before it.
     """
-    significance = selection.left if selection.chosen else selection.where
-    groups = _of_surest_covariate(significance)
-    before = screening.index_with(selection.chosen)
-    price = _PRICE * max(float(np.median(significance.spread)), 1.0)  # Eq. (1)
-    stages = dict.fromkeys(group.basis.stage for group in groups if group.basis is not None)
-    of_stages = [[group for group in groups if group.basis and group.basis.stage == stage] for stage in stages]
-    return [
-        [group.basis for group in _together(screening.data, of_stage, before, price) if group.basis is not None]
-        for of_stage in of_stages
-    ]
+    excess = left.excess - left.rank * left.spread  # Eq. (1) with v of each basis
+    of_covariate = [index for index, group in enumerate(left.groups) if group.name == covariate and _term_of(group)]
+    price = _PRICE * max(float(np.median(left.spread)), 1.0)  # Eq. (1)
+    before = screening.index_with(base.groups)
+    of_stages: dict[str, list[Group]] = {}
+    fine: list[int] = []
+    for index in of_covariate:
+        group = left.groups[index]
+        if not group.index:
+            fine.append(index)
+        elif group.basis is not None:
+            of_stages.setdefault(group.basis.stage, []).append(group)
+    found = [_together(screening.data, groups, before, price) for groups in of_stages.values()]
+    surest = sorted(fine, key=lambda index: -excess[index])[:_FINE]
+    found.append([left.groups[index] for index in surest if excess[index] > 0])
+    return [[group.basis for group in groups if group.basis is not None] for groups in found if groups]
+
+
+def _term_of(group: Group) -> str:
+    """The smooth effect that adds a basis to a model, or nothing."""
+    return group.basis.term if group.basis is not None else ""
 
 
 def _together(data: Whitened, groups: Sequence[Group], before: Sequence[int], price: float) -> list[Group]:
@@ -128,16 +200,6 @@ def _together(data: Whitened, groups: Sequence[Group], before: Sequence[int], pr
         chosen.append(best)
         fitted += best.index
     return chosen
-
-
-def _of_surest_covariate(bases: Significance) -> list[Group]:
-    """All bases of the most significant covariate that have a term; none where it may be chance."""
-    beyond = (bases.chi_square - bases.rank * bases.spread) / np.sqrt(2 * np.maximum(bases.rank, 1.0)) / bases.spread
-    surest = int(np.lexsort((-beyond, -bases.evidence))[0])
-    if bases.p_value(surest) >= CHANCE:
-        return []
-    name = bases.groups[surest].name
-    return [group for group in bases.groups if group.name == name and group.basis is not None and group.basis.term]
 
 
 def _groups_of(bases: Sequence[Basis], robot: Robot) -> Iterator[Group]:

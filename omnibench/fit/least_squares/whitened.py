@@ -56,7 +56,7 @@ def whitened(
         white = weigh(np.concatenate([values[..., None], fitted, extra], axis=-1))
         white = white.reshape(-1, white.shape[-1])
         count = 1 + fitted.shape[2]
-        free = _without(white[:, :count], white[:, count:] * deviations) if len(deviations) else white
+        free = without(white[:, :count], white[:, count:] * deviations) if len(deviations) else white
         free_residuals.append(np.ascontiguousarray(free[:, 0]))
         free_columns.append(free[:, 1:])
     return Whitened(
@@ -64,7 +64,7 @@ def whitened(
     )
 
 
-def _without(values: Array, nuisances: Array) -> Array:
+def without(values: Array, nuisances: Array) -> Array:
     """Values (k, n) less what nuisances (k, m) of unit variance explain: (1 + N N')^(-1/2) values."""
     basis, sizes, _ = np.linalg.svd(nuisances, full_matrices=False)
     shrink = 1 - 1 / np.sqrt(1 + sizes**2)
@@ -126,6 +126,11 @@ class Given:
         covariance = roots @ roots.T
         values: Array = covariance @ self.scores[:, list(index)].sum(axis=0)
         return values, covariance
+
+    def only(self, index: Sequence[int]) -> Given:
+        """Some of the columns, in this order."""
+        rows = list(index)
+        return Given(self.information[np.ix_(rows, rows)], self.scores[:, rows], self.total[rows])
 
     def given(self, index: Sequence[int]) -> Given:
         """The Schur complement beyond further columns."""

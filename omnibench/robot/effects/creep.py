@@ -40,6 +40,7 @@ class CoulombCreep(MotionEffect):
     physics = "Rollers drag with a friction that does not depend on their speed, and the wheels creep against it."
     source = "F. W. Carter, On the action of a locomotive driving wheel, 1926; H. Olsson et al., 1998 (friction)"
     shows_in = "wheel rate"
+    form_covariates = ("wheel rate", "speed")
     fixed_parameters = (Parameter("c", "1", -0.02, 0.02, "creep as a share of the robot's speed"),)
     only_for = "robots with a wheel on rollers"
 

@@ -59,6 +59,7 @@ class StartTransient(MotionEffect):
     physics = "Play has to be taken up and rollers have to align themselves before the wheels drive the robot in full."
     source = "first principles"
     shows_in = "elapsed time"
+    form_covariates = ("distance",)
     fixed_parameters = (
         Parameter("k", "1", -0.2, 0.2, "share of the velocity that is lost at first"),
         Parameter(

@@ -45,8 +45,9 @@ class Effect(ABC):
     residual depends. needs: data that must have been recorded, and signals that are computed only on demand.
     run_nuisance: True if it has one value for each run, which is estimated and reported but is no answer of
     ``discover``. measurement: how to measure it, for an effect that a change of the matrix can absorb. only_for: the
-    robots to which it applies, in words, where these are not all; then override ``applies``. fixed_parameters:
-    parameters that are the same for every robot; otherwise override ``parameters``. in_catalogue: False for a smooth
+    robots to which it applies, in words, where these are not all; then override ``applies``. form_covariates: with what
+    its size may vary (forms.py), by default what follows from shows_in. fixed_parameters: parameters that are the same
+    for every robot; otherwise override ``parameters``. in_catalogue: False for a smooth
     function without physics, which ``discover`` never names.
     """
 
@@ -60,6 +61,7 @@ class Effect(ABC):
     in_catalogue: ClassVar[bool] = True
     measurement: ClassVar[str] = ""
     only_for: ClassVar[str] = ""
+    form_covariates: ClassVar[tuple[str, ...] | None] = None
     fixed_parameters: ClassVar[tuple[Parameter, ...]] = ()
 
     def __init__(self, options: Options | None = None) -> None:

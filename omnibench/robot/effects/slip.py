@@ -45,6 +45,7 @@ class CentripetalSlip(MotionEffect):
     physics = "Slip of the wheels grows with the force that keeps the robot on its curve."
     source = f"{_PACEJKA} (side slip in proportion to the force)"
     shows_in = "command"
+    form_covariates = ("centripetal acceleration",)
     fixed_parameters = (
         Parameter("k", "s", 0.0, 0.1, "velocity towards the inside of the curve per centripetal acceleration"),
     )
@@ -103,6 +104,7 @@ class QuadraticRotationSlip(MotionEffect):
     physics = "The rollers' drag grows with the rate of turn, and the wheels slip against it."
     source = "first principles"
     shows_in = "command"
+    form_covariates = ("turning",)
     fixed_parameters = (Parameter("k", "s/rad", -0.1, 0.1, "share of the rate of turn that is lost per rad/s"),)
 
     def correction(self, signals: Signals, values: Values) -> Array:
@@ -127,6 +129,7 @@ class IcrShift(MotionEffect):
         "instantaneous centers of rotation, 2014"
     )
     shows_in = "command"
+    form_covariates = ("turning",)
     only_for = "skid-steered robots"
     fixed_parameters = (Parameter("x", "m s/rad", -0.1, 0.1, "way ahead of the centre of rotation per rate of turn"),)
 

@@ -89,6 +89,12 @@ def bump(places: Array, values: Values) -> Array:
     return np.exp(-np.square(away).sum(axis=1, keepdims=True))
 
 
+def beyond(places: Array, values: Values) -> Array:
+    """A soft step (F, 1) of positions (F, 2), from 0 to 1 across a line."""
+    across = places @ [np.cos(values["normal"]), np.sin(values["normal"])] - values["distance"]
+    return (0.5 + 0.5 * np.tanh(across / values["width"]))[:, None]
+
+
 AREA = (
     scale("centre_x", "m", -1e6, 1e6, 0.0, "middle of the places that were seen"),
     scale("centre_y", "m", -1e6, 1e6, 0.0, "middle of the places that were seen"),
@@ -159,6 +165,23 @@ class SmoothHeading(SmoothEffect):
         return waves(signals.poses[:, 2], (1, 2, 3))
 
 
+@effects.register("smooth_heading_wave")
+class SmoothHeadingWave(SmoothEffect):
+    """Unknown effect: a wave of the robot's heading, so many times a turn."""
+
+    shows_in = "heading"
+    needs = frozenset({"poses"})
+    labels = ("cos", "sin")
+    fixed_parameters = (
+        *shared(SmoothEffect.modes, labels, "the heading"),
+        scale("harmonic", "1", 1.0, 64.0, 4.0, "waves in a turn of the robot"),
+    )
+
+    def shares(self, signals: Signals, values: Values) -> Array:
+        assert signals.poses is not None  # they are needed
+        return waves(signals.poses[:, 2], (values["harmonic"],))
+
+
 @effects.register("smooth_course")
 class SmoothCourse(SmoothEffect):
     """Unknown effect: a steady push along the way in the world, and two harmonics of the direction of travel there.
@@ -217,6 +240,43 @@ class SmoothPatch(SmoothEffect):
     def shares(self, signals: Signals, values: Values) -> Array:
         assert signals.poses is not None  # they are needed
         return bump(signals.poses[:, :2], values)
+
+
+@effects.register("smooth_place_wave")
+class SmoothPlaceWave(SmoothEffect):
+    """Unknown effect: a plane wave over the floor, as of tiles."""
+
+    shows_in = "place"
+    needs = frozenset({"poses"})
+    labels = ("cos", "sin")
+    fixed_parameters = (
+        *shared(SmoothEffect.modes, labels, "the place"),
+        scale("along_x", "rad/m", -1e3, 1e3, 10.0, "phase per way along x of the reference"),
+        scale("along_y", "rad/m", -1e3, 1e3, 0.0, "phase per way along y of the reference"),
+    )
+
+    def shares(self, signals: Signals, values: Values) -> Array:
+        assert signals.poses is not None  # they are needed
+        return waves(signals.poses[:, :2] @ [values["along_x"], values["along_y"]], (1.0,))
+
+
+@effects.register("smooth_edge")
+class SmoothEdge(SmoothEffect):
+    """Unknown effect: the floor beyond a straight line, as a carpet's edge."""
+
+    shows_in = "place"
+    needs = frozenset({"poses"})
+    labels = ("beyond",)
+    fixed_parameters = (
+        *shared(SmoothEffect.modes, labels, "the line"),
+        scale("normal", "rad", -7.0, 7.0, 0.0, "direction across the line, in the reference's frame"),
+        scale("distance", "m", -1e6, 1e6, 0.0, "of the line from the reference's origin along that direction"),
+        scale("width", "m", 1e-6, 1e6, 0.05, "over which the change sets in"),
+    )
+
+    def shares(self, signals: Signals, values: Values) -> Array:
+        assert signals.poses is not None  # they are needed
+        return beyond(signals.poses[:, :2], values)
 
 
 @effects.register("smooth_command")

@@ -10,9 +10,11 @@ from types import MappingProxyType
 
 from omnibench.errors import DataError, UnknownNameError
 from omnibench.registry import effects
-from omnibench.robot.effects.effect import Effect, Parameter, Values
+from omnibench.robot.effects.effect import Effect, MotionEffect, Parameter, Values
+from omnibench.robot.effects.forms import accepts_form
 from omnibench.robot.kinematics import Robot
 
+_SCALES = -1e9, 1e9  # range of the values that scale a form's covariate; chosen
 _FAR_OUTSIDE = 1e3  # multiple of the plausible range beyond which a value is refused; chosen
 
 
@@ -48,11 +50,12 @@ def make_term(
     check_applies(effect, robot, prefix)
     known = {parameter.name: parameter for parameter in effect.parameters(robot, sessions)}
     for given, value in parameters.items():
-        if given not in known and not effect.accepts(given):
+        if given not in known and not effect.accepts(given) and not _is_form(effect, robot, given):
             raise UnknownNameError("parameter", given, known, prefix)
         if not _is_number(value) or not math.isfinite(value):
             raise DataError(f"{prefix}: parameter {given!r} is {value!r}, not a finite number")
-        low, high = _limits(known.get(given))
+        formed = given.partition(":")[0]
+        low, high = _SCALES if ":" in given and formed not in known else _limits(known.get(formed))
         if not low <= value <= high:
             raise DataError(f"{prefix}: parameter {given!r} is {value:g}, not within {low:g} and {high:g}")
     for parameter in known.values():
@@ -67,6 +70,10 @@ def check_applies(effect: Effect, robot: Robot, prefix: str) -> None:
     """DataError, in one line that begins with ``prefix``: the effect does not apply to the robot."""
     if not effect.applies(robot):
         raise DataError(f"{prefix} is for {effect.only_for}; robot {robot.name} is none, leave the effect out")
+
+
+def _is_form(effect: Effect, robot: Robot, name: str) -> bool:
+    return isinstance(effect, MotionEffect) and accepts_form(effect, robot, name)
 
 
 def _is_number(value: object) -> bool:

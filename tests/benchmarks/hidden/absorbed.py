@@ -69,17 +69,17 @@ def _gain(grid: Grid, values: Values, _: np.random.Generator) -> Correction:
 
 
 ABSORBED: dict[str, Form] = {
-    "lidar_lever_arm": Form(_lever_arm, _lever_arm, {"x": 0.05, "y": 0.05}),
-    "lidar_yaw": Form(_yaw, _yaw, {"beta": np.radians(2)}),
-    "reference_scale": Form(_scale, _scale, {"s": 0.01}),
-    "sample_period_scale": Form(_period, _period, {"s": 0.01}),
-    "tyre_wear": Form(wear, wear, {"radius_s2": 0.01}),  # between training and validation, each of one session
+    "lidar_lever_arm": Form(_lever_arm, _lever_arm, _lever_arm, {"x": 0.05, "y": 0.05}),
+    "lidar_yaw": Form(_yaw, _yaw, _yaw, {"beta": np.radians(2)}),
+    "reference_scale": Form(_scale, _scale, _scale, {"s": 0.01}),
+    "sample_period_scale": Form(_period, _period, _period, {"s": 0.01}),
+    "tyre_wear": Form(wear, wear, wear, {"radius_s2": 0.01}),  # between training and validation, each of one session
 }
 NUISANCES: dict[str, Form] = {
-    "reference_clock_drift": Form(_clock_drift, _clock_drift, {"offset": 0.03, "slope": 0.003}),
+    "reference_clock_drift": Form(_clock_drift, _clock_drift, _clock_drift, {"offset": 0.03, "slope": 0.003}),
 }
 ACTUATORS: dict[str, Form] = {
-    "motor_lag": Form(_lag, _lag, {"tau": 0.08}, one_sided=True),
-    "motor_dead_band": Form(_band, _band, {"band": 0.05}, one_sided=True),
-    "motor_gain": Form(_gain, _gain, {"gain": 0.03}),
+    "motor_lag": Form(_lag, _lag, _lag, {"tau": 0.08}, one_sided=True),
+    "motor_dead_band": Form(_band, _band, _band, {"band": 0.05}, one_sided=True),
+    "motor_gain": Form(_gain, _gain, _gain, {"gain": 0.03}),
 }

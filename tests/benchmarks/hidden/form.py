@@ -1,4 +1,4 @@
-"""Forms of a hidden effect: the catalogue's (matched), another as nature may have it (blind), and its size.
+"""Forms of a hidden effect: the catalogue's (matched), two others as nature may have it (blind, third), and its size.
 
 A form turns the steps of a grid, values and a source of chance into a correction. The chance holds what the catalogue
 has no parameter for: saturation, second harmonics, jitter. It is drawn anew, and alike, at every call.
@@ -24,13 +24,14 @@ WHEELS = ROBOT.wheel_names
 
 @dataclass(frozen=True)
 class Form:
-    """An effect's two forms. plausible: the largest value of each parameter, in SI units. one_sided: never negative.
+    """An effect's three forms. plausible: the largest value of each parameter, in SI units. one_sided: never negative.
 
     shapes: parameters that are chosen and not scaled, with their choices. designs: where it can be told from others.
     """
 
     matched: Make
     blind: Make
+    third: Make
     plausible: Mapping[str, float]
     designs: tuple[str, ...] = ("rich", "flower")
     one_sided: bool = False

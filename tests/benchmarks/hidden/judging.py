@@ -157,7 +157,7 @@ def _parameters(discovery: Discovery, truth: Truth) -> tuple[ParameterError, ...
     shapes = hidden.values | {each.name: each.value for each in effect.parameters if each.shape}
     sight = truth.sight()
     true, _ = projected(sight, FORMS[hidden.name], shapes, truth.signature(sight))
-    estimated = [each for each in effect.parameters if not each.shape]
+    estimated = [each for each in effect.parameters if not each.shape and ":" not in each.name]  # but its forms
     scaled_names = [name for name in FORMS[hidden.name].plausible if not _only_later(name, truth)]
     if {each.name for each in estimated} != set(scaled_names):
         raise ValueError(f"{hidden.name} has the parameters {[each.name for each in estimated]}, not {scaled_names}")

@@ -16,12 +16,13 @@ from .motion import Correction, Grid
 class Unheard:
     """An effect without a name. covariates: where a locator should see it; one of them is enough.
 
-    plausible: what size "amplitude" = 1 is scaled from.
+    plausible: what size "amplitude" = 1 is scaled from. design: where it can be seen.
     """
 
     make: Make
     covariates: tuple[str, ...]
     plausible: float
+    design: str = "rich"
 
 
 def _turn(rates: Array) -> Correction:

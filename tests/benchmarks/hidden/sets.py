@@ -16,6 +16,7 @@ from omnibench.robot.kinematics import Array
 from .absorbed import ABSORBED, ACTUATORS, NUISANCES
 from .disturbances import DISTURBANCES, VALIDATION, Disturbance, scaled
 from .experiment import DESIGNS, RAMP, ROBOT, SAMPLE, Run, plan, true_matrix
+from .fine_structure import FINE
 from .form import Form, Make, Values
 from .forms import FORMS
 from .motion import Correction, Grid
@@ -23,7 +24,9 @@ from .outside import OUTSIDE, Unheard
 from .signature import Sight
 
 Kind = Literal["single", "pair", "outside", "null", "absorbed", "nuisance", "actuator"]
-LEVELS = {"strong": 1000.0, "medium": 100.0, "weak": 25.0}
+FormName = Literal["matched", "blind", "third"]
+LEVELS = {"strong": 1000.0, "medium": 300.0, "weak": 100.0}
+UNHEARD = {**OUTSIDE, **FINE}
 LARGEST = 3.0  # times the plausible range; what needs more is not reachable
 
 
@@ -47,7 +50,7 @@ class Truth:
 
     kind: Kind
     hidden: tuple[Hidden, ...]
-    form: str
+    form: FormName
     design: str
     noise: str
     matrix: Array
@@ -85,7 +88,7 @@ def make_set(
     level: str | float,
     seed: int,
     *,
-    form: Literal["blind", "matched"] = "blind",
+    form: FormName = "blind",
     design: str | None = None,
     noise: str = "plain",
 ) -> tuple[Dataset, Truth]:
@@ -113,7 +116,7 @@ def make_set(
         correction += make_of(kind, each.name, form)(grid, each.values, np.random.default_rng(each_seed))
     clean = _trajectories(grid, grid.poses(correction), _Wheels.of(grid, correction))
     dataset = make_dataset("recording", ROBOT, SAMPLE, recorded(grid, correction, disturbance, rng), simulated=True)
-    covariates = OUTSIDE[names[0]].covariates if kind == "outside" else ()
+    covariates = UNHEARD[names[0]].covariates if kind == "outside" else ()
     return dataset, Truth(kind, hidden, form, design, noise, matrix, disturbance, runs, clean, seeds, covariates)
 
 
@@ -122,12 +125,12 @@ def form_of(kind: Kind, name: str) -> Form:
     return {"absorbed": ABSORBED, "nuisance": NUISANCES, "actuator": ACTUATORS}.get(kind, FORMS)[name]
 
 
-def make_of(kind: Kind, name: str, form: str) -> Make:
+def make_of(kind: Kind, name: str, form: FormName) -> Make:
     """The function that turns values into a correction."""
     if kind == "outside":
-        return OUTSIDE[name].make
+        return UNHEARD[name].make
     found = form_of(kind, name)
-    return found.matched if form == "matched" else found.blind
+    return {"matched": found.matched, "blind": found.blind, "third": found.third}[form]
 
 
 def _design_of(kind: Kind, names: Sequence[str], seed: int) -> str:
@@ -137,6 +140,8 @@ def _design_of(kind: Kind, names: Sequence[str], seed: int) -> str:
     if kind == "single":
         designs = FORMS[names[0]].designs
         return designs[seed % len(designs)]
+    if kind == "outside":
+        return UNHEARD[names[0]].design
     return "sessions" if kind == "pair" and "tyre_wear" in names else "rich"
 
 
@@ -145,13 +150,13 @@ def _hide(
     kind: Kind,
     name: str,
     level: str | float,
-    form: str,
+    form: FormName,
     seed: Sequence[int],
     rng: np.random.Generator,
     disturbance: Disturbance,
 ) -> Hidden:
     make, wanted = make_of(kind, name, form), LEVELS[level] if isinstance(level, str) else level
-    known = OUTSIDE[name] if kind == "outside" else form_of(kind, name)
+    known = UNHEARD[name] if kind == "outside" else form_of(kind, name)
     direction = {"size": float(rng.choice([-1.0, 1.0])) * known.plausible} if isinstance(known, Unheard) else None
     values: Values = direction or form_of(kind, name).direction(rng)
 

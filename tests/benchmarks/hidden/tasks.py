@@ -12,22 +12,26 @@ from omnibench.processes import one_thread
 
 from .absorbed import ABSORBED, ACTUATORS, NUISANCES
 from .disturbances import NULL_KINDS
+from .fine_structure import FINE
 from .forms import FORMS
 from .judging import Judgement, judge
 from .outside import OUTSIDE
 from .pairs import PAIRS
-from .sets import LEVELS, Kind, make_set
+from .sets import LEVELS, FormName, Kind, make_set
 
-NULLS = 30  # for every seed of the others: 600 with 20 seeds
-FAINT = 300.0  # non-centrality of the second level of what no catalogue has
-Group = Literal["single", "matched", "removed", "pair", "outside", "null", "absorbed", "nuisance", "actuator"]
+NULLS = 60  # for every seed of the others: 1200 with 20 seeds
+Group = Literal[
+    "single", "matched", "third", "removed", "pair", "outside", "fine", "null", "absorbed", "nuisance", "actuator"
+]
 GROUPS: tuple[Group, ...] = (
     "single",
     "null",
     "pair",
     "outside",
+    "fine",
     "removed",
     "matched",
+    "third",
     "absorbed",
     "nuisance",
     "actuator",
@@ -48,8 +52,15 @@ class Task(Model):
 
     @property
     def kind(self) -> Kind:
-        """Group of the set: matched forms, and sets for which the name is taken away, hold single effects."""
-        return "single" if self.group == "matched" or self.group == "removed" else self.group
+        """Kind of the set: matched and third forms, and sets whose name is taken away, hold single effects."""
+        if self.group == "matched" or self.group == "third" or self.group == "removed":
+            return "single"
+        return "outside" if self.group == "fine" else self.group
+
+    @property
+    def form(self) -> FormName:
+        """Form of the effects: matched and third where the group says so."""
+        return self.group if self.group == "matched" or self.group == "third" else "blind"
 
 
 class Result(Model):
@@ -77,14 +88,15 @@ def tasks(seeds: range, levels: tuple[float, ...], groups: tuple[Group, ...]) ->
 
 def _of(group: Group, levels: tuple[float, ...]) -> Iterator[tuple[tuple[str, ...], float]]:
     strong = LEVELS["strong"]
-    if group in ("single", "matched"):
+    if group in ("single", "matched", "third"):
         yield from (((name,), level) for name in FORMS for level in levels)
     elif group == "removed":
         yield from (((name,), strong) for name in FORMS)
     elif group == "pair":
         yield from ((pair, strong) for pair in PAIRS)
-    elif group == "outside":
-        yield from (((name,), level) for name in OUTSIDE for level in (strong, FAINT))
+    elif group in ("outside", "fine"):
+        unheard = OUTSIDE if group == "outside" else FINE
+        yield from (((name,), level) for name in unheard for level in (strong, LEVELS["medium"]))
     elif group != "null":
         known = {"absorbed": ABSORBED, "nuisance": NUISANCES, "actuator": ACTUATORS}[group]
         yield from (((name,), strong) for name in known)
@@ -94,8 +106,7 @@ def carry_out(task: Task) -> Result:
     """Make the set, let the workflow discover, judge. Whatever the workflow raises is a failure, and counts as one."""
     with one_thread():
         noise = NULL_KINDS[task.seed % len(NULL_KINDS)] if task.group == "null" else "plain"
-        form: Literal["blind", "matched"] = "matched" if task.group == "matched" else "blind"
-        dataset, truth = make_set(task.kind, task.effects, task.level, task.seed, form=form, noise=noise)
+        dataset, truth = make_set(task.kind, task.effects, task.level, task.seed, form=task.form, noise=noise)
         began = time.perf_counter()
         judgement, failure = None, ""
         try:

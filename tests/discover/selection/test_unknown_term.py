@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from discovery_samples import nameless, simulated
+from discovery_samples import simulated
 from hidden.experiment import ROBOT
 from hidden.sets import Truth, make_set
 
@@ -19,7 +19,7 @@ from omnibench.discover.regressors.covariate_bases import Basis
 from omnibench.discover.selection.competing_models import CompetingModels
 from omnibench.discover.selection.model_selection import Selection, select_effects
 from omnibench.discover.selection.screening import Screening, screen_plain
-from omnibench.discover.selection.unknown_term import add_smooth_term, chosen_functions
+from omnibench.discover.selection.unknown_term import add_smooth_terms, chosen_functions
 from omnibench.fit.least_squares.noise import Whitener
 from omnibench.fit.least_squares.usable_runs import usable_runs
 from omnibench.registry import effects
@@ -42,7 +42,7 @@ def recorded(kind: str) -> tuple[Dataset, Truth]:
 @pytest.fixture(scope="module")
 def grooved() -> tuple[Dataset, Truth, Discovery]:
     dataset, truth = recorded("turning_by_heading")
-    return dataset, truth, discover_effects(dataset, unknown_term=True)
+    return dataset, truth, discover_effects(dataset)
 
 
 @pytest.fixture(scope="module")
@@ -79,18 +79,17 @@ def test_it_is_no_name_and_the_verdict_stays_unknown(grooved: tuple[Dataset, Tru
     found = grooved[2]
     assert found.verdict == "unknown"
     assert found.effects == ()
-    assert {term.name for term in found.extended.effects} <= {"smooth_heading", "smooth_course"}
+    assert {term.name for term in found.extended.effects} <= {"smooth_heading", "smooth_course", "smooth_heading_wave"}
 
 
 def test_it_is_a_step_and_the_notes_tell_what_it_gains(grooved: tuple[Dataset, Truth, Discovery]) -> None:
     found = grooved[2]
-    assert [step.name for step in found.steps] == ["plain matrix", "+ smooth term over heading (no name)"]
+    assert [step.name for step in found.steps] == ["plain matrix", "+ unnamed, over heading"]
     assert found.steps[1].held_out is not None
     assert found.steps[0].held_out is not None
     assert found.steps[1].held_out < found.steps[0].held_out
-    told = [note for note in found.notes if "smooth term" in note]
-    assert len(told) == 1
-    assert "no name: on runs held out it gains" in told[0]
+    (told,) = [note for note in found.notes if "unnamed term" in note]
+    assert "on commands held out it gains" in told
 
 
 def test_the_calibration_file_predicts_the_same(grooved: tuple[Dataset, Truth, Discovery], tmp_path: Path) -> None:
@@ -101,18 +100,18 @@ def test_the_calibration_file_predicts_the_same(grooved: tuple[Dataset, Truth, D
     np.testing.assert_array_equal(again, found.extended.model.reported([log])[0])
 
 
-def test_it_is_added_only_when_asked_for() -> None:
-    found = nameless()
+def test_it_is_left_out_on_request() -> None:
+    found = discover_effects(simulated(), without=("rotation_translation_coupling",), unknown_term=False)
     assert found.verdict == "unknown"
     assert found.extended.effects == ()
-    assert not any("smooth" in note for note in found.notes)
+    assert not any("unnamed" in note for note in found.notes)
 
 
 def test_where_nothing_is_missing_none_is_tried() -> None:
-    found = discover_effects(simulated(()), unknown_term=True)
+    found = discover_effects(simulated(()))
     assert found.verdict == "none"
     assert found.extended.effects == ()
-    assert not any("smooth" in note for note in found.notes)
+    assert not any("unnamed" in note for note in found.notes)
 
 
 def test_of_two_waves_the_one_that_is_there_is_chosen() -> None:
@@ -139,12 +138,12 @@ def test_functions_are_fitted_together_with_named_effects_and_stand_after_them(
 ) -> None:
     screening, selection = screened
     models = with_names(bare, selection, group("heading_drift"))
-    smooth = add_smooth_term(bare.fit, screening, selection, models, FOLDS)
+    smooth = add_smooth_terms(bare.fit, screening, models, selection.where, lambda _: selection.left, FOLDS)
     used = smooth.models.used
     assert used.groups[0].name == "heading_drift"
-    assert {each.name for each in used.groups[1:]} <= {"smooth_heading", "smooth_course"}
+    assert {each.name for each in used.groups[1:]} <= {"smooth_heading", "smooth_course", "smooth_heading_wave"}
     assert smooth.models.weighted[0][1] is used
-    assert "no name" in smooth.note
+    assert "unnamed" in smooth.notes[0]
     calibrated = calibration_terms(used)
     assert calibrated["heading_drift"]["b"] == used.values[0]
 
@@ -154,10 +153,10 @@ def test_nothing_is_added_to_a_model_that_leaves_nothing_of_it(
 ) -> None:
     screening, selection = screened
     models = with_names(bare, selection, group("smooth_heading"), group("smooth_course"))
-    smooth = add_smooth_term(bare.fit, screening, selection, models, FOLDS)
+    smooth = add_smooth_terms(bare.fit, screening, models, selection.where, lambda _: selection.left, FOLDS)
     assert smooth.models is models
-    assert "smooth term" in smooth.note
-    assert "was added" in smooth.note or "left out" in smooth.note
+    assert "unnamed term" in smooth.notes[0]
+    assert "was added" in smooth.notes[0] or "left out" in smooth.notes[0]
 
 
 def test_named_effects_come_one_by_one_and_what_has_no_name_at_once() -> None:
@@ -166,7 +165,7 @@ def test_named_effects_come_one_by_one_and_what_has_no_name_at_once() -> None:
     assert group_counts([named, named, nameless, nameless]) == [1, 2, 4]
     assert group_counts([named]) == [1]
     assert group_counts([]) == []
-    assert step_name(nameless) == "smooth term over place (no name)"
+    assert step_name(nameless) == "unnamed, over place"
 
 
 def plain(dataset: Dataset) -> Extended:

@@ -1,0 +1,220 @@
+"""Fine structure: how the motion between reference poses depends on heading and place, finer than whole columns show.
+
+An error of the motion in one sample, a displacement d (complex, in the reference's frame) and a turn e, moves the pose
+at every later stamp j by d + i (z_j - z) e and by e, z being the robot's place in that sample (paths.py, Eq. (1)). Let
+h_j be the inverse covariance of the residuals times these, by which half the chi-square falls as the pose at stamp j
+moves. The motion in a sample before stamp k then lowers it by
+
+    g_d = sum over j >= k of h_j,    g_e = sum over j >= k of h_j(heading) + Re(conj(i (z_j - z)) h_j),            (1)
+
+and the score of a function f of a covariate in a mode m of motion (along the way, across it, turning) is the sum of
+f m g over a run's samples: one product of matrices for all functions, whatever their number.
+
+With s_z the scores of run z for the d columns of a basis, s their sum and S = sum of (s_z - s / Z)(s_z - s / Z)',
+
+    Q = s' S^-1 s                                                                                                  (2)
+
+is the statistic of Hotelling ("The generalization of Student's ratio", Annals of Mathematical Statistics 2, 1931), of d
+degrees of freedom where nothing is missing, whatever the noise is taken for. Where runs are few, they are cut into
+pieces whose scores stand for those of runs: what is fine varies within a run.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from omnibench.discover.fitting.model_fit import Fit, paths_of
+from omnibench.discover.regressors.column_group import Group
+from omnibench.discover.regressors.covariate_bases import Basis
+from omnibench.discover.regressors.paths import Paths
+from omnibench.discover.regressors.significance import Significance, significance_of_scores
+from omnibench.robot.effects.effect import Values
+from omnibench.robot.effects.smooth import beyond, bump, lever
+from omnibench.robot.kinematics import Array
+
+_COARSE = 0.1  # s: wheel samples are merged up to this duration
+_HARMONICS = 12  # of the heading
+_WAVES = 400  # plane waves over the floor, at most; the shortest are left out
+_DIRECTIONS, _LINES = 12, 9  # directions of lines across the floor, and lines for each
+_EDGE = 0.05  # m, over which the floor changes at a line
+_CELLS = 9  # patches along each side of the floor
+_WIDE = 0.7  # radius of a patch, of the distance between two, as in covariate_bases.py
+_PIECES = 60  # runs or pieces of runs, at least
+_RANK = 1e-6  # share of a column's square that must be left beyond the others of its basis
+_SEEN = 0.002  # share of the samples that must lie in a patch, as in covariate_bases.py
+_TOGETHER = 100  # functions that are evaluated at once
+
+
+@dataclass(frozen=True, eq=False)
+class _Kind:
+    """Functions of one kind: B shapes and their values (F, B, J). term: the smooth effect that adds them to a model."""
+
+    covariate: str
+    term: str
+    detail: str
+    shapes: Sequence[Mapping[str, float]]
+    values: Callable[[slice], Array]
+
+
+def fine_structure(fit: Fit, rng: np.random.Generator) -> Significance | None:
+    """Significance of fine structure in the residuals of a fitted model; None where nothing could show."""
+    paths = paths_of(fit, _COARSE)
+    owner, units = _units(paths)
+    pull = _pull(fit, paths)
+    sums = csr_array((np.ones(len(owner)), (owner, np.arange(len(owner)))), shape=(units, len(owner)))
+    groups: list[Group] = []
+    scores: list[Array] = []
+    for kind in _kinds(paths):
+        for low in range(0, len(kind.shapes), _TOGETHER):
+            part = slice(low, low + _TOGETHER)
+            values = kind.values(part)
+            values -= values.mean(axis=0)  # the matrix holds what is the same everywhere
+            independent = _independent(_scores(sums, pull, values))
+            for shape, of_runs in zip(kind.shapes[part], independent, strict=True):
+                if of_runs.shape[1]:
+                    basis = Basis(
+                        kind.covariate, "body", kind.detail.format(**shape), _NONE, len(kind.shapes), kind.term, shape
+                    )
+                    groups.append(Group("covariate", kind.covariate, (), tries=basis.tries, basis=basis))
+                    scores.append(of_runs)
+    return significance_of_scores(groups, scores, scores, rng) if groups else None
+
+
+_NONE = np.zeros((0, 3, 0))
+
+
+def _units(paths: Paths) -> tuple[NDArray[np.intp], int]:
+    """The run of each sample, or the piece of a run where runs are few, and how many of these there are."""
+    runs = len(paths.logs)
+    pieces = -(-_PIECES // runs)
+    first = np.searchsorted(paths.owner, np.arange(runs + 1))
+    counts = np.diff(first)[paths.owner]
+    place = np.arange(len(paths.owner)) - first[paths.owner]
+    return paths.owner * pieces + place * pieces // counts, runs * pieces
+
+
+def _pull(fit: Fit, paths: Paths) -> Array:
+    """The change of half the chi-square (F, 3) by each sample's motion, times a share, in each of three modes."""
+    signals = paths.signals
+    middle, durations = paths.middle[:, 0] + 1j * paths.middle[:, 1], signals.durations
+    twists = signals.twists
+    way = (twists[:, 0] + 1j * twists[:, 1]) * np.exp(1j * paths.middle[:, 2]) * durations
+    turn = (np.abs(twists[:, 2]) + np.hypot(twists[:, 0], twists[:, 1]) / lever(paths.robot)) * durations
+    pull = np.zeros((len(middle), 3))
+    first = 0
+    weighted = fit.weighted_residuals
+    for log, part, gradient in zip(paths.logs, paths.parts, weighted, strict=True):
+        rows = slice(first, first + len(log.times))
+        first = rows.stop
+        poses = paths.poses[part]
+        push = gradient[:, 0] + 1j * gradient[:, 1]
+        swing = np.real(np.conj(1j * (poses[:, 0] + 1j * poses[:, 1])) * push) + gradient[:, 2]
+        later = np.append(push[::-1].cumsum()[::-1], 0.0)
+        swung = np.append(swing[::-1].cumsum()[::-1], 0.0)
+        stamp = np.searchsorted(log.stamps, log.times - durations[rows] / 2)
+        moved = later[stamp]
+        turned = swung[stamp] - np.real(np.conj(1j * middle[rows]) * moved)  # Eq. (1)
+        pull[rows, 0] = np.real(np.conj(way[rows]) * moved)
+        pull[rows, 1] = np.real(np.conj(1j * way[rows]) * moved)
+        pull[rows, 2] = turn[rows] * turned
+    return pull
+
+
+def _scores(sums: csr_array, pull: Array, values: Array) -> Array:
+    """Scores (Z, B, 3 J) of functions (F, B, J) in three modes: of all of a run's samples."""
+    flat = values.reshape(len(values), -1)
+    of_modes = [np.asarray(sums @ (flat * pull[:, mode, None])) for mode in range(pull.shape[1])]
+    return np.concatenate([each.reshape(-1, *values.shape[1:]) for each in of_modes], axis=2)
+
+
+def _independent(scores: Array) -> list[Array]:
+    """Scores (Z, B, d) of B bases as independent ones (Z, d) whose sums have unit variance, Eq. (2)."""
+    of_bases = np.ascontiguousarray(scores.transpose(1, 0, 2))
+    off = of_bases - of_bases.mean(axis=1, keepdims=True)
+    square = off.transpose(0, 2, 1) @ off
+    scale = 1 / np.sqrt(np.maximum(np.diagonal(square, axis1=1, axis2=2), 1e-300))
+    sizes, vectors = np.linalg.eigh(square * scale[:, :, None] * scale[:, None, :])
+    known = sizes > _RANK
+    independent = of_bases @ (scale[:, :, None] * vectors / np.sqrt(np.where(known, sizes, 1.0))[:, None, :])
+    return [of_runs[:, rows] for of_runs, rows in zip(independent, known, strict=True)]
+
+
+def _kinds(paths: Paths) -> Iterator[_Kind]:
+    """Functions of heading and place, as fine as the paths allow."""
+    heading, places = paths.middle[:, 2], paths.middle[:, :2]
+    harmonics = np.arange(1.0, _HARMONICS + 1)
+    yield _Kind(
+        "heading",
+        "smooth_heading_wave",
+        "the robot's heading, {harmonic:g} times a turn",
+        [{"harmonic": float(number)} for number in harmonics],
+        lambda part: _parts(np.exp(1j * heading[:, None] * harmonics[part])),
+    )
+    low = places.min(axis=0)
+    extent = places.max(axis=0) - low
+    if extent.max() <= _EDGE:
+        return
+    waves, lines, patches = _wave_numbers(), _lines(places), _patches(places)
+    step = np.pi / np.maximum(extent, _EDGE)
+    x, y = (np.exp(1j * axis) for axis in ((places - low) * step).T)
+    yield _Kind(
+        "place",
+        "smooth_place_wave",
+        "a wave over the floor, such as tiles make",
+        [{"along_x": float(step[0] * east), "along_y": float(step[1] * north)} for east, north in waves],
+        lambda part: _parts(np.stack([x**east * y**north for east, north in waves[part]], axis=1)),
+    )
+    for term, detail, shapes, function in (
+        ("smooth_edge", "a line across the floor", lines, beyond),
+        ("smooth_patch", "a patch of the floor", patches, bump),
+    ):
+        yield _Kind("place", term, detail, shapes, partial(_over_places, function, places, shapes))
+
+
+def _over_places(
+    function: Callable[[Array, Values], Array], places: Array, shapes: Sequence[Values], part: slice
+) -> Array:
+    """Values (F, B, 1) of a function of places (F, 2) in several shapes."""
+    return np.stack([function(places, shape) for shape in shapes[part]], axis=1)
+
+
+def _parts(waves: Array) -> Array:
+    """Cosines and sines (F, B, 2) of complex waves (F, B)."""
+    return waves.view(float).reshape(*waves.shape, 2)
+
+
+def _wave_numbers() -> list[tuple[int, int]]:
+    """Half periods (east, north) across the floor of plane waves, the longest waves first, each in one direction."""
+    most = int(np.sqrt(_WAVES))
+    pairs = [pair for pair in product(range(most), range(-most, most + 1)) if pair > (0, 0)]
+    return sorted(pairs, key=lambda pair: math.hypot(*pair))[:_WAVES]
+
+
+def _lines(places: Array) -> list[dict[str, float]]:
+    """Lines across the floor, in each direction where equal shares of the samples lie between them."""
+    shares, lines = np.arange(1, _LINES + 1) / (_LINES + 1), []
+    for normal in (np.pi / _DIRECTIONS * np.arange(_DIRECTIONS)).tolist():
+        distances = np.quantile(places @ [np.cos(normal), np.sin(normal)], shares)
+        lines += [{"normal": normal, "distance": distance, "width": _EDGE} for distance in distances.tolist()]
+    return lines
+
+
+def _patches(places: Array) -> list[dict[str, float]]:
+    """Patches on a grid, where there are samples."""
+    low = places.min(axis=0)
+    spacing = (places.max(axis=0) - low) / (_CELLS - 1)
+    radius, patches = _WIDE * float(spacing.max()), []
+    for steps in product(range(_CELLS), repeat=2):
+        x, y = (low + spacing * steps).tolist()
+        patch = {"centre_x": x, "centre_y": y, "radius": radius}
+        if (bump(places, patch) > np.exp(-1)).mean() > _SEEN:
+            patches.append(patch)
+    return patches
