@@ -72,7 +72,7 @@ def values_of_other_folds(data: Whitened, index: Sequence[int], folds: NDArray[n
     values = np.zeros((len(folds), len(index)))
     for fold in np.unique(folds):
         inside = folds == fold
-        columns = np.concatenate([data.columns[run][:, index] for run in np.flatnonzero(inside)])
+        columns = np.concatenate([data.columns[run] for run in np.flatnonzero(inside).tolist()])[:, index]
         others = Given(whole - columns.T @ columns, data.scores[~inside][:, index], np.diag(whole))
         values[inside] = others.estimate(range(len(index)))[0]  # Eq. (1)
     return values
@@ -102,7 +102,10 @@ def held_out_squares(data: Whitened, index: Sequence[int], folds: NDArray[np.int
 
 def held_out_chi_square(data: Whitened, before: Sequence[int], after: Sequence[int], folds: NDArray[np.intp]) -> Array:
     """Chi-square difference (Z,) of each run between the columns ``before`` and ``after``, its fold held out."""
-    return held_out_squares(data, before, folds) - held_out_squares(data, after, folds)
+    every = sorted({*before, *after})
+    few, place = data.only(every), {column: row for row, column in enumerate(every)}
+    first, last = (held_out_squares(few, [place[each] for each in index], folds) for index in (before, after))
+    return first - last
 
 
 def is_confirmed(data: Whitened, before: Sequence[int], new: Sequence[int], folds: NDArray[np.intp]) -> bool:
