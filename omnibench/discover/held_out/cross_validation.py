@@ -83,7 +83,11 @@ def held_out_residuals(extended: Extended, folds: NDArray[np.intp]) -> list[Arra
 
     Nothing is fitted to the run itself, nor are its nuisances.
     """
-    values = values_of_other_folds(extended.data, range(len(extended.data.information)), folds)
+    return left_by(extended, values_of_other_folds(extended.data, range(len(extended.data.information)), folds))
+
+
+def left_by(extended: Extended, values: Array) -> list[Array]:
+    """Residuals (K, 3) of each run, to first order, by values (Z, p) of all columns, others for each run."""
     return [
         residuals - columns @ value
         for residuals, columns, value in zip(
@@ -94,7 +98,11 @@ def held_out_residuals(extended: Extended, folds: NDArray[np.intp]) -> list[Arra
 
 def held_out_squares(data: Whitened, index: Sequence[int], folds: NDArray[np.intp]) -> Array:
     """Chi-square (Z,) of each run by the columns ``index`` as fitted to all folds but the run's own."""
-    values = values_of_other_folds(data, index, folds)
+    return squares_left_by(data, index, values_of_other_folds(data, index, folds))
+
+
+def squares_left_by(data: Whitened, index: Sequence[int], values: Array) -> Array:
+    """Chi-square (Z,) of each run by values (Z, n) of the columns ``index``, others for each run."""
     of_runs = zip(data.residuals, data.columns, values, strict=True)
     left = [residuals - columns[:, list(index)] @ value for residuals, columns, value in of_runs]
     return np.array([float(np.square(of_run).sum()) for of_run in left])  # Eq. (2)
