@@ -23,7 +23,6 @@ from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
 
-_ALL = slice(None)
 _UNKNOWN_NOISE = NoiseEstimate(FIRST_NOISE, "within runs", 1, "")
 _TOGETHER = 30_000  # samples whose paths are computed at once (chosen)
 # Level of the tests for nuisances. It is strict, since other noise resembles them and what they explain is lost for
@@ -68,16 +67,28 @@ class Fit(TrajectoryFit):
         """The whitening of each run under the noise."""
         return whiteners(self.noise.noise, self.stamps)
 
-    def whitened(
-        self, columns: Sequence[Array], residuals: Sequence[Array] | None = None, runs: slice = _ALL
-    ) -> Whitened:
-        """Columns (K, 3, p) and residuals (K, 3) of some runs, whitened under the noise, nuisances eliminated.
+    def whitened(self, columns: Sequence[Array], residuals: Sequence[Array] | None = None) -> Whitened:
+        """Columns (K, 3, p) and residuals (K, 3) of every run, whitened under the noise, nuisances eliminated.
 
         residuals: the fit's nuisance-free ones where none are given.
         """
-        values = self.nuisance_free_residuals[runs] if residuals is None else residuals
-        deviations = self.nuisances.deviations[self.nuisances.estimated]
-        return whitened(values, columns, self.weightings[runs], self.estimated_slopes[runs], deviations)
+        return self.linearised(columns, self.weightings, residuals)
+
+    def whitened_steps(self, steps: Sequence[Array], residuals: Sequence[Array], runs: slice) -> Whitened:
+        """Columns and residuals (K, 3) of some runs as ``whitened`` has them.
+
+        steps (K, 3, p): differences of the columns from one stamp to the next, the first from 0.
+        """
+        weightings = self.weightings[runs]
+        of_steps = {id(weigh): weigh.of_differences for weigh in weightings}
+        return whitened(
+            residuals[runs],
+            steps,
+            weightings,
+            self.estimated_slopes[runs],
+            self.nuisances.deviations[self.nuisances.estimated],
+            [of_steps[id(weigh)] for weigh in weightings],
+        )
 
     @property
     def weighted_residuals(self) -> list[Array]:

@@ -143,8 +143,20 @@ def _place(paths: Paths) -> Iterator[Basis]:
 
     yield _of_effect(bent, "where on the map the reference is read", shifted, area)
     patches = list(_patches(places))
-    for shapes in patches:
-        yield _of_effect(patch, "a patch of the floor", _smooth(patch, shapes), shapes, tries=len(patches))
+
+    def of_patches(along: Paths) -> Array:
+        shares = np.concatenate([patch.shares(along.signals, shapes) for shapes in patches], axis=1)
+        return np.stack([along.respond(along.by_modes[mode], shares) for mode in patch.modes], axis=3)
+
+    for number, shapes in enumerate(patches):
+        columns = partial(_part_of, of_patches, number)
+        yield _of_effect(patch, "a patch of the floor", columns, shapes, tries=len(patches))
+
+
+def _part_of(columns: Columns, number: int, along: Paths) -> Array:
+    """The columns (S, 3, n) with this number of columns (S, 3, B, n) of several bases."""
+    part: Array = along.once(columns)[:, :, number]
+    return part
 
 
 def _patches(places: Array) -> Iterator[dict[str, float]]:
@@ -198,14 +210,17 @@ def _wheel_angle(paths: Paths) -> Iterator[Basis]:
         return
     effect = SmoothWheelAngle()
 
-    def of_wheels(along: Paths, harmonic: float) -> Array:
-        wheels = range(along.signals.rates.shape[1])
-        columns = [along.of_wheel(wheel, mean_waves(along.signals, wheel, harmonic)) for wheel in wheels]
-        return np.concatenate(columns, axis=2)
+    def of_waves(along: Paths) -> Array:
+        columns = []
+        for wheel in range(along.signals.rates.shape[1]):
+            waves = [mean_waves(along.signals, wheel, harmonic) for harmonic in HARMONICS]
+            slopes = along.of_wheel(wheel, np.concatenate(waves, axis=1))
+            columns.append(slopes.reshape(*slopes.shape[:2], len(HARMONICS), -1))
+        return np.concatenate(columns, axis=3)
 
-    for harmonic in HARMONICS:
+    for number, harmonic in enumerate(HARMONICS):
         words = f"the angle of the wheels, {harmonic:g} times a turn"
-        columns = partial(of_wheels, harmonic=harmonic)
+        columns = partial(_part_of, of_waves, number)
         yield _of_effect(effect, words, columns, {"harmonic": harmonic}, tries=len(HARMONICS))
 
 
@@ -270,14 +285,19 @@ def _command(paths: Paths, trajectories: Sequence[Trajectory]) -> Iterator[Basis
         [np.median(paths.signals.twists[order[low:high]], axis=0) for low, high in pairwise(ends.tolist())]
     )
 
-    def of_command(along: Paths, command: int) -> Array:
-        driven = commands[along.first : along.first + len(along.logs)] == command
-        if not driven.any():
-            return np.zeros((len(along.poses), 3, len(SmoothCommand.modes)))
-        return _in_modes(along, SmoothCommand.modes, driven[along.owner, None].astype(float))
+    def of_commands(along: Paths) -> Array:
+        of_runs = commands[along.first : along.first + len(along.logs)]
+        slopes = np.zeros((len(along.poses), 3, count, len(effect.modes)))
+        for mode, of_mode in enumerate(effect.modes):  # of a run, other commands have slopes of 0
+            of_all = along.respond(along.by_modes[of_mode], np.ones((len(along.owner), 1)))[..., 0]
+            driven = of_runs[along.run]
+            rows = np.flatnonzero(driven >= 0)
+            slopes[rows, :, driven[rows], mode] = of_all[rows]
+        return slopes
 
-    for command, (name, shapes) in enumerate(zip(names, _near_motions(paths, motions), strict=True)):
-        yield _of_effect(effect, f"the command {name}", partial(of_command, command=command), shapes, tries=count)
+    for number_of, (name, shapes) in enumerate(zip(names, _near_motions(paths, motions), strict=True)):
+        columns = partial(_part_of, of_commands, number_of)
+        yield _of_effect(effect, f"the command {name}", columns, shapes, tries=count)
 
 
 def _near_motions(paths: Paths, motions: Array) -> Iterator[dict[str, float]]:

@@ -11,7 +11,7 @@ sum over the samples is enough for each change.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import pairwise
@@ -36,10 +36,9 @@ from omnibench.robot.signals import Signals, signals_of_runs
 # changes.
 _STEP = 0.1  # share of the plausible range: step of a reference effect's parameter for its slope
 _LAST = 5  # samples at the end of a run whose mean velocity leads on to stamps after it, as WheelLog.continued does
-_NUMBERS = 8_000_000  # numbers that are summed at once: 64 MB
 # Samples in a part, a stamp counting as 8: a part's numbers stay in the processor's cache, and its columns are few
-# enough to be held as 64 bits, 25 MB of a thousand (chosen).
-_BLOCK, _STAMPS = 10_000, 8
+# enough to be held as 64 bits, 50 MB of a thousand (chosen).
+_BLOCK, _STAMPS = 30_000, 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,16 +117,6 @@ class Paths:
         direct = self.robot.drive.direct
         return self.respond(self.changes(self.matrix[:, wheel] if direct else self._by_rate[..., wheel]), changes)
 
-    def of_rates(self, change: Array) -> Array:
-        """Slopes (S, 3, 1) by a change (F, N) of all wheel rates."""
-        if self.robot.drive.direct:
-            return self.respond(self.changes(change @ self.matrix.T), None)
-        return self.respond(self.changes(np.einsum("fin,fn->fi", self._by_rate, change)), None)
-
-    def of_steering(self, change: Array) -> Array:
-        """Slopes (S, 3, 1) by a change (F, S) of all steering angles, rad."""
-        return self.respond(self.changes(np.einsum("fin,fn->fi", self._slopes[1], change)), None)
-
     @property
     def _by_rate(self) -> Array:
         return self._slopes[0]
@@ -140,9 +129,13 @@ class Paths:
 
     def of_velocity(self, change: Array) -> Array:
         """Slopes (S, 3, 1) by a change (F, 2) of the velocity in the reference's frame, m/s."""
+        return self._summed(self._in_world(change)[:, :, None])
+
+    def _in_world(self, change: Array) -> Array:
+        """Displacements (F, 3) in each sample by a change (F, 2) of the velocity in the reference's frame, m/s."""
         column = np.zeros((len(change), 3))
         column[:, :2] = change * self.signals.durations[:, None]
-        return self.respond(column, None)
+        return column
 
     def correction(self, effect: MotionEffect, values: Mapping[str, float]) -> Array:
         """Correction of every sample by an effect, (F, n) as its stage has it: of rates, angles, twist or velocity."""
@@ -155,15 +148,22 @@ class Paths:
         """Slopes (S, 3, 1) by the parameter called ``unit`` of an effect. values: its shapes, and 0 for all else."""
         if isinstance(effect, ReferenceEffect):
             return self._of_reference(effect, unit, values)
-        return self.of_correction(effect, self.correction(effect, {**values, unit: 1.0}))
+        return self.of_corrections(effect, [self.correction(effect, {**values, unit: 1.0})])
 
-    def of_correction(self, effect: MotionEffect, change: Array) -> Array:
-        """Slopes (S, 3, 1) by a correction (F, n) at the stage of an effect."""
+    def of_corrections(self, effect: MotionEffect, changes: Sequence[Array]) -> Array:
+        """Slopes (S, 3, J) by J corrections (F, n) at the stage of an effect."""
+        return self._summed(np.stack([self._by_stage(effect, change) for change in changes], axis=2))
+
+    def _by_stage(self, effect: MotionEffect, change: Array) -> Array:
+        """Changes (F, 3) of (z, theta) in each sample by a correction (F, n) at the stage of an effect."""
         if effect.stage == "body":
-            return self.of_body(change, np.ones((len(change), 1)))
+            return self.changes(self.tracked(change))
         if effect.stage == "world":
-            return self.of_velocity(change)
-        return self.of_steering(change) if effect.stage == "steering" else self.of_rates(change)
+            return self._in_world(change)
+        if effect.stage == "steering":
+            return self.changes(np.einsum("fin,fn->fi", self._slopes[1], change))
+        direct = self.robot.drive.direct
+        return self.changes(change @ self.matrix.T if direct else np.einsum("fin,fn->fi", self._by_rate, change))
 
     def _of_reference(self, effect: ReferenceEffect, unit: str, values: Mapping[str, float]) -> Array:
         step = _STEP * next(each.largest for each in effect.parameters(self.robot) if each.name == unit)
@@ -172,29 +172,24 @@ class Paths:
 
     def reported(self, effect: ReferenceEffect, values: Mapping[str, float]) -> Array:
         """Poses (S, 3) that the reference would report with an effect."""
-        reported = []
-        for log, path in zip(self.logs, self.ends, strict=True):
-            position, heading = effect.delays(log.stamps, values)
-            times = np.concatenate([[0.0], log.times])
-            poses = np.column_stack(
-                [
-                    *(_along(log.stamps - position, times, path[:, axis]) for axis in (0, 1)),
-                    _along(log.stamps - heading, times, path[:, 2]),
-                ]
-            )
-            reported.append(effect.reported(poses, log.start, values))
-        return np.concatenate(reported)
+        delays = [effect.delays(log.stamps, values) for log in self.logs]
+        samples, ends = RunSamples.of([log.times for log in self.logs]), np.concatenate(self.ends)
+        of_position, of_heading = (
+            _along(samples, ends, [log.stamps - delay for log, delay in zip(self.logs, of_runs, strict=True)])
+            for of_runs in zip(*delays, strict=True)
+        )
+        taken = np.column_stack([of_position[:, :2], of_heading[:, 2]])
+        runs = zip(self.logs, self.parts, strict=True)
+        return np.concatenate([effect.reported(taken[part], log.start, values) for log, part in runs])
 
-    def respond(self, column: Array, shares: Array | None) -> Array:
+    def respond(self, column: Array, shares: Array) -> Array:
         """Slopes (S, 3, J) by column (F, 3), changes of (z, theta) in each sample, times shares (F, J)."""
-        if shares is None:
-            return self._summed(column[:, :, None])
-        width = max(1, _NUMBERS // (3 * len(column)))
-        blocks = [
-            self._summed(column[:, :, None] * shares[:, None, low : low + width])
-            for low in range(0, shares.shape[1], width)
-        ]
-        return blocks[0] if len(blocks) == 1 else np.concatenate(blocks, axis=2)
+        steps, sums = np.zeros((len(self.poses), 3, shares.shape[1])), self._sums.copy()
+        for axis in range(3):
+            if column[:, axis].any():
+                sums.data = self._sums.data * column[sums.indices, axis]
+                steps[:, axis] = sums @ shares
+        return self._from_steps(steps)
 
     def changes(self, twist: Array) -> Array:
         """Integrals (F, 3) of exp(i theta) dv - i z dw and of dw over each sample. twist: changes (3,) or (F, 3)."""
@@ -205,6 +200,16 @@ class Paths:
         changes[:, 1] = sine * forward + cosine * left - east * turn
         changes[:, 2] = self.signals.durations * turn
         return changes
+
+    def once(self, columns: Callable[[Paths], Array]) -> Array:
+        """Columns along these paths, of which several bases have a part; they are computed once."""
+        if columns not in self._made:
+            self._made[columns] = columns(self)
+        return self._made[columns]
+
+    @cached_property
+    def _made(self) -> dict[Callable[[Paths], Array], Array]:
+        return {}
 
     @cached_property
     def by_modes(self) -> dict[str, Array]:
@@ -222,7 +227,11 @@ class Paths:
 
     def _summed(self, changes: Array) -> Array:
         """Slopes (S, 3, J) by changes (F, 3, J) of (z, theta) in each sample."""
-        steps = np.asarray(self._sums @ changes.reshape(len(changes), -1)).reshape(-1, *changes.shape[1:])
+        steps = np.asarray(self._sums @ changes.reshape(len(changes), -1))
+        return self._from_steps(steps.reshape(-1, *changes.shape[1:]))
+
+    def _from_steps(self, steps: Array) -> Array:
+        """Slopes (S, 3, J) by the changes (S, 3, J) of (z, theta) since the stamp before, which are overwritten."""
         np.cumsum(steps, axis=0, out=steps)
         firsts = [part.start for part in self.parts[1:]]
         before = np.concatenate([np.zeros((1, *steps.shape[1:])), steps[[first - 1 for first in firsts]]])
@@ -283,7 +292,7 @@ def make_paths(
     edges = np.cumsum([0, *(len(log.stamps) for log in logs)])
     parts = tuple(slice(int(low), int(high)) for low, high in pairwise(edges))
     middle, ends = path.middles, path.ends
-    poses = np.concatenate([_poses_along(log, path) for log, path in zip(logs, ends, strict=True)])
+    poses = _along(samples, np.concatenate(ends), [log.stamps for log in logs])
     run = np.repeat(np.arange(len(logs)), np.diff(edges))
     from_start = middle[:, :2] - starts[samples.run, :2]
     turns = np.column_stack([np.cos(middle[:, 2]), np.sin(middle[:, 2]), from_start]) * signals.durations[:, None]
@@ -311,21 +320,25 @@ def _needs(robot: Robot) -> frozenset[str]:
     return frozenset().union(*(effect.needs for effect in trial if effect.applies(robot)))
 
 
-def _along(times: Array, ends: Array, values: Array) -> Array:
-    """A coordinate of a path at any times: at rest before the start, straight on after the last sample."""
-    along: Array = np.interp(times, ends, values)
-    late = times > ends[-1]
-    if late.any():
-        back = max(len(ends) - 1 - _LAST, 0)
-        slope = (values[-1] - values[back]) / (ends[-1] - ends[back])
-        along[late] = values[-1] + slope * (times[late] - ends[-1])
-    return along
+def _along(samples: RunSamples, ends: Array, times: Sequence[Array]) -> Array:
+    """Poses (S, 3) of each run at times (K,), s: at rest before its start, straight on after its last sample.
 
-
-def _poses_along(log: WheelLog, path: Array) -> Array:
-    """Poses (S, 3) at a log's stamps, by straight lines between the poses (F + 1, 3) of its path."""
-    times = np.concatenate([[0.0], log.times])
-    return np.column_stack([_along(log.stamps, times, path[:, axis]) for axis in range(3)])
+    ends (F + Z, 3): poses at the start and at the end of each sample of each run, between which they lie on lines.
+    """
+    sample, share = samples.locate(times)
+    wanted, run = np.concatenate(times), samples.run[sample]
+    before = ends[sample + run]
+    poses: Array = before + share[:, None] * (ends[sample + run + 1] - before)
+    number = np.arange(len(samples.edges) - 1)
+    first, last = samples.edges[:-1] + number, samples.edges[1:] + number  # of the ends of each run
+    back = np.maximum(last - _LAST, first)
+    end = samples.times[samples.edges[1:] - 1]
+    since = np.where(back > first, samples.times[back - number - 1], 0.0)
+    mean = (ends[last] - ends[back]) / (end - since)[:, None]
+    late = np.flatnonzero(wanted > end[run])
+    passed = wanted[late] - end[run[late]]
+    poses[late] = ends[last[run[late]]] + mean[run[late]] * passed[:, None]
+    return poses
 
 
 def _sums(logs: Sequence[WheelLog]) -> csr_array:

@@ -16,7 +16,7 @@ from omnibench.discover.regressors.covariate_bases import Columns, generic_bases
 from omnibench.discover.regressors.paths import Paths
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import Effect, MotionEffect, Parameter, ReferenceEffect
-from omnibench.robot.effects.forms import Forms, forms_of
+from omnibench.robot.effects.forms import Forms, form_profile, forms_of
 from omnibench.robot.kinematics import Array, Robot
 
 # Shapes of an effect: with more of them, one comes near enough to any other form. tests/benchmarks/constants.py varies
@@ -110,15 +110,28 @@ def _of_effect(
     effect: MotionEffect | ReferenceEffect, parameters: Sequence[Parameter], values: Mapping[str, float]
 ) -> Columns:
     """Slopes by some parameters of an effect, the values of all others given."""
-    return lambda along: np.concatenate([along.of_effect(effect, each.name, values) for each in parameters], axis=2)
+
+    def columns(along: Paths) -> Array:
+        if isinstance(effect, ReferenceEffect):
+            return np.concatenate([along.of_effect(effect, each.name, values) for each in parameters], axis=2)
+        units = [along.correction(effect, {**values, each.name: 1.0}) for each in parameters]
+        return along.of_corrections(effect, units)
+
+    return columns
 
 
 def _of_forms(effect: MotionEffect | ReferenceEffect, family: Forms | None, values: Mapping[str, float]) -> Columns:
     """Slopes by the parameters of an effect's forms, if it has any."""
-    if family is None:
+    if family is None or not isinstance(effect, MotionEffect):
         return _none
-    zero = dict(values) | dict.fromkeys((each.name for each in family.parameters), 0.0) | dict(family.scales)
-    return _of_effect(effect, family.parameters, zero)
+    named = [each.name.partition(":")[::2] for each in family.parameters]  # what varies, and with what
+
+    def columns(along: Paths) -> Array:
+        units = {name: along.correction(effect, {**values, name: 1.0}) for name, _ in named}
+        profiles = {key: form_profile(key, effect, along.signals, family.scales) for _, key in named}
+        return along.of_corrections(effect, [units[name] * profiles[key] for name, key in named])
+
+    return columns
 
 
 def _of_matrix(paths: Paths) -> Array:

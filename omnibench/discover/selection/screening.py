@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,8 +77,11 @@ def significance_left(
     """Significance of the generic bases beyond all that an extended model holds, smooth terms among it."""
     fit, groups = extended.fit, _groups_again(extended, screening, without)
     data = _whitened(fit, groups, fit.nuisance_free_residuals, extended.columns)
-    width = len(data.information) - extended.columns[0].shape[2]
-    return significance_of(data, range(width, len(data.information)), groups.bases, rng)
+    width = extended.columns[0].shape[2]
+    first = groups.bases[0].index[0] if groups.bases else 0
+    bases = [replace(group, index=tuple(width + column - first for column in group.index)) for group in groups.bases]
+    found = significance_of(data, range(width), bases, rng)
+    return replace(found, groups=groups.bases)
 
 
 def _groups_again(extended: Extended, earlier: Screening, without: Sequence[str]) -> Groups:
@@ -97,14 +100,19 @@ def _screened(fit: Fit, residuals: Sequence[Array], groups: Groups) -> Screening
     return Screening(groups, data, folds_of_repetitions(fit.runs), EncoderQuantisation(fit, data))
 
 
-def _whitened(fit: Fit, groups: Groups, residuals: Sequence[Array], beside: Sequence[Array] | None = None) -> Whitened:
-    """The groups' columns and residuals (K, 3), whitened, some runs at a time. beside (K, 3, n): further columns."""
+def _whitened(fit: Fit, groups: Groups, residuals: Sequence[Array], fitted: Sequence[Array] | None = None) -> Whitened:
+    """The groups' columns and residuals (K, 3), whitened, some runs at a time.
+
+    fitted (K, 3, n): of a model; then its columns and those of the generic bases alone.
+    """
     left, columns, scores, information = list[Array](), ColumnStore(), list[Array](), np.zeros(())
+    first = groups.bases[0].index[0] if groups.bases else None
     for runs, steps in groups.columns.blocks():
-        values = [np.cumsum(of_run, axis=0, dtype=float) for of_run in steps]
-        if beside is not None:
-            values = [np.concatenate(both, axis=2) for both in zip(values, beside[runs], strict=True)]
-        white = fit.whitened(values, residuals[runs], runs)
+        if fitted is not None:
+            of_model = [np.diff(of_run, axis=0, prepend=0.0) for of_run in fitted[runs]]
+            of_bases = [of_run[..., first:] for of_run in steps]
+            steps = [np.concatenate(both, axis=2) for both in zip(of_model, of_bases, strict=True)]
+        white = fit.whitened_steps(steps, residuals, runs)
         left += white.residuals
         scores.append(white.scores)
         information = information + white.information

@@ -71,10 +71,18 @@ class Whitener:
 
     def __call__(self, residuals: Array) -> Array:
         """Whitened residuals, or derivatives of residuals: (K, 3) or (K, 3, n) to the same shape."""
-        differences = _differences(residuals)
-        split = 2 * differences.shape[1] // 3
-        white = [self._position.whiten(differences[:, :split]), self._heading.whiten(differences[:, split:])]
-        return np.concatenate(white, axis=1).reshape(residuals.shape)
+        return self.of_differences(_differences(residuals).reshape(residuals.shape))
+
+    def of_differences(self, differences: Array) -> Array:
+        """Whitened residuals (K, 3) or (K, 3, n) by their differences from one stamp to the next, the first from 0.
+
+        These are overwritten.
+        """
+        flat = differences.reshape(len(differences), -1)
+        split = 2 * flat.shape[1] // 3
+        for factor, part in ((self._position, flat[:, :split]), (self._heading, flat[:, split:])):
+            factor.whiten_in_place(part)
+        return differences
 
     def transposed(self, white: Array) -> Array:
         """The transposed whitening of whitened values (K, 3, n): the inverse covariance of differences times these."""
@@ -169,19 +177,21 @@ class _Factor:
 
     def whiten(self, differences: Array) -> Array:
         """Independent values (K, n) of differences (K, n) between successive residuals, the first from 0."""
-        if not differences.size:
-            return differences  # LAPACK would write beyond its end
-        if differences.shape[1] < _WIDE:
-            whitened, _ = dtbtrs(self._factor, differences, uplo="L")
-            return whitened
-        diagonal, below = self._factor
-        whitened, carried = np.empty_like(differences), np.empty_like(differences[0])
-        np.divide(differences[0], diagonal[0], out=whitened[0])
-        for row in range(1, len(differences)):
-            np.multiply(whitened[row - 1], below[row - 1], out=carried)
-            np.subtract(differences[row], carried, out=whitened[row])
-            whitened[row] /= diagonal[row]
+        whitened, _ = dtbtrs(self._factor, differences, uplo="L")
         return whitened
+
+    def whiten_in_place(self, differences: Array) -> None:
+        """Replace differences (K, n) by what ``whiten`` makes of them."""
+        if not differences.size:
+            return  # LAPACK would write beyond the end of nothing
+        if differences.shape[1] < _WIDE:
+            differences[:] = self.whiten(differences)
+            return
+        diagonal, below = self._factor
+        differences[0] /= diagonal[0]
+        for row in range(1, len(differences)):
+            differences[row] -= below[row - 1] * differences[row - 1]
+            differences[row] /= diagonal[row]
 
     def transposed(self, white: Array) -> Array:
         """The inverse covariance of the differences times what was whitened to (K, ...)."""

@@ -103,7 +103,8 @@ def weighed_together(
     values (K, 3, n): of every run.
     """
     for members in grouped([id(weigh) for weigh in weightings]):
-        together, columns = np.stack([values[index] for index in members], axis=2), values[members[0]].shape[2]
+        columns = values[members[0]].shape[2]
+        together = np.stack([values[index] for index in members], axis=2, dtype=float)
         white = weightings[members[0]](together.reshape(*together.shape[:2], -1))
         of_runs = white.reshape(*white.shape[:2], len(members), columns)
         yield members, of_runs.transpose(2, 0, 1, 3).reshape(len(members), white.shape[0] * white.shape[1], columns)

@@ -151,12 +151,18 @@ def _contrasts(runs: list[tuple[Array, Array]]) -> Iterator[Difference]:
     Each compares a run with the mean of those that last longer, so that no run is cut to the shortest of all.
     """
     runs = sorted(runs, key=lambda run: -run[0][-1])
-    for count in range(1, len(runs)):
-        stamps, values = common_poses(runs[: count + 1])
-        if len(stamps):
-            residuals, slopes = values[..., 0], values[..., 1:]
-            contrast = (residuals[:-1].mean(axis=0) - residuals[-1]) * np.sqrt(count / (count + 1))
-            yield Difference(stamps, contrast, slopes.mean(axis=0))
+    # Stamps that runs share, and the sum of these runs' values: many runs have few different stamps.
+    sums: dict[bytes, tuple[Array, Array]] = {}
+    for count, (stamps, values) in enumerate(runs):
+        key = stamps.tobytes()
+        if count:
+            grid, chosen = _common([*(times for times, _ in sums.values()), stamps])
+            before = np.sum([total[index] for (_, total), index in zip(sums.values(), chosen, strict=False)], axis=0)
+            own = values[chosen[-1]]
+            if len(grid):
+                contrast = (before[..., 0] / count - own[..., 0]) * np.sqrt(count / (count + 1))
+                yield Difference(grid, contrast, (before + own)[..., 1:] / (count + 1))
+        sums[key] = (stamps, sums[key][1] + values if key in sums else values)
 
 
 def common_poses(runs: list[tuple[Array, Array]]) -> tuple[Array, Array]:
@@ -164,13 +170,19 @@ def common_poses(runs: list[tuple[Array, Array]]) -> tuple[Array, Array]:
 
     Interpolating would average two poses, which have less white noise than one.
     """
-    end = min(stamps[-1] for stamps, _ in runs)
-    coarsest = min((stamps for stamps, _ in runs), key=lambda stamps: int((stamps <= end).sum()))
+    grid, chosen = _common([stamps for stamps, _ in runs])
+    return grid, np.array([values[index] for (_, values), index in zip(runs, chosen, strict=True)])
+
+
+def _common(stamps: Sequence[Array]) -> tuple[Array, list[NDArray[np.intp]]]:
+    """The stamps that the runs with such stamps have in common, and the index of the nearest one in each."""
+    end = min(times[-1] for times in stamps)
+    coarsest = min(stamps, key=lambda times: int((times <= end).sum()))
     grid = coarsest[coarsest <= end]
-    chosen = np.array([_nearest(stamps, grid) for stamps, _ in runs], dtype=np.intp)
+    chosen = [_nearest(times, grid) for times in stamps]
     # A pose is used for one stamp only: using it twice would correlate the white noise.
     fresh = (np.diff(chosen, axis=1, prepend=-1) > 0).all(axis=0)
-    return grid[fresh], np.array([values[index[fresh]] for (_, values), index in zip(runs, chosen, strict=True)])
+    return grid[fresh], [index[fresh] for index in chosen]
 
 
 def _nearest(stamps: Array, grid: Array) -> NDArray[np.intp]:

@@ -66,27 +66,29 @@ def whitened(
     weightings: Sequence[Weighting],
     slopes: Sequence[Array],
     deviations: Array,
+    of_columns: Sequence[Weighting] | None = None,
 ) -> Whitened:
     """Whiten residuals (K, 3) and columns (K, 3, p) of every run.
 
     slopes (K, 3, m): derivatives of each run's poses by its nuisances. deviations (m,): their standard deviations, > 0;
-    they count as noise that all poses of a run share.
+    they count as noise that all poses of a run share. of_columns: weightings of the columns, if these are given in
+    another way than the residuals.
     """
     count, width = len(residuals), columns[0].shape[2]
     beside = [np.concatenate([each[..., None], extra], axis=2) for each, extra in zip(residuals, slopes, strict=True)]
     free_residuals, free_columns = [np.empty(0)] * count, [np.empty((0, width))] * count
     information, scores = np.zeros((width, width)), np.empty((count, width))
-    runs = zip(weighed_together(weightings, beside), weighed_together(weightings, columns), strict=True)
-    for (members, white), (_, of_columns) in runs:
-        of_residuals = white[..., :1]
+    weighed = weighed_together(weightings, beside), weighed_together(of_columns or weightings, columns)
+    for (members, white), (_, fitted) in zip(*weighed, strict=True):
+        left = white[..., :1]
         if len(deviations):
             nuisances = white[..., 1:] * deviations
-            of_residuals, of_columns = without(of_residuals, nuisances), without(of_columns, nuisances)
-        flat = np.concatenate(of_columns)
+            left, fitted = without(left, nuisances), without(fitted, nuisances)
+        flat = fitted.reshape(fitted.shape[0] * fitted.shape[1], width)
         information += flat.T @ flat
-        scores[list(members)] = (of_residuals.swapaxes(1, 2) @ of_columns)[:, 0]
-        for index, left, fitted in zip(members, of_residuals, of_columns, strict=True):
-            free_residuals[index], free_columns[index] = left[:, 0], fitted
+        scores[list(members)] = (left.swapaxes(1, 2) @ fitted)[:, 0]
+        for index, of_residuals, of_run in zip(members, left, fitted, strict=True):
+            free_residuals[index], free_columns[index] = of_residuals[:, 0], of_run
     return Whitened(tuple(free_residuals), tuple(free_columns), information, scores)
 
 

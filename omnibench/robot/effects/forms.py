@@ -135,7 +135,7 @@ def correction_of(effect: MotionEffect, signals: Signals, values: Values) -> Arr
     correction = effect.correction(signals, textbook)
     for key, weights in _forms_given(values).items():
         changed = {each.name: weights.get(each.name, 0.0) for each in _linear(effect, signals.robot)}
-        correction = correction + effect.correction(signals, textbook | changed) * _profile(
+        correction = correction + effect.correction(signals, textbook | changed) * form_profile(
             key, effect, signals, values
         )
     return correction
@@ -204,8 +204,8 @@ def _forms_given(values: Values) -> dict[str, dict[str, float]]:
     return given
 
 
-def _profile(key: str, effect: MotionEffect, signals: Signals, values: Values) -> Array:
-    """By what the correction is multiplied, (F, 1) or (F, N): x^n - m_n of Eq. (1), or of Eq. (2)."""
+def form_profile(key: str, effect: MotionEffect, signals: Signals, values: Values) -> Array:
+    """By what a form multiplies the correction, (F, 1) or (F, N): x^n - m_n of Eq. (1), or of Eq. (2)."""
     covariate, _, last = key.partition(":")
     if covariate == "wheel":
         names = signals.robot.wheel_names
