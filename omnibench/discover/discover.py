@@ -19,6 +19,7 @@ from omnibench.discover.conclude import Findings, conclude
 from omnibench.discover.covariate_dependence import covariate_dependences, without_smooth_term
 from omnibench.discover.fitting.extend import Extended, extend, fit_matrix, without_effects
 from omnibench.discover.fitting.model_fit import Fit
+from omnibench.discover.fitting.windows import in_windows
 from omnibench.discover.held_out.cross_validation import random_folds_of_repetitions
 from omnibench.discover.held_out.gaps import compare_held_out
 from omnibench.discover.held_out.sessions import compare_with_validation, eq6_with_changes
@@ -81,7 +82,7 @@ def discover_effects(
     began, progress = time.monotonic(), Stages(watch)
     check_names(without)
     rng = np.random.default_rng(seed)
-    runs = usable_runs(dataset.split("train"))
+    runs = usable_runs(in_windows([run for run in dataset.split("train") if run.has_poses]) or dataset.split("train"))
     start = _start_matrix(dataset, calibration)
 
     progress.begin("fitting the plain matrix")

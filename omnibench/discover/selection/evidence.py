@@ -94,12 +94,12 @@ _PRIOR = float(np.log(20))  # odds of 1 to 20 that an effect is missing
 _LEFT_RIGHT = 0.04
 # u', when forms may differ a little: the right names of 18 sets of 20 leave nothing, the others 0.006 and 0.016.
 _BEYOND_RIGHT = 0.01
-_FORMS_RIGHT, _BEYOND_FORMS = 0.15, 0.02
+_FORMS_RIGHT, _BEYOND_FORMS = 0.06, 0.003
 _MOST_ODDS = 10.0  # F_max: below 1 / u, so that what is left beside the names as they are can count for more
 _CANCELLING = 0.45  # share of Eq. (10): 1.0 or more of right pairs, 0.2 to 0.3 of the best wrong ones in 4 sets of 24
 _SURELY = 3.0  # standard errors: a normal number is below minus three of them in one of 740 cases
 _IMITATION = 1.0  # odds, at most, of effects that cancel each other or have an impossible sign: even
-_ODDS_OF_ONE = 9.0  # odds(1): with 0.4 to 42 all right names of the study are sure, and no wrong one
+_ODDS_OF_ONE = 5.0  # odds(1): with 0.4 to 42 all right names of the study are sure, and no wrong one
 _ODDS_OF_TWO = 1.0  # odds(2): with 0.3 to 8 all right names of the study are sure, and no wrong one
 _WINDOW = 8.0  # standard deviations about what is left that are integrated over: beyond them is 1e-15 of the integral
 
