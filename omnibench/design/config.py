@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 from pydantic import Discriminator, Field, FiniteFloat, Tag, field_validator, model_validator
@@ -14,23 +13,15 @@ from omnibench.errors import UnknownNameError
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Robot
 from omnibench.robot.odometry import Integration
-from omnibench.simulate.command import Command, beyond_steering, within_steering
+from omnibench.simulate.command import beyond_steering, within_steering
 from omnibench.simulate.config import MotionGrid, SteeringLimit
+from omnibench.simulate.driving.timed_command import TimedCommand
 from omnibench.words import plural
 
 # They guard memory against slips of the pen and decide nothing else: so many samples of four wheels take 640 MB.
 _MOST_COMMANDS = 5000  # commands of a set, at most
 _MOST_SAMPLES = 2e7  # wheel samples and poses of a set's commands together, at most
 Name = Annotated[str, Field(min_length=1, max_length=60)]
-
-
-@dataclass(frozen=True)
-class TimedCommand:
-    """A motion command with its duration, s. ramp: time at its start and its end in which the speed changes, s."""
-
-    command: Command
-    duration: float
-    ramp: float = 0.0
 
 
 class CommandGrid(MotionGrid):
