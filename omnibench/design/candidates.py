@@ -25,9 +25,9 @@ from omnibench.simulate.chain.robot_config import RobotConfig
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.driving.designed_run import run_as_designed
 from omnibench.simulate.driving.timed_command import TimedCommand
-from omnibench.simulate.flower import duration_of
+from omnibench.simulate.flower import planned_commands
 from omnibench.simulate.source import ComparedData
-from omnibench.words import noun_for
+from omnibench.words import noun_for, plural
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,12 +196,13 @@ def candidates_of_simulation(
 
     ConfigError: the commands leave part of the matrix undetermined, there is one only, or the noise is zero.
     """
-    ramp = config.commands.ramp
-    commands = tuple(
-        TimedCommand(command, duration_of(command, config.train, config.commands), ramp) for command in config.driven
-    )
+    planned = planned_commands(config, config.train)
     periods = (config.sample_period, config.pose_period)
-    _, candidates = driven_as_designed(config.robot, integration, periods, {name: commands})
+    pool, candidates = driven_as_designed(config.robot, integration, periods, {name: [each.timed for each in planned]})
+    baseline = np.zeros(len(candidates), dtype=np.intp)
+    for each in planned:
+        baseline[pool[each.timed]] += each.repetitions
+    often = f" x {baseline[0]}" if len(set(baseline)) == 1 else f", {plural(int(baseline.sum()), 'run')}"
     scale = config.train.noise_scale
     noise = Noise(**{kind: scale * getattr(config.noise, kind) for kind in Noise.model_fields})
     return checked_pool(
@@ -213,8 +214,8 @@ def candidates_of_simulation(
             integration=integration,
             candidates=candidates,
             sets={name: tuple(range(len(candidates)))},
-            baseline=np.full(len(candidates), config.repetitions),
-            baseline_name=f"{len(candidates)} {noun_for(len(candidates), 'command')} of {name} x {config.repetitions}",
+            baseline=baseline,
+            baseline_name=f"{len(candidates)} {noun_for(len(candidates), 'command')} of {name}{often}",
             noise=noise,
             noise_source="assumed: what the config simulates for training",
             simulated=True,
