@@ -5,8 +5,8 @@
 Where a set of 180 runs of one speed ends in a class, the runs that are proposed are driven by the same hidden robot,
 and what is discovered in both recordings together is compared with the chance that was promised; so is what as many
 more minutes of the recorded commands tell. Sets and further runs are made by tests/benchmarks/hidden, without the code
-of omnibench. With --omni3 the recording is INESC TEC's robot on circles, and truth is each member of its class in turn, as
-fitted: its recorded wheels are driven again, and the proposed runs are simulated, by omnibench itself.
+of omnibench. With --omni3 the recording is INESC TEC's robot on circles, and truth is each member of its class in turn,
+as fitted: its recorded wheels are driven again, and the proposed runs are simulated, by omnibench itself.
 One line of JSON a set: run again with the same file, and it goes on where it was. Seeds from 2000 on are for tuning.
 """
 
