@@ -203,7 +203,7 @@ class Extrapolation:
 
 @dataclass(frozen=True)
 class ExperimentCommand:
-    """A command of an experiment, in words. seconds: of one run, without placing the robot."""
+    """A command of an experiment, in words. runs: how often it is driven. seconds: of one run."""
 
     motion: str
     runs: int

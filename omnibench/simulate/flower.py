@@ -18,12 +18,11 @@ from omnibench.simulate.driving.timed_command import TimedCommand
 from omnibench.simulate.pose_noise import reference_noise
 from omnibench.simulate.simulation import Simulation
 from omnibench.simulate.truth import TrueRobot, true_record
-from omnibench.simulate.variation import Variation
+from omnibench.simulate.variation import STEADY, Variation
 from omnibench.words import plural
 
 _MANY = 1000  # runs whose checks and tables take more than about a second; chosen
 PAUSE = 10.0  # s between runs
-_STEADY = Variation()
 C = TypeVar("C")
 
 
@@ -89,7 +88,9 @@ def planned_commands(config: FlowerConfig, session: Session) -> list[PlannedComm
     if not chosen.listed:
         seconds = [session.distance / each.speed if each.speed else chosen.turn_duration for each in driven]
         return [
-            PlannedCommand(each.name, TimedCommand(each, driving + chosen.ramp, chosen.ramp), config.repetitions)
+            PlannedCommand(
+                each.name, TimedCommand(each, driving + chosen.ramp, chosen.ramp, chosen.variation), config.repetitions
+            )
             for each, driving in zip(driven, seconds, strict=True)
         ]
     planned = []
@@ -103,12 +104,12 @@ def planned_commands(config: FlowerConfig, session: Session) -> list[PlannedComm
         if listed.heading_deg is not None:
             name, heading = f"{name}_h{listed.heading_deg:g}", math.radians(listed.heading_deg)
         if command in driven:
-            timed = TimedCommand(command, listed.duration, chosen.ramp)
+            timed = TimedCommand(command, listed.duration, chosen.ramp, chosen.variation)
             planned.append(PlannedCommand(name, timed, listed.repetitions, heading))
     return planned
 
 
-def commanded_rates(robot: Robot, command: Command, times: Array, ramp: float, variation: Variation = _STEADY) -> Array:
+def commanded_rates(robot: Robot, command: Command, times: Array, ramp: float, variation: Variation = STEADY) -> Array:
     """Mean wheel rates (F, N) by the design values, rad/s, in samples that end at times (F,), s.
 
     ramp: time in which the rates rise and fall linearly, s.
@@ -121,7 +122,7 @@ def commanded_rates(robot: Robot, command: Command, times: Array, ramp: float, v
     return rates if not ramp else rates * _mean_shares(times, ramp)[:, None]
 
 
-def commanded_steering(robot: Robot, command: Command, times: Array, variation: Variation = _STEADY) -> Array | None:
+def commanded_steering(robot: Robot, command: Command, times: Array, variation: Variation = STEADY) -> Array | None:
     """Steering angles (F, S) by the design values at times (F,), rad, s; None for robots without any."""
     if robot.drive.direct:
         return None
@@ -130,7 +131,7 @@ def commanded_steering(robot: Robot, command: Command, times: Array, variation: 
     return variation.wheels(robot, command, times, ends=True)[1]
 
 
-def true_steering(robot: Robot, run: Trajectory, variation: Variation = _STEADY) -> Array | None:
+def true_steering(robot: Robot, run: Trajectory, variation: Variation = STEADY) -> Array | None:
     """Steering angles (F, S), rad, that exact encoders measure in a simulated run; None for robots without any."""
     chosen = straight_and_pivot(robot)
     pivot = (0.0, 0.0) if chosen is None else chosen[1]
@@ -183,7 +184,7 @@ def _drive(
     timed = planned.command.timed
     command, ramp = timed.command, timed.ramp
     times, pose_times = stamps_of_run(timed.duration, config.sample_period, config.pose_period)
-    variation = config.commands.variation
+    variation = timed.variation
     targets = commanded_rates(config.robot, command, times, ramp, variation)
     start = _start(config, planned.command.heading, rng)
     driven, steering = robot.driven(times, targets), commanded_steering(config.robot, command, times, variation)

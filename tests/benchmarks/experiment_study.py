@@ -1,6 +1,6 @@
 """Study of the experiments that ``omnibench discover`` proposes: do they tell a class of effects apart?
 
-    python tests/benchmarks/experiment_study.py --out experiments.jsonl [--seeds 10] [--omni3] [--table]
+    python tests/benchmarks/experiment_study.py --out experiments.jsonl [--seeds 10] [--omni3 FOLDER] [--table]
 
 Where a set of 180 runs of one speed ends in a class, the runs that are proposed are driven by the same hidden robot,
 and what is discovered in both recordings together is compared with the chance that was promised; so is what as many
@@ -13,7 +13,6 @@ One line of JSON a set: run again with the same file, and it goes on where it wa
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -36,6 +35,7 @@ from omnibench.robot.calibration import EffectTerm
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.like import simulate_like
 from omnibench.simulate.simulate import simulate_dataset
+from omnibench.slam.import_dataset import import_dataset
 
 SURE = 0.95  # weight of a sure name
 LEVELS = (1000.0, 300.0)  # non-centralities of the hidden effect in the recorded runs
@@ -229,10 +229,8 @@ def _hidden(arguments: argparse.Namespace, done: set[str]) -> Iterator[Result]:
 
 
 def _omni3(arguments: argparse.Namespace, done: set[str]) -> Iterator[Result]:
-    sys.path.append(str(Path(__file__).resolve().parents[1]))
-    from real_recordings import omni3
-
-    yield from omni3_sets(omni3(), range(arguments.first_seed, arguments.first_seed + arguments.seeds), done)
+    dataset = import_dataset("optiodom", arguments.omni3)
+    yield from omni3_sets(dataset, range(arguments.first_seed, arguments.first_seed + arguments.seeds), done)
 
 
 def _read(path: Path) -> list[Result]:
@@ -248,7 +246,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--levels", type=float, nargs="+", default=list(LEVELS))
-    parser.add_argument("--omni3", action="store_true", help="omni3's circles in the place of hidden sets")
+    parser.add_argument("--omni3", type=Path, metavar="FOLDER", help="omni3's recordings, in the place of hidden sets")
     parser.add_argument("--table", action="store_true", help="print the table of what is there")
     return parser.parse_args()
 

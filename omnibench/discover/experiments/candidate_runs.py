@@ -15,9 +15,11 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.signals import of_centre
 from omnibench.robot.training_domain import motions_of
+from omnibench.simulate.command import is_within
 from omnibench.simulate.driving.designed_run import run_as_designed
 from omnibench.simulate.driving.drivable_commands import DrivableCommands, Shapes
 from omnibench.simulate.driving.timed_command import TimedCommand
+from omnibench.simulate.variation import Variation
 
 SESSION = "experiment"  # name of the session in which the new runs are driven
 PLACING = 15.0  # s before a run, in which the robot is put into its place: a person walks a few metres (chosen)
@@ -29,6 +31,7 @@ _OFTEN = 0.99  # share of the samples that are no faster than what the robot is 
 _LEAST_FLOOR = 1.0  # m, side of the floor that is free in any case: the robot stands somewhere (chosen)
 _LEAST_STEERING = math.radians(10.0)  # of a robot that only ever drove straight on (chosen)
 _TURNING = 1.0  # rad/s: at most, where the robot never turned as fast (chosen)
+_WEAVE, _WEAVE_PERIOD = 0.3, 3.0  # rad/s and s, by which the rate of turn swings: gear play of a degree shows (chosen)
 _COARSE = 0.05  # s: shorter samples tell the same of constant commands
 _STAMPS = 80  # reference poses of a run that a fit uses, at most: see fit/least_squares/usable_runs.py
 
@@ -54,8 +57,15 @@ def candidate_runs(fit: Fit, effects: Sequence[Effect]) -> tuple[CandidateRun, .
     """
     turned = any(effect.shows_in in ("heading", "place") for effect in effects)
     headings: Sequence[float | None] = _HEADINGS if turned else (None,)
-    commands = dict.fromkeys(_drivable(fit))
+    commands = dict.fromkeys(_drivable(fit, variation_for(effects)))
     return tuple(CandidateRun(timed, heading, _run(fit, timed, heading)) for timed in commands for heading in headings)
+
+
+def variation_for(effects: Sequence[Effect]) -> Variation:
+    """How commands vary within a run: steering that turns shows what it does, and casters that swing round."""
+    steering = any(effect.stage == "steering" or "steering_side" in effect.needs for effect in effects)
+    casters = any("caster_rates" in effect.needs for effect in effects)
+    return Variation(weave=_WEAVE if steering else 0.0, period=_WEAVE_PERIOD, reversals=1 if casters else 0)
 
 
 def placed_seconds(runs: Sequence[Trajectory]) -> float:
@@ -63,8 +73,8 @@ def placed_seconds(runs: Sequence[Trajectory]) -> float:
     return float(np.mean([run.pose_times[-1] for run in runs])) + PLACING
 
 
-def _drivable(fit: Fit) -> Iterator[TimedCommand]:
-    """Commands within the limits of what was recorded, with their ramps."""
+def _drivable(fit: Fit, variation: Variation) -> Iterator[TimedCommand]:
+    """Commands within the limits of what was recorded, with their ramps and a variation."""
     robot = fit.model.robot
     motions = np.concatenate([motions_of(fit.model.matrix, run.times, run.signals) for run in fit.runs])
     twists = of_centre(robot, motions)
@@ -73,17 +83,19 @@ def _drivable(fit: Fit) -> Iterator[TimedCommand]:
     speed = max(speed, turning * robot.reach)  # of a robot that only turned
     steering = [np.abs(run.steering).max(axis=1) for run in fit.runs if run.steering is not None and run.steering.size]
     side = max(float(np.ptp(run.poses[:, :2], axis=0).max()) for run in fit.runs)
+    limit = max(_mostly(np.concatenate(steering)), _LEAST_STEERING) if steering else math.pi
     commands = DrivableCommands(
         robot,
         max_speed=speed,
         max_turn_rate=max(turning, min(_TURNING, speed / robot.reach)),
         max_wheel_rate=_mostly(np.concatenate([np.abs(run.rates).max(axis=1) for run in fit.runs])),
-        steering_limit=max(_mostly(np.concatenate(steering)), _LEAST_STEERING) if steering else math.pi,
+        steering_limit=limit,
         free=(max(side, _LEAST_FLOOR),) * 2,
         shapes=_SHAPES,
     )
     for timed in commands:
-        yield TimedCommand(timed.command, round(timed.duration + RAMP, 1), RAMP)
+        if all(is_within(robot, extreme, limit) for extreme in variation.extremes(timed.command)):
+            yield TimedCommand(timed.command, round(timed.duration + RAMP, 1), RAMP, variation)
 
 
 def _mostly(values: Array) -> float:

@@ -15,11 +15,10 @@ from omnibench.discover.fitting.model_fit import Fit
 from omnibench.discover.result import ExperimentCommand, NamedEffect
 from omnibench.report.numbers import listing
 from omnibench.robot.calibration import matrix_rows
-from omnibench.simulate.command import Command
 from omnibench.simulate.config import FlowerConfig
 from omnibench.words import plural
 
-_WAYS = {0: "ahead", 90: "to the left", 180: "backward", 270: "to the right"}  # directions, deg
+_WAYS = {0: "ahead", 90: "left", 180: "backward", 270: "right"}  # directions of travel, deg
 _SHORTEST_POSES = 0.02  # s between the reference poses that are simulated: denser ones take long and tell little more
 
 
@@ -31,21 +30,19 @@ def commands_in_words(chosen: Sequence[tuple[CandidateRun, int]]) -> tuple[Exper
 
 
 def description_of(
-    names: Sequence[str], commands: Sequence[ExperimentCommand], minutes: float, choice: Choice, recorded: float
+    names: Sequence[str], runs: int, minutes: float, choice: Choice, inseparable: Sequence[tuple[str, str]]
 ) -> str:
-    """What to drive, and what it tells, in a few sentences. recorded: chance after as long of the recorded commands."""
+    """How much to drive, and what it tells, in a few sentences."""
     hour = f"within {LONGEST / 60:.0f} minutes"
-    if not commands:
-        return f"Nothing that this robot can drive {hour} tells {listing(list(names), last='or')} apart."
-    runs = sum(command.runs for command in commands)
-    each = "; ".join(f"{command.motion}, {_times(command.runs)}" for command in commands)
-    pairs = [(names[first], names[second]) for first, second in zip(*np.nonzero(np.triu(~choice.sure)), strict=True)]
-    alike = "".join(f" Nothing that it can drive {hour} tells {first} from {second}." for first, second in pairs)
-    same = f"after {minutes:.1f} more minutes of the commands that were recorded it does so in {_cases(recorded)}"
+    if not runs:
+        return f"Nothing that this robot can drive {hour} tells {listing(list(names), last='from')}."
+    alike = "".join(f" Nothing that it can drive {hour} tells {first} from {second}." for first, second in inseparable)
+    settled = "the right name" if not inseparable else "the right name, as far as it can be told,"
     return (
-        f"Drive {plural(runs, 'run')}, {minutes:.1f} minutes with {PLACING:.0f} s before each to place the robot: "
-        f"{each}. On both recordings together, discover then names the right one of {listing(list(names))} with a "
-        f"weight of 95 % or more in {_cases(choice.chance)}; {same}.{alike}"
+        f"Drive {plural(runs, 'run')}, {minutes:.1f} minutes with {PLACING:.0f} s before each to place the robot. On "
+        f"both recordings together, discover then gives {settled} a weight of 95 % or more in "
+        f"{_cases(choice.chance)}; after {minutes:.1f} more minutes of the commands that were recorded, in "
+        f"{_cases(choice.chance_recorded)}.{alike}"
     )
 
 
@@ -64,7 +61,11 @@ def plan_config(
             "robot": dataset.robot.model_dump() | {"name": dataset.robot.name or "robot"},
             "sample_period": dataset.sample_period,
             "pose_period": max(between, dataset.sample_period, _SHORTEST_POSES),
-            "commands": {"listed": [_listed(candidate, count) for candidate, count in chosen], "ramp": RAMP},
+            "commands": {
+                "listed": [_listed(candidate, count) for candidate, count in chosen],
+                "ramp": RAMP,
+                "variation": chosen[0][0].timed.variation,
+            },
             "steering_limit_deg": min(math.degrees(max(angles)) + 1, 180.0) if angles else None,
             "truth": {
                 "matrix": matrix_rows(fit.model.matrix),
@@ -106,28 +107,23 @@ def _steering(candidate: CandidateRun) -> list[float]:
 
 
 def _in_words(candidate: CandidateRun) -> str:
-    """A run in words: how it moves, how fast and how long."""
-    command, seconds = candidate.timed.command, f"for {candidate.timed.duration:.3g} s"
-    begin = "" if candidate.heading is None else f", begun at a heading of {candidate.heading:.0f} deg"
+    """A run in words: where to, how fast, and how it turns."""
+    command = candidate.timed.command
+    end = "" if candidate.heading is None else f", from a heading of {candidate.heading:.0f}°"
+    variation = candidate.timed.variation
+    if variation.weave:
+        end += f", weaving by {variation.weave:g} rad/s every {variation.period:g} s"
+    if variation.reversals:
+        end += ", turning back halfway"
     side = "left" if command.turn_rate > 0 else "right"
     if not command.speed:
-        return f"turn to the {side} on the spot at {abs(command.turn_rate):.3g} rad/s {seconds}{begin}"
-    speed = f"at {command.speed:.3g} m/s {seconds}{begin}"
-    if not command.turn_rate:
-        return f"straight {_way(command)} {speed}"
-    radius = command.speed / abs(command.turn_rate)
-    return f"{_way(command)} in a curve to the {side} with a radius of {radius:.2g} m {speed}"
-
-
-def _way(command: Command) -> str:
-    """The direction of a command in the robot's frame, in words."""
+        return f"turning {side} on the spot at {abs(command.turn_rate):.3g} rad/s{end}"
     degrees = round(math.degrees(command.direction)) % 360
-    return _WAYS.get(degrees, f"at {degrees} deg to the left of ahead")
-
-
-def _times(count: int) -> str:
-    return {1: "once", 2: "twice"}.get(count, f"{count} times")
+    way = f"{_WAYS.get(degrees, f'towards {degrees}°')} at {command.speed:.3g} m/s"
+    if not command.turn_rate:
+        return f"{way}, straight{end}"
+    return f"{way}, curving {side} (radius {command.speed / abs(command.turn_rate):.2g} m){end}"
 
 
 def _cases(chance: float) -> str:
-    return f"{min(math.floor(100 * chance + 0.5), 99)} of 100 cases"
+    return f"{min(round(100 * chance), 99)} of 100 cases"

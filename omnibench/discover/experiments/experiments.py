@@ -74,24 +74,23 @@ class _Rivals:
 def _experiment(dataset: Dataset, effects: Sequence[NamedEffect], effect: NamedEffect, rivals: _Rivals) -> Experiment:
     fit = rivals.model.fit
     candidates = candidate_runs(fit, [group.effect for group in rivals.members if group.effect is not None])
-    separation, seconds = rivals.separation, np.array([candidate.seconds for candidate in candidates])
-    choice = choose_runs(separation, rivals.of_runs(candidates).information_of_runs, seconds)
-    minutes = float(choice.counts @ seconds) / 60
-    as_many = 60 * minutes / placed_seconds(fit.runs)
-    chance_recorded = separation.prospect(as_many * separation.recorded_mean).chance(choice.sure)
+    seconds = np.array([candidate.seconds for candidate in candidates])
+    information = rivals.of_runs(candidates).information_of_runs
+    choice = choose_runs(rivals.separation, information, seconds, placed_seconds(fit.runs))
     chosen = [(candidates[index], int(choice.counts[index])) for index in np.flatnonzero(choice.counts)]
+    runs, minutes = int(choice.counts.sum()), float(choice.counts @ seconds) / 60
     names = [group.name for group in rivals.members]
-    commands = commands_in_words(chosen)
+    inseparable = tuple(_inseparable(names, choice))
     return Experiment(
         separates=(effect.name, *effect.confusable_with),
-        description=description_of(names, commands, minutes, choice, float(chance_recorded)),
+        description=description_of(names, runs, minutes, choice, inseparable),
         config=plan_config(dataset, fit, effects, effect, chosen) if chosen else "",
-        commands=commands,
-        runs=int(choice.counts.sum()),
+        commands=commands_in_words(chosen),
+        runs=runs,
         minutes=minutes,
         chance=choice.chance if chosen else 0.0,
-        chance_recorded=float(chance_recorded) if chosen else 0.0,
-        inseparable=tuple(_inseparable(names, choice)),
+        chance_recorded=choice.chance_recorded if chosen else 0.0,
+        inseparable=inseparable,
     )
 
 

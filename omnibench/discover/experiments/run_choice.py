@@ -27,18 +27,21 @@ _KEPT = 15  # best commands of each pair of effects: of the others none is chose
 class Choice:
     """Chosen runs.
 
-    counts (C,): of each candidate. chance: that the right name is sure. sure (m, m): pairs that are told apart.
+    counts (C,): of each candidate. chance: that the right name is sure. chance_recorded: the same after as long of the
+    recorded commands. sure (m, m): pairs that are told apart.
     """
 
     counts: Counts
     chance: float
+    chance_recorded: float
     sure: NDArray[np.bool_]
 
 
-def choose_runs(separation: Separation, information: Array, seconds: Array) -> Choice:
+def choose_runs(separation: Separation, information: Array, seconds: Array, recorded: float) -> Choice:
     """The cheapest runs that tell all members apart, or as many pairs of them as can be told.
 
-    information (C, p, p): of one run of each candidate. seconds (C,): that it takes.
+    information (C, p, p): of one run of each candidate. seconds (C,): that it takes. recorded: s that a recorded run
+    takes.
     """
     kept = _promising(separation, information, seconds)
     problem = _Problem(separation, information[kept], seconds[kept])
@@ -49,7 +52,9 @@ def choose_runs(separation: Separation, information: Array, seconds: Array) -> C
         counts = problem.exchanged(counts, sure)
     every = np.zeros(len(seconds), dtype=np.intp)
     every[kept] = counts
-    return Choice(every, problem.prospect(counts).chance(sure), sure)
+    as_many = float(every @ seconds) / recorded
+    again = separation.prospect(as_many * separation.recorded_mean)
+    return Choice(every, problem.prospect(counts).chance(sure), again.chance(sure), sure)
 
 
 def _promising(separation: Separation, information: Array, seconds: Array) -> NDArray[np.intp]:

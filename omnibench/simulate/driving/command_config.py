@@ -13,7 +13,7 @@ from omnibench.config import Model, NonNegative, Positive
 from omnibench.robot.kinematics import Robot
 from omnibench.simulate.command import Command, default_directions, straight_and_pivot
 from omnibench.simulate.driving.timed_command import TimedCommand
-from omnibench.simulate.variation import Variation
+from omnibench.simulate.variation import STEADY, Variation
 
 _ASIDE = 1e-6  # sine of a direction off that of rolling, above which wheels would slide: rounding of degrees
 
@@ -106,7 +106,7 @@ class Commands(MotionGrid):
     turn_rates: tuple[FiniteFloat, ...] = Field((), description="rad/s")
     listed: tuple[ListedCommand, ...] = Field((), description="commands one by one, in the place of the grid")
     ramp: NonNegative = Field(0.0, description="time in which wheel rates rise and fall, which is added to the run, s")
-    variation: Variation = Field(Variation(), description="of the commands within a run")
+    variation: Variation = Field(STEADY, description="of the commands within a run")
 
     @model_validator(mode="after")
     def _are_given(self) -> Commands:

@@ -23,10 +23,10 @@ def run_as_designed(model: OdometryModel, timed: TimedCommand, periods: tuple[fl
         name,
         "train",
         times,
-        commanded_rates(robot, command, times, timed.ramp),
+        commanded_rates(robot, command, times, timed.ramp, timed.variation),
         pose_times,
         np.zeros((len(pose_times), 3)),
-        steering=commanded_steering(robot, command, times),
+        steering=commanded_steering(robot, command, times, timed.variation),
         drive=None if robot.drive.direct else robot.drive,
     )
     (poses,) = model.poses([still.log(pose_times)])
