@@ -111,7 +111,7 @@ class Separation:
     def __init__(self, recorded: Whitened, members: Members) -> None:
         self.members = members
         self._information = recorded.information
-        self.recorded_mean = recorded.information / len(recorded.residuals)  # information (p, p) of a recorded run
+        self.recorded_mean = recorded.information / len(recorded.scores)  # information (p, p) of a recorded run
         self._scores = recorded.scores.sum(axis=0)
         self._threshold = math.log(SURE / (1 - SURE)) + math.log(max(len(members.columns) - 1, 1))  # Eq. (4)
 
