@@ -53,7 +53,9 @@ def odds(information: Array, scores: Array, noise: Array) -> float:
     """Log odds of the first effect against the second. noise: of the scores, larger by the discrepancy."""
 
     def explained(seen: Array) -> Array:
-        of = [seen[index] @ np.linalg.solve(information[np.ix_(index, index)], seen[index]) for index in ([0, 1], [0, 2])]
+        of = [
+            seen[index] @ np.linalg.solve(information[np.ix_(index, index)], seen[index]) for index in ([0, 1], [0, 2])
+        ]
         return np.array(of) - seen[0] ** 2 / information[0, 0]
 
     tempered = 1 + DISCREPANCY**2 * (explained(scores).max() - 1)
