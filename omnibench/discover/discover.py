@@ -17,6 +17,7 @@ from omnibench.data.dataset import Dataset
 from omnibench.discover.calibrations import Request
 from omnibench.discover.conclude import Findings, conclude
 from omnibench.discover.covariate_dependence import covariate_dependences, without_smooth_term
+from omnibench.discover.experiments.experiments import experiments_for
 from omnibench.discover.fitting.extend import Extended, extend, fit_matrix, without_effects
 from omnibench.discover.fitting.model_fit import Fit
 from omnibench.discover.fitting.windows import in_windows
@@ -138,6 +139,10 @@ def discover_effects(
     extrapolations = extrapolations_of(validation.kept, baseline, models.weighted)
     detectability = detectability_of(screening, models.selection)
 
+    if any(effect.confusable_with for effect in effects):
+        progress.begin("choosing runs that tell the look-alikes apart")
+    experiments = experiments_for(dataset, effects, models.weighted)
+
     findings = Findings(
         screening=screening,
         selection=selection,
@@ -152,6 +157,7 @@ def discover_effects(
         steps=steps,
         extrapolations=extrapolations,
         detectability=detectability,
+        experiments=experiments,
         sessions=sessions,
         eq6_of_sessions=eq6_of_sessions,
     )

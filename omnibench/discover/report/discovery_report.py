@@ -11,6 +11,7 @@ from omnibench.discover.report.evidence_figures import CANDIDATES, GAPS, drawn, 
 from omnibench.discover.report.tables import (
     absorbed_table,
     dependence_table,
+    experiment_table,
     extrapolation_table,
     gap_table,
     held_out_table,
@@ -218,8 +219,10 @@ def _classes(discovery: Discovery) -> Iterator[Block]:
         )
     for number, each in enumerate(discovery.experiments, 1):
         yield Paragraph(f"To separate {listing(list(each.separates))}: {each.description}")
-        title = f"That experiment as a config ({experiment_file(number)}): simulate it, or drive its commands"
-        yield Details(title, (Code(each.config),))
+        if each.commands:
+            yield experiment_table(each)
+            title = f"That experiment as a config ({experiment_file(number)}): simulate it before it is driven"
+            yield Details(title, (Code(each.config),))
 
 
 def _hidden(discovery: Discovery) -> Iterator[Block]:

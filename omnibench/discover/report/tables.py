@@ -21,10 +21,18 @@ from omnibench.discover.report.wording import (
     value_and_interval,
     weight_in_words,
 )
-from omnibench.discover.result import CovariateDependence, Discovery, Extrapolation, Gap, Hidden, NamedEffect
+from omnibench.discover.result import (
+    CovariateDependence,
+    Discovery,
+    Experiment,
+    Extrapolation,
+    Gap,
+    Hidden,
+    NamedEffect,
+)
 from omnibench.registry import effects
 from omnibench.report.blocks import Cell, Column, Row, Table
-from omnibench.report.numbers import NOTHING, count, fixed, percent, significant
+from omnibench.report.numbers import NOTHING, count, fixed, listing, percent, significant
 from omnibench.robot.effects.effect import Effect
 from omnibench.words import plural
 
@@ -87,6 +95,18 @@ def _meanings(name: str, dataset: Dataset) -> Mapping[str, str]:
     sessions = tuple(dict.fromkeys(run.session for run in dataset.trajectories if run.session is not None))
     effect: Effect = effects.create(name)
     return {each.name: each.description for each in effect.parameters(dataset.robot, sessions)}
+
+
+def experiment_table(experiment: Experiment) -> Table:
+    """The runs of an experiment."""
+    rows = [Row.of(each.motion, fixed(each.seconds, 1), count(each.runs)) for each in experiment.commands]
+    directions = any("towards" in each.motion for each in experiment.commands)
+    return Table(
+        f"What to drive to tell {listing(list(experiment.separates), last='from')}",
+        (Column("Drive", numeric=False), Column("Each", "s"), Column("Runs")),
+        tuple(rows),
+        "Directions: degrees counter-clockwise from ahead, in the robot's frame." if directions else "",
+    )
 
 
 def held_out_table(discovery: Discovery) -> Table:
