@@ -15,6 +15,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import accumulate, pairwise
 from typing import Literal
 
 import numpy as np
@@ -81,6 +82,68 @@ class WheelLog:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class RunSamples:
+    """The wheel samples of Z runs one after another, F in all.
+
+    times (F,): end of each sample, s from the start of its run. edges (Z + 1,): the first sample of each run, and F.
+    """
+
+    times: Array
+    edges: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, times: Sequence[Array]) -> RunSamples:
+        """The samples of runs that end at times (F,), s, of each run."""
+        return cls(np.concatenate(times), np.cumsum([0, *map(len, times)]))
+
+    @cached_property
+    def run(self) -> NDArray[np.intp]:
+        """The run (F,) of each sample."""
+        return np.repeat(np.arange(len(self.edges) - 1), np.diff(self.edges))
+
+    @cached_property
+    def begins(self) -> Array:
+        """Begin (F,) of each sample, s from the start of its run."""
+        return self.before(self.times)
+
+    @cached_property
+    def durations(self) -> Array:
+        """Durations (F,) of the samples, s."""
+        durations: Array = self.times - self.begins
+        return durations
+
+    def before(self, values: Array) -> Array:
+        """Values (F, ...) of the sample before each sample; 0 of the first ones of the runs."""
+        before = np.empty_like(values)
+        before[1:] = values[:-1]
+        before[self.edges[:-1]] = 0.0
+        return before
+
+    def sums(self, values: Array) -> Array:
+        """Sums (F, ...) of values (F, ...) up to the end of each sample, from the start of its run."""
+        sums = np.empty_like(values)
+        for low, high in pairwise(self.edges.tolist()):
+            np.cumsum(values[low:high], axis=0, out=sums[low:high])
+        return sums
+
+    def locate(self, stamps: Sequence[Array]) -> tuple[NDArray[np.intp], Array]:
+        """The sample that contains each stamp of each run, and the share of it before then: both (S,), of all runs.
+
+        Stamps before the start are at it, those after the last sample at its end.
+        """
+        runs = zip(pairwise(self.edges.tolist()), stamps, strict=True)
+        sample = np.concatenate([low + self.times[low : high - 1].searchsorted(of_run) for (low, high), of_run in runs])
+        begins = self.begins[sample]
+        share = np.clip((np.concatenate(stamps) - begins) / (self.times[sample] - begins), 0.0, 1.0)
+        return sample, share
+
+
+def split_by(values: Array, parts: Sequence[Array]) -> list[Array]:
+    """Values (S, ...) of all runs, cut into those of each run, of which one of the parts (K, ...) is as long."""
+    return [values[low:high] for low, high in pairwise(accumulate(map(len, parts), initial=0))]
+
+
 class OdometryBatch:
     """Poses of several trajectories at their stamps, for any number of candidate matrices.
 
@@ -93,14 +156,14 @@ class OdometryBatch:
     def __init__(self, logs: Sequence[WheelLog], integration: Integration) -> None:
         self.integration: Integration = integration
         self.trajectory = np.repeat(np.arange(len(logs)), [len(log.stamps) for log in logs])
-        located = [locate(log.times, log.stamps) for log in logs]
-        self._sample = np.concatenate([sample for sample, _ in located])
-        share = np.concatenate([share for _, share in located])
-        counts = [int(sample[-1]) + 1 for sample, _ in located]
+        samples = RunSamples.of([log.times for log in logs])
+        located, share = samples.locate([log.stamps for log in logs])
+        self._sample = located - samples.edges[self.trajectory]
+        counts = [int(of_run[-1]) + 1 for of_run in split_by(self._sample, [log.stamps for log in logs])]
         shape = (len(logs), max(counts), logs[0].signals.shape[1])
         self._angles = np.zeros(shape)  # a(k); zeros after a trajectory's last sample move nothing
         for row, (log, count) in enumerate(zip(logs, counts, strict=True)):
-            durations = np.diff(log.times[:count], prepend=0.0)
+            durations = samples.durations[samples.edges[row] :][:count]
             self._angles[row, :count] = log.signals[:count] * durations[:, None]
         self._before = np.zeros(shape)  # C(k-1)
         np.cumsum(self._angles[:, :-1], axis=1, out=self._before[:, 1:])
@@ -167,7 +230,7 @@ class OdometryBatch:
         psi = np.tensordot(self._phase, matrices[:, 2], (2, 1))  # (T, F, P)
         cosine, sine = np.cos(psi), np.sin(psi)
         if self.integration == "arc":
-            stretch = _sinc(np.tensordot(self._angles, matrices[:, 2] / 2, (2, 1)))
+            stretch = chord_shares(np.tensordot(self._angles, matrices[:, 2] / 2, (2, 1)))
             cosine *= stretch
             sine *= stretch
         moved = self._angles_by_wheel @ cosine + 1j * (self._angles_by_wheel @ sine)  # (T, N, P)
@@ -214,7 +277,7 @@ class OdometryBatch:
         if self.integration == "euler":
             return rotation, np.ones(rotation.shape), np.zeros(rotation.shape)
         half_turn = angles @ matrix[2] / 2
-        return rotation, _sinc(half_turn), _sinc_slope(half_turn)
+        return rotation, chord_shares(half_turn), _sinc_slope(half_turn)
 
 
 class OdometryStream:
@@ -289,15 +352,13 @@ def advance(pose: Array, moved: Array, integration: Integration) -> Array:
 
 def locate(times: Array, stamps: Array) -> tuple[NDArray[np.intp], Array]:
     """The sample that contains each stamp (S,), and the share of it before then. times (F,): samples' ends."""
-    sample = np.minimum(np.searchsorted(times, stamps), len(times) - 1)
-    begin = np.where(sample > 0, times[sample - 1], 0.0)
-    share = np.clip((stamps - begin) / (times[sample] - begin), 0.0, 1.0)
-    return sample, share
+    return RunSamples.of([times]).locate([stamps])
 
 
-def _sinc(angle: Array) -> Array:
-    """sin(h)/h."""
-    return np.sinc(np.asarray(angle) / np.pi)
+def chord_shares(half_turns: Array) -> Array:
+    """sin(h)/h: the chord of an arc as a share of its length, for halves h of the angles that it turns by, rad."""
+    shares: Array = np.ones(np.shape(half_turns))
+    return np.divide(np.sin(half_turns), half_turns, out=shares, where=half_turns != 0)
 
 
 def _sinc_slope(angle: Array) -> Array:

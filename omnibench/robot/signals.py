@@ -6,17 +6,20 @@ import cmath
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
+from numpy.typing import NDArray
 
 from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.odometry import WheelLog, advance
-from omnibench.robot.path import Path
+from omnibench.robot.odometry import RunSamples, WheelLog, advance
+from omnibench.robot.path import PathBatch
 from omnibench.robot.planar import compose
 
 _STANDING = 1e-4  # m/s: a slower caster stands; and a way of its direction, of length 1, that is none; chosen
 STILL = 1e-3  # rad/s: a slower wheel counts as standing; chosen
 _SMOOTHING = 0.05  # s, time constant of the smoothed twist whose derivative is the acceleration; chosen
+_LASTING = 40 * _SMOOTHING  # s, after which 4e-18 of a smoothed twist is left: less than rounding
 # rad, half of the angle that a steering motor turns back before it takes the wheel along: above the noise and the steps
 # of usual encoders, and within the play of usual gears; chosen
 _TAKE_UP = 0.01
@@ -63,46 +66,83 @@ class Signals:
 def signals_of(
     log: WheelLog, robot: Robot, matrix: Array, sample_period: float, needs: Collection[str] = ()
 ) -> Signals:
-    """The signals of a log's F samples by a matrix (3, M).
+    """The signals of one log's F samples, see ``signals_of_runs``."""
+    return signals_of_runs([log], RunSamples.of([log.times]), robot, matrix, sample_period, needs)
 
-    sample_period: nominal, s. needs: signals to compute that only some effects need, by name.
 
-    With u_k the twist of sample k, d_k its duration and y_k = y_{k-1} + a (u_k - y_{k-1}), y_0 = 0, the twist smoothed
-    with a = 1 - exp(-sample_period / 50 ms), its acceleration is (y_k - y_{k-1}) / d_k: causal, and
-    with the right integral over time for any durations of samples.
+def signals_of_runs(
+    logs: Sequence[WheelLog],
+    samples: RunSamples,
+    robot: Robot,
+    matrix: Array,
+    sample_period: float,
+    needs: Collection[str] = (),
+) -> Signals:
+    """The signals of the samples of several runs of one session, one run after another, by a matrix (3, M).
+
+    sample_period: nominal, s. needs: signals to compute that only some effects need, by name. What was not recorded of
+    one run is unknown of all.
+
+    With u_k the twist of sample k of a run, d_k its duration and y_k = y_{k-1} + a (u_k - y_{k-1}), y_0 = 0, the twist
+    smoothed with a = 1 - exp(-sample_period / 50 ms), its acceleration is (y_k - y_{k-1}) / d_k: causal, and with the
+    right integral over time for any durations of samples.
     """
-    from scipy.signal import lfilter  # slow to import, and not needed by a live node
-
-    durations = np.diff(log.times, prepend=0.0)
-    tracked = log.signals @ matrix.T
+    durations, rates = samples.durations, np.concatenate([log.rates for log in logs])
+    ends = _joined([log.steering for log in logs])
+    steering, side, swings = None, None, None
+    if ends is not None:
+        before = samples.before(ends)
+        before[samples.edges[:-1]] = ends[samples.edges[:-1]]
+        steering = (before + ends) / 2
+        if "steering_side" in needs:
+            side = np.concatenate([_sides(angles) for angles in np.split(steering, samples.edges[1:-1])])
+    tracked = (rates if logs[0].drive is None else logs[0].drive.signals(rates, steering)) @ matrix.T
     twists = of_centre(robot, tracked)
-    share = smoothing_share(sample_period)
-    smoothed = lfilter([share], [1.0, share - 1.0], twists, axis=0)
-    elapsed = log.times - durations / 2
-    steering, side, swings = log.middle_steering, None, None
-    if steering is not None and "steering_side" in needs:
-        gears = SteeringGears()
-        side = np.array([gears.turned(angles) for angles in steering])
+    smoothed = _smoothed(twists, samples, sample_period)
     if "caster_rates" in needs:
-        caster = Caster(robot)
-        swings = np.array([caster.moved(*sample) for sample in zip(twists.tolist(), durations.tolist(), strict=True)])
+        parts = zip(*(np.split(values, samples.edges[1:-1]) for values in (twists, durations)), strict=True)
+        swings = np.concatenate([_swings(robot, *of_run) for of_run in parts])
+    angles = _joined([log.wheel_angles for log in logs])
+    elapsed = samples.times - durations / 2
+    started_at = None if any(log.started_at is None for log in logs) else np.array([log.started_at for log in logs])
+    starts = np.array([log.start for log in logs])
     return Signals(
         robot=robot,
         durations=durations,
-        rates=log.rates,
+        rates=rates,
         elapsed=elapsed,
         twists=twists,
-        accelerations=np.diff(smoothed, axis=0, prepend=np.zeros((1, 3))) / durations[:, None],
-        travelled=_travelled(log.rates, np.hypot(twists[:, 0], twists[:, 1]) * durations),
-        wheel_angles=None if log.wheel_angles is None else log.wheel_angles - log.rates * (durations / 2)[:, None],
-        session_time=None if log.started_at is None else log.started_at + elapsed,
-        session=log.session,
-        poses=Path(log.times, log.start, tracked * durations[:, None], "arc").middles if "poses" in needs else None,
+        accelerations=(smoothed - samples.before(smoothed)) / durations[:, None],
+        travelled=_travelled(rates, np.sqrt(twists[:, 0] ** 2 + twists[:, 1] ** 2) * durations, samples),
+        wheel_angles=None if angles is None else angles - rates * (durations / 2)[:, None],
+        session_time=None if started_at is None else started_at[samples.run] + elapsed,
+        session=logs[0].session,
+        poses=PathBatch(samples, starts, tracked * durations[:, None], "arc").middles if "poses" in needs else None,
         steering=steering,
-        steering_rates=None if log.steering is None else steering_rates(log.steering, steering, durations),
+        steering_rates=None if ends is None else steering_rates(ends, steering, durations),
         steering_side=side,
         caster_rates=swings,
     )
+
+
+def _joined(of_runs: Sequence[Array | None]) -> Array | None:
+    """Values (F, n) of all runs one after another; None if those of a run are not known."""
+    known = [values for values in of_runs if values is not None]
+    return np.concatenate(known) if len(known) == len(of_runs) else None
+
+
+def _smoothed(twists: Array, samples: RunSamples, sample_period: float) -> Array:
+    """Twists (F, 3) smoothed as ``signals_of_runs`` says, each run from rest."""
+    from scipy.signal import lfilter  # slow to import, and not needed by a live node
+
+    share = smoothing_share(sample_period)
+    smoothed: Array = lfilter([share], [1.0, share - 1.0], twists, axis=0)
+    inner = samples.edges[1:-1]
+    left, rest = smoothed[inner - 1], np.exp(-sample_period / _SMOOTHING * np.arange(1, _LASTING / sample_period + 2))
+    for first, high, carried in zip(inner.tolist(), samples.edges[2:].tolist(), left, strict=True):
+        part = smoothed[first:high][: len(rest)]  # what a run has over from the one before it
+        part -= rest[: len(part), None] * carried
+    return smoothed
 
 
 def steering_rates(ends: Array, middles: Array | None, durations: Array) -> Array:
@@ -274,10 +314,24 @@ def smoothing_share(sample_period: float) -> float:
     return -math.expm1(-sample_period / _SMOOTHING)
 
 
-def _travelled(rates: Array, steps: Array) -> Array:
+def _travelled(rates: Array, steps: Array, samples: RunSamples) -> Array:
     """Distance (F,) to the middle of each sample since all wheels last stood, from each sample's distance (F,), m."""
-    still = (np.abs(rates) < STILL).all(axis=1)
-    way = np.cumsum(steps)
-    last = np.maximum.accumulate(np.where(still, np.arange(len(steps)), -1))
-    before = np.where(last >= 0, way[last], 0.0)
-    return np.where(still, 0.0, way - steps / 2 - before)
+    still: NDArray[np.bool_] = reduce(np.logical_and, (np.abs(rates) < STILL).T)  # all(axis=1) takes twice as long
+    way = np.append(0.0, np.cumsum(steps))
+    number = np.arange(len(steps))
+    since = np.where(still, number + 1, 0)
+    since[samples.edges[:-1]] += np.where(still, 0, number)[samples.edges[:-1]]
+    since = np.maximum.accumulate(since)
+    return np.where(still, 0.0, way[1:] - steps / 2 - way[since])
+
+
+def _sides(angles: Array) -> Array:
+    """Sides (F, S) of its gears' play on which a run's steering motors stand, at angles (F, S), rad."""
+    gears = SteeringGears()
+    return np.array([gears.turned(each) for each in angles])
+
+
+def _swings(robot: Robot, twists: Array, durations: Array) -> Array:
+    """Rates (F,) at which a caster swings round in a run with twists (F, 3), rad/s."""
+    caster = Caster(robot)
+    return np.array([caster.moved(*sample) for sample in zip(twists.tolist(), durations.tolist(), strict=True)])

@@ -103,7 +103,7 @@ class TrueRobot:
         if self._by_model:
             return self.model.reported([log])[0]
         terms = self.model.reference_terms
-        return reported_poses(terms, log, self._path) if terms else self.poses(log)
+        return reported_poses(terms, [log], lambda logs: [self.poses(each) for each in logs])[0]
 
     @property
     def _by_model(self) -> bool:

@@ -94,7 +94,7 @@ def test_a_model_gives_the_poses_of_each_log_by_itself() -> None:
     for method in (chosen.poses, chosen.reported):
         together = method(logs)
         for log, found in zip(logs, together, strict=True):
-            np.testing.assert_array_equal(found, method([log])[0])
+            np.testing.assert_allclose(found, method([log])[0], rtol=0, atol=1e-13)
 
 
 class TestReported:

@@ -11,7 +11,7 @@ sum over the samples is enough for each change.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import pairwise
@@ -26,15 +26,15 @@ from omnibench.registry import effects
 from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect
 from omnibench.robot.effects.forms import correction_of
 from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.odometry import WheelLog
-from omnibench.robot.path import Path
-from omnibench.robot.signals import Signals, signals_of
+from omnibench.robot.odometry import RunSamples, WheelLog
+from omnibench.robot.path import PathBatch
+from omnibench.robot.signals import Signals, signals_of_runs
 
 # tests/benchmarks/constants.py varies both by 0.5 and 2: on a small set with heading drift no verdict and no name
 # changes.
 _STEP = 0.1  # share of the plausible range: step of a reference effect's parameter for its slope
 _LAST = 5  # samples at the end of a run whose mean velocity leads on to stamps after it, as WheelLog.continued does
-_BLOCK = 8_000_000  # numbers that are summed at once: 64 MB
+_BLOCK = 10_000  # samples that are summed at once, so that they stay in the processor's cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ class Paths:
     run: NDArray[np.intp]
     parts: tuple[slice, ...]
     ends: tuple[Array, ...]
-    _sums: csr_array
+    _blocks: tuple[_Block, ...]
     _turns: Array  # (F, 4): cosine, sine, x and y from the run's start, each times the sample's duration
     _lever: Array  # (S, 2): from the run's start
 
@@ -160,9 +160,11 @@ class Paths:
         """Slopes (S, 3, J) by column (F, 3), changes of (z, theta) in each sample, times shares (F, J)."""
         if shares is None:
             shares = np.ones((len(column), 1))
-        width = max(1, _BLOCK // (3 * len(column)))
-        blocks = [self._summed(column, shares[:, low : low + width]) for low in range(0, shares.shape[1], width)]
-        return np.concatenate(blocks, axis=2)
+        slopes = np.empty((len(self.poses), 3, shares.shape[1]))
+        for block in self._blocks:
+            changes = column[block.samples, :, None] * shares[block.samples, None, :]
+            slopes[block.stamps] = block.summed(changes, self._lever[block.stamps])
+        return slopes
 
     def changes(self, twist: Array) -> Array:
         """Integrals (F, 3) of exp(i theta) dv - i z dw and of dw over each sample. twist: changes (3,) or (F, 3)."""
@@ -174,16 +176,29 @@ class Paths:
         changes[:, 2] = self.signals.durations * turn
         return changes
 
-    def _summed(self, column: Array, shares: Array) -> Array:
-        changes = (column[:, :, None] * shares[:, None, :]).reshape(len(column), -1)
-        steps = np.asarray(self._sums @ changes).reshape(-1, 3, shares.shape[1])
+
+@dataclass(frozen=True, eq=False)
+class _Block:
+    """Some of the runs: their samples and stamps; in the block, the first stamp of each run and the run of each stamp.
+
+    sums (s, f): adds up what the block's samples do between one stamp and the next.
+    """
+
+    samples: slice
+    stamps: slice
+    firsts: NDArray[np.intp]
+    run: NDArray[np.intp]
+    sums: csr_array
+
+    def summed(self, changes: Array, lever: Array) -> Array:
+        """Slopes (s, 3, J) by changes (f, 3, J) of (z, theta) in each sample; lever (s, 2): from the run's start."""
+        steps = np.asarray(self.sums @ changes.reshape(len(changes), -1)).reshape(-1, *changes.shape[1:])
         np.cumsum(steps, axis=0, out=steps)
-        firsts = [part.start for part in self.parts[1:]]
-        before = np.concatenate([np.zeros((1, *steps.shape[1:])), steps[[first - 1 for first in firsts]]])
+        before = np.concatenate([np.zeros((1, *steps.shape[1:])), steps[self.firsts[1:] - 1]])
         steps -= before[self.run]
         turned = steps[:, 2]
-        steps[:, 0] -= self._lever[:, 1, None] * turned
-        steps[:, 1] += self._lever[:, 0, None] * turned
+        steps[:, 0] -= lever[:, 1, None] * turned
+        steps[:, 1] += lever[:, 0, None] * turned
         return steps
 
 
@@ -191,40 +206,53 @@ def make_paths(robot: Robot, matrix: Array, logs: Sequence[WheelLog], sample_per
     """The paths of runs by a matrix alone, with exact arcs."""
     order = sorted(range(len(logs)), key=lambda index: str(logs[index].session))
     assert order == list(range(len(logs))), "runs come by session"
+    samples = RunSamples.of([log.times for log in logs])
+    sessions, starts = _sessions(logs, samples.edges), np.array([log.start for log in logs])
     needs = _needs(robot)
-    of_runs = [signals_of(log, robot, matrix, sample_period, needs) for log in logs]
-    paths = [
-        Path(log.times, log.start, (log.signals @ matrix.T) * signals.durations[:, None], "arc")
-        for log, signals in zip(logs, of_runs, strict=True)
+    of_sessions = [
+        signals_of_runs(
+            logs[first:last], RunSamples.of([log.times for log in logs[first:last]]), robot, matrix, sample_period, needs
+        )
+        for _, (first, last), _ in sessions
     ]
-    ends = [path.ends for path in paths]
-    counts = [len(log.times) for log in logs]
-    owner = np.repeat(np.arange(len(logs)), counts)
+    signals = _joined(of_sessions)
+    driven = robot.drive.signals(signals.rates, signals.steering)
+    path = PathBatch(samples, starts, (driven @ matrix.T) * signals.durations[:, None], "arc")
     edges = np.cumsum([0, *(len(log.stamps) for log in logs)])
     parts = tuple(slice(int(low), int(high)) for low, high in pairwise(edges))
-    middle = np.concatenate([path.middles for path in paths])
-    signals = replace(_joined(of_runs), poses=middle)
+    middle, ends = path.middles, path.ends
     sums, poses = _sums(logs, ends)
     run = np.repeat(np.arange(len(logs)), np.diff(edges))
-    starts = np.array([log.start for log in logs])
-    from_start = middle[:, :2] - starts[owner, :2]
+    from_start = middle[:, :2] - starts[samples.run, :2]
     turns = np.column_stack([np.cos(middle[:, 2]), np.sin(middle[:, 2]), from_start]) * signals.durations[:, None]
     return Paths(
         robot=robot,
         matrix=matrix,
         logs=tuple(logs),
-        signals=signals,
-        sessions=_sessions(logs, counts),
-        owner=owner,
+        signals=replace(signals, poses=middle),
+        sessions=tuple((name, part) for name, _, part in sessions),
+        owner=samples.run,
         middle=middle,
         poses=poses,
         run=run,
         parts=parts,
         ends=tuple(ends),
-        _sums=sums,
+        _blocks=tuple(_blocks_of(sums, samples.edges, edges)),
         _turns=turns,
         _lever=poses[:, :2] - starts[run, :2],
     )
+
+
+def _blocks_of(sums: csr_array, first_samples: NDArray[np.intp], first_stamps: NDArray[np.intp]) -> Iterator[_Block]:
+    """Blocks of consecutive runs, of some thousand samples each. sums (S, F): of all runs."""
+    first, runs = 0, len(first_samples) - 1
+    for last in range(1, runs + 1):
+        if last == runs or first_samples[last + 1] - first_samples[first] > _BLOCK:
+            samples, stamps = (slice(int(edge[first]), int(edge[last])) for edge in (first_samples, first_stamps))
+            firsts = first_stamps[first:last] - first_stamps[first]
+            run = np.repeat(np.arange(last - first), np.diff(first_stamps[first : last + 1]))
+            yield _Block(samples, stamps, firsts, run, sums[stamps, samples])
+            first = last
 
 
 def _needs(robot: Robot) -> frozenset[str]:
@@ -265,17 +293,16 @@ def _sums(logs: Sequence[WheelLog], ends: Sequence[Array]) -> tuple[csr_array, A
     return csr_array(entries, shape=(stamp, first)), np.concatenate(poses)
 
 
-def _sessions(logs: Sequence[WheelLog], counts: Sequence[int]) -> tuple[tuple[str | None, slice], ...]:
-    """The samples of each session; its runs come one after another."""
-    sessions: list[tuple[str | None, slice]] = []
-    first = 0
-    for log, count in zip(logs, counts, strict=True):
-        if sessions and sessions[-1][0] == log.session:
-            sessions[-1] = (log.session, slice(sessions[-1][1].start, first + count))
-        else:
-            sessions.append((log.session, slice(first, first + count)))
-        first += count
-    return tuple(sessions)
+def _sessions(
+    logs: Sequence[WheelLog], edges: NDArray[np.intp]
+) -> list[tuple[str | None, tuple[int, int], slice]]:
+    """The name, the first and last runs and the samples of each session; its runs come one after another."""
+    names = [log.session for log in logs]
+    firsts = [index for index, name in enumerate(names) if not index or name != names[index - 1]]
+    return [
+        (names[first], (first, last), slice(int(edges[first]), int(edges[last])))
+        for first, last in pairwise([*firsts, len(logs)])
+    ]
 
 
 def _corrected(effect: MotionEffect, signals: Signals, values: Mapping[str, float]) -> Array:
