@@ -1,9 +1,9 @@
 """Study of ``omnibench discover`` on recordings by simulators that share no code with it (``foreign``).
 
-    python tests/benchmarks/foreign_study.py --out foreign.jsonl --seeds 9000 9001 [--only belt_ripple] [--table]
+    python tests/benchmarks/foreign_study.py --out foreign --seeds 9000 9001 [--only belt_ripple] [--table]
 
-One line of JSON a recording, added as it comes: run again with the same file, and it goes on where it was. What these
-simulators hide is in no catalogue: a confident name is a wrong one.
+Every recording is a job in the store --out, under the code that discovers: run again, it goes on where it was. What
+these simulators hide is in no catalogue: a confident name is a wrong one.
 """
 
 from __future__ import annotations
@@ -16,13 +16,17 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from discover_study import end_at_a_whole_line
+from discover_study import discovering_code
 from scipy.stats import binomtest
 
 from omnibench import discover_effects, load_dataset
 from omnibench.config import Model
 from omnibench.discover.result import Discovery
+from omnibench.jobs.job import Failure, Job, JobWatch, run_jobs
+from omnibench.jobs.local_backends import local_backend
+from omnibench.jobs.result_store import ResultStore, content_key
 from omnibench.processes import one_thread
+from omnibench.progress import Reporter
 
 KINDS = ("cross_wheel_coupling", "slippery_patch", "belt_ripple", "swinging_payload", "tether_pull")
 CONFIDENT = 0.95  # a name's weight from which on the verdict may be "named"
@@ -65,26 +69,28 @@ class Result(Model):
 def main() -> None:
     """Make and judge the recordings that are missing, then print the table."""
     arguments = _arguments()
-    results = read_results(arguments.out)
-    done = {(each.kind, each.seed) for each in results}
-    wanted = [(kind, seed) for seed in arguments.seeds for kind in arguments.only or KINDS]
-    end_at_a_whole_line(arguments.out)
-    for kind, seed in [] if arguments.table else wanted:
-        if (kind, seed) not in done:
-            results.append(carry_out(kind, seed))
-            with arguments.out.open("a") as file:
-                file.write(results[-1].model_dump_json() + "\n")
-            print(results[-1].model_dump_json(), flush=True)
-    print("\n".join(table(results)))
+    store = ResultStore(arguments.out, Result)
+    jobs = [_job(kind, seed) for seed in arguments.seeds for kind in arguments.only or KINDS]
+    if not arguments.table:
+        run_jobs(jobs, store, local_backend(arguments.jobs), _Said())
+    print("\n".join(table([result for job in jobs if (result := store.get(job.key)) is not None])))
 
 
-def read_results(path: Path) -> list[Result]:
-    """The results of a file, none if it is not there. A last line that was cut off is left out."""
-    return [Result.model_validate_json(line) for line in path.read_text().split("\n")[:-1]] if path.exists() else []
+class _Said(JobWatch[Result]):
+    """A line for every recording that ends."""
+
+    def ended(self, number: int, ending: Result | Failure, reused: bool) -> None:  # noqa: ARG002
+        if not reused:
+            print(ending.reason if isinstance(ending, Failure) else ending.model_dump_json(), flush=True)
 
 
-def carry_out(kind: str, seed: int) -> Result:
+def _job(kind: str, seed: int) -> Job[Result]:
+    return Job(content_key({"kind": kind, "seed": seed, "code": discovering_code()}), _carry_out, (kind, seed))
+
+
+def _carry_out(recording: tuple[str, int], _: Reporter) -> Result:
     """Make a recording, let the workflow discover, judge. Whatever the workflow raises is a failure."""
+    kind, seed = recording
     with one_thread(), tempfile.TemporaryDirectory() as folder:
         truth = importlib.import_module(f"foreign.{kind}").make(Path(folder), seed)
         hidden = {"seed": seed} | {key: truth[key] for key in ("kind", "covariates", "noncentrality")}
@@ -142,9 +148,10 @@ def _closed(members: Sequence[Result]) -> str:
 
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="file of results, one line of JSON a recording")
+    parser.add_argument("--out", type=Path, required=True, help="folder of results, a file a recording")
     parser.add_argument("--seeds", type=int, nargs="+", default=[])
     parser.add_argument("--only", action="append", choices=KINDS, help="one kind; may be given again")
+    parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--table", action="store_true", help="print the table of what is there")
     return parser.parse_args()
 

@@ -211,7 +211,12 @@ def make_paths(robot: Robot, matrix: Array, logs: Sequence[WheelLog], sample_per
     needs = _needs(robot)
     of_sessions = [
         signals_of_runs(
-            logs[first:last], RunSamples.of([log.times for log in logs[first:last]]), robot, matrix, sample_period, needs
+            logs[first:last],
+            RunSamples.of([log.times for log in logs[first:last]]),
+            robot,
+            matrix,
+            sample_period,
+            needs,
         )
         for _, (first, last), _ in sessions
     ]
@@ -293,9 +298,7 @@ def _sums(logs: Sequence[WheelLog], ends: Sequence[Array]) -> tuple[csr_array, A
     return csr_array(entries, shape=(stamp, first)), np.concatenate(poses)
 
 
-def _sessions(
-    logs: Sequence[WheelLog], edges: NDArray[np.intp]
-) -> list[tuple[str | None, tuple[int, int], slice]]:
+def _sessions(logs: Sequence[WheelLog], edges: NDArray[np.intp]) -> list[tuple[str | None, tuple[int, int], slice]]:
     """The name, the first and last runs and the samples of each session; its runs come one after another."""
     names = [log.session for log in logs]
     firsts = [index for index, name in enumerate(names) if not index or name != names[index - 1]]
