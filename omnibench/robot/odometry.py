@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import accumulate, pairwise
-from typing import Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ from omnibench.robot.wheels.drive import Drive, in_the_middle
 
 Integration = Literal["euler", "arc"]
 Complex = NDArray[np.complex128]
+T = TypeVar("T", bound=np.generic[Any])
 
 _LAST = 5  # samples whose mean rate continues a log after its last sample; chosen
 _BLOCK = 120_000  # samples at a time (candidates x samples), so that temporaries stay in the processor's cache
@@ -113,14 +114,14 @@ class RunSamples:
         durations: Array = self.times - self.begins
         return durations
 
-    def before(self, values: Array) -> Array:
+    def before(self, values: NDArray[T]) -> NDArray[T]:
         """Values (F, ...) of the sample before each sample; 0 of the first ones of the runs."""
         before = np.empty_like(values)
         before[1:] = values[:-1]
         before[self.edges[:-1]] = 0.0
         return before
 
-    def sums(self, values: Array) -> Array:
+    def sums(self, values: NDArray[T]) -> NDArray[T]:
         """Sums (F, ...) of values (F, ...) up to the end of each sample, from the start of its run."""
         sums = np.empty_like(values)
         for low, high in pairwise(self.edges.tolist()):
@@ -139,7 +140,7 @@ class RunSamples:
         return sample, share
 
 
-def split_by(values: Array, parts: Sequence[Array]) -> list[Array]:
+def split_by(values: NDArray[T], parts: Sequence[Array]) -> list[NDArray[T]]:
     """Values (S, ...) of all runs, cut into those of each run, of which one of the parts (K, ...) is as long."""
     return [values[low:high] for low, high in pairwise(accumulate(map(len, parts), initial=0))]
 

@@ -74,10 +74,12 @@ class PathBatch:
         """x + iy of motions (n, 3) that begin with headings (n,)."""
         turned = headings + moved[:, 2] / 2 if self._arc else headings
         cosine, sine = np.cos(turned), np.sin(turned)
-        steps = np.empty(len(moved), dtype=complex)
+        steps: Complex = np.empty(len(moved), dtype=complex)
         steps.real = moved[:, 0] * cosine - moved[:, 1] * sine
         steps.imag = moved[:, 0] * sine + moved[:, 1] * cosine
-        return steps * chord_shares(moved[:, 2] / 2) if self._arc else steps
+        if self._arc:
+            steps *= chord_shares(moved[:, 2] / 2)
+        return steps
 
 
 class Path:
