@@ -26,7 +26,7 @@ from omnibench.robot.wheels.drive import Drive, in_the_middle
 
 Integration = Literal["euler", "arc"]
 Complex = NDArray[np.complex128]
-T = TypeVar("T", bound=np.generic[Any])
+T = TypeVar("T", bound="np.generic[Any]")
 
 _LAST = 5  # samples whose mean rate continues a log after its last sample; chosen
 _BLOCK = 120_000  # samples at a time (candidates x samples), so that temporaries stay in the processor's cache
