@@ -53,7 +53,7 @@ def test_a_class_and_its_doubts_are_told() -> None:
 
 def test_what_to_drive_to_tell_look_alikes_apart_is_told() -> None:
     told = " ".join(printed(incomplete()).split())
-    assert "What to drive to tell acceleration_slip from reference_time_offset" in told
+    assert "What to drive to tell acceleration_slip from its look-alikes" in told
     assert "turning left on the spot at 1 rad/s 12.5 4" in told
     assert "Drive 4 runs, 1.8 minutes" in told
 

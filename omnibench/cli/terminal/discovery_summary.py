@@ -62,9 +62,9 @@ def _tables(discovery: Discovery) -> Iterator[Table]:
         shown = [found for found in discovery.where if strongest[found.covariate] is found][:_MOST_DEPENDENCES]
         yield dependence_table(shown, "Where the plain matrix fails")
     yield held_out_table(discovery) if discovery.held_out else gap_table(discovery)
-    yield from (experiment_table(each) for each in discovery.experiments if each.commands)
     if discovery.hidden:
         yield hidden_table(worst_of_each(discovery.hidden)[:_HIDDEN])
+    yield from (experiment_table(each) for each in discovery.experiments if each.commands)
 
 
 def _remarks(discovery: Discovery) -> Iterator[str]:

@@ -65,7 +65,7 @@ def variation_for(effects: Sequence[Effect]) -> Variation:
     """How commands vary within a run: steering that turns shows what it does, and casters that swing round."""
     steering = any(effect.stage == "steering" or "steering_side" in effect.needs for effect in effects)
     casters = any("caster_rates" in effect.needs for effect in effects)
-    return Variation(weave=_WEAVE if steering else 0.0, period=_WEAVE_PERIOD, reversals=1 if casters else 0)
+    return Variation(weave=_WEAVE if steering else 0.0, period=_WEAVE_PERIOD, reversals=int(casters))
 
 
 def placed_seconds(runs: Sequence[Trajectory]) -> float:

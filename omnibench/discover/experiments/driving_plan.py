@@ -55,6 +55,7 @@ def plan_config(
 ) -> str:
     """The experiment as a config for ``omnibench simulate``, with the effects that were found as its truth."""
     between = float(np.median(np.concatenate([np.diff(run.pose_times) for run in dataset.split("train")])))
+    variation = chosen[0][0].timed.variation
     angles = [abs(angle) for candidate, _ in chosen for angle in _steering(candidate)]
     config = FlowerConfig.model_validate(
         {
@@ -64,8 +65,8 @@ def plan_config(
             "commands": {
                 "listed": [_listed(candidate, count) for candidate, count in chosen],
                 "ramp": RAMP,
-                "variation": chosen[0][0].timed.variation,
-            },
+            }
+            | ({} if variation.is_none else {"variation": variation}),
             "steering_limit_deg": min(math.degrees(max(angles)) + 1, 180.0) if angles else None,
             "truth": {
                 "matrix": matrix_rows(fit.model.matrix),
@@ -94,7 +95,7 @@ def _listed(candidate: CandidateRun, count: int) -> dict[str, float | int | None
     return {
         "speed": command.speed,
         "direction_deg": round(math.degrees(command.direction), 6),
-        "turn_rate": command.turn_rate,
+        "turn_rate": round(command.turn_rate, 4),
         "duration": candidate.timed.duration,
         "repetitions": count,
         "heading_deg": candidate.heading,
@@ -119,7 +120,8 @@ def _in_words(candidate: CandidateRun) -> str:
     if not command.speed:
         return f"turning {side} on the spot at {abs(command.turn_rate):.3g} rad/s{end}"
     degrees = round(math.degrees(command.direction)) % 360
-    way = f"{_WAYS.get(degrees, f'towards {degrees}°')} at {command.speed:.3g} m/s"
+    beside = f"{degrees}° left of ahead" if degrees < 180 else f"{360 - degrees}° right of ahead"
+    way = f"{_WAYS.get(degrees, beside)} at {command.speed:.3g} m/s"
     if not command.turn_rate:
         return f"{way}, straight{end}"
     return f"{way}, curving {side} (radius {command.speed / abs(command.turn_rate):.2g} m){end}"

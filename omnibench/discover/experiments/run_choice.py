@@ -20,6 +20,8 @@ Counts = NDArray[np.intp]
 LONGEST = 3600.0  # s of an experiment: nobody drives longer to settle a name (chosen)
 _SURE = 0.95  # chance that the right name is sure; two standard deviations give 0.977, uncertain sizes take from it
 _BATCHES = (2, 4, 8)  # runs of a command that are added at once, each command twice at least: their scatter shows
+_PREPARING = 30.0  # s by which a further command must shorten the driving: it has to be prepared, too (chosen)
+_ROUNDS = 3  # of exchanges: the third changes nothing in omni3
 _KEPT = 15  # best commands of each pair of effects: of the others none is chosen in omni3 or the studies' flower
 
 
@@ -48,7 +50,7 @@ def choose_runs(separation: Separation, information: Array, seconds: Array, reco
     counts = problem.greedy()
     sure = problem.sure(problem.prospect(counts))
     counts = problem.pruned(counts, sure)
-    for _ in range(2):
+    for _ in range(_ROUNDS):
         counts = problem.exchanged(counts, sure)
     every = np.zeros(len(seconds), dtype=np.intp)
     every[kept] = counts
@@ -76,6 +78,11 @@ class _Problem:
         """The prospect after counts (..., C) runs."""
         return self._separation.prospect(np.tensordot(counts, self._information, 1))
 
+    def cost(self, counts: Counts) -> Array:
+        """Seconds (...) of counts (..., C) runs, with preparing their commands."""
+        of_each: Array = counts @ self._seconds + _PREPARING * (counts > 0).sum(axis=-1)
+        return of_each
+
     def sure(self, prospect: Prospect) -> NDArray[np.bool_]:
         """Pairs (..., m, m) that are told apart whichever of the two is right."""
         chances = prospect.chances
@@ -90,7 +97,7 @@ class _Problem:
             if self.sure(now).all():
                 break
             larger = self._with_more(counts)
-            taken = (larger - counts) @ self._seconds
+            taken = self.cost(larger) - self.cost(counts)
             inside = larger @ self._seconds <= LONGEST
             gains = (self.prospect(larger).mean_margins - now.mean_margins).sum(axis=(-2, -1)) / taken
             gains[~inside] = 0
@@ -114,7 +121,7 @@ class _Problem:
             enough = (self.sure(self.prospect(fewer)) | ~wanted).all(axis=(-2, -1))
             if not enough.any():
                 return counts
-            counts = fewer[np.where(enough, fewer @ self._seconds, np.inf).argmin()]
+            counts = fewer[np.where(enough, self.cost(fewer), np.inf).argmin()]
 
     def _with_fewer(self, counts: Counts) -> Iterator[Counts]:
         for index in np.flatnonzero(counts):
@@ -125,16 +132,18 @@ class _Problem:
                     yield fewer
 
     def exchanged(self, counts: Counts, wanted: NDArray[np.bool_]) -> Counts:
-        """Counts with each command exchanged for another one where that takes less time."""
+        """Counts with each command exchanged for runs of another one where that takes less time."""
+        each = np.eye(len(counts), dtype=np.intp)
         for index in np.flatnonzero(counts):
             without = counts.copy()
             without[index] = 0
-            each = np.eye(len(counts), dtype=np.intp)
-            others = np.concatenate([without + number * each for number in range(_BATCHES[0], counts[index] + 3)])
-            others = others[others @ self._seconds < counts @ self._seconds - 1]
+            most = counts[index] + 3
+            others = np.concatenate([without + number * each for number in range(1, most)])
+            often_enough = ((others == 0) | (others >= _BATCHES[0])).all(axis=1)
+            others = others[often_enough & (self.cost(others) < self.cost(counts) - 1)]
             if not len(others):
                 continue
             enough = (self.sure(self.prospect(others)) | ~wanted).all(axis=(-2, -1))
             if enough.any():
-                counts = others[np.where(enough, others @ self._seconds, np.inf).argmin()]
+                counts = others[np.where(enough, self.cost(others), np.inf).argmin()]
         return counts

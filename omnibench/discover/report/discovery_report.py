@@ -36,7 +36,7 @@ from omnibench.discover.report.wording import (
     verdict_in_words,
     weight_in_words,
 )
-from omnibench.discover.result import Discovery, Gap, NamedEffect, experiment_file
+from omnibench.discover.result import Discovery, Experiment, Gap, NamedEffect, experiment_file
 from omnibench.environment import package_versions
 from omnibench.report.blocks import (
     Block,
@@ -157,6 +157,8 @@ def what_blocks(discovery: Discovery) -> Iterator[Block]:
         for effect in discovery.effects:
             yield Callout(_effect_title(effect), tuple(_effect_remarks(effect)))
         yield parameter_table(discovery.effects, discovery.dataset)
+    for number, experiment in enumerate(discovery.experiments, 1):
+        yield from _experiment(experiment, experiment_file(number))
     if discovery.absorbed:
         yield absorbed_table(discovery)
     if discovery.not_looked_for:
@@ -164,6 +166,15 @@ def what_blocks(discovery: Discovery) -> Iterator[Block]:
             f"Effects that these recordings cannot show ({len(discovery.not_looked_for)})",
             (not_looked_for_table(discovery),),
         )
+
+
+def _experiment(experiment: Experiment, file: str) -> Iterator[Block]:
+    """What to drive to tell the members of a class apart."""
+    yield Paragraph(f"To separate {listing(list(experiment.separates))}: {experiment.description}")
+    if experiment.commands:
+        yield experiment_table(experiment)
+        title = f"These runs as a config ({file}): simulate them before they are driven"
+        yield Details(title, (Code(experiment.config),))
 
 
 def _effect_title(effect: NamedEffect) -> str:
@@ -217,12 +228,6 @@ def _classes(discovery: Discovery) -> Iterator[Block]:
         yield Callout(
             "What these data cannot tell apart", tuple(" or ".join(names) for names in discovery.classes), "plain"
         )
-    for number, each in enumerate(discovery.experiments, 1):
-        yield Paragraph(f"To separate {listing(list(each.separates))}: {each.description}")
-        if each.commands:
-            yield experiment_table(each)
-            title = f"That experiment as a config ({experiment_file(number)}): simulate it before it is driven"
-            yield Details(title, (Code(each.config),))
 
 
 def _hidden(discovery: Discovery) -> Iterator[Block]:

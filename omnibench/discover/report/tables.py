@@ -32,7 +32,7 @@ from omnibench.discover.result import (
 )
 from omnibench.registry import effects
 from omnibench.report.blocks import Cell, Column, Row, Table
-from omnibench.report.numbers import NOTHING, count, fixed, listing, percent, significant
+from omnibench.report.numbers import NOTHING, count, fixed, percent, significant
 from omnibench.robot.effects.effect import Effect
 from omnibench.words import plural
 
@@ -100,12 +100,10 @@ def _meanings(name: str, dataset: Dataset) -> Mapping[str, str]:
 def experiment_table(experiment: Experiment) -> Table:
     """The runs of an experiment."""
     rows = [Row.of(each.motion, fixed(each.seconds, 1), count(each.runs)) for each in experiment.commands]
-    directions = any("towards" in each.motion for each in experiment.commands)
     return Table(
-        f"What to drive to tell {listing(list(experiment.separates), last='from')}",
+        f"What to drive to tell {experiment.separates[0]} from its look-alikes",
         (Column("Drive", numeric=False), Column("Each", "s"), Column("Runs")),
         tuple(rows),
-        "Directions: degrees counter-clockwise from ahead, in the robot's frame." if directions else "",
     )
 
 

@@ -151,7 +151,7 @@ def test_a_class_names_its_members_and_the_experiment_that_separates_them() -> N
     assert "These data cannot tell it from load_transfer" in told.text
     assert "In doubt: few turns" in told.text
     assert EXPERIMENT.description in told.text
-    rows = told.tables["What to drive to tell acceleration_slip from reference_time_offset"]
+    rows = told.tables["What to drive to tell acceleration_slip from its look-alikes"]
     assert rows[1:] == [["turning left on the spot at 1 rad/s", "12.5", "4"]]
     assert EXPERIMENT.config in told.text
     assert "52.0 %" in told.text
