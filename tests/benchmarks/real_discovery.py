@@ -1,6 +1,6 @@
 """Discovery on recordings of real robots: train on one kind of path, judge plain and extended model on another.
 
-    python tests/benchmarks/real_discovery.py --out real.jsonl [--only omni3] [--table]
+    python tests/benchmarks/real_discovery.py --out real.jsonl [--only omni3] [--unknown-term] [--table]
 
 One line of JSON a row, added as it comes: run again with the same file, and it goes on where it was. With --table the
 table is printed from what is there. A row says what was trained on and what was judged, the verdict, the names, and
@@ -82,12 +82,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="file of results, one line of JSON a row")
     parser.add_argument("--only", nargs="+", default=list(ROBOTS), choices=list(ROBOTS), metavar="ROBOT")
+    parser.add_argument("--unknown-term", action="store_true", help="add a smooth term where nothing has a sure name")
     parser.add_argument("--table", action="store_true", help="print the table of what is there")
     arguments = parser.parse_args()
     rows = _read(arguments.out)
     if not arguments.table:
         with arguments.out.open("a") as file:
-            for row in _carried_out(arguments.only, {row.key for row in rows}):
+            for row in _carried_out(arguments.only, {row.key for row in rows}, unknown_term=arguments.unknown_term):
                 file.write(row.model_dump_json() + "\n")
                 file.flush()
                 print(f"{row.key}: {row.verdict or row.failure}, {row.seconds:.0f} s", flush=True)
@@ -105,13 +106,13 @@ def _read(path: Path) -> list[Row]:
     return [Row.model_validate_json(line) for line in whole.decode().splitlines()]
 
 
-def _carried_out(robots: Sequence[str], done: set[str]) -> Iterator[Row]:
+def _carried_out(robots: Sequence[str], done: set[str], *, unknown_term: bool) -> Iterator[Row]:
     for robot in robots:
         ways = [way for way in WAYS[robot] if f"{robot}: {way.train} -> {way.judge}" not in done]
         if ways:
             recording = _numbered(ROBOTS[robot]())
             for way in ways:
-                yield carry_out(recording, robot, way)
+                yield carry_out(recording, robot, way, unknown_term=unknown_term)
 
 
 def _numbered(recording: Dataset) -> Dataset:
@@ -124,7 +125,7 @@ def _numbered(recording: Dataset) -> Dataset:
     return replace(recording, trajectories=tuple(runs))
 
 
-def carry_out(recording: Dataset, robot: str, way: Way) -> Row:
+def carry_out(recording: Dataset, robot: str, way: Way, *, unknown_term: bool = False) -> Row:
     """Discover on the runs that train, and judge both models on the others."""
     trained = [replace(run, split="train") for run in recording.trajectories if way.trains(run)]
     judged = [replace(run, split="validation") for run in recording.trajectories if way.judges(run)]
@@ -133,7 +134,7 @@ def carry_out(recording: Dataset, robot: str, way: Way) -> Row:
     try:
         with one_thread():
             dataset = make_dataset(robot, recording.robot, recording.sample_period, [*trained, *judged])
-            found = discover_effects(dataset)
+            found = discover_effects(dataset, unknown_term=unknown_term)
             plain, extended = (
                 tuple(map(tuple, final_errors(calibration.model, dataset.split("validation")).tolist()))
                 for calibration in (found.plain, found.extended)
@@ -176,8 +177,8 @@ def print_table(rows: Sequence[Row]) -> None:
         if row.names:
             print(f"    {', '.join(row.names)}")
     if judged:
-        print(f"\n{len(judged)} rows: {better} better, {worse} worse by intervals that hold together with 95 %; Eq. (6) of the "
-              f"extended model is {100 * (math.exp(np.mean(means)) - 1):+.1f} % in the geometric mean; "
+        print(f"\n{len(judged)} rows: {better} better, {worse} worse by intervals that hold together with 95 %; Eq. (6) "
+              f"of the extended model is {100 * (math.exp(np.mean(means)) - 1):+.1f} % in the geometric mean; "
               f"{sum(row.seconds for row in judged):.0f} s")  # fmt: skip
 
 
