@@ -177,8 +177,8 @@ def print_table(rows: Sequence[Row]) -> None:
         if row.names:
             print(f"    {', '.join(row.names)}")
     if judged:
-        print(f"\n{len(judged)} rows: {better} better, {worse} worse by intervals that hold together with 95 %; Eq. (6) "
-              f"of the extended model is {100 * (math.exp(np.mean(means)) - 1):+.1f} % in the geometric mean; "
+        print(f"\n{len(judged)} rows: {better} better, {worse} worse by intervals that hold together with 95 %; Eq. (6)"
+              f" of the extended model is {100 * (math.exp(np.mean(means)) - 1):+.1f} % in the geometric mean; "
               f"{sum(row.seconds for row in judged):.0f} s")  # fmt: skip
 
 
