@@ -9,10 +9,11 @@ from typing import Protocol
 
 import numpy as np
 
-from omnibench.robot.corrected import check_needs, corrected_twists, needs_of
+from omnibench.robot.corrected import check_needs, needs_of
 from omnibench.robot.effect_stream import EffectStream
 from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect
 from omnibench.robot.effects.term import Term
+from omnibench.robot.fade import Fade, faded_twists
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import Integration, OdometryBatch, OdometryStream, WheelLog
 from omnibench.robot.path import Path
@@ -24,7 +25,7 @@ class OdometryModel:
     """A robot's odometry: ``matrix`` (3, M) in m and rad per rad, integration of a sample, and effects.
 
     terms: effects of any stage; those of stage actuator are for simulation and ignored here. sample_period: nominal, s;
-    needed with effects.
+    needed with effects. fade: how the corrections of effects of motion fade outside the training domain; None: not.
     """
 
     robot: Robot
@@ -32,6 +33,7 @@ class OdometryModel:
     integration: Integration
     terms: tuple[Term, ...] = ()
     sample_period: float | None = None
+    fade: Fade | None = None
 
     def __post_init__(self) -> None:
         if self.terms and self.sample_period is None:
@@ -47,6 +49,11 @@ class OdometryModel:
         """Terms of stage wheel, clock, body and world."""
         return tuple(term for term in self.terms if isinstance(term.effect, MotionEffect))
 
+    @property
+    def _corrects(self) -> bool:
+        """True if a motion is not the matrix's alone: effects of motion act, or the matrix fades to the plain one."""
+        return bool(self.motion_terms) or self.fade is not None
+
     @cached_property
     def reference_terms(self) -> tuple[Term, ...]:
         """Terms of stage reference."""
@@ -57,7 +64,7 @@ class OdometryModel:
 
         After the last sample the pose is constant. DataError in one line: a log lacks data that an effect needs.
         """
-        if self.motion_terms:
+        if self._corrects:
             return [self._path(log).poses(log.stamps) for log in logs]
         if not logs:
             return []
@@ -87,22 +94,22 @@ class OdometryModel:
 
         session: its name; None if it is unknown to the calibration. session_time: at the stream's start, s.
         """
-        if not self.motion_terms:
+        if not self._corrects:
             return OdometryStream(self.matrix, self.integration, start, self.robot.drive)
         assert self.sample_period is not None  # there are terms
         needs = needs_of(self.motion_terms)
         signals = SignalStream(self.robot, self.matrix, self.sample_period, session, session_time, needs=needs)
-        return EffectStream(self.motion_terms, signals, self.integration, start)
+        return EffectStream(self.motion_terms, signals, self.integration, start, self.fade)
 
     def _path(self, log: WheelLog) -> Path:
         """The path of a log under the effects of motion."""
         durations = np.diff(log.times, prepend=0.0)[:, None]
-        if not self.motion_terms:
+        if not self._corrects:
             return Path(log.times, log.start, (log.signals @ self.matrix.T) * durations, self.integration)
         assert self.sample_period is not None  # there are terms
         check_needs(self.motion_terms, log)
         signals = signals_of(log, self.robot, self.matrix, self.sample_period, needs_of(self.motion_terms))
-        twists, drift = corrected_twists(self.motion_terms, signals, self.matrix)
+        twists, drift, _ = faded_twists(self.fade, self.motion_terms, signals, self.matrix)
         world = None if drift is None else drift * durations
         return Path(log.times, log.start, twists * durations, self.integration, world)
 
