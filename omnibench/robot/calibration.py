@@ -197,6 +197,11 @@ class Calibration(Shown, Model):
         return np.array(self.matrix)
 
     @property
+    def matrix_without_effects(self) -> Array:
+        """The matrix (3, M) for whoever holds no effects: the plain one, where the file has it."""
+        return self.matrix_array if self.plain is None else np.array(self.plain)
+
+    @property
     def effects_in_words(self) -> str:
         """The effects with their parameters, like ``steering_gain (g 0.1)``."""
         return ", ".join(
