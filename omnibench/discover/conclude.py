@@ -102,7 +102,7 @@ def conclude(dataset: Dataset, request: Request, findings: Findings, seconds: fl
         outliers=fit.jumps,
         poses=sum(len(residuals) for residuals in fit.residuals),
         plain=calibration_of(dataset, baseline, "plain", request, headline),
-        extended=calibration_of(dataset, extended, "extended", request, headline),
+        extended=calibration_of(dataset, extended, "extended", request, headline, baseline),
         trajectories=tuple(run.id for run in fit.runs),
         before=tuple(baseline.fit.residuals),
         after=tuple(fit.residuals),

@@ -30,7 +30,7 @@ from omnibench.discover.result import Discovery
 from omnibench.discover.selection.candidate_groups import check_names
 from omnibench.discover.selection.competing_models import competing_models
 from omnibench.discover.selection.detectability import detectability_of
-from omnibench.discover.selection.extrapolation import extrapolations_of
+from omnibench.discover.selection.extrapolation import extrapolations_of, faded
 from omnibench.discover.selection.fitted_forms import with_fitted_forms
 from omnibench.discover.selection.locating import all_left, located
 from omnibench.discover.selection.model_selection import Selection, select_effects
@@ -130,7 +130,7 @@ def discover_effects(
         effects = named_effects(models, motors)
 
     progress.begin("comparing on runs that were held out")
-    extended = models.used
+    extended = faded(models.used, baseline)
     validation = validation_runs(dataset, extended.fit)
     held_out = compare_held_out(baseline, extended, validation, folds)
     steps = waterfall_steps(plain, baseline, extended, validation)

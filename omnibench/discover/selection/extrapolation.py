@@ -14,6 +14,7 @@ The circle that holds 95 % of normal errors of variance V / 2 in each coordinate
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from omnibench.discover.fitting.extend import Extended, columns_at
 from omnibench.discover.held_out.cross_validation import folds_of_commands, held_out_residuals
 from omnibench.discover.result import Extrapolation
 from omnibench.fit.least_squares.repetitions import grouped
+from omnibench.robot.fade import Fade
 from omnibench.robot.kinematics import Array
 from omnibench.robot.training_domain import extrapolated_share, motions_of, representatives
 
@@ -33,6 +35,16 @@ def training_domain(extended: Extended) -> Array:
     model = extended.fit.model
     motions = [motions_of(model.matrix, run.times, run.signals) for run in extended.fit.runs]
     return representatives(model.robot, np.concatenate(motions))
+
+
+def faded(extended: Extended, baseline: Extended) -> Extended:
+    """The fit with a model whose corrections fade outside the training domain. baseline: the plain matrix, fitted."""
+    model = extended.fit.model
+    if not model.terms:
+        return extended
+    change, domain = model.matrix - baseline.fit.model.matrix, training_domain(extended)
+    fade = Fade(model.robot, change, domain, model.terms, extended.covariance_of_terms)
+    return replace(extended, fit=replace(extended.fit, model=replace(model, fade=fade)))
 
 
 def extrapolations_of(
