@@ -35,8 +35,12 @@ def experiments_for(
 
 @dataclass(frozen=True, eq=False)
 class _Rivals:
-    """The members of a class, and the model in which one of them is. others: effects of that model beside it."""
+    """The members of a class, and the model in which one of them is.
 
+    weight: of the class. others: effects of that model beside the member.
+    """
+
+    weight: float
     model: Extended
     others: tuple[Group, ...]
     members: tuple[Group, ...]
@@ -50,7 +54,9 @@ class _Rivals:
         model = next((each for each in models if any(group.name == effect.name for group in each.groups)), None)
         if model is None or len(members) < 2:
             return None
-        return _Rivals(model, tuple(group for group in model.groups if group.name != effect.name), members)
+        return _Rivals(
+            effect.class_weight, model, tuple(group for group in model.groups if group.name != effect.name), members
+        )
 
     @property
     def groups(self) -> tuple[Group, ...]:
@@ -62,7 +68,7 @@ class _Rivals:
         fit = self.model.fit
         recorded = fit.whitened(columns_of(fit, self.groups), self.model.residuals_without_effects)
         base = fit.model.matrix.size + sum(len(group.parameters) for group in self.others)
-        return Separation(recorded, Members.of(base, self.members))
+        return Separation(recorded, Members.of(base, self.members), self.weight)
 
     def of_runs(self, candidates: Sequence[CandidateRun]) -> Whitened:
         """The columns of runs that could be driven."""
