@@ -26,11 +26,17 @@ def experiments_for(
 
     models: that the recordings cannot tell apart, with their weights.
     """
-    return tuple(
-        _experiment(dataset, effects, effect, rivals)
-        for effect in effects
-        if (rivals := _Rivals.of(effect, [model for _, model in models])) is not None
-    )
+    experiments = []
+    for effect in effects:
+        if effect.confusable_with and effect.stage == "actuator":
+            experiments.append(Experiment((effect.name, *effect.confusable_with), _OF_MOTORS, ""))
+        elif (rivals := _Rivals.of(effect, [model for _, model in models])) is not None:
+            experiments.append(_experiment(dataset, effects, effect, rivals))
+    return tuple(experiments)
+
+
+# Effects of the motors need no reference, and no choice of commands: any others show them (chosen).
+_OF_MOTORS = "Drive at other speeds, from rest to rest: what motors make of their targets depends on nothing else."
 
 
 @dataclass(frozen=True, eq=False)
