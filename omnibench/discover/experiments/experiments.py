@@ -26,17 +26,27 @@ def experiments_for(
 
     models: that the recordings cannot tell apart, with their weights.
     """
-    return tuple(
-        _experiment(dataset, effects, effect, rivals)
-        for effect in effects
-        if (rivals := _Rivals.of(effect, [model for _, model in models])) is not None
-    )
+    experiments = []
+    for effect in effects:
+        if effect.confusable_with and effect.stage == "actuator":
+            experiments.append(Experiment((effect.name, *effect.confusable_with), _OF_MOTORS, ""))
+        elif (rivals := _Rivals.of(effect, [model for _, model in models])) is not None:
+            experiments.append(_experiment(dataset, effects, effect, rivals))
+    return tuple(experiments)
+
+
+# Effects of the motors need no reference, and no choice of commands: any others show them (chosen).
+_OF_MOTORS = "Drive at other speeds, from rest to rest: what motors make of their targets depends on nothing else."
 
 
 @dataclass(frozen=True, eq=False)
 class _Rivals:
-    """The members of a class, and the model in which one of them is. others: effects of that model beside it."""
+    """The members of a class, and the model in which one of them is.
 
+    weight: of the class. others: effects of that model beside the member.
+    """
+
+    weight: float
     model: Extended
     others: tuple[Group, ...]
     members: tuple[Group, ...]
@@ -50,7 +60,9 @@ class _Rivals:
         model = next((each for each in models if any(group.name == effect.name for group in each.groups)), None)
         if model is None or len(members) < 2:
             return None
-        return _Rivals(model, tuple(group for group in model.groups if group.name != effect.name), members)
+        return _Rivals(
+            effect.class_weight, model, tuple(group for group in model.groups if group.name != effect.name), members
+        )
 
     @property
     def groups(self) -> tuple[Group, ...]:
@@ -62,7 +74,7 @@ class _Rivals:
         fit = self.model.fit
         recorded = fit.whitened(columns_of(fit, self.groups), self.model.residuals_without_effects)
         base = fit.model.matrix.size + sum(len(group.parameters) for group in self.others)
-        return Separation(recorded, Members.of(base, self.members))
+        return Separation(recorded, Members.of(base, self.members), self.weight)
 
     def of_runs(self, candidates: Sequence[CandidateRun]) -> Whitened:
         """The columns of runs that could be driven."""

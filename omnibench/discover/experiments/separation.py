@@ -16,7 +16,8 @@ Noise of the further runs, and the discrepancy that tempers the evidence by 1 + 
 
     var L_ij = (b_i - b_j)' D (b_i - b_j) / (1 + delta^2 N).                                                        (3)
 
-Of m members, name i is sure, with a weight of at least p, where against every other one
+A name is sure with a weight of SURE; if the class as a whole has the weight c, its share of the class is p = SURE / c
+then. Of m members, name i has that share where against every other one
 
     L_ij >= ln(p / (1 - p)) + ln(m - 1).                                                                            (4)
 
@@ -45,6 +46,7 @@ from omnibench.robot.kinematics import Array
 
 _DRAWS = 8  # of the values of each member: half and twice as many change the minutes of omni3's plan by less than 10 %
 _PLAUSIBLE = 3.0  # times the plausible size: a larger effect is not to be expected (tests/benchmarks/hidden/sets.py)
+_MOST_SHARE = 0.99  # of a class's weight: where the class itself is not sure, runs can settle no more than its member
 _RIDGE = 1e-9  # of columns of unit length: what no run determines stays at 0, and nothing else changes
 
 
@@ -105,15 +107,16 @@ WANTED = 2.0  # standard deviations of Eq. (3) by which a name shall be sure: 97
 class Separation:
     """Expected log odds between the members of a class after further runs.
 
-    recorded: columns of the recorded runs, with the members' effects put back into the residuals.
+    recorded: columns of the recorded runs, with the members' effects put back into the residuals. weight: of the class.
     """
 
-    def __init__(self, recorded: Whitened, members: Members) -> None:
+    def __init__(self, recorded: Whitened, members: Members, weight: float = 1.0) -> None:
         self.members = members
         self._information = recorded.information
         self.recorded_mean = recorded.information / len(recorded.scores)  # information (p, p) of a recorded run
         self._scores = recorded.scores.sum(axis=0)
-        self._threshold = math.log(SURE / (1 - SURE)) + math.log(max(len(members.columns) - 1, 1))  # Eq. (4)
+        share = min(SURE / weight, _MOST_SHARE)
+        self._threshold = math.log(share / (1 - share)) + math.log(len(members.columns) - 1)  # Eq. (4)
 
     @cached_property
     def _values(self) -> Array:
