@@ -10,7 +10,7 @@ from omnibench.discover.fitting.extend import Extended
 from omnibench.discover.selection.extrapolation import training_domain
 from omnibench.environment import package_versions
 from omnibench.errors import DataError
-from omnibench.fit.evaluate import split_errors
+from omnibench.registry import costs
 from omnibench.robot.calibration import (
     Calibration,
     EffectTerm,
@@ -82,6 +82,6 @@ def _cost(extended: Extended, runs: Sequence[Trajectory]) -> float | None:
     if not runs:
         return None
     try:
-        return split_errors(extended.fit.model, runs).cost
+        return costs.create("final_pose").of_model(extended.fit.model, runs)
     except DataError:
         return None

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import accumulate, pairwise
-from typing import Any, Literal, TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,7 @@ from omnibench.robot.wheels.drive import Drive, in_the_middle
 
 Integration = Literal["euler", "arc"]
 Complex = NDArray[np.complex128]
-T = TypeVar("T", bound="np.generic[Any]")
+Numbers = TypeVar("Numbers", Array, Complex, NDArray[np.intp])
 
 _LAST = 5  # samples whose mean rate continues a log after its last sample; chosen
 _BLOCK = 120_000  # samples at a time (candidates x samples), so that temporaries stay in the processor's cache
@@ -114,14 +114,14 @@ class RunSamples:
         durations: Array = self.times - self.begins
         return durations
 
-    def before(self, values: NDArray[T]) -> NDArray[T]:
+    def before(self, values: Numbers) -> Numbers:
         """Values (F, ...) of the sample before each sample; 0 of the first ones of the runs."""
         before = np.empty_like(values)
         before[1:] = values[:-1]
         before[self.edges[:-1]] = 0.0
         return before
 
-    def sums(self, values: NDArray[T]) -> NDArray[T]:
+    def sums(self, values: Numbers) -> Numbers:
         """Sums (F, ...) of values (F, ...) up to the end of each sample, from the start of its run."""
         sums = np.empty_like(values)
         for low, high in pairwise(self.edges.tolist()):
@@ -140,7 +140,7 @@ class RunSamples:
         return sample, share
 
 
-def split_by(values: NDArray[T], parts: Sequence[Array]) -> list[NDArray[T]]:
+def split_by(values: Numbers, parts: Sequence[Array]) -> list[Numbers]:
     """Values (S, ...) of all runs, cut into those of each run, of which one of the parts (K, ...) is as long."""
     return [values[low:high] for low, high in pairwise(accumulate(map(len, parts), initial=0))]
 

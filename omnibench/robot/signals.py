@@ -19,7 +19,6 @@ from omnibench.robot.planar import compose
 _STANDING = 1e-4  # m/s: a slower caster stands; and a way of its direction, of length 1, that is none; chosen
 STILL = 1e-3  # rad/s: a slower wheel counts as standing; chosen
 _SMOOTHING = 0.05  # s, time constant of the smoothed twist whose derivative is the acceleration; chosen
-_LASTING = 40 * _SMOOTHING  # s, after which 4e-18 of a smoothed twist is left: less than rounding
 # rad, half of the angle that a steering motor turns back before it takes the wheel along: above the noise and the steps
 # of usual encoders, and within the play of usual gears; chosen
 _TAKE_UP = 0.01
@@ -98,7 +97,7 @@ def signals_of_runs(
             side = np.concatenate([_sides(angles) for angles in np.split(steering, samples.edges[1:-1])])
     tracked = (rates if logs[0].drive is None else logs[0].drive.signals(rates, steering)) @ matrix.T
     twists = of_centre(robot, tracked)
-    smoothed = _smoothed(twists, samples, sample_period)
+    smoothed = _smoothed(twists, samples, smoothing_share(sample_period))
     if "caster_rates" in needs:
         parts = zip(*(np.split(values, samples.edges[1:-1]) for values in (twists, durations)), strict=True)
         swings = np.concatenate([_swings(robot, *of_run) for of_run in parts])
@@ -131,17 +130,13 @@ def _joined(of_runs: Sequence[Array | None]) -> Array | None:
     return np.concatenate(known) if len(known) == len(of_runs) else None
 
 
-def _smoothed(twists: Array, samples: RunSamples, sample_period: float) -> Array:
+def _smoothed(twists: Array, samples: RunSamples, share: float) -> Array:
     """Twists (F, 3) smoothed as ``signals_of_runs`` says, each run from rest."""
-    from scipy.signal import lfilter  # slow to import, and not needed by a live node
+    from scipy.linalg.lapack import dtbtrs  # slow to import, and not needed by a live node
 
-    share = smoothing_share(sample_period)
-    smoothed: Array = lfilter([share], [1.0, share - 1.0], twists, axis=0)
-    inner = samples.edges[1:-1]
-    left, rest = smoothed[inner - 1], np.exp(-sample_period / _SMOOTHING * np.arange(1, _LASTING / sample_period + 2))
-    for first, high, carried in zip(inner.tolist(), samples.edges[2:].tolist(), left, strict=True):
-        part = smoothed[first:high][: len(rest)]  # what a run has over from the one before it
-        part -= rest[: len(part), None] * carried
+    bands = np.array([[1.0], [share - 1.0]]).repeat(len(twists), axis=1)
+    bands[1, samples.edges[1:] - 1] = 0.0  # from the last sample of a run to the first of the next
+    smoothed: Array = dtbtrs(bands, share * twists, uplo="L")[0]
     return smoothed
 
 

@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from omnibench.discover.regressors.column_group import Group
+from omnibench.discover.regressors.column_store import ColumnStore
 from omnibench.discover.regressors.covariate_bases import Basis
 from omnibench.discover.selection.candidate_groups import Groups
 from omnibench.discover.selection.screening import Screening
@@ -45,7 +46,7 @@ def screening(
         for index, name in enumerate(named, 1)
     ]
     generic = [
-        Group("covariate", name, (index,), basis=Basis(name, "body", f"the {name}", np.zeros((0, 3, 0))))
+        Group("covariate", name, (index,), basis=Basis(name, "body", f"the {name}"))
         for index, name in enumerate(bases, 1 + len(named))
     ]
     data = Whitened(
@@ -54,7 +55,7 @@ def screening(
         vectors.T @ vectors,
         np.array([of_run.T @ values for of_run, values in zip(columns, residuals, strict=True)]),
     )
-    every = Groups(Group("matrix", "matrix", (0,)), tuple(groups), tuple(generic), np.zeros((0, 3, 0)), ())
+    every = Groups(Group("matrix", "matrix", (0,)), tuple(groups), tuple(generic), ColumnStore(), ())
     return Screening(every, data, np.arange(RUNS) % 5)
 
 

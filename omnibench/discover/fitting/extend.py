@@ -18,19 +18,19 @@ from omnibench.discover.fitting.model_fit import (
     at_runs,
     first_fit,
     model_with,
-    paths_of,
+    paths_in_parts,
     with_noise,
 )
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.regressors.paths import Paths
 from omnibench.fit.least_squares.noise import is_near
 from omnibench.fit.least_squares.trajectory_covariance import FitCovariance
-from omnibench.fit.least_squares.trajectory_fit import split_runs
 from omnibench.fit.least_squares.whitened import Whitened, given
 from omnibench.fit.uncertainty.intervals import EstimatedCovariance
 from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect
 from omnibench.robot.effects.term import Term
 from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.odometry import split_by
 
 # tests/benchmarks/constants.py varies each number by 0.5 and 2: on a small set with heading drift no verdict and no
 # name changes.
@@ -142,7 +142,11 @@ def columns_of(fit: Fit, groups: Sequence[Group]) -> tuple[Array, ...]:
     columns = fit.matrix_jacobian()
     if not groups:
         return tuple(columns)
-    of_groups = split_runs(np.concatenate(list(_of_groups(paths_of(fit), groups)), axis=2), fit.runs)
+    needs = frozenset().union(*(group.effect.needs for group in groups if group.effect is not None))
+    of_groups: list[Array] = []
+    for paths in paths_in_parts(fit, needs):
+        slopes = np.concatenate(list(_of_groups(paths, groups)), axis=2)
+        of_groups += split_by(slopes, [log.stamps for log in paths.logs])
     return tuple(np.concatenate(both, axis=2) for both in zip(columns, of_groups, strict=True))
 
 

@@ -2,27 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.fitting.outliers import without_jumps
-from omnibench.discover.regressors.paths import Paths, make_paths
+from omnibench.discover.regressors.paths import Paths, blocks_of, make_paths
 from omnibench.fit.least_squares.noise import FIRST_NOISE, NoiseEstimate, Whitener, estimate_noise, whiteners
 from omnibench.fit.least_squares.nuisance_noise import noise_of_fit
 from omnibench.fit.least_squares.nuisances import Nuisances
 from omnibench.fit.least_squares.repetitions import differences_between_repetitions
 from omnibench.fit.least_squares.start_frames import in_start_frames
 from omnibench.fit.least_squares.trajectory_fit import TrajectoryFit
-from omnibench.fit.least_squares.whitened import Whitened, without
+from omnibench.fit.least_squares.whitened import Whitened, whitened, without
 from omnibench.robot.effects.term import Term
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
 
+_ALL = slice(None)
 _UNKNOWN_NOISE = NoiseEstimate(FIRST_NOISE, "within runs", 1, "")
+_TOGETHER = 30_000  # samples whose paths are computed at once (chosen)
 # Level of the tests for nuisances. It is strict, since other noise resembles them and what they explain is lost for
 # effects: where encoders tick, start headings raise twice the log-likelihood by 10, and with them an effect was named
 # that the simulated robot does not have (tests/discover/test_robot_recordings.py). Clocks of omni3 and of a hidden set
@@ -42,14 +45,14 @@ class Fit(TrajectoryFit):
     jumps: int = 0
     noise_runs: tuple[Trajectory, ...] = ()
 
-    @property
+    @cached_property
     def with_noise_runs(self) -> Fit:
         """The fit's model at its runs and at those that the noise alone sees."""
         if not self.noise_runs:
             return self
         values = np.vstack([self.nuisances.values, np.zeros((len(self.noise_runs), 3))])
         runs, nuisances = (*self.runs, *self.noise_runs), replace(self.nuisances, values=values)
-        return replace(self, runs=runs, noise_runs=(), nuisances=nuisances).with_likeliest_nuisances()
+        return self.changed(runs=runs, noise_runs=(), nuisances=nuisances).with_likeliest_nuisances()
 
     @property
     def velocities(self) -> list[Array]:
@@ -60,17 +63,21 @@ class Fit(TrajectoryFit):
         """
         return [_velocities(log, poses) for log, poses in zip(self.logs, self.poses, strict=True)]
 
-    @property
+    @cached_property
     def weightings(self) -> list[Whitener]:
         """The whitening of each run under the noise."""
         return whiteners(self.noise.noise, self.stamps)
 
-    def whitened(self, columns: Sequence[Array], residuals: Sequence[Array] | None = None) -> Whitened:
-        """Columns (K, 3, p) and residuals (K, 3) of every run, whitened under the noise, nuisances eliminated.
+    def whitened(
+        self, columns: Sequence[Array], residuals: Sequence[Array] | None = None, runs: slice = _ALL
+    ) -> Whitened:
+        """Columns (K, 3, p) and residuals (K, 3) of some runs, whitened under the noise, nuisances eliminated.
 
         residuals: the fit's nuisance-free ones where none are given.
         """
-        return self.linearised(columns, self.weightings, residuals)
+        values = self.nuisance_free_residuals[runs] if residuals is None else residuals
+        deviations = self.nuisances.deviations[self.nuisances.estimated]
+        return whitened(values, columns, self.weightings[runs], self.estimated_slopes[runs], deviations)
 
     @property
     def weighted_residuals(self) -> list[Array]:
@@ -90,7 +97,7 @@ class Fit(TrajectoryFit):
         """The fit with the most likely nuisances for the residuals that its model leaves."""
         if not self.nuisances.estimated.any():
             return self
-        return replace(self, nuisances=replace(self.nuisances, values=self.likeliest_nuisances(self.weightings)))
+        return self.changed(nuisances=replace(self.nuisances, values=self.likeliest_nuisances(self.weightings)))
 
 
 def _velocities(log: WheelLog, poses: Array) -> Array:
@@ -116,10 +123,10 @@ def with_noise(fit: Fit) -> Fit:
     noise = estimate_noise(differences_between_repetitions(seen.runs, turned), near)
     runs, jumps = without_jumps(fit.runs, turned[:count], noise.noise)
     noise_runs, _ = without_jumps(fit.noise_runs, turned[count:], noise.noise)
-    fit = replace(fit, runs=runs, jumps=fit.jumps + jumps, noise_runs=noise_runs)
+    fit = fit.changed(runs=runs, jumps=fit.jumps + jumps, noise_runs=noise_runs)
     found = noise_of_fit(fit.with_noise_runs, range(3), noise.noise, _CHANCE)
     values = np.where(found.deviations > 0, fit.nuisances.values, 0.0)
-    fit = replace(fit, nuisances=Nuisances(values, found.deviations), noise=found.estimate)
+    fit = fit.changed(nuisances=Nuisances(values, found.deviations), noise=found.estimate)
     return fit.with_likeliest_nuisances()
 
 
@@ -129,6 +136,14 @@ def paths_of(fit: Fit, coarse: float = 0.0) -> Paths:
     together = max(1, int(coarse / fit.model.sample_period))
     logs = [_coarser(log, together) for log in fit.logs]
     return make_paths(fit.model.robot, fit.model.matrix, logs, together * fit.model.sample_period)
+
+
+def paths_in_parts(fit: Fit, needs: Collection[str]) -> Iterator[Paths]:
+    """The paths of some of the fit's runs at a time, by its matrix alone. needs: as for ``make_paths``."""
+    assert fit.model.sample_period is not None
+    for first, last in blocks_of([len(log.times) for log in fit.logs], _TOGETHER):
+        logs = fit.logs[first:last]
+        yield make_paths(fit.model.robot, fit.model.matrix, logs, fit.model.sample_period, needs, first)
 
 
 def _coarser(log: WheelLog, together: int) -> WheelLog:
@@ -146,7 +161,7 @@ def _coarser(log: WheelLog, together: int) -> WheelLog:
 
 def at_model(fit: Fit, model: OdometryModel) -> Fit:
     """Another model at the fit's runs, with the most likely nuisances given the residuals that it leaves."""
-    return replace(fit, model=model).with_likeliest_nuisances()
+    return fit.changed(model=model).with_likeliest_nuisances()
 
 
 def at_runs(fit: Fit, runs: Sequence[Trajectory]) -> Fit:

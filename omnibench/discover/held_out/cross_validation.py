@@ -72,7 +72,7 @@ def values_of_other_folds(data: Whitened, index: Sequence[int], folds: NDArray[n
     values = np.zeros((len(folds), len(index)))
     for fold in np.unique(folds):
         inside = folds == fold
-        columns = np.concatenate([data.columns[run][:, index] for run in np.flatnonzero(inside)])
+        columns = np.concatenate([data.columns[run] for run in np.flatnonzero(inside).tolist()])[:, index]
         others = Given(whole - columns.T @ columns, data.scores[~inside][:, index], np.diag(whole))
         values[inside] = others.estimate(range(len(index)))[0]  # Eq. (1)
     return values
@@ -83,7 +83,11 @@ def held_out_residuals(extended: Extended, folds: NDArray[np.intp]) -> list[Arra
 
     Nothing is fitted to the run itself, nor are its nuisances.
     """
-    values = values_of_other_folds(extended.data, range(len(extended.data.information)), folds)
+    return left_by(extended, values_of_other_folds(extended.data, range(len(extended.data.information)), folds))
+
+
+def left_by(extended: Extended, values: Array) -> list[Array]:
+    """Residuals (K, 3) of each run, to first order, by values (Z, p) of all columns, others for each run."""
     return [
         residuals - columns @ value
         for residuals, columns, value in zip(
@@ -94,7 +98,11 @@ def held_out_residuals(extended: Extended, folds: NDArray[np.intp]) -> list[Arra
 
 def held_out_squares(data: Whitened, index: Sequence[int], folds: NDArray[np.intp]) -> Array:
     """Chi-square (Z,) of each run by the columns ``index`` as fitted to all folds but the run's own."""
-    values = values_of_other_folds(data, index, folds)
+    return squares_left_by(data, index, values_of_other_folds(data, index, folds))
+
+
+def squares_left_by(data: Whitened, index: Sequence[int], values: Array) -> Array:
+    """Chi-square (Z,) of each run by values (Z, n) of the columns ``index``, others for each run."""
     of_runs = zip(data.residuals, data.columns, values, strict=True)
     left = [residuals - columns[:, list(index)] @ value for residuals, columns, value in of_runs]
     return np.array([float(np.square(of_run).sum()) for of_run in left])  # Eq. (2)
@@ -102,7 +110,10 @@ def held_out_squares(data: Whitened, index: Sequence[int], folds: NDArray[np.int
 
 def held_out_chi_square(data: Whitened, before: Sequence[int], after: Sequence[int], folds: NDArray[np.intp]) -> Array:
     """Chi-square difference (Z,) of each run between the columns ``before`` and ``after``, its fold held out."""
-    return held_out_squares(data, before, folds) - held_out_squares(data, after, folds)
+    every = sorted({*before, *after})
+    few, place = data.only(every), {column: row for row, column in enumerate(every)}
+    first, last = (held_out_squares(few, [place[each] for each in index], folds) for index in (before, after))
+    return first - last
 
 
 def is_confirmed(data: Whitened, before: Sequence[int], new: Sequence[int], folds: NDArray[np.intp]) -> bool:

@@ -18,8 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.discover.fitting.extend import Extended
-from omnibench.discover.fitting.model_fit import Fit, at_runs
-from omnibench.discover.held_out.cross_validation import STANDARD_ERRORS, held_out_residuals, held_out_squares
+from omnibench.discover.fitting.model_fit import Fit
+from omnibench.discover.held_out.cross_validation import (
+    STANDARD_ERRORS,
+    left_by,
+    squares_left_by,
+    values_of_other_folds,
+)
 from omnibench.discover.held_out.validation_runs import ValidationRuns
 from omnibench.discover.result import Gap, HeldOut
 from omnibench.fit.least_squares.noise import whiteners
@@ -42,7 +47,7 @@ def compare_held_out(
         held_out.append(_compared("repetitions", before, after, floor))
     if validation.kept:
         before, after = (errors_on(model.fit, validation) for model in (plain, extended))
-        of_session = floor_of(at_runs(extended.fit, validation.kept))
+        of_session = floor_of(validation.kept_under(extended.fit))
         held_out.append(_compared("session", before, after, of_session or floor))
     return tuple(held_out)
 
@@ -76,15 +81,17 @@ class Errors:
 
 def errors_of_repetitions(extended: Extended, folds: NDArray[np.intp]) -> Errors:
     """Errors on the runs of the fit, each predicted from the other folds."""
-    finals = np.array([residuals[-1] for residuals in held_out_residuals(extended, folds)])
-    squares = held_out_squares(extended.data, range(len(extended.data.information)), folds)
+    every = range(len(extended.data.information))
+    values = values_of_other_folds(extended.data, every, folds)
+    finals = np.array([residuals[-1] for residuals in left_by(extended, values)])
+    squares = squares_left_by(extended.data, every, values)
     return Errors(finals, squares / [len(residuals) for residuals in extended.data.residuals])
 
 
 def errors_on(fit: Fit, validation: ValidationRuns) -> Errors:
     """Errors on the validation split: of all final poses, and the chi-square of the poses that do not jump."""
-    finals = np.array([residuals[-1] for residuals in at_runs(fit, validation.runs).residuals])
-    kept = at_runs(fit, validation.kept)
+    finals = np.array([residuals[-1] for residuals in validation.all_under(fit).residuals])
+    kept = validation.kept_under(fit)
     white = kept.whitened([np.zeros((*residuals.shape, 0)) for residuals in kept.residuals]).residuals
     return Errors(finals, np.array([float(np.square(residuals).mean()) for residuals in white]))
 

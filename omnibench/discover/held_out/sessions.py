@@ -29,8 +29,10 @@ def eq6_with_changes(extended: Extended, runs: Sequence[Trajectory], comparison:
     changes = {each.session: np.array(each.matrix) for each in comparison.differences}
     if not changes.keys() & set(names):
         return None
-    model, errors = extended.fit.model, []
-    for name, run in zip(names, runs, strict=True):
+    model, errors = extended.fit.model, list[float]()
+    for name in dict.fromkeys(names):
         changed = model_with(model, model.matrix + changes.get(name, 0.0), model.terms)
-        errors.append(float(np.linalg.norm(changed.reported([run.reference_log])[0][-1] - run.final_pose)))
+        of_session = [run for run, other in zip(runs, names, strict=True) if other == name]
+        ends = np.concatenate(changed.reported([run.final_log for run in of_session]))
+        errors += np.linalg.norm(ends - [run.final_pose for run in of_session], axis=1).tolist()
     return float(np.mean(errors))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.discover.fitting.model_fit import Fit, at_runs
@@ -26,6 +26,20 @@ class ValidationRuns:
     runs: tuple[Trajectory, ...]
     kept: tuple[Trajectory, ...]
     warnings: tuple[str, ...]
+    _fits: dict[OdometryModel, Fit] = field(default_factory=dict)
+
+    def all_under(self, fit: Fit) -> Fit:
+        """The model of a fit at all runs; each model is evaluated once."""
+        there = self._fits.setdefault(fit.model, at_runs(fit, self.runs))
+        nuisances = replace(there.nuisances, deviations=fit.nuisances.deviations)
+        again = there.changed(noise=fit.noise, nuisances=nuisances)
+        _ = again.residuals
+        self._fits[fit.model] = again
+        return again
+
+    def kept_under(self, fit: Fit) -> Fit:
+        """The model of a fit at the runs without poses that jump."""
+        return self.all_under(fit).changed(runs=self.kept)
 
 
 def validation_runs(dataset: Dataset, fit: Fit) -> ValidationRuns:
@@ -42,10 +56,11 @@ def validation_runs(dataset: Dataset, fit: Fit) -> ValidationRuns:
     except DataError as error:
         warnings.append(f"{error}; nothing is compared on it.")
         return ValidationRuns((), (), tuple(warnings))
-    kept, jumps = without_jumps(runs, in_start_frames(runs, at_runs(fit, runs).residuals), fit.noise.noise)
+    there = at_runs(fit, runs)
+    kept, jumps = without_jumps(runs, in_start_frames(runs, there.residuals), fit.noise.noise)
     if jumps:
         warnings.append(f"{jumps} held-out poses contradict their neighbours; whitened χ² is without them.")
-    return ValidationRuns(runs, kept, tuple(warnings))
+    return ValidationRuns(runs, kept, tuple(warnings), {fit.model: there})
 
 
 def noise_runs(runs: Sequence[Trajectory], dataset: Dataset) -> tuple[Trajectory, ...]:

@@ -14,7 +14,7 @@ from omnibench.discover.held_out.gaps import errors_on
 from omnibench.discover.held_out.validation_runs import ValidationRuns
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.result import Step
-from omnibench.fit.least_squares.noise import Whitener
+from omnibench.fit.least_squares.noise import whiteners
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 
@@ -55,7 +55,8 @@ def _step(name: str, fit: Fit, extended: Fit, validation: ValidationRuns) -> Ste
 
 
 def _chi2(noise: Noise, runs: Sequence[Trajectory], residuals: Sequence[Array]) -> float:
-    white = [Whitener(noise, run.pose_times[1:])(values) for run, values in zip(runs, residuals, strict=True)]
+    of_runs = zip(whiteners(noise, [run.pose_times[1:] for run in runs]), residuals, strict=True)
+    white = [whiten(values) for whiten, values in of_runs]
     return float(sum(np.square(values).sum() for values in white) / sum(values.size for values in white))
 
 

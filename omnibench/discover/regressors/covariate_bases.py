@@ -7,18 +7,17 @@ only for commands, sessions and wheels that differ there is more to try than a m
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import product
+from functools import partial
+from itertools import pairwise, product
 
 import numpy as np
 
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.regressors.paths import Paths
 from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect, Stage
-from omnibench.robot.effects.reference_time import ReferenceTimeOffset
 from omnibench.robot.effects.smooth import (
-    MODES,
     SmoothCommand,
     SmoothCourse,
     SmoothEffect,
@@ -28,7 +27,6 @@ from omnibench.robot.effects.smooth import (
     SmoothPatch,
     SmoothPlace,
     bump,
-    direction,
     lever,
 )
 from omnibench.robot.effects.smooth_reference import SmoothMap, SmoothStamps, SmoothStampWave
@@ -54,19 +52,22 @@ _TOP = 0.999  # quantile of the wheel rates up to which functions of them reach
 _SMALL = 1e-9  # range below which a covariate does not vary
 
 
+Columns = Callable[[Paths], Array]  # the columns (S, 3, n) along some paths
+
+
 @dataclass(frozen=True, eq=False)
 class Basis:
-    """Columns (S, 3, n): slopes of the poses by n generic changes that vary with a covariate.
+    """Columns: slopes of the poses by n generic changes that vary with a covariate.
 
-    detail: words that complete "the residual depends on ...", and tell several bases of a covariate apart. tries: bases
-    of this kind, of which the best is taken. term: the smooth effect that adds these changes to a model, or nothing.
-    shapes: the values that shape it.
+    detail: words that complete "the residual depends on ...", and tell several bases of a covariate apart. columns:
+    None where they are not computed along paths. tries: bases of this kind, of which the best is taken. term: the
+    smooth effect that adds these changes to a model, or nothing. shapes: the values that shape it.
     """
 
     covariate: str
     stage: Stage
     detail: str
-    columns: Array
+    columns: Columns | None = None
     tries: int = 1
     term: str = ""
     shapes: Mapping[str, float] = field(default_factory=dict)
@@ -74,22 +75,21 @@ class Basis:
 
 def generic_bases(paths: Paths, trajectories: Sequence[Trajectory]) -> Iterator[Basis]:
     """All bases that these recordings allow: of each covariate that varies and was recorded."""
-    twists = _Twists(paths)
-    yield from _elapsed(paths, twists)
-    yield from _heading(paths, twists)
-    yield from _place(paths, twists)
-    yield from _order(paths, twists, trajectories)
+    yield from _elapsed(paths)
+    yield from _heading()
+    yield from _place(paths)
+    yield from _order(paths, trajectories)
     yield from _wheel_rate(paths)
     yield from _wheel_angle(paths)
     yield from _acceleration(paths)
     yield from _stamps(paths)
-    yield from _command(paths, twists, trajectories)
+    yield from _command(paths, trajectories)
 
 
 def _of_effect(
     effect: MotionEffect | ReferenceEffect,
     detail: str,
-    columns: Array,
+    columns: Columns,
     shapes: Mapping[str, float] | None = None,
     *,
     stage: Stage | None = None,
@@ -99,39 +99,34 @@ def _of_effect(
     return Basis(effect.shows_in, stage or effect.stage, detail, columns, tries, effect.name, shapes or {})
 
 
-class _Twists:
-    """Slopes of the poses by changes of the twist in each of the modes in which a smooth effect acts."""
-
-    def __init__(self, paths: Paths) -> None:
-        self._paths = paths
-        self._changes = {mode: paths.changes(paths.tracked(direction(mode, paths.signals))) for mode in MODES}
-
-    def slopes(self, modes: Sequence[str], shares: Array) -> Array:
-        """Slopes (S, 3, m J) by changes in m modes, each times shares (F, J)."""
-        return np.concatenate([self._paths.respond(self._changes[mode], shares) for mode in modes], axis=2)
-
-    def of_effect(
-        self, effect: SmoothEffect, shapes: Mapping[str, float] | None = None, functions: int | None = None
-    ) -> Array:
-        """Slopes by a smooth effect, of its first so many functions, or of all, in each of its modes."""
-        return self.slopes(effect.modes, effect.shares(self._paths.signals, shapes or {})[:, :functions])
+def _in_modes(along: Paths, modes: Sequence[str], shares: Array) -> Array:
+    """Slopes (S, 3, m J) by changes of the twist in m of the modes in which smooth effects act, times shares (F, J)."""
+    return np.concatenate([along.respond(along.by_modes[mode], shares) for mode in modes], axis=2)
 
 
-def _elapsed(paths: Paths, twists: _Twists) -> Iterator[Basis]:
+def _smooth(effect: SmoothEffect, shapes: Mapping[str, float] | None = None, functions: int | None = None) -> Columns:
+    """Slopes by a smooth effect, of its first so many functions, or of all, in each of its modes."""
+    return lambda along: _in_modes(along, effect.modes, effect.shares(along.signals, shapes or {})[:, :functions])
+
+
+def _elapsed(paths: Paths) -> Iterator[Basis]:
     effect, shapes = SmoothElapsedTime(), {"duration": max(float(paths.signals.elapsed.max()), _SMALL)}
-    yield _of_effect(effect, "the time since the start of a run", twists.of_effect(effect, shapes, _ORDERS), shapes)
+    yield _of_effect(effect, "the time since the start of a run", _smooth(effect, shapes, _ORDERS), shapes)
 
 
-def _heading(paths: Paths, twists: _Twists) -> Iterator[Basis]:
+def _heading() -> Iterator[Basis]:
     heading, course = SmoothHeading(), SmoothCourse()
-    yield _of_effect(heading, "the robot's heading", twists.of_effect(heading))
-    speed = np.hypot(paths.signals.twists[:, 0], paths.signals.twists[:, 1])
-    steady = [paths.of_velocity(speed[:, None] * axis) for axis in np.eye(2)]
-    columns = np.concatenate([*steady, twists.of_effect(course)], axis=2)
-    yield _of_effect(course, "the direction of travel in the world", columns, stage="world")
+    yield _of_effect(heading, "the robot's heading", _smooth(heading))
+
+    def steady_and_course(along: Paths) -> Array:
+        speed = np.hypot(along.signals.twists[:, 0], along.signals.twists[:, 1])
+        steady = [along.of_velocity(speed[:, None] * axis) for axis in np.eye(2)]
+        return np.concatenate([*steady, _smooth(course)(along)], axis=2)
+
+    yield _of_effect(course, "the direction of travel in the world", steady_and_course, stage="world")
 
 
-def _place(paths: Paths, twists: _Twists) -> Iterator[Basis]:
+def _place(paths: Paths) -> Iterator[Basis]:
     places = paths.middle[:, :2]
     centre = places.mean(axis=0)
     reach = float(np.linalg.norm(places - centre, axis=1).max())
@@ -139,14 +134,17 @@ def _place(paths: Paths, twists: _Twists) -> Iterator[Basis]:
         return
     area = {"centre_x": float(centre[0]), "centre_y": float(centre[1]), "reach": reach}
     floor, bent, patch = SmoothPlace(), SmoothMap(), SmoothPatch()
-    yield _of_effect(floor, "where on the floor the robot is", twists.of_effect(floor, area), area)
-    starts = np.array([log.start for log in paths.logs])[paths.run]
-    there, first = (bent.functions(poses[:, :2], area) for poses in (paths.poses, starts))
-    columns = np.concatenate([axis[:, None] * (there - first)[:, None, :] for axis in np.eye(3)], axis=2)
-    yield _of_effect(bent, "where on the map the reference is read", columns, area)
+    yield _of_effect(floor, "where on the floor the robot is", _smooth(floor, area), area)
+
+    def shifted(along: Paths) -> Array:
+        starts = np.array([log.start for log in along.logs])[along.run]
+        there, first = (bent.functions(poses[:, :2], area) for poses in (along.poses, starts))
+        return np.concatenate([axis[:, None] * (there - first)[:, None, :] for axis in np.eye(3)], axis=2)
+
+    yield _of_effect(bent, "where on the map the reference is read", shifted, area)
     patches = list(_patches(places))
     for shapes in patches:
-        yield _of_effect(patch, "a patch of the floor", twists.of_effect(patch, shapes), shapes, tries=len(patches))
+        yield _of_effect(patch, "a patch of the floor", _smooth(patch, shapes), shapes, tries=len(patches))
 
 
 def _patches(places: Array) -> Iterator[dict[str, float]]:
@@ -161,16 +159,21 @@ def _patches(places: Array) -> Iterator[dict[str, float]]:
             yield patch
 
 
-def _order(paths: Paths, twists: _Twists, trajectories: Sequence[Trajectory]) -> Iterator[Basis]:
+def _order(paths: Paths, trajectories: Sequence[Trajectory]) -> Iterator[Basis]:
     time = paths.signals.session_time
     if time is not None and len(paths.logs) > 3:  # any three times lie on a parabola
         effect, shapes = SmoothOrderOfRuns(), {"duration": max(float(time.max()), _SMALL)}
-        columns = twists.of_effect(effect, shapes, _ORDERS)
+        columns = _smooth(effect, shapes, _ORDERS)
         yield _of_effect(effect, "the time since the start of the session", columns, shapes, stage="wheel")
     sessions = list(dict.fromkeys(run.session for run in trajectories))
     if len(sessions) > 1:
         belongs = np.array([[run.session == name for name in sessions[1:]] for run in trajectories], dtype=float)
-        yield Basis("order of runs", "wheel", "the session", twists.slopes(("along", "rotation"), belongs[paths.owner]))
+        yield Basis(
+            "order of runs",
+            "wheel",
+            "the session",
+            lambda along: _in_modes(along, ("along", "rotation"), belongs[along.first + along.owner]),
+        )
 
 
 def _wheel_rate(paths: Paths) -> Iterator[Basis]:
@@ -178,21 +181,32 @@ def _wheel_rate(paths: Paths) -> Iterator[Basis]:
     top = float(np.quantile(np.abs(rates), _TOP))
     if top < _SMALL:
         return
-    effect, shapes, changes = SmoothWheelRate(), {"top": top}, hat_functions(rates, top)
-    of_wheels = [paths.of_wheel(wheel, changes[:, wheel]) for wheel in range(rates.shape[1])]
-    yield _of_effect(effect, "how fast the wheels turn", np.sum(of_wheels, axis=0), shapes)
-    yield _of_effect(effect, "how fast each wheel turns", np.concatenate(of_wheels, axis=2), shapes)
+    effect, shapes = SmoothWheelRate(), {"top": top}
+
+    def of_wheels(along: Paths) -> list[Array]:
+        changes = hat_functions(along.signals.rates, top)
+        return [along.of_wheel(wheel, changes[:, wheel]) for wheel in range(changes.shape[1])]
+
+    yield _of_effect(effect, "how fast the wheels turn", lambda along: np.sum(of_wheels(along), axis=0), shapes)
+    yield _of_effect(
+        effect, "how fast each wheel turns", lambda along: np.concatenate(of_wheels(along), axis=2), shapes
+    )
 
 
 def _wheel_angle(paths: Paths) -> Iterator[Basis]:
-    signals, effect = paths.signals, SmoothWheelAngle()
-    if signals.wheel_angles is None:
+    if paths.signals.wheel_angles is None:
         return
+    effect = SmoothWheelAngle()
+
+    def of_wheels(along: Paths, harmonic: float) -> Array:
+        wheels = range(along.signals.rates.shape[1])
+        columns = [along.of_wheel(wheel, mean_waves(along.signals, wheel, harmonic)) for wheel in wheels]
+        return np.concatenate(columns, axis=2)
+
     for harmonic in HARMONICS:
-        wheels = range(signals.rates.shape[1])
-        columns = [paths.of_wheel(wheel, mean_waves(signals, wheel, harmonic)) for wheel in wheels]
         words = f"the angle of the wheels, {harmonic:g} times a turn"
-        yield _of_effect(effect, words, np.concatenate(columns, axis=2), {"harmonic": harmonic}, tries=len(HARMONICS))
+        columns = partial(of_wheels, harmonic=harmonic)
+        yield _of_effect(effect, words, columns, {"harmonic": harmonic}, tries=len(HARMONICS))
 
 
 def _acceleration(paths: Paths) -> Iterator[Basis]:
@@ -201,17 +215,26 @@ def _acceleration(paths: Paths) -> Iterator[Basis]:
     if max(top, turning) < _SMALL:
         return
     effect, shapes = SmoothAcceleration(), {"top": max(top, _SMALL), "top_turning": max(turning, _SMALL)}
-    columns = [paths.of_effect(effect, name, values) for name, values in _units(effect, paths, shapes)]
-    yield _of_effect(effect, "how the robot accelerates", np.concatenate(columns, axis=2), shapes)
+    units = list(_units(effect, paths, shapes))
+    yield _of_effect(
+        effect,
+        "how the robot accelerates",
+        lambda along: np.concatenate([along.of_effect(effect, name, values) for name, values in units], axis=2),
+        shapes,
+    )
 
 
 def _stamps(paths: Paths) -> Iterator[Basis]:
     stamps = paths.stamps
-    later = paths.of_effect(ReferenceTimeOffset(), "tau", {"tau": 0.0})
 
-    def by_delays(effect: ReferenceEffect, shapes: Mapping[str, float]) -> Array:
-        delays = [effect.delays(stamps, values) for _, values in _units(effect, paths, shapes)]
-        return later * np.stack([[position, position, heading] for position, heading in delays]).T
+    def by_delays(effect: ReferenceEffect, shapes: Mapping[str, float]) -> Columns:
+        units = [values for _, values in _units(effect, paths, shapes)]
+
+        def columns(along: Paths) -> Array:
+            delays = [effect.delays(along.stamps, values) for values in units]
+            return along.by_delay * np.stack([[position, position, heading] for position, heading in delays]).T
+
+        return columns
 
     steps = [np.diff(log.stamps) for log in paths.logs if len(log.stamps) > 1]
     finest = float(np.median(np.concatenate(steps)) if steps else stamps.max())
@@ -234,16 +257,27 @@ def _units(
         yield name, dict.fromkeys(names, 0.0) | dict(shapes) | {name: 1.0}
 
 
-def _command(paths: Paths, twists: _Twists, trajectories: Sequence[Trajectory]) -> Iterator[Basis]:
-    commands = list(dict.fromkeys(run.command for run in trajectories if run.command is not None))
-    if len(commands) < 4:  # three motions are what some matrix makes of any wheel rates
+def _command(paths: Paths, trajectories: Sequence[Trajectory]) -> Iterator[Basis]:
+    names = list(dict.fromkeys(run.command for run in trajectories if run.command is not None))
+    if len(names) < 4:  # three motions are what some matrix makes of any wheel rates
         return
-    belongs = np.array([[run.command == command for command in commands] for run in trajectories], dtype=float)
-    shares = belongs[paths.owner]
-    motions = np.array([np.median(paths.signals.twists[samples], axis=0) for samples in (shares > 0).T])
-    columns, effect, count = twists.slopes(SmoothCommand.modes, shares), SmoothCommand(), len(commands)
-    for number, (command, shapes) in enumerate(zip(commands, _near_motions(paths, motions), strict=True)):
-        yield _of_effect(effect, f"the command {command}", columns[..., number::count], shapes, tries=count)
+    number = {name: index for index, name in enumerate(names)}
+    commands = np.array([-1 if run.command is None else number[run.command] for run in trajectories])
+    of_samples, effect, count = commands[paths.owner], SmoothCommand(), len(names)
+    order = np.argsort(of_samples, kind="stable")
+    ends = np.searchsorted(of_samples[order], np.arange(count + 1))
+    motions = np.array(
+        [np.median(paths.signals.twists[order[low:high]], axis=0) for low, high in pairwise(ends.tolist())]
+    )
+
+    def of_command(along: Paths, command: int) -> Array:
+        driven = commands[along.first : along.first + len(along.logs)] == command
+        if not driven.any():
+            return np.zeros((len(along.poses), 3, len(SmoothCommand.modes)))
+        return _in_modes(along, SmoothCommand.modes, driven[along.owner, None].astype(float))
+
+    for command, (name, shapes) in enumerate(zip(names, _near_motions(paths, motions), strict=True)):
+        yield _of_effect(effect, f"the command {name}", partial(of_command, command=command), shapes, tries=count)
 
 
 def _near_motions(paths: Paths, motions: Array) -> Iterator[dict[str, float]]:

@@ -81,14 +81,11 @@ def fine_structure(fit: Fit, rng: np.random.Generator) -> Significance | None:
             for shape, of_runs in zip(kind.shapes[part], independent, strict=True):
                 if of_runs.shape[1]:
                     basis = Basis(
-                        kind.covariate, "body", kind.detail.format(**shape), _NONE, len(kind.shapes), kind.term, shape
+                        kind.covariate, "body", kind.detail.format(**shape), None, len(kind.shapes), kind.term, shape
                     )
                     groups.append(Group("covariate", kind.covariate, (), tries=basis.tries, basis=basis))
                     scores.append(of_runs)
     return significance_of_scores(groups, scores, scores, rng) if groups else None
-
-
-_NONE = np.zeros((0, 3, 0))
 
 
 def _units(paths: Paths) -> tuple[NDArray[np.intp], int]:

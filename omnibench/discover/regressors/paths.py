@@ -11,7 +11,7 @@ sum over the samples is enough for each change.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import pairwise
@@ -25,6 +25,8 @@ from omnibench.errors import PluginError
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect
 from omnibench.robot.effects.forms import correction_of
+from omnibench.robot.effects.reference_time import ReferenceTimeOffset
+from omnibench.robot.effects.smooth import MODES, direction
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import RunSamples, WheelLog
 from omnibench.robot.path import PathBatch
@@ -34,7 +36,10 @@ from omnibench.robot.signals import Signals, signals_of_runs
 # changes.
 _STEP = 0.1  # share of the plausible range: step of a reference effect's parameter for its slope
 _LAST = 5  # samples at the end of a run whose mean velocity leads on to stamps after it, as WheelLog.continued does
-_BLOCK = 10_000  # samples that are summed at once, so that they stay in the processor's cache
+_NUMBERS = 8_000_000  # numbers that are summed at once: 64 MB
+# Samples in a part, a stamp counting as 8: a part's numbers stay in the processor's cache, and its columns are few
+# enough to be held as 64 bits, 25 MB of a thousand (chosen).
+_BLOCK, _STAMPS = 10_000, 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +48,8 @@ class Paths:
 
     signals: signals of all samples. sessions: the samples of each session. owner (F,): the run of each sample. middle
     (F, 3): pose in the middle of each sample. poses (S, 3): poses at the stamps. run (S,): the run of each stamp.
-    parts: the stamps of each run. ends: for each run, poses at the start and at the end of each sample.
+    parts: the stamps of each run. ends: for each run, poses at the start and at the end of each sample. first: number
+    of the first run, not 0 in a part of longer paths.
     """
 
     robot: Robot
@@ -57,9 +63,32 @@ class Paths:
     run: NDArray[np.intp]
     parts: tuple[slice, ...]
     ends: tuple[Array, ...]
-    _blocks: tuple[_Block, ...]
+    first: int
     _turns: Array  # (F, 4): cosine, sine, x and y from the run's start, each times the sample's duration
     _lever: Array  # (S, 2): from the run's start
+
+    def in_parts(self) -> Iterator[Paths]:
+        """The paths of some runs at a time, few enough that a thousand columns fit into memory."""
+        edges = np.searchsorted(self.owner, np.arange(len(self.logs) + 1))
+        for first, last in blocks_of([_STAMPS * len(log.stamps) + len(log.times) for log in self.logs], _BLOCK):
+            samples = slice(int(edges[first]), int(edges[last]))
+            stamps = slice(self.parts[first].start, self.parts[last - 1].stop)
+            within = [(name, _overlap(part, samples)) for name, part in self.sessions]
+            yield replace(
+                self,
+                logs=self.logs[first:last],
+                signals=_part(self.signals, samples, self.signals.session),
+                sessions=tuple((name, part) for name, part in within if part.start < part.stop),
+                owner=self.owner[samples] - first,
+                middle=self.middle[samples],
+                poses=self.poses[stamps],
+                run=self.run[stamps] - first,
+                parts=tuple(_moved(part, -stamps.start) for part in self.parts[first:last]),
+                ends=self.ends[first:last],
+                first=self.first + first,
+                _turns=self._turns[samples],
+                _lever=self._lever[stamps],
+            )
 
     @property
     def stamps(self) -> Array:
@@ -159,12 +188,13 @@ class Paths:
     def respond(self, column: Array, shares: Array | None) -> Array:
         """Slopes (S, 3, J) by column (F, 3), changes of (z, theta) in each sample, times shares (F, J)."""
         if shares is None:
-            shares = np.ones((len(column), 1))
-        slopes = np.empty((len(self.poses), 3, shares.shape[1]))
-        for block in self._blocks:
-            changes = column[block.samples, :, None] * shares[block.samples, None, :]
-            slopes[block.stamps] = block.summed(changes, self._lever[block.stamps])
-        return slopes
+            return self._summed(column[:, :, None])
+        width = max(1, _NUMBERS // (3 * len(column)))
+        blocks = [
+            self._summed(column[:, :, None] * shares[:, None, low : low + width])
+            for low in range(0, shares.shape[1], width)
+        ]
+        return blocks[0] if len(blocks) == 1 else np.concatenate(blocks, axis=2)
 
     def changes(self, twist: Array) -> Array:
         """Integrals (F, 3) of exp(i theta) dv - i z dw and of dw over each sample. twist: changes (3,) or (F, 3)."""
@@ -176,49 +206,76 @@ class Paths:
         changes[:, 2] = self.signals.durations * turn
         return changes
 
+    @cached_property
+    def by_modes(self) -> dict[str, Array]:
+        """Changes (F, 3) of (z, theta) in each sample by each of the modes in which a smooth effect acts."""
+        return {mode: self.changes(self.tracked(direction(mode, self.signals))) for mode in MODES}
 
-@dataclass(frozen=True, eq=False)
-class _Block:
-    """Some of the runs: their samples and stamps; in the block, the first stamp of each run and the run of each stamp.
+    @cached_property
+    def by_delay(self) -> Array:
+        """Slopes (S, 3, 1) by a delay of the reference, s."""
+        return self.of_effect(ReferenceTimeOffset(), "tau", {"tau": 0.0})
 
-    sums (s, f): adds up what the block's samples do between one stamp and the next.
-    """
+    @cached_property
+    def _sums(self) -> csr_array:
+        return _sums(self.logs)
 
-    samples: slice
-    stamps: slice
-    firsts: NDArray[np.intp]
-    run: NDArray[np.intp]
-    sums: csr_array
-
-    def summed(self, changes: Array, lever: Array) -> Array:
-        """Slopes (s, 3, J) by changes (f, 3, J) of (z, theta) in each sample; lever (s, 2): from the run's start."""
-        steps = np.asarray(self.sums @ changes.reshape(len(changes), -1)).reshape(-1, *changes.shape[1:])
+    def _summed(self, changes: Array) -> Array:
+        """Slopes (S, 3, J) by changes (F, 3, J) of (z, theta) in each sample."""
+        steps = np.asarray(self._sums @ changes.reshape(len(changes), -1)).reshape(-1, *changes.shape[1:])
         np.cumsum(steps, axis=0, out=steps)
-        before = np.concatenate([np.zeros((1, *steps.shape[1:])), steps[self.firsts[1:] - 1]])
+        firsts = [part.start for part in self.parts[1:]]
+        before = np.concatenate([np.zeros((1, *steps.shape[1:])), steps[[first - 1 for first in firsts]]])
         steps -= before[self.run]
         turned = steps[:, 2]
-        steps[:, 0] -= lever[:, 1, None] * turned
-        steps[:, 1] += lever[:, 0, None] * turned
+        steps[:, 0] -= self._lever[:, 1, None] * turned
+        steps[:, 1] += self._lever[:, 0, None] * turned
         return steps
 
 
-def make_paths(robot: Robot, matrix: Array, logs: Sequence[WheelLog], sample_period: float) -> Paths:
-    """The paths of runs by a matrix alone, with exact arcs."""
+def blocks_of(sizes: Sequence[int], most: int) -> Iterator[tuple[int, int]]:
+    """First and last, exclusive, of consecutive runs whose sizes add up to ``most`` at most, or of a single one."""
+    first, total = 0, 0
+    for index, size in enumerate(sizes):
+        if total and total + size > most:
+            yield first, index
+            first, total = index, 0
+        total += size
+    yield first, len(sizes)
+
+
+def _overlap(part: slice, other: slice) -> slice:
+    """The samples that are in both, counted from the first of the other."""
+    return _moved(slice(max(part.start, other.start), max(min(part.stop, other.stop), other.start)), -other.start)
+
+
+def _moved(part: slice, by: int) -> slice:
+    return slice(part.start + by, part.stop + by)
+
+
+def make_paths(
+    robot: Robot,
+    matrix: Array,
+    logs: Sequence[WheelLog],
+    sample_period: float,
+    needs: Collection[str] | None = None,
+    first: int = 0,
+) -> Paths:
+    """The paths of runs by a matrix alone, with exact arcs.
+
+    needs: signals to compute that only some effects need, by default those that any effect needs which applies to the
+    robot. first: number of the first run.
+    """
     order = sorted(range(len(logs)), key=lambda index: str(logs[index].session))
     assert order == list(range(len(logs))), "runs come by session"
     samples = RunSamples.of([log.times for log in logs])
     sessions, starts = _sessions(logs, samples.edges), np.array([log.start for log in logs])
-    needs = _needs(robot)
+    needs = frozenset(_needs(robot) if needs is None else needs) - {"poses"}  # which are computed in any case
     of_sessions = [
         signals_of_runs(
-            logs[first:last],
-            RunSamples.of([log.times for log in logs[first:last]]),
-            robot,
-            matrix,
-            sample_period,
-            needs,
+            logs[low:high], RunSamples.of([log.times for log in logs[low:high]]), robot, matrix, sample_period, needs
         )
-        for _, (first, last), _ in sessions
+        for _, (low, high), _ in sessions
     ]
     signals = _joined(of_sessions)
     driven = robot.drive.signals(signals.rates, signals.steering)
@@ -226,7 +283,7 @@ def make_paths(robot: Robot, matrix: Array, logs: Sequence[WheelLog], sample_per
     edges = np.cumsum([0, *(len(log.stamps) for log in logs)])
     parts = tuple(slice(int(low), int(high)) for low, high in pairwise(edges))
     middle, ends = path.middles, path.ends
-    sums, poses = _sums(logs, ends)
+    poses = np.concatenate([_poses_along(log, path) for log, path in zip(logs, ends, strict=True)])
     run = np.repeat(np.arange(len(logs)), np.diff(edges))
     from_start = middle[:, :2] - starts[samples.run, :2]
     turns = np.column_stack([np.cos(middle[:, 2]), np.sin(middle[:, 2]), from_start]) * signals.durations[:, None]
@@ -242,28 +299,16 @@ def make_paths(robot: Robot, matrix: Array, logs: Sequence[WheelLog], sample_per
         run=run,
         parts=parts,
         ends=tuple(ends),
-        _blocks=tuple(_blocks_of(sums, samples.edges, edges)),
+        first=first,
         _turns=turns,
         _lever=poses[:, :2] - starts[run, :2],
     )
 
 
-def _blocks_of(sums: csr_array, first_samples: NDArray[np.intp], first_stamps: NDArray[np.intp]) -> Iterator[_Block]:
-    """Blocks of consecutive runs, of some thousand samples each. sums (S, F): of all runs."""
-    first, runs = 0, len(first_samples) - 1
-    for last in range(1, runs + 1):
-        if last == runs or first_samples[last + 1] - first_samples[first] > _BLOCK:
-            samples, stamps = (slice(int(edge[first]), int(edge[last])) for edge in (first_samples, first_stamps))
-            firsts = first_stamps[first:last] - first_stamps[first]
-            run = np.repeat(np.arange(last - first), np.diff(first_stamps[first : last + 1]))
-            yield _Block(samples, stamps, firsts, run, sums[stamps, samples])
-            first = last
-
-
 def _needs(robot: Robot) -> frozenset[str]:
-    """Signals that effects which apply to a robot need; its poses are computed in any case."""
+    """Signals that effects which apply to a robot need."""
     trial = [effects.create(entry.name) for entry in effects.entries()]
-    return frozenset().union(*(effect.needs for effect in trial if effect.applies(robot))) - {"poses"}
+    return frozenset().union(*(effect.needs for effect in trial if effect.applies(robot)))
 
 
 def _along(times: Array, ends: Array, values: Array) -> Array:
@@ -277,13 +322,18 @@ def _along(times: Array, ends: Array, values: Array) -> Array:
     return along
 
 
-def _sums(logs: Sequence[WheelLog], ends: Sequence[Array]) -> tuple[csr_array, Array]:
-    """The matrix (S, F) that adds up what samples do between one stamp and the next, and the poses (S, 3) there."""
-    rows, columns, weights, poses = [], [], [], []
+def _poses_along(log: WheelLog, path: Array) -> Array:
+    """Poses (S, 3) at a log's stamps, by straight lines between the poses (F + 1, 3) of its path."""
+    times = np.concatenate([[0.0], log.times])
+    return np.column_stack([_along(log.stamps, times, path[:, axis]) for axis in range(3)])
+
+
+def _sums(logs: Sequence[WheelLog]) -> csr_array:
+    """The matrix (S, F) that adds up what samples do between one stamp and the next."""
+    rows, columns, weights = [], [], []
     stamp, first = 0, 0
-    for log, path in zip(logs, ends, strict=True):
+    for log in logs:
         times = np.concatenate([[0.0], log.times])
-        poses.append(np.column_stack([_along(log.stamps, times, path[:, axis]) for axis in range(3)]))
         edges = np.unique(np.concatenate([times, np.clip(log.stamps, 0.0, times[-1])]))
         middles = (edges[1:] + edges[:-1]) / 2
         sample = np.searchsorted(log.times, middles)
@@ -295,7 +345,7 @@ def _sums(logs: Sequence[WheelLog], ends: Sequence[Array]) -> tuple[csr_array, A
         weights.append(share[inside])
         stamp, first = stamp + len(log.stamps), first + len(log.times)
     entries = (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns)))
-    return csr_array(entries, shape=(stamp, first)), np.concatenate(poses)
+    return csr_array(entries, shape=(stamp, first))
 
 
 def _sessions(logs: Sequence[WheelLog], edges: NDArray[np.intp]) -> list[tuple[str | None, tuple[int, int], slice]]:

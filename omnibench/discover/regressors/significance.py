@@ -201,10 +201,7 @@ def _noise_scores(data: Whitened, fitted: list[int], groups: Sequence[Group]) ->
     if len(taken) == len(fitted):
         return now
     values, _ = given(data, []).estimate(taken)
-    residuals = [
-        of_run - columns[:, taken] @ values for of_run, columns in zip(data.residuals, data.columns, strict=True)
-    ]
-    return given(data.with_residuals(residuals), fitted)
+    return given(data.less(taken, values), fitted)
 
 
 def _evidence(chi_square: Array, rank: Array, spread: Array, tries: Array) -> Array:

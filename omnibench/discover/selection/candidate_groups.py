@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
-from itertools import product
+from itertools import accumulate, pairwise, product
 
 import numpy as np
 
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.regressors.column_group import Group
-from omnibench.discover.regressors.covariate_bases import generic_bases
+from omnibench.discover.regressors.column_store import ColumnStore
+from omnibench.discover.regressors.covariate_bases import Columns, generic_bases
 from omnibench.discover.regressors.paths import Paths
 from omnibench.registry import effects
-from omnibench.robot.effects.effect import Effect, MotionEffect, ReferenceEffect
+from omnibench.robot.effects.effect import Effect, MotionEffect, Parameter, ReferenceEffect
 from omnibench.robot.effects.forms import Forms, forms_of
 from omnibench.robot.kinematics import Array, Robot
 
@@ -34,29 +35,24 @@ class Missing(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Groups:
-    """All groups with their columns (S, 3, p), and the effects that cannot be looked for in these recordings."""
+    """All groups, their columns, and the effects that cannot be looked for in these recordings.
+
+    columns (K, 3, p): for each run, the differences of the columns from one stamp to the next, the first from 0, which
+    lose nothing by being rounded.
+    """
 
     matrix: Group
     effects: tuple[Group, ...]
     bases: tuple[Group, ...]
-    columns: Array
+    columns: ColumnStore
     not_looked_for: tuple[tuple[str, Missing], ...]
 
 
 def make_groups(paths: Paths, trajectories: Sequence[Trajectory], without: Sequence[str]) -> Groups:
     """Groups and columns along paths. without: names of effects that are not to be tried."""
-    columns: list[Array] = [_of_matrix(paths)]
-    count = columns[0].shape[2]
-    matrix = Group("matrix", "matrix", tuple(range(count)))
     named: list[Group] = []
+    sources: list[Columns] = [_of_matrix]
     not_looked_for: list[tuple[str, Missing]] = []
-
-    def add(new: Array) -> tuple[int, ...]:
-        nonlocal count
-        columns.append(new)
-        count += new.shape[2]
-        return tuple(range(count - new.shape[2], count))
-
     sessions = tuple(dict.fromkeys(run.session for run in trajectories if run.session is not None))
     for effect in _candidates(paths.robot, without):
         if missing := _lacks(effect, paths, sessions):
@@ -69,20 +65,60 @@ def make_groups(paths: Paths, trajectories: Sequence[Trajectory], without: Seque
                   product(*(each.choices for each in shaping))]  # fmt: skip
         for shape in shapes:
             base = {each.name: 0.0 for each in linear} | shape
-            index = add(np.concatenate([paths.of_effect(effect, each.name, base) for each in linear], axis=2))
             family = None if len(shapes) > _FEW else _family(paths, effect, [each.name for each in linear], base)
-            forms: tuple[int, ...] = ()
-            if family is not None:
-                zero = base | dict.fromkeys((each.name for each in family.parameters), 0.0) | dict(family.scales)
-                forms = add(
-                    np.concatenate([paths.of_effect(effect, each.name, zero) for each in family.parameters], axis=2)
-                )
-            named.append(Group("effect", effect.name, index, effect, linear, shape, len(shapes), forms, family))
-    bases = [
-        Group("covariate", basis.covariate, add(basis.columns), tries=basis.tries, basis=basis)
-        for basis in generic_bases(paths, trajectories)
-    ]
-    return Groups(matrix, tuple(named), tuple(bases), np.concatenate(columns, axis=2), tuple(not_looked_for))
+            named.append(Group("effect", effect.name, (), effect, linear, shape, len(shapes), family=family))
+            sources += [_of_effect(effect, linear, base), _of_forms(effect, family, base)]
+    bases = list(generic_bases(paths, trajectories))
+    sources += [basis.columns or _none for basis in bases]
+    columns, widths = _stored(paths, sources)
+    ends = accumulate(widths, initial=0)
+    matrix, *others = (tuple(range(low, high)) for low, high in pairwise(ends))
+    return Groups(
+        Group("matrix", "matrix", matrix),
+        tuple(
+            replace(group, index=index, forms=forms)
+            for group, index, forms in zip(named, others[::2], others[1::2], strict=False)
+        ),
+        tuple(
+            Group("covariate", basis.covariate, index, tries=basis.tries, basis=basis)
+            for basis, index in zip(bases, others[2 * len(named) :], strict=True)
+        ),
+        columns,
+        tuple(not_looked_for),
+    )
+
+
+def _stored(paths: Paths, sources: Sequence[Columns]) -> tuple[ColumnStore, list[int]]:
+    """The columns of all sources along the paths, some runs at a time, and how many each source has."""
+    store, widths = ColumnStore(), list[int]()
+    for part in paths.in_parts():
+        columns = [source(part) for source in sources]
+        widths = [of_source.shape[2] for of_source in columns]
+        together = np.concatenate(columns, axis=2)
+        steps = np.diff(together, axis=0, prepend=0.0)
+        firsts = [stamps.start for stamps in part.parts]
+        steps[firsts] = together[firsts]
+        store.append(steps, [stamps.stop - stamps.start for stamps in part.parts])
+    return store, widths
+
+
+def _none(along: Paths) -> Array:
+    return np.zeros((len(along.poses), 3, 0))
+
+
+def _of_effect(
+    effect: MotionEffect | ReferenceEffect, parameters: Sequence[Parameter], values: Mapping[str, float]
+) -> Columns:
+    """Slopes by some parameters of an effect, the values of all others given."""
+    return lambda along: np.concatenate([along.of_effect(effect, each.name, values) for each in parameters], axis=2)
+
+
+def _of_forms(effect: MotionEffect | ReferenceEffect, family: Forms | None, values: Mapping[str, float]) -> Columns:
+    """Slopes by the parameters of an effect's forms, if it has any."""
+    if family is None:
+        return _none
+    zero = dict(values) | dict.fromkeys((each.name for each in family.parameters), 0.0) | dict(family.scales)
+    return _of_effect(effect, family.parameters, zero)
 
 
 def _of_matrix(paths: Paths) -> Array:

@@ -25,7 +25,7 @@ import numpy as np
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.fitting.model_fit import Fit
 from omnibench.fit.least_squares.repetitions import grouped
-from omnibench.fit.least_squares.whitened import given
+from omnibench.fit.least_squares.whitened import Whitened, given
 from omnibench.robot.kinematics import Array
 from omnibench.robot.planar import rotated
 from omnibench.robot.wheels.drive import in_the_middle
@@ -67,21 +67,20 @@ def _tick(steps: Array) -> float:
 class EncoderQuantisation:
     """Upper bounds on the chi-square that encoder quantisation lets columns explain, if every command conspired."""
 
-    def __init__(self, fit: Fit, columns: Sequence[Array]) -> None:
-        """columns (K, 3, p): columns of every run of the fit, before whitening."""
+    def __init__(self, fit: Fit, data: Whitened) -> None:
+        """data: the columns of every run of the fit."""
         self.steps = quantisation_steps(fit.runs)
-        self._count = columns[0].shape[2]
+        self._data = data
         if not self.steps.any():
             return
         errors = [
             _quarter_ticks(run, run.poses[1:] - residuals, fit.model.matrix, self.steps)
             for run, residuals in zip(fit.runs, fit.residuals, strict=True)
         ]
-        data = fit.whitened([np.concatenate(both, axis=2) for both in zip(columns, errors, strict=True)])
+        of_runs = zip(data.columns, fit.whitened(errors).columns, strict=True)
+        products = [columns.T @ of_errors for columns, of_errors in of_runs]
         members = grouped([run.command or run.id for run in fit.runs])
-        products = [both[:, : self._count].T @ both[:, self._count :] for both in data.columns]
         self._products = np.concatenate([sum(products[run] for run in runs) for runs in members], axis=1)
-        self._data = data
 
     def chi_square(self, index: Sequence[int], beyond: Sequence[int]) -> float:
         """The largest chi-square difference (0 without ticks) by the columns ``index`` beyond others."""

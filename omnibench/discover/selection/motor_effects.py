@@ -10,7 +10,7 @@ the parameters minimise |e - f(b)|^2. Their covariance is that of the scatter be
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +19,7 @@ from scipy.optimize import least_squares
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.held_out.cross_validation import folds_of_repetitions
 from omnibench.discover.regressors.column_group import Group
+from omnibench.discover.regressors.column_store import ColumnStore
 from omnibench.discover.regressors.covariate_bases import Basis
 from omnibench.discover.selection.candidate_groups import Groups
 from omnibench.discover.selection.model_selection import Selection, select_effects
@@ -26,7 +27,7 @@ from omnibench.discover.selection.screening import Screening
 from omnibench.fit.least_squares.whitened import Whitened
 from omnibench.fit.uncertainty.intervals import EstimatedCovariance
 from omnibench.registry import effects
-from omnibench.robot.effects.effect import ActuatorEffect
+from omnibench.robot.effects.effect import ActuatorEffect, Parameter
 from omnibench.robot.kinematics import Array, Robot
 
 # tests/benchmarks/constants.py varies each number by 0.5 and 2: on a small set with motor lag no verdict and no name
@@ -37,6 +38,7 @@ _STEP = 0.2  # share of the plausible range: step of a parameter for its slope, 
 _KNOTS = 7  # knots of the functions of target rates
 _ORDERS = 5  # orders of the functions of time
 _EQUAL = 1e-9  # rad/s: rates nearer to their targets are copies of them
+_Slopes = Callable[[Trajectory], Array]  # slopes (F, N, n) of a run's wheel rates
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,16 +70,16 @@ def select_motor_effects(
 
 def _screen(runs: Sequence[Trajectory], errors: Sequence[Array], robot: Robot, without: Sequence[str]) -> Screening:
     """All motor effects and generic bases as columns against the errors (F, N) of the rates."""
-    groups, columns = _groups(runs, robot, without)
-    noise = _noise_of(errors)
-    residuals = tuple(of_run.ravel() / noise for of_run in errors)
-    scaled = tuple(of_run.reshape(-1, of_run.shape[-1]) / noise for of_run in columns)
-    data = Whitened(
-        residuals,
-        scaled,
-        np.sum([of_run.T @ of_run for of_run in scaled], axis=0),
-        np.array([slopes.T @ of_run for slopes, of_run in zip(scaled, residuals, strict=True)]),
-    )
+    groups, sources = _groups(runs, robot, without)
+    noise, columns = _noise_of(errors), ColumnStore()
+    residuals = [of_run.ravel() / noise for of_run in errors]
+    scores, information = [], np.zeros(())
+    for run, of_run in zip(runs, residuals, strict=True):
+        slopes = np.concatenate([source(run) for source in sources], axis=-1).reshape(len(of_run), -1) / noise
+        scores.append(slopes.T @ of_run)
+        information = information + slopes.T @ slopes
+        columns.append(slopes, [len(slopes)])
+    data = Whitened(residuals, columns, information, np.array(scores))
     return Screening(groups, data, folds_of_repetitions(runs))
 
 
@@ -92,33 +94,32 @@ def _noise_of(errors: Sequence[Array]) -> float:
     return max(float(np.median(np.abs(steps))) / _MEDIAN / np.sqrt(2), _LEAST * float(np.abs(steps).mean()), _EQUAL)
 
 
-def _groups(runs: Sequence[Trajectory], robot: Robot, without: Sequence[str]) -> tuple[Groups, list[Array]]:
-    columns: list[list[Array]] = [[] for _ in runs]
-    count = 0
+def _groups(runs: Sequence[Trajectory], robot: Robot, without: Sequence[str]) -> tuple[Groups, list[_Slopes]]:
+    """All groups, and the slopes (F, N, n) of a run's rates by each group in turn."""
+    named, bases, sources, count = list[Group](), list[Group](), list[_Slopes](), 0
 
-    def add(slopes: Sequence[Array]) -> tuple[int, ...]:
+    def add(slopes: _Slopes) -> tuple[int, ...]:
         nonlocal count
-        for of_run, new in zip(columns, slopes, strict=True):
-            of_run.append(new)
-        count += slopes[0].shape[-1]
-        return tuple(range(count - slopes[0].shape[-1], count))
+        sources.append(slopes)
+        width = slopes(runs[0]).shape[-1]
+        count += width
+        return tuple(range(count - width, count))
 
-    named, bases = [], []
     for effect in _candidates(without):
         parameters = effect.parameters(robot)
-        nothing = {each.name: 0.0 for each in parameters}
-        steps = {each.name: _STEP * each.largest for each in parameters}
-        slopes = [
-            np.stack([_change(effect, run, {**nothing, name: step}) / step for name, step in steps.items()], axis=-1)
-            for run in runs
-        ]
-        named.append(Group("effect", effect.name, add(slopes), effect, parameters))
+        named.append(Group("effect", effect.name, add(_slopes_of(effect, parameters)), effect, parameters))
     for covariate, detail, slopes in _bases(runs):
-        basis = Basis(covariate, "actuator", detail, np.zeros((0, 3, 0)))
+        basis = Basis(covariate, "actuator", detail)
         bases.append(Group("covariate", covariate, add(slopes), basis=basis))
-    matrix = Group("matrix", "matrix", ())
-    stacked = [np.concatenate(of_run, axis=-1) for of_run in columns]
-    return Groups(matrix, tuple(named), tuple(bases), np.zeros((0, 3, 0)), ()), stacked
+    return Groups(Group("matrix", "matrix", ()), tuple(named), tuple(bases), ColumnStore(), ()), sources
+
+
+def _slopes_of(effect: ActuatorEffect, parameters: Sequence[Parameter]) -> _Slopes:
+    nothing = {each.name: 0.0 for each in parameters}
+    steps = {each.name: _STEP * each.largest for each in parameters}
+    return lambda run: np.stack(
+        [_change(effect, run, {**nothing, name: step}) / step for name, step in steps.items()], axis=-1
+    )
 
 
 def _candidates(without: Sequence[str]) -> Iterator[ActuatorEffect]:
@@ -135,7 +136,7 @@ def _change(effect: ActuatorEffect, run: Trajectory, values: Mapping[str, float]
     return effect.driven(np.diff(run.times, prepend=0.0), targets, values) - targets
 
 
-def _bases(runs: Sequence[Trajectory]) -> Iterator[tuple[str, str, list[Array]]]:
+def _bases(runs: Sequence[Trajectory]) -> Iterator[tuple[str, str, _Slopes]]:
     top = max(float(np.abs(_targets(run)).max()) for run in runs)
     longest = max(float(run.times[-1]) for run in runs)
     knots = np.linspace(-top, top, _KNOTS)
@@ -143,18 +144,20 @@ def _bases(runs: Sequence[Trajectory]) -> Iterator[tuple[str, str, list[Array]]]
     yield (
         "wheel rate",
         "the wheel rate that the motors were told",
-        [np.maximum(0.0, 1 - np.abs(_targets(run)[..., None] - knots) / spacing) for run in runs],
+        lambda run: np.maximum(0.0, 1 - np.abs(_targets(run)[..., None] - knots) / spacing),
     )
-    waves = [np.cos(np.pi * np.arange(_ORDERS) * run.times[:, None] / longest) for run in runs]
     yield (
         "elapsed time",
         "the time since the start of a run",
-        [np.sign(_targets(run))[..., None] * wave[:, None, :] for run, wave in zip(runs, waves, strict=True)],
+        lambda run: (
+            np.sign(_targets(run))[..., None]
+            * np.cos(np.pi * np.arange(_ORDERS) * run.times[:, None] / longest)[:, None, :]
+        ),
     )
     yield (
         "acceleration",
         "how the targets change",
-        [np.gradient(_targets(run), axis=0)[..., None] / np.median(np.diff(run.times)) for run in runs],
+        lambda run: np.gradient(_targets(run), axis=0)[..., None] / np.median(np.diff(run.times)),
     )
 
 

@@ -12,10 +12,10 @@ from omnibench.discover.fitting.extend import Extended
 from omnibench.discover.fitting.model_fit import Fit, paths_of
 from omnibench.discover.held_out.cross_validation import folds_of_repetitions, is_confirmed
 from omnibench.discover.regressors.column_group import Group
+from omnibench.discover.regressors.column_store import ColumnStore
 from omnibench.discover.regressors.significance import Significance, significance_of
 from omnibench.discover.selection.candidate_groups import Groups, make_groups
 from omnibench.discover.selection.encoder_quantisation import EncoderQuantisation
-from omnibench.fit.least_squares.trajectory_fit import split_runs
 from omnibench.fit.least_squares.whitened import Given, Whitened, given
 from omnibench.robot.kinematics import Array
 
@@ -76,18 +76,15 @@ def significance_left(
 ) -> Significance:
     """Significance of the generic bases beyond all that an extended model holds, smooth terms among it."""
     fit, groups = extended.fit, _groups_again(extended, screening, without)
-    columns = [
-        np.concatenate([of_bases, fitted], axis=2)
-        for of_bases, fitted in zip(split_runs(groups.columns, fit.runs), extended.columns, strict=True)
-    ]
-    data = fit.whitened(columns)
-    return significance_of(data, range(groups.columns.shape[2], len(data.information)), groups.bases, rng)
+    data = _whitened(fit, groups, fit.nuisance_free_residuals, extended.columns)
+    width = len(data.information) - extended.columns[0].shape[2]
+    return significance_of(data, range(width, len(data.information)), groups.bases, rng)
 
 
 def _groups_again(extended: Extended, earlier: Screening, without: Sequence[str]) -> Groups:
     """The groups of an earlier screening unless further poses were left out."""
     fit = extended.fit
-    same_poses = len(earlier.groups.columns) == sum(len(residuals) for residuals in fit.residuals)
+    same_poses = earlier.groups.columns.rows == sum(len(residuals) for residuals in fit.residuals)
     return earlier.groups if same_poses else _groups_at(fit, without)
 
 
@@ -96,10 +93,20 @@ def _groups_at(fit: Fit, without: Sequence[str]) -> Groups:
 
 
 def _screened(fit: Fit, residuals: Sequence[Array], groups: Groups) -> Screening:
-    columns = split_runs(groups.columns, fit.runs)
-    return Screening(
-        groups,
-        fit.whitened(columns, residuals),
-        folds_of_repetitions(fit.runs),
-        EncoderQuantisation(fit, columns),
-    )
+    data = _whitened(fit, groups, residuals)
+    return Screening(groups, data, folds_of_repetitions(fit.runs), EncoderQuantisation(fit, data))
+
+
+def _whitened(fit: Fit, groups: Groups, residuals: Sequence[Array], beside: Sequence[Array] | None = None) -> Whitened:
+    """The groups' columns and residuals (K, 3), whitened, some runs at a time. beside (K, 3, n): further columns."""
+    left, columns, scores, information = list[Array](), ColumnStore(), list[Array](), np.zeros(())
+    for runs, steps in groups.columns.blocks():
+        values = [np.cumsum(of_run, axis=0, dtype=float) for of_run in steps]
+        if beside is not None:
+            values = [np.concatenate(both, axis=2) for both in zip(values, beside[runs], strict=True)]
+        white = fit.whitened(values, residuals[runs], runs)
+        left += white.residuals
+        scores.append(white.scores)
+        information = information + white.information
+        columns.append(np.concatenate(white.columns), [len(of_run) for of_run in white.columns])
+    return Whitened(left, columns, information, np.concatenate(scores))

@@ -160,7 +160,7 @@ def _of_families(plain: Fit, screening: Screening, base: Extended, folds: NDArra
     for index in sorted(best, key=lambda row: -gains[row])[:_FAMILIES]:
         group, effect = groups[index], groups[index].effect
         if effect is not None and gains[index] > 0:
-            basis = Basis(effect.shows_in, effect.stage, f"as {group.name} would be", np.zeros((0, 3, 0)))
+            basis = Basis(effect.shows_in, effect.stage, f"as {group.name} would be")
             used = extend(plain, [*base.groups, replace(group, basis=basis)])
             yield _Trial(effect.shows_in, (used.groups[-1],), used, _held_out_gain(used, len(base.groups), folds))
 

@@ -34,6 +34,7 @@ _LOGARITHMS = (np.log(1e-4), np.log(1e2))
 # Change of twice the log-likelihood below which a component is set to zero: nothing beside 2.7, a test at 5 % (Self
 # and Liang 1987). Half of it and twice change nothing (tests/benchmarks/constants_fit.py).
 _NO_LOSS = 1e-3
+_WIDE = 200  # columns from which on a row at a time is faster than LAPACK, which takes every column by itself
 _COORDINATES = (("position", slice(0, 2)), ("heading", slice(2, 3)))
 # First guess of the noise, replaced after one fit: 1 cm or 0.01 rad, and as much again in a second. Half of it and
 # twice move estimates by 0.002 of their standard deviations at most (tests/benchmarks/constants_fit.py).
@@ -168,7 +169,18 @@ class _Factor:
 
     def whiten(self, differences: Array) -> Array:
         """Independent values (K, n) of differences (K, n) between successive residuals, the first from 0."""
-        whitened, _ = dtbtrs(self._factor, differences, uplo="L")
+        if not differences.size:
+            return differences  # LAPACK would write beyond its end
+        if differences.shape[1] < _WIDE:
+            whitened, _ = dtbtrs(self._factor, differences, uplo="L")
+            return whitened
+        diagonal, below = self._factor
+        whitened, carried = np.empty_like(differences), np.empty_like(differences[0])
+        np.divide(differences[0], diagonal[0], out=whitened[0])
+        for row in range(1, len(differences)):
+            np.multiply(whitened[row - 1], below[row - 1], out=carried)
+            np.subtract(differences[row], carried, out=whitened[row])
+            whitened[row] /= diagonal[row]
         return whitened
 
     def transposed(self, white: Array) -> Array:
@@ -218,6 +230,13 @@ class _Factor:
         backward, _ = dpbtrf(np.stack([on[::-1], np.append(off[::-1], 0.0)]), lower=1)
         inner = 1 / (pivots + np.square(backward[0])[::-1] - on)
         return inner, -below[:-1] / diagonal[:-1] * inner[1:]
+
+
+def _condensed(differences: Array) -> Array:
+    """At most K columns (K, n) with the products D D' of differences D (K, N), all that their likelihood needs."""
+    if differences.shape[1] <= len(differences):
+        return np.asfortranarray(differences)
+    return np.linalg.qr(differences.T).R.T
 
 
 def _differences(residuals: Array) -> Array:
@@ -280,15 +299,17 @@ def _most_likely(groups: list[tuple[Array, Array]], near: Array | None) -> tuple
     longest = max(float(stamps[-1]) for stamps, _ in groups)
     units = size * np.array([1.0, longest**-0.5, 1.0])
 
-    prepared = [(np.diff(stamps, prepend=0.0), np.asfortranarray(_differences(values))) for stamps, values in groups]
+    prepared = [
+        (np.diff(stamps, prepend=0.0), values.shape[1], _condensed(_differences(values))) for stamps, values in groups
+    ]
 
     def negative_log_likelihood(components: Array) -> float:
         """Twice the negative log-likelihood for each value, up to a constant."""
         white, walk, bias = components
         total = 0.0
-        for steps, differences in prepared:
+        for steps, number, differences in prepared:
             factor = _Factor(white, walk, bias, steps)
-            total += differences.shape[1] * factor.log_determinant + float(np.square(factor.whiten(differences)).sum())
+            total += number * factor.log_determinant + float(np.square(factor.whiten(differences)).sum())
         return total / count
 
     if near is not None and near.any():

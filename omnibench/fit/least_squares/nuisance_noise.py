@@ -22,6 +22,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import minimize, minimize_scalar
 from scipy.special import chdtri
 
@@ -109,20 +110,64 @@ class SeparateNoise:
         return cls(noise, deviations, total, 2 * np.square(components) * slopes)
 
 
+@dataclass(frozen=True, eq=False)
+class _Products:
+    """Products of differences at the same stamps, whitened, with the columns of some nuisances.
+
+    log_determinant: ln |C|. squares (n,), beside (n, m), inner (n, m, m): r'r, N'r and N'N of n differences.
+    """
+
+    log_determinant: float
+    squares: Array
+    beside: Array
+    inner: Array
+
+    @classmethod
+    def of(cls, whitener: Whitener, white: Array) -> _Products:
+        """Products of white (K, 3, n, 1 + m), differences and nuisances."""
+        of_runs = white.reshape(-1, *white.shape[2:]).transpose(1, 0, 2)
+        products = of_runs.transpose(0, 2, 1) @ of_runs
+        return cls(whitener.log_determinant, products[:, 0, 0], products[:, 1:, 0], products[:, 1:, 1:])
+
+    def lower(self, sizes: Array) -> Array:
+        """Cholesky factors (n, m, m) of 1 + S N'N S, S being the sizes (m,)."""
+        lower: Array = np.linalg.cholesky(np.eye(len(sizes)) + self.inner * np.outer(sizes, sizes))
+        return lower
+
+    def minus_log_likelihood(self, sizes: Array) -> float:
+        """-2 ln L, Eq. (1), of nuisances with standard deviations (m,)."""
+        lower = self.lower(sizes)
+        reduced = np.linalg.solve(lower, (sizes * self.beside)[..., None])
+        determinants = 2 * np.log(np.diagonal(lower, axis1=1, axis2=2)).sum()
+        total = len(self.squares) * self.log_determinant + self.squares.sum() - np.square(reduced).sum() + determinants
+        return float(total)
+
+
+def _whitened(whitener: Whitener, values: Array, columns: Array) -> Array:
+    """Differences (K, 3, n) and columns (K, 3, n, m), whitened: (K, 3, n, 1 + m)."""
+    both = np.concatenate([values[..., None], columns], axis=3)
+    return whitener(both.reshape(*values.shape[:2], -1)).reshape(both.shape)
+
+
+def _products(differences: Differences, noise: Noise, used: NDArray[np.intp]) -> list[_Products]:
+    """The products of all differences with the columns of the nuisances ``used``, by stamps."""
+    products = []
+    for stamps, values, columns in differences.by_stamps:
+        whitener = Whitener(noise, stamps)
+        products.append(_Products.of(whitener, _whitened(whitener, values, columns[..., used])))
+    return products
+
+
 def _likelihood(whitener: Whitener, values: Array, columns: Array, deviations: Array) -> tuple[float, Array]:
     """-2 ln L of differences (K, 3, n), and its derivatives (9,) by the variances; columns (K, 3, n, 3): N."""
     count, known = values.shape[2], np.flatnonzero(deviations)
     sizes = deviations[known]
-    white = whitener(np.concatenate([values[..., None], columns[..., known]], axis=3).reshape(*values.shape[:2], -1))
-    of_runs = white.reshape(-1, count, 1 + len(known)).transpose(1, 0, 2)
-    products = of_runs.transpose(0, 2, 1) @ of_runs
-    squares, beside, inner = products[:, 0, 0], products[:, 1:, 0], products[:, 1:, 1:]  # r'r, N'r, N'N
-    lower = np.linalg.cholesky(np.eye(len(known)) + inner * np.outer(sizes, sizes))
+    white = _whitened(whitener, values, columns[..., known])
+    products = _Products.of(whitener, white)
+    beside, inner, lower = products.beside, products.inner, products.lower(sizes)
     reduced = np.linalg.solve(lower, sizes[:, None] * np.concatenate([beside[..., None], inner], axis=2))
-    total = count * whitener.log_determinant + squares.sum() - np.square(reduced[..., 0]).sum()
-    total += 2 * np.log(np.diagonal(lower, axis1=1, axis2=2)).sum()
     # Eq. (2): a, and columns Z such that (C + N S S N')^-1 = C^-1 - Z Z'.
-    solved = whitener.transposed(white).reshape(*values.shape, -1)
+    solved = whitener.transposed(white)
     roots = np.linalg.solve(lower, sizes[:, None] * np.eye(len(known)))
     removed = np.einsum("ksnj,nij->ksni", solved[..., 1:], roots)
     remaining = solved[..., 0] - np.einsum("ksni,ni->ksn", removed, reduced[..., 0])
@@ -132,7 +177,7 @@ def _likelihood(whitener: Whitener, values: Array, columns: Array, deviations: A
     left = beside - np.einsum("nij,ni->nj", reduced[..., 1:], reduced[..., 0])  # N' a
     of_nuisances = np.diagonal(inner, axis1=1, axis2=2) - np.square(reduced[..., 1:]).sum(axis=1) - np.square(left)
     slopes[len(_NAMES) + known] = of_nuisances.sum(axis=0)
-    return float(total), slopes
+    return products.minus_log_likelihood(sizes), slopes
 
 
 def separate_nuisances(
@@ -169,20 +214,24 @@ def _along(differences: Differences, now: SeparateNoise, kind: int) -> SeparateN
     reach, bias = float(_LARGEST[kind]), now.noise.bias_heading
     if kind == TURN:
         reach = min(max(2 * bias, 4 * now.noise.pose_heading, 1e-6), reach)
+    used = np.flatnonzero((now.deviations > 0) | (np.arange(3) == kind))
+    held = None if kind == TURN else _products(differences, now.noise, used)
 
-    def with_deviation(deviation: float) -> SeparateNoise:
-        noise = now.noise
-        if kind == TURN:
-            noise = noise.model_copy(update={"bias_heading": float(np.sqrt(max(bias**2 - deviation**2, 0.0)))})
-        return SeparateNoise.of(differences, noise, np.where(np.arange(3) == kind, deviation, now.deviations))
+    def deviations_with(deviation: float) -> Array:
+        return np.where(np.arange(3) == kind, deviation, now.deviations)
 
-    answer = minimize_scalar(
-        lambda deviation: with_deviation(deviation).minus_log_likelihood,
-        bounds=(0.0, reach),
-        method="bounded",
-        options={"xatol": 1e-6},
-    )
-    return with_deviation(float(answer.x))
+    def noise_with(deviation: float) -> Noise:
+        if kind != TURN:
+            return now.noise
+        return now.noise.model_copy(update={"bias_heading": float(np.sqrt(max(bias**2 - deviation**2, 0.0)))})
+
+    def minus_log_likelihood(deviation: float) -> float:
+        products = _products(differences, noise_with(deviation), used) if held is None else held
+        return sum(of_group.minus_log_likelihood(deviations_with(deviation)[used]) for of_group in products)
+
+    answer = minimize_scalar(minus_log_likelihood, bounds=(0.0, reach), method="bounded", options={"xatol": 1e-6})
+    found = float(answer.x)
+    return SeparateNoise.of(differences, noise_with(found), deviations_with(found))
 
 
 def _polished(differences: Differences, near: SeparateNoise) -> SeparateNoise:

@@ -10,13 +10,14 @@ eta, the likeliest values for the residuals that a model would leave without nui
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
+from omnibench.fit.least_squares.repetitions import grouped
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import WheelLog
 
@@ -57,9 +58,11 @@ class Nuisances:
 
 def log_of(run: Trajectory, nuisances: Array) -> WheelLog:
     """The run's log at the times when its poses were taken, its start turned. nuisances (3,): rad, s, s per s."""
-    turn, offset, slope = nuisances
-    log = run.log(run.pose_times[1:] * (1 - slope) - offset)
-    return replace(log.continued(float(log.stamps[-1])), start=log.start + np.array([0.0, 0.0, turn]))
+    turn, offset, slope = nuisances.tolist()
+    stamps = run.pose_times[1:]
+    log = run.log(stamps * (1 - slope) - offset if slope or offset else stamps)
+    log = log.continued(float(log.stamps[-1]))
+    return replace(log, start=log.start + np.array([0.0, 0.0, turn])) if turn else log
 
 
 def nuisance_columns(path: Array, velocity: Array, stamps: Array) -> Array:
@@ -83,9 +86,24 @@ def likeliest_nuisances(
     if not known.any():
         return values
     prior = np.diag(nuisances.deviations[known] ** -2.0)
-    for row, (weigh, of_run, columns) in enumerate(zip(weightings, residuals, slopes, strict=True)):
-        white = weigh(np.concatenate([of_run[..., None], columns], axis=-1))
-        flat = white.reshape(-1, white.shape[-1])
-        inner = flat[:, 1:]
-        values[row, known] = np.linalg.solve(inner.T @ inner + prior, inner.T @ flat[:, 0])
+    both = [np.concatenate([of_run[..., None], extra], axis=2) for of_run, extra in zip(residuals, slopes, strict=True)]
+    for members, white in weighed_together(weightings, both):
+        inner = white[..., 1:]
+        products = inner.swapaxes(1, 2) @ white
+        found = np.linalg.solve(products[..., 1:] + prior, products[..., :1])
+        values[np.ix_(np.array(members), known)] = found[..., 0]
     return values
+
+
+def weighed_together(
+    weightings: Sequence[Weighting], values: Sequence[Array]
+) -> Iterator[tuple[tuple[int, ...], Array]]:
+    """The weighted values (R, 3 k, n) of each R runs that share a weighting, and which runs these are.
+
+    values (K, 3, n): of every run.
+    """
+    for members in grouped([id(weigh) for weigh in weightings]):
+        together, columns = np.stack([values[index] for index in members], axis=2), values[members[0]].shape[2]
+        white = weightings[members[0]](together.reshape(*together.shape[:2], -1))
+        of_runs = white.reshape(*white.shape[:2], len(members), columns)
+        yield members, of_runs.transpose(2, 0, 1, 3).reshape(len(members), white.shape[0] * white.shape[1], columns)

@@ -12,9 +12,11 @@ Eliminated, they leave plain least squares in d, whose columns whitened.py makes
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any, Self
 
 import numpy as np
 
@@ -25,11 +27,14 @@ from omnibench.fit.least_squares.nuisances import (
     likeliest_nuisances,
     log_of,
     nuisance_columns,
+    weighed_together,
 )
 from omnibench.fit.least_squares.whitened import Whitened, whitened
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.odometry import OdometryBatch, WheelLog
+from omnibench.robot.odometry import OdometryBatch, WheelLog, split_by
+
+_TOGETHER = 20  # runs of about the same length whose derivatives are computed at once (chosen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +44,15 @@ class TrajectoryFit:
     model: OdometryModel
     runs: tuple[Trajectory, ...]
     nuisances: Nuisances
+
+    def changed(self, **changes: Any) -> Self:
+        """The fit with other values of some fields, and what was computed already and does not depend on these."""
+        other = replace(self, **changes)
+        same_runs = len(other.runs) == len(self.runs) and all(map(operator.is_, other.runs, self.runs))
+        if same_runs and np.array_equal(other.nuisances.values, self.nuisances.values):
+            known = ("logs", "poses", "residuals", "slopes") if other.model is self.model else ("logs",)
+            vars(other).update({name: vars(self)[name] for name in known if name in vars(self)})
+        return other
 
     @cached_property
     def logs(self) -> list[WheelLog]:
@@ -73,12 +87,12 @@ class TrajectoryFit:
         They are differences over two samples: the rate of a single one has its full encoder noise.
         """
         period = float(np.median(np.concatenate([np.diff(run.times, prepend=0.0) for run in self.runs])))
-        later = np.array([0.0, -period, 0.0])
-        after, before = (
-            self.model.reported([log_of(run, values) for run, values in zip(self.runs, moved, strict=True)])
-            for moved in (self.nuisances.values + later, self.nuisances.values - later)
-        )
-        return [(late - early) / (2 * period) for late, early in zip(after, before, strict=True)]
+        shifted = []
+        for run, log in zip(self.runs, self.logs, strict=True):
+            stamps = np.concatenate([log.stamps + period, log.stamps - period])
+            shifted.append(replace(run.log(stamps).continued(float(stamps.max())), start=log.start))
+        both = (np.split(poses, 2) for poses in self.model.reported(shifted))
+        return [(late - early) / (2 * period) for late, early in both]
 
     @property
     def estimated_slopes(self) -> list[Array]:
@@ -88,7 +102,7 @@ class TrajectoryFit:
             return [np.empty((*residuals.shape, 0)) for residuals in self.residuals]
         return [slopes[..., known] for slopes in self.slopes]
 
-    @property
+    @cached_property
     def nuisance_free_residuals(self) -> list[Array]:
         """Residuals (K, 3) if all nuisances that are estimated were 0, to first order."""
         if not self.nuisances.estimated.any():
@@ -101,13 +115,22 @@ class TrajectoryFit:
 
     def matrix_jacobian(self) -> list[Array]:
         """Derivatives (K, 3, 3N) of the poses by the elements of the matrix, row by row."""
-        columns = OdometryBatch(self.logs, self.model.integration).jacobian(self.model.matrix)
-        return split_runs(columns.reshape(len(columns), 3, -1), self.runs)
+        columns: list[Array] = [np.empty(0)] * len(self.runs)
+        by_length = sorted(range(len(self.runs)), key=lambda index: len(self.logs[index].times))
+        for first in range(0, len(by_length), _TOGETHER):
+            part = [self.logs[index] for index in by_length[first : first + _TOGETHER]]
+            slopes = OdometryBatch(part, self.model.integration).jacobian(self.model.matrix)
+            of_runs = split_by(slopes.reshape(len(slopes), 3, -1), [log.stamps for log in part])
+            for index, of_run in zip(by_length[first:], of_runs, strict=False):
+                columns[index] = of_run
+        return columns
 
     def chi_square(self, weightings: Sequence[Weighting]) -> Array:
         """Every run's share (Z,) in the objective, Eq. (1) with d = e = 0."""
-        white = [weigh(residuals) for weigh, residuals in zip(weightings, self.residuals, strict=True)]
-        return self.nuisances.chi_square + [float(np.square(of_run).sum()) for of_run in white]
+        squares = np.empty(len(self.runs))
+        for members, white in weighed_together(weightings, [residuals[..., None] for residuals in self.residuals]):
+            squares[list(members)] = np.square(white).sum(axis=(1, 2))
+        return self.nuisances.chi_square + squares
 
     def linearised(
         self, columns: Sequence[Array], weightings: Sequence[Weighting], residuals: Sequence[Array] | None = None

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from omnibench.fit.least_squares.nuisances import Weighting
+from omnibench.fit.least_squares.nuisances import Weighting, weighed_together
 from omnibench.robot.kinematics import Array
 
 # Share of a direction's information that must be left beyond other columns for it to count: a thousandth of its length,
 # far above rounding. Half of it and twice change no calibration (tests/benchmarks/constants_fit.py) and no discovery
 # (tests/benchmarks/constants.py).
 _DETERMINED = 1e-6
+_KEPT = 4  # Schur complements that are kept: beyond the matrix and beyond all effects, with forms or without (chosen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,19 +25,39 @@ class Whitened:
     all runs. scores (Z, p): columns times residuals of each run.
     """
 
-    residuals: tuple[Array, ...]
-    columns: tuple[Array, ...]
+    residuals: Sequence[Array]
+    columns: Sequence[Array]
     information: Array
     scores: Array
+    _complements: dict[tuple[int, ...], Given] = field(init=False, default_factory=dict)
 
     @property
     def information_of_runs(self) -> Array:
         """Products (Z, p, p) of the columns of each run."""
         return np.array([columns.T @ columns for columns in self.columns])
 
-    def with_residuals(self, residuals: Sequence[Array]) -> Whitened:
-        """These columns with other whitened residuals."""
-        return Whitened(tuple(residuals), self.columns, self.information, _scores(self.columns, residuals))
+    def only(self, index: Sequence[int]) -> Whitened:
+        """Some of the columns, in this order."""
+        rows = list(index)
+        columns = [np.asarray(of_run[:, rows], dtype=float) for of_run in self.columns]
+        return Whitened(self.residuals, columns, self.information[np.ix_(rows, rows)], self.scores[:, rows])
+
+    def less(self, index: Sequence[int], values: Array) -> Whitened:
+        """The columns with the residuals less some of the columns times values (n,)."""
+        rows, left, scores = list(index), list[Array](), np.empty_like(self.scores)
+        for run, (residuals, columns) in enumerate(zip(self.residuals, self.columns, strict=True)):
+            left.append(residuals - columns[:, rows] @ values)
+            scores[run] = left[-1] @ columns
+        return replace(self, residuals=left, scores=scores)
+
+    def given(self, index: Sequence[int]) -> Given:
+        """Schur complement of all columns once the columns ``index`` are fitted; the last few are kept."""
+        key = tuple(index)
+        if key not in self._complements:
+            if len(self._complements) >= _KEPT:
+                self._complements.pop(next(iter(self._complements)))
+            self._complements[key] = _beyond(self.information, self.scores, np.diag(self.information).copy(), key)
+        return self._complements[key]
 
 
 def whitened(
@@ -51,36 +72,30 @@ def whitened(
     slopes (K, 3, m): derivatives of each run's poses by its nuisances. deviations (m,): their standard deviations, > 0;
     they count as noise that all poses of a run share.
     """
-    free_residuals, free_columns = [], []
-    for values, fitted, weigh, extra in zip(residuals, columns, weightings, slopes, strict=True):
-        white = weigh(np.concatenate([values[..., None], fitted, extra], axis=-1))
-        white = white.reshape(-1, white.shape[-1])
-        count = 1 + fitted.shape[2]
-        free = without(white[:, :count], white[:, count:] * deviations) if len(deviations) else white
-        free_residuals.append(np.ascontiguousarray(free[:, 0]))
-        free_columns.append(free[:, 1:])
-    return Whitened(
-        tuple(free_residuals), tuple(free_columns), _products(free_columns), _scores(free_columns, free_residuals)
-    )
+    count, width = len(residuals), columns[0].shape[2]
+    beside = [np.concatenate([each[..., None], extra], axis=2) for each, extra in zip(residuals, slopes, strict=True)]
+    free_residuals, free_columns = [np.empty(0)] * count, [np.empty((0, width))] * count
+    information, scores = np.zeros((width, width)), np.empty((count, width))
+    runs = zip(weighed_together(weightings, beside), weighed_together(weightings, columns), strict=True)
+    for (members, white), (_, of_columns) in runs:
+        of_residuals = white[..., :1]
+        if len(deviations):
+            nuisances = white[..., 1:] * deviations
+            of_residuals, of_columns = without(of_residuals, nuisances), without(of_columns, nuisances)
+        flat = np.concatenate(of_columns)
+        information += flat.T @ flat
+        scores[list(members)] = (of_residuals.swapaxes(1, 2) @ of_columns)[:, 0]
+        for index, left, fitted in zip(members, of_residuals, of_columns, strict=True):
+            free_residuals[index], free_columns[index] = left[:, 0], fitted
+    return Whitened(tuple(free_residuals), tuple(free_columns), information, scores)
 
 
 def without(values: Array, nuisances: Array) -> Array:
-    """Values (k, n) less what nuisances (k, m) of unit variance explain: (1 + N N')^(-1/2) values."""
+    """Values (..., k, n) less what nuisances (..., k, m) of unit variance explain: (1 + N N')^(-1/2) values."""
     basis, sizes, _ = np.linalg.svd(nuisances, full_matrices=False)
     shrink = 1 - 1 / np.sqrt(1 + sizes**2)
-    return values - basis @ (shrink[:, None] * (basis.T @ values))
-
-
-def _products(columns: Sequence[Array]) -> Array:
-    total = np.zeros((columns[0].shape[1],) * 2)
-    for part in range(0, len(columns), 32):
-        stacked = np.concatenate(columns[part : part + 32])
-        total += stacked.T @ stacked
-    return total
-
-
-def _scores(columns: Sequence[Array], residuals: Sequence[Array]) -> Array:
-    return np.array([slopes.T @ values for slopes, values in zip(columns, residuals, strict=True)])
+    left: Array = values - basis @ (shrink[..., None] * (basis.swapaxes(-1, -2) @ values))
+    return left
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +109,7 @@ class Given:
     information: Array
     scores: Array
     total: Array
+    _roots: dict[tuple[int, ...], Array] = field(init=False, default_factory=dict)
 
     def chi_square(self, index: Sequence[int]) -> float:
         """Chi-square difference: by how much fitting some columns lowers it."""
@@ -106,7 +122,12 @@ class Given:
 
     def roots(self, index: Sequence[int]) -> Array:
         """Matrix (n, d) that turns the scores of n columns into d independent ones of unit variance."""
-        index = list(index)
+        key = tuple(index)
+        if key not in self._roots:
+            self._roots[key] = self._roots_of(list(key))
+        return self._roots[key]
+
+    def _roots_of(self, index: list[int]) -> Array:
         scale = 1 / np.sqrt(np.maximum(self.total[index], 1e-300))
         inner = self.information[np.ix_(index, index)] * np.outer(scale, scale)
         values, vectors = np.linalg.eigh(inner)
@@ -139,7 +160,7 @@ class Given:
 
 def given(data: Whitened, index: Sequence[int]) -> Given:
     """Schur complement of all columns once the columns ``index`` are fitted."""
-    return _beyond(data.information, data.scores, np.diag(data.information).copy(), index)
+    return data.given(index)
 
 
 def _beyond(information: Array, scores: Array, total: Array, index: Sequence[int]) -> Given:

@@ -32,14 +32,13 @@ class MotorLag(ActuatorEffect):
 
 def _reached(left: Array, targets: Array) -> Array:
     """Rates (F, N) at the beginning of each sample; left (F,): share of the distance to the target after a sample."""
-    from scipy.signal import lfilter  # slow to import, and not needed by a live node
+    from scipy.linalg.lapack import dtbtrs  # slow to import, and not needed by a live node
 
     before = np.zeros(targets.shape)
-    if np.allclose(left, left[0], rtol=1e-9, atol=0.0):
-        before[1:] = lfilter([1 - left[0]], [1.0, -left[0]], targets[:-1], axis=0)
-        return before
-    for sample in range(1, len(targets)):
-        before[sample] = targets[sample - 1] + (before[sample - 1] - targets[sample - 1]) * left[sample - 1]
+    if len(targets) > 1:
+        bands = np.ones((2, len(targets) - 1))
+        bands[1, :-1] = -left[1:-1]
+        before[1:] = dtbtrs(bands, (1 - left[:-1, None]) * targets[:-1], uplo="L")[0]
     return before
 
 

@@ -44,7 +44,7 @@ def test_ticks_are_found_in_wheel_rates_that_are_written_with_six_digits(tick: f
 def bound(commands: Sequence[str], columns: Sequence[np.ndarray], beyond: Sequence[int] = ()) -> float:
     runs = [run_of(FORWARD, command, f"run {number}") for number, command in enumerate(commands)]
     fit = extended_of(runs, [np.zeros((2, 3)) for _ in runs]).fit
-    return EncoderQuantisation(fit, columns).chi_square([0], beyond)
+    return EncoderQuantisation(fit, fit.whitened(columns)).chi_square([0], beyond)
 
 
 def test_a_column_explains_at_most_the_quarter_ticks_that_all_push_along_it() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from screening_samples import FIRST, FOURTH, MATRIX, POSITIVE, SECOND, THIRD, screening
@@ -91,7 +93,8 @@ def test_an_effect_of_an_impossible_sign_has_even_odds_and_gets_no_name() -> Non
 def test_what_one_run_alone_shows_is_no_effect() -> None:
     given = screening({DRIFT: FIRST}, BASES, [0, 0, 0, 0, 0])
     residuals = (given.data.residuals[0] + 80 * FIRST, *given.data.residuals[1:])
-    again = Screening(given.groups, given.data.with_residuals(residuals), given.folds)
+    scores = np.array([each.T @ own for each, own in zip(given.data.columns, residuals, strict=True)])
+    again = Screening(given.groups, replace(given.data, residuals=residuals, scores=scores), given.folds)
     assert again.beyond_matrix().chi_square((1,)) == pytest.approx(80**2 / 20)
     assert selected(again).chosen == ()
 

@@ -160,7 +160,7 @@ def test_nothing_is_added_to_a_model_that_leaves_nothing_of_it(
 
 
 def test_named_effects_come_one_by_one_and_what_has_no_name_at_once() -> None:
-    basis = Basis("place", "body", "where on the floor the robot is", np.zeros((0, 3, 0)))
+    basis = Basis("place", "body", "where on the floor the robot is")
     named, nameless = group("heading_drift"), replace(group("smooth_place"), basis=basis)
     assert group_counts([named, named, nameless, nameless]) == [1, 2, 4]
     assert group_counts([named]) == [1]
