@@ -128,12 +128,15 @@ def _cause(discovery: Discovery) -> tuple[str, str]:
     sessions = ", sessions differ" if discovery.sessions.differences else sessions
     verdict = f"{verdict_in_words(discovery)}{sessions}"
     if not discovery.effects:
-        return discovery.verdict, verdict
+        unnamed = " and of the gap an unnamed term closes what is shown" if discovery.extends else ""
+        return discovery.verdict, f"{verdict}{unnamed}"
     first, *more = discovery.effects
     others = [name for name in first.confusable_with if name != first.name]
     name = first.name.replace("_", " ")
     name += f" or {len(others)} others" if len(others) > 1 else f" or {others[0].replace('_', ' ')}" if others else ""
     name += f", and {len(more)} more" if more else ""
+    if discovery.verdict == "unknown":
+        verdict = f"likeliest, but no name is sure{sessions}"
     return name, f"{verdict}; weight of the name {weight_in_words(first.weight)}"
 
 

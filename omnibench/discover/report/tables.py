@@ -75,7 +75,11 @@ def parameter_table(found: Sequence[NamedEffect], dataset: Dataset) -> Table:
         others = [name for name in effect.confusable_with if name != effect.name]
         alike = f", cannot be told from {' and '.join(others)}" if others else ""
         rows.append(
-            Row.of(f"{effect.name} ({effect.stage}), weight {weight_in_words(effect.weight)}{alike}", role="group")
+            Row.of(
+                f"{effect.name} ({effect.stage}), weight {weight_in_words(effect.weight)}{alike}; "
+                f"{effect.form or 'as in the textbook'}",
+                role="group",
+            )
         )
         for each in effect.parameters:
             value, interval, unit = value_and_interval(each)
