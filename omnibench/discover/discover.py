@@ -27,6 +27,7 @@ from omnibench.discover.held_out.sessions import compare_with_validation, eq6_wi
 from omnibench.discover.held_out.validation_runs import noise_runs, validation_runs
 from omnibench.discover.held_out.waterfall import waterfall_steps
 from omnibench.discover.result import Discovery
+from omnibench.discover.selection.averaged_model import averaged
 from omnibench.discover.selection.candidate_groups import check_names
 from omnibench.discover.selection.competing_models import competing_models
 from omnibench.discover.selection.detectability import detectability_of
@@ -130,13 +131,14 @@ def discover_effects(
         effects = named_effects(models, motors)
 
     progress.begin("comparing on runs that were held out")
-    extended = faded(models.used, baseline)
+    average = averaged(models.weighted)
+    extended = faded(average.extended, baseline)
     validation = validation_runs(dataset, extended.fit)
     held_out = compare_held_out(baseline, extended, validation, folds)
-    steps = waterfall_steps(plain, baseline, extended, validation)
+    steps = waterfall_steps(plain, baseline, models.used, extended, validation)
     sessions = compare_with_validation(extended, validation)
     eq6_of_sessions = eq6_with_changes(extended, validation.runs, sessions)
-    extrapolations = extrapolations_of(validation.kept, baseline, models.weighted)
+    extrapolations = extrapolations_of(validation.kept, baseline, extended, average.members)
     detectability = detectability_of(screening, models.selection)
 
     if any(effect.confusable_with for effect in effects):
@@ -149,7 +151,7 @@ def discover_effects(
         effects=effects,
         dependences=dependences,
         verdict=verdict,
-        term_notes=term_notes,
+        term_notes=(*term_notes, *filter(None, [average.note])),
         baseline=baseline,
         extended=extended,
         validation=validation,
