@@ -41,6 +41,17 @@ def extrapolation_warning(calibration: Calibration, runs: Sequence[Trajectory]) 
     )
 
 
+def share_outside(calibration: Calibration, runs: Sequence[Trajectory]) -> float | None:
+    """Share of the runs' time in motions that a calibration was not fitted to; None where these are not known."""
+    if not calibration.driven or not runs:
+        return None
+    domain = TrainingDomain(calibration.robot, calibration.driven)
+    times = [float(run.times[-1]) for run in runs]
+    motions = (motions_of(calibration.matrix_array, run.times, run.signals) for run in runs)
+    outside = [domain.outside_in_run(of_run).mean() * time for of_run, time in zip(motions, times, strict=True)]
+    return float(sum(outside) / sum(times))
+
+
 def _first(commands: Sequence[str]) -> str:
     others = len(commands) - _NAMED
     return ", ".join(commands[:_NAMED]) + (f" and {others} more" if others > 0 else "")

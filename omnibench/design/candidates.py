@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from omnibench.config import read_yaml, validate
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.storage import load_dataset
-from omnibench.design.config import DesignConfig, TimedCommand
+from omnibench.design.config import DesignConfig
 from omnibench.design.d_optimality import Counts
 from omnibench.errors import ConfigError, DataError, OmnibenchError, UnknownNameError
 from omnibench.fit.problem import training_split
@@ -23,9 +23,11 @@ from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
 from omnibench.simulate.chain.robot_config import RobotConfig
 from omnibench.simulate.config import FlowerConfig
-from omnibench.simulate.flower import commanded_rates, commanded_steering, duration_of, stamps_of_run
+from omnibench.simulate.driving.designed_run import run_as_designed
+from omnibench.simulate.driving.timed_command import TimedCommand
+from omnibench.simulate.flower import planned_commands
 from omnibench.simulate.source import ComparedData
-from omnibench.words import noun_for
+from omnibench.words import noun_for, plural
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,12 +196,13 @@ def candidates_of_simulation(
 
     ConfigError: the commands leave part of the matrix undetermined, there is one only, or the noise is zero.
     """
-    ramp = config.commands.ramp
-    commands = tuple(
-        TimedCommand(command, duration_of(command, config.train, config.commands), ramp) for command in config.driven
-    )
+    planned = planned_commands(config, config.train)
     periods = (config.sample_period, config.pose_period)
-    _, candidates = driven_as_designed(config.robot, integration, periods, {name: commands})
+    pool, candidates = driven_as_designed(config.robot, integration, periods, {name: [each.timed for each in planned]})
+    baseline = np.zeros(len(candidates), dtype=np.intp)
+    for each in planned:
+        baseline[pool[each.timed]] += each.repetitions
+    often = f" x {baseline[0]}" if len(set(baseline)) == 1 else f", {plural(int(baseline.sum()), 'run')}"
     scale = config.train.noise_scale
     noise = Noise(**{kind: scale * getattr(config.noise, kind) for kind in Noise.model_fields})
     return checked_pool(
@@ -211,8 +214,8 @@ def candidates_of_simulation(
             integration=integration,
             candidates=candidates,
             sets={name: tuple(range(len(candidates)))},
-            baseline=np.full(len(candidates), config.repetitions),
-            baseline_name=f"{len(candidates)} {noun_for(len(candidates), 'command')} of {name} x {config.repetitions}",
+            baseline=baseline,
+            baseline_name=f"{len(candidates)} {noun_for(len(candidates), 'command')} of {name}{often}",
             noise=noise,
             noise_source="assumed: what the config simulates for training",
             simulated=True,
@@ -254,32 +257,8 @@ def driven_as_designed(
     names = [timed.command.name for timed in commands]
     candidates = []
     for timed, name in zip(commands, names, strict=True):
-        command = timed.command
         title = name if names.count(name) == 1 else f"{name}_t{timed.duration:.4g}"
-        times, pose_times = stamps_of_run(timed.duration, *periods)
-        rates = commanded_rates(robot, command, times, timed.ramp)
-        still = Trajectory(
-            title,
-            "train",
-            times,
-            rates,
-            pose_times,
-            np.zeros((len(pose_times), 3)),
-            steering=commanded_steering(robot, command, times),
-            drive=None if robot.drive.direct else robot.drive,
-        )
-        (poses,) = model.poses([still.log(pose_times)])
-        run = replace(
-            still,
-            poses=poses,
-            command=title,
-            v=command.speed,
-            alpha=command.direction,
-            omega=command.turn_rate,
-            duration=float(times[-1]),
-            distance=command.speed * (float(times[-1]) - timed.ramp),
-        )
-        candidates.append(CandidateRun(title, (run,)))
+        candidates.append(CandidateRun(title, (run_as_designed(model, timed, periods, title),)))
     return {timed: index for index, timed in enumerate(commands)}, tuple(candidates)
 
 

@@ -3,34 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from pydantic import Discriminator, Field, FiniteFloat, Tag, field_validator, model_validator
+from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 
-from omnibench.config import Model, NonNegative, Positive
+from omnibench.config import Model, Positive
 from omnibench.data.importers.robot_option import RobotOption
 from omnibench.errors import UnknownNameError
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Robot
 from omnibench.robot.odometry import Integration
-from omnibench.simulate.command import Command, beyond_steering, within_steering
-from omnibench.simulate.config import MotionGrid, SteeringLimit
+from omnibench.simulate.command import beyond_steering, within_steering
+from omnibench.simulate.config import SteeringLimit
+from omnibench.simulate.driving.command_config import MotionGrid, SingleCommand
+from omnibench.simulate.driving.timed_command import TimedCommand
 from omnibench.words import plural
 
 # They guard memory against slips of the pen and decide nothing else: so many samples of four wheels take 640 MB.
 _MOST_COMMANDS = 5000  # commands of a set, at most
 _MOST_SAMPLES = 2e7  # wheel samples and poses of a set's commands together, at most
 Name = Annotated[str, Field(min_length=1, max_length=60)]
-
-
-@dataclass(frozen=True)
-class TimedCommand:
-    """A motion command with its duration, s. ramp: time at its start and its end in which the speed changes, s."""
-
-    command: Command
-    duration: float
-    ramp: float = 0.0
 
 
 class CommandGrid(MotionGrid):
@@ -50,28 +42,6 @@ class CommandGrid(MotionGrid):
         for command in self.grid(robot):
             driven = self.duration or (self.distance or 0.0) / max(command.speed, 1e-9)
             yield TimedCommand(command, driven if command.speed else self.turn_duration)
-
-
-class SingleCommand(Model):
-    """One command."""
-
-    speed: NonNegative = Field(description="m/s")
-    direction_deg: FiniteFloat = Field(0.0, description="degrees, in the robot's frame")
-    turn_rate: FiniteFloat = Field(0.0, description="rad/s")
-    duration: Positive = Field(description="s")
-
-    @model_validator(mode="after")
-    def _moves(self) -> SingleCommand:
-        if not self.speed and not self.turn_rate:
-            raise ValueError("this command does not move the robot; give a speed or a turn_rate")
-        return self
-
-    def commands(self, robot: Robot) -> Iterator[TimedCommand]:
-        """The one command. ValueError: the robot's wheels do not roll in its direction."""
-        direction = self.direction_deg if self.speed else 0.0
-        grid = MotionGrid(speeds=(self.speed,), directions_deg=(direction,), turn_rates=(self.turn_rate,))
-        for command in grid.grid(robot):
-            yield TimedCommand(command, self.duration)
 
 
 class OtherSet(Model):

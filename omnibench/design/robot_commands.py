@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,39 +13,21 @@ from pydantic import Field, model_validator
 from omnibench.config import Model, Positive, validate
 from omnibench.data.importers.robot_option import RobotOption
 from omnibench.design.candidates import CandidatePool, checked_pool, driven_as_designed, refuse_choice
-from omnibench.design.config import TimedCommand
 from omnibench.errors import ConfigError
 from omnibench.robot.calibration import Noise
-from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration
-from omnibench.simulate.command import (
-    Command,
-    default_directions,
-    is_within,
-    sharpest_turn,
-    steering_limit,
-    straight_and_pivot,
-    wheels_of,
-)
-from omnibench.simulate.true_motion import TrueMotion
+from omnibench.simulate.command import Command, default_directions, steering_limit, wheels_of
+from omnibench.simulate.driving.drivable_commands import LONGEST, SHORTEST, DrivableCommands, Shapes
 from omnibench.words import plural
 
 # What follows offers shapes of runs; more of them change a design little, because it is a choice of few (chosen).
-_RADII = (0.1, 0.2, 0.4, 0.8)  # shares of the free side of the area
-_TURNS = (45.0, 90.0, 180.0, 360.0)  # deg, of an arc
-_ROOM_TO_STEER = 1.15  # times the smallest radius, of an arc: a controller needs some of the steering's range
-_SPINS = (360.0, 1080.0)  # deg, on the spot
-_LINES = (0.5, 1.0)  # shares of the longest line
-_LONGEST = 60.0  # s of a run: a person gets tired, and a reference drifts
-_SHORTEST = 0.1  # m of a line or an arc: a shorter one drowns in noise
-_HEADINGS = np.radians(np.arange(0.0, 180.0, 7.5))  # in which a run may begin in the area, whose sides are two of them
+_SHAPES = Shapes(lines=(0.5, 1.0), radii=(0.1, 0.2, 0.4, 0.8), turns=(45.0, 90.0, 180.0, 360.0), spins=(360.0, 1080.0))
 _MOST = {
     "steering_limit": 180.0,
     "position_noise": 10.0,
     "heading_noise": 90.0,
 }  # deg, m, deg: more is a slip of the pen
 _SET = "robot"  # name of the candidates' set
-_POINTS = 60  # places of a path at which the area is checked
 _SAMPLE_PERIOD, _POSE_PERIOD = 0.05, 0.25  # s; commands are constant, so that longer samples tell the same
 # White noise of a motion capture or of scan matching, and per sqrt(s) what a floor and slip add: the order of magnitude
 # of the recordings that omnibench was tried on, 3 to 9 mm.
@@ -140,8 +121,8 @@ class RobotCommands(Model):
                 f"--max-speed {self.max_speed:g}: at --max-wheel-rate {self._wheel_rate:g} rad/s the wheels drive at "
                 f"most {math.floor(1000 * fastest) / 1000:g} m/s; give no more, or raise the wheels' rate"
             )
-        if min(self._free) < 2 * _SHORTEST:
-            need = 2 * (self._half_width + _SHORTEST)
+        if min(self._free) < 2 * SHORTEST:
+            need = 2 * (self._half_width + SHORTEST)
             raise ValueError(
                 f"--area {self.area[0]:g}x{self.area[1]:g}: the robot alone takes {2 * self._half_width:.2g} m; give "
                 f"both sides at least {math.ceil(10 * need) / 10:g} m"
@@ -156,7 +137,7 @@ class RobotCommands(Model):
         commands, robot = tuple(dict.fromkeys(self.commands())), self.robot
         if not any(timed.command.turn_rate for timed in commands):
             raise ConfigError(
-                f"{source}: no curve that it can drive within {_LONGEST:g} s fits an area of {self.area[0]:g} x "
+                f"{source}: no curve that it can drive within {LONGEST:g} s fits an area of {self.area[0]:g} x "
                 f"{self.area[1]:g} m; give a larger --area, or a greater --steering-limit or --max-speed"
             )
         _, candidates = driven_as_designed(robot, integration, (_SAMPLE_PERIOD, _POSE_PERIOD), {_SET: commands})
@@ -187,61 +168,17 @@ class RobotCommands(Model):
             )
         )
 
-    def commands(self) -> Iterator[TimedCommand]:
+    def commands(self) -> DrivableCommands:
         """Lines, arcs to both sides and turns on the spot, each as fast as the limits allow."""
-        rolls = straight_and_pivot(self.robot)
-        pivot = (0.0, 0.0) if rolls is None else rolls[1]
-        for direction in map(math.radians, default_directions(self.robot)):
-            if line := self._drivable(direction, 0.0, pivot):
-                longest = min(max(self._free), _LONGEST * line.speed)
-                for share in _LINES:
-                    yield TimedCommand(line, _tidy(share * longest) / line.speed)
-            for radius in self._radii(direction, pivot):
-                for side in (1.0, -1.0):
-                    if arc := self._drivable(direction, side / radius, pivot):
-                        yield from self._of_length(arc, [math.radians(turn) * radius / arc.speed for turn in _TURNS])
-        for side in (1.0, -1.0):
-            spin = Command(0.0, 0.0, side * self._slower(Command(0.0, 0.0, side, pivot)), pivot)
-            if is_within(self.robot, spin, self._steering_limit):
-                yield from self._of_length(spin, [math.radians(turn) / abs(spin.turn_rate) for turn in _SPINS])
-
-    def _radii(self, direction: float, pivot: tuple[float, float]) -> list[float]:
-        """Radii of arcs, m: shares of the area, and a little more than the smallest that a robot steers."""
-        radii = [_tidy(share * max(self._free)) for share in _RADII]
-        if self.robot.drive.direct:
-            return radii
-        tightest = 1 / sharpest_turn(self.robot, Command(1.0, direction, 1 / _SHORTEST, pivot), self._steering_limit)
-        return [_tidy(_ROOM_TO_STEER * tightest), *radii] if tightest > _SHORTEST else radii
-
-    def _drivable(self, direction: float, curvature: float, pivot: tuple[float, float]) -> Command | None:
-        """The fastest command of a shape within the limits; None beyond the steering limit. curvature: 1/m."""
-        share = self._slower(Command(1.0, direction, curvature, pivot))
-        speed = _tidy(share)
-        command = Command(speed, direction, curvature * speed, pivot)
-        return command if is_within(self.robot, command, self._steering_limit) else None
-
-    def _slower(self, command: Command) -> float:
-        """Factor by which a command becomes as fast as speed, rate of turn and wheels allow."""
-        rates, _ = wheels_of(self.robot, command.twist)
-        limits = [self._wheel_rate / max(np.abs(rates).max(), 1e-12)]
-        limits += [self.max_speed / command.speed] if command.speed else []
-        limits += [self.max_turn_rate / abs(command.turn_rate)] if command.turn_rate else []
-        return float(min(limits))
-
-    def _of_length(self, command: Command, durations: list[float]) -> Iterator[TimedCommand]:
-        """The command for those durations, s, that are neither too long nor lead out of the area."""
-        for duration in durations:
-            long_enough = not command.speed or command.speed * duration >= _SHORTEST
-            if long_enough and duration <= _LONGEST and self._fits(command.twist * duration):
-                yield TimedCommand(command, duration)
-
-    def _fits(self, moved: Array) -> bool:
-        """True if the path of a constant twist stays in the area from some start and heading. moved (3,): m, m, rad."""
-        path = TrueMotion(np.ones(1), np.zeros(3), moved[None], "arc").poses(np.linspace(0.0, 1.0, _POINTS))
-        places = path[:, 0] + 1j * path[:, 1]
-        turned = places * np.exp(1j * _HEADINGS)[:, None]
-        wide, deep = np.ptp(turned.real, axis=1), np.ptp(turned.imag, axis=1)
-        return bool(((wide <= self._free[0] + 1e-9) & (deep <= self._free[1] + 1e-9)).any())
+        return DrivableCommands(
+            self.robot,
+            self.max_speed,
+            self.max_turn_rate,
+            self._wheel_rate,
+            self._steering_limit,
+            self._free,
+            _SHAPES,
+        )
 
     @property
     def _straight_rates(self) -> list[float]:
@@ -278,9 +215,3 @@ class RobotCommands(Model):
             f"Commands were made for at most {', '.join(words)}, and a free floor of {self.area[0]:g} x "
             f"{self.area[1]:g} m, of which the robot's wheels need {self._half_width:.2g} m about its centre."
         )
-
-
-def _tidy(value: float) -> float:
-    """A value rounded down to two digits, as a person sets it."""
-    digits = 1 - math.floor(math.log10(value))
-    return math.floor(value * 10.0**digits + 1e-9) / 10.0**digits

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.discover.fitting.extend import Extended
 from omnibench.discover.selection.extrapolation import training_domain
@@ -21,7 +19,6 @@ from omnibench.robot.calibration import (
     fitted_calibration,
     matrix_rows,
 )
-from omnibench.robot.kinematics import Array
 
 
 @dataclass(frozen=True)
@@ -39,8 +36,12 @@ def calibration_of(
     name: str,
     request: Request,
     reason: str,
+    plain: Extended | None = None,
 ) -> Calibration:
-    """The calibration of a fit with its noise, covariance and provenance. reason: why the fit ended, in words."""
+    """The calibration of a fit with its noise, covariance and provenance.
+
+    reason: why the fit ended, in words. plain: the fit of the plain matrix, to which the effects of a model fade.
+    """
     terms = tuple(
         EffectTerm(name=term.name, parameters={key: float(value) for key, value in term.values.items()})
         for term in extended.fit.model.terms
@@ -53,9 +54,10 @@ def calibration_of(
         integration=extended.fit.model.integration,
         effects=terms,
         noise=extended.fit.noise.noise,
-        covariance=covariance_rows(_with_shapes(extended)),
+        covariance=covariance_rows(extended.covariance_of_terms),
         session=extended.fit.runs[0].session,
         driven=tuple(tuple(float(value) for value in motion) for motion in training_domain(extended)),
+        plain=matrix_rows(plain.fit.model.matrix) if plain is not None and terms else None,
         provenance=Provenance(
             dataset=dataset.name,
             dataset_hash=dataset.hash,
@@ -83,16 +85,3 @@ def _cost(extended: Extended, runs: Sequence[Trajectory]) -> float | None:
         return costs.create("final_pose").of_model(extended.fit.model, runs)
     except DataError:
         return None
-
-
-def _with_shapes(extended: Extended) -> Array:
-    """The covariance, with rows and columns of zeros for shape parameters: these were chosen, not fitted."""
-    elements = extended.fit.model.matrix.size
-    fitted = list(range(elements))
-    count = elements
-    for group in extended.groups:
-        fitted += range(count, count + len(group.parameters))
-        count += len(group.parameters) + len(group.shapes)
-    covariance, fitted_covariance = np.zeros((count, count)), extended.covariance.matrix
-    covariance[np.ix_(fitted, fitted)] = (fitted_covariance + fitted_covariance.T) / 2
-    return covariance

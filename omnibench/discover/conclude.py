@@ -11,13 +11,13 @@ import numpy as np
 from omnibench.data.dataset import Dataset
 from omnibench.discover.calibrations import Request, calibration_of
 from omnibench.discover.covariate_dependence import Dependences
-from omnibench.discover.experiments import experiments_for
 from omnibench.discover.fitting.extend import Extended
 from omnibench.discover.fitting.model_fit import Fit
 from omnibench.discover.held_out.gaps import training_gap
 from omnibench.discover.held_out.validation_runs import ValidationRuns
 from omnibench.discover.result import (
     Discovery,
+    Experiment,
     Extrapolation,
     HeldOut,
     NamedEffect,
@@ -59,6 +59,7 @@ class Findings:
     steps: tuple[Step, ...]
     extrapolations: tuple[Extrapolation, ...]
     detectability: Detectability
+    experiments: tuple[Experiment, ...]
     sessions: SessionComparison
     eq6_of_sessions: float | None
 
@@ -95,13 +96,13 @@ def conclude(dataset: Dataset, request: Request, findings: Findings, seconds: fl
         held_out=held_out,
         steps=findings.steps,
         extrapolations=findings.extrapolations,
-        experiments=experiments_for(dataset, effects, fit),
+        experiments=findings.experiments,
         notes=(*_notes(findings), *findings.term_notes, *findings.validation.warnings),
         noise=fit.noise,
         outliers=fit.jumps,
         poses=sum(len(residuals) for residuals in fit.residuals),
         plain=calibration_of(dataset, baseline, "plain", request, headline),
-        extended=calibration_of(dataset, extended, "extended", request, headline),
+        extended=calibration_of(dataset, extended, "extended", request, headline, baseline),
         trajectories=tuple(run.id for run in fit.runs),
         before=tuple(baseline.fit.residuals),
         after=tuple(fit.residuals),

@@ -17,18 +17,21 @@ from omnibench.data.dataset import Dataset
 from omnibench.discover.calibrations import Request
 from omnibench.discover.conclude import Findings, conclude
 from omnibench.discover.covariate_dependence import covariate_dependences, without_smooth_term
+from omnibench.discover.experiments.experiments import experiments_for
 from omnibench.discover.fitting.extend import Extended, extend, fit_matrix, without_effects
 from omnibench.discover.fitting.model_fit import Fit
+from omnibench.discover.fitting.windows import in_windows
 from omnibench.discover.held_out.cross_validation import random_folds_of_repetitions
 from omnibench.discover.held_out.gaps import compare_held_out
 from omnibench.discover.held_out.sessions import compare_with_validation, eq6_with_changes
 from omnibench.discover.held_out.validation_runs import noise_runs, validation_runs
 from omnibench.discover.held_out.waterfall import waterfall_steps
 from omnibench.discover.result import Discovery
+from omnibench.discover.selection.averaged_model import averaged
 from omnibench.discover.selection.candidate_groups import check_names
 from omnibench.discover.selection.competing_models import competing_models
 from omnibench.discover.selection.detectability import detectability_of
-from omnibench.discover.selection.extrapolation import extrapolations_of
+from omnibench.discover.selection.extrapolation import extrapolations_of, faded
 from omnibench.discover.selection.fitted_forms import with_fitted_forms
 from omnibench.discover.selection.locating import all_left, located
 from omnibench.discover.selection.model_selection import Selection, select_effects
@@ -81,7 +84,7 @@ def discover_effects(
     began, progress = time.monotonic(), Stages(watch)
     check_names(without)
     rng = np.random.default_rng(seed)
-    runs = usable_runs(dataset.split("train"))
+    runs = usable_runs(in_windows([run for run in dataset.split("train") if run.has_poses]) or dataset.split("train"))
     start = _start_matrix(dataset, calibration)
 
     progress.begin("fitting the plain matrix")
@@ -128,14 +131,19 @@ def discover_effects(
         effects = named_effects(models, motors)
 
     progress.begin("comparing on runs that were held out")
-    extended = models.used
+    average = averaged(models.weighted)
+    extended = faded(average.extended, baseline)
     validation = validation_runs(dataset, extended.fit)
     held_out = compare_held_out(baseline, extended, validation, folds)
-    steps = waterfall_steps(plain, baseline, extended, validation)
+    steps = waterfall_steps(plain, baseline, models.used, extended, validation)
     sessions = compare_with_validation(extended, validation)
     eq6_of_sessions = eq6_with_changes(extended, validation.runs, sessions)
-    extrapolations = extrapolations_of(validation.kept, baseline, models.weighted)
+    extrapolations = extrapolations_of(validation.kept, baseline, extended, average.members)
     detectability = detectability_of(screening, models.selection)
+
+    if any(effect.confusable_with for effect in effects):
+        progress.begin("choosing runs that tell the look-alikes apart")
+    experiments = experiments_for(dataset, effects, models.weighted)
 
     findings = Findings(
         screening=screening,
@@ -143,7 +151,7 @@ def discover_effects(
         effects=effects,
         dependences=dependences,
         verdict=verdict,
-        term_notes=term_notes,
+        term_notes=(*term_notes, *filter(None, [average.note])),
         baseline=baseline,
         extended=extended,
         validation=validation,
@@ -151,6 +159,7 @@ def discover_effects(
         steps=steps,
         extrapolations=extrapolations,
         detectability=detectability,
+        experiments=experiments,
         sessions=sessions,
         eq6_of_sessions=eq6_of_sessions,
     )

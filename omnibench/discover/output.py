@@ -65,7 +65,7 @@ def write_discovery(
             chosen.rmdir()  # only if it is empty
         raise
     for stale in chosen.glob("experiment-*.yaml"):  # files of an earlier discovery
-        if stale.name not in map(experiment_file, range(1, len(discovery.experiments) + 1)):
+        if stale.name not in _experiments(discovery):
             remove(stale)
     if not discovery.extends:
         remove(chosen / CALIBRATION_FILES["extended"])
@@ -83,10 +83,15 @@ def _contents(discovery: Discovery, options: DiscoverOptions, folder: Path) -> d
     }
     if discovery.extends:
         texts[CALIBRATION_FILES["extended"]] = to_yaml(discovery.extended)
-    texts |= {experiment_file(number): each.config for number, each in enumerate(discovery.experiments, 1)}
+    texts |= _experiments(discovery)
     contents = {folder / name: text.encode("utf-8") for name, text in texts.items()}
     contents[folder / "residuals.parquet"] = encode_table(residual_table(discovery), "parquet")
     return contents
+
+
+def _experiments(discovery: Discovery) -> dict[str, str]:
+    """The configs of experiments by their files' names, without those that have none."""
+    return {experiment_file(number): each.config for number, each in enumerate(discovery.experiments, 1) if each.config}
 
 
 def _config(options: DiscoverOptions) -> str:

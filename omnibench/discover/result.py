@@ -204,12 +204,33 @@ class Extrapolation:
 
 
 @dataclass(frozen=True)
+class ExperimentCommand:
+    """A command of an experiment, in words. runs: how often it is driven. seconds: of one run."""
+
+    motion: str
+    runs: int
+    seconds: float
+
+
+@dataclass(frozen=True)
 class Experiment:
-    """An experiment that tells the members of a class apart. config: for ``omnibench simulate``, in YAML."""
+    """The cheapest runs that tell the members of a class apart, beside those that were recorded.
+
+    config: for ``omnibench simulate``, in YAML; empty where no runs tell any members apart. minutes: of the runs, with
+    placing the robot. chance: that the right name then has a weight of 0.95, for the member that is hardest to tell.
+    chance_recorded: the same after as many minutes of the commands that were recorded. inseparable: pairs of members
+    that stay alike whatever is driven.
+    """
 
     separates: tuple[str, ...]
     description: str
     config: str
+    commands: tuple[ExperimentCommand, ...] = ()
+    runs: int = 0
+    minutes: float = 0.0
+    chance: float = 0.0
+    chance_recorded: float = 0.0
+    inseparable: tuple[tuple[str, str], ...] = ()
 
 
 def is_other_session(training: Sequence[Trajectory], held_out: Sequence[Trajectory]) -> bool:

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from omnibench.config import Model
 from omnibench.data.dataset import SPLITS, Dataset, Trajectory
-from omnibench.data.domain_check import extrapolation_warning
+from omnibench.data.domain_check import extrapolation_warning, share_outside
 from omnibench.data.references.run_references import UNITS, ReferenceKind
 from omnibench.errors import require_type
 from omnibench.fit.held_out import judge, nothing_held_out, unfitted_runs
@@ -42,6 +42,7 @@ class SplitErrors(Model):
 
     Of runs that have references in the place of poses they are means over these; None where no run has any of a
     position or length, or of an angle. references: errors at these by their kind; left out where there are none.
+    outside: share of the runs' time in motions that the calibration was not fitted to; left out where it is not known.
     """
 
     trajectories: int = Field(exclude=True)
@@ -51,6 +52,7 @@ class SplitErrors(Model):
     heading_mean_rad: float | None
     heading_max_rad: float | None
     references: tuple[ReferenceErrors, ...] = Field((), exclude_if=lambda references: not references)
+    outside: float | None = Field(None, exclude_if=lambda outside: outside is None)
 
 
 class Evaluation(Shown, Model):
@@ -100,7 +102,10 @@ def evaluate(calibration: Calibration, dataset: Dataset) -> Evaluation:
         loss=calibration.provenance.loss if calibration.provenance else None,
         simulated=dataset.simulated,
         trajectories=len(dataset.trajectories),
-        splits={name: split_errors(model, group) for name, group in groups.items()},
+        splits={
+            name: split_errors(model, group).model_copy(update={"outside": share_outside(calibration, group)})
+            for name, group in groups.items()
+        },
         design={name: split_errors(design, group) for name, group in groups.items()},
         unfitted=None if held_out is None else {name: _count(held_out, group) for name, group in groups.items()},
         held_out=verdict,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -20,6 +21,7 @@ from omnibench.config import Model, NonNegative, parse_yaml, printable, read_yam
 from omnibench.errors import ConfigError, DataError, require_type
 from omnibench.files import write_text
 from omnibench.robot.effects.term import make_term
+from omnibench.robot.fade import Fade
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
@@ -138,6 +140,11 @@ class Calibration(Shown, Model):
     driven: tuple[tuple[FiniteFloat, FiniteFloat, FiniteFloat], ...] | None = Field(
         None, description="motions that it was fitted to, m/s, m/s, rad/s; its effects are not known to hold beyond"
     )
+    plain: tuple[Row, Row, Row] | None = Field(
+        None,
+        description="matrix without effects, to which these fade beyond such motions as far as they are not sure",
+        exclude_if=_is_none,
+    )
     provenance: Provenance | None = None
 
     @model_validator(mode="after")
@@ -148,20 +155,23 @@ class Calibration(Shown, Model):
                 f"signals are {', '.join(self.signals or ()) or 'none'}, but the columns of this robot's matrix are "
                 f"{', '.join(signals)}; put them in this order"
             )
-        for index, row in enumerate(self.matrix, 1):
-            if len(row) != len(signals):
-                what = "wheel" if self.robot.drive.direct else "drive signal"
-                raise ValueError(
-                    f"row {index} of the matrix has {plural(len(row), 'value')}, "
-                    f"the robot has {plural(len(signals), what)}"
-                )
-        if flaw := matrix_flaw(self.matrix_array):
-            raise ValueError(f"matrix holds {flaw}")
+        for name, matrix in (("matrix", self.matrix), ("plain matrix", self.plain)):
+            for index, row in enumerate(matrix or (), 1):
+                if len(row) != len(signals):
+                    what = "wheel" if self.robot.drive.direct else "drive signal"
+                    raise ValueError(
+                        f"row {index} of the {name} has {plural(len(row), 'value')}, "
+                        f"the robot has {plural(len(signals), what)}"
+                    )
+            if matrix is not None and (flaw := matrix_flaw(np.array(matrix))):
+                raise ValueError(f"{name} holds {flaw}")
         if self.covariance is not None:
             size = 3 * len(signals) + sum(len(term.parameters) for term in self.effects)
             if [len(row) for row in self.covariance] != [size] * size:
                 raise ValueError(f"covariance is not {size} x {size}")
             _check_covariance(np.array(self.covariance))
+        if self.plain is not None and not (self.covariance and self.driven):
+            raise ValueError("plain is the matrix to which effects fade; for that, covariance and driven are needed")
         return self
 
     @model_serializer(mode="wrap")
@@ -175,12 +185,21 @@ class Calibration(Shown, Model):
         """The odometry model of the file. OmnibenchError: an effect or one of its parameters is unknown."""
         where = f"calibration {self.name!r}"
         terms = tuple(make_term(term.name, term.parameters, self.robot, where) for term in self.effects)
-        return OdometryModel(self.robot, self.matrix_array, self.integration, terms, self.sample_period)
+        model = OdometryModel(self.robot, self.matrix_array, self.integration, terms, self.sample_period)
+        if self.plain is None or not terms:
+            return model
+        change, driven = self.matrix_array - np.array(self.plain), np.array(self.driven)
+        return replace(model, fade=Fade(self.robot, change, driven, terms, np.array(self.covariance)))
 
     @property
     def matrix_array(self) -> Array:
         """The matrix as an array (3, M)."""
         return np.array(self.matrix)
+
+    @property
+    def matrix_without_effects(self) -> Array:
+        """The matrix (3, M) for whoever holds no effects: the plain one, where the file has it."""
+        return self.matrix_array if self.plain is None else np.array(self.plain)
 
     @property
     def effects_in_words(self) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, get_args
 
 import numpy as np
@@ -69,8 +70,7 @@ def _model(robot: Any, integration: Integration | None) -> OdometryModel:
         return OdometryModel.of_design(robot, integration or "arc")
     require_type(robot, Calibration, "read_calibration, or a Robot with omnibench.Robot(name=..., wheels=[...])")
     model = robot.model
-    chosen = integration or model.integration
-    return OdometryModel(model.robot, model.matrix, chosen, model.terms, model.sample_period)
+    return replace(model, integration=integration or model.integration)
 
 
 def _check(robot: Robot, log: WheelLog) -> None:

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from omnibench.robot.corrected import corrected_twists
 from omnibench.robot.effects.term import Term
+from omnibench.robot.fade import Fade, faded_twists
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, OdometryStream, advance
 from omnibench.robot.signals import SignalStream
@@ -25,10 +25,15 @@ class EffectStream(OdometryStream):
     """
 
     def __init__(
-        self, terms: Sequence[Term], signals: SignalStream, integration: Integration, start: Array | None = None
+        self,
+        terms: Sequence[Term],
+        signals: SignalStream,
+        integration: Integration,
+        start: Array | None = None,
+        fade: Fade | None = None,
     ) -> None:
         super().__init__(signals.matrix, integration, start, signals.robot.drive)
-        self._terms, self._signals = tuple(terms), signals
+        self._terms, self._signals, self._fade = tuple(terms), signals, fade
         self._needs_poses = any("poses" in term.effect.needs for term in self._terms)
         self._left_at: Array | None = None
 
@@ -49,7 +54,7 @@ class EffectStream(OdometryStream):
         steered = None if middle is None or steering is None else (middle, np.asarray(steering, dtype=float))
         self.driven = self.driven_signals(angles, middle)
         signals = self._signals.next(angles / duration, duration, wheel_angles, self.frame_heading, steered)
-        twists, drift = corrected_twists(self._terms, signals, self.matrix)
+        twists, drift, doubts = faded_twists(self._fade, self._terms, signals, self.matrix)
         before, moved = self.pose, twists[0] * duration
         self.pose = advance(before, moved, self.integration)
         if drift is not None:
@@ -57,11 +62,21 @@ class EffectStream(OdometryStream):
             self.pose = self.pose + np.array([added.real, added.imag, 0.0])
             moved = moved + self._in_body(added, before[2], moved[2])
         self.moved, self._left_at = moved, self.pose
+        self.doubts = None if doubts is None else self._all_in_body(duration * doubts[0], before[2])
         return self.pose
+
+    def _all_in_body(self, doubts: Array, heading: float) -> Array:
+        """Deviations (3, r) of a motion in the robot's frame from those (5, r) of its twist and of its drift."""
+        turn = self.frame_heading + heading
+        cosine, sine = math.cos(turn), math.sin(turn)
+        of_drift = np.array([[cosine, sine], [-sine, cosine], [0.0, 0.0]]) @ doubts[3:]
+        in_body: Array = doubts[:3] + of_drift
+        return in_body
 
     def _take_at_once(self, angles: Array, wheel_angles: Array | None, steering: Array | None) -> Array:
         """Advance by wheel angles (N,) rad that take no time: without rates no effect acts, and the matrix stands."""
         self._follow()
+        self.doubts = None
         self._signals.turn(angles, wheel_angles)
         self._left_at = super().drive(angles, steering=steering)
         self._signals.move(self.moved)

@@ -8,10 +8,11 @@ from functools import cached_property
 
 import numpy as np
 
-from omnibench.robot.corrected import check_needs, corrected_twists, needs_of
+from omnibench.robot.corrected import check_needs, needs_of
 from omnibench.robot.effect_stream import EffectStream
 from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect
 from omnibench.robot.effects.term import Term
+from omnibench.robot.fade import Fade, faded_twists
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import Integration, OdometryStream, RunSamples, WheelLog
 from omnibench.robot.path import PathBatch
@@ -25,7 +26,7 @@ class OdometryModel:
     """A robot's odometry: ``matrix`` (3, M) in m and rad per rad, integration of a sample, and effects.
 
     terms: effects of any stage; those of stage actuator are for simulation and ignored here. sample_period: nominal, s;
-    needed with effects.
+    needed with effects. fade: how the corrections of effects of motion fade outside the training domain; None: not.
     """
 
     robot: Robot
@@ -33,6 +34,7 @@ class OdometryModel:
     integration: Integration
     terms: tuple[Term, ...] = ()
     sample_period: float | None = None
+    fade: Fade | None = None
 
     def __post_init__(self) -> None:
         if self.terms and self.sample_period is None:
@@ -47,6 +49,11 @@ class OdometryModel:
     def motion_terms(self) -> tuple[Term, ...]:
         """Terms of stage wheel, clock, body and world."""
         return tuple(term for term in self.terms if isinstance(term.effect, MotionEffect))
+
+    @property
+    def _corrects(self) -> bool:
+        """True if a motion is not the matrix's alone: effects of motion act, or the matrix fades to the plain one."""
+        return bool(self.motion_terms) or self.fade is not None
 
     @cached_property
     def reference_terms(self) -> tuple[Term, ...]:
@@ -80,12 +87,12 @@ class OdometryModel:
 
         session: its name; None if it is unknown to the calibration. session_time: at the stream's start, s.
         """
-        if not self.motion_terms:
+        if not self._corrects:
             return OdometryStream(self.matrix, self.integration, start, self.robot.drive)
         assert self.sample_period is not None  # there are terms
         needs = needs_of(self.motion_terms)
         signals = SignalStream(self.robot, self.matrix, self.sample_period, session, session_time, needs=needs)
-        return EffectStream(self.motion_terms, signals, self.integration, start)
+        return EffectStream(self.motion_terms, signals, self.integration, start, self.fade)
 
     def _of_paths(
         self, logs: Sequence[WheelLog], quantity: Callable[[PathBatch, Sequence[Array]], list[Array]]
@@ -103,7 +110,7 @@ class OdometryModel:
         """The paths of the logs of one session under the effects of motion."""
         samples, starts = RunSamples.of([log.times for log in logs]), np.array([log.start for log in logs])
         durations = samples.durations[:, None]
-        if not self.motion_terms:
+        if not self._corrects:
             driven = np.concatenate([log.signals for log in logs])
             return PathBatch(samples, starts, (driven @ self.matrix.T) * durations, self.integration)
         assert self.sample_period is not None  # there are terms
@@ -111,7 +118,7 @@ class OdometryModel:
             check_needs(self.motion_terms, log)
         needs = needs_of(self.motion_terms)
         signals = signals_of_runs(logs, samples, self.robot, self.matrix, self.sample_period, needs)
-        twists, drift = corrected_twists(self.motion_terms, signals, self.matrix)
+        twists, drift, _ = faded_twists(self.fade, self.motion_terms, signals, self.matrix)
         world = None if drift is None else drift * durations
         return PathBatch(samples, starts, twists * durations, self.integration, world)
 

@@ -284,9 +284,10 @@ class OdometryBatch:
 class OdometryStream:
     """Odometry one sample at a time: ``drive`` advances ``pose`` (3,) in m, m, rad.
 
-    moved (3,): the last sample's motion in the robot's frame, m, m, rad. driven (M,): integrals of its signals, rad,
-    without effects. frame_heading: the heading of the stream's frame in the reference's, rad; effects of the world act
-    along the axes of the reference.
+    moved (3,): the last sample's motion in the robot's frame, m, m, rad. doubts (3, r): its standard deviations, in r
+    independent directions, by what effects extrapolate; None where nothing is extrapolated. driven (M,): integrals of
+    its signals, rad, without effects. frame_heading: the heading of the stream's frame in the reference's, rad; effects
+    of the world act along the axes of the reference.
     """
 
     def __init__(
@@ -299,6 +300,7 @@ class OdometryStream:
         self.pose = np.zeros(3) if start is None else np.array(start, dtype=float)
         self.moved = np.zeros(3)
         self.driven: Array = np.zeros(matrix.shape[1])
+        self.doubts: Array | None = None
         self.frame_heading = 0.0
 
     def drive(

@@ -54,21 +54,29 @@ class TrainingDomain:
         self._known = np.asarray(motions, dtype=float) * self._scale
         self._size = _size(self._known)
 
+    def excess(self, motions: Array) -> Array:
+        """How far (k,) motions (k, 3) are outside, in widths of what counts as near to a known motion; 0 inside."""
+        at_wheels = motions * self._scale
+        excess: Array = np.maximum(self._distances(at_wheels) / (_NEAR * self._size) - 1, 0.0)
+        return np.where(np.linalg.norm(at_wheels, axis=1) < _STANDING * self._size, 0.0, excess)
+
     def is_outside(self, motion: Array) -> bool:
-        """True if one motion (3,) is outside; without SciPy, whose import would delay a live node."""
-        at_wheels = motion * self._scale
-        if np.linalg.norm(at_wheels) < _STANDING * self._size:
-            return False
-        return bool(np.linalg.norm(self._known - at_wheels, axis=1).min() > _NEAR * self._size)
+        """True if one motion (3,) is outside."""
+        return bool(self.outside(motion[None])[0])
 
     def outside(self, motions: Array) -> NDArray[np.bool_]:
         """True (k,) for each of many motions (k, 3) that is outside."""
+        outside: NDArray[np.bool_] = self.excess(motions) > 0
+        return outside
+
+    def _distances(self, at_wheels: Array) -> Array:
+        """Distances (k,) of motions (k, 3), m/s, from the nearest known one; one without SciPy, slow to import live."""
+        if len(at_wheels) == 1:
+            return np.sqrt(np.square(self._known - at_wheels).sum(axis=1).min(keepdims=True))
         from scipy.spatial import KDTree
 
-        at_wheels = motions * self._scale
-        far = KDTree(self._known).query(at_wheels)[0] > _NEAR * self._size
-        outside: NDArray[np.bool_] = far & (np.linalg.norm(at_wheels, axis=1) >= _STANDING * self._size)
-        return outside
+        distances: Array = KDTree(self._known).query(at_wheels)[0]
+        return distances
 
     def outside_in_run(self, motions: Array) -> NDArray[np.bool_]:
         """True (k,) for the motions (k, 3) of one run that are outside; all False where they are mere transitions."""

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import product
 from typing import Annotated, Generic, Literal, Self, TypeVar
 
 from pydantic import AfterValidator, Field, FiniteFloat, model_validator
 
-from omnibench.config import Model, NonNegative, Positive
+from omnibench.config import Model, Positive
 from omnibench.data.dataset import Split
 from omnibench.errors import UnknownNameError
 from omnibench.robot.calibration import EffectTerm, Noise
@@ -19,17 +18,14 @@ from omnibench.robot.published_matrices import PUBLISHED
 from omnibench.simulate.command import (
     Command,
     beyond_steering,
-    default_directions,
-    straight_and_pivot,
     within_steering,
 )
-from omnibench.simulate.variation import Variation
+from omnibench.simulate.driving.command_config import Commands, MotionGrid
 from omnibench.words import plural
 
 _MOST_NOISE = 1e4  # rad/s, or a factor; chosen: a hundred thousand turns a minute
 _MOST_RUNS = 100_000  # simulated runs; chosen: more take hours and gigabytes
 _MOST_ROWS = 1e8  # wheel samples and poses; more do not fit into memory
-_ASIDE = 1e-6  # sine of a direction off that of rolling, above which wheels would slide: rounding of degrees
 SteeringLimit = Annotated[
     float | None,
     Field(None, gt=0, le=180, description="largest steering angle, degrees; default: tricycle 80, car 35, others 90"),
@@ -120,60 +116,6 @@ class Session(RobotSession):
     noise_scale: float = Field(1.0, ge=0, le=_MOST_NOISE, description="factor on all noise of the reference")
 
 
-class MotionGrid(Model):
-    """Motion commands: every direction with every rate of turn, at each speed."""
-
-    speeds: tuple[NonNegative, ...] = Field((0.2,), min_length=1, description="m/s")
-    directions_deg: tuple[FiniteFloat, ...] | None = Field(
-        None, min_length=1, description="default: every 45; forward and backward for a robot that cannot go sideways"
-    )
-    turn_rates: tuple[FiniteFloat, ...] = Field(min_length=1, description="rad/s")
-    turn_duration: Positive = Field(6.0, description="duration of turns on the spot, s")
-
-    def directions(self, robot: Robot) -> tuple[float, ...]:
-        """Directions, deg, for a robot. ValueError: its fixed wheels do not roll in one that is given."""
-        if self.directions_deg is None:
-            return default_directions(robot)
-        rolls = straight_and_pivot(robot)
-        for direction in self.directions_deg:
-            if rolls is not None and abs(math.sin(math.radians(direction) - rolls[0])) > _ASIDE:
-                forward, backward = default_directions(robot)
-                raise ValueError(
-                    f"directions_deg: this robot's fixed wheels would slide at {direction:g} deg; give {forward:g} and "
-                    f"{backward:g}, or leave directions_deg out"
-                )
-        return self.directions_deg
-
-    def extremes(self, command: Command) -> tuple[Command, ...]:
-        """The commands between which a run of this one varies."""
-        return (command,)
-
-    def grid(self, robot: Robot) -> list[Command]:
-        """Every direction with every rate of turn, at each speed; the direction of a turn on the spot is 0.
-
-        ValueError as for ``directions``.
-        """
-        rolls = straight_and_pivot(robot)
-        pivot = (0.0, 0.0) if rolls is None else rolls[1]
-        directions = self.directions(robot)
-        return [
-            Command(speed, math.radians(direction), turn_rate, pivot)
-            for speed, turn_rate in product(self.speeds, self.turn_rates)
-            for direction in (directions if speed > 0 else (0.0,))
-            if speed or turn_rate
-        ]
-
-
-class Commands(MotionGrid):
-    """Motion commands and the ramps with which they are driven."""
-
-    ramp: NonNegative = Field(0.0, description="time in which wheel rates rise and fall, which is added to the run, s")
-    variation: Variation = Field(Variation(), description="of the commands within a run")
-
-    def extremes(self, command: Command) -> tuple[Command, ...]:
-        return self.variation.extremes(command)
-
-
 class EncoderNoise(Noise):
     """Noise of the encoders, and of the reference poses as in a calibration file."""
 
@@ -200,7 +142,7 @@ class Experiment(Model, Generic[S]):
 
     @model_validator(mode="after")
     def _something_moves(self) -> Self:
-        if not any(self.commands.speeds) and not any(self.commands.turn_rates):
+        if not self.commands.moves:
             raise ValueError("commands: no command moves the robot")
         if self.steering_limit_deg is not None and self.robot.drive.direct:
             raise ValueError("steering_limit_deg: no wheel of this robot steers; leave it out")
@@ -259,11 +201,7 @@ class FlowerConfig(Experiment[Session]):
 
     @model_validator(mode="after")
     def _can_be_driven(self) -> FlowerConfig:
-        shortest = min(session.distance for session in self.sessions.values()) / max(*self.commands.speeds, 1e-9)
-        if math.isfinite(shortest) and shortest < self.sample_period:
-            raise ValueError("runs are shorter than one sample; raise distance or lower sample_period")
-        if 0.0 in self.commands.speeds:
-            shortest = min(shortest, self.commands.turn_duration)
+        shortest = self._shortest()
         if self.commands.ramp > shortest:
             raise ValueError(
                 f"commands.ramp: {self.commands.ramp:g} s; the shortest run would have to slow down before it has its "
@@ -281,16 +219,31 @@ class FlowerConfig(Experiment[Session]):
             )
         return self
 
+    def _shortest(self) -> float:
+        """Duration of the shortest run without its ramps, s."""
+        chosen = self.commands
+        if chosen.listed:
+            return min(each.duration for each in chosen.listed) - chosen.ramp
+        shortest = min(session.distance for session in self.sessions.values()) / max(*chosen.speeds, 1e-9)
+        if math.isfinite(shortest) and shortest < self.sample_period:
+            raise ValueError("runs are shorter than one sample; raise distance or lower sample_period")
+        return min(shortest, chosen.turn_duration) if 0.0 in chosen.speeds else shortest
+
     @property
     def runs(self) -> int:
         """Number of runs of all sessions, at most."""
         chosen = self.commands
+        if chosen.listed:
+            return sum(each.repetitions for each in chosen.listed) * len(self.sessions)
         commands = len(chosen.speeds) * len(chosen.directions(self.robot)) * len(chosen.turn_rates)
         return commands * self.repetitions * len(self.sessions)
 
     def _rows(self) -> float:
         """Number of wheel samples and poses of the experiment."""
         chosen = self.commands
+        if chosen.listed:
+            seconds = len(self.sessions) * sum(each.repetitions * each.duration for each in chosen.listed)
+            return seconds / self.sample_period + seconds / self.pose_period
         ways = [session.distance for session in self.sessions.values()]
         driven = [way / speed + chosen.ramp for way in ways for speed in chosen.speeds if speed]
         turns = (chosen.turn_duration + chosen.ramp) * len(ways) * (0.0 in chosen.speeds)

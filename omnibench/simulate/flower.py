@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 
@@ -13,16 +13,17 @@ from omnibench.data.dataset import Split, Trajectory, make_dataset
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.simulate.command import Command, straight_and_pivot, wheels_of
-from omnibench.simulate.config import Commands, FlowerConfig, Session
+from omnibench.simulate.config import FlowerConfig, Session
+from omnibench.simulate.driving.timed_command import TimedCommand
 from omnibench.simulate.pose_noise import reference_noise
 from omnibench.simulate.simulation import Simulation
 from omnibench.simulate.truth import TrueRobot, true_record
-from omnibench.simulate.variation import Variation
+from omnibench.simulate.variation import STEADY, Variation
 from omnibench.words import plural
 
 _MANY = 1000  # runs whose checks and tables take more than about a second; chosen
 PAUSE = 10.0  # s between runs
-_STEADY = Variation()
+C = TypeVar("C")
 
 
 def simulate_flower(
@@ -64,20 +65,51 @@ def simulate_flower(
 
 
 def runs_of(
-    commands: Sequence[Command], repetitions: int, order: Literal["shuffled", "sorted"], rng: np.random.Generator
-) -> list[tuple[Command, int]]:
-    """Every command with the number of each of its repetitions, in the order in which they are driven."""
-    runs = [(command, repetition) for command in commands for repetition in range(1, repetitions + 1)]
+    commands: Sequence[tuple[C, int]], order: Literal["shuffled", "sorted"], rng: np.random.Generator
+) -> list[tuple[C, int]]:
+    """Every command, given with its repetitions, with the number of each, in the order in which they are driven."""
+    runs = [(command, repetition) for command, count in commands for repetition in range(1, count + 1)]
     return [runs[index] for index in rng.permutation(len(runs))] if order == "shuffled" else runs
 
 
-def duration_of(command: Command, session: Session, chosen: Commands) -> float:
-    """Duration of a command in a session, s; ramps lengthen a run, so that its length in m stays."""
-    driven = session.distance / command.speed if command.speed else chosen.turn_duration
-    return driven + chosen.ramp
+@dataclass(frozen=True)
+class PlannedCommand:
+    """A command of a session. heading: at the start, rad; None: as for all runs."""
+
+    name: str
+    timed: TimedCommand
+    repetitions: int
+    heading: float | None = None
 
 
-def commanded_rates(robot: Robot, command: Command, times: Array, ramp: float, variation: Variation = _STEADY) -> Array:
+def planned_commands(config: FlowerConfig, session: Session) -> list[PlannedCommand]:
+    """The commands within the steering limit; ramps lengthen the runs of a grid, so that their length in m stays."""
+    chosen, driven = config.commands, config.driven
+    if not chosen.listed:
+        seconds = [session.distance / each.speed if each.speed else chosen.turn_duration for each in driven]
+        return [
+            PlannedCommand(
+                each.name, TimedCommand(each, driving + chosen.ramp, chosen.ramp, chosen.variation), config.repetitions
+            )
+            for each, driving in zip(driven, seconds, strict=True)
+        ]
+    planned = []
+    lengths: dict[Command, set[float]] = {}
+    for listed in chosen.listed:
+        lengths.setdefault(listed.command(config.robot), set()).add(listed.duration)
+    for listed in chosen.listed:
+        command = listed.command(config.robot)
+        name = command.name if len(lengths[command]) == 1 else f"{command.name}_t{listed.duration:g}"
+        heading = None
+        if listed.heading_deg is not None:
+            name, heading = f"{name}_h{listed.heading_deg:g}", math.radians(listed.heading_deg)
+        if command in driven:
+            timed = TimedCommand(command, listed.duration, chosen.ramp, chosen.variation)
+            planned.append(PlannedCommand(name, timed, listed.repetitions, heading))
+    return planned
+
+
+def commanded_rates(robot: Robot, command: Command, times: Array, ramp: float, variation: Variation = STEADY) -> Array:
     """Mean wheel rates (F, N) by the design values, rad/s, in samples that end at times (F,), s.
 
     ramp: time in which the rates rise and fall linearly, s.
@@ -90,7 +122,7 @@ def commanded_rates(robot: Robot, command: Command, times: Array, ramp: float, v
     return rates if not ramp else rates * _mean_shares(times, ramp)[:, None]
 
 
-def commanded_steering(robot: Robot, command: Command, times: Array, variation: Variation = _STEADY) -> Array | None:
+def commanded_steering(robot: Robot, command: Command, times: Array, variation: Variation = STEADY) -> Array | None:
     """Steering angles (F, S) by the design values at times (F,), rad, s; None for robots without any."""
     if robot.drive.direct:
         return None
@@ -99,7 +131,7 @@ def commanded_steering(robot: Robot, command: Command, times: Array, variation: 
     return variation.wheels(robot, command, times, ends=True)[1]
 
 
-def true_steering(robot: Robot, run: Trajectory, variation: Variation = _STEADY) -> Array | None:
+def true_steering(robot: Robot, run: Trajectory, variation: Variation = STEADY) -> Array | None:
     """Steering angles (F, S), rad, that exact encoders measure in a simulated run; None for robots without any."""
     chosen = straight_and_pivot(robot)
     pivot = (0.0, 0.0) if chosen is None else chosen[1]
@@ -118,7 +150,8 @@ def _mean_shares(times: Array, ramp: float) -> Array:
 
 def _session(config: FlowerConfig, robot: TrueRobot, split: Split, session: Session) -> Iterator[Trajectory]:
     rng = np.random.default_rng(session.seed)
-    runs = runs_of(config.driven, config.repetitions, config.order, rng)
+    commands = [(each, each.repetitions) for each in planned_commands(config, session)]
+    runs = runs_of(commands, config.order, rng)
     started_at = 0.0
     angles: Array = np.zeros(len(config.robot.wheel_names))
     for number, (command, repetition) in enumerate(runs, 1):
@@ -134,7 +167,7 @@ class _Planned:
 
     id: str
     split: Split
-    command: Command
+    command: PlannedCommand
     repetition: int
     started_at: float
     angles: Array
@@ -148,12 +181,12 @@ def _drive(
     Encoders are exact between runs, so that recorded and true wheel angles do not drift apart: the angles (N,) at the
     run's end are those at which the next one begins.
     """
-    command, ramp = planned.command, config.commands.ramp
-    duration = duration_of(command, session, config.commands)
-    times, pose_times = stamps_of_run(duration, config.sample_period, config.pose_period)
-    variation = config.commands.variation
+    timed = planned.command.timed
+    command, ramp = timed.command, timed.ramp
+    times, pose_times = stamps_of_run(timed.duration, config.sample_period, config.pose_period)
+    variation = timed.variation
     targets = commanded_rates(config.robot, command, times, ramp, variation)
-    start = _start(config, rng)
+    start = _start(config, planned.command.heading, rng)
     driven, steering = robot.driven(times, targets), commanded_steering(config.robot, command, times, variation)
     log = robot.log(times, driven, start, pose_times, planned.angles, planned.started_at, planned.split, steering)
     rates = log.rates + config.noise.encoder * rng.standard_normal(targets.shape)
@@ -164,7 +197,7 @@ def _drive(
     run = Trajectory(
         id=planned.id,
         split=planned.split,
-        command=command.name,
+        command=planned.command.name,
         repetition=planned.repetition,
         session=planned.split,
         started_at=planned.started_at,
@@ -184,11 +217,10 @@ def _drive(
     return run, angles[-1]
 
 
-def _start(config: FlowerConfig, rng: np.random.Generator) -> Array:
-    if config.start == "fixed":
-        return np.zeros(3)
+def _start(config: FlowerConfig, heading: float | None, rng: np.random.Generator) -> Array:
     half = config.start_area / 2
-    return rng.uniform((-half, -half, -math.pi), (half, half, math.pi))
+    start = np.zeros(3) if config.start == "fixed" else rng.uniform((-half, -half, -math.pi), (half, half, math.pi))
+    return start if heading is None else np.append(start[:2], heading)
 
 
 def stamps_of_run(duration: float, sample_period: float, pose_period: float) -> tuple[Array, Array]:

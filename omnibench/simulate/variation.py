@@ -53,6 +53,9 @@ class Variation(Model):
         return rates, steering
 
 
+STEADY = Variation()  # a run holds its command throughout
+
+
 def _within_legs(angles: Array, legs: NDArray[np.intp]) -> Array:
     """Directions (F,) of rolling, rad, either way: continuous in each leg, which begins within a quarter turn."""
     chosen = np.empty_like(angles)

@@ -85,7 +85,7 @@ class _Said(JobWatch[Result]):
 
 
 def _job(task: Task) -> Job[Result]:
-    return Job(content_key({"task": task, "code": _code()}), _carry_out, task)
+    return Job(content_key({"task": task, "code": discovering_code()}), _carry_out, task)
 
 
 def _carry_out(task: Task, _: Reporter) -> Result:
@@ -93,11 +93,14 @@ def _carry_out(task: Task, _: Reporter) -> Result:
 
 
 @cache
-def _code() -> str:
+def discovering_code() -> str:
+    """A hash of the code that discovers and of that which hides."""
     package = Path(omnibench.__file__).parent
-    makers = Path(__file__).parent / "hidden"
+    makers = Path(__file__).parent
     rooms = (file for room in ROOMS for file in (package / room).rglob("*.py") if "report" not in file.parts)
-    return code_digest(package, rooms) + code_digest(makers, makers.glob("*.py"))
+    return code_digest(package, rooms) + code_digest(
+        makers, [*makers.glob("hidden/*.py"), *makers.glob("foreign/*.py")]
+    )
 
 
 def _print_rows(title: str, rows: Sequence[Row]) -> None:

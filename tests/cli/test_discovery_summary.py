@@ -37,7 +37,7 @@ def test_verdict_effect_places_gap_and_files_are_told() -> None:
     told = printed(named())
     assert "flower (simulated data): 36 training runs" in told
     assert "verdict: named (found and named)" in told
-    assert "rotation_translation_coupling (body), weight > 99.9 %" in told
+    assert "rotation_translation_coupling (body), weight 99.9 %; as in the textbook" in told
     assert "Where the plain matrix fails" in told
     assert "held-out session: 36 runs" in told
     assert "results/flower/now/report.html" in told
@@ -49,6 +49,13 @@ def test_a_class_and_its_doubts_are_told() -> None:
     told = " ".join(printed(replace(named(), verdict="class", effects=(effect,))).split())
     assert "cannot be told from load_transfer" in told
     assert "In doubt: rotation_translation_coupling: few turns." in told
+
+
+def test_what_to_drive_to_tell_look_alikes_apart_is_told() -> None:
+    told = " ".join(printed(incomplete()).split())
+    assert "What to drive to tell acceleration_slip from its look-alikes" in told
+    assert "turning left on the spot at 1 rad/s 12.5 4" in told
+    assert "Drive 4 runs, 1.8 minutes" in told
 
 
 def test_what_is_left_and_new_motions_are_told() -> None:

@@ -10,7 +10,14 @@ from shared_results import made_once
 
 from omnibench.data.dataset import Dataset
 from omnibench.discover.discover import discover_effects
-from omnibench.discover.result import CovariateDependence, Discovery, Experiment, Extrapolation, HeldOut
+from omnibench.discover.result import (
+    CovariateDependence,
+    Discovery,
+    Experiment,
+    ExperimentCommand,
+    Extrapolation,
+    HeldOut,
+)
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.simulate import simulate_dataset
 
@@ -24,6 +31,7 @@ APR02 = {
 Effects = tuple[dict[str, Any], ...]
 COUPLING: Effects = ({"name": "rotation_translation_coupling", "parameters": {"kx": 0.3, "ky": -0.2}},)
 ECCENTRICITY: Effects = ({"name": "wheel_eccentricity", "parameters": {"a_a": 0.02, "b_a": 0.0}},)
+DEAD_ZONE: Effects = ({"name": "wheel_dead_zone", "parameters": {"c": 0.03}},)
 DELAY: Effects = ({"name": "reference_time_offset", "parameters": {"tau": 0.06}},)
 
 
@@ -82,6 +90,12 @@ def lagging() -> Discovery:
     return discover_effects(simulated(({"name": "motor_lag", "parameters": {"tau": 0.15}},)))
 
 
+@made_once
+def look_alike() -> Discovery:
+    """Wheels that lose a constant rate: at one speed they look like wheels that creep."""
+    return discover_effects(simulated(DEAD_ZONE, validation=None))
+
+
 def incomplete() -> Discovery:
     """Named, with more of whatever a discovery may hold than these data give rise to."""
     found = named()
@@ -115,6 +129,11 @@ def held_out(found: Discovery, data: str) -> HeldOut:
 EXTRAPOLATION = Extrapolation("v0.4_a90_w1", "turns at 1.0 rad/s, where training had at most 0.35 rad/s", 0.041, 0.152)
 EXPERIMENT = Experiment(
     ("acceleration_slip", "reference_time_offset"),
-    "Turn on the spot at two rates: only a time offset shows there.",
+    "Drive 4 runs, 1.8 minutes with 15 s before each to place the robot.",
     "generator: flower\ncommands: {speeds: [0.0], directions_deg: [0], turn_rates: [-1.0, 1.0]}\n",
+    (ExperimentCommand("turning left on the spot at 1 rad/s", 4, 12.5),),
+    runs=4,
+    minutes=1.83,
+    chance=0.97,
+    chance_recorded=0.02,
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +10,13 @@ import pytest
 from discovery_samples import COUPLING, lagging, nameless, nothing, repeated, simulated
 
 from omnibench.data.dataset import Dataset
+from omnibench.data.joining import joined
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.result import Discovery
 from omnibench.errors import UnknownNameError
 from omnibench.fit.evaluate import evaluate
 from omnibench.robot.calibration import read_calibration, write_calibration
+from omnibench.simulate.like import simulate_like
 from omnibench.simulate.source import read_simulation
 
 
@@ -120,11 +123,15 @@ def test_squares_are_told_to_hold_motions_that_circles_had_not(recorded: Discove
     assert any("turning on the spot" in each.description for each in recorded.extrapolations)
 
 
-def test_the_experiment_that_tells_a_class_apart_does_so_when_it_is_simulated(
-    recorded: Discovery, tmp_path: Path
+def test_the_runs_that_are_proposed_tell_the_class_apart_together_with_the_recorded_ones(
+    recorded: Discovery, omni3: Dataset, tmp_path: Path
 ) -> None:
-    assert recorded.experiments
-    (tmp_path / "experiment.yaml").write_text(recorded.experiments[0].config)
-    found = discover_effects(read_simulation(tmp_path / "experiment.yaml").simulate().dataset)
+    (experiment,) = recorded.experiments
+    assert experiment.chance >= 0.95 > experiment.chance_recorded
+    (tmp_path / "experiment.yaml").write_text(experiment.config)
+    proposed = read_simulation(tmp_path / "experiment.yaml").simulate().dataset
+    assert len(proposed.trajectories) == experiment.runs
+    circles = replace(omni3, trajectories=omni3.split("train"))
+    found = discover_effects(joined(simulate_like(circles, recorded.extended, noise_seed=1), [proposed]))
     assert found.effects[0].name == recorded.effects[0].name
     assert found.effects[0].weight >= 0.95

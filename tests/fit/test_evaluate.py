@@ -124,3 +124,13 @@ def test_motions_that_the_effects_were_not_fitted_to_are_warned_of() -> None:
     (warning,) = evaluate(extended, dataset()).warnings
     assert "of 12 runs drive motions that calibration 'truth' was not fitted to" in warning
     assert evaluate(extended.model_copy(update={"driven": None}), dataset()).warnings == ()
+
+
+def test_the_share_of_time_outside_of_what_was_driven_is_told_of_every_split() -> None:
+    recorded = dataset()
+    known = tuple((*map(float, motion),) for run in recorded.split("train") for motion in run.signals @ TRUTH.T)
+    errors = evaluate(calibration().model_copy(update={"driven": known}), recorded).splits
+    assert errors["train"].outside == 0.0
+    assert errors["validation"].outside == pytest.approx(3 * (errors["all"].outside or 0.0))  # 4 runs of 12, as long
+    assert 0 < (errors["validation"].outside or 0.0) <= 1
+    assert "outside" not in evaluate(calibration(), recorded).splits["all"].model_dump()

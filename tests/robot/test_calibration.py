@@ -50,6 +50,7 @@ PROVENANCE = Provenance(
     outcome="converged",
     reason="step below 1e-09 after 4 cone programs: done",
 )
+APR_MATRIX = published_matrix("palacin2023_eq8")
 
 
 def a_calibration(**changes: Any) -> Calibration:
@@ -57,7 +58,7 @@ def a_calibration(**changes: Any) -> Calibration:
         "name": "flower closed_form",
         "robot": APR_02,
         "sample_period": 0.01,
-        "matrix": matrix_rows(published_matrix("palacin2023_eq8")),
+        "matrix": matrix_rows(APR_MATRIX),
         "integration": "euler",
     }
     return Calibration(**(given_values | changes))
@@ -188,6 +189,30 @@ def test_the_model_of_a_file_gives_the_same_poses_to_the_last_bit(tmp_path: Path
     np.testing.assert_array_equal(again.reported([log])[0], written.model.reported([log])[0])
 
 
+def test_a_file_with_the_plain_matrix_comes_back_and_its_effects_fade(tmp_path: Path) -> None:
+    slip = EffectTerm(name="centripetal_slip", parameters={"k": 0.05})
+    covariance = tuple(map(tuple, np.diag([1e-9] * 9 + [0.1**2]).tolist()))
+    fading = a_calibration(
+        effects=(slip,), covariance=covariance, driven=((0.01, 0.0, 0.0),), plain=matrix_rows(1.1 * APR_MATRIX)
+    )
+    write_calibration(fading, tmp_path / "calibration.yaml")
+    again, log = read_calibration(tmp_path / "calibration.yaml"), a_drive(1)
+    assert again == fading
+    (poses,), (plain,) = again.model.poses([log]), a_calibration(matrix=fading.plain).model.poses([log])
+    (whole,) = a_calibration(effects=(slip,)).model.poses([log])
+    assert np.abs(poses - plain).max() < 0.1 * np.abs(whole - plain).max()
+
+
+def test_a_file_without_it_stays_as_it_was(tmp_path: Path) -> None:
+    slip = EffectTerm(name="centripetal_slip", parameters={"k": 0.05})
+    covariance = tuple(map(tuple, np.diag([1e-9] * 9 + [0.1**2]).tolist()))
+    before = a_calibration(effects=(slip,), covariance=covariance, driven=((0.01, 0.0, 0.0),))
+    write_calibration(before, tmp_path / "calibration.yaml")
+    assert "plain" not in yaml.safe_load((tmp_path / "calibration.yaml").read_text())
+    log, whole = a_drive(1), a_calibration(effects=(slip,))
+    np.testing.assert_array_equal(before.model.poses([log])[0], whole.model.poses([log])[0])
+
+
 def test_an_effect_of_a_plug_in_is_run(tmp_path: Path) -> None:
     @effects.register("standstill")
     class Standstill(MotionEffect):
@@ -258,6 +283,8 @@ REFUSED: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "infinity in the matrix": (put("matrix", [[math.inf] * 3] * 3), "matrix.0.0: Input should be a finite number"),
     "an element that no wheel has": (put("matrix", [[1e6] * 3] * 3), "matrix holds 1e+06, which no wheel can drive"),
     "text in the matrix": (put("matrix", [["x"] * 3] * 3), "matrix.0.0: "),
+    "a plain matrix of another shape": (put("plain", rows(3, 3, 4)), "row 3 of the plain matrix has 4 values"),
+    "a plain matrix without a covariance": (put("plain", rows(3, 3, 3)), "covariance and driven are needed"),
     "a covariance of another shape": (put("covariance", rows(*[3] * 3)), "covariance is not 9 x 9"),
     "NaN in the noise": (put("noise", {"pose_position": math.nan}), "noise.pose_position: "),
     "negative noise": (put("noise", {"walk_heading": -0.1}), "noise.walk_heading: "),

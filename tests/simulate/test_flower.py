@@ -291,6 +291,27 @@ def test_turns_on_the_spot_last_as_long_as_configured() -> None:
     assert {run.times[-1] for run in dataset.trajectories} == {2.0}
 
 
+LISTED = [
+    {"speed": 0.1, "duration": 6.0, "repetitions": 2},
+    {"speed": 0.1, "duration": 9.0, "heading_deg": 90},
+    {"turn_rate": 0.5, "duration": 4.0, "repetitions": 3},
+]
+
+
+def test_listed_commands_are_driven_as_long_as_often_and_from_where_each_says() -> None:
+    given = small(commands={"listed": LISTED, "ramp": 0.3}, noise=QUIET)
+    runs = simulate_dataset(given).dataset.trajectories
+    driven = sorted((run.command, float(run.times[-1]), round(math.degrees(run.start[2]))) for run in runs)
+    assert driven == [
+        *[("v0.1_a0_w0_t6", 6.0, 0)] * 2,
+        ("v0.1_a0_w0_t9_h90", 9.0, 90),
+        *[("v0_a0_w0.5", 4.0, 0)] * 3,
+    ]
+    assert given.runs == len(runs)
+    (northward,) = (run for run in runs if run.command == "v0.1_a0_w0_t9_h90")
+    assert northward.poses[-1, 1] > 0.8 > 0.1 > abs(northward.poses[-1, 0])
+
+
 def test_tolerances_draw_a_robot_about_its_design() -> None:
     tolerances = {"radius": 0.02, "distance": 0.03, "angle_deg": 0.5, "seed": 7}
     given = config(truth={"tolerances": tolerances})
@@ -336,6 +357,15 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "a truth of another shape": ({"truth": {"matrix": [[1.0, 2.0]] * 3}}, "truth.matrix must have 3 rows of 3 values"),
     "no commands that move": (commands_with(speeds=[0], turn_rates=[0]), "commands: no command moves the robot"),
+    "neither a grid nor a list": ({"commands": {"speeds": [0.2]}}, "commands: give turn_rates (rad/s) of a grid"),
+    "a listed command that stands": (
+        {"commands": {"listed": [{"duration": 1.0}]}},
+        "commands.listed.0: this command does not move the robot",
+    ),
+    "a ramp longer than a listed run": (
+        {"commands": {"listed": [{"speed": 0.1, "duration": 1.0}], "ramp": 0.8}},
+        "commands.ramp: 0.8 s; the shortest run",
+    ),
     "no directions": (commands_with(directions_deg=[]), "commands.directions_deg: "),
     "a negative speed": (commands_with(speeds=[-0.2]), "commands.speeds.0: "),
     "an infinite rate of turn": (commands_with(turn_rates=[math.inf]), "commands.turn_rates.0: "),

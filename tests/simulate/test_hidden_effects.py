@@ -24,7 +24,8 @@ from omnibench.robot.odometry import WheelLog
 from omnibench.robot.planar import moved_to
 from omnibench.robot.published_matrices import published_matrix
 from omnibench.simulate.command import Command
-from omnibench.simulate.config import Commands, EncoderNoise, FlowerConfig
+from omnibench.simulate.config import EncoderNoise, FlowerConfig
+from omnibench.simulate.driving.command_config import Commands
 from omnibench.simulate.flower import commanded_rates
 from omnibench.simulate.simulate import simulate_dataset
 

@@ -169,6 +169,8 @@ def print_evaluation(console: Console, evaluation: Evaluation) -> None:
         title = f"{split}: {plural(evaluation.splits[split].trajectories, 'run')}"
         if evaluation.unfitted is not None:
             title += f", {_of_all(evaluation.unfitted[split], evaluation.splits[split].trajectories)} held out"
+        if (outside := evaluation.splits[split].outside) is not None:
+            title += f", {100 * outside:.0f} % of the time outside of what it was fitted to"
         rows.append(Row.of(title, role="group"))
         for label, errors in (("calibration", evaluation.splits[split]), ("design", evaluation.design[split])):
             figures = (

@@ -12,6 +12,7 @@ from omnibench.cli.terminal.console import print_ending
 from omnibench.cli.terminal.tables import in_brief, print_table
 from omnibench.discover.report.tables import (
     dependence_table,
+    experiment_table,
     gap_table,
     held_out_table,
     hidden_table,
@@ -63,10 +64,13 @@ def _tables(discovery: Discovery) -> Iterator[Table]:
     yield held_out_table(discovery) if discovery.held_out else gap_table(discovery)
     if discovery.hidden:
         yield hidden_table(worst_of_each(discovery.hidden)[:_HIDDEN])
+    yield from (experiment_table(each) for each in discovery.experiments if each.commands)
 
 
 def _remarks(discovery: Discovery) -> Iterator[str]:
     yield ""
+    for experiment in discovery.experiments:
+        yield experiment.description
     for effect in discovery.effects:
         if len(effect.parameters) > _PARAMETERS:
             yield f"{effect.name}: {plural(len(effect.parameters) - _PARAMETERS, 'more parameter')} in the report"
@@ -103,16 +107,17 @@ def _print_files(console: Console, discovery: Discovery, folder: Path) -> None:
         calibration = f"plain calibration, as nothing was added: {folder / 'plain.yaml'}"
     console.print(calibration, soft_wrap=True)
     for number, experiment in enumerate(discovery.experiments, 1):
-        file = folder / experiment_file(number)
-        console.print(f"to separate {listing(list(experiment.separates))}:\n{file}", soft_wrap=True)
+        if experiment.config:
+            console.print(f"the runs to drive, as a config: {folder / experiment_file(number)}", soft_wrap=True)
     console.print(f"report: {folder / 'report.html'}", soft_wrap=True)
 
 
 def _print_ending(discovery: Discovery, folder: Path) -> None:
     """Print the last sentence: run the extended model, drive what separates look-alikes, or keep the plain matrix."""
-    if discovery.experiments:
-        drive = f"drive the commands of {folder / experiment_file(1)}, and discover in those runs, too"
-        print_ending("more than one effect explains these data", drive)
+    if any(experiment.runs for experiment in discovery.experiments):
+        drive = "drive the runs above, import them with --set train=*, join both recordings and discover again"
+        join = ("omnibench", "import", "dataset", "RECORDED", "--set", "join=NEW", "-o", "BOTH")
+        print_ending("more than one effect explains these data", drive, *join)
     elif discovery.extends:
         use = ("omnibench", "export", folder / CALIBRATION_FILES["extended"], "--to", "c_header")
         print_ending("the extended calibration holds what the matrix lacked", "use it on the robot", *use)

@@ -15,8 +15,9 @@ from omnibench.data.importers.copied_reference import follows_the_wheels
 from omnibench.data.importers.encoder_options import EncoderOptions, Signs
 from omnibench.data.importers.runs.reference_options import RADIANS, SECONDS, HeadingUnit, TimeUnit
 from omnibench.data.importers.runs.reread_runs import Columns, in_seconds, reread_runs, scans_of
+from omnibench.data.joining import joined
 from omnibench.data.splits import Names, complete
-from omnibench.data.storage import read_recorded
+from omnibench.data.storage import load_dataset, read_recorded
 from omnibench.errors import DataError
 from omnibench.registry import importers
 
@@ -36,6 +37,7 @@ class DatasetOptions(EncoderOptions):
     steering_columns: Names = Field((), description="its steered wheels in the robot's order; default by name")
     pose_columns: Names = Field(_POSE, description="columns of x, y and heading, as [y,x,theta]")
     heading_unit: HeadingUnit = Field("rad", description="unit of the headings as the data set has them")
+    join: Names = Field((), description="folders of further data sets of this robot, whose runs are added as they are")
 
     @model_validator(mode="after")
     def _fits_together(self) -> DatasetOptions:
@@ -105,4 +107,5 @@ class DatasetFolder(Importer):
                 "the reference is the robot's odometry: some matrix makes its headings of the wheels to "
                 f"{residual:.1g} rad a second; record an independent one"
             )
-        return replace(dataset, warnings=(*warnings, *dataset.warnings))
+        dataset = replace(dataset, warnings=(*warnings, *dataset.warnings))
+        return joined(dataset, [load_dataset(folder) for folder in options.join])

@@ -75,6 +75,19 @@ class Extended:
             for residuals, columns in zip(self.fit.nuisance_free_residuals, self.columns, strict=True)
         ]
 
+    @property
+    def covariance_of_terms(self) -> Array:
+        """Covariance (n, n) of the matrix and of all values of the terms; 0 for shapes, which are not fitted."""
+        elements = self.fit.model.matrix.size
+        fitted = list(range(elements))
+        count = elements
+        for group in self.groups:
+            fitted += range(count, count + len(group.parameters))
+            count += len(group.parameters) + len(group.shapes)
+        covariance = np.zeros((count, count))
+        covariance[np.ix_(fitted, fitted)] = (self.covariance.matrix + self.covariance.matrix.T) / 2
+        return covariance
+
 
 def fit_matrix(
     runs: Sequence[Trajectory],

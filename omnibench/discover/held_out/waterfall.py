@@ -19,15 +19,18 @@ from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 
 
-def waterfall_steps(plain: Fit, baseline: Extended, extended: Extended, validation: ValidationRuns) -> tuple[Step, ...]:
+def waterfall_steps(
+    plain: Fit, baseline: Extended, used: Extended, extended: Extended, validation: ValidationRuns
+) -> tuple[Step, ...]:
     """The plain matrix (baseline), then the models with one effect more each; all under the extended model's noise.
 
-    plain: the fit that models between the first and the last are extended from.
+    used: the model with the effects that are named, one after another. extended: the last model, which may be the
+    average of that one and others. plain: the fit that models between the first and the last are extended from.
     """
     models = [("plain matrix", baseline)]
-    for count in group_counts(extended.groups):
-        model = extended if count == len(extended.groups) else extend(plain, extended.groups[:count])
-        models.append((f"+ {step_name(extended.groups[count - 1])}", model))
+    for count in group_counts(used.groups):
+        model = extended if count == len(used.groups) else extend(plain, used.groups[:count])
+        models.append((f"+ {step_name(used.groups[count - 1])}", model))
     return tuple(_step(name, model.fit, extended.fit, validation) for name, model in models)
 
 

@@ -15,8 +15,7 @@ With s_z the scores of run z for the d columns of a basis, s their sum and S = s
     Q = s' S^-1 s                                                                                                  (2)
 
 is the statistic of Hotelling ("The generalization of Student's ratio", Annals of Mathematical Statistics 2, 1931), of d
-degrees of freedom where nothing is missing, whatever the noise is taken for. Where runs are few, they are cut into
-pieces whose scores stand for those of runs: what is fine varies within a run.
+degrees of freedom where nothing is missing, whatever the noise is taken for.
 """
 
 from __future__ import annotations
@@ -28,7 +27,6 @@ from functools import partial
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from omnibench.discover.fitting.model_fit import Fit, paths_of
@@ -47,7 +45,7 @@ _DIRECTIONS, _LINES = 12, 9  # directions of lines across the floor, and lines f
 _EDGE = 0.05  # m, over which the floor changes at a line
 _CELLS = 9  # patches along each side of the floor
 _WIDE = 0.7  # radius of a patch, of the distance between two, as in covariate_bases.py
-_PIECES = 60  # runs or pieces of runs, at least
+_RUNS = 15  # at least: the scatter of six scores is hardly known from fewer; chosen
 _RANK = 1e-6  # share of a column's square that must be left beyond the others of its basis
 _SEEN = 0.002  # share of the samples that must lie in a patch, as in covariate_bases.py
 _TOGETHER = 100  # functions that are evaluated at once
@@ -66,10 +64,11 @@ class _Kind:
 
 def fine_structure(fit: Fit, rng: np.random.Generator) -> Significance | None:
     """Significance of fine structure in the residuals of a fitted model; None where nothing could show."""
+    if len(fit.runs) < _RUNS:
+        return None
     paths = paths_of(fit, _COARSE)
-    owner, units = _units(paths)
-    pull = _pull(fit, paths)
-    sums = csr_array((np.ones(len(owner)), (owner, np.arange(len(owner)))), shape=(units, len(owner)))
+    pull, owner = _pull(fit, paths), paths.owner
+    sums = csr_array((np.ones(len(owner)), (owner, np.arange(len(owner)))), shape=(len(fit.runs), len(owner)))
     groups: list[Group] = []
     scores: list[Array] = []
     for kind in _kinds(paths):
@@ -86,16 +85,6 @@ def fine_structure(fit: Fit, rng: np.random.Generator) -> Significance | None:
                     groups.append(Group("covariate", kind.covariate, (), tries=basis.tries, basis=basis))
                     scores.append(of_runs)
     return significance_of_scores(groups, scores, scores, rng) if groups else None
-
-
-def _units(paths: Paths) -> tuple[NDArray[np.intp], int]:
-    """The run of each sample, or the piece of a run where runs are few, and how many of these there are."""
-    runs = len(paths.logs)
-    pieces = -(-_PIECES // runs)
-    first = np.searchsorted(paths.owner, np.arange(runs + 1))
-    counts = np.diff(first)[paths.owner]
-    place = np.arange(len(paths.owner)) - first[paths.owner]
-    return paths.owner * pieces + place * pieces // counts, runs * pieces
 
 
 def _pull(fit: Fit, paths: Paths) -> Array:

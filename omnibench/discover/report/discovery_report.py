@@ -11,6 +11,7 @@ from omnibench.discover.report.evidence_figures import CANDIDATES, GAPS, drawn, 
 from omnibench.discover.report.tables import (
     absorbed_table,
     dependence_table,
+    experiment_table,
     extrapolation_table,
     gap_table,
     held_out_table,
@@ -35,7 +36,7 @@ from omnibench.discover.report.wording import (
     verdict_in_words,
     weight_in_words,
 )
-from omnibench.discover.result import Discovery, Gap, NamedEffect, experiment_file
+from omnibench.discover.result import Discovery, Experiment, Gap, NamedEffect, experiment_file
 from omnibench.environment import package_versions
 from omnibench.report.blocks import (
     Block,
@@ -127,12 +128,15 @@ def _cause(discovery: Discovery) -> tuple[str, str]:
     sessions = ", sessions differ" if discovery.sessions.differences else sessions
     verdict = f"{verdict_in_words(discovery)}{sessions}"
     if not discovery.effects:
-        return discovery.verdict, verdict
+        unnamed = " and of the gap an unnamed term closes what is shown" if discovery.extends else ""
+        return discovery.verdict, f"{verdict}{unnamed}"
     first, *more = discovery.effects
     others = [name for name in first.confusable_with if name != first.name]
     name = first.name.replace("_", " ")
     name += f" or {len(others)} others" if len(others) > 1 else f" or {others[0].replace('_', ' ')}" if others else ""
     name += f", and {len(more)} more" if more else ""
+    if discovery.verdict == "unknown":
+        verdict = f"likeliest, but no name is sure{sessions}"
     return name, f"{verdict}; weight of the name {weight_in_words(first.weight)}"
 
 
@@ -156,6 +160,8 @@ def what_blocks(discovery: Discovery) -> Iterator[Block]:
         for effect in discovery.effects:
             yield Callout(_effect_title(effect), tuple(_effect_remarks(effect)))
         yield parameter_table(discovery.effects, discovery.dataset)
+    for number, experiment in enumerate(discovery.experiments, 1):
+        yield from _experiment(experiment, experiment_file(number))
     if discovery.absorbed:
         yield absorbed_table(discovery)
     if discovery.not_looked_for:
@@ -163,6 +169,15 @@ def what_blocks(discovery: Discovery) -> Iterator[Block]:
             f"Effects that these recordings cannot show ({len(discovery.not_looked_for)})",
             (not_looked_for_table(discovery),),
         )
+
+
+def _experiment(experiment: Experiment, file: str) -> Iterator[Block]:
+    """What to drive to tell the members of a class apart."""
+    yield Paragraph(f"To separate {listing(list(experiment.separates))}: {experiment.description}")
+    if experiment.commands:
+        yield experiment_table(experiment)
+        title = f"These runs as a config ({file}): simulate them before they are driven"
+        yield Details(title, (Code(experiment.config),))
 
 
 def _effect_title(effect: NamedEffect) -> str:
@@ -216,10 +231,6 @@ def _classes(discovery: Discovery) -> Iterator[Block]:
         yield Callout(
             "What these data cannot tell apart", tuple(" or ".join(names) for names in discovery.classes), "plain"
         )
-    for number, each in enumerate(discovery.experiments, 1):
-        yield Paragraph(f"To separate {listing(list(each.separates))}: {each.description}")
-        title = f"That experiment as a config ({experiment_file(number)}): simulate it, or drive its commands"
-        yield Details(title, (Code(each.config),))
 
 
 def _hidden(discovery: Discovery) -> Iterator[Block]:

@@ -21,7 +21,15 @@ from omnibench.discover.report.wording import (
     value_and_interval,
     weight_in_words,
 )
-from omnibench.discover.result import CovariateDependence, Discovery, Extrapolation, Gap, Hidden, NamedEffect
+from omnibench.discover.result import (
+    CovariateDependence,
+    Discovery,
+    Experiment,
+    Extrapolation,
+    Gap,
+    Hidden,
+    NamedEffect,
+)
 from omnibench.registry import effects
 from omnibench.report.blocks import Cell, Column, Row, Table
 from omnibench.report.numbers import NOTHING, count, fixed, percent, significant
@@ -67,7 +75,11 @@ def parameter_table(found: Sequence[NamedEffect], dataset: Dataset) -> Table:
         others = [name for name in effect.confusable_with if name != effect.name]
         alike = f", cannot be told from {' and '.join(others)}" if others else ""
         rows.append(
-            Row.of(f"{effect.name} ({effect.stage}), weight {weight_in_words(effect.weight)}{alike}", role="group")
+            Row.of(
+                f"{effect.name} ({effect.stage}), weight {weight_in_words(effect.weight)}{alike}; "
+                f"{effect.form or 'as in the textbook'}",
+                role="group",
+            )
         )
         for each in effect.parameters:
             value, interval, unit = value_and_interval(each)
@@ -87,6 +99,16 @@ def _meanings(name: str, dataset: Dataset) -> Mapping[str, str]:
     sessions = tuple(dict.fromkeys(run.session for run in dataset.trajectories if run.session is not None))
     effect: Effect = effects.create(name)
     return {each.name: each.description for each in effect.parameters(dataset.robot, sessions)}
+
+
+def experiment_table(experiment: Experiment) -> Table:
+    """The runs of an experiment."""
+    rows = [Row.of(each.motion, fixed(each.seconds, 1), count(each.runs)) for each in experiment.commands]
+    return Table(
+        f"What to drive to tell {experiment.separates[0]} from its look-alikes",
+        (Column("Drive", numeric=False), Column("Each", "s"), Column("Runs")),
+        tuple(rows),
+    )
 
 
 def held_out_table(discovery: Discovery) -> Table:

@@ -52,6 +52,8 @@ STAGES: Mapping[Stage, str] = {
 }
 METRICS: Mapping[Literal["eq6", "chi2"], str] = {"eq6": "Eq. (6), final poses", "chi2": "whitened χ² per residual"}
 
+# Share of the error before, below which a gap was there, even if nobody knows how small errors could be (chosen).
+_BETTER = 0.95
 # Times the plain matrix's bound: a larger one of the extended model, which its training says nothing of, is no figure
 # to go by. Words alone hang on it (chosen; on omni3's squares the bounds are 50 to 2,000 times as large).
 _UNBOUNDED = 10.0
@@ -187,9 +189,9 @@ def chance(p_value: float) -> str:
 
 
 def closed_in_words(gap: Gap) -> str:
-    """The share of a gap that is closed, or that there is no gap."""
+    """The share of a gap that is closed, or that there is no gap, or none that is known."""
     if gap.closed is None:
-        return "no gap to close"
+        return "no share known" if gap.after < _BETTER * gap.before else "no gap to close"
     return percent(gap.closed)
 
 

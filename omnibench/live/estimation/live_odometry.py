@@ -1,11 +1,13 @@
 """Odometry with its covariance, one wheel step at a time, from a calibration's model and noise.
 
-The covariance P of the pose (x, y, heading) has two parts, P = W + J C J^T:                                    (L1)
+The covariance P of the pose (x, y, heading) has these parts, P = W + J C J^T + E E^T:                           (L1)
 
 - W is that of a random walk: each step adds the noise model's variances and carries W along, W <- F W F^T + Q, with F
   the derivative of the pose after the step with respect to the pose before it.                                 (L2)
 - C is the covariance of the matrix's elements, J the derivative of the pose with respect to them. The matrix errs in
   the same way all the time, so that J adds up along the way.                                                   (L3)
+- E are the deviations of the pose by those of motions that effects extrapolate, Eq. (3) of robot/fade.py; these are the
+  same all the time, too, and add up as J does.                                                                 (L4)
 
 The matrix moves the tracked point. Where that is mounted off the robot's centre, W and J are of its pose, and what is
 told is of the centre.
@@ -97,6 +99,7 @@ class LiveOdometry:
         signals = len(self._drive.names)
         self._jacobian = _MatrixJacobian(signals, calibration.integration)
         self._elements: Array | None = None
+        self._doubts: Array | None = None  # E (3, r) of Eq. (L4), once something was extrapolated
         self._blocks = np.zeros((3, signals, signals))
         if calibration.provenance is not None and calibration.provenance.on_bounds:
             LOG.warning(
@@ -108,7 +111,7 @@ class LiveOdometry:
             self._elements = np.array(calibration.covariance)[: 3 * signals, : 3 * signals]
             by_row = self._elements.reshape(3, signals, 3, signals)
             self._blocks = np.stack([by_row[row, :, row] for row in range(3)])
-        self._matrix_variances = [0.0, 0.0, 0.0]  # variances of the twist by the matrix's covariance
+        self._matrix_variances = [0.0, 0.0, 0.0]  # variances of the twist by the matrix's covariance, and by effects
 
     @property
     def driven(self) -> Array:
@@ -122,6 +125,8 @@ class LiveOdometry:
         if self._elements is not None:
             jacobian = self._jacobian.values
             covariance = covariance + jacobian @ self._elements @ jacobian.T
+        if self._doubts is not None:
+            covariance = covariance + self._doubts @ self._doubts.T
         return covariance if self._centre is None else carried(covariance, (self.pose - self._stream.pose)[:2])
 
     @property
@@ -157,6 +162,7 @@ class LiveOdometry:
         self._steering = steering
         self._walk.set(covariance)
         self._jacobian.clear()
+        self._doubts = None
 
     def continued(self, calibration: Calibration) -> LiveOdometry:
         """Odometry with another calibration from the same pose and covariance on."""
@@ -186,7 +192,7 @@ class LiveOdometry:
             twist_now = self._stream.matrix @ rates if step.blind else moved / step.duration
             self.twist = twist_now if self._centre is None else self._centre.of_twist @ twist_now
             self._duration = step.duration
-            self._matrix_variances = ((self._blocks @ rates) @ rates).tolist()
+            self._matrix_variances = ((self._blocks @ rates) @ rates + self._doubtful_variances(step.duration)).tolist()
         position, heading = self._walk_variances(step, moved, twist)
         self._propagate(before, self._stream.driven, position, heading)
         moved, integration = self._centre_moved()
@@ -266,6 +272,23 @@ class LiveOdometry:
         self._walk.add(position, heading)
         if self._elements is not None:
             self._jacobian.add(driven, to_x - x, to_y - y, start, end)
+        if (doubts := self._stream.doubts) is not None or self._doubts is not None:
+            self._add_doubts(doubts, (to_x - x, to_y - y), start, end)
+
+    def _add_doubts(self, moved: Array | None, along: tuple[float, float], start: float, end: float) -> None:
+        """Eq. (L4) for a step along (x, y), m, from heading to heading, rad, whose motion has deviations (3, r)."""
+        if self._doubts is None:
+            assert moved is not None  # something is extrapolated
+            self._doubts = np.zeros_like(moved)
+        self._doubts[0] -= along[1] * self._doubts[2]
+        self._doubts[1] += along[0] * self._doubts[2]
+        if moved is not None:
+            self._doubts += _slopes(self._stream.integration == "arc", *along, start, end) @ moved
+
+    def _doubtful_variances(self, duration: float) -> Array:
+        """Variances (3,) of the last step's twist by what effects extrapolate."""
+        doubts = self._stream.doubts
+        return np.zeros(3) if doubts is None else np.square(doubts / duration).sum(axis=1)
 
 
 class _RandomWalk:
@@ -315,12 +338,16 @@ class _MatrixJacobian:
 
     def add(self, driven: Array, along_x: float, along_y: float, start: float, end: float) -> None:
         """Add a step: integrals (M,) of its signals, rad, path (m) in the world's frame, headings at its ends (rad)."""
-        direction, half = ((start + end) / 2, 0.5) if self._arc else (start, 0.0)
-        cosine, sine = math.cos(direction), math.sin(direction)
         by_row = self._by_row
         turned = by_row[2, 2]
         # row 3 turns this step by the heading's error so far, and by half of the turn in the step itself
         by_row[0, 2] -= along_y * turned
         by_row[1, 2] += along_x * turned
-        shares = ((cosine, -sine, -half * along_y), (sine, cosine, half * along_x), (0.0, 0.0, 1.0))
-        by_row += np.array(shares)[:, :, None] * driven
+        by_row += _slopes(self._arc, along_x, along_y, start, end)[:, :, None] * driven
+
+
+def _slopes(arc: bool, along_x: float, along_y: float, start: float, end: float) -> Array:
+    """Derivatives (3, 3) of a step along a path (m), between two headings (rad), by its motion in the robot's frame."""
+    direction, half = ((start + end) / 2, 0.5) if arc else (start, 0.0)
+    cosine, sine = math.cos(direction), math.sin(direction)
+    return np.array([[cosine, -sine, -half * along_y], [sine, cosine, half * along_x], [0.0, 0.0, 1.0]])

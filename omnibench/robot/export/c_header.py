@@ -29,6 +29,7 @@ _STEERING = (
 def c_header(calibration: Calibration, prefix: str) -> tuple[str, tuple[str, ...]]:
     """The header's text, with identifiers that begin with ``prefix``, and a warning for everything left out."""
     upper, robot = prefix.upper(), calibration.robot
+    matrix = calibration.matrix_without_effects if _is_plain(calibration) else calibration.matrix_array
     names = ", ".join(f'"{name}"' for name in robot.wheel_names)
     rates = f"const double rates[{upper}_WHEELS]"
     if robot.drive.direct:
@@ -63,7 +64,7 @@ def c_header(calibration: Calibration, prefix: str) -> tuple[str, tuple[str, ...
 
 /* Inverse kinematic matrix: rows x, y (m) and heading (rad) per radian of each {per}. */
 static const double {prefix}_matrix[3][{columns}] = {{
-{_rows(calibration.matrix_array)}
+{_rows(matrix)}
 }};
 
 {code}\
@@ -95,8 +96,10 @@ static inline void {prefix}_odometry_step({arguments})
     if left := _left_out(calibration):
         warnings.append(
             "it holds the matrix, and a steering's gain and zero; other effects of the calibration are left out: "
-            f"{left}; the matrix was fitted with them"
+            f"{left}; the matrix was fitted with{'out' if _is_plain(calibration) else ''} them"
         )
+    elif calibration.plain is not None:
+        warnings.append("its effects do not fade beyond what was driven; there, errors may be larger than stated")
     if robot.mount is not None:
         warnings.append("the header's pose is that of the tracked point, which is not the robot's centre (mount)")
     return text, tuple(warnings)
@@ -104,12 +107,20 @@ static inline void {prefix}_odometry_step({arguments})
 
 def _held(calibration: Calibration, effect: str, parameter: str) -> float:
     """The value of an effect that the header holds; 0 without it."""
+    if _is_plain(calibration):
+        return 0
     return sum(term.parameters[parameter] for term in calibration.effects if term.name == effect)
+
+
+def _is_plain(calibration: Calibration) -> bool:
+    """True if the header holds the plain matrix and no effects: some of these it cannot hold."""
+    return calibration.plain is not None and any(term.name not in _HELD for term in calibration.effects)
 
 
 def _left_out(calibration: Calibration) -> str:
     """The effects that the header does not hold, in words."""
-    others = tuple(term for term in calibration.effects if term.name not in _HELD)
+    plain = _is_plain(calibration)
+    others = tuple(term for term in calibration.effects if plain or term.name not in _HELD)
     return calibration.model_copy(update={"effects": others}).effects_in_words
 
 

@@ -131,7 +131,7 @@ def _diagonal(variances: Array) -> tuple[str, ...]:
 
 
 def _warnings(calibration: Calibration, fitted: Controller, design: Controller) -> tuple[str, ...]:
-    robot, true = calibration.robot, fitted.seen(calibration.robot, calibration.matrix_array)
+    robot, true = calibration.robot, fitted.seen(calibration.robot, calibration.matrix_without_effects)
     left = remaining_error(robot, fitted.matrix, true, fitted.base)
     by_design = remaining_error(robot, design.matrix, true, fitted.base)
     warnings = [

@@ -37,7 +37,7 @@ def robot_localization(calibration: Calibration) -> tuple[str, tuple[str, ...]]:
     ConfigError: the calibration has no noise model.
     """
     try:
-        publisher = controller(calibration.robot, calibration.matrix_array)
+        publisher = controller(calibration.robot, calibration.matrix_without_effects)
     except ConfigError:
         publisher = None
     base = Mount() if publisher is None else publisher.base

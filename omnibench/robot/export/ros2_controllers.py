@@ -21,7 +21,7 @@ def ros2_controllers(calibration: Calibration) -> tuple[str, tuple[str, ...], st
 
     ConfigError: no controller can describe this robot.
     """
-    fitted = controller(calibration.robot, calibration.matrix_array)
+    fitted = controller(calibration.robot, calibration.matrix_without_effects)
     design = controller(calibration.robot, calibration.robot.inverse_kinematic_matrix)
     return *document(calibration, fitted, design), fitted.name
 

@@ -122,7 +122,7 @@ class _RobotSimulator:
     def session(self, split: Split, session: RobotSession) -> Iterator[_Recorded]:
         """The runs of a session one after the other; wheel angles go on from run to run."""
         config, rng = self.config, np.random.default_rng(session.seed)
-        runs = runs_of(self.commands, config.repetitions, config.order, rng)
+        runs = runs_of([(command, config.repetitions) for command in self.commands], config.order, rng)
         motions = [self._motion(command, session, rng) for command, _ in runs]
         steered, motions = self._steered([command for command, _ in runs], motions)
         targets = [target_rates(config.robot, motion) for motion in motions]

@@ -28,15 +28,17 @@ ROBOT = Robot(
 
 @dataclass(frozen=True)
 class Command:
-    """Speed (m/s), direction in the robot's frame (rad), rate of turn (rad/s)."""
+    """Speed (m/s), direction in the robot's frame (rad), rate of turn (rad/s). seconds: of a run, if not by LENGTH."""
 
     speed: float
     direction: float
     turn: float
+    seconds: float | None = None
 
     @property
     def name(self) -> str:
-        return f"v{self.speed:g}_a{math.degrees(self.direction):.0f}_w{self.turn:g}"
+        name = f"v{self.speed:g}_a{math.degrees(self.direction):.0f}_w{self.turn:g}"
+        return name if self.seconds is None else f"{name}_t{self.seconds:g}"
 
     @property
     def twist(self) -> Array:
@@ -46,6 +48,8 @@ class Command:
     @property
     def samples(self) -> int:
         """Wheel samples of a run: the ramps do not shorten the way."""
+        if self.seconds is not None:
+            return round(self.seconds / SAMPLE)
         return round((LENGTH / self.speed + RAMP if self.speed else TURN) / SAMPLE)
 
 

@@ -136,7 +136,7 @@ def rotation_slip_threshold(grid: Grid, values: Values, rng: np.random.Generator
 
 def heading_drift_that_settles(grid: Grid, values: Values, rng: np.random.Generator) -> Correction:
     """A drift that starts stronger, in every run and in the session, and settles: two constants of time."""
-    jump, constant = rng.uniform(0.5, 1.2), rng.uniform(1.0, 3.0)  # -, s
+    jump, constant = rng.uniform(0.8, 1.6), rng.uniform(1.0, 3.0)  # -, s
     warming, session = rng.uniform(0.3, 0.8), rng.uniform(500, 1500)  # -, s
     course = 1 + jump * np.exp(-grid.elapsed / constant) + warming * np.exp(-grid.session_time / session)
     return _body(rotation=values["b"] * course)

@@ -128,7 +128,7 @@ def test_every_place_stands_in_a_table_with_its_significance(report: Page) -> No
 
 def test_parameters_have_intervals_and_units(report: Page) -> None:
     rows = report.tables["Parameters of the effects that were added"]
-    assert "rotation_translation_coupling (body), weight > 99.9 %" in rows[1][0]
+    assert "rotation_translation_coupling (body), weight 99.9 %; as in the textbook" in rows[1][0]
     for row, name, true in zip(rows[2:], ("kx", "ky"), COUPLING[0]["parameters"].values(), strict=True):
         assert row[0].startswith(f"{name} | relative change of the rate of turn")
         assert row[3] == "s/m"
@@ -151,6 +151,8 @@ def test_a_class_names_its_members_and_the_experiment_that_separates_them() -> N
     assert "These data cannot tell it from load_transfer" in told.text
     assert "In doubt: few turns" in told.text
     assert EXPERIMENT.description in told.text
+    rows = told.tables["What to drive to tell acceleration_slip from its look-alikes"]
+    assert rows[1:] == [["turning left on the spot at 1 rad/s", "12.5", "4"]]
     assert EXPERIMENT.config in told.text
     assert "52.0 %" in told.text
 

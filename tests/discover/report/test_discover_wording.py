@@ -67,6 +67,7 @@ def test_a_chance_below_any_meaning_is_cut() -> None:
 
 def test_no_gap_is_not_a_gap_that_stayed_open() -> None:
     assert closed_in_words(Gap("eq6", 1.0, 1.0, 1.0, None, 0.1)) == "no gap to close"
+    assert closed_in_words(Gap("eq6", 1.0, 0.4, None, None, 0.1)) == "no share known"
     assert gap_in_words(Gap("eq6", 0.0412, 0.0213, 0.0205, 0.961, 0.001)) == "0.0412 → 0.0213 (floor 0.0205), 96.1 %"
 
 

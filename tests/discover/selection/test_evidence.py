@@ -94,7 +94,7 @@ def credibility(
 
 
 def test_a_name_that_leaves_nothing_is_credible_and_one_that_leaves_half_is_not() -> None:
-    right, wrong = credibility([0, 20, 0, 0, 0], 0.0, 0.0), credibility([0, 20, 0, 0, 0], 399.0, 0.0)
+    right, wrong = credibility([0, 20, 0, 0, 0], 0.0, 0.0), credibility([0, 20, 0, 0, 0], 399.0, 399.0)
     assert right.probability > 0.99
     assert right.left_share == 0.0
     assert wrong.probability < 0.02
@@ -106,20 +106,20 @@ def test_a_name_is_the_less_credible_the_more_it_leaves() -> None:
     assert found == sorted(found, reverse=True)
 
 
-def test_what_slightly_different_forms_explain_raises_the_odds_only_so_far() -> None:
+def test_what_bases_do_not_find_beside_a_name_raises_the_odds_only_so_far() -> None:
     unexplained, little, nothing = (
         credibility([0, 20, 0, 0, 0], 40.0, beyond).probability for beyond in (40.0, 2.0, 0.0)
     )
     assert unexplained < little == nothing < 1
 
 
-def test_two_names_have_a_ninth_of_the_odds_of_one() -> None:
+def test_two_names_have_a_fifth_of_the_odds_of_one() -> None:
     one = credibility([0, 20, 0, 0, 0], 20.0, 20.0)
     two = credibility(
         [0, np.sqrt(201), np.sqrt(200), 0, 0], 20.0, 20.0, count=2
     )  # as large together: 401 - 2 = 400 - 1
     odds = [each.probability / (1 - each.probability) for each in (one, two)]
-    assert odds[1] == pytest.approx(odds[0] / 9)
+    assert odds[1] == pytest.approx(odds[0] / 5)
 
 
 def test_an_effect_of_an_impossible_sign_has_even_odds_at_most() -> None:

@@ -21,12 +21,12 @@ def test_the_training_domain_is_what_the_training_runs_drove() -> None:
 def test_a_command_that_the_training_drove_is_no_extrapolation() -> None:
     plain = extended_of(TRAINING, NOTHING)
     again = [run_of(1.05 * FORWARD, "a little faster", "again", split="validation")]
-    assert extrapolations_of(again, plain, [(1.0, plain)]) == ()
+    assert extrapolations_of(again, plain, plain, [(1.0, plain)]) == ()
 
 
 def test_a_command_that_the_training_never_drove_is_named_with_how_much_of_it_is_new() -> None:
     plain = extended_of(TRAINING, NOTHING)
-    (found,) = extrapolations_of([*TURNED, *TRAINING], plain, [(1.0, plain)])
+    (found,) = extrapolations_of([*TURNED, *TRAINING], plain, plain, [(1.0, plain)])
     assert found.command == "turn"
     assert found.description.startswith("100 % of its time it drives what no training run drove, such as ")
     assert (found.before_m, found.after_m) == (0.0, 0.0)  # nothing is left, and all is known
@@ -34,7 +34,7 @@ def test_a_command_that_the_training_never_drove_is_named_with_how_much_of_it_is
 
 def test_the_bound_follows_from_what_commands_that_were_held_out_left() -> None:
     plain = extended_of(TRAINING, [np.array([[0.0, 0.0, 0.0], [0.03, 0.04, 0.0]]) for _ in TRAINING])
-    (found,) = extrapolations_of(TURNED, plain, [(1.0, plain)])
+    (found,) = extrapolations_of(TURNED, plain, plain, [(1.0, plain)])
     assert found.before_m == pytest.approx(RADIUS_95 * 0.05)
 
 
@@ -43,7 +43,7 @@ def test_the_bound_follows_from_what_the_matrix_is_known_to() -> None:
     covariance[1, 1] = 0.001**2  # m12, the share of the second wheel in the motion along x, to 1 mm a rad
     sideways = [run_of(SIDEWAYS, "sideways", split="validation")]
     plain, unsure = extended_of(TRAINING, NOTHING), extended_of(TRAINING, NOTHING, covariance=covariance)
-    (found,) = extrapolations_of(sideways, plain, [(1.0, unsure)])
+    (found,) = extrapolations_of(sideways, plain, unsure, [(1.0, unsure)])
     assert found.before_m == 0.0
     assert found.after_m == pytest.approx(RADIUS_95 * 0.001 * abs(SIDEWAYS[1]) * SECONDS, rel=1e-6)
 
@@ -52,6 +52,6 @@ def test_models_that_disagree_widen_the_bound_by_their_weights() -> None:
     slower = MATRIX * np.array([[1.0], [0.9], [1.0]])
     plain, other = extended_of(TRAINING, NOTHING), extended_of(TRAINING, NOTHING, matrix=slower)
     sideways = [run_of(SIDEWAYS, "sideways", split="validation")]
-    (found,) = extrapolations_of(sideways, plain, [(0.8, plain), (0.2, other)])
-    apart = 0.1 * 0.2 * SECONDS  # m between the two ends; with weights of 4 to 1 their variance is 0.16 of its square
-    assert found.after_m == pytest.approx(RADIUS_95 * 0.4 * apart, rel=1e-6)
+    (found,) = extrapolations_of(sideways, plain, plain, [(0.8, plain), (0.2, other)])
+    apart = 0.1 * 0.2 * SECONDS  # m between the two ends
+    assert found.after_m == pytest.approx(RADIUS_95 * np.sqrt(0.2) * apart, rel=1e-6)

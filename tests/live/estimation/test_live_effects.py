@@ -31,7 +31,7 @@ from omnibench.live.replay.concatenated_drive import concatenate_recording, conc
 from omnibench.live.replay.replay_player import events
 from omnibench.live.wheels.wheel_input import WheelStep
 from omnibench.live.wire.messages import JOINT_STATE, JointState
-from omnibench.robot.calibration import Calibration, EffectTerm, covariance_rows, matrix_rows, write_calibration
+from omnibench.robot.calibration import Calibration, EffectTerm, Noise, covariance_rows, matrix_rows, write_calibration
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, WheelLog
 from omnibench.robot.planar import relative
@@ -131,6 +131,40 @@ class TestAgreesWithTheBatch:
         path = drive(1.0)
         last, last_with_effect = (fed(RobotTracker("apr", each), path.payloads())[-1] for each in (plain, using))
         np.testing.assert_allclose(last_with_effect.covariance, last.covariance, rtol=1e-9)
+
+    def test_odom_fades_outside_the_training_domain_as_the_batch_does(self) -> None:
+        using = fading(term("heading_drift", b=0.05), deviation=0.02)
+        path = drive(1.0, using=using)
+        whole = using.model_copy(update={"plain": None})
+        np.testing.assert_allclose(
+            odometry(fed(RobotTracker("apr", using), path.payloads()))[1:], batch(path, using), atol=1e-9
+        )
+        assert np.abs(batch(path, using) - batch(path, whole)).max() > 1e-3
+
+    def test_the_covariance_grows_by_what_effects_extrapolate_and_only_there(self) -> None:
+        """A heading that drifts by an unsure rate displaces the robot sideways of its way by half of what it turns."""
+        using, speed, seconds = fading(term("heading_drift", b=0.05), deviation=0.02), 0.2, 2.0
+        known, new = (driven_for(using, seconds, twist).covariance for twist in ((speed, 0.0, 0.0), (0.0, speed, 0.0)))
+        assert np.abs(known).max() < 1e-12
+        assert new[2, 2] > (0.02 * seconds) ** 2
+        assert new[0, 2] == pytest.approx(-speed * seconds / 2 * new[2, 2], rel=0.02)
+        assert new[0, 0] == pytest.approx((speed * seconds / 2) ** 2 * new[2, 2], rel=0.04)
+
+
+def fading(effect: EffectTerm, deviation: float) -> Calibration:
+    """A calibration without other noise, fitted to driving forwards, whose effect has a value of this deviation."""
+    covariance = covariance_rows(np.diag([0.0] * 9 + [deviation**2]))
+    quiet = Noise(walk_position=1e-9, walk_heading=1e-9)
+    changes = {"covariance": covariance, "driven": ((0.2, 0.0, 0.0),), "plain": calibration().matrix, "noise": quiet}
+    return with_effects(effect).model_copy(update=changes)
+
+
+def driven_for(using: Calibration, seconds: float, twist: tuple[float, float, float]) -> LiveOdometry:
+    rates = np.linalg.solve(using.matrix_array, twist)
+    live = LiveOdometry(using)
+    for _ in range(round(seconds / PERIOD)):
+        live.step(WheelStep(0, PERIOD, PERIOD * rates, rates))
+    return live
 
 
 class TestSwaps:

@@ -12,7 +12,7 @@ import pytest
 from export_samples import CAR, DIFF, SWERVE, TRICYCLE, calibration, disturbed, mounted
 from sample_robots import APR_02
 
-from omnibench.robot.calibration import Provenance
+from omnibench.robot.calibration import Provenance, matrix_rows
 from omnibench.robot.export.formats import Export, export_calibration
 from omnibench.robot.kinematics import Array, Robot, Wheel
 from omnibench.robot.odometry import Integration, OdometryStream
@@ -183,6 +183,16 @@ def test_effects_are_warned_of() -> None:
     export = export_calibration(document, "c_header")
     assert "slip" in export.warnings[0]
     assert "left out: effects slip (k 0.1)" in export.text
+
+
+def test_without_its_effects_the_matrix_is_the_one_that_was_fitted_without_them() -> None:
+    plain, slip = APR_02.inverse_kinematic_matrix, {"name": "centripetal_slip", "parameters": {"k": 0.1}}
+    spread = {"covariance": np.eye(10).tolist(), "driven": [[0.1, 0.0, 0.0]], "plain": matrix_rows(plain)}
+    document = calibration(APR_02, 1.1 * plain, effects=[slip], **spread)
+    export, of_plain = export_calibration(document, "c_header"), export_calibration(calibration(APR_02), "c_header")
+    table = of_plain.text[of_plain.text.index("_matrix[3]") : of_plain.text.index("};")]
+    assert table in export.text
+    assert "the matrix was fitted without them" in export.warnings[0]
 
 
 def test_a_tracked_point_off_the_centre_is_warned_of() -> None:

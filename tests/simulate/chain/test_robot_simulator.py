@@ -19,7 +19,8 @@ from omnibench.fit.calibrate import calibrate
 from omnibench.robot.kinematics import wheel_equations
 from omnibench.robot.odometry import OdometryBatch
 from omnibench.simulate.chain.robot_config import RobotConfig
-from omnibench.simulate.config import MotionGrid, Truth
+from omnibench.simulate.config import Truth
+from omnibench.simulate.driving.command_config import MotionGrid
 from omnibench.simulate.simulate import simulate_dataset
 from omnibench.simulate.simulation import Simulation
 from omnibench.simulate.source import read_simulation

@@ -1,0 +1,73 @@
+"""Joining data sets: the runs of several recordings of one robot in one, each recording with sessions of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from omnibench.data.dataset import Dataset, make_dataset
+from omnibench.data.splits import complete
+from omnibench.errors import DataError
+
+_SAME_PERIOD = 0.1  # share by which sample periods may differ: as between drives of one robot (chosen)
+
+
+def joined(first: Dataset, others: Sequence[Dataset]) -> Dataset:
+    """The runs of data sets of one robot in one, under the first one's name. Splits stay.
+
+    Ids and sessions that two of them share get the name of their data set before them; a session without a name is
+    called as its data set. Absolute angles, targets and covariances that only some have are left out, and so are scans.
+    DataError: another robot, or another sample period.
+    """
+    if not others:
+        return first
+    datasets = (first, *others)
+    names = _distinct([dataset.name for dataset in datasets])
+    runs = []
+    ids, sessions = set[str](), set[str]()
+    for name, dataset in zip(names, datasets, strict=True):
+        _check_fits(first, dataset)
+        of_sessions = {run.session: run.session or name for run in dataset.trajectories}
+        of_sessions = {
+            given: f"{name}/{session}" if session in sessions else session for given, session in of_sessions.items()
+        }
+        taken = set(ids)
+        for run in dataset.trajectories:
+            new = f"{name}/{run.id}" if run.id in taken else run.id
+            runs.append(replace(run, id=new, session=of_sessions[run.session]))
+            ids.add(new)
+        sessions |= set(of_sessions.values())
+    made = make_dataset(
+        first.name,
+        first.robot,
+        first.sample_period,
+        complete(runs),
+        description=first.description,
+        source="; ".join(dict.fromkeys(dataset.source for dataset in datasets if dataset.source)),
+        licence="; ".join(dict.fromkeys(dataset.licence for dataset in datasets if dataset.licence)),
+        simulated=any(dataset.simulated for dataset in datasets),
+    )
+    warnings = [warning for dataset in datasets for warning in dataset.warnings]
+    if any(dataset.scans is not None for dataset in datasets):
+        warnings.append("scans are left out of joined data sets")
+    return replace(made, warnings=tuple(dict.fromkeys([*warnings, *made.warnings])))
+
+
+def _check_fits(first: Dataset, other: Dataset) -> None:
+    """DataError: another robot or sample period than the first's."""
+    robots = [dataset.robot.model_dump(exclude={"name"}) for dataset in (first, other)]
+    if robots[0] != robots[1]:
+        raise DataError(
+            f"data set {other.name}: its robot is not that of {first.name}; give both the same robot.yaml "
+            "(omnibench import dataset FOLDER --set robot=FILE)"
+        )
+    if abs(other.sample_period / first.sample_period - 1) > _SAME_PERIOD:
+        raise DataError(
+            f"data set {other.name}: its wheels were sampled every {other.sample_period:g} s, those of {first.name} "
+            f"every {first.sample_period:g} s; discover in each by itself"
+        )
+
+
+def _distinct(names: Sequence[str]) -> list[str]:
+    """The names, of which those that occur before have a number behind them."""
+    return [name if name not in names[:index] else f"{name}-{index + 1}" for index, name in enumerate(names)]

@@ -1,0 +1,1 @@
+"""Experiments that tell the members of a class of effects apart: the cheapest runs, and the chance that they do."""

@@ -1,0 +1,1 @@
+"""Commands that a robot can drive, with their durations, and runs of them as designed."""
