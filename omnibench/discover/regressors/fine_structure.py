@@ -24,10 +24,9 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import product
+from itertools import pairwise, product
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from omnibench.discover.fitting.model_fit import Fit, paths_of
 from omnibench.discover.regressors.column_group import Group
@@ -48,7 +47,7 @@ _WIDE = 0.7  # radius of a patch, of the distance between two, as in covariate_b
 _RUNS = 15  # at least: the scatter of six scores is hardly known from fewer; chosen
 _RANK = 1e-6  # share of a column's square that must be left beyond the others of its basis
 _SEEN = 0.002  # share of the samples that must lie in a patch, as in covariate_bases.py
-_TOGETHER = 100  # functions that are evaluated at once
+_NUMBERS = 1_000_000  # values of functions that are computed at once (chosen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,16 +66,14 @@ def fine_structure(fit: Fit, rng: np.random.Generator) -> Significance | None:
     if len(fit.runs) < _RUNS:
         return None
     paths = paths_of(fit, _COARSE)
-    pull, owner = _pull(fit, paths), paths.owner
-    sums = csr_array((np.ones(len(owner)), (owner, np.arange(len(owner)))), shape=(len(fit.runs), len(owner)))
+    pull, together = _pull(fit, paths), max(1, _NUMBERS // len(paths.owner))
+    edges = np.searchsorted(paths.owner, np.arange(len(fit.runs) + 1)).tolist()
     groups: list[Group] = []
     scores: list[Array] = []
     for kind in _kinds(paths):
-        for low in range(0, len(kind.shapes), _TOGETHER):
-            part = slice(low, low + _TOGETHER)
-            values = kind.values(part)
-            values -= values.mean(axis=0)  # the matrix holds what is the same everywhere
-            independent = _independent(_scores(sums, pull, values))
+        for low in range(0, len(kind.shapes), together):
+            part = slice(low, low + together)
+            independent = _independent(_scores(edges, pull, kind.values(part)))
             for shape, of_runs in zip(kind.shapes[part], independent, strict=True):
                 if of_runs.shape[1]:
                     basis = Basis(
@@ -114,11 +111,17 @@ def _pull(fit: Fit, paths: Paths) -> Array:
     return pull
 
 
-def _scores(sums: csr_array, pull: Array, values: Array) -> Array:
-    """Scores (Z, B, 3 J) of functions (F, B, J) in three modes: of all of a run's samples."""
+def _scores(edges: Sequence[int], pull: Array, values: Array) -> Array:
+    """Scores (Z, B, 3 J) of functions (F, B, J) in three modes: of all of a run's samples, which begin at the edges.
+
+    The functions count from their means, as the matrix holds what is the same everywhere.
+    """
     flat = values.reshape(len(values), -1)
-    of_modes = [np.asarray(sums @ (flat * pull[:, mode, None])) for mode in range(pull.shape[1])]
-    return np.concatenate([each.reshape(-1, *values.shape[1:]) for each in of_modes], axis=2)
+    mean = flat.mean(axis=0)
+    of_runs = [pull[low:high].T @ flat[low:high] - pull[low:high].sum(axis=0)[:, None] * mean
+               for low, high in pairwise(edges)]  # fmt: skip
+    scores = np.array(of_runs).reshape(-1, pull.shape[1], *values.shape[1:])
+    return scores.transpose(0, 2, 1, 3).reshape(len(scores), values.shape[1], -1)
 
 
 def _independent(scores: Array) -> list[Array]:
@@ -150,13 +153,17 @@ def _kinds(paths: Paths) -> Iterator[_Kind]:
         return
     waves, lines, patches = _wave_numbers(), _lines(places), _patches(places)
     step = np.pi / np.maximum(extent, _EDGE)
-    x, y = (np.exp(1j * axis) for axis in ((places - low) * step).T)
+    east, north = ((places - low) * step).T
+    most = max(max(abs(number) for number in pair) for pair in waves)
+    along_x = np.exp(1j * east[:, None] * np.arange(most + 1))
+    along_y = np.exp(1j * north[:, None] * np.arange(-most, most + 1))
+    columns = np.array(waves) + np.array([0, most])
     yield _Kind(
         "place",
         "smooth_place_wave",
         "a wave over the floor, such as tiles make",
         [{"along_x": float(step[0] * east), "along_y": float(step[1] * north)} for east, north in waves],
-        lambda part: _parts(np.stack([x**east * y**north for east, north in waves[part]], axis=1)),
+        lambda part: _parts(along_x.take(columns[part, 0], axis=1) * along_y.take(columns[part, 1], axis=1)),
     )
     for term, detail, shapes, function in (
         ("smooth_edge", "a line across the floor", lines, beyond),

@@ -67,7 +67,7 @@ def make_groups(paths: Paths, trajectories: Sequence[Trajectory], without: Seque
             base = {each.name: 0.0 for each in linear} | shape
             family = None if len(shapes) > _FEW else _family(paths, effect, [each.name for each in linear], base)
             named.append(Group("effect", effect.name, (), effect, linear, shape, len(shapes), family=family))
-            sources += [_of_effect(effect, linear, base), _of_forms(effect, family, base)]
+            sources.append(_of_effect(effect, linear, named[-1]))
     bases = list(generic_bases(paths, trajectories))
     sources += [basis.columns or _none for basis in bases]
     columns, widths = _stored(paths, sources)
@@ -76,12 +76,12 @@ def make_groups(paths: Paths, trajectories: Sequence[Trajectory], without: Seque
     return Groups(
         Group("matrix", "matrix", matrix),
         tuple(
-            replace(group, index=index, forms=forms)
-            for group, index, forms in zip(named, others[::2], others[1::2], strict=False)
+            replace(group, index=index[: len(group.parameters)], forms=index[len(group.parameters) :])
+            for group, index in zip(named, others, strict=False)
         ),
         tuple(
             Group("covariate", basis.covariate, index, tries=basis.tries, basis=basis)
-            for basis, index in zip(bases, others[2 * len(named) :], strict=True)
+            for basis, index in zip(bases, others[len(named) :], strict=True)
         ),
         columns,
         tuple(not_looked_for),
@@ -106,30 +106,18 @@ def _none(along: Paths) -> Array:
     return np.zeros((len(along.poses), 3, 0))
 
 
-def _of_effect(
-    effect: MotionEffect | ReferenceEffect, parameters: Sequence[Parameter], values: Mapping[str, float]
-) -> Columns:
-    """Slopes by some parameters of an effect, the values of all others given."""
+def _of_effect(effect: MotionEffect | ReferenceEffect, linear: Sequence[Parameter], group: Group) -> Columns:
+    """Slopes by the parameters of an effect, then by those of its forms, if it has any."""
+    values, forms = {each.name: 0.0 for each in linear} | dict(group.shapes), group.family
+    varied = [] if forms is None else [each.name.partition(":")[::2] for each in forms.parameters]
 
     def columns(along: Paths) -> Array:
         if isinstance(effect, ReferenceEffect):
-            return np.concatenate([along.of_effect(effect, each.name, values) for each in parameters], axis=2)
-        units = [along.correction(effect, {**values, each.name: 1.0}) for each in parameters]
-        return along.of_corrections(effect, units)
-
-    return columns
-
-
-def _of_forms(effect: MotionEffect | ReferenceEffect, family: Forms | None, values: Mapping[str, float]) -> Columns:
-    """Slopes by the parameters of an effect's forms, if it has any."""
-    if family is None or not isinstance(effect, MotionEffect):
-        return _none
-    named = [each.name.partition(":")[::2] for each in family.parameters]  # what varies, and with what
-
-    def columns(along: Paths) -> Array:
-        units = {name: along.correction(effect, {**values, name: 1.0}) for name, _ in named}
-        profiles = {key: form_profile(key, effect, along.signals, family.scales) for _, key in named}
-        return along.of_corrections(effect, [units[name] * profiles[key] for name, key in named])
+            return np.concatenate([along.of_effect(effect, each.name, values) for each in linear], axis=2)
+        units = {each.name: along.correction(effect, {**values, each.name: 1.0}) for each in linear}
+        scales = {} if forms is None else forms.scales
+        profiles = {key: form_profile(key, effect, along.signals, scales) for _, key in varied}
+        return along.of_corrections(effect, [*units.values(), *(units[name] * profiles[key] for name, key in varied)])
 
     return columns
 
