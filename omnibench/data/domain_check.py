@@ -34,7 +34,9 @@ def extrapolation_warning(calibration: Calibration, runs: Sequence[Trajectory]) 
         return None
     commands = sorted(worst, key=lambda command: -worst[command][0])
     words = domain.in_words(worst[commands[0]][1])
-    consequence = extrapolation_consequence([term.name for term in calibration.effects])
+    consequence = extrapolation_consequence(
+        [term.name for term in calibration.effects], fading=calibration.plain is not None
+    )
     return (
         f"{count} of {len(runs)} runs drive motions that calibration {calibration.name!r} was not fitted to "
         f"({_first(commands)}), such as {words}: {consequence}"

@@ -88,10 +88,15 @@ class TrainingDomain:
         return _in_words(motions * self._scale, motions)
 
 
-def extrapolation_consequence(effects: Sequence[str]) -> str:
-    """The consequence of extrapolation for effects of these names, in words."""
-    verb = "is" if len(effects) == 1 else "are"
-    return f"{', '.join(effects)} {verb} not known to hold there, and errors may be larger than stated"
+def extrapolation_consequence(effects: Sequence[str], *, fading: bool = False) -> str:
+    """The consequence of extrapolation for effects of these names, in words. fading: they do so where unsure."""
+    names = list(dict.fromkeys(effects))
+    one = len(names) == 1
+    fades = f"{'fades' if one else 'fade'} to the plain matrix where unsure, " if fading else ""
+    return (
+        f"{', '.join(names)} {'is' if one else 'are'} not known to hold there, {fades}and errors may be larger than "
+        "stated"
+    )
 
 
 def _scale(robot: Robot) -> Array:

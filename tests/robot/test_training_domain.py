@@ -114,4 +114,6 @@ def test_a_run_shorter_than_the_smoothing_has_one_motion() -> None:
 
 def test_it_is_told_what_is_not_known() -> None:
     assert extrapolation_consequence(["a"]) == "a is not known to hold there, and errors may be larger than stated"
-    assert extrapolation_consequence(["a", "b"]).startswith("a, b are not known to hold there")
+    assert extrapolation_consequence(["a", "b", "a"], fading=True) == (
+        "a, b are not known to hold there, fade to the plain matrix where unsure, and errors may be larger than stated"
+    )

@@ -62,6 +62,8 @@ class ExtrapolationMonitor:
             LOG.warning(
                 "%s: drives motions that %r was not fitted to, such as %s: %s; told once, then counted in health",
                 *(self._robot, self._calibration.name, domain.in_words(motion[None])),
-                extrapolation_consequence([term.name for term in self._calibration.effects]),
+                extrapolation_consequence(
+                    [term.name for term in self._calibration.effects], fading=self._calibration.plain is not None
+                ),
             )
         self.seconds += self._lasted if before <= _TRANSITION else self._elapsed
