@@ -73,8 +73,7 @@ class _Rivals:
         """Expected separation of the members, by the recorded runs."""
         fit = self.model.fit
         recorded = fit.whitened(columns_of(fit, self.groups), self.model.residuals_without_effects)
-        base = fit.model.matrix.size + sum(len(group.parameters) for group in self.others)
-        return Separation(recorded, Members.of(base, self.members), self.weight)
+        return Separation(recorded, Members.of(fit.model.matrix, self.others, self.members), self.weight)
 
     def of_runs(self, candidates: Sequence[CandidateRun]) -> Whitened:
         """The columns of runs that could be driven."""

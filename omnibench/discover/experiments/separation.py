@@ -12,9 +12,12 @@ i against j
 
     L_ij = ln B'_i - ln t_i - ln B'_j + ln t_j.                                                                     (2)
 
-Noise of the further runs, and the discrepancy that tempers the evidence by 1 + delta^2 N, scatter them by
+Noise of the further runs, the discrepancy that tempers the evidence by T = 1 + delta^2 N, and the matrix, each column
+of which may have become larger by a small share (sd s) since the recorded runs, scatter them by
 
-    var L_ij = (b_i - b_j)' D (b_i - b_j) / (1 + delta^2 N).                                                        (3)
+    var L_ij = (b_i - b_j)' D (b_i - b_j) / T + s^2 sum over k of ((b_i - b_j)' D m_k / T)^2,                       (3)
+
+with m_k column k of the matrix in its place among all columns, and 0 elsewhere.
 
 A name is sure with a weight of SURE; if the class as a whole has the weight c, its share of the class is p = SURE / c
 then. Of m members, name i has that share where against every other one
@@ -46,6 +49,9 @@ from omnibench.robot.kinematics import Array
 
 _DRAWS = 8  # of the values of each member: half and twice as many change the minutes of omni3's plan by less than 10 %
 _PLAUSIBLE = 3.0  # times the plausible size: a larger effect is not to be expected (tests/benchmarks/hidden/sets.py)
+# s: radii change by so much with temperature, pressure and load within a day (chosen). A change by 0.3 % of all radii
+# leaves the names of a small flower right, one by 1 % makes a class of them again.
+_CHANGE = 0.002
 _MOST_SHARE = 0.99  # of a class's weight: where the class itself is not sure, runs can settle no more than its member
 _RIDGE = 1e-9  # of columns of unit length: what no run determines stays at 0, and nothing else changes
 
@@ -55,22 +61,29 @@ class Members:
     """The members of a class, m of them, among p columns.
 
     base: columns that are fitted in any case. columns: those of each member. tries: shapes that were tried of each.
-    prior (p,): inverse variances of the columns' values before any run.
+    prior (p,): inverse variances of the columns' values before any run. changes (p, M): standard deviations of the
+    values between the recorded and further runs, one column for each independent cause.
     """
 
     base: tuple[int, ...]
     columns: tuple[tuple[int, ...], ...]
     tries: Array
     prior: Array
+    changes: Array
 
     @staticmethod
-    def of(base: int, groups: Sequence[Group]) -> Members:
-        """Members whose columns follow those of the base, in turn."""
+    def of(matrix: Array, others: Sequence[Group], groups: Sequence[Group]) -> Members:
+        """Members whose columns follow those of a matrix (3, M) and of other effects, in turn."""
+        base = matrix.size + sum(len(group.parameters) for group in others)
         firsts = base + np.cumsum([0, *(len(group.parameters) for group in groups)])
         sizes = [each.largest for group in groups for each in group.parameters]
         prior = np.concatenate([np.zeros(base), 1 / np.square(_PLAUSIBLE * np.array(sizes))])
         columns = tuple(tuple(range(first, last)) for first, last in pairwise(firsts))
-        return Members(tuple(range(base)), columns, np.array([float(group.tries) for group in groups]), prior)
+        changes = np.zeros((firsts[-1], matrix.shape[1]))
+        for signal, values in enumerate(matrix.T):
+            changes[signal : matrix.size : matrix.shape[1], signal] = _CHANGE * values  # elements row by row
+        tries = np.array([float(group.tries) for group in groups])
+        return Members(tuple(range(base)), columns, tries, prior, changes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,8 +164,10 @@ class Separation:
         fitted = fitted.reshape(*further.shape[:-2], count, len(self._scores), count, _DRAWS)
         apart = np.moveaxis(fitted[..., own, :, own, :], 0, -2)[..., None, :, :, :] - fitted
         flat = apart.reshape(*apart.shape[:-2], -1)
-        scatter = (flat * (further[..., None, :, :] @ flat)).sum(axis=-2).reshape(shape)
-        deviation = np.sqrt(np.maximum(scatter, 0.0) / tempered[..., None, :, :])  # Eq. (3)
+        weighed, over = further[..., None, :, :] @ flat, tempered[..., None, :, :]
+        scatter = np.maximum((flat * weighed).sum(axis=-2), 0.0).reshape(shape)
+        changed = np.square(self.members.changes.T @ weighed).sum(axis=-2).reshape(shape)
+        deviation = np.sqrt(scatter / over + changed / np.square(over))  # Eq. (3)
         margins = (odds - self._threshold) / np.maximum(deviation, 1.0)
         margins[..., own, own, :] = np.inf
         return Prospect(np.swapaxes(margins, -3, -2))

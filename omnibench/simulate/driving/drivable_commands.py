@@ -88,7 +88,10 @@ class DrivableCommands:
         radii = [tidy(share * max(self.free)) for share in self.shapes.radii]
         if self.robot.drive.direct:
             return radii
-        tightest = 1 / sharpest_turn(self.robot, Command(1.0, direction, 1 / SHORTEST, pivot), self.steering_limit)
+        sharpest = sharpest_turn(self.robot, Command(1.0, direction, 1 / SHORTEST, pivot), self.steering_limit)
+        if not sharpest:
+            return []
+        tightest = 1 / sharpest
         return [tidy(_ROOM_TO_STEER * tightest), *radii] if tightest > SHORTEST else radii
 
     def _drivable(self, direction: float, curvature: float, pivot: tuple[float, float], pace: float) -> Command | None:

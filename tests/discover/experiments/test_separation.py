@@ -26,7 +26,7 @@ def separation(effects: int = 2) -> Separation:
     recorded = Whitened((), (), information, (information @ VALUES[:size])[None])
     columns = tuple((1 + number,) for number in range(effects))
     prior = np.array([0.0, *np.full(effects, 1 / 900.0)])
-    return Separation(recorded, Members((0,), columns, np.ones(effects), prior))
+    return Separation(recorded, Members((0,), columns, np.ones(effects), prior, np.zeros((size, 1))))
 
 
 def run_that_shows(*columns: int, size: int = 3, strength: float = 1.0) -> Array:
