@@ -63,11 +63,10 @@ class SmoothTerm:
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """A model with a term over a covariate, and the chi-square difference (Z,) that they make for held-out runs."""
+    """A term over a covariate, and the chi-square difference (Z,) that it makes for each run when it is held out."""
 
     covariate: str
     terms: tuple[Group, ...]
-    used: Extended
     gains: Array
 
     @property
@@ -107,18 +106,18 @@ def add_smooth_terms(
         trials = [
             trial
             for name in covariates
-            for trial in _trials(plain, screening, models.used, left, name, folds if name == "command" else commands)
+            for trial in _trials(screening, models.used, left, name, folds if name == "command" else commands)
         ]
-        trials += _of_families(plain, screening, models.used, commands) if covariates and not notes else ()
+        trials += _of_families(screening, models.used, commands) if covariates and not notes else ()
         best = max(trials, key=lambda trial: float(trial.gains.mean()), default=None)
         if best is None or not is_gain(best.gains):
             if not notes:
                 notes.append(_nothing_added(covariates, best))
             break
-        others = tuple((weight, extend(plain, [*model.groups, *best.terms])) for weight, model in models.weighted[1:])
-        models = replace(models, used=best.used, weighted=((models.weighted[0][0], best.used), *others))
+        weighted = tuple((weight, extend(plain, [*model.groups, *best.terms])) for weight, model in models.weighted)
+        models = replace(models, used=weighted[0][1], weighted=weighted)
         notes.append(f"The extended model holds {best.words}: on commands held out it gains {best.gained}.")
-        left = looking_again(best.used)
+        left = looking_again(models.used)
     return SmoothTerm(models, left, tuple(notes))
 
 
@@ -140,18 +139,19 @@ def _surest_covariates(left: Significance) -> list[str]:
 
 
 def _trials(
-    plain: Fit, screening: Screening, base: Extended, left: Significance, covariate: str, folds: NDArray[np.intp]
+    screening: Screening, base: Extended, left: Significance, covariate: str, folds: NDArray[np.intp]
 ) -> Iterator[_Trial]:
-    """The model with functions of one covariate: those of whole columns, by stage, and those of fine structure."""
+    """Functions of one covariate: those of whole columns, by stage, and those of fine structure."""
     for bases in surest_bases(screening, base, left, covariate):
-        terms = chosen_functions(base, list(_groups_of(bases, plain.model.robot)))
-        if terms:
-            used = extend(plain, [*base.groups, *terms])
-            yield _Trial(covariate, tuple(terms), used, _held_out_gain(used, len(base.groups), folds))
+        groups = list(_groups_of(bases, base.fit.model.robot))
+        data = _linearised(base, groups)
+        kept = _kept_functions(data, groups)
+        if kept:
+            yield _Trial(covariate, tuple(_restricted(groups, kept)), _held_out_gains(data, groups, kept, folds))
 
 
-def _of_families(plain: Fit, screening: Screening, base: Extended, folds: NDArray[np.intp]) -> Iterator[_Trial]:
-    """The model with each of the effects that explain most beyond it."""
+def _of_families(screening: Screening, base: Extended, folds: NDArray[np.intp]) -> Iterator[_Trial]:
+    """Each of the effects that explain most beyond a model."""
     beyond = given(screening.data, screening.index_with(base.groups))
     names = {group.name for group in base.groups}
     groups = [group for group in screening.groups.effects if group.name not in names]
@@ -160,9 +160,9 @@ def _of_families(plain: Fit, screening: Screening, base: Extended, folds: NDArra
     for index in sorted(best, key=lambda row: -gains[row])[:_FAMILIES]:
         group, effect = groups[index], groups[index].effect
         if effect is not None and gains[index] > 0:
-            basis = Basis(effect.shows_in, effect.stage, f"as {group.name} would be")
-            used = extend(plain, [*base.groups, replace(group, basis=basis)])
-            yield _Trial(effect.shows_in, (used.groups[-1],), used, _held_out_gain(used, len(base.groups), folds))
+            unnamed = replace(group, basis=Basis(effect.shows_in, effect.stage, f"as {group.name} would be"))
+            data, every = _linearised(base, [unnamed]), range(len(unnamed.parameters))
+            yield _Trial(effect.shows_in, (unnamed,), _held_out_gains(data, [unnamed], every, folds))
 
 
 def surest_bases(screening: Screening, base: Extended, left: Significance, covariate: str) -> list[list[Basis]]:
@@ -245,39 +245,48 @@ def chosen_functions(base: Extended, groups: Sequence[Group]) -> list[Group]:
     largest gain first. Those that the data hardly determine beyond the chosen ones are passed over, and those that
     would need a coefficient far outside its plausible range.
     """
-    data = base.fit.whitened(columns_of(base.fit, [*base.groups, *groups]))
-    owner = np.repeat(np.arange(len(groups)), [len(group.parameters) for group in groups])
-    names = [parameter.name for group in groups for parameter in group.parameters]
+    return _restricted(groups, _kept_functions(_linearised(base, groups), groups))
+
+
+def _linearised(base: Extended, groups: Sequence[Group]) -> Whitened:
+    """Columns of a model and then of all functions of some groups, about the model's fit."""
+    return base.fit.whitened(columns_of(base.fit, [*base.groups, *groups]))
+
+
+def _kept_functions(data: Whitened, groups: Sequence[Group]) -> list[int]:
+    """The functions of some groups, whose columns are the last ones, that are chosen; by their numbers."""
     limits = _LARGEST * np.array([parameter.high for group in groups for parameter in group.parameters])
-    first = data.information.shape[0] - len(owner)
-    left = given(data, range(first))
-    kept: set[int] = set()
-    while len(kept) < len(owner):
+    first = len(data.information) - len(limits)
+    left, kept = given(data, range(first)), list[int]()
+    while len(kept) < len(limits):
         size, score = np.diag(left.information)[first:], left.scores[:, first:].sum(axis=0)
         allowed = (size > _DETERMINED * left.total[first:]) & (np.abs(score) < limits * size)
         gain = np.where(allowed, np.square(score) / np.maximum(size, 1e-300), 0.0)
         best = int(gain.argmax())
         if gain[best] <= np.log(len(data.scores)):  # Eq. (2)
             break
-        kept.add(best)
+        kept.append(best)
         left = left.given([first + best])
-    chosen = []
-    for number, group in enumerate(groups):
-        names_kept = {names[row] for row in kept if owner[row] == number}
-        parameters = tuple(each for each in group.parameters if each.name in names_kept)
-        fixed = {each.name: 0.0 for each in group.parameters if each.name not in names_kept}
+    return kept
+
+
+def _restricted(groups: Sequence[Group], kept: Sequence[int]) -> list[Group]:
+    """Groups with the functions of these numbers alone, all others 0; those without any are left out."""
+    restricted, number = [], 0
+    for group in groups:
+        numbers = range(number, number + len(group.parameters))
+        number = numbers.stop
+        parameters = tuple(each for row, each in zip(numbers, group.parameters, strict=True) if row in kept)
+        fixed = {each.name: 0.0 for row, each in zip(numbers, group.parameters, strict=True) if row not in kept}
         if parameters:
-            chosen.append(replace(group, parameters=parameters, shapes=fixed | dict(group.shapes)))
-    return chosen
+            restricted.append(replace(group, parameters=parameters, shapes=fixed | dict(group.shapes)))
+    return restricted
 
 
-def _held_out_gain(extended: Extended, named: int, folds: NDArray[np.intp]) -> Array:
-    """Chi-square difference (Z,) of each held-out run by all groups after the first ``named``."""
-    elements = extended.fit.model.matrix.size
-    before = range(elements + sum(len(group.parameters) for group in extended.groups[:named]))
-    after = range(elements + len(extended.values))
-    data = extended.fit.whitened(extended.columns, extended.residuals_without_effects)
-    return held_out_chi_square(data, before, after, folds)
+def _held_out_gains(data: Whitened, groups: Sequence[Group], kept: Sequence[int], folds: NDArray[np.intp]) -> Array:
+    """Chi-square difference (Z,) that these functions, whose columns are the last ones, make for each held-out run."""
+    first = len(data.information) - sum(len(group.parameters) for group in groups)
+    return held_out_chi_square(data, range(first), [*range(first), *(first + row for row in kept)], folds)
 
 
 def _capital(text: str) -> str:
