@@ -20,8 +20,8 @@ from pydantic import (
 from omnibench.config import Model, NonNegative, parse_yaml, printable, read_yaml, to_yaml, validate
 from omnibench.errors import ConfigError, DataError, require_type
 from omnibench.files import write_text
+from omnibench.robot.domain.fade import Fade
 from omnibench.robot.effects.term import make_term
-from omnibench.robot.fade import Fade
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration

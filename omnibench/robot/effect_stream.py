@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from omnibench.robot.domain.fade import Fade, faded_twists
 from omnibench.robot.effects.term import Term
-from omnibench.robot.fade import Fade, faded_twists
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, OdometryStream, advance
 from omnibench.robot.signals import SignalStream

@@ -9,10 +9,10 @@ from functools import cached_property
 import numpy as np
 
 from omnibench.robot.corrected import check_needs, needs_of
+from omnibench.robot.domain.fade import Fade, faded_twists
 from omnibench.robot.effect_stream import EffectStream
 from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect
 from omnibench.robot.effects.term import Term
-from omnibench.robot.fade import Fade, faded_twists
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import Integration, OdometryStream, RunSamples, WheelLog
 from omnibench.robot.path import PathBatch

@@ -11,11 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sample_robots import APR_02
 
-from omnibench.robot.fade import Fade
+from omnibench.robot.domain.fade import Fade
+from omnibench.robot.domain.training_domain import motions_of, representatives
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
-from omnibench.robot.training_domain import motions_of, representatives
 
 FORWARDS, SIDEWAYS = np.array([0.2, 0.0, 0.0]), np.array([0.0, 0.2, 0.0])
 GROWN = term("speed_dependent_radius", k=0.01)

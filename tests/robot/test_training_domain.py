@@ -10,14 +10,14 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from sample_robots import APR_02
 
-from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.training_domain import (
+from omnibench.robot.domain.training_domain import (
     TrainingDomain,
     extrapolated_share,
     extrapolation_consequence,
     motions_of,
     representatives,
 )
+from omnibench.robot.kinematics import Array, Robot
 
 DISTANCE = 0.195  # m, of the APR-02's wheels
 FORWARDS = np.array([0.2, 0.0, 0.0])

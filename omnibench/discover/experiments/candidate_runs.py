@@ -10,11 +10,11 @@ import numpy as np
 
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.fitting.model_fit import Fit
+from omnibench.robot.domain.training_domain import motions_of
 from omnibench.robot.effects.effect import Effect
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.signals import of_centre
-from omnibench.robot.training_domain import motions_of
 from omnibench.simulate.command import is_within
 from omnibench.simulate.driving.designed_run import run_as_designed
 from omnibench.simulate.driving.drivable_commands import DrivableCommands, Shapes

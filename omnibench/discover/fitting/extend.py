@@ -22,6 +22,7 @@ from omnibench.discover.fitting.model_fit import (
     with_noise,
 )
 from omnibench.discover.regressors.column_group import Group
+from omnibench.discover.regressors.effect_slopes import slopes_by
 from omnibench.discover.regressors.paths import Paths
 from omnibench.fit.least_squares.noise import is_near
 from omnibench.fit.least_squares.trajectory_covariance import FitCovariance
@@ -161,8 +162,7 @@ def _of_groups(paths: Paths, groups: Sequence[Group]) -> Iterator[Array]:
     for group in groups:
         assert isinstance(group.effect, MotionEffect | ReferenceEffect)
         base = {each.name: 0.0 for each in group.parameters} | dict(group.shapes)
-        for each in group.parameters:
-            yield paths.of_effect(group.effect, each.name, base)
+        yield slopes_by(paths, group.effect, [each.name for each in group.parameters], base)
 
 
 def _descend(fit: Fit, groups: Sequence[Group], values: Array) -> tuple[Fit, Array, Whitened, tuple[Array, ...]]:

@@ -15,9 +15,10 @@ from itertools import pairwise, product
 import numpy as np
 
 from omnibench.data.dataset import Trajectory
+from omnibench.discover.regressors.effect_slopes import slopes_by, slopes_by_delay
 from omnibench.discover.regressors.paths import Paths
 from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect, Stage
-from omnibench.robot.effects.smooth import (
+from omnibench.robot.effects.smooth.motion import (
     SmoothCommand,
     SmoothCourse,
     SmoothEffect,
@@ -29,8 +30,8 @@ from omnibench.robot.effects.smooth import (
     bump,
     lever,
 )
-from omnibench.robot.effects.smooth_reference import SmoothMap, SmoothStamps, SmoothStampWave
-from omnibench.robot.effects.smooth_wheels import (
+from omnibench.robot.effects.smooth.reference import SmoothMap, SmoothStamps, SmoothStampWave
+from omnibench.robot.effects.smooth.wheels import (
     HARMONICS,
     SmoothAcceleration,
     SmoothWheelAngle,
@@ -136,12 +137,8 @@ def _place(paths: Paths) -> Iterator[Basis]:
     floor, bent, patch = SmoothPlace(), SmoothMap(), SmoothPatch()
     yield _of_effect(floor, "where on the floor the robot is", _smooth(floor, area), area)
 
-    def shifted(along: Paths) -> Array:
-        starts = np.array([log.start for log in along.logs])[along.run]
-        there, first = (bent.functions(poses[:, :2], area) for poses in (along.poses, starts))
-        return np.concatenate([axis[:, None] * (there - first)[:, None, :] for axis in np.eye(3)], axis=2)
-
-    yield _of_effect(bent, "where on the map the reference is read", shifted, area)
+    bent_map = _by_parameters(bent, paths, area)
+    yield _of_effect(bent, "where on the map the reference is read", bent_map, area)
     patches = list(_patches(places))
 
     def of_patches(along: Paths) -> Array:
@@ -230,24 +227,20 @@ def _acceleration(paths: Paths) -> Iterator[Basis]:
     if max(top, turning) < _SMALL:
         return
     effect, shapes = SmoothAcceleration(), {"top": max(top, _SMALL), "top_turning": max(turning, _SMALL)}
-    units = list(_units(effect, paths, shapes))
-    yield _of_effect(
-        effect,
-        "how the robot accelerates",
-        lambda along: np.concatenate([along.of_effect(effect, name, values) for name, values in units], axis=2),
-        shapes,
-    )
+    yield _of_effect(effect, "how the robot accelerates", _by_parameters(effect, paths, shapes), shapes)
 
 
 def _stamps(paths: Paths) -> Iterator[Basis]:
     stamps = paths.stamps
 
     def by_delays(effect: ReferenceEffect, shapes: Mapping[str, float]) -> Columns:
-        units = [values for _, values in _units(effect, paths, shapes)]
+        names = _linear(effect, paths)
+        units = [dict.fromkeys(names, 0.0) | dict(shapes) | {name: 1.0} for name in names]
 
         def columns(along: Paths) -> Array:
             delays = [effect.delays(along.stamps, values) for values in units]
-            return along.by_delay * np.stack([[position, position, heading] for position, heading in delays]).T
+            of_axes = np.stack([[position, position, heading] for position, heading in delays]).T
+            return along.once(slopes_by_delay) * of_axes
 
         return columns
 
@@ -263,13 +256,14 @@ def _stamps(paths: Paths) -> Iterator[Basis]:
         yield _of_effect(wave, words, by_delays(wave, shapes), shapes, tries=_FREQUENCIES)
 
 
-def _units(
-    effect: MotionEffect | ReferenceEffect, paths: Paths, shapes: Mapping[str, float]
-) -> Iterator[tuple[str, dict[str, float]]]:
-    """Each linear parameter of an effect, and the values in which it is 1 and the others are 0."""
-    names = [each.name for each in effect.parameters(paths.robot) if not each.choices]
-    for name in names:
-        yield name, dict.fromkeys(names, 0.0) | dict(shapes) | {name: 1.0}
+def _by_parameters(effect: MotionEffect | ReferenceEffect, paths: Paths, shapes: Mapping[str, float]) -> Columns:
+    """Slopes by all linear parameters of an effect."""
+    names = _linear(effect, paths)
+    return lambda along: slopes_by(along, effect, names, dict.fromkeys(names, 0.0) | dict(shapes))
+
+
+def _linear(effect: MotionEffect | ReferenceEffect, paths: Paths) -> list[str]:
+    return [each.name for each in effect.parameters(paths.robot) if not each.choices]
 
 
 def _command(paths: Paths, trajectories: Sequence[Trajectory]) -> Iterator[Basis]:

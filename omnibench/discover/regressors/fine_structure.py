@@ -34,7 +34,7 @@ from omnibench.discover.regressors.covariate_bases import Basis
 from omnibench.discover.regressors.paths import Paths
 from omnibench.discover.regressors.significance import Significance, significance_of_scores
 from omnibench.robot.effects.effect import Values
-from omnibench.robot.effects.smooth import beyond, bump, lever
+from omnibench.robot.effects.smooth.motion import beyond, bump, lever
 from omnibench.robot.kinematics import Array
 
 _COARSE = 0.1  # s: wheel samples are merged up to this duration

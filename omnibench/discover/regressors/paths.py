@@ -11,7 +11,7 @@ sum over the samples is enough for each change.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import pairwise
@@ -21,20 +21,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from omnibench.errors import PluginError
 from omnibench.registry import effects
-from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect
-from omnibench.robot.effects.forms import correction_of
-from omnibench.robot.effects.reference_time import ReferenceTimeOffset
-from omnibench.robot.effects.smooth import MODES, direction
+from omnibench.robot.effects.smooth.motion import MODES, direction
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import RunSamples, WheelLog
 from omnibench.robot.path import PathBatch
 from omnibench.robot.signals import Signals, signals_of_runs
 
-# tests/benchmarks/constants.py varies both by 0.5 and 2: on a small set with heading drift no verdict and no name
+# tests/benchmarks/constants.py varies it by 0.5 and 2: on a small set with heading drift no verdict and no name
 # changes.
-_STEP = 0.1  # share of the plausible range: step of a reference effect's parameter for its slope
 _LAST = 5  # samples at the end of a run whose mean velocity leads on to stamps after it, as WheelLog.continued does
 # Samples in a part, a stamp counting as 8: a part's numbers stay in the processor's cache, and its columns are few
 # enough to be held as 64 bits, 50 MB of a thousand (chosen).
@@ -76,7 +71,7 @@ class Paths:
             yield replace(
                 self,
                 logs=self.logs[first:last],
-                signals=_part(self.signals, samples, self.signals.session),
+                signals=part_of(self.signals, samples, self.signals.session),
                 sessions=tuple((name, part) for name, part in within if part.start < part.stop),
                 owner=self.owner[samples] - first,
                 middle=self.middle[samples],
@@ -115,11 +110,16 @@ class Paths:
     def of_wheel(self, wheel: int, changes: Array) -> Array:
         """Slopes (S, 3, J) of the poses by changes (F, J) of one wheel's rate, rad/s."""
         direct = self.robot.drive.direct
-        return self.respond(self.changes(self.matrix[:, wheel] if direct else self._by_rate[..., wheel]), changes)
+        return self.respond(self.changes(self.matrix[:, wheel] if direct else self._slopes[0][..., wheel]), changes)
 
-    @property
-    def _by_rate(self) -> Array:
-        return self._slopes[0]
+    def by_rates(self, changes: Array) -> Array:
+        """Changes (F, 3) of the tracked point's twist by changes (F, N) of the wheel rates, rad/s."""
+        direct = self.robot.drive.direct
+        return changes @ self.matrix.T if direct else np.einsum("fin,fn->fi", self._slopes[0], changes)
+
+    def by_angles(self, changes: Array) -> Array:
+        """Changes (F, 3) of the tracked point's twist by changes (F, S) of the steering angles, rad."""
+        return np.einsum("fin,fn->fi", self._slopes[1], changes)
 
     @cached_property
     def _slopes(self) -> tuple[Array, Array]:
@@ -129,58 +129,13 @@ class Paths:
 
     def of_velocity(self, change: Array) -> Array:
         """Slopes (S, 3, 1) by a change (F, 2) of the velocity in the reference's frame, m/s."""
-        return self._summed(self._in_world(change)[:, :, None])
+        return self.summed(self.in_world(change)[:, :, None])
 
-    def _in_world(self, change: Array) -> Array:
+    def in_world(self, change: Array) -> Array:
         """Displacements (F, 3) in each sample by a change (F, 2) of the velocity in the reference's frame, m/s."""
         column = np.zeros((len(change), 3))
         column[:, :2] = change * self.signals.durations[:, None]
         return column
-
-    def correction(self, effect: MotionEffect, values: Mapping[str, float]) -> Array:
-        """Correction of every sample by an effect, (F, n) as its stage has it: of rates, angles, twist or velocity."""
-        parts = []
-        for session, part in self.sessions:
-            parts.append(_corrected(effect, _part(self.signals, part, session), values))
-        return np.concatenate(parts)
-
-    def of_effect(self, effect: MotionEffect | ReferenceEffect, unit: str, values: Mapping[str, float]) -> Array:
-        """Slopes (S, 3, 1) by the parameter called ``unit`` of an effect. values: its shapes, and 0 for all else."""
-        if isinstance(effect, ReferenceEffect):
-            return self._of_reference(effect, unit, values)
-        return self.of_corrections(effect, [self.correction(effect, {**values, unit: 1.0})])
-
-    def of_corrections(self, effect: MotionEffect, changes: Sequence[Array]) -> Array:
-        """Slopes (S, 3, J) by J corrections (F, n) at the stage of an effect."""
-        return self._summed(np.stack([self._by_stage(effect, change) for change in changes], axis=2))
-
-    def _by_stage(self, effect: MotionEffect, change: Array) -> Array:
-        """Changes (F, 3) of (z, theta) in each sample by a correction (F, n) at the stage of an effect."""
-        if effect.stage == "body":
-            return self.changes(self.tracked(change))
-        if effect.stage == "world":
-            return self._in_world(change)
-        if effect.stage == "steering":
-            return self.changes(np.einsum("fin,fn->fi", self._slopes[1], change))
-        direct = self.robot.drive.direct
-        return self.changes(change @ self.matrix.T if direct else np.einsum("fin,fn->fi", self._by_rate, change))
-
-    def _of_reference(self, effect: ReferenceEffect, unit: str, values: Mapping[str, float]) -> Array:
-        step = _STEP * next(each.largest for each in effect.parameters(self.robot) if each.name == unit)
-        after, before = (self.reported(effect, {**values, unit: sign * step}) for sign in (1, -1))
-        return ((after - before) / (2 * step))[..., None]
-
-    def reported(self, effect: ReferenceEffect, values: Mapping[str, float]) -> Array:
-        """Poses (S, 3) that the reference would report with an effect."""
-        delays = [effect.delays(log.stamps, values) for log in self.logs]
-        samples, ends = RunSamples.of([log.times for log in self.logs]), np.concatenate(self.ends)
-        of_position, of_heading = (
-            _along(samples, ends, [log.stamps - delay for log, delay in zip(self.logs, of_runs, strict=True)])
-            for of_runs in zip(*delays, strict=True)
-        )
-        taken = np.column_stack([of_position[:, :2], of_heading[:, 2]])
-        runs = zip(self.logs, self.parts, strict=True)
-        return np.concatenate([effect.reported(taken[part], log.start, values) for log, part in runs])
 
     def respond(self, column: Array, shares: Array) -> Array:
         """Slopes (S, 3, J) by column (F, 3), changes of (z, theta) in each sample, times shares (F, J)."""
@@ -217,15 +172,10 @@ class Paths:
         return {mode: self.changes(self.tracked(direction(mode, self.signals))) for mode in MODES}
 
     @cached_property
-    def by_delay(self) -> Array:
-        """Slopes (S, 3, 1) by a delay of the reference, s."""
-        return self.of_effect(ReferenceTimeOffset(), "tau", {"tau": 0.0})
-
-    @cached_property
     def _sums(self) -> csr_array:
         return _sums(self.logs)
 
-    def _summed(self, changes: Array) -> Array:
+    def summed(self, changes: Array) -> Array:
         """Slopes (S, 3, J) by changes (F, 3, J) of (z, theta) in each sample."""
         steps = np.asarray(self._sums @ changes.reshape(len(changes), -1))
         return self._from_steps(steps.reshape(-1, *changes.shape[1:]))
@@ -292,7 +242,7 @@ def make_paths(
     edges = np.cumsum([0, *(len(log.stamps) for log in logs)])
     parts = tuple(slice(int(low), int(high)) for low, high in pairwise(edges))
     middle, ends = path.middles, path.ends
-    poses = _along(samples, np.concatenate(ends), [log.stamps for log in logs])
+    poses = along_ends(samples, np.concatenate(ends), [log.stamps for log in logs])
     run = np.repeat(np.arange(len(logs)), np.diff(edges))
     from_start = middle[:, :2] - starts[samples.run, :2]
     turns = np.column_stack([np.cos(middle[:, 2]), np.sin(middle[:, 2]), from_start]) * signals.durations[:, None]
@@ -320,7 +270,7 @@ def _needs(robot: Robot) -> frozenset[str]:
     return frozenset().union(*(effect.needs for effect in trial if effect.applies(robot)))
 
 
-def _along(samples: RunSamples, ends: Array, times: Sequence[Array]) -> Array:
+def along_ends(samples: RunSamples, ends: Array, times: Sequence[Array]) -> Array:
     """Poses (S, 3) of each run at times (K,), s: at rest before its start, straight on after its last sample.
 
     ends (F + Z, 3): poses at the start and at the end of each sample of each run, between which they lie on lines.
@@ -371,23 +321,7 @@ def _sessions(logs: Sequence[WheelLog], edges: NDArray[np.intp]) -> list[tuple[s
     ]
 
 
-def _corrected(effect: MotionEffect, signals: Signals, values: Mapping[str, float]) -> Array:
-    """Correction by an effect. Raises PluginError where it fails, has another shape, or is not finite."""
-    steered = len(signals.robot.drive.steered)
-    width = {"body": 3, "world": 2, "steering": steered}.get(effect.stage, signals.rates.shape[1])
-    way_out = f"try omnibench plugin check, or leave it out: --without {effect.name}"
-    try:
-        correction = np.asarray(correction_of(effect, signals, values), dtype=float)
-    except Exception as error:  # a plug-in may raise anything
-        said = f"{type(error).__name__}: {error}"
-        raise PluginError(f"effect {effect.name!r}: its correction ended in {said}; {way_out}") from error
-    if correction.shape != (len(signals.rates), width) or not np.isfinite(correction).all():
-        expected = f"{(len(signals.rates), width)} finite values"
-        raise PluginError(f"effect {effect.name!r}: its correction is not {expected} but {correction.shape}; {way_out}")
-    return correction
-
-
-def _part(signals: Signals, part: slice, session: str | None) -> Signals:
+def part_of(signals: Signals, part: slice, session: str | None) -> Signals:
     """The signals of some samples, which are of one session."""
     values = {item.name: getattr(signals, item.name) for item in fields(signals)}
     chosen: dict[str, Any] = {name: value[part] for name, value in values.items() if isinstance(value, np.ndarray)}

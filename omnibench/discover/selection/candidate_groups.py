@@ -13,6 +13,7 @@ from omnibench.data.dataset import Trajectory
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.regressors.column_store import ColumnStore
 from omnibench.discover.regressors.covariate_bases import Columns, generic_bases
+from omnibench.discover.regressors.effect_slopes import correction_along, slopes_by, slopes_by_corrections
 from omnibench.discover.regressors.paths import Paths
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import Effect, MotionEffect, Parameter, ReferenceEffect
@@ -113,11 +114,12 @@ def _of_effect(effect: MotionEffect | ReferenceEffect, linear: Sequence[Paramete
 
     def columns(along: Paths) -> Array:
         if isinstance(effect, ReferenceEffect):
-            return np.concatenate([along.of_effect(effect, each.name, values) for each in linear], axis=2)
-        units = {each.name: along.correction(effect, {**values, each.name: 1.0}) for each in linear}
+            return slopes_by(along, effect, [each.name for each in linear], values)
+        units = {each.name: correction_along(along, effect, {**values, each.name: 1.0}) for each in linear}
         scales = {} if forms is None else forms.scales
         profiles = {key: form_profile(key, effect, along.signals, scales) for _, key in varied}
-        return along.of_corrections(effect, [*units.values(), *(units[name] * profiles[key] for name, key in varied)])
+        every = [*units.values(), *(units[name] * profiles[key] for name, key in varied)]
+        return slopes_by_corrections(along, effect, every)
 
     return columns
 
@@ -156,7 +158,7 @@ def _family(paths: Paths, effect: Effect, names: Sequence[str], values: Mapping[
     """The forms of an effect, which these recordings can tell; None for one that has no others."""
     if not isinstance(effect, MotionEffect):
         return None
-    corrections = {name: paths.correction(effect, {**values, name: 1.0}) for name in names}
+    corrections = {name: correction_along(paths, effect, {**values, name: 1.0}) for name in names}
     forms = forms_of(effect, paths.signals, corrections)
     return forms if forms.parameters else None
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from omnibench.live.wheels.wheel_input import WheelStep
 from omnibench.robot.calibration import Calibration
+from omnibench.robot.domain.training_domain import TrainingDomain, extrapolation_consequence
 from omnibench.robot.kinematics import Array
-from omnibench.robot.training_domain import TrainingDomain, extrapolation_consequence
 
 LOG = logging.getLogger("omnibench.live")
 _WINDOW = 0.5  # s, over which a twist is averaged before it is judged; chosen

@@ -9,7 +9,7 @@ import numpy as np
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import MotionEffect, Parameter, Values
 from omnibench.robot.effects.per_wheel import has_rollers, one_for_each_wheel
-from omnibench.robot.effects.smooth import waves
+from omnibench.robot.effects.smooth.motion import waves
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.signals import Signals
 

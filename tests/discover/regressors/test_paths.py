@@ -11,6 +11,7 @@ from discovery_samples import simulated
 from omnibench.config import validate
 from omnibench.discover.fitting.extend import fit_matrix
 from omnibench.discover.fitting.model_fit import Fit, paths_of
+from omnibench.discover.regressors.effect_slopes import slopes_by
 from omnibench.fit.least_squares.usable_runs import usable_runs
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import ActuatorEffect
@@ -73,7 +74,7 @@ def check_slopes(fitted: Fit, name: str) -> None:
             return np.concatenate(model.reported(list(paths.logs)))
 
         expected = (poses(step) - poses(-step)) / (2 * step)
-        slopes = paths.of_effect(effect, parameter.name, base)[..., 0]
+        slopes = slopes_by(paths, effect, [parameter.name], base)[..., 0]
         # A reference effect's slope is taken over a tenth of its range, along a path with corners at its ramps; in the
         # others the middle of a sample (40 ms) stands for all of it.
         tolerance = 0.05 if effect.stage == "reference" else 3e-4
@@ -82,5 +83,5 @@ def check_slopes(fitted: Fit, name: str) -> None:
 
 def test_samples_put_together_give_the_same_slopes_of_what_varies_slowly(fitted: Fit) -> None:
     effect = effects.create("heading_drift")
-    fine, coarse = (paths_of(fitted, together).of_effect(effect, "b", {"b": 0.0}) for together in (0.0, 0.12))
+    fine, coarse = (slopes_by(paths_of(fitted, together), effect, ["b"], {"b": 0.0}) for together in (0.0, 0.12))
     assert np.abs(fine - coarse).max() < 2e-3 * np.abs(fine).max()

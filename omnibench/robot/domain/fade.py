@@ -37,11 +37,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.robot.corrected import corrected_twists
+from omnibench.robot.domain.training_domain import TrainingDomain
 from omnibench.robot.effects.effect import MotionEffect
 from omnibench.robot.effects.term import Term
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.signals import Signals
-from omnibench.robot.training_domain import TrainingDomain
 
 GROWTH = 4.0
 _KNOWN = 1e-9  # share of the largest variance below which a direction of the parameters has none but by rounding

@@ -7,7 +7,7 @@ import numpy as np
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import MotionEffect, Parameter, Values
 from omnibench.robot.effects.per_wheel import of_wheels, one_for_each_wheel
-from omnibench.robot.effects.smooth import NO_PHYSICS, NO_SOURCE, direction, scale
+from omnibench.robot.effects.smooth.motion import NO_PHYSICS, NO_SOURCE, direction, scale
 from omnibench.robot.effects.wheel_angle import ripple
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.signals import STILL, Signals

@@ -10,7 +10,7 @@ import numpy as np
 
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import Parameter, ReferenceEffect, Values
-from omnibench.robot.effects.smooth import (
+from omnibench.robot.effects.smooth.motion import (
     AREA,
     NO_PHYSICS,
     NO_SOURCE,
@@ -39,6 +39,7 @@ class BentMap(ReferenceEffect):
     source = NO_SOURCE
     shows_in = "place"
     in_catalogue = False
+    axes = tuple(_AXES)
     labels: ClassVar[tuple[str, ...]]
 
     @abstractmethod
