@@ -39,6 +39,7 @@ _ROUNDS = 4  # rounds that fit noise and plain matrix by turns, at most; fewer w
 _NEAR = 0.02  # share of the largest component of the noise by which two noises may differ, see is_near
 _STEPS = 4  # Gauss-Newton steps, at most
 _HALVINGS = 10  # of a step that leads too far, at most: to a thousandth of it
+_ROUNDING = 1e-6  # share of chi-square by which a step of an ended fit may raise it, as numbers are rounded
 _STILL = 0.05  # standard errors: a smaller step, which no interval shows, ends the fit
 
 
@@ -171,16 +172,18 @@ def _descend(fit: Fit, groups: Sequence[Group], values: Array) -> tuple[Fit, Arr
     data = fit.whitened(columns)
     for _ in range(_STEPS):
         step, covariance = given(data, []).estimate(range(elements + len(values)))
-        before, began, seen = fit, values, _chi_square(data)
-        for _ in range(_HALVINGS if _bends(groups) else 1):
-            values = began + step[elements:]
-            matrix = before.model.matrix + step[:elements].reshape(before.model.matrix.shape)
-            fit = at_model(before, model_with(before.model, matrix, terms_of(groups, values)))
+        before, least = (fit, values, data), _chi_square(data) * (1 + _ROUNDING)
+        for share in 0.5 ** np.arange(_HALVINGS):
+            values = before[1] + share * step[elements:]
+            matrix = before[0].model.matrix + (share * step[:elements]).reshape(fit.model.matrix.shape)
+            fit = at_model(before[0], model_with(before[0].model, matrix, terms_of(groups, values)))
             data = fit.whitened(columns)
-            if _chi_square(data) < seen:
+            if _chi_square(data) <= least:
                 break
-            step = step / 2
-        if _size(step, covariance) < _STILL:
+        else:
+            fit, values, data = before
+            break
+        if _size(share * step, covariance) < _STILL:
             break
     return fit, values, data, columns
 

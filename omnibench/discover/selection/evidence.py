@@ -44,9 +44,9 @@ with the largest N of these j in Eq. (3).
 
 What is left over. Names that are wrong leave more than right ones. Generic bases still find a chi-square x beyond the
 names, of standard deviation sigma by chance. Names that explain N and leave a share s of the whole leave N s / (1 - s)
-in expectation; a non-central chi-square has the variance 2 d + 4 lambda, with x for lambda:
+in expectation, and a non-central chi-square has the variance 2 d + 4 lambda:
 
-    x | s ~ N(N s / (1 - s), sigma^2 + 4 x),                                                                       (6)
+    x | s ~ N(lambda, sigma^2 + 4 lambda),    lambda = N s / (1 - s),                                              (6)
     p(s | right) = exp(-s / u) / u,    p(s | wrong) = 1,    0 < s < 1,                                             (7)
     F(x, u) = integral of p(x | s) p(s | right) ds / integral of p(x | s) p(s | wrong) ds.                         (8)
 
@@ -96,8 +96,8 @@ _PRIOR = float(np.log(20))  # odds of 1 to 20 that an effect is missing
 _LEFT_RIGHT, _BEYOND_RIGHT = 0.04, 0.01
 # u and u' of names with forms. In 54 blind sets whose forms were chosen to be far from the textbook's, other forms
 # explain a share of 0.02 of right names in the median, 0.28 in the ninth decile, and bases find 0.002 beside them in
-# the mean. Of a real robot, bases find 0.036 beside what holds on other paths (omni3's circles): u' is as above.
-_FORMS_RIGHT, _BEYOND_FORMS = 0.06, 0.01
+# the mean: u' is more than twice that. The best wrong names for a heading that drifts leave 0.02 to 0.05 to bases.
+_FORMS_RIGHT, _BEYOND_FORMS = 0.06, 0.005
 _MOST_ODDS = 10.0  # F_max: below 1 / u, so that what is left beside the names as they are can count for more
 _CANCELLING = 0.45  # share of Eq. (10): 1.0 or more of right pairs, 0.2 to 0.3 of the best wrong ones in 4 sets of 24
 _SURELY = 3.0  # standard errors: a normal number is below minus three of them in one of 740 cases
@@ -206,13 +206,13 @@ def credibility_of(
     whole = energy + of_forms
     odds = _ODDS_OF_ONE if len(chosen) == 1 else _ODDS_OF_TWO / (len(chosen) - 1)
     if rank:
-        odds *= bayes_factor(of_forms, math.sqrt(2 * rank + 4 * of_forms), energy, _FORMS_RIGHT)
+        odds *= bayes_factor(of_forms, math.sqrt(2 * rank), energy, _FORMS_RIGHT)
     else:
         size, spread = left.surplus_chi_square
-        odds *= bayes_factor(size, math.sqrt(spread**2 + 4 * size), energy, _LEFT_RIGHT)
+        odds *= bayes_factor(size, spread, energy, _LEFT_RIGHT)
     beside, scatter = beyond.surplus_chi_square
     usual = _BEYOND_FORMS if rank else _BEYOND_RIGHT
-    odds *= min(bayes_factor(beside, math.sqrt(scatter**2 + 4 * beside), whole, usual), _MOST_ODDS)  # Eq. (9)
+    odds *= min(bayes_factor(beside, scatter, whole, usual), _MOST_ODDS)  # Eq. (9)
     if (len(chosen) > 1 and joint_share(start, chosen) < _CANCELLING) or _has_wrong_sign(start, chosen):
         odds = min(odds, _IMITATION)  # Eq. (10)
     share = beside / (beside + whole)
@@ -223,18 +223,22 @@ def credibility_of(
 def bayes_factor(left: float, deviation: float, energy: float, usual: float) -> float:
     """Bayes factor F of right names against wrong ones where a chi-square ``left`` is found beside them, Eq. (8).
 
-    deviation: standard deviation of ``left``, above 0. energy: non-centrality N that the names explain. usual: mean
-    share u of the whole that right names leave.
+    deviation: standard deviation sigma of ``left`` by chance, above 0. energy: non-centrality N that the names explain.
+    usual: mean share u of the whole that right names leave.
     """
-    nearest, farthest = (max(left + side * _WINDOW * deviation, 0.0) for side in (-1, 1))
-    low, middle, high = (size / (energy + size) for size in (nearest, left, farthest))
+    # Where |x - lambda| is _WINDOW deviations, by the quadratic equation in lambda.
+    middle = left + 2 * _WINDOW**2
+    apart = math.sqrt(middle**2 - left**2 + (_WINDOW * deviation) ** 2)
+    shares = [size / (energy + size) for size in (max(middle - apart, 0.0), left, middle + apart)]
+    low, high = shares[0], shares[2]
 
     def likelihood(density: Callable[[float], float]) -> float:
         def at(share: float) -> float:
-            expected = energy * share / (1 - share)  # Eq. (6)
-            return density(share) * math.exp(-(((left - expected) / deviation) ** 2) / 2)
+            expected = energy * share / (1 - share)
+            variance = deviation**2 + 4 * expected  # Eq. (6)
+            return density(share) * math.exp(-((left - expected) ** 2) / variance / 2) / math.sqrt(variance)
 
-        return float(quad(at, low, high, points=[middle, min(low + usual, high)])[0])
+        return float(quad(at, low, high, epsabs=0.0, points=[shares[1], min(low + usual, high)])[0])
 
     right, wrong = likelihood(lambda share: math.exp(-share / usual) / usual), likelihood(lambda _: 1.0)  # Eq. (7)
     return right / wrong  # Eq. (8)
