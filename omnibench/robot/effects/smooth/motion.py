@@ -19,8 +19,6 @@ from omnibench.robot.effects.effect import MotionEffect, Parameter, Values
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.signals import Signals
 
-NO_PHYSICS = "None: a function that was fitted to what the model left, without a cause."
-NO_SOURCE = "fitted to data"
 SURFACES = ("x", "y", "xx", "xy", "yy", "xxx", "xxy", "xyy", "yyy")
 _LARGEST = 0.1  # plausible size of a coefficient, a share of the motion; chosen
 _SLOW = 1e-3  # m/s, below which the direction of travel is ill-defined; chosen
@@ -106,13 +104,18 @@ PATCH = (
 )
 
 
-class SmoothEffect(MotionEffect):
+class WithoutCause:
+    """What an effect says that describes an error and not its cause: no such effect is in the catalogue."""
+
+    physics = "None: a function that was fitted to what the model left, without a cause."
+    source = "fitted to data"
+    in_catalogue = False
+
+
+class SmoothEffect(WithoutCause, MotionEffect):
     """Changes of the motion that depend on a covariate: for each of ``modes`` a sum of the ``labels`` functions."""
 
     stage = "body"
-    physics = NO_PHYSICS
-    source = NO_SOURCE
-    in_catalogue = False
     modes: ClassVar[tuple[str, ...]] = ("along", "across", "turn")
     labels: ClassVar[tuple[str, ...]]
 

@@ -12,10 +12,9 @@ from omnibench.registry import effects
 from omnibench.robot.effects.effect import Parameter, ReferenceEffect, Values
 from omnibench.robot.effects.smooth.motion import (
     AREA,
-    NO_PHYSICS,
-    NO_SOURCE,
     PATCH,
     SURFACES,
+    WithoutCause,
     bump,
     inside_of,
     scale,
@@ -29,16 +28,13 @@ _ROUNDS = 200  # steps of the fixed-point iteration that inverts a map, at most;
 _SAME = 1e-13  # m, rad: a smaller change ends the iteration
 
 
-class BentMap(ReferenceEffect):
+class BentMap(WithoutCause, ReferenceEffect):
     """A distorted map: reported poses are shifted by functions of the position, relative to the run's start.
 
     ``corrected`` assumes that the map is invertible.
     """
 
-    physics = NO_PHYSICS
-    source = NO_SOURCE
     shows_in = "place"
-    in_catalogue = False
     axes = tuple(_AXES)
     labels: ClassVar[tuple[str, ...]]
 
@@ -97,13 +93,10 @@ class SmoothMapPatch(BentMap):
 
 
 @effects.register("smooth_stamps")
-class SmoothStamps(ReferenceEffect):
+class SmoothStamps(WithoutCause, ReferenceEffect):
     """Unknown effect: delays that grow with the stamp, up to the last one seen, and that alternate."""
 
-    physics = NO_PHYSICS
-    source = NO_SOURCE
     shows_in = "stamps"
-    in_catalogue = False
     fixed_parameters = (
         *(
             Parameter(f"{what}_{kind}", "s", -0.1, 0.1, f"by how much earlier the {what} was taken, {words}")
@@ -128,13 +121,10 @@ class SmoothStamps(ReferenceEffect):
 
 
 @effects.register("smooth_stamp_wave")
-class SmoothStampWave(ReferenceEffect):
+class SmoothStampWave(WithoutCause, ReferenceEffect):
     """Unknown effect: a delay of the poses that swings with their stamps, at one frequency."""
 
-    physics = NO_PHYSICS
-    source = NO_SOURCE
     shows_in = "stamps"
-    in_catalogue = False
     fixed_parameters = (
         Parameter("cos", "s", -0.1, 0.1, "by how much earlier the pose was taken, with the cosine"),
         Parameter("sin", "s", -0.1, 0.1, "by how much earlier the pose was taken, with the sine"),

@@ -7,7 +7,7 @@ import numpy as np
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import MotionEffect, Parameter, Values
 from omnibench.robot.effects.per_wheel import of_wheels, one_for_each_wheel
-from omnibench.robot.effects.smooth.motion import NO_PHYSICS, NO_SOURCE, direction, scale
+from omnibench.robot.effects.smooth.motion import WithoutCause, direction, scale
 from omnibench.robot.effects.wheel_angle import ripple
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.signals import STILL, Signals
@@ -34,14 +34,11 @@ def _between_knots(rates: Array, top: float, heights: Array) -> Array:
 
 
 @effects.register("smooth_wheel_rate")
-class SmoothWheelRate(MotionEffect):
+class SmoothWheelRate(WithoutCause, MotionEffect):
     """Unknown effect: a piecewise linear function of each wheel's rate, which holds its value beyond the rates seen."""
 
     stage = "wheel"
-    physics = NO_PHYSICS
-    source = NO_SOURCE
     shows_in = "wheel rate"
-    in_catalogue = False
 
     def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
         at_knots = [
@@ -57,14 +54,11 @@ class SmoothWheelRate(MotionEffect):
 
 
 @effects.register("smooth_common_rate")
-class SmoothCommonRate(MotionEffect):
+class SmoothCommonRate(WithoutCause, MotionEffect):
     """Unknown effect: a finer function of the wheel rate, the same for all wheels, held beyond the rates seen."""
 
     stage = "wheel"
-    physics = NO_PHYSICS
-    source = NO_SOURCE
     shows_in = "wheel rate"
-    in_catalogue = False
     fixed_parameters = (
         *(
             Parameter(f"change_{knot}", "rad/s", -0.02, 0.02, f"change at knot {knot} of 0 to {_COMMON_KNOTS - 1}")
@@ -79,15 +73,12 @@ class SmoothCommonRate(MotionEffect):
 
 
 @effects.register("smooth_wheel_angle")
-class SmoothWheelAngle(MotionEffect):
+class SmoothWheelAngle(WithoutCause, MotionEffect):
     """Unknown effect: a wave of each wheel's angle, so many times a turn."""
 
     stage = "wheel"
-    physics = NO_PHYSICS
-    source = NO_SOURCE
     shows_in = "wheel angle"
     needs = frozenset({"wheel_angles"})
-    in_catalogue = False
 
     def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
         return (
@@ -115,14 +106,11 @@ _OF_ACCELERATION = (
 
 
 @effects.register("smooth_acceleration")
-class SmoothAcceleration(MotionEffect):
+class SmoothAcceleration(WithoutCause, MotionEffect):
     """Unknown effect: changes that grow with the acceleration, up to the largest that was seen, and then no more."""
 
     stage = "body"
-    physics = NO_PHYSICS
-    source = NO_SOURCE
     shows_in = "acceleration"
-    in_catalogue = False
     fixed_parameters = (
         *_OF_ACCELERATION,
         scale("top", "m/s2", 1e-9, 1e9, 10.0, "the largest acceleration that was seen"),
