@@ -1,6 +1,6 @@
 """Discovery on recordings of real robots: train on one kind of path, judge plain and extended model on another.
 
-    python tests/benchmarks/real_discovery.py --out real.jsonl [--only omni3] [--unknown-term] [--table]
+    python tests/benchmarks/real_discovery.py --out real.jsonl [--only omni3] [--no-unknown-term] [--table]
 
 One line of JSON a row, added as it comes: run again with the same file, and it goes on where it was. With --table the
 table is printed from what is there. A row says what was trained on and what was judged, the verdict, the names, and
@@ -82,13 +82,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="file of results, one line of JSON a row")
     parser.add_argument("--only", nargs="+", default=list(ROBOTS), choices=list(ROBOTS), metavar="ROBOT")
-    parser.add_argument("--unknown-term", action="store_true", help="add a smooth term where nothing has a sure name")
+    parser.add_argument("--no-unknown-term", action="store_true", help="add no term without a name")
     parser.add_argument("--table", action="store_true", help="print the table of what is there")
     arguments = parser.parse_args()
     rows = _read(arguments.out)
     if not arguments.table:
         with arguments.out.open("a") as file:
-            for row in _carried_out(arguments.only, {row.key for row in rows}, unknown_term=arguments.unknown_term):
+            for row in _carried_out(arguments.only, {row.key for row in rows}, unknown_term=not arguments.no_unknown_term):
                 file.write(row.model_dump_json() + "\n")
                 file.flush()
                 print(f"{row.key}: {row.verdict or row.failure}, {row.seconds:.0f} s", flush=True)
@@ -125,7 +125,7 @@ def _numbered(recording: Dataset) -> Dataset:
     return replace(recording, trajectories=tuple(runs))
 
 
-def carry_out(recording: Dataset, robot: str, way: Way, *, unknown_term: bool = False) -> Row:
+def carry_out(recording: Dataset, robot: str, way: Way, *, unknown_term: bool) -> Row:
     """Discover on the runs that train, and judge both models on the others."""
     trained = [replace(run, split="train") for run in recording.trajectories if way.trains(run)]
     judged = [replace(run, split="validation") for run in recording.trajectories if way.judges(run)]
