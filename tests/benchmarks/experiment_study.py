@@ -16,6 +16,7 @@ import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from hidden.forms import FORMS
@@ -144,8 +145,8 @@ def discovered_with_models(dataset: Dataset) -> tuple[Discovery, CompetingModels
     kept: list[CompetingModels] = []
     compete = discovering.competing_models
 
-    def keeping(*arguments: object) -> CompetingModels:
-        kept.append(compete(*arguments))  # type: ignore[arg-type]
+    def keeping(*arguments: Any) -> CompetingModels:
+        kept.append(compete(*arguments))
         return kept[-1]
 
     discovering.competing_models = keeping

@@ -88,7 +88,9 @@ def main() -> None:
     rows = _read(arguments.out)
     if not arguments.table:
         with arguments.out.open("a") as file:
-            for row in _carried_out(arguments.only, {row.key for row in rows}, unknown_term=not arguments.no_unknown_term):
+            for row in _carried_out(
+                arguments.only, {row.key for row in rows}, unknown_term=not arguments.no_unknown_term
+            ):
                 file.write(row.model_dump_json() + "\n")
                 file.flush()
                 print(f"{row.key}: {row.verdict or row.failure}, {row.seconds:.0f} s", flush=True)

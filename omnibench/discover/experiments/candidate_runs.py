@@ -27,9 +27,9 @@ RAMP = 0.3  # s at the start and the end of a run in which the speed changes: wh
 # Shapes: finer steps change the minutes little, because runs of several kinds are combined (chosen).
 _SHAPES = Shapes(lines=(1.0,), radii=(0.2, 0.5), turns=(180.0, 360.0), spins=(360.0, 1080.0), paces=(1.0, 0.5, 0.25))
 _HEADINGS = (0.0, 90.0, 180.0, 270.0)  # deg, at the start, for effects that depend on the heading
-_OFTEN = 0.99  # share of the samples that are no faster than what the robot is taken to be able to do: spikes are not
+_OFTEN = 0.99  # quantile of the speeds that the robot is taken to be able to drive: spikes lie beyond (chosen)
 _LEAST_FLOOR = 1.0  # m, side of the floor that is free in any case: the robot stands somewhere (chosen)
-_LEAST_STEERING = math.radians(10.0)  # of a robot that only ever drove straight on (chosen)
+_LEAST_STEERING = math.radians(10.0)  # rad: limit of the steering where a robot only drove straight on (chosen)
 _TURNING = 1.0  # rad/s: at most, where the robot never turned as fast (chosen)
 _WEAVE, _WEAVE_PERIOD = 0.3, 3.0  # rad/s and s, by which the rate of turn swings: gear play of a degree shows (chosen)
 _COARSE = 0.05  # s: shorter samples tell the same of constant commands
@@ -80,7 +80,7 @@ def _drivable(fit: Fit, variation: Variation) -> Iterator[TimedCommand]:
     twists = of_centre(robot, motions)
     speed = _mostly(np.hypot(twists[:, 0], twists[:, 1]))
     turning = _mostly(np.abs(twists[:, 2]))
-    speed = max(speed, turning * robot.reach)  # of a robot that only turned
+    speed = max(speed, turning * robot.reach)  # a robot that only turned has wheels that drove that fast
     steering = [np.abs(run.steering).max(axis=1) for run in fit.runs if run.steering is not None and run.steering.size]
     side = max(float(np.ptp(run.poses[:, :2], axis=0).max()) for run in fit.runs)
     limit = max(_mostly(np.concatenate(steering)), _LEAST_STEERING) if steering else math.pi

@@ -47,13 +47,13 @@ from omnibench.discover.selection.model_selection import SURE
 from omnibench.fit.least_squares.whitened import Given, Whitened
 from omnibench.robot.kinematics import Array
 
-_DRAWS = 8  # of the values of each member: half and twice as many change the minutes of omni3's plan by less than 10 %
+_DRAWS = 8  # draws of each member's values: half and twice as many change the minutes of omni3's plan by under 10 %
 _PLAUSIBLE = 3.0  # times the plausible size: a larger effect is not to be expected (tests/benchmarks/hidden/sets.py)
 # s: radii change by so much with temperature, pressure and load within a day (chosen). A change by 0.3 % of all radii
 # leaves the names of a small flower right, one by 1 % makes a class of them again.
 _CHANGE = 0.002
-_MOST_SHARE = 0.99  # of a class's weight: where the class itself is not sure, runs can settle no more than its member
-_RIDGE = 1e-9  # of columns of unit length: what no run determines stays at 0, and nothing else changes
+_MOST_SHARE = 0.99  # share of a class's weight at which its member counts as settled; the class may be no surer
+_RIDGE = 1e-9  # ridge of columns of unit length: values that no run determines stay at 0
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from io import BufferedRandom
 from itertools import accumulate, pairwise
-from typing import IO, overload
+from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +32,7 @@ class ColumnStore(Sequence[Array]):
 
     def __init__(self) -> None:
         self._blocks: list[_Block] = []
-        self._file: IO[bytes] | None = None
+        self._file: BufferedRandom | None = None
         self._held = self._written = 0  # bytes
 
     def append(self, columns: Array, counts: Sequence[int]) -> None:
@@ -70,7 +71,7 @@ class ColumnStore(Sequence[Array]):
         assert self._file is not None  # the block is in it
         values = np.empty(block.shape, dtype=np.float32)
         self._file.seek(block.offset)
-        self._file.readinto(values.data)  # type: ignore[attr-defined]  # a file of bytes has it
+        self._file.readinto(values.data)
         return values
 
     @property

@@ -229,7 +229,7 @@ def make_paths(
     assert order == list(range(len(logs))), "runs come by session"
     samples = RunSamples.of([log.times for log in logs])
     sessions, starts = _sessions(logs, samples.edges), np.array([log.start for log in logs])
-    needs = frozenset(_needs(robot) if needs is None else needs) - {"poses"}  # which are computed in any case
+    needs = frozenset(_needs(robot) if needs is None else needs) - {"poses"}  # poses are computed in any case
     of_sessions = [
         signals_of_runs(
             logs[low:high], RunSamples.of([log.times for log in logs[low:high]]), robot, matrix, sample_period, needs

@@ -172,7 +172,7 @@ def what_blocks(discovery: Discovery) -> Iterator[Block]:
 
 
 def _experiment(experiment: Experiment, file: str) -> Iterator[Block]:
-    """What to drive to tell the members of a class apart."""
+    """The paragraph, table and config of the runs that tell the members of a class apart."""
     yield Paragraph(f"To separate {listing(list(experiment.separates))}: {experiment.description}")
     if experiment.commands:
         yield experiment_table(experiment)

@@ -135,7 +135,7 @@ def log_evidence(chi_square: Array, rank: Array, energy: float, discrepancy: flo
 
 
 def form_evidence(now: Given, groups: Sequence[Group], energy: float, discrepancy: float) -> float:
-    """What the forms of a set of effects add to the logarithm of its evidence, Eq. (3a). now: columns beyond others."""
+    """Gain of log evidence by the forms of a set of effects, Eq. (3a). now: columns beyond others."""
     forms = forms_of(groups)
     if not forms:
         return 0.0

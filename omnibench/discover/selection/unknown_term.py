@@ -45,8 +45,8 @@ _FINE = 8  # bases of fine structure, at most: neighbours of the surest are amon
 # place gained on each and lost on squares, 107 mm to 168 mm.
 _COMMANDS = 12
 _FAMILIES = 2  # effects of the catalogue that are tried
-_ROUNDS = 3  # terms that are added one after another, at most: as many as effects are named
-_COVARIATES = 2  # that are tried each time: as many as a headline names
+_ROUNDS = 3  # most terms that are added one after another: as many as effects are named
+_COVARIATES = 2  # covariates that are tried for a term: as many as a headline names
 _PRICE = 2.0  # times v d, Eq. (1)
 _DETERMINED = 0.01  # share of a function that must be left beyond the others: its standard error is 10 times its own
 _LARGEST = 3.0  # times the plausible range: a larger coefficient stands for something else

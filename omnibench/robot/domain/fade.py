@@ -79,7 +79,7 @@ class Fade:
         rows = elements + known
         strengths, vectors = np.linalg.eigh(covariance[np.ix_(rows, rows)] / np.outer(sizes, sizes))
         kept = strengths > _KNOWN * strengths.max(initial=0.0)
-        self._roots = vectors[:, kept] * np.sqrt(strengths[kept])  # of S, in units of the standard deviations
+        self._roots = vectors[:, kept] * np.sqrt(strengths[kept])  # square root of S, in standard deviations
         inverse = vectors[:, kept] / np.sqrt(strengths[kept])
         along = covariance[:elements, rows] / sizes @ inverse  # R S^+ of the roots
         self._matrices = along.T.reshape(-1, *change.shape)
