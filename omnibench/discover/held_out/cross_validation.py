@@ -23,8 +23,10 @@ from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.fitting.extend import Extended
+from omnibench.discover.fitting.model_fit import Fit
 from omnibench.fit.least_squares.repetitions import grouped
 from omnibench.fit.least_squares.whitened import Given, Whitened
+from omnibench.robot.domain.training_domain import kinds_of_motion
 from omnibench.robot.kinematics import Array
 
 _FOLDS = 5  # Hastie, Tibshirani and Friedman, Elements of Statistical Learning, 2009, section 7.10.1: five or ten
@@ -63,6 +65,17 @@ def folds_of_commands(runs: Sequence[Trajectory]) -> NDArray[np.intp]:
     for number, members in enumerate(grouped([run.command or run.id for run in runs])):
         folds[list(members)] = number % _FOLDS
     return folds
+
+
+def kinds_of_runs(fit: Fit) -> NDArray[np.intp]:
+    """The number (Z,) of the kind of motion of each run of a fit: of runs whose mean twists are near to each other."""
+    means = [run.signals.T @ np.diff(run.times, prepend=0.0) / run.times[-1] for run in fit.runs]
+    return kinds_of_motion(fit.model.robot, np.array(means) @ fit.model.matrix.T)
+
+
+def folds_of_kinds(fit: Fit) -> NDArray[np.intp]:
+    """A fold (Z,) for each run of a fit: all runs of a kind of motion go to the same one."""
+    return kinds_of_runs(fit) % _FOLDS
 
 
 def values_of_other_folds(data: Whitened, index: Sequence[int], folds: NDArray[np.intp]) -> Array:

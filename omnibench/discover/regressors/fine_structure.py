@@ -7,8 +7,8 @@ moves. The motion in a sample before stamp k then lowers it by
 
     g_d = sum over j >= k of h_j,    g_e = sum over j >= k of h_j(heading) + Re(conj(i (z_j - z)) h_j),            (1)
 
-and the score of a function f of a covariate in a mode m of motion (along the way, across it, turning) is the sum of
-f m g over a run's samples: one product of matrices for all functions, whatever their number.
+and the score of a function f of a covariate in a mode m of motion (along the way, across it, turning per way or by the
+rate of turn) is the sum of f m g over a run's samples: one product of matrices for all functions, whatever their number.
 
 With s_z the scores of run z for the d columns of a basis, s their sum and S = sum of (s_z - s / Z)(s_z - s / Z)',
 
@@ -34,7 +34,7 @@ from omnibench.discover.regressors.covariate_bases import Basis
 from omnibench.discover.regressors.paths import Paths
 from omnibench.discover.regressors.significance import Significance, significance_of_scores
 from omnibench.robot.effects.effect import Values
-from omnibench.robot.effects.smooth.motion import beyond, bump, lever
+from omnibench.robot.effects.smooth.motion import MODES, beyond, bump, lever
 from omnibench.robot.kinematics import Array
 
 _COARSE = 0.1  # s: wheel samples are merged up to this duration
@@ -85,13 +85,13 @@ def fine_structure(fit: Fit, rng: np.random.Generator) -> Significance | None:
 
 
 def _pull(fit: Fit, paths: Paths) -> Array:
-    """The change of half the chi-square (F, 3) by each sample's motion, times a share, in each of three modes."""
+    """The change of half the chi-square (F, 4) by each sample's motion, times a share, in each of the modes."""
     signals = paths.signals
     middle, durations = paths.middle[:, 0] + 1j * paths.middle[:, 1], signals.durations
     twists = signals.twists
     way = (twists[:, 0] + 1j * twists[:, 1]) * np.exp(1j * paths.middle[:, 2]) * durations
     turn = (np.abs(twists[:, 2]) + np.hypot(twists[:, 0], twists[:, 1]) / lever(paths.robot)) * durations
-    pull = np.zeros((len(middle), 3))
+    pull = np.zeros((len(middle), len(MODES)))
     first = 0
     weighted = fit.weighted_residuals
     for log, part, gradient in zip(paths.logs, paths.parts, weighted, strict=True):
@@ -108,11 +108,12 @@ def _pull(fit: Fit, paths: Paths) -> Array:
         pull[rows, 0] = np.real(np.conj(way[rows]) * moved)
         pull[rows, 1] = np.real(np.conj(1j * way[rows]) * moved)
         pull[rows, 2] = turn[rows] * turned
+        pull[rows, 3] = twists[rows, 2] * durations[rows] * turned
     return pull
 
 
 def _scores(edges: Sequence[int], pull: Array, values: Array) -> Array:
-    """Scores (Z, B, 3 J) of functions (F, B, J) in three modes: of all of a run's samples, which begin at the edges.
+    """Scores (Z, B, m J) of functions (F, B, J) in m modes: of all of a run's samples, which begin at the edges.
 
     The functions count from their means, as the matrix holds what is the same everywhere.
     """

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from omnibench.discover.fitting.extend import Extended
 from omnibench.discover.fitting.model_fit import Fit, paths_of
-from omnibench.discover.held_out.cross_validation import folds_of_repetitions, is_confirmed
+from omnibench.discover.held_out.cross_validation import folds_of_repetitions, is_confirmed, kinds_of_runs
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.regressors.column_store import ColumnStore
 from omnibench.discover.regressors.significance import Significance, significance_of
@@ -28,13 +28,15 @@ _COARSE = 0.03
 class Screening:
     """Columns of all candidates against the residuals of the plain matrix.
 
-    folds (Z,): by which runs are held out. quantisation: the encoders', None where it does not matter.
+    folds (Z,): by which runs are held out. quantisation: the encoders', None where it does not matter. kinds: number of
+    kinds of motion that the runs drive, None where these do not matter.
     """
 
     groups: Groups
     data: Whitened
     folds: NDArray[np.intp]
     quantisation: EncoderQuantisation | None = None
+    kinds: int | None = None
 
     def beyond_matrix(self) -> Given:
         """Schur complement of all columns once the matrix is fitted."""
@@ -97,7 +99,8 @@ def _groups_at(fit: Fit, without: Sequence[str]) -> Groups:
 
 def _screened(fit: Fit, residuals: Sequence[Array], groups: Groups) -> Screening:
     data = _whitened(fit, groups, residuals)
-    return Screening(groups, data, folds_of_repetitions(fit.runs), EncoderQuantisation(fit, data))
+    kinds = len(set(kinds_of_runs(fit).tolist()))
+    return Screening(groups, data, folds_of_repetitions(fit.runs), EncoderQuantisation(fit, data), kinds)
 
 
 def _whitened(fit: Fit, groups: Groups, residuals: Sequence[Array], fitted: Sequence[Array] | None = None) -> Whitened:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from omnibench.discover.covariate_dependence import weights_of_covariates
 from omnibench.discover.fitting.extend import Extended, columns_of, extend
 from omnibench.discover.fitting.model_fit import Fit
-from omnibench.discover.held_out.cross_validation import folds_of_commands, held_out_chi_square, is_gain
+from omnibench.discover.held_out.cross_validation import folds_of_kinds, held_out_chi_square, is_gain, kinds_of_runs
 from omnibench.discover.regressors.column_group import Group, best_shapes
 from omnibench.discover.regressors.covariate_bases import Basis
 from omnibench.discover.regressors.significance import Significance
@@ -35,15 +35,17 @@ from omnibench.discover.selection.screening import Screening
 from omnibench.fit.least_squares.whitened import Whitened, given
 from omnibench.registry import effects
 from omnibench.robot.kinematics import Array, Robot
+from omnibench.words import plural
 
 # tests/benchmarks/constants.py varies each number by 0.5 and 2, also where nothing has a name: what is said of gaps on
 # held-out runs changes only at half the price, where none of the wet patch's counts as closed.
 _GRID = 6  # patches of the map along each side of the area
 _MOST = 5  # bases that are put together, at most
 _FINE = 8  # bases of fine structure, at most: neighbours of the surest are among them
-# Commands without which a gain on those held out says nothing of other paths: with omni3's four circles, terms over the
-# place gained on each and lost on squares, 107 mm to 168 mm.
-_COMMANDS = 12
+# Kinds of motion without which a gain on those held out says nothing of other paths. On recordings of real robots terms
+# gained where 36 kinds were driven (robotino, by 12 %), and lost with 4 to 8 of them (omni3's circles, 107 mm to 112 mm
+# on squares; diff, 7 mm to 17 mm): tests/benchmarks/real_discovery.py.
+_KINDS = 12
 _FAMILIES = 2  # effects of the catalogue that are tried
 _ROUNDS = 3  # most terms that are added one after another: as many as effects are named
 _COVARIATES = 2  # covariates that are tried for a term: as many as a headline names
@@ -97,18 +99,18 @@ def add_smooth_terms(
     another, badly. folds (Z,): the fold in which each run is held out where no command can be, as a function of the
     command says nothing of others.
     """
-    commands, notes = folds_of_commands(plain.runs), list[str]()
-    if (count := len({run.command or run.id for run in plain.runs})) < _COMMANDS:
-        few = f"No unnamed term was tried: {count} commands do not tell whether it would hold for others."
+    kinds, notes = folds_of_kinds(plain), list[str]()
+    if (count := len(set(kinds_of_runs(plain).tolist()))) < _KINDS:
+        few = f"No unnamed term was tried: {plural(count, 'kind')} of motion cannot tell whether it holds for others."
         return SmoothTerm(models, left, (few,))
     for _ in range(_ROUNDS):
         covariates = _surest_covariates(left)
         trials = [
             trial
             for name in covariates
-            for trial in _trials(screening, models.used, left, name, folds if name == "command" else commands)
+            for trial in _trials(screening, models.used, left, name, folds if name == "command" else kinds)
         ]
-        trials += _of_families(screening, models.used, commands) if covariates and not notes else ()
+        trials += _of_families(screening, models.used, kinds) if covariates and not notes else ()
         best = max(trials, key=lambda trial: float(trial.gains.mean()), default=None)
         if best is None or not is_gain(best.gains):
             if not notes:
@@ -116,7 +118,7 @@ def add_smooth_terms(
             break
         weighted = tuple((weight, extend(plain, [*model.groups, *best.terms])) for weight, model in models.weighted)
         models = replace(models, used=weighted[0][1], weighted=weighted)
-        notes.append(f"The extended model holds {best.words}: on commands held out it gains {best.gained}.")
+        notes.append(f"The extended model holds {best.words}: on motions held out it gains {best.gained}.")
         left = looking_again(models.used)
     return SmoothTerm(models, left, tuple(notes))
 
@@ -126,7 +128,7 @@ def _nothing_added(covariates: Sequence[str], best: _Trial | None) -> str:
         return "No unnamed term was tried: nothing that is left depends on what a model could use."
     if best is None:
         return f"No unnamed term was added: no function of {' or '.join(covariates)} is plainly there by itself."
-    return f"{_capital(best.words)} was tried and left out: on commands held out it gains {best.gained}."
+    return f"{_capital(best.words)} was tried and left out: on motions held out it gains {best.gained}."
 
 
 def _surest_covariates(left: Significance) -> list[str]:

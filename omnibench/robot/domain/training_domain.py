@@ -39,6 +39,19 @@ def representatives(robot: Robot, motions: Array) -> Array:
     return motions[chosen]
 
 
+def kinds_of_motion(robot: Robot, motions: Array) -> NDArray[np.intp]:
+    """The number (k,) of the kind of each of several motions (k, 3): all of a kind are near to its first one."""
+    at_wheels = motions * _scale(robot)
+    near, firsts, kinds = _NEAR * _size(at_wheels), list[Array](), []
+    for motion in at_wheels:
+        distances = [float(np.linalg.norm(motion - first)) for first in firsts]
+        kind = next((number for number, distance in enumerate(distances) if distance < near), len(firsts))
+        kinds.append(kind)
+        if kind == len(firsts):
+            firsts.append(motion)
+    return np.array(kinds, dtype=np.intp)
+
+
 def extrapolated_share(robot: Robot, fitted: Array, motions: Array) -> tuple[float, str]:
     """The share of motions (k, 3) outside the training domain of ``fitted`` (n, 3), and what they are, in words."""
     domain = TrainingDomain(robot, fitted)

@@ -89,7 +89,7 @@ def test_it_is_a_step_and_the_notes_tell_what_it_gains(grooved: tuple[Dataset, T
     assert found.steps[0].held_out is not None
     assert found.steps[1].held_out < found.steps[0].held_out
     (told,) = [note for note in found.notes if "unnamed term" in note]
-    assert "on commands held out it gains" in told
+    assert "on motions held out it gains" in told
 
 
 def test_the_calibration_file_predicts_the_same(grooved: tuple[Dataset, Truth, Discovery], tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ MODES = {
     "turn": "in turning, per way of the wheels",
     "rotation": "of the rate of turn",
 }
+ALL_MODES = tuple(MODES)
 
 
 def scale(name: str, unit: str, low: float, high: float, usual: float, description: str) -> Parameter:
@@ -174,9 +175,10 @@ class SmoothHeadingWave(SmoothEffect):
 
     shows_in = "heading"
     needs = frozenset({"poses"})
+    modes = ALL_MODES
     labels = ("cos", "sin")
     fixed_parameters = (
-        *shared(SmoothEffect.modes, labels, "the heading"),
+        *shared(ALL_MODES, labels, "the heading"),
         scale("harmonic", "1", 1.0, 64.0, 4.0, "waves in a turn of the robot"),
     )
 
@@ -237,8 +239,9 @@ class SmoothPatch(SmoothEffect):
 
     shows_in = "place"
     needs = frozenset({"poses"})
+    modes = ALL_MODES
     labels = ("bump",)
-    fixed_parameters = (*shared(SmoothEffect.modes, labels, "the place"), *PATCH)
+    fixed_parameters = (*shared(ALL_MODES, labels, "the place"), *PATCH)
 
     def shares(self, signals: Signals, values: Values) -> Array:
         assert signals.poses is not None  # they are needed
@@ -251,9 +254,10 @@ class SmoothPlaceWave(SmoothEffect):
 
     shows_in = "place"
     needs = frozenset({"poses"})
+    modes = ALL_MODES
     labels = ("cos", "sin")
     fixed_parameters = (
-        *shared(SmoothEffect.modes, labels, "the place"),
+        *shared(ALL_MODES, labels, "the place"),
         scale("along_x", "rad/m", -1e3, 1e3, 10.0, "phase per way along x of the reference"),
         scale("along_y", "rad/m", -1e3, 1e3, 0.0, "phase per way along y of the reference"),
     )
@@ -269,9 +273,10 @@ class SmoothEdge(SmoothEffect):
 
     shows_in = "place"
     needs = frozenset({"poses"})
+    modes = ALL_MODES
     labels = ("beyond",)
     fixed_parameters = (
-        *shared(SmoothEffect.modes, labels, "the line"),
+        *shared(ALL_MODES, labels, "the line"),
         scale("normal", "rad", -7.0, 7.0, 0.0, "direction across the line, in the reference's frame"),
         scale("distance", "m", -1e6, 1e6, 0.0, "of the line from the reference's origin along that direction"),
         scale("width", "m", 1e-6, 1e6, 0.05, "over which the change sets in"),
