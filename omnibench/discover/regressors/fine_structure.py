@@ -8,7 +8,7 @@ moves. The motion in a sample before stamp k then lowers it by
     g_d = sum over j >= k of h_j,    g_e = sum over j >= k of h_j(heading) + Re(conj(i (z_j - z)) h_j),            (1)
 
 and the score of a function f of a covariate in a mode m of motion (along the way, across it, turning per way or by the
-rate of turn) is the sum of f m g over a run's samples: one product of matrices for all functions, whatever their number.
+rate of turn) is the sum of f m g over a run's samples: one product of matrices for all functions, however many.
 
 With s_z the scores of run z for the d columns of a basis, s their sum and S = sum of (s_z - s / Z)(s_z - s / Z)',
 
@@ -31,6 +31,7 @@ import numpy as np
 from omnibench.discover.fitting.model_fit import Fit, paths_of
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.regressors.covariate_bases import Basis
+from omnibench.discover.regressors.floor_joints import floor_joints
 from omnibench.discover.regressors.paths import Paths
 from omnibench.discover.regressors.significance import Significance, significance_of_scores
 from omnibench.robot.effects.effect import Values
@@ -38,6 +39,7 @@ from omnibench.robot.effects.smooth.motion import MODES, beyond, bump, lever
 from omnibench.robot.kinematics import Array
 
 _COARSE = 0.1  # s: wheel samples are merged up to this duration
+_FINE = 0.03  # s: the same for joints of the floor, which a robot crosses within this
 _HARMONICS = 12  # of the heading
 _WAVES = 400  # plane waves over the floor, at most; the shortest are left out
 _DIRECTIONS, _LINES = 12, 9  # directions of lines across the floor, and lines for each
@@ -81,6 +83,10 @@ def fine_structure(fit: Fit, rng: np.random.Generator) -> Significance | None:
                     )
                     groups.append(Group("covariate", kind.covariate, (), tries=basis.tries, basis=basis))
                     scores.append(of_runs)
+    finer = paths_of(fit, _FINE)
+    for group, of_runs in floor_joints(finer, _pull(fit, finer)):
+        groups.append(group)
+        scores.append(of_runs)
     return significance_of_scores(groups, scores, scores, rng) if groups else None
 
 

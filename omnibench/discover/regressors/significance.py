@@ -34,7 +34,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from omnibench.discover.regressors.column_group import Group, best_shapes
@@ -42,6 +41,7 @@ from omnibench.fit.least_squares.whitened import Given, Whitened, given
 from omnibench.robot.kinematics import Array
 
 # tests/benchmarks/constants.py varies each number by 0.5 and 2 on small blind sets: no verdict and no name changes.
+_TOGETHER = 2000  # columns whose signs are changed at once, so that memory is small (chosen)
 _FLIPS = 499  # B; Eq. (3) gives chances smaller than 1 / B (at 5 %, 99 would do: Davison and Hinkley, section 4.2.5)
 _TAIL = 0.1  # k / B: Knijnenburg et al. fit no more than a quarter of the flips
 _ENOUGH = 0.25  # share of the k that must reach z for Eq. (2): 12 flips, at least 10 in Knijnenburg et al.
@@ -150,7 +150,7 @@ def significance_of_scores(
     steady = np.array([_without_any_one(of_runs) for of_runs in scores])
     spread = np.maximum([float(np.square(of_runs).sum()) / max(of_runs.shape[1], 1) for of_runs in by_chance], 1.0)
     signs = rng.choice([-1.0, 1.0], size=(_FLIPS, len(by_chance[0]) if by_chance else 0))
-    flipped = _sums_by_group(np.square(signs @ np.concatenate(by_chance, axis=1)), rank.astype(int))
+    flipped = _flipped(signs, by_chance)
     chance = _evidence(flipped, rank, spread, tries)
     evidence = _evidence(steady[None], rank, spread, tries)[0]
     scatter = np.sqrt(2 * np.maximum(rank, 1.0)) * spread
@@ -170,12 +170,19 @@ def significance_of_scores(
     )
 
 
-def _sums_by_group(values: Array, counts: NDArray[np.intp]) -> Array:
-    """Sums (B, G) of values (B, D), of so many columns of each group in turn."""
-    totals = np.cumsum(np.concatenate([np.zeros((len(values), 1)), values], axis=1), axis=1)
-    ends = np.cumsum(counts)
-    sums: Array = totals[:, ends] - totals[:, ends - counts]
-    return sums
+def _flipped(signs: Array, scores: Sequence[Array]) -> Array:
+    """Chi-square differences (B, G) of groups by their scores (Z, d), the signs of whole runs changed B times."""
+    chi_square = np.zeros((len(signs), len(scores)))
+    first = 0
+    for last in range(1, len(scores) + 1):
+        columns = [of_runs.shape[1] for of_runs in scores[first:last]]
+        if last == len(scores) or sum(columns) >= _TOGETHER:
+            squares = np.square(signs @ np.concatenate(scores[first:last], axis=1))
+            totals = np.cumsum(np.concatenate([np.zeros((len(signs), 1)), squares], axis=1), axis=1)
+            ends = np.cumsum(columns)
+            chi_square[:, first:last] = totals[:, ends] - totals[:, ends - columns]
+            first = last
+    return chi_square
 
 
 def _without_any_one(scores: Array) -> float:

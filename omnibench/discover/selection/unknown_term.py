@@ -185,7 +185,7 @@ def surest_bases(screening: Screening, base: Extended, left: Significance, covar
         elif group.basis is not None:
             of_stages.setdefault(group.basis.stage, []).append(group)
     found = [_together(screening.data, groups, before, price) for groups in of_stages.values()]
-    surest = sorted(fine, key=lambda index: -excess[index])[:_FINE]
+    surest = sorted(fine, key=lambda index: (-left.evidence[index], -excess[index]))[:_FINE]
     found.append([left.groups[index] for index in surest if excess[index] > 0])
     return [[group.basis for group in groups if group.basis is not None] for groups in found if groups]
 
@@ -222,7 +222,7 @@ def _groups_of(bases: Sequence[Basis], robot: Robot) -> Iterator[Group]:
 
 def _terms_of(basis: Basis) -> Iterator[tuple[str, Mapping[str, float]]]:
     """The terms whose functions are candidates: the basis's own, and finer ones."""
-    yield basis.term, basis.shapes
+    yield from ((basis.term, shapes) for shapes in basis.parts or (basis.shapes,))
     if basis.term == "smooth_wheel_rate":
         yield "smooth_common_rate", basis.shapes
     if basis.term == "smooth_map":

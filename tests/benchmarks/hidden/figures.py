@@ -94,7 +94,8 @@ def _outside_row(results: Sequence[Result], level: float, least: str, aim: str) 
 
 
 def _flagged(judged: Judgement) -> bool:
-    return judged.verdict in ("unknown", "incomplete")
+    """Said to be without a name; or with the one that the catalogue has for it after all (Unheard.called)."""
+    return judged.verdict in ("unknown", "incomplete") or judged.outcome == "right"
 
 
 def _closed_unknown(results: Sequence[Result]) -> Iterable[float | None]:
@@ -138,6 +139,12 @@ def further_table(results: Sequence[Result]) -> list[Row]:
         Row("outside: confident wrong name", "", "", rate(outside, _confident_wrong)),
         Row("fine structure, flagged", "", "", rate(of_group(results, "fine", level=STRONG), _flagged)),
         Row("fine structure, flagged at 300", "", "", rate(of_group(results, "fine", level=MEDIUM), _flagged)),
+        Row(
+            "fine structure that the catalogue has a name for, so named",
+            "",
+            "",
+            rate(of_group(results, "fine"), _first),
+        ),
         Row("fine structure: confident wrong name", "", "", rate(of_group(results, "fine"), _confident_wrong)),
         Row("error of stated weights, all sets", "", "", weight_error(every)),
         Row("nuisances named", "", "", rate(of_group(results, "nuisance"), _named)),

@@ -31,6 +31,11 @@ def _wheel_harmonic(grid: Grid, values: Values, rng: np.random.Generator) -> Cor
     return Correction(wheel=values["size"] * wheels * np.cos(times * grid.angles + phase) * grid.rates)
 
 
+def _name_of_wheel_harmonic(rng: np.random.Generator) -> tuple[str, ...]:
+    """A radius that changes n times a turn is the catalogue's roller ripple of n rollers, from three on."""
+    return ("roller_ripple",) if rng.integers(2, 9) >= 3 else ()
+
+
 def _tiles(grid: Grid, values: Values, rng: np.random.Generator) -> Correction:
     """Joints of square tiles that slow the robot within centimetres, or jolt its heading, each by its own height."""
     pitch, angle, width = rng.uniform(0.2, 0.5), rng.uniform(0, np.pi / 2), rng.uniform(0.008, 0.02)  # m, rad, m
@@ -77,7 +82,7 @@ def _yaw(rates: Array) -> Correction:
 
 FINE: dict[str, Unheard] = {
     "heading_harmonic": Unheard(_heading_harmonic, ("heading",), 0.05),
-    "wheel_harmonic": Unheard(_wheel_harmonic, ("wheel angle",), 0.05, design="precise"),
+    "wheel_harmonic": Unheard(_wheel_harmonic, ("wheel angle",), 0.05, "precise", _name_of_wheel_harmonic),
     "tiles": Unheard(_tiles, ("place",), 0.1),
     "carpet_edge": Unheard(_carpet_edge, ("place",), 0.05),
     "shimmy": Unheard(_shimmy, ("elapsed time",), 0.05),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,13 +17,15 @@ from .motion import Correction, Grid
 class Unheard:
     """An effect without a name. covariates: where a locator should see it; one of them is enough.
 
-    plausible: what size "amplitude" = 1 is scaled from. design: where it can be seen.
+    plausible: what size "amplitude" = 1 is scaled from. design: where it can be seen. called: the names that the
+    catalogue has for what is drawn from a generator after all.
     """
 
     make: Make
     covariates: tuple[str, ...]
     plausible: float
     design: str = "rich"
+    called: Callable[[np.random.Generator], tuple[str, ...]] = lambda _: ()
 
 
 def _turn(rates: Array) -> Correction:

@@ -46,7 +46,10 @@ class Hidden:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """Truth of a data set. clean: its runs without noise. covariates: of effects outside the catalogue only."""
+    """Truth of a data set. clean: its runs without noise.
+
+    covariates, called: of effects outside the catalogue only; called: names that it has for them after all.
+    """
 
     kind: Kind
     hidden: tuple[Hidden, ...]
@@ -59,10 +62,11 @@ class Truth:
     clean: tuple[Trajectory, ...]
     seeds: tuple[tuple[int, ...], ...]
     covariates: tuple[str, ...] = ()
+    called: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
-        return tuple(each.name for each in self.hidden)
+        return (*(each.name for each in self.hidden), *self.called)
 
     @property
     def reachable(self) -> bool:
@@ -116,8 +120,13 @@ def make_set(
         correction += make_of(kind, each.name, form)(grid, each.values, np.random.default_rng(each_seed))
     clean = _trajectories(grid, grid.poses(correction), _Wheels.of(grid, correction))
     dataset = make_dataset("recording", ROBOT, SAMPLE, recorded(grid, correction, disturbance, rng), simulated=True)
-    covariates = UNHEARD[names[0]].covariates if kind == "outside" else ()
-    return dataset, Truth(kind, hidden, form, design, noise, matrix, disturbance, runs, clean, seeds, covariates)
+    covariates, called = (), ()
+    if kind == "outside":
+        unheard = UNHEARD[names[0]]
+        covariates, called = unheard.covariates, unheard.called(np.random.default_rng(seeds[0]))
+    return dataset, Truth(
+        kind, hidden, form, design, noise, matrix, disturbance, runs, clean, seeds, covariates, called
+    )
 
 
 def form_of(kind: Kind, name: str) -> Form:

@@ -88,10 +88,15 @@ def bump(places: Array, values: Values) -> Array:
     return np.exp(-np.square(away).sum(axis=1, keepdims=True))
 
 
+def across(places: Array, values: Values) -> Array:
+    """Distances (F,) of positions (F, 2) from a line, on the side of its normal positive, m."""
+    distances: Array = places @ [np.cos(values["normal"]), np.sin(values["normal"])] - values["distance"]
+    return distances
+
+
 def beyond(places: Array, values: Values) -> Array:
     """A soft step (F, 1) of positions (F, 2), from 0 to 1 across a line."""
-    across = places @ [np.cos(values["normal"]), np.sin(values["normal"])] - values["distance"]
-    return (0.5 + 0.5 * np.tanh(across / values["width"]))[:, None]
+    return (0.5 + 0.5 * np.tanh(across(places, values) / values["width"]))[:, None]
 
 
 AREA = (
@@ -102,6 +107,12 @@ AREA = (
 PATCH = (
     *AREA[:2],
     scale("radius", "m", 1e-6, 1e6, 2.0, "from the centre, where 1/e of the change is left"),
+)
+
+
+LINE = (
+    scale("normal", "rad", -7.0, 7.0, 0.0, "direction across the line, in the reference's frame"),
+    scale("distance", "m", -1e6, 1e6, 0.0, "of the line from the reference's origin along that direction"),
 )
 
 
@@ -277,14 +288,32 @@ class SmoothEdge(SmoothEffect):
     labels = ("beyond",)
     fixed_parameters = (
         *shared(ALL_MODES, labels, "the line"),
-        scale("normal", "rad", -7.0, 7.0, 0.0, "direction across the line, in the reference's frame"),
-        scale("distance", "m", -1e6, 1e6, 0.0, "of the line from the reference's origin along that direction"),
+        *LINE,
         scale("width", "m", 1e-6, 1e6, 0.05, "over which the change sets in"),
     )
 
     def shares(self, signals: Signals, values: Values) -> Array:
         assert signals.poses is not None  # they are needed
         return beyond(signals.poses[:, :2], values)
+
+
+@effects.register("smooth_joint")
+class SmoothJoint(SmoothEffect):
+    """Unknown effect: a joint of the floor along a straight line, as between two rows of tiles."""
+
+    shows_in = "place"
+    needs = frozenset({"poses"})
+    modes = ALL_MODES
+    labels = ("joint",)
+    fixed_parameters = (
+        *shared(ALL_MODES, labels, "the line"),
+        *LINE,
+        scale("width", "m", 1e-6, 1e6, 0.03, "across the joint, where 1/e of the change is left on either side"),
+    )
+
+    def shares(self, signals: Signals, values: Values) -> Array:
+        assert signals.poses is not None  # they are needed
+        return np.exp(-np.square(across(signals.poses[:, :2], values) / values["width"]))[:, None]
 
 
 @effects.register("smooth_command")
