@@ -41,6 +41,7 @@ from omnibench.robot.kinematics import Array
 _COARSE = 0.1  # s: wheel samples are merged up to this duration
 _FINE = 0.03  # s: the same for joints of the floor, which a robot crosses within this
 _HARMONICS = 12  # of the heading
+_SWINGS, _OF_SESSION = 48, 12  # half periods in the longest run and session (chosen; in 10 s, up to 2.4 Hz)
 _WAVES = 400  # plane waves over the floor, at most; the shortest are left out
 _DIRECTIONS, _LINES = 12, 9  # directions of lines across the floor, and lines for each
 _EDGE = 0.05  # m, over which the floor changes at a line
@@ -144,7 +145,7 @@ def _independent(scores: Array) -> list[Array]:
 
 
 def _kinds(paths: Paths) -> Iterator[_Kind]:
-    """Functions of heading and place, as fine as the paths allow."""
+    """Functions of heading, time and place, as fine as the paths allow."""
     heading, places = paths.middle[:, 2], paths.middle[:, :2]
     harmonics = np.arange(1.0, _HARMONICS + 1)
     yield _Kind(
@@ -154,6 +155,7 @@ def _kinds(paths: Paths) -> Iterator[_Kind]:
         [{"harmonic": float(number)} for number in harmonics],
         lambda part: _parts(np.exp(1j * heading[:, None] * harmonics[part])),
     )
+    yield from _waves_of_time(paths)
     low = places.min(axis=0)
     extent = places.max(axis=0) - low
     if extent.max() <= _EDGE:
@@ -177,6 +179,25 @@ def _kinds(paths: Paths) -> Iterator[_Kind]:
         ("smooth_patch", "a patch of the floor", patches, bump),
     ):
         yield _Kind("place", term, detail, shapes, partial(_over_places, function, places, shapes))
+
+
+def _waves_of_time(paths: Paths) -> Iterator[_Kind]:
+    """Waves of the time since the start of a run, and of a session, from half a period in the longest one on."""
+    of_session = paths.signals.session_time
+    kinds = [("elapsed time", "smooth_time_wave", "the time since the start, {frequency:.2g} times a second",
+              paths.signals.elapsed, _SWINGS)]  # fmt: skip
+    if of_session is not None:
+        words = "the time since the session's start, {frequency:.2g} times a second"
+        kinds.append(("order of runs", "smooth_session_wave", words, of_session, _OF_SESSION))
+    for covariate, term, detail, time, most in kinds:
+        frequencies = np.arange(1, most + 1) / (2 * max(float(time.max()), 1e-9))
+        shapes = [{"frequency": frequency} for frequency in frequencies.tolist()]
+        yield _Kind(covariate, term, detail, shapes, partial(_over_time, time, frequencies))
+
+
+def _over_time(time: Array, frequencies: Array, part: slice) -> Array:
+    """Values (F, B, 2) of waves of times (F,)."""
+    return _parts(np.exp(2j * np.pi * time[:, None] * frequencies[part]))
 
 
 def _over_places(

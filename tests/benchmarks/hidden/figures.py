@@ -140,7 +140,7 @@ def further_table(results: Sequence[Result]) -> list[Row]:
         Row("fine structure, flagged", "", "", rate(of_group(results, "fine", level=STRONG), _flagged)),
         Row("fine structure, flagged at 300", "", "", rate(of_group(results, "fine", level=MEDIUM), _flagged)),
         Row(
-            "fine structure that the catalogue has a name for, so named",
+            "fine structure, by the name that the catalogue has for it",
             "",
             "",
             rate(of_group(results, "fine"), _first),

@@ -24,7 +24,14 @@ from omnibench.robot.signals import Signals, signals_of
 MOTION = (
     *("smooth_elapsed_time", "smooth_heading", "smooth_course", "smooth_place", "smooth_patch", "smooth_command"),
     *("smooth_order_of_runs", "smooth_wheel_rate", "smooth_common_rate", "smooth_wheel_angle", "smooth_acceleration"),
-    *("smooth_heading_wave", "smooth_place_wave", "smooth_edge"),
+    *(
+        "smooth_heading_wave",
+        "smooth_place_wave",
+        "smooth_edge",
+        "smooth_joint",
+        "smooth_time_wave",
+        "smooth_session_wave",
+    ),
 )
 REFERENCE = ("smooth_map", "smooth_map_patch", "smooth_stamps", "smooth_stamp_wave")
 seeds = st.integers(0, 2**32 - 1)

@@ -166,6 +166,22 @@ class SmoothElapsedTime(SmoothEffect):
 _TURNS = ("cos1", "sin1", "cos2", "sin2", "cos3", "sin3")
 
 
+@effects.register("smooth_time_wave")
+class SmoothTimeWave(SmoothEffect):
+    """Unknown effect: a wave of the time since the start of a run, at one frequency."""
+
+    shows_in = "elapsed time"
+    modes = ALL_MODES
+    labels = ("cos", "sin")
+    fixed_parameters = (
+        *shared(ALL_MODES, labels, "the time since the start"),
+        scale("frequency", "Hz", 1e-6, 1e6, 1.0, "waves in a second"),
+    )
+
+    def shares(self, signals: Signals, values: Values) -> Array:
+        return waves(2 * np.pi * signals.elapsed, (values["frequency"],))
+
+
 @effects.register("smooth_heading")
 class SmoothHeading(SmoothEffect):
     """Unknown effect: the first three harmonics of the robot's heading."""
@@ -334,6 +350,24 @@ class SmoothCommand(SmoothEffect):
         away = signals.twists - [values["vx"], values["vy"], values["omega"]]
         away = away * [1.0, 1.0, lever(signals.robot)] / values["width"]
         return np.exp(-np.square(away).sum(axis=1, keepdims=True) / 2)
+
+
+@effects.register("smooth_session_wave")
+class SmoothSessionWave(SmoothEffect):
+    """Unknown effect: a wave of the time since the session's start, at one frequency."""
+
+    shows_in = "order of runs"
+    needs = frozenset({"session_time"})
+    modes = ALL_MODES
+    labels = ("cos", "sin")
+    fixed_parameters = (
+        *shared(ALL_MODES, labels, "the session's time"),
+        scale("frequency", "Hz", 1e-9, 1e6, 1e-3, "waves in a second"),
+    )
+
+    def shares(self, signals: Signals, values: Values) -> Array:
+        assert signals.session_time is not None  # it is needed
+        return waves(2 * np.pi * signals.session_time, (values["frequency"],))
 
 
 @effects.register("smooth_order_of_runs")
