@@ -168,26 +168,28 @@ def _of_families(screening: Screening, base: Extended, folds: NDArray[np.intp]) 
 
 
 def surest_bases(screening: Screening, base: Extended, left: Significance, covariate: str) -> list[list[Basis]]:
-    """Bases of a covariate that a model can use, those of each stage apart, and those of fine structure.
+    """Bases of a covariate that a model can use: those of each stage apart, and those of each term of fine structure.
 
-    Each gains beyond those before it.
+    Of a stage, each gains beyond those before it.
     """
     excess = left.excess - left.rank * left.spread  # Eq. (1) with v of each basis
     of_covariate = [index for index, group in enumerate(left.groups) if group.name == covariate and _term_of(group)]
     price = _PRICE * max(float(np.median(left.spread)), 1.0)  # Eq. (1)
     before = screening.index_with(base.groups)
     of_stages: dict[str, list[Group]] = {}
-    fine: list[int] = []
+    of_terms: dict[str, list[int]] = {}
     for index in of_covariate:
         group = left.groups[index]
         if not group.index:
-            fine.append(index)
+            of_terms.setdefault(_term_of(group), []).append(index)
         elif group.basis is not None:
             of_stages.setdefault(group.basis.stage, []).append(group)
     found = [_together(screening.data, groups, before, price) for groups in of_stages.values()]
-    surest = sorted(fine, key=lambda index: (-left.evidence[index], -excess[index]))[:_FINE]
-    found.append([left.groups[index] for index in surest if excess[index] > 0])
-    return [[group.basis for group in groups if group.basis is not None] for groups in found if groups]
+    for fine in of_terms.values():
+        surest = sorted(fine, key=lambda index: -excess[index])
+        found.append([left.groups[index] for index in surest[:_FINE] if excess[index] > 0])
+    bases = [[group.basis for group in groups if group.basis is not None] for groups in found if groups]
+    return [of_kind[:1] if of_kind[0].parts else of_kind for of_kind in bases]
 
 
 def _term_of(group: Group) -> str:
@@ -241,9 +243,11 @@ def _terms_of(basis: Basis) -> Iterator[tuple[str, Mapping[str, float]]]:
 
 
 def chosen_functions(base: Extended, groups: Sequence[Group]) -> list[Group]:
-    """Groups with only those functions that gain more than ln(runs) beyond matrix, effects and each other (BIC).
+    """Groups with only those functions that gain more than ln(runs) + ln(functions) beyond all others.
 
-    All other parameters are 0; groups without any function are left out. Functions are chosen one after another, the
+    This is the extended Bayesian information criterion with gamma = 1/2, which makes up for the choice among many
+    (J. Chen and Z. Chen, "Extended Bayesian information criteria for model selection with large model spaces",
+    Biometrika 95, 2008). All other parameters are 0; groups without any function are left out. Functions are chosen one after another, the
     largest gain first. Those that the data hardly determine beyond the chosen ones are passed over, and those that
     would need a coefficient far outside its plausible range.
     """
@@ -265,7 +269,7 @@ def _kept_functions(data: Whitened, groups: Sequence[Group]) -> list[int]:
         allowed = (size > _DETERMINED * left.total[first:]) & (np.abs(score) < limits * size)
         gain = np.where(allowed, np.square(score) / np.maximum(size, 1e-300), 0.0)
         best = int(gain.argmax())
-        if gain[best] <= np.log(len(data.scores)):  # Eq. (2)
+        if gain[best] <= np.log(len(data.scores)) + np.log(len(limits)):
             break
         kept.append(best)
         left = left.given([first + best])
