@@ -247,9 +247,9 @@ def chosen_functions(base: Extended, groups: Sequence[Group]) -> list[Group]:
 
     This is the extended Bayesian information criterion with gamma = 1/2, which makes up for the choice among many
     (J. Chen and Z. Chen, "Extended Bayesian information criteria for model selection with large model spaces",
-    Biometrika 95, 2008). All other parameters are 0; groups without any function are left out. Functions are chosen one after another, the
-    largest gain first. Those that the data hardly determine beyond the chosen ones are passed over, and those that
-    would need a coefficient far outside its plausible range.
+    Biometrika 95, 2008). All other parameters are 0; groups without any function are left out. Functions are chosen one
+    after another, the largest gain first. Those that the data hardly determine beyond the chosen ones are passed over,
+    and those that would need a coefficient far outside its plausible range.
     """
     return _restricted(groups, _kept_functions(_linearised(base, groups), groups))
 
