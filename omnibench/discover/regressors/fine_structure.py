@@ -33,7 +33,7 @@ from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.regressors.covariate_bases import Basis
 from omnibench.discover.regressors.floor_joints import floor_joints
 from omnibench.discover.regressors.paths import Paths
-from omnibench.discover.regressors.significance import Significance, significance_of_scores
+from omnibench.discover.regressors.significance import Significance, significance_of_scores, together
 from omnibench.robot.effects.effect import Values
 from omnibench.robot.effects.smooth.motion import MODES, beyond, bump, lever
 from omnibench.robot.kinematics import Array
@@ -68,27 +68,30 @@ def fine_structure(fit: Fit, rng: np.random.Generator) -> Significance | None:
     """Significance of fine structure in the residuals of a fitted model; None where nothing could show."""
     if len(fit.runs) < _RUNS:
         return None
-    paths = paths_of(fit, _COARSE)
-    pull, together = _pull(fit, paths), max(1, _NUMBERS // len(paths.owner))
-    edges = np.searchsorted(paths.owner, np.arange(len(fit.runs) + 1)).tolist()
-    groups: list[Group] = []
-    scores: list[Array] = []
-    for kind in _kinds(paths):
-        for low in range(0, len(kind.shapes), together):
-            part = slice(low, low + together)
-            independent = _independent(_scores(edges, pull, kind.values(part)))
-            for shape, of_runs in zip(kind.shapes[part], independent, strict=True):
-                if of_runs.shape[1]:
-                    basis = Basis(
-                        kind.covariate, "body", kind.detail.format(**shape), None, len(kind.shapes), kind.term, shape
-                    )
-                    groups.append(Group("covariate", kind.covariate, (), tries=basis.tries, basis=basis))
-                    scores.append(of_runs)
-    finer = paths_of(fit, _FINE)
-    for group, of_runs in floor_joints(finer, _pull(fit, finer)):
-        groups.append(group)
-        scores.append(of_runs)
-    return significance_of_scores(groups, scores, scores, rng) if groups else None
+    paths, finer = paths_of(fit, _COARSE), paths_of(fit, _FINE)
+    pull = _pull(fit, paths)
+    families = [*(_of_kind(paths, pull, kind) for kind in _kinds(paths)), floor_joints(finer, _pull(fit, finer))]
+    found: Significance | None = None
+    for family in families:
+        members = list(family)
+        if members:
+            groups, scores = zip(*members, strict=True)
+            found = together(significance_of_scores(groups, scores, scores, rng), found)
+    return found
+
+
+def _of_kind(paths: Paths, pull: Array, kind: _Kind) -> Iterator[tuple[Group, Array]]:
+    """Groups of one kind and their scores (Z, d)."""
+    edges = np.searchsorted(paths.owner, np.arange(len(paths.logs) + 1)).tolist()
+    at_once = max(1, _NUMBERS // len(paths.owner))
+    for low in range(0, len(kind.shapes), at_once):
+        part = slice(low, low + at_once)
+        independent = _independent(_scores(edges, pull, kind.values(part)))
+        for shape, of_runs in zip(kind.shapes[part], independent, strict=True):
+            if of_runs.shape[1]:
+                detail, tries = kind.detail.format(**shape), len(kind.shapes)
+                basis = Basis(kind.covariate, "body", detail, None, tries, kind.term, shape)
+                yield Group("covariate", kind.covariate, (), tries=tries, basis=basis), of_runs
 
 
 def _pull(fit: Fit, paths: Paths) -> Array:

@@ -16,10 +16,11 @@ chance is stated too large rather than too small. Of B flips, the chance p of an
 
     p = (1 + number of m_b >= z) / (B + 1)                                                                         (2)
 
-(Davison and Hinkley, Bootstrap methods and their application, 1997, Eq. 4.11). Where hardly any flip reaches z, an
-exponential tail is fitted to the k largest m_b (Knijnenburg et al., "Fewer permutations, more accurate P-values",
-Bioinformatics 25, 2009, with shape 0): z of a single group is -log10 of a uniform number, and so exponential itself.
-With m_(k) the least of these k, above which k - 1 lie, by maximum likelihood:
+(Davison and Hinkley, Bootstrap methods and their application, 1997, Eq. 4.11) for groups of one family; for several it
+is so many times as large (Bonferroni). Where hardly any flip reaches z, an exponential tail is fitted to the k largest
+m_b (Knijnenburg et al., "Fewer permutations, more accurate P-values", Bioinformatics 25, 2009, with shape 0): z of a
+single group is -log10 of a uniform number, and so exponential itself. With m_(k) the least of these k, above which
+k - 1 lie, by maximum likelihood:
 
     p = k / B exp(-(z - m_(k)) / s),    s = sum of m_b - m_(k) over the k largest / (k - 1).                        (3)
 
@@ -50,13 +51,31 @@ _MOST_TAKEN = 3  # groups, at most, that are taken out of the residuals that sta
 
 
 @dataclass(frozen=True, eq=False)
+class Family:
+    """Groups that are tested together. chance (B,): the largest evidence of them in each random flip, sorted."""
+
+    groups: int
+    chance: Array
+
+    def p_value(self, evidence: float) -> float:
+        """The chance that any of the groups reaches an evidence where nothing is missing."""
+        chance = self.chance
+        exceeded = int((chance >= evidence).sum())
+        tail = max(int(_TAIL * len(chance)), 1)
+        if exceeded >= int(_ENOUGH * tail):
+            return (exceeded + 1) / (len(chance) + 1)  # Eq. (2)
+        edge = float(chance[-tail])
+        scale = max(float((chance[-tail:] - edge).sum()) / max(tail - 1, 1), 1e-3)  # above 0 where all flips tie
+        return float(max(tail / len(chance) * np.exp(-(evidence - edge) / scale), 1e-300))  # Eq. (3)
+
+
+@dataclass(frozen=True, eq=False)
 class Significance:
     """Chi-square differences of G groups and how significant they are.
 
     chi_square (G,): the differences Q. steady (G,): these without the run that adds most. rank (G,): degrees of freedom
     d. spread (G,): mean difference v by chance per degree of freedom. evidence (G,): z of Eq. (1), without the run that
-    adds most. chance (B,): the largest evidence of all groups in each random flip, sorted. surplus: Eq. (4).
-    surplus_of: the group that has it.
+    adds most. families: of these groups, in turn. surplus: Eq. (4). surplus_of: the group that has it.
     """
 
     groups: tuple[Group, ...]
@@ -65,7 +84,7 @@ class Significance:
     rank: Array
     spread: Array
     evidence: Array
-    chance: Array
+    families: tuple[Family, ...]
     surplus: float
     surplus_of: int
 
@@ -75,15 +94,13 @@ class Significance:
         return np.maximum(self.chi_square - self.rank * self.spread, 0.0)
 
     def p_value(self, index: int) -> float:
-        """The chance that any of the groups is as significant as the one at ``index`` where nothing is missing."""
-        evidence, chance = float(self.evidence[index]), self.chance
-        exceeded = int((chance >= evidence).sum())
-        tail = max(int(_TAIL * len(chance)), 1)
-        if exceeded >= int(_ENOUGH * tail):
-            return (exceeded + 1) / (len(chance) + 1)  # Eq. (2)
-        edge = float(chance[-tail])
-        scale = max(float((chance[-tail:] - edge).sum()) / max(tail - 1, 1), 1e-3)  # above 0 where all flips tie
-        return float(max(tail / len(chance) * np.exp(-(evidence - edge) / scale), 1e-300))  # Eq. (3)
+        """The chance that any of the groups is as significant as the one at ``index`` where nothing is missing.
+
+        Each family is as likely to hold it (Bonferroni).
+        """
+        ends = np.cumsum([family.groups for family in self.families])
+        family = self.families[int(np.searchsorted(ends, index, side="right"))]
+        return min(len(self.families) * family.p_value(float(self.evidence[index])), 1.0)
 
     @property
     def best(self) -> int:
@@ -105,11 +122,8 @@ class Significance:
         return max(self.surplus, 0.0) * scatter, scatter
 
 
-def together(first: Significance, second: Significance | None, rng: np.random.Generator) -> Significance:
-    """Significance of the groups of both, each corrected for all: the largest evidence of a flip is that of either.
-
-    Flips of the two are paired at random, which states the chance too large where they go together.
-    """
+def together(first: Significance, second: Significance | None) -> Significance:
+    """Significance of the groups of both, whose families stay apart: what is rough in one makes no noise in another."""
     if second is None:
         return first
     surer = second.surplus > first.surplus
@@ -119,7 +133,7 @@ def together(first: Significance, second: Significance | None, rng: np.random.Ge
             name: np.concatenate([getattr(each, name) for each in (first, second)])
             for name in ("chi_square", "steady", "rank", "spread", "evidence")
         },
-        chance=np.sort(np.maximum(first.chance, rng.permutation(second.chance))),
+        families=(*first.families, *second.families),
         surplus=max(first.surplus, second.surplus),
         surplus_of=second.surplus_of + len(first.groups) if surer else first.surplus_of,
     )
@@ -164,7 +178,7 @@ def significance_of_scores(
         rank=rank,
         spread=spread,
         evidence=evidence,
-        chance=np.sort(chance.max(axis=1)),
+        families=(Family(len(groups), np.sort(chance.max(axis=1))),),
         surplus=float(beyond[best]) - usual,
         surplus_of=best,
     )

@@ -26,7 +26,7 @@ def located(
 
     baseline: the plain matrix under the noise of the extended model.
     """
-    where = together(selection.where, fine_structure(baseline.fit, rng), rng)
+    where = together(selection.where, fine_structure(baseline.fit, rng))
     return replace(
         selection, where=where, left=all_left(extended, screening, without, rng) if extended.groups else where
     )
@@ -37,4 +37,4 @@ def all_left(
 ) -> Significance:
     """Significance of generic bases and of fine structure beyond all that an extended model holds."""
     bases = significance_left(extended, screening, without, rng)
-    return together(bases, fine_structure(extended.fit, rng), rng)
+    return together(bases, fine_structure(extended.fit, rng))

@@ -8,7 +8,7 @@ from scipy.stats import binomtest, chi2
 from screening_samples import FIRST, SECOND, THIRD, screening
 
 from omnibench.discover.regressors.column_group import Group
-from omnibench.discover.regressors.significance import Significance, significance_of
+from omnibench.discover.regressors.significance import Family, Significance, significance_of
 from omnibench.fit.least_squares.whitened import Whitened
 
 GROUPS = tuple(Group("covariate", f"group {start}", tuple(range(start, start + 2))) for start in range(2, 22, 2))
@@ -69,7 +69,7 @@ def test_what_depends_on_few_runs_is_found_where_these_agree() -> None:
 def by_chance(evidence: float, chance: np.ndarray) -> Significance:
     """One group of so much evidence, where random flips made ``chance``."""
     one = np.ones(1)
-    return Significance(GROUPS[:1], one, one, one, one, np.array([evidence]), np.sort(chance), 0.0, 0)
+    return Significance(GROUPS[:1], one, one, one, one, np.array([evidence]), (Family(1, np.sort(chance)),), 0.0, 0)
 
 
 def test_a_chance_that_many_flips_reach_is_their_share_with_the_data_as_one_more() -> None:

@@ -7,7 +7,7 @@ import pytest
 from screening_samples import FIRST, PARAMETER, POSITIVE, SECOND, THIRD, screening
 
 from omnibench.discover.regressors.column_group import Group
-from omnibench.discover.regressors.significance import Significance
+from omnibench.discover.regressors.significance import Family, Significance
 from omnibench.discover.selection.evidence import (
     Credibility,
     bayes_factor,
@@ -26,7 +26,7 @@ def significance(left: float, rank: int = 1) -> Significance:
     one = np.ones(1)
     surplus = left / np.sqrt(2 * rank)
     basis = Group("covariate", "place", (3,))
-    return Significance((basis,), left * one, left * one, rank * one, one, one, np.zeros(499), surplus, 0)
+    return Significance((basis,), left * one, left * one, rank * one, one, one, (Family(1, np.zeros(499)),), surplus, 0)
 
 
 def test_the_evidence_of_a_difference_is_that_of_the_likeliest_g_prior() -> None:
