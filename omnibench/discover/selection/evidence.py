@@ -53,9 +53,11 @@ in expectation, and a non-central chi-square has the variance 2 d + 4 lambda:
 So it is asked twice: x is what other forms of the effects explain, and x' what generic bases find beside all forms.
 Names without other forms leave to x what bases find beside them:
 
-    odds that n names are right = odds(n) F(x, u) min(F(x', u'), F_max),    probability = odds / (1 + odds).        (9)
+    odds that n names are right = odds(n) m F(x, u) min(F(x', u'), F_max),    probability = odds / (1 + odds).      (9)
 
-Prior odds(n) are odds(1) of a single name, and odds(2) / (n - 1) of several.
+Prior odds(n) are odds(1) of a single name, and odds(2) / (n - 1) of several; m is the number of sets of names that
+explain as much, of which one may be right: the product over the places of 1 / sum of P(i | A)^2 over the names i (the
+number of equally likely ones: M. O. Hill, "Diversity and evenness", Ecology 54, 1973).
 
 The odds are at most even where the names imitate something else: where they cancel each other, so that together they
 make less than a share of what each makes alone, or where a parameter surely has a sign that physics forbids.       (10)
@@ -192,11 +194,17 @@ class Credibility:
 
 
 def credibility_of(
-    sets: EffectSets, start: Given, chosen: Sequence[Group], left: Significance, beyond: Significance
+    sets: EffectSets,
+    start: Given,
+    chosen: Sequence[Group],
+    left: Significance,
+    beyond: Significance,
+    alike: float = 1.0,
 ) -> Credibility:
     """Probability that the names of chosen effects are right, by what generic bases still find, Eq. (9) and (10).
 
     left: significance of the bases after the effects. beyond: after the effects in slightly different forms, too.
+    alike: number m of sets of names that explain as much.
     """
     energy = max(sets.energy, 1.0)  # no less than the variance of one number, so that a share of it is defined
     forms = start.given(indices_of(chosen)).only(forms_of(chosen))
@@ -204,7 +212,7 @@ def credibility_of(
     rank = forms.rank(every)
     of_forms = max(forms.chi_square(every) - rank, 0.0)
     whole = energy + of_forms
-    odds = _ODDS_OF_ONE if len(chosen) == 1 else _ODDS_OF_TWO / (len(chosen) - 1)
+    odds = alike * (_ODDS_OF_ONE if len(chosen) == 1 else _ODDS_OF_TWO / (len(chosen) - 1))
     if rank:
         odds *= bayes_factor(of_forms, math.sqrt(2 * rank), energy, _FORMS_RIGHT)
     else:

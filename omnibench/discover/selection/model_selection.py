@@ -9,6 +9,7 @@ probability against all other effects in its place, Eq. (5), times the probabili
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -114,12 +115,19 @@ def _search(screening: Screening, candidates: Sequence[Group], rng: np.random.Ge
         return _Search((), (), pool, steps, left, 0.0, 1.0, DISCREPANCY)
     beyond = significance_of(data, [*fitted, *forms_of(chosen)], bases, rng)
     sets = effect_sets(start, pool, len(chosen))
-    credibility = credibility_of(sets, start, chosen, left, beyond)  # Eq. (9)
+    alike = _look_alikes(start, pool, chosen)
+    credibility = credibility_of(sets, start, chosen, left, beyond, alike)  # Eq. (9)
     share, known, discrepancy = credibility.left_share, credibility.probability, credibility.discrepancy
     if known < _CREDIBLE:
         left = significance_of(data, screening.groups.matrix.index, bases, rng)
         return _Search((), chosen, pool, steps, left, share, known, discrepancy)
     return _Search(chosen, (), pool, steps, left, share, known, discrepancy)
+
+
+def _look_alikes(start: Given, pool: Sequence[Group], chosen: Sequence[Group]) -> float:
+    """Effective number of sets of names that explain as much as the chosen one, Eq. (9)."""
+    of_positions = (_probabilities(start, pool, chosen, position, DISCREPANCY) for position in range(len(chosen)))
+    return math.prod(1 / sum(probability**2 for _, probability in of_position) for of_position in of_positions)
 
 
 def _forward_selection(
