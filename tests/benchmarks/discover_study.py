@@ -22,7 +22,6 @@ import omnibench
 from omnibench.jobs.job import Failure, Job, JobWatch, run_jobs
 from omnibench.jobs.local_backends import local_backend
 from omnibench.jobs.result_store import ResultStore, code_digest, content_key
-from omnibench.progress import Reporter
 
 ROOMS = ("data", "discover", "fit", "robot")  # the code that a result depends on, beside the makers of sets
 
@@ -85,11 +84,7 @@ class _Said(JobWatch[Result]):
 
 
 def _job(task: Task) -> Job[Result]:
-    return Job(content_key({"task": task, "code": discovering_code()}), _carry_out, task)
-
-
-def _carry_out(task: Task, _: Reporter) -> Result:
-    return carry_out(task)
+    return Job(content_key({"task": task, "code": discovering_code()}), carry_out, task)
 
 
 @cache

@@ -9,61 +9,19 @@ these simulators hide is in no catalogue: a confident name is a wrong one.
 from __future__ import annotations
 
 import argparse
-import importlib
-import tempfile
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 from discover_study import discovering_code
+from foreign.judging import Result, carry_out
 from scipy.stats import binomtest
 
-from omnibench import discover_effects, load_dataset
-from omnibench.config import Model
-from omnibench.discover.result import Discovery
 from omnibench.jobs.job import Failure, Job, JobWatch, run_jobs
 from omnibench.jobs.local_backends import local_backend
 from omnibench.jobs.result_store import ResultStore, content_key
-from omnibench.processes import one_thread
-from omnibench.progress import Reporter
 
 KINDS = ("cross_wheel_coupling", "slippery_patch", "belt_ripple", "swinging_payload", "tether_pull")
-CONFIDENT = 0.95  # a name's weight from which on the verdict may be "named"
-
-
-class Result(Model):
-    """What came of a recording. where: the covariates named, the most probable first.
-
-    closed_chi2, closed_eq6: share of the gap to the validation session that is closed; None: no gap beyond two standard
-    errors, or a failure of the workflow, whose reason is then in ``failure``.
-    """
-
-    kind: str
-    seed: int
-    noncentrality: float
-    covariates: tuple[str, ...]
-    verdict: str = ""
-    names: tuple[tuple[str, float], ...] = ()
-    where: tuple[str, ...] = ()
-    closed_chi2: float | None = None
-    closed_eq6: float | None = None
-    seconds: float = 0.0
-    failure: str = ""
-
-    @property
-    def flagged(self) -> bool:
-        """Something is said to be there that no name explains."""
-        return self.verdict in ("unknown", "incomplete")
-
-    @property
-    def located(self) -> bool:
-        """A right covariate is among the two most probable."""
-        return bool(set(self.where[:2]) & set(self.covariates))
-
-    @property
-    def misnamed(self) -> bool:
-        return any(weight >= CONFIDENT for _, weight in self.names)
 
 
 def main() -> None:
@@ -72,7 +30,7 @@ def main() -> None:
     store = ResultStore(arguments.out, Result)
     jobs = [_job(kind, seed) for seed in arguments.seeds for kind in arguments.only or KINDS]
     if not arguments.table:
-        run_jobs(jobs, store, local_backend(arguments.jobs), _Said())
+        run_jobs(jobs, store, local_backend(arguments.jobs, ("foreign.judging",)), _Said())
     print("\n".join(table([result for job in jobs if (result := store.get(job.key)) is not None])))
 
 
@@ -85,35 +43,7 @@ class _Said(JobWatch[Result]):
 
 
 def _job(kind: str, seed: int) -> Job[Result]:
-    return Job(content_key({"kind": kind, "seed": seed, "code": discovering_code()}), _carry_out, (kind, seed))
-
-
-def _carry_out(recording: tuple[str, int], _: Reporter) -> Result:
-    """Make a recording, let the workflow discover, judge. Whatever the workflow raises is a failure."""
-    kind, seed = recording
-    with one_thread(), tempfile.TemporaryDirectory() as folder:
-        truth = importlib.import_module(f"foreign.{kind}").make(Path(folder), seed)
-        hidden = {"seed": seed} | {key: truth[key] for key in ("kind", "covariates", "noncentrality")}
-        began = time.perf_counter()
-        try:
-            return judged(hidden, discover_effects(load_dataset(folder), seed=seed), time.perf_counter() - began)
-        except Exception as error:  # the study goes on, and the table says so
-            return Result(**hidden, failure=f"{type(error).__name__}: {error}")
-
-
-def judged(hidden: dict[str, object], discovery: Discovery, seconds: float) -> Result:
-    """The answer beside what is hidden."""
-    probable = sorted(discovery.where, key=lambda each: -each.weight)
-    session = next((each for each in discovery.held_out if each.data == "session"), None)
-    return Result(
-        **hidden,
-        verdict=discovery.verdict,
-        names=tuple((each.name, each.weight) for each in discovery.effects),
-        where=tuple(dict.fromkeys(each.covariate for each in probable)),
-        closed_chi2=session.chi2.closed if session else None,
-        closed_eq6=session.eq6.closed if session else None,
-        seconds=seconds,
-    )
+    return Job(content_key({"kind": kind, "seed": seed, "code": discovering_code()}), carry_out, (kind, seed))
 
 
 def table(results: Sequence[Result]) -> list[str]:

@@ -9,6 +9,7 @@ from typing import Literal
 from omnibench.config import Model
 from omnibench.discover.discover import discover_effects
 from omnibench.processes import one_thread
+from omnibench.progress import Reporter, no_progress
 
 from .absorbed import ABSORBED, ACTUATORS, NUISANCES
 from .disturbances import NULL_KINDS
@@ -102,7 +103,7 @@ def _of(group: Group, levels: tuple[float, ...]) -> Iterator[tuple[tuple[str, ..
         yield from (((name,), strong) for name in known)
 
 
-def carry_out(task: Task) -> Result:
+def carry_out(task: Task, _: Reporter = no_progress) -> Result:
     """Make the set, let the workflow discover, judge. Whatever the workflow raises is a failure, and counts as one."""
     with one_thread():
         noise = NULL_KINDS[task.seed % len(NULL_KINDS)] if task.group == "null" else "plain"
