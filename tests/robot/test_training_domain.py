@@ -14,6 +14,7 @@ from omnibench.robot.domain.training_domain import (
     TrainingDomain,
     extrapolated_share,
     extrapolation_consequence,
+    kinds_of_motion,
     motions_of,
     representatives,
 )
@@ -45,6 +46,22 @@ def test_a_few_representatives_are_near_every_motion(motions: Array, robot: str)
     assert away.max() <= (1 + np.sqrt(3)) * 0.05 * largest + 1e-9  # a cell of the grid, and one more step
     apart = np.linalg.norm(kept[:, None] - kept, axis=2) + np.diag(np.full(len(kept), np.inf))
     assert apart.min() > 0.05 * largest
+
+
+@given(_twists, st.sampled_from(sorted(ROBOTS)))
+def test_motions_of_a_kind_are_near_its_first_one_and_those_are_far_from_each_other(motions: Array, robot: str) -> None:
+    kinds, own = kinds_of_motion(ROBOTS[robot], motions), at_wheels(ROBOTS[robot], motions)
+    near = 0.15 * np.linalg.norm(own, axis=1).max()
+    firsts = np.array([own[kinds == kind][0] for kind in range(kinds.max() + 1)])
+    assert (np.linalg.norm(own - firsts[kinds], axis=1) <= near + 1e-9).all()
+    apart = np.linalg.norm(firsts[:, None] - firsts, axis=2) + np.diag(np.full(len(firsts), np.inf))
+    assert apart.min() >= near - 1e-9
+
+
+def test_the_directions_and_turns_of_a_flower_are_kinds_of_their_own() -> None:
+    flower = [[0.2 * np.cos(angle), 0.2 * np.sin(angle), turn]
+              for angle in np.radians(np.arange(0, 360, 30)) for turn in (-0.35, 0.0, 0.35)]  # fmt: skip
+    assert len(set(kinds_of_motion(APR_02, np.array(flower)).tolist())) == 36
 
 
 @given(_twists, st.sampled_from(sorted(ROBOTS)))

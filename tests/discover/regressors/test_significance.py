@@ -8,7 +8,7 @@ from scipy.stats import binomtest, chi2
 from screening_samples import FIRST, SECOND, THIRD, screening
 
 from omnibench.discover.regressors.column_group import Group
-from omnibench.discover.regressors.significance import Family, Significance, significance_of
+from omnibench.discover.regressors.significance import Family, Significance, significance_of, together
 from omnibench.fit.least_squares.whitened import Whitened
 
 GROUPS = tuple(Group("covariate", f"group {start}", tuple(range(start, start + 2))) for start in range(2, 22, 2))
@@ -81,6 +81,14 @@ def test_a_chance_that_hardly_any_flip_reaches_is_that_of_an_exponential_tail() 
     tail = np.concatenate([[1.0], 1.0 + np.linspace(0.0, 1.0, 48)])  # 48 of them beyond the least, by 0.5 in the mean
     chance = np.concatenate([np.zeros(450), tail])
     assert by_chance(3.0, chance).p_value(0) == pytest.approx(49 / 499 * np.exp(-(3 - 1) / 0.5))
+
+
+def test_what_chance_makes_of_one_family_does_not_hide_another() -> None:
+    calm, rough = by_chance(4.0, np.linspace(0, 1, 499)), by_chance(0.5, np.linspace(0, 20, 499))
+    both = together(calm, rough)
+    assert both.p_value(0) == pytest.approx(2 * calm.p_value(0))  # of two families
+    assert both.p_value(1) == min(2 * rough.p_value(0), 1.0)
+    assert both.groups == (*calm.groups, *rough.groups)
 
 
 def test_the_scale_of_the_tail_is_right_in_the_mean() -> None:

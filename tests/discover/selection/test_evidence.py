@@ -106,6 +106,17 @@ def test_a_name_is_the_less_credible_the_more_it_leaves() -> None:
     assert found == sorted(found, reverse=True)
 
 
+def test_of_look_alikes_one_is_right_more_likely_than_a_single_name_that_explains_as_much() -> None:
+    given = screening({DRIFT: FIRST, BIAS: FIRST}, BASES, [0, 20, 0, 0, 0])
+    start, chosen = given.beyond_matrix(), given.groups.effects[:1]
+    single, alike = (
+        credibility_of(effect_sets(start, chosen, 1), start, chosen, significance(40.0), significance(10.0), number)
+        for number in (1.0, 2.0)
+    )
+    odds = [each.probability / (1 - each.probability) for each in (single, alike)]
+    assert odds[1] == pytest.approx(2 * odds[0])
+
+
 def test_what_bases_do_not_find_beside_a_name_raises_the_odds_only_so_far() -> None:
     unexplained, little, nothing = (
         credibility([0, 20, 0, 0, 0], 40.0, beyond).probability for beyond in (40.0, 2.0, 0.0)

@@ -72,6 +72,13 @@ def test_one_effect_that_explains_what_two_others_would_is_chosen_in_their_place
     assert names(found) == [SLIP]
 
 
+@pytest.mark.parametrize(("kinds", "most"), [(7, 1), (8, 2), (None, 2)])
+def test_there_are_four_kinds_of_motion_for_every_effect_that_is_chosen(kinds: int | None, most: int) -> None:
+    given = screening({DRIFT: FIRST, BIAS: SECOND, SLIP: FOURTH}, BASES, [0, 15, 25, 0, 0])
+    assert len(selected(replace(given, kinds=kinds)).steps) >= most
+    assert len(selected(replace(given, kinds=kinds)).chosen + selected(replace(given, kinds=kinds)).tentative) == most
+
+
 def test_an_effect_that_leaves_most_to_the_generic_bases_is_given_up_and_stays_tentative() -> None:
     found = selected(screening({DRIFT: FIRST}, BASES, [0, 15, 0, 15, 0]))
     assert found.chosen == ()

@@ -148,6 +148,16 @@ def test_functions_are_fitted_together_with_named_effects_and_stand_after_them(
     assert calibrated["heading_drift"]["b"] == used.values[0]
 
 
+def test_runs_of_few_kinds_of_motion_get_no_term(grooved: tuple[Dataset, Truth, Discovery]) -> None:
+    dataset = grooved[0]
+    commands = sorted({run.command or "" for run in dataset.trajectories})[:9]
+    few = replace(dataset, trajectories=tuple(run for run in dataset.trajectories if run.command in commands))
+    found = discover_effects(few)
+    assert found.verdict == "unknown"
+    assert found.extended.effects == ()
+    assert any("No unnamed term was tried: 9 kinds of motion" in note for note in found.notes)
+
+
 def test_nothing_is_added_to_a_model_that_leaves_nothing_of_it(
     bare: Extended, screened: tuple[Screening, Selection]
 ) -> None:
