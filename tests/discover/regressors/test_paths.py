@@ -29,6 +29,8 @@ NAMES = [
     and not entry.cls.run_nuisance
 ]
 
+NAMELESS = [entry.name for entry in effects.entries() if not getattr(entry.cls, "in_catalogue", True)]
+
 
 def on_robot(robot: str) -> Fit:
     """The plain matrix fitted to a few runs of the APR-02 or of a config's robot, the tracked point off its centre."""
@@ -58,6 +60,19 @@ def test_slopes_by_an_effect_are_the_models_own(robot: str) -> None:
     applied = [name for name in NAMES if effects.create(name).applies(fit.model.robot)]
     for name in applied:
         check_slopes(fit, name)
+
+
+@pytest.mark.parametrize("name", NAMELESS)
+def test_slopes_by_an_effect_without_a_name_are_the_models_own(fitted: Fit, name: str) -> None:
+    check_slopes(fitted, name)
+
+
+def test_slopes_by_some_parameters_are_those_columns_of_the_slopes_by_all(fitted: Fit) -> None:
+    paths, effect = paths_of(fitted), effects.create("smooth_course")
+    names = [each.name for each in effect.parameters(paths.robot)]
+    values = dict.fromkeys(names, 0.0)
+    every, some = (slopes_by(paths, effect, chosen, values) for chosen in (names, names[::-3]))
+    np.testing.assert_allclose(some, every[:, :, ::-3], rtol=1e-9, atol=1e-12)
 
 
 def check_slopes(fitted: Fit, name: str) -> None:

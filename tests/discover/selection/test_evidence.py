@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import ncx2
 from screening_samples import FIRST, PARAMETER, POSITIVE, SECOND, THIRD, screening
 
 from omnibench.discover.regressors.column_group import Group
@@ -79,6 +80,15 @@ def test_where_little_noise_blurs_what_is_left_the_bayes_factor_is_the_ratio_of_
 
 def test_a_large_effect_that_leaves_nothing_is_as_credible_as_the_prior_of_its_share_says() -> None:
     assert bayes_factor(0.0, 2.0, 1e9, 0.04) == pytest.approx(25.0, rel=1e-6)
+
+
+@pytest.mark.parametrize("left", [0.0, 5.0, 20.0, 40.0])
+def test_the_bayes_factor_is_near_that_of_non_central_chi_squares(left: float) -> None:
+    freedom, energy, usual = 8, 800.0, 0.005
+    shares = np.linspace(1e-5, 0.3, 30_000)
+    density = ncx2.pdf(left + freedom, freedom, energy * shares / (1 - shares))
+    exact = (density * np.exp(-shares / usual) / usual).sum() / density.sum()
+    assert bayes_factor(left, 4.0, energy, usual) == pytest.approx(exact, rel=0.35)
 
 
 def test_noise_that_is_larger_than_any_share_says_nothing() -> None:
