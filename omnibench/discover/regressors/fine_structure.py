@@ -68,16 +68,25 @@ def fine_structure(fit: Fit, rng: np.random.Generator) -> Significance | None:
     """Significance of fine structure in the residuals of a fitted model; None where nothing could show."""
     if len(fit.runs) < _RUNS:
         return None
-    paths, finer = paths_of(fit, _COARSE), paths_of(fit, _FINE)
-    pull = _pull(fit, paths)
-    families = [*(_of_kind(paths, pull, kind) for kind in _kinds(paths)), floor_joints(finer, _pull(fit, finer))]
     found: Significance | None = None
-    for family in families:
-        members = list(family)
+    for members in _families(fit):
         if members:
             groups, scores = zip(*members, strict=True)
             found = together(significance_of_scores(groups, scores, scores, rng), found)
     return found
+
+
+def _families(fit: Fit) -> Iterator[list[tuple[Group, Array]]]:
+    """Groups of each kind with their scores (Z, d); the paths of one are given up before those of the next are made."""
+    yield from _of_kinds(paths_of(fit, _COARSE), fit)
+    finer = paths_of(fit, _FINE)
+    yield list(floor_joints(finer, _pull(fit, finer)))
+
+
+def _of_kinds(paths: Paths, fit: Fit) -> Iterator[list[tuple[Group, Array]]]:
+    pull = _pull(fit, paths)
+    for kind in _kinds(paths):
+        yield list(_of_kind(paths, pull, kind))
 
 
 def _of_kind(paths: Paths, pull: Array, kind: _Kind) -> Iterator[tuple[Group, Array]]:

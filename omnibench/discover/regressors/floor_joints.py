@@ -93,4 +93,4 @@ class _Bins:
         scores -= scores.sum(axis=1, keepdims=True) * self.share  # the matrix holds what is the same everywhere
         of_bins = scores[:, self.kept]
         normed: Array = of_bins / np.sqrt(np.maximum(np.square(of_bins).sum(axis=0), 1e-300))
-        return normed
+        return normed.astype(np.float32)  # there are many, and no more digits are needed

@@ -1,16 +1,18 @@
 """Terms without a name, where no name is sure: functions of the covariate that the residuals depend on most surely.
 
-They are kept if held-out commands gain by them. With Q the chi-square difference of a basis of d columns beyond those
-that were taken before it, and v what chance makes of Q / d, a further basis is put to them if
+They are kept if motions gain by them that are held out, whole kinds at a time. With Q the chi-square difference of a
+basis of d columns beyond those that were taken before it, and v what chance makes of Q / d, a further basis is put to
+them if
 
     Q > 2 v d                                                                                                       (1)
 
-(Akaike, "A new look at the statistical model identification", IEEE Trans. Automatic Control 19, 1974). Of all functions
-of these bases, one after another is fitted that lowers the chi-square of Z runs by more than
+(Akaike, "A new look at the statistical model identification", IEEE Trans. Automatic Control 19, 1974). Of all P
+functions of these bases, one after another is fitted that lowers the chi-square of Z runs by more than
 
-    ln Z                                                                                                            (2)
+    ln Z + ln P                                                                                                     (2)
 
-(Schwarz, "Estimating the dimension of a model", Annals of Statistics 6, 1978).
+(the extended Bayesian information criterion with gamma = 1/2, which makes up for the choice among many: J. Chen and
+Z. Chen, "Extended Bayesian information criteria for model selection with large model spaces", Biometrika 95, 2008).
 """
 
 from __future__ import annotations
@@ -243,13 +245,11 @@ def _terms_of(basis: Basis) -> Iterator[tuple[str, Mapping[str, float]]]:
 
 
 def chosen_functions(base: Extended, groups: Sequence[Group]) -> list[Group]:
-    """Groups with only those functions that gain more than ln(runs) + ln(functions) beyond all others.
+    """Groups with only those functions that gain more than Eq. (2) beyond matrix, effects and each other.
 
-    This is the extended Bayesian information criterion with gamma = 1/2, which makes up for the choice among many
-    (J. Chen and Z. Chen, "Extended Bayesian information criteria for model selection with large model spaces",
-    Biometrika 95, 2008). All other parameters are 0; groups without any function are left out. Functions are chosen one
-    after another, the largest gain first. Those that the data hardly determine beyond the chosen ones are passed over,
-    and those that would need a coefficient far outside its plausible range.
+    All other parameters are 0; groups without any function are left out. Functions are chosen one after another, the
+    largest gain first. Those that the data hardly determine beyond the chosen ones are passed over, and those that
+    would need a coefficient far outside its plausible range.
     """
     return _restricted(groups, _kept_functions(_linearised(base, groups), groups))
 
@@ -269,7 +269,7 @@ def _kept_functions(data: Whitened, groups: Sequence[Group]) -> list[int]:
         allowed = (size > _DETERMINED * left.total[first:]) & (np.abs(score) < limits * size)
         gain = np.where(allowed, np.square(score) / np.maximum(size, 1e-300), 0.0)
         best = int(gain.argmax())
-        if gain[best] <= np.log(len(data.scores)) + np.log(len(limits)):
+        if gain[best] <= np.log(len(data.scores)) + np.log(len(limits)):  # Eq. (2)
             break
         kept.append(best)
         left = left.given([first + best])
