@@ -1,9 +1,12 @@
 """Covariate dependence: where the residuals depend on something, before any effect is added and after all are.
 
-With t bases of its kind, a basis A has the probability ln P(A) = ln B'(A) - ln t + constant, B' of evidence.py, Eq. (2)
-and (3), and a covariate the sum over its bases: the probability that what is missing depends on it rather than on
-another that was tried. As in significance.py, chi-square differences are those without the run that adds most, divided
-by what chance makes of them.                                                                                      (1)
+With t bases of its kind, a basis A has the probability ln P(A) = ln B'(A) - ln t + constant, B' of evidence.py, Eq.
+(2), and a covariate the sum over its bases: the probability that what is missing depends on it rather than on another
+that was tried. As in significance.py, chi-square differences Q are those without the run that adds most, divided by
+what chance makes of them. As no basis has the form of what is missing, what they have beyond chance counts less, with N
+the largest Q - d of all bases (compare evidence.py, Eq. (3)):
+
+    Q' = d + (Q - d) / (1 + delta^2 N).                                                                            (1)
 """
 
 from __future__ import annotations
@@ -65,10 +68,10 @@ def _significant(
     still: a word for the description. quantisation: the chi-square difference that encoder quantisation could make.
     """
     best: dict[str, int] = {}
-    for index in np.argsort(-bases.evidence, kind="stable"):
-        best.setdefault(bases.groups[index].name, int(index))
+    for index in bases.surest:
+        best.setdefault(bases.groups[index].name, index)
     weights, dependences = weights_of_covariates(bases), []
-    for index in sorted(best.values(), key=lambda row: -bases.evidence[row]):
+    for index in best.values():
         group, p_value = bases.groups[index], bases.p_value(index)
         assert group.basis is not None
         if p_value < _SHOWN:
@@ -87,9 +90,10 @@ def _significant(
 def weights_of_covariates(bases: Significance) -> dict[str, float]:
     """The probability of each covariate, Eq. (1)."""
     chi_square = bases.steady / bases.spread
-    energy = float(max((chi_square - bases.rank).max(initial=0.0), 0.0))
+    beyond = chi_square - bases.rank
+    tempered = bases.rank + beyond / (1 + _DISCREPANCY**2 * max(float(beyond.max(initial=0.0)), 0.0))  # Eq. (1)
     tries = np.array([group.tries for group in bases.groups], dtype=float)
-    evidence = log_evidence(chi_square, bases.rank, energy, _DISCREPANCY) - np.log(tries)
+    evidence = log_evidence(tempered, bases.rank, 0.0) - np.log(tries)
     likely = np.exp(evidence - evidence.max(initial=0.0))
     weights: dict[str, float] = {}
     for group, weight in zip(bases.groups, likely / max(likely.sum(), 1e-300), strict=True):

@@ -50,7 +50,9 @@ def test_a_few_representatives_are_near_every_motion(motions: Array, robot: str)
 
 @given(_twists, st.sampled_from(sorted(ROBOTS)))
 def test_motions_of_a_kind_are_near_its_first_one_and_those_are_far_from_each_other(motions: Array, robot: str) -> None:
-    kinds, own = kinds_of_motion(ROBOTS[robot], motions), at_wheels(ROBOTS[robot], motions)
+    spreads = np.abs(motions[::-1]) / 2
+    own = np.hstack([at_wheels(ROBOTS[robot], each) for each in (motions, spreads)])
+    kinds = kinds_of_motion(ROBOTS[robot], motions, spreads)
     near = 0.15 * np.linalg.norm(own, axis=1).max()
     firsts = np.array([own[kinds == kind][0] for kind in range(kinds.max() + 1)])
     assert (np.linalg.norm(own - firsts[kinds], axis=1) <= near + 1e-9).all()
@@ -61,7 +63,12 @@ def test_motions_of_a_kind_are_near_its_first_one_and_those_are_far_from_each_ot
 def test_the_directions_and_turns_of_a_flower_are_kinds_of_their_own() -> None:
     flower = [[0.2 * np.cos(angle), 0.2 * np.sin(angle), turn]
               for angle in np.radians(np.arange(0, 360, 30)) for turn in (-0.35, 0.0, 0.35)]  # fmt: skip
-    assert len(set(kinds_of_motion(APR_02, np.array(flower)).tolist())) == 36
+    assert len(set(kinds_of_motion(APR_02, np.array(flower), np.zeros((36, 3))).tolist())) == 36
+
+
+def test_paths_that_end_where_they_began_are_of_as_many_kinds_as_they_swing_differently() -> None:
+    swings = np.array([[0.2, 0.0, 0.0], [0.2, 0.0, 0.01], [0.0, 0.0, 1.0], [0.2, 0.0, 1.0]])
+    assert kinds_of_motion(APR_02, 1e-4 * swings, swings).tolist() == [0, 0, 1, 2]
 
 
 @given(_twists, st.sampled_from(sorted(ROBOTS)))

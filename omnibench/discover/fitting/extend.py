@@ -38,7 +38,7 @@ from omnibench.robot.odometry import split_by
 _ROUNDS = 4  # rounds that fit noise and plain matrix by turns, at most; fewer where the noise stays within 2 %
 _NEAR = 0.02  # share of the largest component of the noise by which two noises may differ, see is_near
 _STEPS = 4  # Gauss-Newton steps, at most
-_HALVINGS = 10  # of a step that leads too far, at most: to a thousandth of it
+_HALVINGS = 10  # tries of a step that leads too far, each half of the one before: at last 1 / 512 of it
 _ROUNDING = 1e-6  # share of chi-square by which a step of an ended fit may raise it, as numbers are rounded
 _STILL = 0.05  # standard errors: a smaller step, which no interval shows, ends the fit
 
@@ -183,7 +183,7 @@ def _descend(fit: Fit, groups: Sequence[Group], values: Array) -> tuple[Fit, Arr
         else:
             fit, values, data = before
             break
-        if _size(share * step, covariance) < _STILL:
+        if _size(step, covariance) < _STILL:
             break
     return fit, values, data, columns
 

@@ -68,9 +68,20 @@ def folds_of_commands(runs: Sequence[Trajectory]) -> NDArray[np.intp]:
 
 
 def kinds_of_runs(fit: Fit) -> NDArray[np.intp]:
-    """The number (Z,) of the kind of motion of each run of a fit: of runs whose mean twists are near to each other."""
-    means = [run.signals.T @ np.diff(run.times, prepend=0.0) / run.times[-1] for run in fit.runs]
-    return kinds_of_motion(fit.model.robot, np.array(means) @ fit.model.matrix.T)
+    """The number (Z,) of the kind of motion of each run of a fit: all runs of a command are of one.
+
+    Commands are of one kind if the means and the spreads of their twists are near to each other.
+    """
+    twists = [run.signals @ fit.model.matrix.T for run in fit.runs]
+    commands = [list(members) for members in grouped([run.command or run.id for run in fit.runs])]
+    means, spreads = (
+        np.array([np.mean([of(twists[run], axis=0) for run in members], axis=0) for members in commands])
+        for of in (np.mean, np.std)
+    )
+    kinds = np.zeros(len(fit.runs), dtype=np.intp)
+    for members, kind in zip(commands, kinds_of_motion(fit.model.robot, means, spreads), strict=True):
+        kinds[members] = kind
+    return kinds
 
 
 def folds_of_kinds(fit: Fit) -> NDArray[np.intp]:
@@ -78,16 +89,19 @@ def folds_of_kinds(fit: Fit) -> NDArray[np.intp]:
     return kinds_of_runs(fit) % _FOLDS
 
 
+def without_runs(data: Whitened, held_out: NDArray[np.bool_]) -> Given:
+    """The columns over all runs but those (Z,) that are held out."""
+    columns = np.concatenate([data.columns[run] for run in np.flatnonzero(held_out).tolist()])
+    return Given(data.information - columns.T @ columns, data.scores[~held_out], np.diag(data.information))
+
+
 def values_of_other_folds(data: Whitened, index: Sequence[int], folds: NDArray[np.intp]) -> Array:
     """Values (Z, n) of the columns ``index``: for each run, those fitted to the runs of all folds but its own."""
     index = list(index)
-    whole = data.information[np.ix_(index, index)]
+    few = data.only(index)
     values = np.zeros((len(folds), len(index)))
     for fold in np.unique(folds):
-        inside = folds == fold
-        columns = np.concatenate([data.columns[run] for run in np.flatnonzero(inside).tolist()])[:, index]
-        others = Given(whole - columns.T @ columns, data.scores[~inside][:, index], np.diag(whole))
-        values[inside] = others.estimate(range(len(index)))[0]  # Eq. (1)
+        values[folds == fold] = without_runs(few, folds == fold).estimate(range(len(index)))[0]  # Eq. (1)
     return values
 
 

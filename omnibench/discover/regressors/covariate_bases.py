@@ -63,7 +63,7 @@ class Basis:
     detail: words that complete "the residual depends on ...", and tell several bases of a covariate apart. columns:
     None where they are not computed along paths. tries: bases of this kind, of which the best is taken. term: the
     smooth effect that adds these changes to a model, or nothing. shapes: the values that shape it. parts: shapes of the
-    functions that make up a basis of more than a model can use, the surest of them.
+    term's functions where these are others than the basis's own.
     """
 
     covariate: str
@@ -73,7 +73,7 @@ class Basis:
     tries: int = 1
     term: str = ""
     shapes: Mapping[str, float] = field(default_factory=dict)
-    parts: tuple[Mapping[str, float], ...] = ()
+    parts: tuple[Mapping[str, float], ...] | None = None
 
 
 def generic_bases(paths: Paths, trajectories: Sequence[Trajectory]) -> Iterator[Basis]:

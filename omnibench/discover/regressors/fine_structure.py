@@ -1,21 +1,20 @@
-"""Fine structure: how the motion between reference poses depends on heading and place, finer than whole columns show.
+"""Fine structure: how the motion between poses depends on heading, place and time, finer than whole columns show.
 
-An error of the motion in one sample, a displacement d (complex, in the reference's frame) and a turn e, moves the pose
-at every later stamp j by d + i (z_j - z) e and by e, z being the robot's place in that sample (paths.py, Eq. (1)). Let
-h_j be the inverse covariance of the residuals times these, by which half the chi-square falls as the pose at stamp j
-moves. The motion in a sample before stamp k then lowers it by
+An error of the motion in one sample, a displacement d and a turn e (paths.py, Eq. (1), from the run's start), moves the
+pose at every later stamp j by d + i z_j e and by e. Let h_j be the inverse covariance of the residuals times these, by
+which half the chi-square falls as the pose at stamp j moves. The motion in a sample before stamp k then lowers it by
 
-    g_d = sum over j >= k of h_j,    g_e = sum over j >= k of h_j(heading) + Re(conj(i (z_j - z)) h_j),            (1)
+    g_d = sum over j >= k of h_j,    g_e = sum over j >= k of h_j(heading) + Re(conj(i z_j) h_j),                  (1)
 
 and the score of a function f of a covariate in a mode m of motion (along the way, across it, turning per way or by the
 rate of turn) is the sum of f m g over a run's samples: one product of matrices for all functions, however many.
 
-With s_z the scores of run z for the d columns of a basis, s their sum and S = sum of (s_z - s / Z)(s_z - s / Z)',
+With s_z the scores of run z for the d columns of a basis, s their sum over Z runs and S = sum of s_z s_z',
 
-    Q = s' S^-1 s                                                                                                  (2)
+    Q = q / (1 - q / Z),    q = s' S^-1 s                                                                          (2)
 
 is the statistic of Hotelling ("The generalization of Student's ratio", Annals of Mathematical Statistics 2, 1931), of d
-degrees of freedom where nothing is missing, whatever the noise is taken for.
+degrees of freedom where nothing is missing, whatever the noise is taken for. S stays the same where signs are flipped.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ from omnibench.discover.regressors.floor_joints import floor_joints
 from omnibench.discover.regressors.paths import Paths
 from omnibench.discover.regressors.significance import Significance, significance_of_scores, together
 from omnibench.robot.effects.effect import Values
-from omnibench.robot.effects.smooth.motion import MODES, beyond, bump, lever
+from omnibench.robot.effects.smooth.motion import MODES, beyond, bump
 from omnibench.robot.kinematics import Array
 
 _COARSE = 0.1  # s: wheel samples are merged up to this duration
@@ -47,7 +46,8 @@ _DIRECTIONS, _LINES = 12, 9  # directions of lines across the floor, and lines f
 _EDGE = 0.05  # m, over which the floor changes at a line
 _CELLS = 9  # patches along each side of the floor
 _WIDE = 0.7  # radius of a patch, of the distance between two, as in covariate_bases.py
-_RUNS = 15  # at least: the scatter of six scores is hardly known from fewer; chosen
+_RUNS = 15  # at least: the scatter of eight scores is hardly known from fewer; chosen
+_ROUNDING = 1e-16  # share of the largest column's square below which a column is what rounding leaves
 _RANK = 1e-6  # share of a column's square that must be left beyond the others of its basis
 _SEEN = 0.002  # share of the samples that must lie in a patch, as in covariate_bases.py
 _NUMBERS = 1_000_000  # values of functions that are computed at once (chosen)
@@ -69,18 +69,22 @@ def fine_structure(fit: Fit, rng: np.random.Generator) -> Significance | None:
     if len(fit.runs) < _RUNS:
         return None
     found: Significance | None = None
-    for members in _families(fit):
+    for members, studentised in _families(fit):
         if members:
             groups, scores = zip(*members, strict=True)
-            found = together(significance_of_scores(groups, scores, scores, rng), found)
+            of_family = significance_of_scores(groups, scores, scores, rng, studentised=studentised)
+            found = together(of_family, found)
     return found
 
 
-def _families(fit: Fit) -> Iterator[list[tuple[Group, Array]]]:
-    """Groups of each kind with their scores (Z, d); the paths of one are given up before those of the next are made."""
-    yield from _of_kinds(paths_of(fit, _COARSE), fit)
+def _families(fit: Fit) -> Iterator[tuple[list[tuple[Group, Array]], bool]]:
+    """Groups of each kind with their scores (Z, d), and whether these are to be studentised, Eq. (2).
+
+    The paths of one are given up before those of the next are made.
+    """
+    yield from ((members, True) for members in _of_kinds(paths_of(fit, _COARSE), fit))
     finer = paths_of(fit, _FINE)
-    yield list(floor_joints(finer, _pull(fit, finer)))
+    yield list(floor_joints(finer, _pull(fit, finer))), False
 
 
 def _of_kinds(paths: Paths, fit: Fit) -> Iterator[list[tuple[Group, Array]]]:
@@ -105,29 +109,19 @@ def _of_kind(paths: Paths, pull: Array, kind: _Kind) -> Iterator[tuple[Group, Ar
 
 def _pull(fit: Fit, paths: Paths) -> Array:
     """The change of half the chi-square (F, 4) by each sample's motion, times a share, in each of the modes."""
-    signals = paths.signals
-    middle, durations = paths.middle[:, 0] + 1j * paths.middle[:, 1], signals.durations
-    twists = signals.twists
-    way = (twists[:, 0] + 1j * twists[:, 1]) * np.exp(1j * paths.middle[:, 2]) * durations
-    turn = (np.abs(twists[:, 2]) + np.hypot(twists[:, 0], twists[:, 1]) / lever(paths.robot)) * durations
-    pull = np.zeros((len(middle), len(MODES)))
+    pull = np.zeros((len(paths.owner), len(MODES)))
+    changes = [paths.by_modes[mode] for mode in MODES]
     first = 0
-    weighted = fit.weighted_residuals
-    for log, part, gradient in zip(paths.logs, paths.parts, weighted, strict=True):
+    for log, part, gradient in zip(paths.logs, paths.parts, fit.weighted_residuals, strict=True):
         rows = slice(first, first + len(log.times))
         first = rows.stop
-        poses = paths.poses[part]
-        push = gradient[:, 0] + 1j * gradient[:, 1]
-        swing = np.real(np.conj(1j * (poses[:, 0] + 1j * poses[:, 1])) * push) + gradient[:, 2]
-        later = np.append(push[::-1].cumsum()[::-1], 0.0)
-        swung = np.append(swing[::-1].cumsum()[::-1], 0.0)
-        stamp = np.searchsorted(log.stamps, log.times - durations[rows] / 2)
-        moved = later[stamp]
-        turned = swung[stamp] - np.real(np.conj(1j * middle[rows]) * moved)  # Eq. (1)
-        pull[rows, 0] = np.real(np.conj(way[rows]) * moved)
-        pull[rows, 1] = np.real(np.conj(1j * way[rows]) * moved)
-        pull[rows, 2] = turn[rows] * turned
-        pull[rows, 3] = twists[rows, 2] * durations[rows] * turned
+        lever = paths.lever[part]
+        swing = lever[:, 0] * gradient[:, 1] - lever[:, 1] * gradient[:, 0] + gradient[:, 2]
+        later = np.column_stack([gradient[:, :2], swing])[::-1].cumsum(axis=0)[::-1]
+        stamp = np.searchsorted(log.stamps, log.times - paths.signals.durations[rows] / 2)
+        moved = np.vstack([later, np.zeros(3)])[stamp]
+        for mode, change in enumerate(changes):
+            pull[rows, mode] = (change[rows] * moved).sum(axis=1)  # Eq. (1)
     return pull
 
 
@@ -147,9 +141,10 @@ def _scores(edges: Sequence[int], pull: Array, values: Array) -> Array:
 def _independent(scores: Array) -> list[Array]:
     """Scores (Z, B, d) of B bases as independent ones (Z, d) whose sums have unit variance, Eq. (2)."""
     of_bases = np.ascontiguousarray(scores.transpose(1, 0, 2))
-    off = of_bases - of_bases.mean(axis=1, keepdims=True)
-    square = off.transpose(0, 2, 1) @ off
-    scale = 1 / np.sqrt(np.maximum(np.diagonal(square, axis1=1, axis2=2), 1e-300))
+    square = of_bases.transpose(0, 2, 1) @ of_bases
+    sizes_of = np.diagonal(square, axis1=1, axis2=2)
+    there = sizes_of > _ROUNDING * sizes_of.max(initial=0.0)  # a function that is the same everywhere leaves no more
+    scale = np.where(there, 1 / np.sqrt(np.maximum(sizes_of, 1e-300)), 0.0)
     sizes, vectors = np.linalg.eigh(square * scale[:, :, None] * scale[:, None, :])
     known = sizes > _RANK
     independent = of_bases @ (scale[:, :, None] * vectors / np.sqrt(np.where(known, sizes, 1.0))[:, None, :])
@@ -202,8 +197,10 @@ def _waves_of_time(paths: Paths) -> Iterator[_Kind]:
         words = "the time since the session's start, {frequency:.2g} times a second"
         kinds.append(("order of runs", "smooth_session_wave", words, of_session, _OF_SESSION))
     for covariate, term, detail, time, most in kinds:
-        frequencies = np.arange(1, most + 1) / (2 * max(float(time.max()), 1e-9))
-        shapes = [{"frequency": frequency} for frequency in frequencies.tolist()]
+        if time.max() <= 0:
+            continue
+        frequencies = np.arange(1, most + 1) / (2 * float(time.max()))
+        shapes = [{"frequency": frequency, "duration": float(time.max())} for frequency in frequencies.tolist()]
         yield _Kind(covariate, term, detail, shapes, partial(_over_time, time, frequencies))
 
 

@@ -29,6 +29,7 @@ _WIDTH = 0.03  # m, of a bin: wheels meet a joint within a part of their own siz
 _MOST_BINS = 300  # each way: on larger floors bins are wider (chosen)
 _CROSSED = 5  # runs that must cross a bin: the scatter of fewer says nothing (chosen)
 _OUTLYING = 0.005  # share of the samples beyond the bins on either side
+_MOST_LINES = 40  # candidates in each direction and across it: so many tiles of 0.3 m lie over 6 m both ways (chosen)
 _SURE = 2.0  # standard deviations by which a line must show to be a candidate of a model: by chance one in 22 does
 # Modes of fine_structure.py that joints change together: the wheels are held up, or the robot is knocked round.
 _CHANGES = {"slow the robot": (0, 3), "turn the robot": (2,)}
@@ -43,18 +44,20 @@ def floor_joints(paths: Paths, pull: Array) -> Iterator[tuple[Group, Array]]:
         for words, modes in _CHANGES.items():
             of_samples = pull[:, list(modes)].sum(axis=1)
             scores = [of_axis.scores(paths.owner, of_samples) for of_axis in bins]
-            parts = tuple(part for both in zip(bins, scores, strict=True) for part in _surest(*both))
-            if parts:
+            together = np.concatenate(scores, axis=1)
+            if together.shape[1]:
+                lines = [line for both in zip(bins, scores, strict=True) for line in _lines(*both)]
+                parts = tuple(shapes for _, shapes in sorted(lines, key=lambda line: -line[0])[:_MOST_LINES])
                 detail, tries = f"joints of the floor that {words}, such as tiles have", _DIRECTIONS * len(_CHANGES)
                 basis = Basis("place", "body", detail, None, tries, "smooth_joint", {"normal": normal}, parts)
-                yield Group("covariate", "place", (), tries=tries, basis=basis), np.concatenate(scores, axis=1)
+                yield Group("covariate", "place", (), tries=tries, basis=basis), together
 
 
-def _surest(bins: _Bins, scores: Array) -> Iterator[dict[str, float]]:
-    """The lines in whose bins most happens."""
-    for distance, score in zip(bins.middles[bins.kept].tolist(), scores.sum(axis=0).tolist(), strict=True):
-        if abs(score) > _SURE:
-            yield {"normal": bins.normal, "distance": distance, "width": bins.width}
+def _lines(bins: _Bins, scores: Array) -> Iterator[tuple[float, dict[str, float]]]:
+    """The lines in whose bins most happens, by how many standard deviations."""
+    for distance, score in zip(bins.middles[bins.kept].tolist(), np.abs(scores.sum(axis=0)).tolist(), strict=True):
+        if score > _SURE:
+            yield score, {"normal": bins.normal, "distance": distance, "width": bins.width}
 
 
 @dataclass(frozen=True, eq=False)

@@ -59,7 +59,7 @@ class Paths:
     ends: tuple[Array, ...]
     first: int
     _turns: Array  # (F, 4): cosine, sine, x and y from the run's start, each times the sample's duration
-    _lever: Array  # (S, 2): from the run's start
+    lever: Array  # (S, 2): of the stamps, from the run's start
 
     def in_parts(self) -> Iterator[Paths]:
         """The paths of some runs at a time, few enough that a thousand columns fit into memory."""
@@ -81,7 +81,7 @@ class Paths:
                 ends=self.ends[first:last],
                 first=self.first + first,
                 _turns=self._turns[samples],
-                _lever=self._lever[stamps],
+                lever=self.lever[stamps],
             )
 
     @property
@@ -187,8 +187,8 @@ class Paths:
         before = np.concatenate([np.zeros((1, *steps.shape[1:])), steps[[first - 1 for first in firsts]]])
         steps -= before[self.run]
         turned = steps[:, 2]
-        steps[:, 0] -= self._lever[:, 1, None] * turned
-        steps[:, 1] += self._lever[:, 0, None] * turned
+        steps[:, 0] -= self.lever[:, 1, None] * turned
+        steps[:, 1] += self.lever[:, 0, None] * turned
         return steps
 
 
@@ -260,7 +260,7 @@ def make_paths(
         ends=tuple(ends),
         first=first,
         _turns=turns,
-        _lever=poses[:, :2] - starts[run, :2],
+        lever=poses[:, :2] - starts[run, :2],
     )
 
 

@@ -33,6 +33,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.special import chdtrc
@@ -105,7 +106,12 @@ class Significance:
     @property
     def best(self) -> int:
         """Index of the most significant group."""
-        return int(self.evidence.argmax())
+        return self.surest[0]
+
+    @cached_property
+    def surest(self) -> list[int]:
+        """Indices of the groups, the most significant first."""
+        return sorted(range(len(self.groups)), key=lambda index: (self.p_value(index), -float(self.evidence[index])))
 
     @property
     def best_shapes(self) -> list[int]:
@@ -152,19 +158,26 @@ def significance_of(
 
 
 def significance_of_scores(
-    groups: Sequence[Group], scores: Sequence[Array], by_chance: Sequence[Array], rng: np.random.Generator
+    groups: Sequence[Group],
+    scores: Sequence[Array],
+    by_chance: Sequence[Array],
+    rng: np.random.Generator,
+    *,
+    studentised: bool = False,
 ) -> Significance:
     """Significance of groups by the scores (Z, d) that each has in every run, independent and of unit variance in sum.
 
-    by_chance: scores that stand for noise.
+    by_chance: scores that stand for noise. studentised: the unit is the scores' own scatter, by which a sum that is no
+    chance is measured too small: chi-square differences are then Q = q / (1 - q / Z) of sums of squares q.
     """
     rank = np.array([of_runs.shape[1] for of_runs in scores], dtype=float)
     tries = np.array([group.tries for group in groups], dtype=float)
-    chi_square = np.array([float(np.square(of_runs.sum(axis=0)).sum()) for of_runs in scores])
-    steady = np.array([_without_any_one(of_runs) for of_runs in scores])
+    runs = len(scores[0]) if studentised and scores else np.inf
+    chi_square = _student(np.array([float(np.square(of_runs.sum(axis=0)).sum()) for of_runs in scores]), runs)
+    steady = _student(np.array([_without_any_one(of_runs) for of_runs in scores]), runs)
     spread = np.maximum([float(np.square(of_runs).sum()) / max(of_runs.shape[1], 1) for of_runs in by_chance], 1.0)
     signs = rng.choice([-1.0, 1.0], size=(_FLIPS, len(by_chance[0]) if by_chance else 0))
-    flipped = _flipped(signs, by_chance)
+    flipped = _student(_flipped(signs, by_chance), runs)
     chance = _evidence(flipped, rank, spread, tries)
     evidence = _evidence(steady[None], rank, spread, tries)[0]
     scatter = np.sqrt(2 * np.maximum(rank, 1.0)) * spread
@@ -182,6 +195,11 @@ def significance_of_scores(
         surplus=float(beyond[best]) - usual,
         surplus_of=best,
     )
+
+
+def _student(squares: Array, runs: float) -> Array:
+    """Chi-square differences by sums of squares in units of the scores' own scatter over so many runs."""
+    return squares / np.maximum(1 - squares / runs, 1 / runs)
 
 
 def _flipped(signs: Array, scores: Sequence[Array]) -> Array:

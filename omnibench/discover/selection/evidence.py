@@ -55,9 +55,9 @@ Names without other forms leave to x what bases find beside them:
 
     odds that n names are right = odds(n) m F(x, u) min(F(x', u'), F_max),    probability = odds / (1 + odds).      (9)
 
-Prior odds(n) are odds(1) of a single name, and odds(2) / (n - 1) of several; m is the number of sets of names that
-explain as much, of which one may be right: the product over the places of 1 / sum of P(i | A)^2 over the names i (the
-number of equally likely ones: M. O. Hill, "Diversity and evenness", Ecology 54, 1973).
+Prior odds(n) are odds(1) of a single name, and odds(2) / (n - 1) of several; m is the number of look-alikes, any of
+which may be right: 1 / sum of P(i | A)^2 over the names i of a place, as many as are equally likely (M. O. Hill,
+"Diversity and evenness", Ecology 54, 1973), in the place where it is largest.
 
 The odds are at most even where the names imitate something else: where they cancel each other, so that together they
 make less than a share of what each makes alone, or where a parameter surely has a sign that physics forbids.       (10)
@@ -204,7 +204,7 @@ def credibility_of(
     """Probability that the names of chosen effects are right, by what generic bases still find, Eq. (9) and (10).
 
     left: significance of the bases after the effects. beyond: after the effects in slightly different forms, too.
-    alike: number m of sets of names that explain as much.
+    alike: number m of look-alikes.
     """
     energy = max(sets.energy, 1.0)  # no less than the variance of one number, so that a share of it is defined
     forms = start.given(indices_of(chosen)).only(forms_of(chosen))

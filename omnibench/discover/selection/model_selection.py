@@ -9,7 +9,6 @@ probability against all other effects in its place, Eq. (5), times the probabili
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -125,9 +124,9 @@ def _search(screening: Screening, candidates: Sequence[Group], rng: np.random.Ge
 
 
 def _look_alikes(start: Given, pool: Sequence[Group], chosen: Sequence[Group]) -> float:
-    """Effective number of sets of names that explain as much as the chosen one, Eq. (9)."""
+    """Effective number of names that explain as much in the place that has most of them, Eq. (9)."""
     of_positions = (_probabilities(start, pool, chosen, position, DISCREPANCY) for position in range(len(chosen)))
-    return math.prod(1 / sum(probability**2 for _, probability in of_position) for of_position in of_positions)
+    return max(1 / sum(probability**2 for _, probability in of_position) for of_position in of_positions)
 
 
 def _forward_selection(

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -27,15 +28,16 @@ from numpy.typing import NDArray
 from omnibench.discover.covariate_dependence import weights_of_covariates
 from omnibench.discover.fitting.extend import Extended, columns_of, extend
 from omnibench.discover.fitting.model_fit import Fit
-from omnibench.discover.held_out.cross_validation import folds_of_kinds, held_out_chi_square, is_gain, kinds_of_runs
+from omnibench.discover.held_out.cross_validation import folds_of_kinds, is_gain, kinds_of_runs, without_runs
 from omnibench.discover.regressors.column_group import Group, best_shapes
 from omnibench.discover.regressors.covariate_bases import Basis
 from omnibench.discover.regressors.significance import Significance
 from omnibench.discover.selection.competing_models import CompetingModels
 from omnibench.discover.selection.model_selection import CHANCE
 from omnibench.discover.selection.screening import Screening
-from omnibench.fit.least_squares.whitened import Whitened, given
+from omnibench.fit.least_squares.whitened import Given, Whitened, given
 from omnibench.registry import effects
+from omnibench.robot.effects.smooth.motion import SmoothJoint
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.words import plural
 
@@ -45,8 +47,8 @@ _GRID = 6  # patches of the map along each side of the area
 _MOST = 5  # bases that are put together, at most
 _FINE = 8  # bases of fine structure, at most: neighbours of the surest are among them
 # Kinds of motion without which a gain on those held out says nothing of other paths. On recordings of real robots terms
-# gained where 36 kinds were driven (robotino, by 12 %), and lost with 4 to 8 of them (omni3's circles, 107 mm to 112 mm
-# on squares; diff, 7 mm to 17 mm): tests/benchmarks/real_discovery.py.
+# gained where 36 kinds were driven (robotino: a seventh of Eq. (6)), and lost with 4 to 8 of them (omni3's circles:
+# 107 mm to 112 mm on squares; diff: 7 mm to 17 mm), see tests/benchmarks/real_discovery.py.
 _KINDS = 12
 _FAMILIES = 2  # effects of the catalogue that are tried
 _ROUNDS = 3  # most terms that are added one after another: as many as effects are named
@@ -98,8 +100,8 @@ def add_smooth_terms(
     catalogue that explains most and whose name is not sure. left: what the residuals depend on after the effects;
     looking_again: what they depend on after more. Matrix, named effects and terms are fitted together. Functions of one
     covariate are of one stage, of several stages that which gains most: what happens at one stage can be imitated at
-    another, badly. folds (Z,): the fold in which each run is held out where no command can be, as a function of the
-    command says nothing of others.
+    another, badly. folds (Z,): the fold in which each run is held out where no kind of motion can be, as a function of
+    the command says nothing of others.
     """
     kinds, notes = folds_of_kinds(plain), list[str]()
     if (count := len(set(kinds_of_runs(plain).tolist()))) < _KINDS:
@@ -148,10 +150,11 @@ def _trials(
     """Functions of one covariate: those of whole columns, by stage, and those of fine structure."""
     for bases in surest_bases(screening, base, left, covariate):
         groups = list(_groups_of(bases, base.fit.model.robot))
-        data = _linearised(base, groups)
-        kept = _kept_functions(data, groups)
-        if kept:
-            yield _Trial(covariate, tuple(_restricted(groups, kept)), _held_out_gains(data, groups, kept, folds))
+        data, limits = _linearised(base, groups), _limits_of(groups)
+        choose = partial(_kept_functions, limits=limits)
+        if kept := choose(given(data, [])):
+            gains = _held_out_gains(data, len(limits), choose, folds)
+            yield _Trial(covariate, tuple(_restricted(groups, kept)), gains)
 
 
 def _of_families(screening: Screening, base: Extended, folds: NDArray[np.intp]) -> Iterator[_Trial]:
@@ -165,8 +168,9 @@ def _of_families(screening: Screening, base: Extended, folds: NDArray[np.intp]) 
         group, effect = groups[index], groups[index].effect
         if effect is not None and gains[index] > 0:
             unnamed = replace(group, basis=Basis(effect.shows_in, effect.stage, f"as {group.name} would be"))
-            data, every = _linearised(base, [unnamed]), range(len(unnamed.parameters))
-            yield _Trial(effect.shows_in, (unnamed,), _held_out_gains(data, [unnamed], every, folds))
+            every = range(len(unnamed.parameters))
+            held_out = _held_out_gains(_linearised(base, [unnamed]), len(every), partial(_all_of, every), folds)
+            yield _Trial(effect.shows_in, (unnamed,), held_out)
 
 
 def surest_bases(screening: Screening, base: Extended, left: Significance, covariate: str) -> list[list[Basis]]:
@@ -187,11 +191,14 @@ def surest_bases(screening: Screening, base: Extended, left: Significance, covar
         elif group.basis is not None:
             of_stages.setdefault(group.basis.stage, []).append(group)
     found = [_together(screening.data, groups, before, price) for groups in of_stages.values()]
-    for fine in of_terms.values():
-        surest = sorted(fine, key=lambda index: -excess[index])
-        found.append([left.groups[index] for index in surest[:_FINE] if excess[index] > 0])
-    bases = [[group.basis for group in groups if group.basis is not None] for groups in found if groups]
-    return [of_kind[:1] if of_kind[0].parts else of_kind for of_kind in bases]
+    for term, fine in of_terms.items():
+        if term == SmoothJoint.name:
+            best = min(fine, key=left.surest.index)
+            found.append([left.groups[best]] if left.p_value(best) < CHANCE else [])
+        else:
+            surest = sorted(fine, key=lambda index: -excess[index])
+            found.append([left.groups[index] for index in surest[:_FINE] if excess[index] > 0])
+    return [[group.basis for group in groups if group.basis is not None] for groups in found if groups]
 
 
 def _term_of(group: Group) -> str:
@@ -226,7 +233,8 @@ def _groups_of(bases: Sequence[Basis], robot: Robot) -> Iterator[Group]:
 
 def _terms_of(basis: Basis) -> Iterator[tuple[str, Mapping[str, float]]]:
     """The terms whose functions are candidates: the basis's own, and finer ones."""
-    yield from ((basis.term, shapes) for shapes in basis.parts or (basis.shapes,))
+    own = (basis.shapes,) if basis.parts is None else basis.parts
+    yield from ((basis.term, shapes) for shapes in own)
     if basis.term == "smooth_wheel_rate":
         yield "smooth_common_rate", basis.shapes
     if basis.term == "smooth_map":
@@ -251,7 +259,7 @@ def chosen_functions(base: Extended, groups: Sequence[Group]) -> list[Group]:
     largest gain first. Those that the data hardly determine beyond the chosen ones are passed over, and those that
     would need a coefficient far outside its plausible range.
     """
-    return _restricted(groups, _kept_functions(_linearised(base, groups), groups))
+    return _restricted(groups, _kept_functions(given(_linearised(base, groups), []), _limits_of(groups)))
 
 
 def _linearised(base: Extended, groups: Sequence[Group]) -> Whitened:
@@ -259,21 +267,29 @@ def _linearised(base: Extended, groups: Sequence[Group]) -> Whitened:
     return base.fit.whitened(columns_of(base.fit, [*base.groups, *groups]))
 
 
-def _kept_functions(data: Whitened, groups: Sequence[Group]) -> list[int]:
-    """The functions of some groups, whose columns are the last ones, that are chosen; by their numbers."""
-    limits = _LARGEST * np.array([parameter.high for group in groups for parameter in group.parameters])
-    first = len(data.information) - len(limits)
-    left, kept = given(data, range(first)), list[int]()
+def _limits_of(groups: Sequence[Group]) -> Array:
+    """The largest sizes (P,) that functions of some groups may have."""
+    return _LARGEST * np.array([parameter.high for group in groups for parameter in group.parameters])
+
+
+def _kept_functions(columns: Given, limits: Array) -> Sequence[int]:
+    """The functions that are chosen, by their numbers. columns: of a model, then of all functions."""
+    first = len(columns.information) - len(limits)
+    left, kept = columns.given(range(first)), list[int]()
     while len(kept) < len(limits):
         size, score = np.diag(left.information)[first:], left.scores[:, first:].sum(axis=0)
         allowed = (size > _DETERMINED * left.total[first:]) & (np.abs(score) < limits * size)
         gain = np.where(allowed, np.square(score) / np.maximum(size, 1e-300), 0.0)
         best = int(gain.argmax())
-        if gain[best] <= np.log(len(data.scores)) + np.log(len(limits)):  # Eq. (2)
+        if gain[best] <= np.log(len(columns.scores)) + np.log(len(limits)):  # Eq. (2)
             break
         kept.append(best)
         left = left.given([first + best])
     return kept
+
+
+def _all_of(functions: Sequence[int], _: Given) -> Sequence[int]:
+    return functions
 
 
 def _restricted(groups: Sequence[Group], kept: Sequence[int]) -> list[Group]:
@@ -289,10 +305,24 @@ def _restricted(groups: Sequence[Group], kept: Sequence[int]) -> list[Group]:
     return restricted
 
 
-def _held_out_gains(data: Whitened, groups: Sequence[Group], kept: Sequence[int], folds: NDArray[np.intp]) -> Array:
-    """Chi-square difference (Z,) that these functions, whose columns are the last ones, make for each held-out run."""
-    first = len(data.information) - sum(len(group.parameters) for group in groups)
-    return held_out_chi_square(data, range(first), [*range(first), *(first + row for row in kept)], folds)
+def _held_out_gains(
+    data: Whitened, functions: int, choose: Callable[[Given], Sequence[int]], folds: NDArray[np.intp]
+) -> Array:
+    """Chi-square difference (Z,) that functions make for each held-out run, chosen and fitted by the other folds.
+
+    data: columns of a model, then of so many functions.
+    """
+    first, gains = len(data.information) - functions, np.zeros(len(folds))
+    for fold in np.unique(folds):
+        inside = np.flatnonzero(folds == fold).tolist()
+        others = without_runs(data, folds == fold)
+        chosen = [*range(first), *(first + row for row in choose(others))]
+        for index, sign in ((list(range(first)), 1), (chosen, -1)):
+            values, _ = others.estimate(index)
+            for run in inside:
+                left = data.residuals[run] - data.columns[run][:, index] @ values
+                gains[run] += sign * float(np.square(left).sum())
+    return gains
 
 
 def _capital(text: str) -> str:

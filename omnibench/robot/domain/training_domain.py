@@ -39,17 +39,20 @@ def representatives(robot: Robot, motions: Array) -> Array:
     return motions[chosen]
 
 
-def kinds_of_motion(robot: Robot, motions: Array) -> NDArray[np.intp]:
-    """The number (k,) of the kind of each of several motions (k, 3): all of a kind are near to its first one."""
-    at_wheels = motions * _scale(robot)
-    near, firsts, kinds = _NEAR * _size(at_wheels), list[Array](), []
-    for motion in at_wheels:
-        distances = [float(np.linalg.norm(motion - first)) for first in firsts]
-        kind = next((number for number, distance in enumerate(distances) if distance < near), len(firsts))
-        kinds.append(kind)
-        if kind == len(firsts):
-            firsts.append(motion)
-    return np.array(kinds, dtype=np.intp)
+def kinds_of_motion(robot: Robot, means: Array, spreads: Array) -> NDArray[np.intp]:
+    """The number (k,) of the kind of each of several paths: all of a kind are near to its first one.
+
+    means, spreads (k, 3): of their twists, and standard deviations about these.
+    """
+    paths = np.hstack([means, spreads]) * np.tile(_scale(robot), 2)
+    size = _size(paths)
+    kinds, firsts = np.zeros(len(paths), dtype=np.intp), list[int]()
+    for number, path in enumerate(paths):
+        near = np.flatnonzero(np.linalg.norm(paths[firsts] - path, axis=1) < _NEAR * size)
+        kinds[number] = near[0] if len(near) else len(firsts)
+        if not len(near):
+            firsts.append(number)
+    return kinds
 
 
 def extrapolated_share(robot: Robot, fitted: Array, motions: Array) -> tuple[float, str]:

@@ -168,7 +168,7 @@ _TURNS = ("cos1", "sin1", "cos2", "sin2", "cos3", "sin3")
 
 @effects.register("smooth_time_wave")
 class SmoothTimeWave(SmoothEffect):
-    """Unknown effect: a wave of the time since the start of a run, at one frequency."""
+    """Unknown effect: a wave of the time since the start of a run; after the longest run seen the value is held."""
 
     shows_in = "elapsed time"
     modes = ALL_MODES
@@ -176,10 +176,11 @@ class SmoothTimeWave(SmoothEffect):
     fixed_parameters = (
         *shared(ALL_MODES, labels, "the time since the start"),
         scale("frequency", "Hz", 1e-6, 1e6, 1.0, "waves in a second"),
+        scale("duration", "s", 1e-3, 1e6, 5.0, "of the longest run that was seen"),
     )
 
     def shares(self, signals: Signals, values: Values) -> Array:
-        return waves(2 * np.pi * signals.elapsed, (values["frequency"],))
+        return waves(2 * np.pi * np.minimum(signals.elapsed, values["duration"]), (values["frequency"],))
 
 
 @effects.register("smooth_heading")
@@ -354,7 +355,7 @@ class SmoothCommand(SmoothEffect):
 
 @effects.register("smooth_session_wave")
 class SmoothSessionWave(SmoothEffect):
-    """Unknown effect: a wave of the time since the session's start, at one frequency."""
+    """Unknown effect: a wave of the time since the session's start; after the longest seen the value is held."""
 
     shows_in = "order of runs"
     needs = frozenset({"session_time"})
@@ -363,11 +364,12 @@ class SmoothSessionWave(SmoothEffect):
     fixed_parameters = (
         *shared(ALL_MODES, labels, "the session's time"),
         scale("frequency", "Hz", 1e-9, 1e6, 1e-3, "waves in a second"),
+        scale("duration", "s", 1e-3, 1e9, 3600.0, "of the longest session that was seen"),
     )
 
     def shares(self, signals: Signals, values: Values) -> Array:
         assert signals.session_time is not None  # it is needed
-        return waves(2 * np.pi * signals.session_time, (values["frequency"],))
+        return waves(2 * np.pi * np.minimum(signals.session_time, values["duration"]), (values["frequency"],))
 
 
 @effects.register("smooth_order_of_runs")
