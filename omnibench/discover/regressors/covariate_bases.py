@@ -131,11 +131,9 @@ def _heading() -> Iterator[Basis]:
 
 def _place(paths: Paths) -> Iterator[Basis]:
     places = paths.middle[:, :2]
-    centre = places.mean(axis=0)
-    reach = float(np.linalg.norm(places - centre, axis=1).max())
-    if reach < _SMALL:
+    area = area_of(places)
+    if area["reach"] < _SMALL:
         return
-    area = {"centre_x": float(centre[0]), "centre_y": float(centre[1]), "reach": reach}
     floor, bent, patch = SmoothPlace(), SmoothMap(), SmoothPatch()
     yield _of_effect(floor, "where on the floor the robot is", _smooth(floor, area), area)
 
@@ -150,6 +148,13 @@ def _place(paths: Paths) -> Iterator[Basis]:
     for number, shapes in enumerate(patches):
         columns = partial(_part_of, of_patches, number)
         yield _of_effect(patch, "a patch of the floor", columns, shapes, tries=len(patches))
+
+
+def area_of(places: Array) -> dict[str, float]:
+    """The circle that holds positions (F, 2): the values that shape functions of the place on the floor."""
+    centre = places.mean(axis=0)
+    reach = float(np.linalg.norm(places - centre, axis=1).max())
+    return {"centre_x": float(centre[0]), "centre_y": float(centre[1]), "reach": reach}
 
 
 def _part_of(columns: Columns, number: int, along: Paths) -> Array:

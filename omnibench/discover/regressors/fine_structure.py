@@ -29,7 +29,7 @@ import numpy as np
 
 from omnibench.discover.fitting.model_fit import Fit, paths_of
 from omnibench.discover.regressors.column_group import Group
-from omnibench.discover.regressors.covariate_bases import Basis
+from omnibench.discover.regressors.covariate_bases import Basis, area_of
 from omnibench.discover.regressors.floor_joints import floor_joints
 from omnibench.discover.regressors.paths import Paths
 from omnibench.discover.regressors.significance import Significance, significance_of_scores, together
@@ -167,7 +167,7 @@ def _kinds(paths: Paths) -> Iterator[_Kind]:
     extent = places.max(axis=0) - low
     if extent.max() <= _EDGE:
         return
-    waves, lines, patches = _wave_numbers(), _lines(places), _patches(places)
+    waves, lines, patches, area = _wave_numbers(), _lines(places), _patches(places), area_of(places)
     step = np.pi / np.maximum(extent, _EDGE)
     east, north = ((places - low) * step).T
     most = max(max(abs(number) for number in pair) for pair in waves)
@@ -178,7 +178,7 @@ def _kinds(paths: Paths) -> Iterator[_Kind]:
         "place",
         "smooth_place_wave",
         "a wave over the floor, such as tiles make",
-        [{"along_x": float(step[0] * east), "along_y": float(step[1] * north)} for east, north in waves],
+        [{"along_x": float(step[0] * east), "along_y": float(step[1] * north)} | area for east, north in waves],
         lambda part: _parts(along_x.take(columns[part, 0], axis=1) * along_y.take(columns[part, 1], axis=1)),
     )
     for term, detail, shapes, function in (

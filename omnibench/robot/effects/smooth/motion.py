@@ -278,7 +278,7 @@ class SmoothPatch(SmoothEffect):
 
 @effects.register("smooth_place_wave")
 class SmoothPlaceWave(SmoothEffect):
-    """Unknown effect: a plane wave over the floor, as of tiles."""
+    """Unknown effect: a plane wave over the floor, as of tiles; beyond the places seen the value is held."""
 
     shows_in = "place"
     needs = frozenset({"poses"})
@@ -288,11 +288,13 @@ class SmoothPlaceWave(SmoothEffect):
         *shared(ALL_MODES, labels, "the place"),
         scale("along_x", "rad/m", -1e3, 1e3, 10.0, "phase per way along x of the reference"),
         scale("along_y", "rad/m", -1e3, 1e3, 0.0, "phase per way along y of the reference"),
+        *AREA,
     )
 
     def shares(self, signals: Signals, values: Values) -> Array:
         assert signals.poses is not None  # they are needed
-        return waves(signals.poses[:, :2] @ [values["along_x"], values["along_y"]], (1.0,))
+        held = values["reach"] * inside_of(signals.poses[:, :2], values)
+        return waves(held @ [values["along_x"], values["along_y"]], (1.0,))
 
 
 @effects.register("smooth_edge")
