@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from extended_samples import FORWARD, SIDEWAYS, TURN, extended_of, run_of
 from screening_samples import FIRST, SECOND, screening
 
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.held_out.cross_validation import (
     folds_of_commands,
+    folds_of_kinds,
     folds_of_repetitions,
     held_out_chi_square,
     is_confirmed,
+    kinds_of_runs,
     random_folds_of_repetitions,
     values_of_other_folds,
 )
@@ -54,6 +59,25 @@ def test_at_random_repetitions_still_go_to_different_folds_and_differ_by_the_gen
 def test_all_runs_of_a_command_are_held_out_together_and_runs_without_one_by_themselves() -> None:
     folds = folds_of_commands(runs_of("a", "b", "a", None, None))
     assert folds.tolist() == [0, 1, 0, 2, 3]
+
+
+def test_a_command_and_those_like_it_are_held_out_together() -> None:
+    runs = [run_of(FORWARD, "ahead"), run_of(SIDEWAYS, "aside"), run_of(1.01 * FORWARD, "a little faster"),
+            run_of(TURN, "turn"), run_of(FORWARD, "ahead")]  # fmt: skip
+    fit = extended_of(runs, [np.zeros((2, 3))] * 5).fit
+    assert kinds_of_runs(fit).tolist() == [0, 1, 0, 2, 0]
+    assert folds_of_kinds(fit).tolist() == [0, 1, 0, 2, 0]
+
+
+def test_out_and_back_is_one_kind_of_motion_however_its_mean_scatters() -> None:
+    there, back = np.tile(FORWARD, (20, 1)), np.tile(-FORWARD, (20, 1))
+    rng = np.random.default_rng(0)
+    runs = [replace(run_of(FORWARD, "to and fro"), rates=np.vstack([there, back]) + 0.01 * rng.standard_normal((40, 3)))
+            for _ in range(20)]  # fmt: skip
+    apart = [replace(run, command=None, id=str(number)) for number, run in enumerate(runs)]
+    for recorded in (runs, apart):
+        fit = extended_of(recorded, [np.zeros((2, 3))] * 20).fit
+        assert set(kinds_of_runs(fit).tolist()) == {0}
 
 
 def test_a_run_is_predicted_by_the_mean_of_the_other_folds() -> None:

@@ -1,12 +1,17 @@
-"""Fine structure between poses, on the catalogue-free sets of the exam: found, and in the right place."""
+"""Fine structure between poses, on sets of the exam that no catalogue has a name for: found, and in the right place."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
+from discovery_samples import APR02, simulated
 from hidden.sets import make_set
 
+from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.discover.fitting.extend import fit_matrix
+from omnibench.discover.fitting.model_fit import Fit, paths_of
 from omnibench.discover.regressors.fine_structure import fine_structure
 from omnibench.discover.regressors.significance import Significance
 from omnibench.fit.least_squares.usable_runs import usable_runs
@@ -14,23 +19,20 @@ from omnibench.fit.least_squares.usable_runs import usable_runs
 CHANCE = 0.002
 
 
-def found_in(kind: str, level: float, seed: int) -> Significance:
-    """Fine structure that the plain matrix leaves in 180 runs. kind: of the sets, or nothing."""
-    dataset, _ = make_set("outside" if kind else "null", kind, level, seed)
-    runs = usable_runs(dataset.split("train"))
-    start = dataset.robot.inverse_kinematic_matrix
-    fit = fit_matrix(runs, dataset.robot, dataset.sample_period, start)
-    found = fine_structure(fit, np.random.default_rng(seed))
+def fit_of(runs: Sequence[Trajectory], dataset: Dataset) -> Fit:
+    return fit_matrix(usable_runs(runs), dataset.robot, dataset.sample_period, dataset.robot.inverse_kinematic_matrix)
+
+
+def found_in(fit: Fit) -> Significance:
+    found = fine_structure(fit, np.random.default_rng(0))
     assert found is not None
     return found
 
 
-def surest(found: Significance) -> tuple[str, str, float]:
-    """Covariate and term of the surest group, and its chance."""
-    index = min(range(len(found.groups)), key=found.p_value)
-    basis = found.groups[index].basis
-    assert basis is not None
-    return basis.covariate, basis.term, found.p_value(index)
+def found_beside(kind: str, seed: int) -> Significance:
+    """Fine structure that the plain matrix leaves in 180 runs with something of a non-centrality of 300."""
+    dataset, _ = make_set("outside", kind, 300.0, seed)
+    return found_in(fit_of(dataset.split("train"), dataset))
 
 
 @pytest.mark.parametrize(
@@ -42,13 +44,15 @@ def surest(found: Significance) -> tuple[str, str, float]:
     ],
 )
 def test_what_happens_within_a_turn_a_run_or_a_session_is_seen_over_it(kind: str, covariate: str, term: str) -> None:
-    place, by, chance = surest(found_in(kind, 300.0, 1031))
-    assert (place, by) == (covariate, term)
-    assert chance < CHANCE
+    found = found_beside(kind, 1031)
+    basis = found.groups[found.best].basis
+    assert basis is not None
+    assert (basis.covariate, basis.term) == (covariate, term)
+    assert found.p_value(found.best) < CHANCE
 
 
 def test_joints_that_knock_the_robot_round_are_seen_in_the_direction_in_which_they_lie() -> None:
-    found = found_in("tiles", 300.0, 1022)  # whose joints lie at 84.7 deg
+    found = found_beside("tiles", 1022)  # whose joints lie at 84.7 deg
     joints = [index for index, group in enumerate(found.groups) if group.basis and group.basis.term == "smooth_joint"]
     best = max(joints, key=lambda index: found.evidence[index])
     basis = found.groups[best].basis
@@ -58,6 +62,30 @@ def test_joints_that_knock_the_robot_round_are_seen_in_the_direction_in_which_th
     assert "turn the robot" in basis.detail
 
 
-def test_where_nothing_is_missing_no_fine_structure_is_surer_than_chance() -> None:
-    found = found_in("", 0.0, 60)
-    assert min(found.p_value(index) for index in range(len(found.groups))) > CHANCE
+@pytest.mark.parametrize("commands", [3, 6, 12])
+def test_where_nothing_is_missing_no_fine_structure_is_surer_than_chance_however_few_runs(commands: int) -> None:
+    dataset, _ = make_set("null", "", 0.0, 1003, design="small")
+    kept = sorted({run.command or "" for run in dataset.trajectories})[:commands]
+    found = found_in(fit_of([run for run in dataset.split("train") if run.command in kept], dataset))
+    assert found.p_value(found.best) > CHANCE
+
+
+def test_few_runs_have_no_fine_structure() -> None:
+    dataset = simulated()
+    assert fine_structure(fit_of(dataset.split("train")[:14], dataset), np.random.default_rng(0)) is None
+
+
+def test_a_wave_scores_as_its_slopes_do_where_the_tracked_point_is_off_the_robots_centre() -> None:
+    dataset = simulated(robot=APR02 | {"mount": {"x": 0.2, "y": -0.1, "yaw": 0.3}})
+    fit = fit_of(dataset.split("train"), dataset)
+    found, paths = found_in(fit), paths_of(fit, 0.0)
+    number = next(row for row, group in enumerate(found.groups) if group.name == "heading")  # once a turn
+    heading = paths.middle[:, 2]
+    shares = np.column_stack([np.cos(heading), np.sin(heading)])
+    shares -= shares.mean(axis=0)
+    slopes = np.concatenate([paths.respond(changes, shares) for changes in paths.by_modes.values()], axis=2)
+    gradient = fit.weighted_residuals
+    scores = np.array([np.einsum("ka,kaj->j", of_run, slopes[part]) for of_run, part in
+                       zip(gradient, paths.parts, strict=True)])  # fmt: skip
+    square = scores.sum(axis=0) @ np.linalg.solve(scores.T @ scores, scores.sum(axis=0))
+    assert found.chi_square[number] == pytest.approx(square / (1 - square / len(scores)), rel=0.1)

@@ -130,6 +130,22 @@ def test_the_heading_is_the_references_in_a_stream_whose_frame_is_turned() -> No
 
 
 @pytest.mark.parametrize(
+    ("name", "last", "later"),
+    [
+        ("smooth_time_wave", {"elapsed": np.array([5.0])}, {"elapsed": np.array([7.3])}),
+        ("smooth_session_wave", {"session_time": np.array([3600.0])}, {"session_time": np.array([5e3])}),
+        ("smooth_place_wave", {"poses": at(2.0, 0.0)}, {"poses": at(3.7, 0.0)}),
+    ],
+)
+def test_waves_end_with_what_was_seen(name: str, last: dict[str, Array], later: dict[str, Array]) -> None:
+    there, beyond = (
+        added(name, signals(twists=driving(0.3, 0.0, 0.0), **place), along_cos=0.1, along_sin=0.05)
+        for place in (last, later)
+    )
+    np.testing.assert_allclose(beyond, there, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
     ("mode", "expected"),
     [("along", [0.03, 0.04, 0.0]), ("across", [-0.04, 0.03, 0.0]), ("turn", [0.0, 0.0, 0.1 * (0.6 + 0.5 / 0.195)])],
 )
