@@ -63,7 +63,7 @@ class Basis:
     detail: words that complete "the residual depends on ...", and tell several bases of a covariate apart. columns:
     None where they are not computed along paths. tries: bases of this kind, of which the best is taken. term: the
     smooth effect that adds these changes to a model, or nothing. shapes: the values that shape it. parts: shapes of the
-    term's functions where these are others than the basis's own.
+    term's functions, by default the basis's own.
     """
 
     covariate: str

@@ -38,7 +38,7 @@ from omnibench.robot.effects.smooth.motion import MODES, beyond, bump
 from omnibench.robot.kinematics import Array
 
 _COARSE = 0.1  # s: wheel samples are merged up to this duration
-_FINE = 0.03  # s: the same for joints of the floor, which a robot crosses within this
+_FINE = 0.03  # s: shorter wheel samples are merged where joints of the floor are looked for (1 cm at 0.3 m/s)
 _HARMONICS = 12  # of the heading
 _SWINGS, _OF_SESSION = 48, 12  # half periods in the longest run and session (chosen; in 10 s, up to 2.4 Hz)
 _WAVES = 400  # plane waves over the floor, at most; the shortest are left out

@@ -117,7 +117,7 @@ LINE = (
 
 
 class WithoutCause:
-    """What an effect says that describes an error and not its cause: no such effect is in the catalogue."""
+    """Attributes of effects that describe an error and not its cause, and so are not in the catalogue."""
 
     physics = "None: a function that was fitted to what the model left, without a cause."
     source = "fitted to data"
