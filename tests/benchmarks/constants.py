@@ -36,7 +36,8 @@ FRONT = ("usable_runs", "_start_matrix", "fit_matrix", "screen_plain", "screen_e
          "without_effects")  # fmt: skip
 TAIL = ("validation_runs", "compare_held_out", "waterfall_steps", "extrapolations_of", "calibration_of")
 OF_FRONT = ("fitting", "regressors.covariate_bases", "regressors.effect_slopes", "regressors.paths",
-            "selection.screening", "selection.candidate_groups", "selection.encoder_quantisation", "conclude", RUNS)  # fmt: skip
+            "selection.screening", "selection.candidate_groups", "selection.encoder_quantisation", "conclude",
+            RUNS)  # fmt: skip
 OF_TAIL = ("held_out", "selection.extrapolation")
 
 
