@@ -36,9 +36,8 @@ def description_of(
     hour = f"within {LONGEST / 60:.0f} minutes"
     if not runs:
         return f"Nothing that this robot can drive {hour} surely tells {listing(list(names), last='from')}."
-    alike = "".join(
-        f" Nothing that it can drive {hour} surely tells {first} from {second}." for first, second in inseparable
-    )
+    pairs = "; nor ".join(f"{first} from {second}" for first, second in inseparable)
+    alike = f" Nothing that it can drive {hour} surely tells {pairs}." if pairs else ""
     settled = "the right name" if not inseparable else "the right name, as far as it can be told,"
     return (
         f"Drive {plural(runs, 'run')}, {minutes:.1f} minutes with {PLACING:.0f} s before each to place the robot. On "
