@@ -1,20 +1,6 @@
 """Fine structure: how the motion between poses depends on heading, place and time, finer than whole columns show.
 
-An error of the motion in one sample, a displacement d and a turn e (paths.py, Eq. (1), from the run's start), moves the
-pose at every later stamp j by d + i z_j e and by e. Let h_j be the inverse covariance of the residuals times these, by
-which half the chi-square falls as the pose at stamp j moves. The motion in a sample before stamp k then lowers it by
-
-    g_d = sum over j >= k of h_j,    g_e = sum over j >= k of h_j(heading) + Re(conj(i z_j) h_j),                  (1)
-
-and the score of a function f of a covariate in a mode m of motion (along the way, across it, turning per way or by the
-rate of turn) is the sum of f m g over a run's samples: one product of matrices for all functions, however many.
-
-With s_z the scores of run z for the d columns of a basis, s their sum over Z runs and S = sum of s_z s_z',
-
-    Q = q / (1 - q / Z),    q = s' S^-1 s                                                                          (2)
-
-is the statistic of Hotelling ("The generalization of Student's ratio", Annals of Mathematical Statistics 2, 1931), of d
-degrees of freedom where nothing is missing, whatever the noise is taken for. S stays the same where signs are flipped.
+Scores are those of local_scores.py: one product of matrices for all functions, however many.
 """
 
 from __future__ import annotations
@@ -31,14 +17,16 @@ from omnibench.discover.fitting.model_fit import Fit, paths_of
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.regressors.covariate_bases import Basis, area_of
 from omnibench.discover.regressors.floor_joints import floor_joints
+from omnibench.discover.regressors.local_scores import independent_scores, pull_in_modes
 from omnibench.discover.regressors.paths import Paths
 from omnibench.discover.regressors.significance import Significance, significance_of_scores, together
+from omnibench.discover.regressors.wheel_waves import waves_of_wheels
 from omnibench.robot.effects.effect import Values
-from omnibench.robot.effects.smooth.motion import MODES, beyond, bump
+from omnibench.robot.effects.smooth.motion import beyond, bump
 from omnibench.robot.kinematics import Array
 
 _COARSE = 0.1  # s: wheel samples are merged up to this duration
-_FINE = 0.03  # s: shorter wheel samples are merged where joints of the floor are looked for (1 cm at 0.3 m/s)
+_FINE = 0.03  # s: shorter wheel samples are merged where joints of the floor and waves of wheels are looked for
 _HARMONICS = 12  # of the heading
 _SWINGS, _OF_SESSION = 48, 12  # half periods in the longest run and session (chosen; in 10 s, up to 2.4 Hz)
 _WAVES = 400  # plane waves over the floor, at most; the shortest are left out
@@ -47,8 +35,6 @@ _EDGE = 0.05  # m, over which the floor changes at a line
 _CELLS = 9  # patches along each side of the floor
 _WIDE = 0.7  # radius of a patch, of the distance between two, as in covariate_bases.py
 _RUNS = 15  # at least: the scatter of eight scores is hardly known from fewer; chosen
-_ROUNDING = 1e-16  # share of the largest column's square below which a column is what rounding leaves
-_RANK = 1e-6  # share of a column's square that must be left beyond the others of its basis
 _SEEN = 0.002  # share of the samples that must lie in a patch, as in covariate_bases.py
 _NUMBERS = 1_000_000  # values of functions that are computed at once (chosen)
 
@@ -84,11 +70,12 @@ def _families(fit: Fit) -> Iterator[tuple[list[tuple[Group, Array]], bool]]:
     """
     yield from ((members, True) for members in _of_kinds(paths_of(fit, _COARSE), fit))
     finer = paths_of(fit, _FINE)
-    yield list(floor_joints(finer, _pull(fit, finer))), False
+    yield list(waves_of_wheels(fit, finer)), True
+    yield list(floor_joints(finer, pull_in_modes(fit, finer))), False
 
 
 def _of_kinds(paths: Paths, fit: Fit) -> Iterator[list[tuple[Group, Array]]]:
-    pull = _pull(fit, paths)
+    pull = pull_in_modes(fit, paths)
     for kind in _kinds(paths):
         yield list(_of_kind(paths, pull, kind))
 
@@ -99,30 +86,12 @@ def _of_kind(paths: Paths, pull: Array, kind: _Kind) -> Iterator[tuple[Group, Ar
     at_once = max(1, _NUMBERS // len(paths.owner))
     for low in range(0, len(kind.shapes), at_once):
         part = slice(low, low + at_once)
-        independent = _independent(_scores(edges, pull, kind.values(part)))
+        independent = independent_scores(_scores(edges, pull, kind.values(part)))
         for shape, of_runs in zip(kind.shapes[part], independent, strict=True):
             if of_runs.shape[1]:
                 detail, tries = kind.detail.format(**shape), len(kind.shapes)
                 basis = Basis(kind.covariate, "body", detail, None, tries, kind.term, shape)
                 yield Group("covariate", kind.covariate, (), tries=tries, basis=basis), of_runs
-
-
-def _pull(fit: Fit, paths: Paths) -> Array:
-    """The change of half the chi-square (F, 4) by each sample's motion, times a share, in each of the modes."""
-    pull = np.zeros((len(paths.owner), len(MODES)))
-    changes = [paths.by_modes[mode] for mode in MODES]
-    first = 0
-    for log, part, gradient in zip(paths.logs, paths.parts, fit.weighted_residuals, strict=True):
-        rows = slice(first, first + len(log.times))
-        first = rows.stop
-        lever = paths.lever[part]
-        swing = lever[:, 0] * gradient[:, 1] - lever[:, 1] * gradient[:, 0] + gradient[:, 2]
-        later = np.column_stack([gradient[:, :2], swing])[::-1].cumsum(axis=0)[::-1]
-        stamp = np.searchsorted(log.stamps, log.times - paths.signals.durations[rows] / 2)
-        moved = np.vstack([later, np.zeros(3)])[stamp]
-        for mode, change in enumerate(changes):
-            pull[rows, mode] = (change[rows] * moved).sum(axis=1)  # Eq. (1)
-    return pull
 
 
 def _scores(edges: Sequence[int], pull: Array, values: Array) -> Array:
@@ -136,19 +105,6 @@ def _scores(edges: Sequence[int], pull: Array, values: Array) -> Array:
                for low, high in pairwise(edges)]  # fmt: skip
     scores = np.array(of_runs).reshape(-1, pull.shape[1], *values.shape[1:])
     return scores.transpose(0, 2, 1, 3).reshape(len(scores), values.shape[1], -1)
-
-
-def _independent(scores: Array) -> list[Array]:
-    """Scores (Z, B, d) of B bases as independent ones (Z, d) whose sums have unit variance, Eq. (2)."""
-    of_bases = np.ascontiguousarray(scores.transpose(1, 0, 2))
-    square = of_bases.transpose(0, 2, 1) @ of_bases
-    sizes_of = np.diagonal(square, axis1=1, axis2=2)
-    there = sizes_of > _ROUNDING * sizes_of.max(initial=0.0)  # a function that is the same everywhere leaves no more
-    scale = np.where(there, 1 / np.sqrt(np.maximum(sizes_of, 1e-300)), 0.0)
-    sizes, vectors = np.linalg.eigh(square * scale[:, :, None] * scale[:, None, :])
-    known = sizes > _RANK
-    independent = of_bases @ (scale[:, :, None] * vectors / np.sqrt(np.where(known, sizes, 1.0))[:, None, :])
-    return [of_runs[:, rows] for of_runs, rows in zip(independent, known, strict=True)]
 
 
 def _kinds(paths: Paths) -> Iterator[_Kind]:
