@@ -23,8 +23,9 @@ from omnibench.discover.regressors.paths import Paths
 from omnibench.robot.kinematics import Array
 
 _LOW, _HIGH = 0.1, 6.0  # waves a turn; slower ones look like radii, for faster ones there are whole columns (chosen)
-_MOST = 2000  # numbers of waves; over angles that tell more apart, the higher ones are left out (chosen)
+_MOST = 1500  # numbers of waves; over angles that tell more apart, the higher ones are left out (chosen)
 _WIDTH = 0.1  # w, rad: the fastest wave moves on by 0.6 rad, by which it shows at 98 % (chosen)
+_TOGETHER = 300_000  # scores of runs and numbers of waves that are computed at once (chosen)
 _TURNS = 10  # over all runs, from which on waves a turn can be told from a radius (chosen)
 
 
@@ -39,17 +40,17 @@ def waves_of_wheels(fit: Fit, paths: Paths) -> Iterator[tuple[Group, Array]]:
     numbers = np.arange(_LOW, _HIGH, np.pi / span)[:_MOST]
     rates = paths.signals.rates
     changes = [paths.changes(paths.by_rates(rates * unit)) for unit in np.eye(rates.shape[1])]
-    pull = pull_by(fit, paths, changes)
-    of_wheels = [_scores(paths, angles[:, wheel], pull[:, wheel], numbers) for wheel in range(rates.shape[1])]
-    parts = [part[..., None] for scores in of_wheels for part in (scores.real, scores.imag)]
-    independent = independent_scores(np.concatenate(parts, axis=2))
-    for number, of_runs in zip(numbers.tolist(), independent, strict=True):
-        if of_runs.shape[1]:
-            detail = f"the angle of the wheels, {number:.3g} times a turn"
-            basis = Basis(
-                "wheel angle", "wheel", detail, None, len(numbers), "smooth_wheel_angle", {"harmonic": number}
-            )
-            yield Group("covariate", "wheel angle", (), tries=len(numbers), basis=basis), of_runs.astype(np.float32)
+    pull, at_once = pull_by(fit, paths, changes), max(1, _TOGETHER // len(paths.logs))
+    for first in range(0, len(numbers), at_once):
+        some = numbers[first : first + at_once]
+        waves = [_scores(paths, angles[:, wheel], pull[:, wheel], some) for wheel in range(rates.shape[1])]
+        parts = [part[..., None] for scores in waves for part in (scores.real, scores.imag)]
+        independent = independent_scores(np.concatenate(parts, axis=2))
+        for number, of_runs in zip(some.tolist(), independent, strict=True):
+            if of_runs.shape[1]:
+                detail, tries = f"the angle of the wheels, {number:.3g} times a turn", len(numbers)
+                basis = Basis("wheel angle", "wheel", detail, None, tries, "smooth_wheel_angle", {"harmonic": number})
+                yield Group("covariate", "wheel angle", (), tries=tries, basis=basis), of_runs.astype(np.float32)
 
 
 def _scores(paths: Paths, angles: Array, pull: Array, numbers: Array) -> Array:

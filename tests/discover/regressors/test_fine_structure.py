@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from discovery_samples import APR02, simulated
+from discovery_samples import APR02, shorn, simulated
 from hidden.sets import make_set
 
 from omnibench.data.dataset import Dataset, Trajectory
@@ -60,6 +60,21 @@ def test_joints_that_knock_the_robot_round_are_seen_in_the_direction_in_which_th
     assert found.p_value(best) < CHANCE
     assert np.degrees(basis.shapes["normal"]) == pytest.approx(84.7, abs=4)
     assert "turn the robot" in basis.detail
+
+
+def test_a_belt_is_seen_at_the_number_of_times_that_it_turns_with_its_wheel() -> None:
+    found = found_beside("belt", 1030)  # which turns half as often
+    basis = found.groups[found.best].basis
+    assert basis is not None
+    assert basis.term == "smooth_wheel_angle"
+    assert basis.shapes["harmonic"] == pytest.approx(0.5, abs=0.01)
+    assert found.p_value(found.best) < CHANCE
+
+
+def test_without_absolute_angles_of_the_wheels_none_of_their_waves_are_looked_for() -> None:
+    dataset = shorn(simulated(), angles=None)
+    groups = found_in(fit_of(dataset.split("train"), dataset)).groups
+    assert not any(group.name == "wheel angle" for group in groups)
 
 
 @pytest.mark.parametrize("commands", [3, 6, 12])
