@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from discover_study import discovering_code
-from foreign.judging import Result, carry_out
+from foreign_judging import Result, carry_out
 from scipy.stats import binomtest
 
 from omnibench.jobs.job import Failure, Job, JobWatch, run_jobs
@@ -30,7 +30,7 @@ def main() -> None:
     store = ResultStore(arguments.out, Result)
     jobs = [_job(kind, seed) for seed in arguments.seeds for kind in arguments.only or KINDS]
     if not arguments.table:
-        run_jobs(jobs, store, local_backend(arguments.jobs, ("foreign.judging",)), _Said())
+        run_jobs(jobs, store, local_backend(arguments.jobs, ("foreign_judging",)), _Said())
     print("\n".join(table([result for job in jobs if (result := store.get(job.key)) is not None])))
 
 

@@ -1,4 +1,4 @@
-"""Judging what is discovered in a recording by one of these simulators."""
+"""Judging what is discovered in a recording by a simulator of ``foreign``."""
 
 from __future__ import annotations
 
