@@ -64,7 +64,7 @@ def fine_structure(fit: Fit, rng: np.random.Generator) -> Significance | None:
 
 
 def _families(fit: Fit) -> Iterator[tuple[list[tuple[Group, Array]], bool]]:
-    """Groups of each kind with their scores (Z, d), and whether these are to be studentised, Eq. (2).
+    """Groups of each kind with their scores (Z, d), and whether these are to be studentised (local_scores.py, Eq. (2)).
 
     The paths of one are given up before those of the next are made.
     """

@@ -1,7 +1,7 @@
 """Joints of the floor, as between tiles: what happens to the motion within centimetres of parallel lines.
 
 Across lines with the normal n a place p has the coordinate u = n . p. Let s_zb be the score of run z for a change of
-the motion in bin b of u alone (fine_structure.py, Eq. (1)), beyond a change of the same size everywhere. With the bins
+the motion in bin b of u alone (local_scores.py, Eq. (1)), beyond a change of the same size everywhere. With the bins
 of n and of the direction across it together, since tiles have joints both ways,
 
     Q = sum over b of (sum over z of s_zb)^2 / (sum over z of s_zb^2)                                               (1)
@@ -31,7 +31,7 @@ _CROSSED = 5  # runs that must cross a bin: the scatter of fewer says nothing (c
 _OUTLYING = 0.005  # share of the samples beyond the bins on either side
 _MOST_LINES = 40  # candidates in each direction and across it: so many tiles of 0.3 m lie over 6 m both ways (chosen)
 _SURE = 2.0  # standard deviations by which a line must show to be a candidate of a model: by chance one in 22 does
-# Modes of fine_structure.py that joints change together: the wheels are held up, or the robot is knocked round.
+# Modes, by their numbers in MODES, that joints change together: the wheels are held up, or the robot is knocked round.
 _CHANGES = {"slow the robot": (0, 3), "turn the robot": (2,)}
 
 

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from omnibench.discover.covariate_dependence import weights_of_covariates
 from omnibench.discover.fitting.extend import Extended, columns_of, extend
 from omnibench.discover.fitting.model_fit import Fit
-from omnibench.discover.held_out.cross_validation import folds_of_kinds, is_gain, kinds_of_runs, without_runs
+from omnibench.discover.held_out.cross_validation import folds_of_kinds, is_gain, without_runs
 from omnibench.discover.regressors.column_group import Group, best_shapes
 from omnibench.discover.regressors.covariate_bases import Basis
 from omnibench.discover.regressors.significance import Significance
@@ -104,7 +104,7 @@ def add_smooth_terms(
     the command says nothing of others.
     """
     kinds, notes = folds_of_kinds(plain), list[str]()
-    if (count := len(set(kinds_of_runs(plain).tolist()))) < _KINDS:
+    if (count := screening.kinds or 0) < _KINDS:
         few = f"No unnamed term was tried: {plural(count, 'kind')} of motion cannot tell whether it holds for others."
         return SmoothTerm(models, left, (few,))
     for _ in range(_ROUNDS):
