@@ -18,6 +18,7 @@ from omnibench.discover.result import (
     Step,
     Verdict,
 )
+from omnibench.discover.selection.model_selection import SURE
 from omnibench.registry import effects
 from omnibench.report.numbers import NOTHING, decimals_for, fixed, listing, percent, significant, span, with_unit
 from omnibench.robot.effects.effect import Stage
@@ -157,7 +158,8 @@ def _cause_in_words(effect: NamedEffect) -> str:
     what = entry.summary.partition(":")[0].rstrip(".") if entry.cls.in_catalogue else "Something that has no name"
     others = [name.replace("_", " ") for name in effect.confusable_with if name != effect.name]
     alike = f"; it may as well be {listing(others, 3)}" if others else ""
-    return f"{what} ({effect.name.replace('_', ' ')}{alike})"
+    doubt = "" if effect.class_weight >= SURE else "Likeliest, but not sure: "
+    return f"{doubt}{what} ({effect.name.replace('_', ' ')}{alike})"
 
 
 def weight_in_words(weight: float) -> str:

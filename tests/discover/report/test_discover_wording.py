@@ -10,6 +10,7 @@ from discovery_samples import held_out, named
 from omnibench.discover.report.tables import extrapolation_table
 from omnibench.discover.report.wording import (
     added,
+    answer_in_words,
     chance,
     closed_in_words,
     extrapolations_in_words,
@@ -96,3 +97,11 @@ def test_runs_of_which_none_is_repeated_are_not_called_repetitions() -> None:
     alone = replace(found, noise=replace(found.noise, source="within runs"))
     assert held_out_in_words(alone, repetitions) == "held-out runs"
     assert "No command is repeated" in floor_in_words(alone)
+
+
+def test_a_cause_that_is_not_sure_is_said_to_be_the_likeliest() -> None:
+    found = named()
+    (effect,) = found.effects
+    doubtful = replace(found, effects=(replace(effect, class_weight=0.5),))
+    assert not answer_in_words(found).startswith("Likeliest")
+    assert answer_in_words(doubtful) == f"Likeliest, but not sure: {answer_in_words(found)}"
