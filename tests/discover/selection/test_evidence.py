@@ -162,3 +162,24 @@ def test_effects_that_cancel_each_other_have_even_odds_at_most() -> None:
     assert joint < 0.45
     found = credibility_of(effect_sets(start, chosen, 2), start, chosen, significance(0.0), significance(0.0))
     assert found.probability == 0.5
+
+
+@pytest.mark.parametrize(
+    ("apart", "along", "credible"),
+    [
+        (25.0, 25.0, False),  # the function explains all of it, the name 82 %
+        (25.0, 0.0, True),  # the name explains all of it, the function 82 %
+        (0.5, 0.5, True),  # the function is the name's own but for 0.0001
+    ],
+)
+def test_a_name_has_even_odds_at_most_where_one_function_that_is_not_its_own_explains_more(
+    apart: float, along: float, credible: bool
+) -> None:
+    function, residual = (
+        np.cos(np.radians(turn)) * FIRST + np.sin(np.radians(turn)) * THIRD for turn in (apart, along)
+    )
+    given = screening({DRIFT: FIRST, BIAS: SECOND}, {"place": function}, (20 * residual).tolist())
+    start, chosen = given.beyond_matrix(), given.groups.effects[:1]
+    found = credibility_of(effect_sets(start, chosen, 1), start, chosen, significance(0.0), significance(0.0))
+    assert (found.probability > 0.95) is credible
+    assert credible or found.probability == 0.5
