@@ -36,7 +36,8 @@ def description_of(
     hour = f"within {LONGEST / 60:.0f} minutes"
     if not runs:
         return f"Nothing that this robot can drive {hour} surely tells {listing(list(names), last='from')}."
-    pairs = "; nor ".join(f"{first} from {second}" for first, second in inseparable)
+    from_first = {first: [second for one, second in inseparable if one == first] for first, _ in inseparable}
+    pairs = "; nor ".join(f"{first} from {listing(others, last='or')}" for first, others in from_first.items())
     alike = f" Nothing that it can drive {hour} surely tells {pairs}." if pairs else ""
     settled = "the right name" if not inseparable else "the right name, as far as it can be told,"
     return (

@@ -13,6 +13,8 @@ from wheeled_samples import DIFF, SWERVE, TRICYCLE, driven
 from omnibench.data.joining import joined
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.experiments.candidate_runs import candidate_runs
+from omnibench.discover.experiments.driving_plan import description_of
+from omnibench.discover.experiments.run_choice import Choice
 from omnibench.discover.fitting.extend import fit_matrix
 from omnibench.discover.fitting.model_fit import Fit
 from omnibench.fit.least_squares.usable_runs import usable_runs
@@ -101,3 +103,9 @@ def test_steering_is_turned_within_a_run_where_its_play_is_in_doubt() -> None:
     assert steady is not None
     assert weaving is not None
     assert np.ptp(steady) == 0 < np.ptp(weaving)
+
+
+def test_effects_that_nothing_tells_apart_are_listed_with_all_that_each_looks_like() -> None:
+    choice = Choice(np.array([1]), 0.6, 0.0, np.eye(3, dtype=bool))
+    said = description_of("abc", 1, 0.5, choice, [("a", "b"), ("a", "c"), ("b", "c")])
+    assert said.endswith("surely tells a from b or c; nor b from c.")
