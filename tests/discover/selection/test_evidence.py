@@ -183,3 +183,15 @@ def test_a_name_has_even_odds_at_most_where_one_function_that_is_not_its_own_exp
     found = credibility_of(effect_sets(start, chosen, 1), start, chosen, significance(0.0), significance(0.0))
     assert (found.probability > 0.95) is credible
     assert credible or found.probability == 0.5
+
+
+def test_two_names_have_even_odds_at_most_where_one_function_explains_nearly_as_much() -> None:
+    function = np.cos(np.radians(7)) * FIRST + np.sin(np.radians(7)) * THIRD  # 98.5 % of what the names explain
+    given = screening({DRIFT: FIRST, BIAS: SECOND}, {"place": function}, [0, 20, 1, 0, 0])
+    start, both = given.beyond_matrix(), given.groups.effects
+    sure, even = (
+        credibility_of(effect_sets(start, chosen, len(chosen)), start, chosen, significance(0.0), significance(0.0))
+        for chosen in (both[:1], both)
+    )
+    assert sure.probability > 0.95
+    assert even.probability == 0.5
