@@ -30,7 +30,7 @@ chance. With the likeliest v the forms raise the evidence, and the more so the l
     ln B_f = sum of (z^2 v / (1 + v) - ln(1 + v)) / 2,    v = max(0, mean z^2 - 1),
     ln B'(A) = ln B'(A) + ln B_f - max(z'z - m, 0) / (rho N),                                                     (3a)
 
-so that the share of N that forms explain has an exponential distribution with the mean rho.
+so that the share of N that forms explain has an exponential distribution with the mean rho (1 + delta^2 N).
 
 Prior odds. The odds that an effect is missing are 1 to 20; of its t shapes, if it has several, each is as likely:
 
@@ -61,8 +61,10 @@ which may be right: 1 / sum of P(i | A)^2 over the names i of a place, as many a
 
 The odds are at most even where the names imitate something else: where they cancel each other, so that together they
 make less than a share of what each makes alone; where a parameter surely has a sign that physics forbids; or where a
-single function of the generic bases has more evidence, Eq. (2) and (3), than the names in all their forms, Eq. (3a),
-and is not in the span of these: a simpler cause is likelier.                                                       (10)
+single column of the generic bases has more evidence, Eq. (2), than the names in all their forms, Eq. (3a), and has
+evidence beside each of the names in the textbook's form, too, with N of Eq. (3) the largest of all of these. Only
+columns count that keep a hundredth of themselves beyond the matrix, and of that a hundredth beyond the names in all
+their forms. Neither side has prior odds.                                                                           (10)
 
 The rates of right and wrong names to which all this leads are printed by tests/benchmarks/discover_study.py.
 """
@@ -107,8 +109,8 @@ _MOST_ODDS = 8.0  # F_max: below 1 / u, so that what is left beside the names as
 _CANCELLING = 0.45  # share of Eq. (10): 1.0 or more of right pairs, 0.2 to 0.3 of the best wrong ones in 4 sets of 24
 _SURELY = 3.0  # standard errors: a normal number is below minus three of them in one of 740 cases
 _IMITATION = 1.0  # odds, at most, of effects that imitate something else: even
-# Share of itself that a function must keep to be something else: right names leave 0.001 at most of one that is their
-# own, and the best wrong ones 0.02 or more, in 75 sets (Eq. 10).
+# Share of itself that a column must keep to be something else, Eq. (10): right names leave 0.001 at most of a column
+# that has the form of one of them, in 75 sets.
 _ELSE = 0.01
 _ODDS_OF_ONE = 5.0  # odds(1): of what has a form, one name of six does not stand for its cause; chosen
 _ODDS_OF_TWO = 1.0  # odds(2): with 0.3 to 8 all right names of the study are sure, and no wrong one
@@ -289,16 +291,21 @@ def joint_share(start: Given, chosen: Sequence[Group]) -> float:
 def one_function_explains_more(start: Given, chosen: Sequence[Group], functions: Sequence[int], energy: float) -> bool:
     """True if one column of the generic bases has more evidence than the effects in all their forms, Eq. (10).
 
-    start: columns beyond the matrix. functions: the columns of the bases. energy: non-centrality N of the effects.
+    It must have evidence beside each of them, too: beside a right name it finds nothing, however few its parameters.
+    start: columns beyond the matrix. functions: the columns of the bases. energy: the largest non-centrality N of any
+    set of effects.
     """
     names, columns = indices_of(chosen), np.array(functions, dtype=int)
     whole = np.diag(start.information)[columns]
     left = np.diag(start.given([*names, *forms_of(chosen)]).information)[columns]
-    others = (whole > _ELSE * start.total[columns]) & (left > _ELSE * whole)
-    if not others.any():
+    others = np.flatnonzero((whole > _ELSE * start.total[columns]) & (left > _ELSE * whole))
+    if not len(others):
         return False
     explained = np.square(start.scores[:, columns[others]].sum(axis=0)) / whole[others]
-    most, energy = np.array([explained.max()]), max(energy, float(explained.max()) - 1)
+    best, most = int(columns[others[explained.argmax()]]), explained.max()
+    energy = max(energy, float(most) - 1)
     chi_square, rank = np.array([start.chi_square(names)]), np.array([start.rank(names)])
     of_names = log_evidence(chi_square, rank, energy) + form_evidence(start, chosen, energy, DISCREPANCY)
-    return bool(log_evidence(most, np.ones(1), energy)[0] > of_names[0])
+    beside = np.array([start.given(group.index).chi_square([best]) for group in chosen])
+    of_function, *besides = log_evidence(np.array([most, *beside]), np.ones(1 + len(beside)), energy)
+    return bool(of_function > of_names[0]) and all(evidence > 0 for evidence in besides)

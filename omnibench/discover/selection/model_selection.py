@@ -4,7 +4,8 @@ Equations are those of evidence.py. Effects are added one by one, and all that w
 n-th if the surest effect beyond those chosen is no chance (Eq. (3) of significance.py), and all n effects of the set
 with the largest posterior, Eq. (4), gain on runs that are held out. Where a smaller set has a larger posterior, the
 n-th effect is still taken if it explains most of what generic bases find beside the others. A name's weight is its
-probability against all other effects in its place, Eq. (5), times the probability that all names are right, Eq. (9).
+probability against all other effects in its place, Eq. (5), times the probability that all names are right, Eq. (9)
+and (10).
 """
 
 from __future__ import annotations
@@ -56,7 +57,8 @@ class Selection:
     probability that what is missing is in the catalogue. stand_ins: for each chosen effect, the others that could take
     its place. steps: significance of all candidates when each effect was looked for. where, left: significance of the
     generic bases before any effect and after the chosen ones. left_share: share of the chi-square that the effects
-    leave. tentative: effects that were given up because too much is left beside them, to first order.
+    leave. tentative: effects that were given up because too much is left beside them, to first order, or because they
+    imitate something else.
     """
 
     chosen: tuple[Group, ...]

@@ -186,12 +186,19 @@ def test_a_name_has_even_odds_at_most_where_one_function_that_is_not_its_own_exp
 
 
 def test_two_names_have_even_odds_at_most_where_one_function_explains_nearly_as_much() -> None:
-    function = np.cos(np.radians(7)) * FIRST + np.sin(np.radians(7)) * THIRD  # 98.5 % of what the names explain
-    given = screening({DRIFT: FIRST, BIAS: SECOND}, {"place": function}, [0, 20, 1, 0, 0])
+    both = (FIRST + SECOND) / np.sqrt(2)
+    function = np.cos(np.radians(7)) * both + np.sin(np.radians(7)) * THIRD  # 98.5 % of what both explain, each 50 %
+    assert joint_credibility(function, 20 * both) == 0.5
+
+
+def test_two_names_stay_sure_where_one_function_explains_no_more_than_the_first_of_them() -> None:
+    function = np.cos(np.radians(7)) * FIRST + np.sin(np.radians(7)) * THIRD
+    assert joint_credibility(function, 300 * FIRST + 30 * SECOND) > 0.95
+
+
+def joint_credibility(function: np.ndarray, residual: np.ndarray) -> float:
+    """Probability that two names are right, beside a basis of one function."""
+    given = screening({DRIFT: FIRST, BIAS: SECOND}, {"place": function}, residual.tolist())
     start, both = given.beyond_matrix(), given.groups.effects
-    sure, even = (
-        credibility_of(effect_sets(start, chosen, len(chosen)), start, chosen, significance(0.0), significance(0.0))
-        for chosen in (both[:1], both)
-    )
-    assert sure.probability > 0.95
-    assert even.probability == 0.5
+    sets = effect_sets(start, both, 2)
+    return credibility_of(sets, start, both, significance(0.0), significance(0.0)).probability
