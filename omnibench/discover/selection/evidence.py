@@ -192,13 +192,16 @@ def effect_sets(start: Given, pool: Sequence[Group], most: int) -> EffectSets:
 class Credibility:
     """Probability that chosen names are right.
 
-    left_share: share of the chi-square that generic bases or other forms of the effects still find. discrepancy: delta
-    of Eq. (3), estimated from what is left beside all forms.
+    left_share: share of the chi-square that generic bases still find beside the effects in all their forms. off_form:
+    share that other forms of the effects explain, or bases where there are none. discrepancy: delta of Eq. (3),
+    estimated from what is left. imitation: in words, why the effects imitate something else, Eq. (10), or nothing.
     """
 
     left_share: float
+    off_form: float
     probability: float
     discrepancy: float
+    imitation: str
 
 
 def credibility_of(
@@ -221,24 +224,17 @@ def credibility_of(
     of_forms = max(forms.chi_square(every) - rank, 0.0)
     whole = energy + of_forms
     odds = alike * (_ODDS_OF_ONE if len(chosen) == 1 else _ODDS_OF_TWO / (len(chosen) - 1))
-    if rank:
-        odds *= bayes_factor(of_forms, math.sqrt(2 * rank), energy, _FORMS_RIGHT)
-    else:
-        size, spread = left.surplus_chi_square
-        odds *= bayes_factor(size, spread, energy, _LEFT_RIGHT)
+    size, spread = (of_forms, math.sqrt(2 * rank)) if rank else left.surplus_chi_square
+    odds *= bayes_factor(size, spread, energy, _FORMS_RIGHT if rank else _LEFT_RIGHT)
     beside, scatter = beyond.surplus_chi_square
     usual = _BEYOND_FORMS if rank else _BEYOND_RIGHT
     odds *= min(bayes_factor(beside, scatter, whole, usual), _MOST_ODDS)  # Eq. (9)
-    functions = [index for group in left.groups for index in group.index]
-    if (
-        (len(chosen) > 1 and joint_share(start, chosen) < _CANCELLING)
-        or _has_wrong_sign(start, chosen)
-        or one_function_explains_more(start, chosen, functions, energy)
-    ):
+    imitated = imitation(start, chosen, [index for group in left.groups for index in group.index], energy)
+    if imitated:
         odds = min(odds, _IMITATION)  # Eq. (10)
     share = beside / (beside + whole)
     discrepancy = float(np.clip(math.sqrt(share), _LEAST_DISCREPANCY, _MOST_DISCREPANCY))
-    return Credibility(share, odds / (1 + odds), discrepancy)
+    return Credibility(share, size / (size + energy), odds / (1 + odds), discrepancy, imitated)
 
 
 def bayes_factor(left: float, deviation: float, energy: float, usual: float) -> float:
@@ -265,6 +261,21 @@ def bayes_factor(left: float, deviation: float, energy: float, usual: float) -> 
     return right / wrong  # Eq. (8)
 
 
+def imitation(start: Given, chosen: Sequence[Group], functions: Sequence[int], energy: float) -> str:
+    """Why chosen effects imitate something else, Eq. (10), in words, or nothing if they do not.
+
+    start: columns beyond the matrix. functions: the columns of the bases. energy: the largest non-centrality N of any
+    set of effects.
+    """
+    if len(chosen) > 1 and joint_share(start, chosen) < _CANCELLING:
+        return "they cancel each other"
+    if _has_wrong_sign(start, chosen):
+        return "of an impossible sign"
+    if _one_function_explains_more(start, chosen, functions, energy):
+        return "one function explains more"
+    return ""
+
+
 def _has_wrong_sign(start: Given, chosen: Sequence[Group]) -> bool:
     """True if a parameter is surely negative that physics allows to be positive only.
 
@@ -288,12 +299,10 @@ def joint_share(start: Given, chosen: Sequence[Group]) -> float:
     return start.chi_square(index) / max(apart, 1e-300)
 
 
-def one_function_explains_more(start: Given, chosen: Sequence[Group], functions: Sequence[int], energy: float) -> bool:
+def _one_function_explains_more(start: Given, chosen: Sequence[Group], functions: Sequence[int], energy: float) -> bool:
     """True if one column of the generic bases has more evidence than the effects in all their forms, Eq. (10).
 
     It must have evidence beside each of them, too: beside a right name it finds nothing, however few its parameters.
-    start: columns beyond the matrix. functions: the columns of the bases. energy: the largest non-centrality N of any
-    set of effects.
     """
     names, columns = indices_of(chosen), np.array(functions, dtype=int)
     whole = np.diag(start.information)[columns]

@@ -14,6 +14,7 @@ from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.robot.kinematics import Array
 
 from .absorbed import ABSORBED, ACTUATORS, NUISANCES
+from .distorted import distorted
 from .disturbances import DISTURBANCES, VALIDATION, Disturbance, scaled
 from .experiment import DESIGNS, RAMP, ROBOT, SAMPLE, Run, plan, true_matrix
 from .fine_structure import FINE
@@ -24,7 +25,7 @@ from .outside import OUTSIDE, Unheard
 from .signature import Sight
 
 Kind = Literal["single", "pair", "outside", "null", "absorbed", "nuisance", "actuator"]
-FormName = Literal["matched", "blind", "third"]
+FormName = Literal["matched", "blind", "third", "distorted"]
 LEVELS = {"strong": 1000.0, "medium": 300.0, "weak": 100.0}
 UNHEARD = {**OUTSIDE, **FINE}
 LARGEST = 3.0  # times the plausible range; what needs more is not reachable
@@ -139,6 +140,8 @@ def make_of(kind: Kind, name: str, form: FormName) -> Make:
     if kind == "outside":
         return UNHEARD[name].make
     found = form_of(kind, name)
+    if form == "distorted":
+        return distorted(found.blind)
     return {"matched": found.matched, "blind": found.blind, "third": found.third}[form]
 
 
