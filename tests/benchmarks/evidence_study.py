@@ -23,7 +23,7 @@ import numpy as np
 from hidden.forms import FORMS
 from hidden.outside import OUTSIDE
 from hidden.pairs import PAIRS
-from hidden.sets import LEVELS, Kind, make_set
+from hidden.sets import LEVELS, FormName, Kind, make_set
 
 from omnibench.config import Model
 from omnibench.discover.fitting.extend import extend, fit_matrix
@@ -84,10 +84,8 @@ def sets(seeds: range) -> Iterator[tuple[Hidden, tuple[str, ...], int]]:
 def measured(kind: Hidden, effects: tuple[str, ...], seed: int) -> Result:
     """What right and wrong names leave in one set."""
     rng = np.random.default_rng(seed)
-    if kind == "distorted":
-        dataset, _ = make_set("single", effects, LEVELS["strong"], seed, form="distorted")
-    else:
-        dataset, _ = make_set(kind, effects, LEVELS["strong"], seed)
+    of_set: tuple[Kind, FormName] = ("single", "distorted") if kind == "distorted" else (kind, "blind")
+    dataset, _ = make_set(of_set[0], effects, LEVELS["strong"], seed, form=of_set[1])
     runs = usable_runs(dataset.split("train"))
     plain = fit_matrix(runs, dataset.robot, dataset.sample_period, dataset.robot.inverse_kinematic_matrix)
     screening = screen_plain(plain, ())

@@ -105,12 +105,14 @@ _LEFT_RIGHT, _BEYOND_RIGHT = 0.04, 0.01
 # bases find 0.02 beside all forms in the mean, 0.05 in the ninth decile. Wrong names that leave as little imitate one
 # function of the bases: Eq. (10).
 _FORMS_RIGHT, _BEYOND_FORMS = 0.06, 0.02
-_MOST_ODDS = 8.0  # F_max: below 1 / u, so that what is left beside the names as they are can count for more
+# F_max: below 1 / u, so that what forms explain can count for more. With 10, a heading drift that no catalogue has
+# would be named where forms of another effect explain 0.21 to 0.22 of it.
+_MOST_ODDS = 8.0
 _CANCELLING = 0.45  # share of Eq. (10): 1.0 or more of right pairs, 0.2 to 0.3 of the best wrong ones in 4 sets of 24
 _SURELY = 3.0  # standard errors: a normal number is below minus three of them in one of 740 cases
 _IMITATION = 1.0  # odds, at most, of effects that imitate something else: even
-# Share of itself that a column must keep to be something else, Eq. (10): right names leave 0.001 at most of a column
-# that has the form of one of them, in 75 sets.
+# Share of itself that a column must keep to be something else, Eq. (10). Columns of a right name's own form keep 0.001
+# at most, in 75 sets.
 _ELSE = 0.01
 _ODDS_OF_ONE = 5.0  # odds(1): of what has a form, one name of six does not stand for its cause; chosen
 _ODDS_OF_TWO = 1.0  # odds(2): with 0.3 to 8 all right names of the study are sure, and no wrong one

@@ -140,9 +140,8 @@ def make_of(kind: Kind, name: str, form: FormName) -> Make:
     if kind == "outside":
         return UNHEARD[name].make
     found = form_of(kind, name)
-    if form == "distorted":
-        return distorted(found.blind)
-    return {"matched": found.matched, "blind": found.blind, "third": found.third}[form]
+    forms = {"matched": found.matched, "blind": found.blind, "third": found.third, "distorted": distorted(found.blind)}
+    return forms[form]
 
 
 def _design_of(kind: Kind, names: Sequence[str], seed: int) -> str:
