@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from io import StringIO
@@ -37,7 +38,7 @@ def test_verdict_effect_places_gap_and_files_are_told() -> None:
     told = printed(named())
     assert "flower (simulated data): 36 training runs" in told
     assert "verdict: named (found and named)" in told
-    assert "rotation_translation_coupling (body), weight 99.8 %; as in the textbook" in told
+    assert re.search(r"rotation_translation_coupling \(body\), weight 9[5-9]\.\d %; as in the textbook", told)
     assert "Where the plain matrix fails" in told
     assert "held-out session: 36 runs" in told
     assert "results/flower/now/report.html" in told
