@@ -84,9 +84,9 @@ from omnibench.discover.regressors.significance import Significance
 from omnibench.fit.least_squares.whitened import Given
 from omnibench.robot.kinematics import Array
 
-# tests/benchmarks/evidence_study.py prints again what is measured here, on 38 blind sets with one strong effect, 30 with
-# two, 24 with what no catalogue has, and 32 with one effect in a distorted form; tests/benchmarks/constants.py what
-# changes on others if a number is half or twice as large.
+# tests/benchmarks/evidence_study.py prints again what is measured here, on 38 blind sets with one strong effect, 30
+# with two, 24 with what no catalogue has, and 32 with one effect in a distorted form; tests/benchmarks/constants.py
+# what changes on others if a number is half or twice as large.
 #
 # delta, along the other effect in whose direction the catalogue's form is farthest off: below 0.09 in nine sets of ten,
 # 0.06 in half of them. With 0.2, three of eight others would lose a sure name; with 0.05 none would change.
