@@ -107,7 +107,7 @@ def test_published_times_stand_beside_evaluations_of_the_same_methods(result: Co
     assert slow[:3] == ["slow", "903 s", "1"]
     assert fast[:3] == ["fast", "637 s", f"{evaluations:.0f}"]
     assert change[:2] == ["fast against slow", "−29 %"]
-    assert change[2] == f"+{100 * (evaluations - 1):.1f} %"
+    assert change[2] == f"+{100 * (evaluations - 1):,.1f} %"
     assert "Hardware and program differ" in table.note
 
 
