@@ -203,7 +203,7 @@ class Dataset(Shown):
                 value = getattr(trajectory, item.name)
                 if item.name == "drive" or (item.name in ("steering", "references") and value is None):
                     continue  # the robot has it; runs without steering or references keep the hash of earlier versions
-                if isinstance(value, np.ndarray):
+                if item.name in _ARRAYS and value is not None:
                     digest.update(np.ascontiguousarray(value, dtype=float).tobytes())
                 elif isinstance(value, References):
                     digest.update(repr(value.content).encode())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -14,8 +15,11 @@ from omnibench.data.references.reference_table import REFERENCE_COLUMNS, TABLE
 from omnibench.data.run_checks import stored_pose_times_flaw
 from omnibench.data.scan_files import ScansOnDisk, write_scans
 from omnibench.data.scans import Scans
+from omnibench.data.stored.stored_rows import MOST_IN_MEMORY, count_rows
+from omnibench.data.stored.stored_wheels import StoredWheels, WholeTableError
 from omnibench.data.tables.dataset_tables import POSE_COLUMNS, DatasetTables, tables_of
 from omnibench.data.tables.table import Table, read_table, table_file
+from omnibench.data.tables.wheel_samples import WheelSamples, WheelTable
 from omnibench.errors import DataError, require_type
 from omnibench.files import FileContent, TableFormat, encode_table, remove, resolved, write_files
 
@@ -29,12 +33,14 @@ class RecordedDataset:
     scans: ScansOnDisk | None
 
 
-def load_dataset(path: Path | str) -> Dataset:
+def load_dataset(path: Path | str, *, most_in_memory: int = MOST_IN_MEMORY) -> Dataset:
     """Read and check a data set folder.
 
+    most_in_memory: wheel samples up to which they are kept; those of Parquet files with more stay there, and are read
+    run by run where they are used.
     DataError names the file, the row (1 is the first after the header) and what is wrong.
     """
-    recorded = read_recorded(Path(path))
+    recorded = read_recorded(Path(path), most_in_memory)
     header = recorded.header
     dataset = make_dataset(
         header.name,
@@ -50,18 +56,27 @@ def load_dataset(path: Path | str) -> Dataset:
     return replace(dataset, imported=header.imported)
 
 
-def read_recorded(folder: Path) -> RecordedDataset:
-    """Read a data set folder and check its tables. DataError as for ``load_dataset``."""
+def read_recorded(folder: Path, most_in_memory: int = MOST_IN_MEMORY) -> RecordedDataset:
+    """Read a data set folder and check its tables. Arguments and DataError as for ``load_dataset``."""
     header = read_header(folder)
-    rates = [f"omega_{wheel}" for wheel in header.wheels]
-    tables = DatasetTables(
-        read_table(folder, "trajectories", ("trajectory", "split")),
-        read_table(folder, "wheels", ("trajectory", "t", *rates)),
-        _poses(folder),
-        None if table_file(folder, TABLE) is None else read_table(folder, TABLE, REFERENCE_COLUMNS),
-    )
-    trajectories = tables.trajectories(header.robot)
+    runs = read_table(folder, "trajectories", ("trajectory", "split"))
+    poses = _poses(folder)
+    references = None if table_file(folder, TABLE) is None else read_table(folder, TABLE, REFERENCE_COLUMNS)
+    try:
+        wheels = _wheels(folder, header, most_in_memory)
+        trajectories = DatasetTables(runs, wheels, poses, references).trajectories(header.robot)
+    except WholeTableError:
+        wheels = _wheels(folder, header, sys.maxsize)
+        trajectories = DatasetTables(runs, wheels, poses, references).trajectories(header.robot)
     return RecordedDataset(header, trajectories, _scans(folder, header, [trajectory.id for trajectory in trajectories]))
+
+
+def _wheels(folder: Path, header: Header, most_in_memory: int) -> WheelSamples:
+    """The table of wheel samples, in memory where it is small."""
+    file = table_file(folder, "wheels")
+    if file is not None and file.suffix == ".parquet" and count_rows(file) > most_in_memory:
+        return StoredWheels(file)
+    return WheelTable(read_table(folder, "wheels", ("trajectory", "t", *(f"omega_{wheel}" for wheel in header.wheels))))
 
 
 def save_dataset(

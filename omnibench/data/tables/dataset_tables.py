@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Real
 from pathlib import Path
@@ -15,16 +15,17 @@ from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory
 from omnibench.data.dataset import make_dataset as of_trajectories
 from omnibench.data.references.reference_table import REFERENCE_COLUMNS, TABLE, read_references, reference_frame
 from omnibench.data.references.run_references import References
-from omnibench.data.run_checks import Flaw, pose_times_flaw, stored_pose_times_flaw, wheel_times_flaw
+from omnibench.data.run_checks import pose_times_flaw, stored_pose_times_flaw
 from omnibench.data.scans import Scans
 from omnibench.data.splits import every_second
+from omnibench.data.tables.rows_of_runs import Rows, check_times, rows_by_trajectory
 from omnibench.data.tables.table import Table, checked_table
+from omnibench.data.tables.wheel_samples import WheelArrays, WheelSamples, WheelTable
 from omnibench.errors import DataError, nearest, require_type
 from omnibench.robot.kinematics import Array, Robot
 
 POSE_COLUMNS = ("trajectory", "t", "x", "y", "theta")
 _RUN_NUMBERS = ("started_at", "v", "alpha", "omega", "duration", "distance")
-_Rows = np.ndarray[Any, np.dtype[np.intp]]  # indices of rows of a table
 _COVARIANCE = ("xx", "xy", "xtheta", "yy", "ytheta", "thetatheta")
 _ONLY_RUN = "run"  # id of the run of tables without a column "trajectory"
 _PERIOD_DECIMALS = 9  # of a sample period in s that is taken from stamps: ns
@@ -126,7 +127,7 @@ def _tables(robot: Robot, trajectories: Any, wheels: Any, poses: Any, references
         commands = runs["command"].to_list() if "command" in runs.columns else [None] * len(runs)
         runs = runs.with_columns(pl.Series("split", every_second(commands), dtype=pl.String))
     of_runs = checked_table(Path("trajectories"), runs, ("trajectory", "split"))
-    return DatasetTables(of_runs, checked["wheels"], checked.get("poses"), checked.get(TABLE))
+    return DatasetTables(of_runs, WheelTable(checked["wheels"]), checked.get("poses"), checked.get(TABLE))
 
 
 def _frame(name: str, content: Any) -> pl.DataFrame:
@@ -158,26 +159,23 @@ class DatasetTables:
     """The tables of a data set, whose required columns are there. poses: None where all runs have references."""
 
     runs: Table
-    wheels: Table
+    wheels: WheelSamples
     poses: Table | None
     references: Table | None
 
     def trajectories(self, robot: Robot) -> list[Trajectory]:
         """The runs of the tables. DataError names the table, the row and what is wrong."""
-        runs, wheels, poses = self.runs, self.wheels, self.poses
-        _check_steering(wheels, robot)
+        runs, poses = self.runs, self.poses
         _check_runs(runs)
-        wheel_rows = _rows_by_trajectory(runs, wheels)
-        _check_times(wheels, wheel_rows, wheel_times_flaw)
-        samples = _WheelColumns(wheels, robot)
+        samples = self.wheels.of_runs(runs, robot)
         ids = runs.frame["trajectory"].to_list()
-        ends = {run: samples.times[rows] for run, rows in zip(ids, wheel_rows, strict=True)}
+        ends = {run: arrays.times for run, arrays in zip(ids, samples, strict=True)}
         started = set() if poses is None else set(poses.frame["trajectory"])
         references = read_references(self.references, ends, started, runs.file.name)
         pose_rows = _pose_rows(runs, poses, references)
         reference = None if poses is None else _PoseColumns(poses)
         return [
-            _trajectory(row, samples, wheel_rows[index], reference, pose_rows[index], references.get(row["trajectory"]))
+            _trajectory(row, samples[index], reference, pose_rows[index], references.get(row["trajectory"]))
             for index, row in enumerate(runs.frame.iter_rows(named=True))
         ]
 
@@ -195,36 +193,12 @@ def tables_of(dataset: Dataset) -> dict[str, pl.DataFrame]:
     return tables
 
 
-class _WheelColumns:
-    def __init__(self, table: Table, robot: Robot) -> None:
-        wheels, steered = robot.wheel_names, robot.drive.steered
-        self.times = table.numbers("t")
-        rates = table.stack([f"omega_{wheel}" for wheel in wheels])
-        assert rates is not None  # their presence was checked on reading
-        self.rates = rates
-        self.steering = table.stack([f"steer_{wheel}" for wheel in steered]) if steered else None
-        self.angles = table.stack([f"phi_{wheel}" for wheel in wheels])
-        self.targets = table.stack([f"target_{wheel}" for wheel in wheels])
-
-
 class _PoseColumns:
     def __init__(self, table: Table) -> None:
         self.times = table.numbers("t")
         self.poses = np.column_stack([table.numbers(column) for column in ("x", "y", "theta")])
         upper = table.stack([f"cov_{name}" for name in _COVARIANCE])
         self.covariances = None if upper is None else upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
-
-
-def _check_steering(wheels: Table, robot: Robot) -> None:
-    """DataError: there is no column with the steering angles of a wheel."""
-    columns = wheels.frame.columns
-    for wheel in robot.drive.steered:
-        if (column := f"steer_{wheel}") not in columns:
-            hint = nearest(column, [name for name in columns if not name.startswith("omega_")])
-            raise DataError(
-                f"{wheels.file}: column {column!r}, the steering angle of wheel {wheel} (rad, counter-clockwise, at "
-                f"the sample's end), is missing; {hint}found: {', '.join(columns)}"
-            )
 
 
 def _check_runs(runs: Table) -> None:
@@ -248,7 +222,7 @@ def _refuse_infinite(runs: Table, values: pl.Series) -> None:
     runs.refuse(infinite, lambda row: f"{values.name} is {values[row]}; leave it empty if it is not known")
 
 
-def _pose_rows(runs: Table, poses: Table | None, referenced: Collection[str]) -> list[_Rows]:
+def _pose_rows(runs: Table, poses: Table | None, referenced: Collection[str]) -> list[Rows]:
     """The rows of poses of each run; runs that have references may have none, or the start alone."""
     ids = runs.frame["trajectory"].to_list()
     if poses is None:
@@ -256,43 +230,18 @@ def _pose_rows(runs: Table, poses: Table | None, referenced: Collection[str]) ->
             if run not in referenced:
                 raise runs.fail(index, f"trajectory {run} has neither references nor, without poses.parquet, poses")
         return [np.zeros(0, dtype=np.intp) for _ in ids]
-    rows = _rows_by_trajectory(runs, poses, referenced)
+    rows = rows_by_trajectory(runs, poses, referenced)
     given = [(run in referenced, of_run) for run, of_run in zip(ids, rows, strict=True) if len(of_run)]
-    _check_times(poses, [of_run for has_references, of_run in given if not has_references], stored_pose_times_flaw)
-    _check_times(poses, [of_run for has_references, of_run in given if has_references], pose_times_flaw)
+    check_times(poses, [of_run for has_references, of_run in given if not has_references], stored_pose_times_flaw)
+    check_times(poses, [of_run for has_references, of_run in given if has_references], pose_times_flaw)
     return rows
-
-
-def _rows_by_trajectory(runs: Table, table: Table, others: Collection[str] = ()) -> list[_Rows]:
-    """The rows of ``table`` that belong to each run, in the file's order; a run among the others may have none."""
-    ids = runs.frame["trajectory"].to_list()
-    number = {identity: index for index, identity in enumerate(ids)}
-    named = table.frame["trajectory"]
-    codes = np.array([number.get(identity, -1) for identity in named])
-    table.refuse(codes < 0, lambda row: f"trajectory {named[row]} is not in {runs.file.name}")
-    order = np.argsort(codes, kind="stable")
-    counts = np.bincount(codes, minlength=len(ids))
-    for index, count in enumerate(counts):
-        if count == 0 and ids[index] not in others:
-            what = "wheel samples" if table.file.stem == "wheels" else "reference poses"
-            raise DataError(f"{table.file}: trajectory {ids[index]} ({runs.file.name}, row {index + 1}) has no {what}")
-    return np.split(order, np.cumsum(counts)[:-1])
-
-
-def _check_times(table: Table, groups: Sequence[_Rows], find_flaw: Callable[[Array, str], Flaw | None]) -> None:
-    """DataError for the first run whose times in ``table`` have a flaw. groups: the rows of each run."""
-    times = table.numbers("t")
-    for rows in groups:
-        if (flaw := find_flaw(times[rows], table.frame["trajectory"][int(rows[0])])) is not None:
-            raise table.fail(int(rows[flaw[0]]), flaw[1])
 
 
 def _trajectory(
     run: dict[str, Any],
-    wheels: _WheelColumns,
-    wheel_rows: _Rows,
+    wheels: WheelArrays,
     reference: _PoseColumns | None,
-    pose_rows: _Rows,
+    pose_rows: Rows,
     references: References | None,
 ) -> Trajectory:
     pose_times: Array = np.zeros(1)
@@ -304,16 +253,16 @@ def _trajectory(
     return Trajectory(
         id=run["trajectory"],
         split=cast(Split, run["split"]),
-        times=wheels.times[wheel_rows],
-        rates=wheels.rates[wheel_rows],
+        times=wheels.times,
+        rates=wheels.rates,
         pose_times=pose_times,
         poses=poses,
         command=None if run.get("command") is None else str(run["command"]),
         repetition=None if run.get("repetition") is None else round(run["repetition"]),
         session=None if run.get("session") is None else str(run["session"]),
-        angles=None if wheels.angles is None else wheels.angles[wheel_rows],
-        targets=None if wheels.targets is None else wheels.targets[wheel_rows],
-        steering=None if wheels.steering is None else wheels.steering[wheel_rows],
+        angles=wheels.angles,
+        targets=wheels.targets,
+        steering=wheels.steering,
         pose_covariances=covariances,
         references=references,
         **_run_numbers(run),

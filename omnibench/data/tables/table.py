@@ -19,15 +19,19 @@ _TEXTS = dict.fromkeys(("trajectory", "command", "split", "session"), pl.String)
 
 
 class Table:
-    """A table and the file it came from. Rows of messages count from 1, the first after the header."""
+    """A table and the file it came from. Rows of messages count from 1, the first after the header.
 
-    def __init__(self, file: Path, frame: pl.DataFrame) -> None:
+    rows_before: rows of the file that stand before those of the frame.
+    """
+
+    def __init__(self, file: Path, frame: pl.DataFrame, rows_before: int = 0) -> None:
         self.file = file
         self.frame = frame
+        self.rows_before = rows_before
 
     def fail(self, row: int, what: str) -> DataError:
         """The error to raise for ``row``, counted from 0."""
-        return DataError(f"{self.file}, row {row + 1}: {what}")
+        return DataError(f"{self.file}, row {self.rows_before + row + 1}: {what}")
 
     def refuse(self, faulty: NDArray[np.bool_] | pl.Series, words: Callable[[int], str]) -> None:
         """DataError for the first row that is ``faulty`` (rows,). words: what is wrong in that row, counted from 0."""
@@ -95,18 +99,23 @@ def read_table(folder: Path, name: str, required: Sequence[str]) -> Table:
     return checked_table(file, frame, required)
 
 
-def checked_table(file: Path, frame: pl.DataFrame, required: Sequence[str]) -> Table:
+def checked_table(file: Path, frame: pl.DataFrame, required: Sequence[str], rows_before: int = 0) -> Table:
     """A frame as a table. DataError when it has no rows, or a required column or a trajectory's name is missing.
 
-    file: where it is from; of a frame in memory its name in messages.
+    file: where it is from; of a frame in memory its name in messages. rows_before: as in Table.
     """
-    if missing := [column for column in required if column not in frame.columns]:
-        raise missing_column(file, missing[0], frame.columns, missing[1:])
+    check_columns(file, frame.columns, required)
     if frame.is_empty():
         raise DataError(f"{file}: it has no rows")
-    table = Table(file, frame)
+    table = Table(file, frame, rows_before)
     table.name_trajectories()
     return table
+
+
+def check_columns(file: Path, columns: Sequence[str], required: Sequence[str]) -> None:
+    """DataError names the required columns that are not among those of a file."""
+    if missing := [column for column in required if column not in columns]:
+        raise missing_column(file, missing[0], columns, missing[1:])
 
 
 def table_file(folder: Path, name: str) -> Path | None:

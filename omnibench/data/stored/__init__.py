@@ -1,0 +1,1 @@
+"""Data sets larger than memory: runs whose samples are read where they are used."""

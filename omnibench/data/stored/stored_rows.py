@@ -1,0 +1,164 @@
+"""Arrays of a run that are read from their file where they are used, and not kept.
+
+A data set larger than memory is read in blocks of whole runs. The last few blocks that were read stay in memory, so
+that code which takes one run after another reads every block once.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from omnibench.errors import DataError
+from omnibench.robot.kinematics import Array
+
+MOST_IN_MEMORY = 5_000_000  # wheel samples that are kept: 200 MB of three wheels' (chosen)
+BLOCK_ROWS = 500_000  # rows of a block: 16 MB of four columns; half and twice take within 5 % as long (chosen)
+_BLOCKS_KEPT = 4  # of all files together: two tables of neighbouring runs, wheels and poses (chosen)
+
+
+@dataclass(frozen=True)
+class BlockFile:
+    """A Parquet table in blocks of whole runs, each column of which holds numbers.
+
+    edges: the first row of every block, and the number of rows. state: time of change and size of the file when it was
+    opened; DataError when it has changed since.
+    """
+
+    file: Path
+    edges: tuple[int, ...]
+    state: tuple[int, int]
+
+    def rows(self, columns: tuple[str, ...], first: int, count: int) -> Array:
+        """Values (count, n) of some columns from row ``first`` on, of one block, read-only."""
+        block = int(np.searchsorted(self._edges, first, side="right")) - 1
+        begin = self.edges[block]
+        return _BLOCKS.of(self, columns, block)[first - begin : first - begin + count]
+
+    def read(self, columns: tuple[str, ...], block: int) -> Array:
+        """Values (rows, n) of some columns of a block. DataError: the file has changed, or cannot be read."""
+        if file_state(self.file) != self.state:
+            raise DataError(f"{self.file}: the file has changed since it was opened; load the data set again")
+        begin, end = self.edges[block : block + 2]
+        values = read_rows(self.file, columns, begin, end - begin).cast(pl.Float64).to_numpy()
+        values.flags.writeable = False
+        return values
+
+    @cached_property
+    def _edges(self) -> Array:
+        return np.array(self.edges)
+
+
+def file_state(file: Path) -> tuple[int, int]:
+    """Time of change, ns, and size of a file, bytes. DataError: it cannot be read."""
+    try:
+        status = file.stat()
+    except OSError as error:
+        raise DataError(f"{file}: cannot be read: {error.strerror}") from None
+    return status.st_mtime_ns, status.st_size
+
+
+def read_rows(file: Path, columns: Sequence[str], first: int, count: int) -> pl.DataFrame:
+    """Some rows of a Parquet file. DataError: it cannot be read."""
+    try:
+        return pl.scan_parquet(file).select(columns).slice(first, count).collect()
+    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as error:
+        raise DataError(f"{file}: cannot be read: {error}") from None
+
+
+def count_rows(file: Path) -> int:
+    """The number of rows of a Parquet file. DataError: it cannot be read."""
+    try:
+        return int(pl.scan_parquet(file).select(pl.len()).collect().item())
+    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as error:
+        raise DataError(f"{file}: cannot be read: {error}") from None
+
+
+@dataclass
+class _Blocks:
+    """The blocks that were read last, for all threads of this process."""
+
+    kept: OrderedDict[tuple[BlockFile, tuple[str, ...], int], Array] = field(default_factory=OrderedDict)
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def of(self, file: BlockFile, columns: tuple[str, ...], block: int) -> Array:
+        key = file, columns, block
+        with self.lock:
+            if key in self.kept:
+                self.kept.move_to_end(key)
+                return self.kept[key]
+            while len(self.kept) >= _BLOCKS_KEPT:  # before the next is read: memory never holds one more
+                self.kept.popitem(last=False)
+            values = self.kept[key] = file.read(columns, block)
+            return values
+
+
+_BLOCKS = _Blocks()
+
+
+@dataclass(frozen=True, eq=False)
+class StoredRows(np.lib.mixins.NDArrayOperatorsMixin):
+    """Rows of a run that behave like their array: (count, n), or (count,) where ``flat``. Whatever uses it reads it.
+
+    columns: those that are read together. chosen: the places of this array's among them. last: the last value of a
+    flat one, which is known without reading.
+    """
+
+    file: BlockFile
+    columns: tuple[str, ...]
+    chosen: tuple[int, ...]
+    first: int
+    count: int
+    flat: bool = False
+    last: float | None = None
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return (self.count,) if self.flat else (self.count, len(self.chosen))
+
+    @property
+    def ndim(self) -> int:
+        return len(self.shape)
+
+    @property
+    def size(self) -> int:
+        return self.count if self.flat else self.count * len(self.chosen)
+
+    dtype = np.dtype(float)
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:
+        rows = self.file.rows(self.columns, self.first, self.count)
+        low, high = self.chosen[0], self.chosen[-1] + 1
+        values = rows[:, low] if self.flat else rows[:, low:high]
+        return values.astype(dtype) if dtype is not None and dtype != values.dtype else values
+
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:
+        return getattr(ufunc, method)(*(_read(each) for each in inputs), **options)
+
+    def __getitem__(self, key: Any) -> Any:
+        if self.last is not None and isinstance(key, int) and key in (-1, self.count - 1):
+            return self.last
+        return np.asarray(self)[key]
+
+    def __iter__(self) -> Any:
+        return iter(np.asarray(self))
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):  # protocols of copy and pickle, not of arrays
+            raise AttributeError(name)
+        return getattr(np.asarray(self), name)
+
+
+def _read(value: Any) -> Any:
+    return np.asarray(value) if isinstance(value, StoredRows) else value
