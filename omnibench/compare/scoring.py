@@ -23,7 +23,8 @@ from omnibench.fit.uncertainty.ratio_intervals import UnitName, units_of
 from omnibench.registry import calibrators, costs
 from omnibench.robot.calibration import matrix_rows
 from omnibench.robot.kinematics import Array
-from omnibench.robot.odometry import Integration, OdometryBatch
+from omnibench.robot.odometry import Integration
+from omnibench.robot.odometry_of_stored import odometry_of
 
 
 class SplitScorer:
@@ -37,7 +38,7 @@ class SplitScorer:
         self._odometry = cost.batch(trajectories, integration)
         self._reference = cost.reference(trajectories)
         self._trajectories, self._integration = tuple(trajectories), integration
-        self._ends = OdometryBatch([trajectory.final_log for trajectory in trajectories], integration)
+        self._ends = odometry_of([trajectory.final_log for trajectory in trajectories], integration)
         self._final = np.array([trajectory.final_pose for trajectory in trajectories])
 
     def cost(self, matrix: Array) -> float:

@@ -23,7 +23,7 @@ that are summed over blocks, as slip lasts.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -112,18 +112,36 @@ def match_clocks(robot: Robot, runs: Sequence[Streams], search: float = _SEARCH)
     usable = [each for each in windows if each is not None]
     if not usable:
         return [None] * len(runs)
-    clocks = [each.scanned(search) for each in usable]
+    fitted, clocks = _fitted_together(usable, search)
+    matches = iter([each.match(fitted, clock, search) for each, clock in zip(usable, clocks, strict=True)])
+    return [None if each is None else next(matches) for each in windows]
+
+
+def match_each_clock(
+    robot: Robot, some: Sequence[Streams], runs: Iterable[Streams], search: float = _SEARCH
+) -> list[ClockMatch | None]:
+    """The clock of the reference in every one of many runs, as match_clocks, one run at a time.
+
+    h and s of Eq. (2) and (3) are those that fit ``some`` of them.
+    """
+    usable = [each for each in (_Windows.of(robot, run) for run in some) if each is not None]
+    if not usable:
+        return [None for _ in runs]
+    fitted, _ = _fitted_together(usable, search)
+    windows = (_Windows.of(robot, run) for run in runs)
+    return [None if each is None else each.match(fitted, each.settled(fitted, search), search) for each in windows]
+
+
+def _fitted_together(windows: Sequence[_Windows], search: float) -> tuple[list[Array], list[Clock]]:
+    """The coefficients h and s, and the clocks, that fit runs best together."""
+    clocks = [each.scanned(search) for each in windows]
     for _ in range(_ROUNDS):
-        fitted, before = _coefficients(usable, clocks), clocks
-        clocks = [each.improved(fitted, clock) for each, clock in zip(usable, clocks, strict=True)]
-        pairs = zip(usable, before, clocks, strict=True)
+        fitted, before = _coefficients(windows, clocks), clocks
+        clocks = [each.improved(fitted, clock) for each, clock in zip(windows, clocks, strict=True)]
+        pairs = zip(windows, before, clocks, strict=True)
         if max(each.farthest_step(old[0] - new[0], old[1] - new[1]) for each, old, new in pairs) < _SETTLED:
             break
-    # A clock beyond the search is chance: any clock suits a reference that stands still.
-    near = [abs(clock[0]) <= search + _WINDOW for clock in clocks]
-    settled = zip(usable, clocks, near, strict=True)
-    matches = iter([each.match(fitted, clock) if within else None for each, clock, within in settled])
-    return [None if each is None else next(matches) for each in windows]
+    return fitted, clocks
 
 
 Clock = tuple[float, float]
@@ -209,14 +227,18 @@ class _Windows:
         """The columns that tell the heading, and those that tell the way."""
         return slice(0, self.heading), slice(self.heading, None)
 
-    def scanned(self, search: float) -> Clock:
-        """The offset by which the run itself fits best, with coefficients of its own."""
+    def settled(self, fitted: Sequence[Array], search: float) -> Clock:
+        """The clock by which the run fits given coefficients best."""
+        return self.improved(fitted, self.scanned(search, fitted), _ROUNDS)
+
+    def scanned(self, search: float, fitted: Sequence[Array] | None = None) -> Clock:
+        """The offset by which the run itself fits best, with coefficients of its own unless some are given."""
         steps = int(np.ceil(search / _COARSE))
         offsets = np.arange(-steps, steps + 1) * _COARSE
         parts = np.array_split(offsets, -(-len(offsets) * len(self.starts) // _MOST_BINS))
-        return float(offsets[int(np.argmin(np.concatenate([self._unexplained(part) for part in parts])))]), 0.0
+        return float(offsets[int(np.argmin(np.concatenate([self._unexplained(part, fitted) for part in parts])))]), 0.0
 
-    def _unexplained(self, offsets: Array) -> Array:
+    def _unexplained(self, offsets: Array, fitted: Sequence[Array] | None) -> Array:
         """Products (L,) of the shares of heading and way that the wheels do not explain by offsets (L,), s.
 
         Bins count at their mean time, which is near enough for steps of _COARSE.
@@ -225,10 +247,11 @@ class _Windows:
         counts = _between(_means(self.stamps[:, None], self.starts)[:, 0] + offsets[:, None], self.edges, self.counted)
         columns = counts[:, self.last] - counts[:, self.first]
         shares = np.ones(len(offsets))
-        for channel, shown in zip(self.channels(), self.shown, strict=True):
+        for number, (channel, shown) in enumerate(zip(self.channels(), self.shown, strict=True)):
             wanted = np.where(within, shown, 0.0)
             told = columns[..., channel]
-            left = np.where(within, shown - (told @ _solved(told, wanted, within)[..., None])[..., 0], 0.0)
+            solved = _solved(told, wanted, within) if fitted is None else fitted[number]
+            left = np.where(within, shown - (told @ solved[..., None])[..., 0], 0.0)
             whole = (wanted**2).sum(axis=1)
             share = np.maximum((left**2).sum(axis=1) / np.maximum(whole, 1e-300), 1e-9)
             shares *= np.where(whole > 0, share, 1.0)
@@ -259,9 +282,9 @@ class _Windows:
         least = 1e-6 + 1e-3 * np.sqrt(np.mean(self.shown**2, axis=1))
         return least if not sizes.size else np.maximum(1.4826 * np.median(sizes, axis=1), least)
 
-    def improved(self, fitted: Sequence[Array], clock: Clock) -> Clock:
+    def improved(self, fitted: Sequence[Array], clock: Clock, steps: int = _STEPS) -> Clock:
         """The clock after some steps of Gauss-Newton."""
-        for _ in range(_STEPS):
+        for _ in range(steps):
             residuals, slopes, weights = self.residuals(fitted, clock)
             design = self._design(slopes)
             normal, wanted = (design * weights.ravel()) @ design.T, design @ (weights * residuals).ravel()
@@ -298,9 +321,12 @@ class _Windows:
             rows.append((slopes * moments).ravel())
         return np.array(rows)
 
-    def match(self, fitted: Sequence[Array], clock: Clock) -> ClockMatch | None:
-        """The clock with its standard errors; None if the run does not tell it."""
-        if not self._told(fitted, clock):
+    def match(self, fitted: Sequence[Array], clock: Clock, search: float) -> ClockMatch | None:
+        """The clock with its standard errors; None if the run does not tell it.
+
+        A clock beyond the search is chance: any clock suits a reference that stands still.
+        """
+        if abs(clock[0]) > search + _WINDOW or not self._told(fitted, clock):
             return None
         residuals, slopes, weights = self.residuals(fitted, clock)
         design = self._design(slopes)

@@ -14,6 +14,7 @@ from omnibench.data.checks.finding import findings_of
 from omnibench.data.checks.implausible import implausible
 from omnibench.data.header import Imported
 from omnibench.data.headings import unwrap
+from omnibench.data.periods import median_period
 from omnibench.data.references.reference_flaws import reference_flaw
 from omnibench.data.references.reference_headings import with_whole_turns
 from omnibench.data.references.reference_units import odd_references
@@ -22,7 +23,8 @@ from omnibench.data.run_checks import check_sample_period, pose_times_flaw, reac
 from omnibench.data.scans import Scans
 from omnibench.errors import DataError, nearest, require_type
 from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.odometry import WheelLog
+from omnibench.robot.odometry import WheelLog, kept_with_samples
+from omnibench.robot.planar import interpolated
 from omnibench.robot.wheels.drive import Drive, in_the_middle
 from omnibench.views import Shown
 from omnibench.words import plural
@@ -34,6 +36,7 @@ WHEEL_DIGITS = 8
 # A reference that moves by more, m and rad, is no noise of one that stands; a robot whose wheels drive less than the
 # share of that has a dead encoder. Chosen: motion capture scatters by mm, and no wheel slips a hundredfold.
 _MOVED, _TURNED, _HARDLY = 0.05, 0.1, 0.01
+_EVERY = 1.0  # s between the moments at which wheel angles are compared where there are no poses; chosen
 _ARRAYS = ("times", "rates", "pose_times", "poses", "angles", "targets", "pose_covariances", "steering")
 
 
@@ -82,13 +85,21 @@ class Trajectory(Shown):
                     raise DataError(f"trajectory {self.id}: {name}: expected numbers, in rows of one length") from None
         return replace(self, **arrays)
 
-    @cached_property
+    @kept_with_samples
     def signals(self) -> Array:
         """Drive signals (F, M) of the wheel samples, rad/s: the rates, where the robot does not steer."""
         if self.drive is None:
             return self.rates
         assert self.steering is not None  # the drive steers
         return self.drive.signals(self.rates, in_the_middle(self.steering))
+
+    @cached_property
+    def angles_at_poses(self) -> Array:
+        """Integrals (K, M) of the drive signals up to each reference pose, rad; without poses once a second."""
+        times = np.append(0.0, self.times)
+        driven = np.cumsum(self.signals * np.diff(times)[:, None], axis=0)
+        stamps = self.pose_times if self.has_poses else np.arange(0.0, times[-1] + _EVERY, _EVERY)
+        return interpolated(stamps, times, np.vstack([np.zeros(driven.shape[1]), driven]))
 
     @property
     def has_poses(self) -> bool:
@@ -238,7 +249,7 @@ def make_dataset(
             raise DataError(f"data set {name}: trajectory {trajectory.id} is there twice; give each its own id")
         seen.add(trajectory.id)
         _check_run(f"data set {name}", robot, trajectory)
-    median = _median_period(raw)
+    median = median_period(raw)
     check_sample_period(f"data set {name}", sample_period, median)
     logs = [trajectory.log(trajectory.pose_times) for trajectory in raw]
     warnings = implausible(robot, logs, [trajectory.poses for trajectory in raw])
@@ -284,11 +295,6 @@ def _copied(dataset: Dataset) -> list[str]:
     count, shown = len(dataset.copies), ", ".join(dataset.copies[:5])
     are = "is a copy of a training run and is" if count == 1 else "are copies of training runs and are"
     return [f"{plural(count, 'trajectory')} {are} left out of validation: {shown}"]
-
-
-def _median_period(trajectories: Sequence[Trajectory]) -> float:
-    """The median time between wheel samples, s, which is robust to jitter and gaps."""
-    return float(np.median(np.concatenate([np.diff(trajectory.times, prepend=0.0) for trajectory in trajectories])))
 
 
 def _other_periods(median: float, sample_period: float) -> list[str]:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Protocol
 
-from omnibench.data.dataset import Dataset, make_dataset
+from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.splits import complete
 from omnibench.errors import DataError
+from omnibench.robot.kinematics import Robot
 
+SCANS_LEFT_OUT = "scans are left out of joined data sets"
 _SAME_PERIOD = 0.1  # share by which sample periods may differ: as between drives of one robot (chosen)
 
 
@@ -22,26 +25,13 @@ def joined(first: Dataset, others: Sequence[Dataset]) -> Dataset:
     if not others:
         return first
     datasets = (first, *others)
-    names = _distinct([dataset.name for dataset in datasets])
-    runs = []
-    ids, sessions = set[str](), set[str]()
-    for name, dataset in zip(names, datasets, strict=True):
-        _check_fits(first, dataset)
-        of_sessions = {run.session: run.session or name for run in dataset.trajectories}
-        of_sessions = {
-            given: f"{name}/{session}" if session in sessions else session for given, session in of_sessions.items()
-        }
-        taken = set(ids)
-        for run in dataset.trajectories:
-            new = f"{name}/{run.id}" if run.id in taken else run.id
-            runs.append(replace(run, id=new, session=of_sessions[run.session]))
-            ids.add(new)
-        sessions |= set(of_sessions.values())
+    for dataset in others:
+        check_fits(first, dataset)
     made = make_dataset(
         first.name,
         first.robot,
         first.sample_period,
-        complete(runs),
+        complete(distinct_runs([(dataset.name, dataset.trajectories) for dataset in datasets])),
         description=first.description,
         source="; ".join(dict.fromkeys(dataset.source for dataset in datasets if dataset.source)),
         licence="; ".join(dict.fromkeys(dataset.licence for dataset in datasets if dataset.licence)),
@@ -49,11 +39,22 @@ def joined(first: Dataset, others: Sequence[Dataset]) -> Dataset:
     )
     warnings = [warning for dataset in datasets for warning in dataset.warnings]
     if any(dataset.scans is not None for dataset in datasets):
-        warnings.append("scans are left out of joined data sets")
+        warnings.append(SCANS_LEFT_OUT)
     return replace(made, warnings=tuple(dict.fromkeys([*warnings, *made.warnings])))
 
 
-def _check_fits(first: Dataset, other: Dataset) -> None:
+class _Described(Protocol):
+    """What a data set says of itself."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def robot(self) -> Robot: ...
+    @property
+    def sample_period(self) -> float: ...
+
+
+def check_fits(first: _Described, other: _Described) -> None:
     """DataError: another robot or sample period than the first's."""
     robots = [dataset.robot.model_dump(exclude={"name"}) for dataset in (first, other)]
     if robots[0] != robots[1]:
@@ -64,8 +65,26 @@ def _check_fits(first: Dataset, other: Dataset) -> None:
     if abs(other.sample_period / first.sample_period - 1) > _SAME_PERIOD:
         raise DataError(
             f"data set {other.name}: its wheels were sampled every {other.sample_period:g} s, those of {first.name} "
-            f"every {first.sample_period:g} s; discover in each by itself"
+            f"every {first.sample_period:g} s; take each by itself"
         )
+
+
+def distinct_runs(recordings: Sequence[tuple[str, Sequence[Trajectory]]]) -> list[Trajectory]:
+    """The runs of recordings, which are given with their names, under ids and sessions that no two recordings share."""
+    runs = []
+    ids, sessions = set[str](), set[str]()
+    for name, (_, trajectories) in zip(_distinct([name for name, _ in recordings]), recordings, strict=True):
+        of_sessions = {run.session: run.session or name for run in trajectories}
+        of_sessions = {
+            given: f"{name}/{session}" if session in sessions else session for given, session in of_sessions.items()
+        }
+        taken = set(ids)
+        for run in trajectories:
+            new = f"{name}/{run.id}" if run.id in taken else run.id
+            runs.append(replace(run, id=new, session=of_sessions[run.session]))
+            ids.add(new)
+        sessions |= set(of_sessions.values())
+    return runs
 
 
 def _distinct(names: Sequence[str]) -> list[str]:

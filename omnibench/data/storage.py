@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
+from omnibench.data.dataset_folders import dataset_folders
 from omnibench.data.header import Header, read_header
+from omnibench.data.joining import SCANS_LEFT_OUT, check_fits, distinct_runs
 from omnibench.data.references.reference_table import REFERENCE_COLUMNS, TABLE
 from omnibench.data.run_checks import stored_pose_times_flaw
 from omnibench.data.scan_files import ScansOnDisk, write_scans
 from omnibench.data.scans import Scans
+from omnibench.data.splits import complete
 from omnibench.data.stored.stored_rows import MOST_IN_MEMORY, count_rows
 from omnibench.data.stored.stored_wheels import StoredWheels, WholeTableError
 from omnibench.data.tables.dataset_tables import POSE_COLUMNS, DatasetTables, tables_of
 from omnibench.data.tables.table import Table, read_table, table_file
-from omnibench.data.tables.wheel_samples import WheelSamples, WheelTable
+from omnibench.data.tables.wheel_samples import WheelTable
 from omnibench.errors import DataError, require_type
 from omnibench.files import FileContent, TableFormat, encode_table, remove, resolved, write_files
 
@@ -33,50 +36,73 @@ class RecordedDataset:
     scans: ScansOnDisk | None
 
 
-def load_dataset(path: Path | str, *, most_in_memory: int = MOST_IN_MEMORY) -> Dataset:
-    """Read and check a data set folder.
+def load_dataset(path: Path | str | Sequence[Path | str], *, most_in_memory: int = MOST_IN_MEMORY) -> Dataset:
+    """Read and check a data set: a folder, or several of one robot, named one by one or by a glob.
 
     most_in_memory: wheel samples up to which they are kept; those of Parquet files with more stay there, and are read
-    run by run where they are used.
+    run by run where they are used. Of several folders ids and sessions that two share get the name of their folder's
+    data set before them.
     DataError names the file, the row (1 is the first after the header) and what is wrong.
     """
-    recorded = read_recorded(Path(path), most_in_memory)
-    header = recorded.header
+    folders = dataset_folders(path)
+    left = sum(_stored_samples(folder) for folder in folders) > most_in_memory
+    recorded = [read_recorded(folder, left_in_files=left) for folder in folders]
+    headers = [each.header for each in recorded]
+    first, last = headers[0], headers[-1]
+    for other in headers[1:]:
+        check_fits(first, other)
+    runs = recorded[0].trajectories
+    if len(recorded) > 1:
+        runs = complete(distinct_runs([(each.header.name, each.trajectories) for each in recorded]))
     dataset = make_dataset(
-        header.name,
-        header.robot,
-        header.sample_period,
-        recorded.trajectories,
-        description=header.description,
-        source=header.source,
-        licence=header.licence,
-        simulated=header.simulated,
-        scans=recorded.scans,
+        first.name if all(header.name == first.name for header in headers) else f"{first.name} to {last.name}",
+        first.robot,
+        first.sample_period,
+        runs,
+        description=_all_of([header.description for header in headers]),
+        source=_all_of([header.source for header in headers]),
+        licence=_all_of([header.licence for header in headers]),
+        simulated=any(header.simulated for header in headers),
+        scans=recorded[0].scans if len(recorded) == 1 else None,
     )
-    return replace(dataset, imported=header.imported)
+    if len(recorded) > 1 and any(each.scans is not None for each in recorded):
+        dataset = replace(dataset, warnings=(*dataset.warnings, SCANS_LEFT_OUT))
+    return replace(dataset, imported=first.imported if len(recorded) == 1 else None)
 
 
-def read_recorded(folder: Path, most_in_memory: int = MOST_IN_MEMORY) -> RecordedDataset:
-    """Read a data set folder and check its tables. Arguments and DataError as for ``load_dataset``."""
+def _all_of(texts: Sequence[str]) -> str:
+    """The texts that differ, one after another."""
+    return "; ".join(dict.fromkeys(filter(None, texts)))
+
+
+def read_recorded(folder: Path, *, left_in_files: bool = False) -> RecordedDataset:
+    """Read a data set folder and check its tables. DataError as for ``load_dataset``.
+
+    left_in_files: the wheel samples of a Parquet file stay there, if its rows allow to read it run by run.
+    """
     header = read_header(folder)
     runs = read_table(folder, "trajectories", ("trajectory", "split"))
     poses = _poses(folder)
     references = None if table_file(folder, TABLE) is None else read_table(folder, TABLE, REFERENCE_COLUMNS)
-    try:
-        wheels = _wheels(folder, header, most_in_memory)
-        trajectories = DatasetTables(runs, wheels, poses, references).trajectories(header.robot)
-    except WholeTableError:
-        wheels = _wheels(folder, header, sys.maxsize)
-        trajectories = DatasetTables(runs, wheels, poses, references).trajectories(header.robot)
+    whole = partial(read_table, folder, "wheels", ("trajectory", "t", *(f"omega_{wheel}" for wheel in header.wheels)))
+    trajectories = None
+    if left_in_files and (file := _parquet_of_wheels(folder)) is not None:
+        with suppress(WholeTableError):
+            trajectories = DatasetTables(runs, StoredWheels(file), poses, references).trajectories(header.robot)
+    if trajectories is None:
+        trajectories = DatasetTables(runs, WheelTable(whole()), poses, references).trajectories(header.robot)
     return RecordedDataset(header, trajectories, _scans(folder, header, [trajectory.id for trajectory in trajectories]))
 
 
-def _wheels(folder: Path, header: Header, most_in_memory: int) -> WheelSamples:
-    """The table of wheel samples, in memory where it is small."""
+def _stored_samples(folder: Path) -> int:
+    """The number of wheel samples that a folder has in a Parquet file."""
+    file = _parquet_of_wheels(folder)
+    return 0 if file is None else count_rows(file)
+
+
+def _parquet_of_wheels(folder: Path) -> Path | None:
     file = table_file(folder, "wheels")
-    if file is not None and file.suffix == ".parquet" and count_rows(file) > most_in_memory:
-        return StoredWheels(file)
-    return WheelTable(read_table(folder, "wheels", ("trajectory", "t", *(f"omega_{wheel}" for wheel in header.wheels))))
+    return file if file is not None and file.suffix == ".parquet" else None
 
 
 def save_dataset(

@@ -17,6 +17,7 @@ from omnibench.registry import Options, costs
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog
+from omnibench.robot.odometry_of_stored import odometry_of
 
 NO_ERROR = 1e-9  # m, rad: smaller errors are rounding
 
@@ -84,7 +85,7 @@ class Cost(ABC):
         """The odometry of the trajectories at this cost's stamps, or what it says of their references."""
         if (rows := self.rows(trajectories)) is not None:
             return ReferenceBatch(rows, integration)
-        return OdometryBatch(self.logs(trajectories), integration)
+        return odometry_of(self.logs(trajectories), integration)
 
     def reference(self, trajectories: Sequence[Trajectory]) -> Array:
         """The reference poses (S, 3) at this cost's stamps, or what was observed in their place."""

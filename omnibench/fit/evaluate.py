@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -92,10 +93,14 @@ def evaluate(calibration: Calibration, dataset: Dataset) -> Evaluation:
     present = {split: dataset.split(split) for split in SPLITS if dataset.split(split)}
     groups: dict[str, tuple[Trajectory, ...]] = {str(name): group for name, group in present.items()}
     groups["all"] = dataset.trajectories
-    model, design = calibration.model, OdometryModel.of_design(dataset.robot, calibration.integration)
-    sessions = compare_sessions(model, dataset.trajectories)
+    design = OdometryModel.of_design(dataset.robot, calibration.integration)
+    fitted, designed = (ModelErrors.of(model, dataset.trajectories) for model in (calibration.model, design))
+    sessions = compare_sessions(calibration.model, dataset.trajectories)
     held_out, unknown = _held_out(calibration, dataset)
-    verdict = nothing_held_out(unknown) if unknown else verdict_on(model, held_out or ())
+    if unknown:
+        verdict = nothing_held_out(unknown)
+    else:
+        verdict = judge(designed.of_runs(held_out or ()), fitted.of_runs(held_out or ()), held_out or ())
     warning = extrapolation_warning(calibration, dataset.trajectories)
     return Evaluation(
         dataset=dataset.name,
@@ -103,10 +108,10 @@ def evaluate(calibration: Calibration, dataset: Dataset) -> Evaluation:
         simulated=dataset.simulated,
         trajectories=len(dataset.trajectories),
         splits={
-            name: split_errors(model, group).model_copy(update={"outside": share_outside(calibration, group)})
+            name: fitted.on(group).model_copy(update={"outside": share_outside(calibration, group)})
             for name, group in groups.items()
         },
-        design={name: split_errors(design, group) for name, group in groups.items()},
+        design={name: designed.on(group) for name, group in groups.items()},
         unfitted=None if held_out is None else {name: _count(held_out, group) for name, group in groups.items()},
         held_out=verdict,
         sessions=(*sessions.sentences, *sessions.doubts),
@@ -169,27 +174,51 @@ def positions_and_headings(errors: Array) -> tuple[Array, Array]:
     return np.hypot(errors[:, 0], errors[:, 1]), np.abs(errors[:, 2])
 
 
-def split_errors(model: OdometryModel, trajectories: Sequence[Trajectory]) -> SplitErrors:
-    """Errors of a model on some trajectories."""
-    errors = final_errors(model, trajectories)
-    positions, headings = positions_and_headings(errors)
-    placed, turned = measured_parts(trajectories)
-    return SplitErrors(
-        trajectories=len(trajectories),
-        cost=costs.create("final_pose").of_model(model, trajectories),
-        position_mean_m=float(positions[placed].mean()) if placed.any() else None,
-        position_max_m=float(positions[placed].max()) if placed.any() else None,
-        heading_mean_rad=float(headings[turned].mean()) if turned.any() else None,
-        heading_max_rad=float(headings[turned].max()) if turned.any() else None,
-        references=tuple(
-            ReferenceErrors(
-                kind=kind,
-                references=len(of_kind),
-                unit=UNITS[kind],
-                mean=float(np.mean(of_kind[:, 0])),
-                max=float(np.max(of_kind[:, 0])),
-                in_sigmas=float(np.sqrt(np.mean(np.square(of_kind[:, 1])))),
-            )
-            for kind, of_kind in errors_by_kind(model, trajectories).items()
-        ),
-    )
+@dataclass(frozen=True, eq=False)
+class ModelErrors:
+    """Errors of a model on some runs. of_final_poses: see final_errors, by the runs' ids."""
+
+    model: OdometryModel
+    of_final_poses: Mapping[str, Array]
+
+    @classmethod
+    def of(cls, model: OdometryModel, trajectories: Sequence[Trajectory]) -> ModelErrors:
+        """The errors of a model on some runs."""
+        ids = (run.id for run in trajectories)
+        return cls(model, dict(zip(ids, final_errors(model, trajectories), strict=True)))
+
+    def of_runs(self, trajectories: Sequence[Trajectory]) -> Array:
+        """The final errors (Z, 3) of some of the runs."""
+        return np.array([self.of_final_poses[run.id] for run in trajectories]).reshape(-1, 3)
+
+    def on(self, trajectories: Sequence[Trajectory]) -> SplitErrors:
+        """The errors on some of the runs."""
+        errors = self.of_runs(trajectories)
+        positions, headings = positions_and_headings(errors)
+        placed, turned = measured_parts(trajectories)
+        return SplitErrors(
+            trajectories=len(trajectories),
+            cost=self._cost(trajectories, errors),
+            position_mean_m=float(positions[placed].mean()) if placed.any() else None,
+            position_max_m=float(positions[placed].max()) if placed.any() else None,
+            heading_mean_rad=float(headings[turned].mean()) if turned.any() else None,
+            heading_max_rad=float(headings[turned].max()) if turned.any() else None,
+            references=tuple(
+                ReferenceErrors(
+                    kind=kind,
+                    references=len(of_kind),
+                    unit=UNITS[kind],
+                    mean=float(np.mean(of_kind[:, 0])),
+                    max=float(np.max(of_kind[:, 0])),
+                    in_sigmas=float(np.sqrt(np.mean(np.square(of_kind[:, 1])))),
+                )
+                for kind, of_kind in errors_by_kind(self.model, trajectories).items()
+            ),
+        )
+
+    def _cost(self, trajectories: Sequence[Trajectory], errors: Array) -> float:
+        """Eq. (6) of some of the runs."""
+        cost = costs.create("final_pose")
+        if any(run.references is not None for run in trajectories):
+            return cost.of_model(self.model, trajectories)
+        return float(cost.combine(errors[None], np.arange(len(errors)))[0])

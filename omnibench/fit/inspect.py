@@ -82,7 +82,7 @@ def inspect_dataset(dataset: Dataset) -> Inspection:
     """
     require_type(dataset, Dataset, "load_dataset")
     trajectories = dataset.trajectories
-    periods = np.concatenate([np.diff(t.times, prepend=0.0) for t in trajectories])
+    periods = np.array([[steps.min(), steps.max()] for t in trajectories for steps in [np.diff(t.times, prepend=0.0)]])
     pose_periods = np.concatenate([np.diff(t.pose_times) for t in trajectories])
     training = dataset.split("train") or trajectories
     span = driven_span(training)
@@ -100,7 +100,7 @@ def inspect_dataset(dataset: Dataset) -> Inspection:
         sample_period_s=dataset.sample_period,
         sample_period_range_s=(float(periods.min()), float(periods.max())),
         pose_period_s=float(np.median(pose_periods)) if len(pose_periods) else None,
-        wheel_samples=len(periods),
+        wheel_samples=sum(len(t.times) for t in trajectories),
         reference_poses=len(pose_periods) + sum(run.start_known for run in trajectories),
         references=_references(trajectories),
         has_angles=all(t.angles is not None for t in trajectories),

@@ -49,8 +49,8 @@ def linear_system(
     """
     moved = reference - np.array([run.start for run in runs])[odometry.trajectory]
     chosen = [np.ones(len(run.poses), dtype=bool) for run in runs] if used is None else used
-    headings = [
+    headings = (
         np.interp(np.append(0.0, run.times[:-1]), run.pose_times[near], run.poses[near, 2])
         for run, near in zip(runs, chosen, strict=True)
-    ]
+    )
     return moved, odometry.position_design(headings)

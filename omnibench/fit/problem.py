@@ -34,6 +34,7 @@ from omnibench.fit.span import Unidentified, directions_kept, driven_span
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import Integration, OdometryBatch
+from omnibench.robot.odometry_of_stored import odometry_of
 
 _PROGRESS_PERIOD = 0.1  # s, least time between two reports of progress: ten a second are all that a reader sees
 # Evaluations from which on the fast evaluator repays the time it takes to build. Both ways give the same costs to 1e-11
@@ -195,7 +196,7 @@ class CalibrationProblem:
             if isinstance(searched, MatrixElements) and len(searched.null):
                 self._frame = DrivenFrame.of(searched)
                 logs = self._frame.logs(logs)
-                odometry = OdometryBatch(logs, self.integration)
+                odometry = odometry_of(logs, self.integration)
             box = ElementBox.of(self._frame or searched, self.lower, self.upper)
             self._evaluator = make_evaluator(odometry, logs, self.integration, box)
         self._evaluator_tried = True

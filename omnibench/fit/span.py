@@ -12,7 +12,6 @@ import numpy as np
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.planar import interpolated
 
 Unidentified = Literal["keep", "fit", "shrink"]
 State = Literal["driven", "weak", "undriven"]
@@ -29,8 +28,6 @@ _NULL_SHARE = 1e-2
 # On the simulated recordings of tests/benchmarks/constants_fit.py half of it and twice change nothing; with half of it
 # Robotino's would count as driven.
 WEAK_SHARE = 0.1
-
-_EVERY = 1.0  # s between the moments at which wheel angles are compared where there are no poses; chosen
 
 # The following decide on names of directions alone; half of each and twice give the same names
 # (tests/benchmarks/constants_fit.py).
@@ -79,7 +76,7 @@ def driven_span(trajectories: Sequence[Trajectory]) -> DrivenSpan:
     """
     if not trajectories:
         raise DataError("no trajectories; nothing can be calibrated")
-    increments = [np.diff(_angles_at_poses(trajectory), axis=0) for trajectory in trajectories]
+    increments = [np.diff(trajectory.angles_at_poses, axis=0) for trajectory in trajectories]
     wheels = increments[0].shape[1]
     # Rows of zeros give N directions even if there are fewer increments than wheels.
     _, strengths, directions = np.linalg.svd(
@@ -217,12 +214,3 @@ def _signed(directions: Array) -> Array:
     leading = (np.abs(directions) > 0.5 * np.abs(directions).max(axis=1, keepdims=True)).argmax(axis=1)
     signed: Array = directions * np.sign(directions[np.arange(len(directions)), leading])[:, None]
     return signed
-
-
-def _angles_at_poses(trajectory: Trajectory) -> Array:
-    """Wheel angles (K, N) driven up to each reference pose, rad; without poses once a second."""
-    driven = np.cumsum(trajectory.signals * np.diff(trajectory.times, prepend=0.0)[:, None], axis=0)
-    times = np.concatenate([[0.0], trajectory.times])
-    angles = np.vstack([np.zeros(driven.shape[1]), driven])
-    stamps = trajectory.pose_times if trajectory.has_poses else np.arange(0.0, times[-1] + _EVERY, _EVERY)
-    return interpolated(stamps, times, angles)

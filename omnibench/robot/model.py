@@ -14,7 +14,8 @@ from omnibench.robot.effect_stream import EffectStream
 from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect
 from omnibench.robot.effects.term import Term
 from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.odometry import Integration, OdometryStream, RunSamples, WheelLog
+from omnibench.robot.odometry import Integration, OdometryStream, RunSamples, WheelLog, split_by
+from omnibench.robot.odometry_of_stored import StoredOdometry, are_many
 from omnibench.robot.path import PathBatch
 from omnibench.robot.signals import SignalStream, signals_of_runs
 
@@ -65,6 +66,9 @@ class OdometryModel:
 
         After the last sample the pose is constant. DataError in one line: a log lacks data that an effect needs.
         """
+        if not self._corrects and are_many(logs) and all((np.diff(log.stamps) >= 0).all() for log in logs):
+            of_all = StoredOdometry(logs, self.integration).poses(self.matrix[None])[0]
+            return split_by(of_all, [log.stamps for log in logs])
         return self._of_paths(logs, PathBatch.poses)
 
     def reported(self, logs: Sequence[WheelLog]) -> list[Array]:

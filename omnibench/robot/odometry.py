@@ -12,11 +12,11 @@ s = sin(h)/h with h = m3.a(k)/2. For a given row 3 positions are linear in rows 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import accumulate, pairwise
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,10 +26,21 @@ from omnibench.robot.wheels.drive import Drive, in_the_middle
 
 Integration = Literal["euler", "arc"]
 Complex = NDArray[np.complex128]
+Value = TypeVar("Value")
 Numbers = TypeVar("Numbers", Array, Complex, NDArray[np.intp])
 
 _LAST = 5  # samples whose mean rate continues a log after its last sample; chosen
 _BLOCK = 120_000  # samples at a time (candidates x samples), so that temporaries stay in the processor's cache
+
+
+class kept_with_samples(cached_property[Value]):  # noqa: N801 (a decorator)
+    """A property that is computed once where ``rates`` are in memory, and each time where they are read when used."""
+
+    def __get__(self, instance: Any, owner: type[Any] | None = None) -> Any:
+        value = super().__get__(instance, owner)
+        if instance is not None and not isinstance(instance.rates, np.ndarray):
+            vars(instance).pop(self.attrname, None)
+        return value
 
 
 @dataclass(frozen=True)
@@ -54,12 +65,12 @@ class WheelLog:
     steering: Array | None = None
     drive: Drive | None = None
 
-    @cached_property
+    @kept_with_samples
     def middle_steering(self) -> Array | None:
         """Steering angles (F, S) in the middle of each sample, rad; None where none are measured."""
         return None if self.steering is None else in_the_middle(self.steering)
 
-    @cached_property
+    @kept_with_samples
     def signals(self) -> Array:
         """Drive signals (F, M): the rates, or what they and the steering angles make."""
         return self.rates if self.drive is None else self.drive.signals(self.rates, self.middle_steering)
@@ -73,14 +84,22 @@ class WheelLog:
         if until <= end:
             return self
         rates = self.rates[-_LAST:].mean(axis=0)
-        angles = self.wheel_angles
+        angles, steering = self.wheel_angles, self.steering
         return replace(
             self,
-            times=np.append(self.times, until),
-            rates=np.vstack([self.rates, rates]),
-            wheel_angles=None if angles is None else np.vstack([angles, angles[-1] + rates * (until - end)]),
-            steering=None if self.steering is None else np.vstack([self.steering, self.steering[-1]]),
+            times=_followed(self.times, np.array(until)),
+            rates=_followed(self.rates, rates),
+            wheel_angles=None if angles is None else _followed(angles, angles[-1] + rates * (until - end)),
+            steering=None if steering is None else _followed(steering, steering[-1]),
         )
+
+
+def _followed(rows: Array, row: Array) -> Array:
+    """Rows (F, ...) and one more (...); of an array that is read where it is used, another one of that kind."""
+    if isinstance(rows, np.ndarray):
+        return np.concatenate([rows, row[None]])
+    longer: Array = rows.followed_by(row)
+    return longer
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,18 +217,22 @@ class OdometryBatch:
         row_12, row_3 = self._at_stamps(
             self._slopes(self._angles, self._before, matrix), self._slopes(self._piece, self._piece_before, matrix)
         )
+        return self._as_jacobian(row_12, row_3, self.driven)
+
+    def _as_jacobian(self, row_12: Complex, row_3: Complex, driven: Array) -> Array:
+        """Derivatives (S, 3, 3, M) from those of x + iy (S, M) by m1 + i m2 and by m3 in the frames of the starts."""
         row_12, row_3 = row_12 * self._turn[:, None], row_3 * self._turn[:, None]
-        zero = np.zeros_like(self.driven)
+        zero = np.zeros_like(driven)
         return np.stack(
             [
                 np.stack([row_12.real, -row_12.imag, row_3.real], axis=1),
                 np.stack([row_12.imag, row_12.real, row_3.imag], axis=1),
-                np.stack([zero, zero, self.driven], axis=1),
+                np.stack([zero, zero, driven], axis=1),
             ],
             axis=1,
         )
 
-    def position_design(self, headings: Sequence[Array]) -> Complex:
+    def position_design(self, headings: Iterable[Array]) -> Complex:
         """Regressors (S, M) of (x - x0) + i(y - y0) on m1 + i m2 for given headings.
 
         headings: for each log (F,), the absolute heading at the start of each sample, rad.

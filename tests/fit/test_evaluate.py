@@ -11,7 +11,7 @@ from fit_samples import noisy_trajectories
 
 from omnibench.data.dataset import Dataset, make_dataset
 from omnibench.errors import DataError
-from omnibench.fit.evaluate import evaluate, split_errors
+from omnibench.fit.evaluate import ModelErrors, evaluate
 from omnibench.robot.calibration import Calibration, EffectTerm, matrix_rows
 from omnibench.robot.kinematics import Robot
 from omnibench.robot.model import OdometryModel
@@ -40,7 +40,7 @@ def test_errors_are_those_of_the_final_pose() -> None:
     errors = [model.poses([run.final_log])[0][0] - run.poses[-1] for run in runs]
     positions = [math.hypot(error[0], error[1]) for error in errors]
     headings = [abs(error[2]) for error in errors]
-    found = split_errors(model, runs)
+    found = ModelErrors.of(model, runs).on(runs)
     assert found.trajectories == 12
     assert found.cost == pytest.approx(np.mean([math.hypot(*error) for error in errors]), abs=1e-14)
     assert found.position_mean_m == pytest.approx(np.mean(positions), abs=1e-14)
@@ -68,7 +68,7 @@ def test_a_split_that_is_empty_is_left_out() -> None:
 
 def test_the_design_is_evaluated_beside_the_calibration() -> None:
     found = evaluate(calibration(), dataset())
-    design = split_errors(OdometryModel.of_design(ROBOT, "arc"), dataset().trajectories)
+    design = ModelErrors.of(OdometryModel.of_design(ROBOT, "arc"), dataset().trajectories).on(dataset().trajectories)
     assert found.design["all"] == design
     assert found.splits["all"].cost < 0.5 * design.cost
 

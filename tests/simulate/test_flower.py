@@ -18,7 +18,7 @@ from omnibench.config import validate
 from omnibench.data.dataset import Dataset, Split
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import ConfigError
-from omnibench.fit.evaluate import split_errors
+from omnibench.fit.evaluate import ModelErrors
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.published_matrices import published_matrix
@@ -184,9 +184,9 @@ def test_validation_has_noise_of_its_own() -> None:
 def test_without_noise_the_truth_scores_nothing(integration: Any) -> None:
     simulation = simulate_dataset(small(noise=QUIET, integration=integration))
     truth = OdometryModel(simulation.dataset.robot, np.array(simulation.truth.matrix), simulation.truth.integration)
-    assert split_errors(truth, simulation.dataset.trajectories).cost < 1e-14
+    assert ModelErrors.of(truth, simulation.dataset.trajectories).on(simulation.dataset.trajectories).cost < 1e-14
     design = OdometryModel.of_design(simulation.dataset.robot, integration)
-    assert split_errors(design, simulation.dataset.trajectories).cost > 0.02
+    assert ModelErrors.of(design, simulation.dataset.trajectories).on(simulation.dataset.trajectories).cost > 0.02
 
 
 def test_the_truth_record_holds_eq_8_and_how_it_was_driven() -> None:
@@ -334,7 +334,7 @@ def test_mecanum_wheels_are_simulated_too() -> None:
     simulation = simulate_dataset(given)
     truth = OdometryModel(given.robot, np.array(simulation.truth.matrix), "arc")
     assert truth.matrix.shape == (3, 4)
-    assert split_errors(truth, simulation.dataset.trajectories).cost < 1e-14
+    assert ModelErrors.of(truth, simulation.dataset.trajectories).on(simulation.dataset.trajectories).cost < 1e-14
 
 
 def commands_with(**changes: Any) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from sample_robots import DIFFERENTIAL, SWERVE, TRICYCLE
 
 from omnibench.errors import ConfigError, DataError
-from omnibench.fit.evaluate import split_errors
+from omnibench.fit.evaluate import ModelErrors
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.simulate.command import Command
@@ -52,8 +52,8 @@ def test_the_effect_explains_what_the_mechanics_do_to_first_order_at_least(name:
     made, model, share = hidden(name)
     plain = OdometryModel(model.robot, model.matrix, "arc")
     runs = made.dataset.trajectories
-    assert split_errors(plain, runs).cost > 1e-3
-    assert split_errors(model, runs).cost < share * split_errors(plain, runs).cost
+    assert ModelErrors.of(plain, runs).on(runs).cost > 1e-3
+    assert ModelErrors.of(model, runs).on(runs).cost < share * ModelErrors.of(plain, runs).on(runs).cost
 
 
 @pytest.mark.parametrize("name", HIDDEN)
@@ -157,7 +157,12 @@ class TestVariation:
         made = simulate_dataset(experiment(name, commands=commands, truth={"tolerances": {}}))
         # An angle in the middle of a sample is the mean of those at its ends, which differ where the speed is reversed.
         missed = {"car": 2e-6, "swerve": 2e-3}.get(name, 1e-8)
-        assert split_errors(OdometryModel.of_design(made.dataset.robot, "arc"), made.dataset.trajectories).cost < missed
+        assert (
+            ModelErrors.of(OdometryModel.of_design(made.dataset.robot, "arc"), made.dataset.trajectories)
+            .on(made.dataset.trajectories)
+            .cost
+            < missed
+        )
 
     @pytest.mark.parametrize("name", ["tricycle", "swerve"])
     def test_steering_angles_can_be_told_again_from_the_truth(self, name: str) -> None:

@@ -12,7 +12,7 @@ from config_robots import NAMES, QUIET, experiment, robot, settings
 from omnibench.config import validate
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrate import calibrate
-from omnibench.fit.evaluate import split_errors
+from omnibench.fit.evaluate import ModelErrors
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import MotionEffect, Parameter, Values
 from omnibench.robot.kinematics import Array
@@ -47,8 +47,8 @@ def test_without_noise_the_truth_scores_nothing_and_the_design_does_not(name: st
     runs, truth = made.dataset.trajectories, OdometryModel(made.dataset.robot, np.array(made.truth.matrix), "arc")
     assert made.dataset.warnings == ()
     # A car's wheels out of place make it turn by what is not quite linear in its signals: 2 to 3 mm over 4 m here.
-    assert split_errors(truth, runs).cost < (5e-3 if name == "car" else 1e-9)
-    assert split_errors(OdometryModel.of_design(made.dataset.robot, "arc"), runs).cost > 1e-2
+    assert ModelErrors.of(truth, runs).on(runs).cost < (5e-3 if name == "car" else 1e-9)
+    assert ModelErrors.of(OdometryModel.of_design(made.dataset.robot, "arc"), runs).on(runs).cost > 1e-2
 
 
 def test_robots_that_cannot_go_sideways_drive_forward_and_backward_and_turn_on_the_spot() -> None:
@@ -178,7 +178,7 @@ def test_what_a_config_simulates_is_calibrated_and_holds_on_the_other_session(na
     dataset = simulate_dataset(validate(FlowerConfig, settings(name), name)).dataset
     calibrated = calibrate(dataset, "closed_form").calibration.model
     design, found = (
-        split_errors(model, dataset.split("validation")).cost
+        ModelErrors.of(model, dataset.split("validation")).on(dataset.split("validation")).cost
         for model in (OdometryModel.of_design(dataset.robot, "arc"), calibrated)
     )
     assert found < 0.35 * design

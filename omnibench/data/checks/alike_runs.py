@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+from xxhash import xxh3_64_intdigest
 
 from omnibench.data.checks.finding import Finding
 from omnibench.data.checks.stream_faults import runs_in_words
@@ -19,7 +20,7 @@ _DIGIT = 1e-7  # m, to which positions are compared; below the noise of any refe
 
 def copied_runs(runs: Sequence[Trajectory]) -> Iterator[Finding]:
     """Runs that repeat an earlier one."""
-    seen: dict[bytes, str] = {}
+    seen: dict[int, str] = {}
     copies: dict[str, str] = {}
     for run in runs:
         keys = set(_keys(run))
@@ -40,10 +41,10 @@ def copied_runs(runs: Sequence[Trajectory]) -> Iterator[Finding]:
         )
 
 
-def _keys(run: Trajectory) -> Iterator[bytes]:
+def _keys(run: Trajectory) -> Iterator[int]:
     """Digests of every stretch of reference positions that change often enough."""
     rounded = np.round(run.poses[:, :2] / _DIGIT).astype(np.int64)
     changes = np.append(0, np.cumsum(np.any(np.diff(rounded, axis=0) != 0, axis=1)))
     for row in range(len(rounded) - _ROWS + 1):
         if changes[row + _ROWS - 1] - changes[row] >= _CHANGES:
-            yield rounded[row : row + _ROWS].tobytes()
+            yield xxh3_64_intdigest(rounded[row : row + _ROWS])

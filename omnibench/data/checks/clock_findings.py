@@ -8,18 +8,24 @@ import numpy as np
 
 from omnibench.data.checks.finding import Finding, Severity
 from omnibench.data.checks.stream_faults import runs_in_words
-from omnibench.data.clock_matching import ClockMatch, Streams, match_clocks
+from omnibench.data.clock_matching import ClockMatch, Streams, match_clocks, match_each_clock
 from omnibench.data.dataset import Trajectory
+from omnibench.data.stored.drawn_runs import MOST_DRAWN, drawn_runs
 from omnibench.robot.kinematics import Array, Robot
 
 # s that a clock must be off, and in standard errors, to be told (chosen: simulated runs, whose clocks are right, are
 # below); from _SPOILS, s, on it spoils a fit.
 _LEAST, _ERRORS, _SPOILS = 0.05, 4.0, 0.15
 
+_TOGETHER = 600_000  # wheel samples of the runs by which coefficients of very many are found: 100 of a minute (chosen)
+
 
 def clocks_of(robot: Robot, runs: Sequence[Trajectory]) -> list[ClockMatch | None]:
     """The clock of every run's reference; None where it does not show."""
-    return match_clocks(robot, [Streams.of_run(run) for run in runs])
+    if sum(len(run.times) for run in runs) <= MOST_DRAWN:
+        return match_clocks(robot, [Streams.of_run(run) for run in runs])
+    some = [Streams.of_run(run) for run in drawn_runs(runs, _TOGETHER)]
+    return match_each_clock(robot, some, map(Streams.of_run, runs))
 
 
 def clock_findings(runs: Sequence[Trajectory], clocks: Sequence[ClockMatch | None]) -> Iterator[Finding]:

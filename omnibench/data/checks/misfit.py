@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.checks.misreading import Misreading, Reading
+from omnibench.data.stored.drawn_runs import in_memory
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import OdometryBatch, WheelLog
 from omnibench.robot.planar import wrapped
@@ -57,7 +58,7 @@ class Recording:
         size = -(-sum(len(logs[index].times) for index in some) // _MOST_SAMPLES)
         seen = [_evenly(len(poses[index]), _MOST_STAMPS) for index in some]
         coarse = [
-            replace(_coarser(logs[index], size), stamps=logs[index].stamps[stamps])
+            replace(_coarser(in_memory(logs[index]), size), stamps=logs[index].stamps[stamps])
             for index, stamps in zip(some, seen, strict=True)
         ]
         return cls(

@@ -31,6 +31,7 @@ from omnibench.data.checks.misreading import (
 )
 from omnibench.data.checks.motion_fit import FreeFit, Windows, continuous
 from omnibench.data.checks.steering_readings import steering_readings, steering_transforms
+from omnibench.data.stored.drawn_runs import in_memory
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import WheelLog
 
@@ -64,7 +65,7 @@ class Recorded:
         """Runs from first to last that are looked at, all if they are few or short."""
         samples = sum(len(log.times) for log in self.logs)
         every = max(1, math.ceil(samples / _MOST_SAMPLES)) if len(self.logs) > 3 else 1
-        logs = self.logs[::every]
+        logs = [in_memory(log) for log in self.logs[::every]]
         poses = [continuous(log.stamps, each) for log, each in zip(logs, self.poses[::every], strict=True)]
         return Recorded(self.robot, logs, poses)
 

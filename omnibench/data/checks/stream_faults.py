@@ -11,6 +11,7 @@ from omnibench.data.checks.misreading import wheels_in_words
 from omnibench.data.checks.reference_jumps import reference_jumps
 from omnibench.data.checks.steering_readings import frozen_steering
 from omnibench.data.dataset import Trajectory
+from omnibench.data.periods import median_period
 from omnibench.robot.kinematics import Array, Robot, wheel_equations
 from omnibench.words import plural, some
 
@@ -43,10 +44,12 @@ def stream_faults(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Finding]
     """
     posed = [run for run in runs if run.has_poses]
     yield from _restarts(robot, runs)
-    yield from _gaps_of(robot, runs, "wheel_dropout", lambda run: np.append(0.0, run.times), "wheel samples")
+    usual = median_period(runs)
+    yield from _gaps_of(robot, runs, "wheel_dropout", usual, lambda run: np.append(0.0, run.times), "wheel samples")
     if not posed:
         return
-    yield from _gaps_of(robot, posed, "reference_dropout", lambda run: run.pose_times, "reference poses")
+    usual = float(np.median(np.concatenate([np.diff(run.pose_times) for run in posed])))
+    yield from _gaps_of(robot, posed, "reference_dropout", usual, lambda run: run.pose_times, "reference poses")
     frozen = _standing(robot, posed)
     yield from _frozen(posed, frozen)
     yield from dead_wheels(robot, posed)
@@ -82,11 +85,15 @@ def _restarts(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Finding]:
 
 
 def _gaps_of(
-    robot: Robot, runs: Sequence[Trajectory], kind: Kind, times_of: Callable[[Trajectory], Array], what: str
+    robot: Robot,
+    runs: Sequence[Trajectory],
+    kind: Kind,
+    usual: float,
+    times_of: Callable[[Trajectory], Array],
+    what: str,
 ) -> Iterator[Finding]:
-    """Samples or poses, ``what``, that are missing for long while the robot drives."""
+    """Samples or poses, ``what``, that are missing for long while the robot drives. usual: their period, s."""
     found, lengths = [], []
-    usual = float(np.median(np.concatenate([np.diff(times_of(run)) for run in runs])))
     least = max(_LEAST_GAP, _PERIODS * usual)
     for run in runs:
         times = times_of(run)

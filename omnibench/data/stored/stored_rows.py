@@ -6,10 +6,11 @@ that code which takes one run after another reads every block once.
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -109,7 +110,7 @@ class StoredRows(np.lib.mixins.NDArrayOperatorsMixin):
     """Rows of a run that behave like their array: (count, n), or (count,) where ``flat``. Whatever uses it reads it.
 
     columns: those that are read together. chosen: the places of this array's among them. last: the last value of a
-    flat one, which is known without reading.
+    flat one, which is known without reading. more: rows that follow those of the file.
     """
 
     file: BlockFile
@@ -119,10 +120,11 @@ class StoredRows(np.lib.mixins.NDArrayOperatorsMixin):
     count: int
     flat: bool = False
     last: float | None = None
+    more: tuple[Array, ...] = ()
 
     @property
     def shape(self) -> tuple[int, ...]:
-        return (self.count,) if self.flat else (self.count, len(self.chosen))
+        return (len(self),) if self.flat else (len(self), len(self.chosen))
 
     @property
     def ndim(self) -> int:
@@ -130,24 +132,30 @@ class StoredRows(np.lib.mixins.NDArrayOperatorsMixin):
 
     @property
     def size(self) -> int:
-        return self.count if self.flat else self.count * len(self.chosen)
+        return math.prod(self.shape)
 
     dtype = np.dtype(float)
 
     def __len__(self) -> int:
-        return self.count
+        return self.count + len(self.more)
+
+    def followed_by(self, row: Array) -> StoredRows:
+        """The rows and one more."""
+        return replace(self, more=(*self.more, row), last=float(row) if self.flat else None)
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:
         rows = self.file.rows(self.columns, self.first, self.count)
         low, high = self.chosen[0], self.chosen[-1] + 1
         values = rows[:, low] if self.flat else rows[:, low:high]
+        if self.more:
+            values = np.concatenate([values, self.more])
         return values.astype(dtype) if dtype is not None and dtype != values.dtype else values
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:
         return getattr(ufunc, method)(*(_read(each) for each in inputs), **options)
 
     def __getitem__(self, key: Any) -> Any:
-        if self.last is not None and isinstance(key, int) and key in (-1, self.count - 1):
+        if self.last is not None and isinstance(key, int) and key in (-1, len(self) - 1):
             return self.last
         return np.asarray(self)[key]
 

@@ -13,6 +13,7 @@ import polars as pl
 
 from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory
 from omnibench.data.dataset import make_dataset as of_trajectories
+from omnibench.data.periods import median_period
 from omnibench.data.references.reference_table import REFERENCE_COLUMNS, TABLE, read_references, reference_frame
 from omnibench.data.references.run_references import References
 from omnibench.data.run_checks import pose_times_flaw, stored_pose_times_flaw
@@ -105,8 +106,7 @@ def _sample_period(runs: Sequence[Trajectory]) -> float:
     """The median time between wheel samples, s."""
     if not runs:
         return 1.0  # that there is no run is said next
-    periods = np.concatenate([np.diff(run.times, prepend=0.0) for run in runs])
-    return round(float(np.median(periods)), _PERIOD_DECIMALS)
+    return round(median_period(runs), _PERIOD_DECIMALS)
 
 
 def _tables(robot: Robot, trajectories: Any, wheels: Any, poses: Any, references: Any) -> DatasetTables:

@@ -19,6 +19,7 @@ from omnibench.data.clock_matching import ClockMatch
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.importers.copied_reference import follows_the_wheels
 from omnibench.data.references.reference_units import odd_references
+from omnibench.data.stored.drawn_runs import drawn_runs
 from omnibench.fit.check.expected_gain import Gain, expected_gain
 from omnibench.fit.check.fixes import command, with_fixes
 from omnibench.fit.check.foreign_reference import foreign_reference
@@ -59,7 +60,7 @@ def check_recording(read: RecordingSource) -> CheckReport:
     clocks = clocks_of(robot, runs)
     aligned = [_by_wheels(run, clock) for run, clock in zip(runs, clocks, strict=True)]
     faults = list(stream_faults(robot, [*aligned, *(run for run in dataset.trajectories if not run.has_poses)]))
-    odometry = list(_odometry(dataset, runs))
+    odometry = list(_odometry(dataset, drawn_runs(runs)))
     spoiled = {finding.kind for finding in (*faults, *odometry)} & set(_SPOILED)
     seen = recorded(replace(dataset, trajectories=tuple(aligned)))
     explained = search(seen)
@@ -80,7 +81,7 @@ def check_recording(read: RecordingSource) -> CheckReport:
     off = [] if spoiled or foreign else list(clock_findings(runs, clocks))
     found += off
     measured = any(run.references is not None for run in dataset.trajectories)
-    found += _left_open(dataset) if measured else missing_motions(robot, aligned)
+    found += _left_open(dataset) if measured else missing_motions(robot, drawn_runs(aligned))
     found += too_few(dataset.trajectories)
     findings = with_fixes(read, sorted(_distinct(found), key=lambda finding: _ORDER[finding.severity]))
     clocks_agree = not any(finding.severity == "error" for finding in off)

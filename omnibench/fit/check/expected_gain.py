@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from omnibench.data.dataset import Dataset, Trajectory
+from omnibench.data.stored.drawn_runs import in_memory
 from omnibench.fit.check.missing_motions import command_names
 from omnibench.fit.evaluate import final_errors
 from omnibench.fit.held_out import judge
@@ -46,7 +47,7 @@ def expected_gain(dataset: Dataset, *, clocks_agree: bool = True) -> Gain:
     off that a gain which is not significant says nothing.
     """
     robot, every = dataset.robot, dataset.trajectories
-    chosen = every[:: -(-len(every) // _MOST)]
+    chosen = [in_memory(run) for run in every[:: -(-len(every) // _MOST)]]
     unknown = "whether a calibration is needed cannot be told from"
     if len(chosen) < _FEWEST:
         return Gain(None, f"{unknown} {plural(len(chosen), 'run')}; {_FEWEST} are needed")

@@ -13,6 +13,7 @@ from omnibench.data.checks.finding import Finding
 from omnibench.data.checks.misread_search import Recorded
 from omnibench.data.dataset import Dataset
 from omnibench.data.importer import Importer
+from omnibench.data.periods import median_period
 from omnibench.data.storage import load_dataset
 from omnibench.errors import ConfigError, DataError
 from omnibench.registry import importers
@@ -171,7 +172,7 @@ def recorded(dataset: Dataset) -> Recorded:
 def odd_times(dataset: Dataset) -> bool:
     """True if samples or poses follow each other so slowly, or so fast, that their times are likely in another unit."""
     posed = [run for run in dataset.trajectories if run.has_poses]
-    wheels = float(np.median(np.concatenate([np.diff(run.times, prepend=0.0) for run in dataset.trajectories])))
+    wheels = median_period(dataset.trajectories)
     poses = float(np.median(np.concatenate([np.diff(run.pose_times) for run in posed]))) if posed else 1.0
     return wheels > _SLOWEST or wheels < _FASTEST or poses > _SLOWEST_POSES or poses < _FASTEST
 

@@ -44,6 +44,8 @@ _NUISANCES = 1e-4
 _ALL = 0.01
 # Chance below which no figure is printed but "< 10⁻⁹": tails that thin are not those of real noise (chosen).
 _LEAST = 1e-9
+# Reference poses that are compared, which take 2 kB each (chosen: 80 of each of 750 runs).
+_MOST_POSES = 60_000
 # Names of sessions, or of wheels, that a sentence lists (chosen).
 _LISTED = 3
 _ALONE = "all runs are of one session"
@@ -121,7 +123,7 @@ def compare_sessions(model: OdometryModel, trajectories: Sequence[Trajectory]) -
     if len(set(sessions_of(trajectories))) < 2:
         return SessionComparison(untested=_ALONE)
     try:
-        runs = usable_runs(trajectories, "all")
+        runs = usable_runs(trajectories, "all", _MOST_POSES)
     except DataError as error:
         return SessionComparison(untested=str(error))
     if untested := _untested(runs):

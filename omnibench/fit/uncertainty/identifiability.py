@@ -26,7 +26,8 @@ from omnibench.fit.uncertainty.physical import (
 from omnibench.fit.uncertainty.unidentified import open_directions
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.odometry import Integration, OdometryBatch
+from omnibench.robot.odometry import Integration
+from omnibench.robot.odometry_of_stored import odometry_of
 
 ROWS = ("x", "y", "heading")
 # Standard deviation, as a share of a row's largest element, above which the row counts as rough along a direction:
@@ -161,7 +162,7 @@ def _quick_noise(
         return GIVEN, robot.inverse_kinematic_matrix
     if not usable:
         raise DataError("no trajectory has a reference pose after its start; nothing can be identified")
-    odometry = OdometryBatch([run.reference_log for run in usable], integration)
+    odometry = odometry_of([run.reference_log for run in usable], integration)
     reference = np.concatenate([run.poses[1:] for run in usable])
     matrix = linear_fit(odometry, usable, reference, robot.inverse_kinematic_matrix, span.driven)
     return noise_of_matrix(usable, matrix, integration), matrix

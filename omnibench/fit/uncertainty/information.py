@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Literal
 
 import numpy as np
@@ -14,7 +14,8 @@ from omnibench.fit.loss.jumps import without_jumps
 from omnibench.fit.loss.losses import LossName
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
-from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog
+from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog, split_by
+from omnibench.robot.odometry_of_stored import StoredOdometry, are_many, together
 
 Stamps = Literal["reference", "final"]
 
@@ -28,13 +29,17 @@ def noise_of_matrix(
     has any.
     """
     runs = [run for run in runs if run.has_poses]
-    logs = [run.reference_log for run in runs]
-    residuals = [
-        OdometryBatch([log], integration).poses(matrix[None])[0] - run.poses[1:]
-        for log, run in zip(logs, runs, strict=True)
-    ]
+    residuals = [poses - run.poses[1:] for poses, run in zip(_poses(runs, matrix, integration), runs, strict=True)]
     near, residuals = without_jumps(runs, residuals, loss)
     return estimate_noise(differences_between_repetitions(near, residuals))
+
+
+def _poses(runs: Sequence[Trajectory], matrix: Array, integration: Integration) -> list[Array]:
+    """The odometry (K, 3) of each run at its reference poses."""
+    logs = [run.reference_log for run in runs]
+    if are_many(logs):
+        return split_by(StoredOdometry(logs, integration).poses(matrix[None])[0], [log.stamps for log in logs])
+    return [OdometryBatch([log], integration).poses(matrix[None])[0] for log in logs]
 
 
 def information_of_run(
@@ -46,11 +51,7 @@ def information_of_run(
     the start or at the last alone. A WheelLog has its own stamps, > 0. Wheel rates and start pose count as exact; a
     noisy start position is part of the noise's bias.
     """
-    log = run if isinstance(run, WheelLog) else _log(run, stamps)
-    jacobian = OdometryBatch([log], integration).jacobian(matrix)  # (K, 3, 3, N)
-    whitened = Whitener(noise, log.stamps)(jacobian.reshape(len(jacobian), 3, -1))
-    columns = whitened.reshape(-1, whitened.shape[-1])
-    information: Array = columns.T @ columns
+    (information,) = information_of_runs([run], matrix, integration, noise, stamps=stamps)
     return information
 
 
@@ -63,9 +64,21 @@ def information_of_runs(
     stamps: Stamps = "reference",
 ) -> Array:
     """Fisher information (Z, 3N, 3N) of each run; their sum is that of all runs together."""
-    size = matrix.size
-    information = [information_of_run(run, matrix, integration, noise, stamps=stamps) for run in runs]
-    return np.array(information).reshape(len(runs), size, size)
+    logs = [run if isinstance(run, WheelLog) else _log(run, stamps) for run in runs]
+    information = np.empty((len(runs), matrix.size, matrix.size))
+    for of_run, log, jacobian in zip(information, logs, _jacobians(logs, matrix, integration), strict=True):
+        whitened = Whitener(noise, log.stamps)(jacobian.reshape(len(jacobian), 3, -1))
+        columns = whitened.reshape(-1, whitened.shape[-1])
+        of_run[:] = columns.T @ columns
+    return information
+
+
+def _jacobians(logs: Sequence[WheelLog], matrix: Array, integration: Integration) -> Iterator[Array]:
+    """Derivatives (K, 3, 3, N) of the poses of each log."""
+    of_stored = are_many(logs)
+    for part in together(logs) if of_stored else ([log] for log in logs):
+        odometry = (StoredOdometry if of_stored else OdometryBatch)(part, integration)
+        yield from split_by(odometry.jacobian(matrix), [log.stamps for log in part])
 
 
 def _log(run: Trajectory, stamps: Stamps) -> WheelLog:

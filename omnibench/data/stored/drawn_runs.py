@@ -1,0 +1,33 @@
+"""Some of very many runs, by which a whole recording is judged."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from typing import Any, TypeVar
+
+import numpy as np
+
+from omnibench.data.periods import Sampled
+from omnibench.data.stored.stored_rows import StoredRows
+
+Run = TypeVar("Run", bound=Sampled)
+Data = TypeVar("Data", bound=Any)
+
+MOST_DRAWN = 3_000_000  # wheel samples by which a recording is judged: 500 runs of a minute at 100 Hz (chosen)
+
+
+def drawn_runs(runs: Sequence[Run], most: int = MOST_DRAWN) -> list[Run]:
+    """All runs, or of more than ``most`` wheel samples some, in memory, that chance has drawn: always the same ones."""
+    samples = sum(len(run.times) for run in runs)
+    if samples <= most:
+        return list(runs)
+    count = max(1, len(runs) * most // samples)
+    chosen = np.sort(np.random.default_rng(0).choice(len(runs), count, replace=False))
+    return [in_memory(runs[index]) for index in chosen.tolist()]
+
+
+def in_memory(run: Data) -> Data:
+    """A run, or a log, with copies of the arrays that are read where they are used."""
+    stored = {item.name: value for item in fields(run) if isinstance(value := getattr(run, item.name), StoredRows)}
+    return replace(run, **{name: np.array(value) for name, value in stored.items()}) if stored else run
