@@ -9,7 +9,7 @@ import typer
 
 from omnibench.cli.options import (
     CalibrationFile,
-    DatasetFolder,
+    DatasetFolders,
     Force,
     Json,
     Plugins,
@@ -24,7 +24,7 @@ calibration_app = typer.Typer()
 
 @calibration_app.command()
 def calibrate(
-    dataset: DatasetFolder,
+    dataset: DatasetFolders,
     output: Annotated[
         Path | None, output_option("Calibration file to write. Default: it is only shown.", metavar="FILE.yaml")
     ] = None,
@@ -152,7 +152,7 @@ def calibrate(
 @calibration_app.command()
 def evaluate(
     calibration: CalibrationFile,
-    dataset: DatasetFolder,
+    dataset: DatasetFolders,
     plugins: Plugins = None,
     as_json: Json = False,
 ) -> None:
@@ -181,7 +181,7 @@ def evaluate(
 @calibration_app.command()
 def certify(
     calibration: CalibrationFile,
-    dataset: DatasetFolder,
+    dataset: DatasetFolders,
     box: Annotated[
         Literal["paper", "row"] | None,
         typer.Option(help="Matrices to compare with; see calibrate. Default: the box of the calibration's search."),

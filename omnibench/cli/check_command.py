@@ -20,7 +20,10 @@ check_app = typer.Typer()
 @check_app.command()
 def check(
     source: Annotated[
-        Path, typer.Argument(help="Data set folder, folder or file of CSV tables, or a bag.", metavar="SOURCE")
+        list[Path],
+        typer.Argument(
+            help="Data set folder, or several; folder or file of CSV tables, or a bag.", metavar="SOURCE..."
+        ),
     ],
     importer: Annotated[
         str | None,

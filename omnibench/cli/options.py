@@ -24,6 +24,10 @@ def output_option(text: str, **settings: Any) -> Any:
 
 
 DatasetFolder = Annotated[Path, typer.Argument(help="Data set folder.")]
+DatasetFolders = Annotated[
+    list[Path],
+    typer.Argument(help="Data set folder; several of one robot, or a glob, count as one.", metavar="DATASET..."),
+]
 CalibrationFile = Annotated[Path, typer.Argument(help="Calibration file.")]
 WhichDataset = Annotated[str | None, typer.Option(help="Name of the data set, if the config has several.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on standard output, and nothing else.")]

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from omnibench.cli.options import (
-    DatasetFolder,
+    DatasetFolders,
     Figures,
     Force,
     Json,
@@ -28,7 +28,7 @@ recording_app = typer.Typer()
 
 @recording_app.command()
 def inspect(
-    dataset: DatasetFolder,
+    dataset: DatasetFolders,
     report: Annotated[
         Path | None,
         typer.Option(metavar="FILE.html", help="Write a page: paths, motions driven, wheel rates, runs step by step."),
@@ -59,13 +59,14 @@ def inspect(
         return print_json(inspection)
     print_inspection(make_console(), inspection)
     warn(inspection.warnings)
+    named = dataset[0] if len(dataset) == 1 else recordings.name
     missing = [each.motion for each in inspection.identifiability.directions if each.state != "driven" and each.motion]
     if missing:
         return print_ending(
-            f"{dataset} hardly tells {' or '.join(missing)}", "read what to drive", "omnibench", "guide", "driving"
+            f"{named} hardly tells {' or '.join(missing)}", "read what to drive", "omnibench", "guide", "driving"
         )
-    told = f"{dataset} determines {'all' if not inspection.identifiability.sentences else 'most'} of the matrix"
-    return print_ending(told, "calibrate it", "omnibench", "calibrate", dataset, "-o", "calibration.yaml")
+    told = f"{named} determines {'all' if not inspection.identifiability.sentences else 'most'} of the matrix"
+    return print_ending(told, "calibrate it", "omnibench", "calibrate", *dataset, "-o", "calibration.yaml")
 
 
 @recording_app.command()

@@ -191,7 +191,7 @@ class CalibrationProblem:
 
         ``cost`` builds it by itself when a search asks for many candidates. Both ways give the same costs to 1e-11.
         """
-        if not self._evaluator_tried and isinstance(self.odometry, OdometryBatch):
+        if not self._evaluator_tried and type(self.odometry) is OdometryBatch:
             logs, odometry, searched = self.objective.logs(self.trajectories), self.odometry, self.parameterisation
             if isinstance(searched, MatrixElements) and len(searched.null):
                 self._frame = DrivenFrame.of(searched)

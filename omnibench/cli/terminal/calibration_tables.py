@@ -228,17 +228,19 @@ def _size(value: float, unit: str) -> str:
     return f"{math.degrees(value):.2f} deg" if unit == "rad" else f"{1000 * value:.1f} mm"
 
 
-def print_verdict_ending(verdict: HeldOutVerdict, calibration: Calibration, file: Path, dataset: Path) -> None:
+def print_verdict_ending(
+    verdict: HeldOutVerdict, calibration: Calibration, file: Path, datasets: Sequence[Path]
+) -> None:
     """Print the last sentence of ``calibrate`` and ``evaluate``: use a calibration, record more, or look for faults."""
     if verdict.verdict == "better":
         use = ("omnibench", "export", file, "--to", _format_for(calibration))
         print_ending(f"{file} is better than the design on runs that were held out", "use it on the robot", *use)
     elif verdict.verdict == "worse":
-        look = ("omnibench", "inspect", dataset)
+        look = ("omnibench", "inspect", *datasets)
         print_ending(f"{file} is worse than the design: do not use it", "see what the recordings lack", *look)
     elif verdict.verdict == "undecided":
         more = "record more runs for validation; what these tell"
-        print_ending(f"whether {file} is better than the design is open", more, "omnibench", "inspect", dataset)
+        print_ending(f"whether {file} is better than the design is open", more, "omnibench", "inspect", *datasets)
     else:
         other = ("omnibench", "evaluate", file, "DATASET")
         print_ending(f"{file} was not judged by other runs", "try it on a recording that it was not fitted to", *other)
@@ -253,17 +255,17 @@ def _format_for(calibration: Calibration) -> str:
     return "ros2_controllers"
 
 
-def print_certificate_ending(certified: CertifiedCalibration, file: Path, dataset: Path) -> None:
+def print_certificate_ending(certified: CertifiedCalibration, file: Path, datasets: Sequence[Path]) -> None:
     """Print the last sentence of ``certify``: whether a better search is worth the time."""
     gap = max(certified.certificate.gap, 0.0)
     if gap <= _NOTHING_TO_GAIN:
-        found = ("omnibench", "discover", dataset, "--model", file)
+        found = ("omnibench", "discover", *datasets, "--model", file)
         print_ending(f"no search can gain more than {gap:.2%} on {file}", "look for what a matrix lacks", *found)
     elif not certified.proof.finished:
-        longer = ("omnibench", "certify", file, dataset, "--seconds", "600")
+        longer = ("omnibench", "certify", file, *datasets, "--seconds", "600")
         print_ending(f"a better matrix may save up to {gap:.1%} of the cost", "prove more, with more time", *longer)
     else:
-        exact = ("omnibench", "calibrate", dataset, "-o", "better.yaml")
+        exact = ("omnibench", "calibrate", *datasets, "-o", "better.yaml")
         print_ending(f"a better matrix may save up to {gap:.1%} of the cost", "search for it", *exact)
 
 

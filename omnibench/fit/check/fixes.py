@@ -45,8 +45,9 @@ def command(read: RecordingSource, findings: Sequence[Finding]) -> str:
 
 def next_command(read: RecordingSource) -> str:
     """The command line that goes on where nothing is to be mended: a data set is calibrated, a log imported first."""
-    if read.folder is not None and (read.folder / "dataset.yaml").is_file():
-        return shlex.join(["omnibench", "calibrate", str(read.folder), "-o", "calibration.yaml"])
+    places = read.places or ([read.folder] if read.folder and (read.folder / "dataset.yaml").is_file() else [])
+    if places:
+        return shlex.join(["omnibench", "calibrate", *map(str, places), "-o", "calibration.yaml"])
     return _import(read.importer, read.source, read.options, _target(read))
 
 

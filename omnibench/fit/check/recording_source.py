@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ import numpy as np
 from omnibench.data.checks.finding import Finding
 from omnibench.data.checks.misread_search import Recorded
 from omnibench.data.dataset import Dataset
+from omnibench.data.dataset_folders import dataset_folders
 from omnibench.data.importer import Importer
 from omnibench.data.periods import median_period
 from omnibench.data.storage import load_dataset
@@ -31,7 +32,8 @@ class RecordingSource:
     """A data set and how it was read.
 
     importer, options: by which ``source`` is read again. folder: of the data set, where it is one. findings: those
-    of reading it. in_memory: ``source`` is only where the data set would be saved, whatever stands there.
+    of reading it. in_memory: ``source`` is only where the data set would be saved, whatever stands there. places: the
+    folders of a data set that are several.
     """
 
     dataset: Dataset
@@ -41,6 +43,7 @@ class RecordingSource:
     folder: Path | None = None
     findings: tuple[Finding, ...] = field(default=())
     in_memory: bool = False
+    places: tuple[Path, ...] = ()
 
     @property
     def readable(self) -> bool:
@@ -49,13 +52,24 @@ class RecordingSource:
 
 
 def read_source(
-    source: Path, form: str | None = None, options: Mapping[str, Any] | None = None, robot: Path | None = None
+    source: Path | Sequence[Path],
+    form: str | None = None,
+    options: Mapping[str, Any] | None = None,
+    robot: Path | None = None,
 ) -> RecordingSource:
-    """Read a data set folder, or recordings with an importer, which is recognised unless it is given.
+    """Read a data set folder, or several, or recordings with an importer, which is recognised unless it is given.
 
     DataError or ConfigError in one line where it cannot be read.
     """
     given = dict(options or {}) | ({"robot": str(robot)} if robot else {})
+    places = dataset_folders(source)
+    if len(places) > 1:
+        if form or given:
+            raise ConfigError(
+                f"{places[0]} and {len(places) - 1} more: an importer reads one source; import each by itself"
+            )
+        return replace(of_dataset(load_dataset(places)), places=tuple(places))
+    (source,) = places
     if not source.exists():
         raise DataError(f"{source}: no such file or folder")
     name = form or recognised(source)

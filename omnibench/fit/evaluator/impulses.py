@@ -9,6 +9,7 @@ of exp(i m3.c) along the sample, taken by Gauss-Legendre quadrature, whose error
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from math import factorial
 
@@ -67,7 +68,9 @@ def make_path(log: WheelLog, integration: Integration) -> Path:
     return Path(angles, before, ends, reached[ends])
 
 
-def quadrature(paths: list[Path], row: Array, weight: Array, tolerance: float, integration: Integration) -> int | None:
+def quadrature(
+    paths: Iterable[Path], row: Array, weight: Array, tolerance: float, integration: Integration
+) -> int | None:
     """Gauss-Legendre nodes that a piece needs for an error of at most ``tolerance`` (m) over a path; None: too many.
 
     row (N,): the largest absolute elements of row 3; weight (N,): those of rows 1 and 2 together (m per rad).

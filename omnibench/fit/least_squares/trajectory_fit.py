@@ -34,7 +34,6 @@ from omnibench.fit.least_squares.whitened import Whitened, whitened
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import OdometryBatch, WheelLog, split_by
-from omnibench.robot.odometry_of_stored import StoredOdometry, are_many
 
 _TOGETHER = 20  # runs of about the same length whose derivatives are computed at once (chosen)
 
@@ -117,9 +116,6 @@ class TrajectoryFit:
 
     def matrix_jacobian(self) -> list[Array]:
         """Derivatives (K, 3, 3N) of the poses by the elements of the matrix, row by row."""
-        if are_many(self.logs):
-            of_all = StoredOdometry(self.logs, self.model.integration).jacobian(self.model.matrix)
-            return split_by(of_all.reshape(len(of_all), 3, -1), self.stamps)
         columns: list[Array] = [np.empty(0)] * len(self.runs)
         by_length = sorted(range(len(self.runs)), key=lambda index: len(self.logs[index].times))
         for first in range(0, len(by_length), _TOGETHER):

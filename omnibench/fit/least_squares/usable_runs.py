@@ -14,17 +14,12 @@ from omnibench.robot.kinematics import Array
 # tests/benchmarks/constants.py varies each number by 0.5 and 2: on a small set with heading drift no verdict and no
 # name changes.
 _MOST_STAMPS = 80  # reference poses used of a run: neighbours in denser references share their errors
-_FEWEST_STAMPS = 4  # of a run where all together are many; chosen
 _STANDING = 1e-3  # rad/s: slower wheels count as standing; one of 0.1 m moves 0.1 mm in a second
 _OVERHANG = 0.5  # s after the last wheel sample in which reference poses are still used, see ``log_of``
 
 
-def usable_runs(
-    trajectories: Sequence[Trajectory], split: str = "train", most_poses: int | None = None
-) -> tuple[Trajectory, ...]:
+def usable_runs(trajectories: Sequence[Trajectory], split: str = "train") -> tuple[Trajectory, ...]:
     """Runs of a split with a reference pose after their start, by session and time, at most 80 stamps each.
-
-    most_poses: stamps of all runs together, unless a run is left with fewer than 4; default: no limit.
 
     Raises DataError where there are none, or where the wheels stand in all of them.
     """
@@ -41,8 +36,7 @@ def usable_runs(
     if max(float(np.abs(run.rates).max()) for run in runs) < _STANDING:
         raise DataError(f"the wheels stand in all runs of the split {split}; drive some, or check the columns omega_*")
     runs.sort(key=lambda run: (str(run.session), run.started_at or 0.0))
-    most = _MOST_STAMPS if most_poses is None else max(_FEWEST_STAMPS, min(_MOST_STAMPS, most_poses // len(runs)))
-    return tuple(_thinned(run, most) for run in runs)
+    return tuple(_thinned(run) for run in runs)
 
 
 def with_poses(run: Trajectory, index: Array) -> Trajectory:
@@ -56,8 +50,8 @@ def _covered_poses(run: Trajectory) -> int:
     return int((run.pose_times <= run.times[-1] + _OVERHANG).sum())
 
 
-def _thinned(run: Trajectory, most: int) -> Trajectory:
+def _thinned(run: Trajectory) -> Trajectory:
     last = _covered_poses(run) - 1
-    if last == len(run.pose_times) - 1 <= most:
+    if last == len(run.pose_times) - 1 <= _MOST_STAMPS:
         return run
-    return with_poses(run, np.unique(np.round(np.linspace(last, 0, min(last, most) + 1)).astype(int)))
+    return with_poses(run, np.unique(np.round(np.linspace(last, 0, min(last, _MOST_STAMPS) + 1)).astype(int)))

@@ -1,4 +1,13 @@
-"""Minimising a weighted sum of norms of affine residuals in a box: a second-order cone program (cvxpy, Clarabel)."""
+"""Minimising a weighted sum of norms of affine residuals in a box: a second-order cone program (cvxpy, Clarabel).
+
+Of many residuals e_s(d) = r_s + J_s d Newton's method is some hundred times as fast. With their directions
+u_s = e_s / |e_s| the sum f = sum_s w_s |e_s| has
+
+    f' = sum_s w_s J_s' u_s,    f'' = sum_s w_s / |e_s| J_s' (1 - u_s u_s') J_s.                          (1)
+
+f is convex, so that a minimum inside the box is that of the program. Where a residual vanishes, or the minimum lies on
+a bound, f has no such derivatives there, and the cone program decides.
+"""
 
 from __future__ import annotations
 
@@ -19,6 +28,11 @@ _ACCURACY = {"tol_gap_abs": 1e-12, "tol_gap_rel": 1e-12, "tol_feas": 1e-12}
 # square. Both ways solve the same program; half of it and twice change nothing (tests/benchmarks/constants_fit.py).
 _MOST_PREPARED = 5000
 
+# Newton's method: most steps; residuals, as shares of their mean, that count as vanished; the decrease, as a share of
+# the sum, after which one more step reaches rounding, as convergence is quadratic; the least part of a step. Chosen:
+# where they stop too early, the cone program decides.
+_MOST_STEPS, _VANISHING, _NO_GAIN, _LEAST_PART = 30, 1e-9, 1e-16, 1e-6
+
 
 class SolverError(OmnibenchError):
     """The solver did not reach an optimum."""
@@ -32,6 +46,7 @@ class SumOfNormsProgram:
 
     def __init__(self, residuals: Array, jacobian: Array, lower: Array, upper: Array) -> None:
         count, components, size = jacobian.shape
+        self._residuals, self._jacobian = residuals, jacobian
         self._lower, self._upper = lower, upper
         # Steps in units of the box and residuals in units of their size keep the program well scaled.
         self._unit = np.where(upper > lower, (upper - lower) / 2, 1.0)
@@ -46,10 +61,48 @@ class SumOfNormsProgram:
 
     def step(self, shares: Array) -> Array:
         """The best step (n,) for shares (S,) >= 0. Raises SolverError."""
+        if len(shares) > _MOST_PREPARED and (step := self._by_newton(shares / shares.sum())) is not None:
+            return step
         self._shares.value = shares / shares.sum()
         # A program that cvxpy prepares for changing shares takes memory that grows with the square of their number.
         solve_program(self._program, ignore_dpp=len(shares) > _MOST_PREPARED)
         return np.clip(self._step.value * self._unit, self._lower, self._upper)
+
+    def _by_newton(self, shares: Array) -> Array | None:
+        """The best step (n,) by Eq. (1); None where it is not found inside the box."""
+        free = self._upper > self._lower
+        unit = self._unit[free]
+        columns, step = self._jacobian[..., free] * unit, np.zeros(len(unit))
+        left = self._residuals
+        for _ in range(_MOST_STEPS):
+            sizes = np.linalg.norm(left, axis=1)
+            value, used = float(shares @ sizes), shares > 0
+            if (sizes[used] <= _VANISHING * value).any():
+                return None
+            directions = left / np.maximum(sizes, 1e-300)[:, None]
+            along = np.einsum("sk,skn->sn", directions, columns)
+            weighted = np.sqrt(shares / np.maximum(sizes, 1e-300))
+            spread = (columns * weighted[:, None, None]).reshape(-1, len(unit))
+            reach = along * weighted[:, None]
+            slope, curvature = shares @ along, spread.T @ spread - reach.T @ reach
+            try:
+                change = -np.linalg.solve(curvature, slope)
+            except np.linalg.LinAlgError:
+                return None
+            gain = -float(slope @ change)
+            if gain <= _NO_GAIN * value:
+                found = np.zeros(len(free))
+                found[free] = (step + change) * unit
+                inside = (found > self._lower) & (found < self._upper)
+                return found if inside[free].all() else None
+            part = 1.0
+            while shares @ np.linalg.norm(left + columns @ (part * change), axis=1) > value - part * gain / 4:
+                part /= 2
+                if part < _LEAST_PART:
+                    return None
+            step = step + part * change
+            left = self._residuals + columns @ step
+        return None
 
 
 def solve_program(problem: Any, ignore_dpp: bool = False) -> None:

@@ -21,6 +21,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from omnibench.data.dataset import Trajectory
+from omnibench.data.stored.drawn_runs import drawn_runs
 from omnibench.errors import DataError
 from omnibench.fit.least_squares.noise import whiteners
 from omnibench.fit.least_squares.nuisance_noise import FitNoise, noise_of_fit
@@ -44,8 +45,6 @@ _NUISANCES = 1e-4
 _ALL = 0.01
 # Chance below which no figure is printed but "< 10⁻⁹": tails that thin are not those of real noise (chosen).
 _LEAST = 1e-9
-# Reference poses that are compared, which take 2 kB each (chosen: 80 of each of 750 runs).
-_MOST_POSES = 60_000
 # Names of sessions, or of wheels, that a sentence lists (chosen).
 _LISTED = 3
 _ALONE = "all runs are of one session"
@@ -119,11 +118,14 @@ class SessionComparison:
 
 
 def compare_sessions(model: OdometryModel, trajectories: Sequence[Trajectory]) -> SessionComparison:
-    """Compare the sessions of recordings by a model; noise and nuisances are estimated from their repetitions."""
+    """Compare the sessions of recordings by a model; noise and nuisances are estimated from their repetitions.
+
+    Of very many runs some that chance has drawn are compared.
+    """
     if len(set(sessions_of(trajectories))) < 2:
         return SessionComparison(untested=_ALONE)
     try:
-        runs = usable_runs(trajectories, "all", _MOST_POSES)
+        runs = usable_runs(drawn_runs(trajectories), "all")
     except DataError as error:
         return SessionComparison(untested=str(error))
     if untested := _untested(runs):
