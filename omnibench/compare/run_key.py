@@ -19,7 +19,15 @@ from omnibench.registry import calibrators, costs
 
 _PACKAGE = Path(__file__).parents[1]
 # Files that every run depends on; ** takes in subfolders.
-_SHARED = ("robot/**/*.py", "fit/**/*.py", "data/dataset.py", "data/references/*.py", "compare/plan.py")
+_SHARED = (
+    "robot/**/*.py",
+    "fit/**/*.py",
+    "data/dataset.py",
+    "data/periods.py",
+    "data/references/*.py",
+    "data/stored/*.py",
+    "compare/plan.py",
+)
 _CALIBRATORS = "fit/calibrators/*.py"
 _NO_PART = "fit/check/*.py"  # judges recordings before they are fitted
 

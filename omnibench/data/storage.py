@@ -22,7 +22,7 @@ from omnibench.data.stored.stored_rows import MOST_IN_MEMORY, count_rows
 from omnibench.data.stored.stored_wheels import StoredWheels, WholeTableError
 from omnibench.data.tables.dataset_tables import POSE_COLUMNS, DatasetTables, tables_of
 from omnibench.data.tables.table import Table, read_table, table_file
-from omnibench.data.tables.wheel_samples import WheelTable
+from omnibench.data.tables.wheel_table import WheelTable
 from omnibench.errors import DataError, require_type
 from omnibench.files import FileContent, TableFormat, encode_table, remove, resolved, write_files
 

@@ -18,6 +18,7 @@ from omnibench.fit.cost import Cost
 from omnibench.fit.evaluator.driven_frame import DrivenFrame
 from omnibench.fit.evaluator.element_box import ElementBox
 from omnibench.fit.evaluator.evaluator import PoseEvaluator, make_evaluator
+from omnibench.fit.evaluator.parted_evaluator import PartedEvaluator, make_parted_evaluator
 from omnibench.fit.geometry import GeometryLimits, WheelGeometry
 from omnibench.fit.loss.end_poses import moved_ends_in_words, with_ends_from_others
 from omnibench.fit.loss.robust_cost import RobustCost, norms_of
@@ -34,12 +35,14 @@ from omnibench.fit.span import Unidentified, directions_kept, driven_span
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import Integration, OdometryBatch
-from omnibench.robot.odometry_of_stored import odometry_of
+from omnibench.robot.odometry_of_stored import StoredOdometry
 
 _PROGRESS_PERIOD = 0.1  # s, least time between two reports of progress: ten a second are all that a reader sees
 # Evaluations from which on the fast evaluator repays the time it takes to build. Both ways give the same costs to 1e-11
 # m; half of it and twice change no estimate (tests/benchmarks/constants_fit.py).
 _WORTH_BUILDING = 50
+# Of runs that are read where they are used: building takes 19 us a sample, one evaluation 0.05 us (chosen).
+_WORTH_BUILDING_OF_STORED = 400
 _ON_BOUND = 1e-6  # share of the box's width: an element closer than that to a bound lies on it
 _ROUNDING = 1e-12  # share of a bound: an element beyond it by less lies in the box
 
@@ -131,7 +134,7 @@ class CalibrationProblem:
         self.best_vector = self.start
         self.best_cost = np.inf
         self.history: list[Improvement] = []
-        self._evaluator: PoseEvaluator | None = None
+        self._evaluator: PoseEvaluator | PartedEvaluator | None = None
         self._frame: DrivenFrame | None = None  # of the evaluator's matrices, where directions are kept
         self._evaluator_tried = False
         self._watch = watch
@@ -171,7 +174,8 @@ class CalibrationProblem:
         self._check_budget()
         asked = len(candidates)
         candidates = candidates[: self.remaining]
-        if self.evaluations + len(candidates) >= _WORTH_BUILDING and not self._evaluator_tried:
+        worth = _WORTH_BUILDING_OF_STORED if isinstance(self.odometry, StoredOdometry) else _WORTH_BUILDING
+        if self.evaluations + len(candidates) >= worth and not self._evaluator_tried:
             self.build_evaluator()
         values = self._fast_values(candidates, self._evaluator) if self._evaluator else self.values(candidates)
         self._record(candidates, values)
@@ -184,21 +188,25 @@ class CalibrationProblem:
         with np.errstate(all="ignore"):
             return self._costs_of_poses(self.odometry.poses(self.parameterisation.matrices(candidates)))
 
-    def build_evaluator(self) -> PoseEvaluator | None:
+    def build_evaluator(self) -> PoseEvaluator | PartedEvaluator | None:
         """The fast evaluator, which ``cost`` uses from now on; None where direct integration is faster.
 
         There is none for references other than poses either.
 
         ``cost`` builds it by itself when a search asks for many candidates. Both ways give the same costs to 1e-11.
         """
-        if not self._evaluator_tried and type(self.odometry) is OdometryBatch:
+        if not self._evaluator_tried and isinstance(self.odometry, OdometryBatch):
             logs, odometry, searched = self.objective.logs(self.trajectories), self.odometry, self.parameterisation
             if isinstance(searched, MatrixElements) and len(searched.null):
                 self._frame = DrivenFrame.of(searched)
-                logs = self._frame.logs(logs)
-                odometry = odometry_of(logs, self.integration)
             box = ElementBox.of(self._frame or searched, self.lower, self.upper)
-            self._evaluator = make_evaluator(odometry, logs, self.integration, box)
+            if isinstance(odometry, StoredOdometry):
+                self._evaluator = make_parted_evaluator(logs, self.integration, box, self._frame)
+            else:
+                if self._frame is not None:
+                    logs = self._frame.logs(logs)
+                    odometry = OdometryBatch(logs, self.integration)
+                self._evaluator = make_evaluator(odometry, logs, self.integration, box)
         self._evaluator_tried = True
         return self._evaluator
 
@@ -253,7 +261,7 @@ class CalibrationProblem:
         elements = self.matrix(vector).ravel()
         return elements if bool(self.inside(elements[None])[0]) else vector
 
-    def _fast_values(self, candidates: Array, evaluator: PoseEvaluator) -> Array:
+    def _fast_values(self, candidates: Array, evaluator: PoseEvaluator | PartedEvaluator) -> Array:
         """Costs (P,) by the fast evaluator for candidates in its box, by direct integration for the others."""
         with np.errstate(all="ignore"):
             matrices = self.parameterisation.matrices(candidates)

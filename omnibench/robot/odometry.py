@@ -96,10 +96,10 @@ class WheelLog:
 
 def _followed(rows: Array, row: Array) -> Array:
     """Rows (F, ...) and one more (...); of an array that is read where it is used, another one of that kind."""
-    if isinstance(rows, np.ndarray):
-        return np.concatenate([rows, row[None]])
-    longer: Array = rows.followed_by(row)
-    return longer
+    if (followed := getattr(rows, "followed_by", None)) is not None:
+        longer: Array = followed(row)
+        return longer
+    return np.concatenate([rows, row[None]])
 
 
 @dataclass(frozen=True, eq=False)

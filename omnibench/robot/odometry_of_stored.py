@@ -14,7 +14,9 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Complex, Integration, OdometryBatch, RunSamples, WheelLog
 from omnibench.robot.path_sums import path_sums
 
-_HELD = 5_000_000  # samples up to which an OdometryBatch holds them, in 0.5 kB each of three wheels (chosen)
+# Samples up to which an OdometryBatch holds them, in 0.1 kB each of three wheels, and of logs that are read where they
+# are used (chosen).
+_HELD, _HELD_OF_STORED = 5_000_000, 1_000_000
 _TOGETHER = 500_000  # samples that are read together (chosen: as many as a block of a stored table)
 _MATRICES = 3  # whose poses are kept: a descent goes on from one of the last (chosen)
 
@@ -26,7 +28,8 @@ def odometry_of(logs: Sequence[WheelLog], integration: Integration) -> OdometryB
 
 def are_many(logs: Sequence[WheelLog]) -> bool:
     """True if logs have so many samples that odometry should not hold them."""
-    return sum(len(log.times) for log in logs) > _HELD
+    most = _HELD if all(isinstance(log.times, np.ndarray) for log in logs) else _HELD_OF_STORED
+    return sum(len(log.times) for log in logs) > most
 
 
 def together(logs: Iterable[WheelLog], samples: int = _TOGETHER) -> Iterator[list[WheelLog]]:
@@ -69,7 +72,7 @@ class StoredOdometry(OdometryBatch):
         self._descends = False
 
     @cached_property
-    def driven(self) -> Array:  # type: ignore[override]
+    def driven(self) -> Array:
         """Integrals (S, M) of the signals up to each stamp, rad."""
         kept = next(iter(self._kept.values()), None) or self._of_all([np.zeros((3, self._signals))], slopes=False)[0]
         return kept.driven
@@ -140,9 +143,10 @@ def _sums(
 
 def _joined(parts: Sequence[_AtStamps]) -> _AtStamps:
     """The sums of parts one after another."""
-    slopes = None
-    if all(part.slopes is not None for part in parts):
-        slopes = tuple(np.concatenate(rows) for rows in zip(*(part.slopes or () for part in parts), strict=True))
+    slopes = [part.slopes for part in parts if part.slopes is not None]
+    row_12, row_3 = ([each[row] for each in slopes] for row in range(2))
     return _AtStamps(
-        np.concatenate([part.moved for part in parts]), np.concatenate([part.driven for part in parts]), slopes
+        np.concatenate([part.moved for part in parts]),
+        np.concatenate([part.driven for part in parts]),
+        (np.concatenate(row_12), np.concatenate(row_3)) if slopes else None,
     )

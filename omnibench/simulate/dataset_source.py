@@ -34,7 +34,9 @@ class DatasetSource(Model):
 
     model_config = ConfigDict(extra="forbid", frozen=True, validate_by_name=True, validate_by_alias=True)
 
-    path: RelativePath | None = Field(None, description="a data set folder; relative to the config file")
+    path: RelativePath | tuple[RelativePath, ...] | None = Field(
+        None, description="a data set folder, a glob or a list of them; relative to the config file"
+    )
     simulate: SimulatedConfig | None = None
     import_: ImportSource | None = Field(default=None, alias="import")
 

@@ -47,4 +47,4 @@ def _keys(run: Trajectory) -> Iterator[int]:
     changes = np.append(0, np.cumsum(np.any(np.diff(rounded, axis=0) != 0, axis=1)))
     for row in range(len(rounded) - _ROWS + 1):
         if changes[row + _ROWS - 1] - changes[row] >= _CHANGES:
-            yield xxh3_64_intdigest(rounded[row : row + _ROWS])
+            yield xxh3_64_intdigest(rounded[row : row + _ROWS].tobytes())

@@ -10,8 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.model import OdometryModel
-from omnibench.robot.odometry import WheelLog
 from omnibench.robot.planar import relative, wrapped
 
 # A step is a jump if it differs from the odometry's by more than this, m and rad, and by more than the share of the
@@ -21,11 +19,10 @@ _LEAST, _SHARE = (0.05, 0.1), 0.5
 _TIMES, _NEARLY_ALL, _FEWEST = 4.0, 0.95, 20
 
 
-def reference_jumps(robot: Robot, log: WheelLog, poses: Array) -> NDArray[np.intp]:
-    """Indices of the poses (K, 3), at the log's stamps, after which the reference jumps to the next one."""
+def reference_jumps(robot: Robot, odometry: Array, poses: Array) -> NDArray[np.intp]:
+    """Indices of the poses (K, 3) after which the reference jumps to the next one. odometry (K, 3): of the design."""
     if len(poses) <= _FEWEST:
         return np.empty(0, dtype=np.intp)
-    (odometry,) = OdometryModel.of_design(robot, "arc").poses([log])
     driven, seen = relative(odometry[:-1], odometry[1:]), relative(poses[:-1], poses[1:])
     way = np.hypot(driven[:, 0], driven[:, 1]) + robot.reach * np.abs(driven[:, 2])
     position = np.hypot(*(seen - driven)[:, :2].T)

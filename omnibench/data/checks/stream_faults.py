@@ -13,6 +13,7 @@ from omnibench.data.checks.steering_readings import frozen_steering
 from omnibench.data.dataset import Trajectory
 from omnibench.data.periods import median_period
 from omnibench.robot.kinematics import Array, Robot, wheel_equations
+from omnibench.robot.model import OdometryModel
 from omnibench.words import plural, some
 
 # Gaps that are told, s, and as a multiple of the usual period (chosen: a Robotino's log has gaps of 0.24 s at 31 ms).
@@ -263,8 +264,9 @@ def expected_angles(robot: Robot, run: Trajectory) -> Array:
 
 def _jumps(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Finding]:
     found, count = [], 0
-    for run in runs:
-        jumps = reference_jumps(robot, run.log(run.pose_times), run.poses)
+    odometry = OdometryModel.of_design(robot, "arc").poses([run.log(run.pose_times) for run in runs])
+    for run, driven in zip(runs, odometry, strict=True):
+        jumps = reference_jumps(robot, driven, run.poses)
         if len(jumps):
             found.append(run.id)
             count += len(jumps)

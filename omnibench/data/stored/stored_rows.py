@@ -149,7 +149,9 @@ class StoredRows(np.lib.mixins.NDArrayOperatorsMixin):
         values = rows[:, low] if self.flat else rows[:, low:high]
         if self.more:
             values = np.concatenate([values, self.more])
-        return values.astype(dtype) if dtype is not None and dtype != values.dtype else values
+        if dtype is not None and dtype != values.dtype:
+            return values.astype(dtype)
+        return values.copy() if copy else values  # a view would keep the whole block
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:
         return getattr(ufunc, method)(*(_read(each) for each in inputs), **options)

@@ -14,7 +14,7 @@ from omnibench.data.run_checks import wheel_times_flaw
 from omnibench.data.stored.stored_rows import BLOCK_ROWS, BlockFile, StoredRows, file_state, read_rows
 from omnibench.data.tables.rows_of_runs import no_rows, refuse_unknown
 from omnibench.data.tables.table import Table, check_columns, checked_table
-from omnibench.data.tables.wheel_samples import WheelArrays, check_steering, wheel_columns
+from omnibench.data.tables.wheel_table import WheelArrays, check_steering, wheel_columns
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Robot
 

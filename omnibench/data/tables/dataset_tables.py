@@ -21,7 +21,7 @@ from omnibench.data.scans import Scans
 from omnibench.data.splits import every_second
 from omnibench.data.tables.rows_of_runs import Rows, check_times, rows_by_trajectory
 from omnibench.data.tables.table import Table, checked_table
-from omnibench.data.tables.wheel_samples import WheelArrays, WheelSamples, WheelTable
+from omnibench.data.tables.wheel_table import WheelArrays, WheelSource, WheelTable
 from omnibench.errors import DataError, nearest, require_type
 from omnibench.robot.kinematics import Array, Robot
 
@@ -159,7 +159,7 @@ class DatasetTables:
     """The tables of a data set, whose required columns are there. poses: None where all runs have references."""
 
     runs: Table
-    wheels: WheelSamples
+    wheels: WheelSource
     poses: Table | None
     references: Table | None
 

@@ -29,7 +29,8 @@ def noise_of_matrix(
     has any.
     """
     runs = [run for run in runs if run.has_poses]
-    residuals = [poses - run.poses[1:] for poses, run in zip(_poses(runs, matrix, integration), runs, strict=True)]
+    odometry = _poses(runs, matrix, integration)
+    residuals: list[Array] = [poses - run.poses[1:] for poses, run in zip(odometry, runs, strict=True)]
     near, residuals = without_jumps(runs, residuals, loss)
     return estimate_noise(differences_between_repetitions(near, residuals))
 

@@ -13,6 +13,7 @@ from omnibench.data.importers.runs.reference_stream import ReferenceStream
 from omnibench.data.importers.runs.rests import departure, find_rests
 from omnibench.data.importers.wheel_samples import WheelSamples
 from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
 
 Span = tuple[float, float]
@@ -34,8 +35,9 @@ def breaks(samples: WheelSamples, reference: ReferenceStream, options: Reference
         for part in samples.stretches():
             seen = np.flatnonzero((times >= samples.begins[part][0]) & (times <= samples.ends[part][-1]))
             if len(seen):
-                log = wheel_log(samples, part, options.robot, times[seen])
-                found |= set(seen[reference_jumps(options.robot, log, reference.poses[seen])].tolist())
+                model = OdometryModel.of_design(options.robot, "arc")
+                (driven,) = model.poses([wheel_log(samples, part, options.robot, times[seen])])
+                found |= set(seen[reference_jumps(options.robot, driven, reference.poses[seen])].tolist())
     return [(float(times[index]), float(times[index + 1])) for index in sorted(found)]
 
 

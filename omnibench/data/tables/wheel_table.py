@@ -24,7 +24,7 @@ class WheelArrays(NamedTuple):
     targets: Array | None = None
 
 
-class WheelSamples(Protocol):
+class WheelSource(Protocol):
     """A table of wheel samples, in memory or in its file."""
 
     def of_runs(self, runs: Table, robot: Robot) -> list[WheelArrays]:
@@ -62,7 +62,7 @@ class WheelTable:
     table: Table
 
     def of_runs(self, runs: Table, robot: Robot) -> list[WheelArrays]:
-        """The samples of each of the runs, see WheelSamples."""
+        """The samples of each of the runs, see WheelSource."""
         table = self.table
         check_steering(table.file, table.frame.columns, robot)
         rows_of_runs = rows_by_trajectory(runs, table)
