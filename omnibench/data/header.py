@@ -67,7 +67,9 @@ def read_header(folder: Path) -> Header:
         raise DataError(f"{folder}: {what}; a data set is a folder with dataset.yaml in it")
     file = folder / "dataset.yaml"
     if not file.exists():
-        raise DataError(f"{file}: no such file, and so {folder} is no data set; `omnibench import` makes one of a log")
+        several = any(folder.glob("*/dataset.yaml"))
+        way = f"its folders are some: give '{folder}/*'" if several else "`omnibench import` makes one of a log"
+        raise DataError(f"{file}: no such file, and so {folder} is no data set; {way}")
     try:
         content = read_yaml(file)
         given = content.get("format") if isinstance(content, dict) else None

@@ -14,9 +14,9 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Complex, Integration, OdometryBatch, RunSamples, WheelLog
 from omnibench.robot.path_sums import path_sums
 
-# Samples up to which an OdometryBatch holds them, in 0.1 kB each of three wheels, and of logs that are read where they
-# are used (chosen).
-_HELD, _HELD_OF_STORED = 5_000_000, 1_000_000
+# Samples up to which an OdometryBatch holds them, in 0.1 kB each of three wheels (chosen: beyond, reading them anew and
+# summing in compiled code takes a tenth of the time, too).
+_HELD = 1_000_000
 _TOGETHER = 500_000  # samples that are read together (chosen: as many as a block of a stored table)
 _MATRICES = 3  # whose poses are kept: a descent goes on from one of the last (chosen)
 
@@ -28,8 +28,7 @@ def odometry_of(logs: Sequence[WheelLog], integration: Integration) -> OdometryB
 
 def are_many(logs: Sequence[WheelLog]) -> bool:
     """True if logs have so many samples that odometry should not hold them."""
-    most = _HELD if all(isinstance(log.times, np.ndarray) for log in logs) else _HELD_OF_STORED
-    return sum(len(log.times) for log in logs) > most
+    return sum(len(log.times) for log in logs) > _HELD
 
 
 def together(logs: Iterable[WheelLog], samples: int = _TOGETHER) -> Iterator[list[WheelLog]]:

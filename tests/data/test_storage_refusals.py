@@ -160,17 +160,18 @@ REFUSED: dict[str, tuple[Change, str, str]] = {
 }
 
 
+@pytest.mark.parametrize("most_in_memory", [100, 0], ids=["in memory", "in its file"])
 @pytest.mark.parametrize("fmt", FORMATS)
 @pytest.mark.parametrize("case", REFUSED)
 def test_refused_in_one_line_that_names_file_row_and_reason(
-    good: dict[Format, Path], tmp_path: Path, case: str, fmt: Format
+    good: dict[Format, Path], tmp_path: Path, case: str, fmt: Format, most_in_memory: int
 ) -> None:
     change, place, reason = REFUSED[case]
     folder = tmp_path / "dataset"
     shutil.copytree(good[fmt], folder)
     change(folder)
     with pytest.raises(DataError) as refusal:
-        load_dataset(folder)
+        load_dataset(folder, most_in_memory=most_in_memory)
     message = str(refusal.value)
     separator = "" if place.startswith(":") else "/"
     assert message.startswith(f"{folder}{separator}{place.format(x=fmt)}")

@@ -40,7 +40,7 @@ def command(read: RecordingSource, findings: Sequence[Finding]) -> str:
     if not changes:
         return ""
     typed = _command(read, changes)
-    return typed if read.readable else f"{typed}  # after save_dataset(dataset, {str(read.source)!r})"
+    return typed if read.readable or read.places else f"{typed}  # after save_dataset(dataset, {str(read.source)!r})"
 
 
 def next_command(read: RecordingSource) -> str:
@@ -53,6 +53,9 @@ def next_command(read: RecordingSource) -> str:
 
 def _command(read: RecordingSource, changes: Sequence[Mapping[str, Any]]) -> str:
     """The command line; by way of a data set where the importer cannot."""
+    if read.places:
+        each = _import("dataset", Path("EACH"), mended_options(read, "dataset", {}, changes), Path("EACH_mended"))
+        return f"for each in {shlex.join(map(str, read.places))}; do {each.replace('EACH', '${each}')}; done"
     try:
         return _import(
             read.importer, read.source, mended_options(read, read.importer, read.options, changes), _target(read)

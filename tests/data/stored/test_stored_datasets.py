@@ -1,0 +1,210 @@
+"""Data sets whose wheel samples stay in their file give what they give in memory, and mend nothing silently."""
+
+from __future__ import annotations
+
+import os
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from sample_robots import APR_02, MECANUM
+from wheeled_samples import CAR, DIFF, SWERVE, driven
+
+import omnibench.data.periods as periods
+import omnibench.data.stored.stored_wheels as stored_wheels
+import omnibench.robot.odometry_of_stored as odometry_of_stored
+from omnibench.data.dataset import Dataset
+from omnibench.data.periods import median_period
+from omnibench.data.storage import load_dataset, save_dataset
+from omnibench.data.stored.drawn_runs import drawn_runs, in_memory
+from omnibench.data.stored.stored_rows import StoredRows
+from omnibench.errors import DataError
+from omnibench.fit.calibrate import calibrate
+from omnibench.fit.certify import certify_optimum
+from omnibench.fit.check.checking import check
+from omnibench.fit.evaluate import evaluate
+from omnibench.fit.inspect import inspect_dataset
+from omnibench.robot.kinematics import Robot
+
+
+def recorded(robot: Robot = APR_02, runs: int = 12) -> Dataset:
+    """Runs of four commands under a reference that is noisy; the later half validates."""
+    dataset, rng = driven(robot, runs), np.random.default_rng(1)
+    named = [
+        replace(
+            run,
+            command=f"c{number % 4}",
+            session="day",
+            split="train" if number < runs // 2 else "validation",
+            poses=run.poses + rng.normal(0, 0.005, run.poses.shape),
+        )
+        for number, run in enumerate(dataset.trajectories)
+    ]
+    return replace(dataset, trajectories=tuple(named))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("stored") / "fleet"
+    save_dataset(recorded(runs=32), place)
+    return place
+
+
+@pytest.fixture
+def nothing_held(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Odometry reads the samples anew whenever it needs them, however few there are."""
+    monkeypatch.setattr(odometry_of_stored, "_HELD", 0)
+    monkeypatch.setattr(odometry_of_stored, "_TOGETHER", 200)
+
+
+@pytest.mark.parametrize("robot", [APR_02, MECANUM, DIFF, CAR, SWERVE], ids=lambda robot: robot.name)
+def test_what_stays_in_its_file_is_the_data_set_that_was_saved(robot: Robot, tmp_path: Path) -> None:
+    save_dataset(recorded(robot), tmp_path / "saved")
+    held, stored = load_dataset(tmp_path / "saved"), load_dataset(tmp_path / "saved", most_in_memory=0)
+    assert all(isinstance(run.times, StoredRows) for run in stored.trajectories)
+    assert (stored.hash, stored.warnings) == (held.hash, held.warnings)
+    assert stored.fingerprints("train") == held.fingerprints("train")
+
+
+@pytest.mark.usefixtures("nothing_held")
+@pytest.mark.parametrize("robot", [APR_02, MECANUM, DIFF, CAR, SWERVE], ids=lambda robot: robot.name)
+def test_calibrated_evaluated_checked_and_inspected_as_in_memory(
+    robot: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save_dataset(recorded(robot), tmp_path / "saved")
+    stored = load_dataset(tmp_path / "saved", most_in_memory=0)
+    found = calibrate(stored).calibration
+    told = evaluate(found, stored), check(stored), inspect_dataset(stored)
+    monkeypatch.setattr(odometry_of_stored, "_HELD", 10**9)
+    held = load_dataset(tmp_path / "saved")
+    expected = calibrate(held).calibration
+    assert found.matrix_array == pytest.approx(expected.matrix_array, rel=1e-9, abs=1e-12)
+    assert np.array(found.covariance) == pytest.approx(np.array(expected.covariance), rel=1e-6, abs=1e-18)
+    assert told[0].splits["all"].cost == pytest.approx(evaluate(found, held).splits["all"].cost, rel=1e-9)
+    assert [finding.what for finding in told[1].findings] == [finding.what for finding in check(held).findings]
+    numbers = inspect_dataset(held)
+    assert (told[2].wheel_samples, told[2].sample_period_range_s, told[2].driven_shares) == (
+        numbers.wheel_samples,
+        numbers.sample_period_range_s,
+        numbers.driven_shares,
+    )
+
+
+@pytest.mark.usefixtures("nothing_held")
+@pytest.mark.parametrize("cost", ["final_pose", "final_position", "final_heading", "trajectory"])
+def test_bounds_of_all_costs_are_proven_as_in_memory(folder: Path, cost: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    stored = load_dataset(folder, most_in_memory=0)
+    found = calibrate(stored, cost=cost).calibration
+    bound = certify_optimum(found, stored, parts=40).certificate.lower_bound
+    monkeypatch.setattr(odometry_of_stored, "_HELD", 10**9)
+    expected = certify_optimum(found, load_dataset(folder), parts=40).certificate.lower_bound
+    assert bound == pytest.approx(expected, rel=1e-9)
+    assert bound > 0
+
+
+@pytest.mark.usefixtures("nothing_held")
+def test_a_search_by_the_evaluators_of_parts_finds_what_it_finds_by_one(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("omnibench.fit.problem._WORTH_BUILDING_OF_STORED", 0)
+    options = {"budget": None, "seed": 3}
+    stored = calibrate(load_dataset(folder, most_in_memory=0), "genetic", **options).result
+    monkeypatch.setattr(odometry_of_stored, "_HELD", 10**9)
+    assert stored.cost == pytest.approx(calibrate(load_dataset(folder), "genetic", **options).result.cost, rel=1e-3)
+
+
+def test_several_folders_or_a_glob_are_one_data_set(tmp_path: Path) -> None:
+    whole = recorded()
+    for day in range(3):
+        part = replace(whole, name=f"day{day}", trajectories=whole.trajectories[4 * day : 4 * day + 4])
+        save_dataset(replace(part, scans=None), tmp_path / f"day{day}")
+    by_name = load_dataset([tmp_path / f"day{day}" for day in range(3)])
+    by_glob = load_dataset(tmp_path / "day*", most_in_memory=0)
+    assert by_name.name == by_glob.name == "day0 to day2"
+    assert [run.id for run in by_glob.trajectories] == [run.id for run in whole.trajectories]
+    assert by_name.hash == by_glob.hash
+    together = calibrate(replace(by_glob, name=whole.name)).calibration.matrix_array
+    assert together == pytest.approx(calibrate(whole).calibration.matrix_array, rel=1e-12)
+
+
+def test_runs_of_the_same_name_get_that_of_their_folder(tmp_path: Path) -> None:
+    for name in ("monday", "tuesday"):
+        save_dataset(replace(recorded(runs=4), name=name), tmp_path / name)
+    ids = [run.id for run in load_dataset(tmp_path / "*day").trajectories]
+    assert ids[0] == "run-0"
+    assert ids[4] == "tuesday/run-0"
+    assert len(set(ids)) == 8
+
+
+def test_a_glob_that_matches_nothing_is_said(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"day\*: no data set folder matches$"):
+        load_dataset(tmp_path / "day*")
+
+
+def test_a_folder_of_data_sets_says_how_to_name_them(tmp_path: Path) -> None:
+    save_dataset(recorded(runs=4), tmp_path / "one")
+    with pytest.raises(DataError, match=r"its folders are some: give '.*/\*'"):
+        load_dataset(tmp_path)
+
+
+def test_rows_that_interleave_are_read_whole(tmp_path: Path) -> None:
+    save_dataset(recorded(), tmp_path / "saved")
+    before = load_dataset(tmp_path / "saved").hash
+    file = tmp_path / "saved" / "wheels.parquet"
+    pl.read_parquet(file).sort("t", maintain_order=True).write_parquet(file)
+    mixed = load_dataset(tmp_path / "saved", most_in_memory=0)
+    assert isinstance(mixed.trajectories[0].times, np.ndarray)
+    assert mixed.hash == before
+
+
+def test_a_faulty_row_far_into_the_file_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stored_wheels, "_ROWS", 50)
+    save_dataset(recorded(), tmp_path / "saved")
+    file = tmp_path / "saved" / "wheels.parquet"
+    table = pl.read_parquet(file)
+    late = pl.int_range(pl.len()) == 200  # the first row of a piece, within a run
+    table.with_columns(t=pl.when(late).then(0.01).otherwise(pl.col("t"))).write_parquet(file)
+    with pytest.raises(DataError, match=r"wheels\.parquet, row 201: t "):
+        load_dataset(tmp_path / "saved", most_in_memory=0)
+
+
+def test_a_file_that_changes_under_the_data_set_is_not_read_on(tmp_path: Path) -> None:
+    save_dataset(recorded(), tmp_path / "saved")
+    stored = load_dataset(tmp_path / "saved", most_in_memory=0)
+    file = tmp_path / "saved" / "wheels.parquet"
+    os.utime(file, (1, 1))
+    pickled = pickle.loads(pickle.dumps(stored.trajectories[5]))  # another process has no block in memory
+    with pytest.raises(DataError, match="the file has changed since it was opened; load the data set again"):
+        pickled.rates.file.read(pickled.rates.columns, 0)
+
+
+@given(periods_of=st.lists(st.floats(1e-4, 10.0), min_size=3, max_size=60))
+def test_the_median_of_very_many_periods_is_one_of_the_middle_ones(periods_of: list[float]) -> None:
+    runs = [load_like(np.cumsum(part)) for part in (periods_of[:2], periods_of[2:])]
+    spacings = np.sort(np.concatenate([np.diff(run.times, prepend=0.0) for run in runs]))
+    before, periods._TOGETHER = periods._TOGETHER, 0
+    try:
+        median = median_period(runs)
+    finally:
+        periods._TOGETHER = before
+    assert median == pytest.approx(spacings[len(spacings) // 2], rel=3e-9)
+
+
+class load_like:  # noqa: N801 (a run of which only the times matter)
+    def __init__(self, times: np.ndarray) -> None:
+        self.times = times
+
+
+def test_some_runs_are_drawn_always_the_same_and_into_memory(folder: Path) -> None:
+    runs = load_dataset(folder, most_in_memory=0).trajectories
+    some = drawn_runs(runs, most=400)
+    assert len(some) == 5
+    assert [run.id for run in some] == [run.id for run in drawn_runs(runs, most=400)]
+    assert all(isinstance(run.rates, np.ndarray) and run.rates.base is None for run in some)
+    assert list(runs) == drawn_runs(runs, most=10**6)
+    assert in_memory(runs[0]).fingerprint == runs[0].fingerprint
