@@ -24,11 +24,14 @@ from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.data.stored.drawn_runs import drawn_runs, in_memory
 from omnibench.data.stored.stored_rows import StoredRows
 from omnibench.errors import DataError
+from omnibench.fit.bounds.lower_bound import LowerBounds
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.certify import certify_optimum
 from omnibench.fit.check.checking import check
 from omnibench.fit.evaluate import evaluate
 from omnibench.fit.inspect import inspect_dataset
+from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
+from omnibench.registry import costs
 from omnibench.robot.kinematics import Robot
 
 
@@ -100,11 +103,25 @@ def test_calibrated_evaluated_checked_and_inspected_as_in_memory(
 def test_bounds_of_all_costs_are_proven_as_in_memory(folder: Path, cost: str, monkeypatch: pytest.MonkeyPatch) -> None:
     stored = load_dataset(folder, most_in_memory=0)
     found = calibrate(stored, cost=cost).calibration
-    bound = certify_optimum(found, stored, parts=40).certificate.lower_bound
+    row_3 = np.array([0.01, -0.02, 0.005])
+    proof, sums = certify_optimum(found, stored, parts=20), bounds_of(stored, cost)._stamps
     monkeypatch.setattr(odometry_of_stored, "_HELD", 10**9)
-    expected = certify_optimum(found, load_dataset(folder), parts=40).certificate.lower_bound
-    assert bound == pytest.approx(expected, rel=1e-9)
-    assert bound > 0
+    held = load_dataset(folder)
+    expected, held_sums = certify_optimum(found, held, parts=20), bounds_of(held, cost)._stamps
+    assert proof.certificate.lower_bound == pytest.approx(expected.certificate.lower_bound, rel=1e-9)
+    assert sums.curvature == pytest.approx(held_sums.curvature, rel=1e-12)
+    for of_stored, of_held in zip(sums.at(row_3), held_sums.at(row_3), strict=True):
+        assert of_stored == pytest.approx(of_held, rel=1e-12, abs=1e-12)
+
+
+def bounds_of(dataset: Dataset, cost: str) -> LowerBounds:
+    runs = dataset.split("train")
+    searched = make_parameterisation("matrix", dataset.robot, runs)
+    return LowerBounds(
+        CalibrationProblem(
+            dataset.robot, runs, costs.create(cost), searched, integration="arc", budget=Budget(), seed=0
+        )
+    )
 
 
 @pytest.mark.usefixtures("nothing_held")
