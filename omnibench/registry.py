@@ -171,7 +171,7 @@ def loaded_plugin_files() -> dict[Path, PluginFailure | None]:
 def import_copies(copies: Mapping[Path, Path]) -> list[PluginFailure]:
     """Import plug-in files of another machine from their copies here, by the names that they have there.
 
-    Loading their folders finds them, whether or not the folders are here. The failures of those that cannot be imported.
+    Loading their folders finds them, whether or not the folders are here. Returns the failures of those that fail.
     """
     _copies.update(copies)
     return [failure for path in copies if (failure := load_plugin_file(path)) is not None]

@@ -1,15 +1,15 @@
 """Backend of a Dask cluster. Results come back to the client, which alone writes the store.
 
 A job's begin, its reports and its end are events from its worker; the future only tells that it is lost. A worker that
-is killed takes its jobs with it: the scheduler gives them to another, and the begins of each are counted here, since the
-scheduler also counts jobs that only waited there.
+is killed takes its jobs with it: the scheduler gives them to another, and the begins of each are counted here, since
+the scheduler also counts jobs that only waited there.
 """
 
 from __future__ import annotations
 
 import pickle
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from errno import EDQUOT, ENOSPC
 from functools import partial
 from queue import Empty, SimpleQueue
@@ -18,12 +18,12 @@ from uuid import uuid4
 
 from distributed import KilledWorker
 
-from omnibench.errors import DataError, OmnibenchError
+from omnibench.errors import DataError
 from omnibench.jobs.dask_worker import Order, Told, carry_out, content
-from omnibench.jobs.job import TRIES, Ended, Failure, Job, JobWatch
+from omnibench.jobs.job import TRIES, BackendError, Ended, Failure, Job, JobWatch
 from omnibench.jobs.job_process import in_job
 from omnibench.jobs.local_backends import InPlace
-from omnibench.jobs.packing import Packer
+from omnibench.jobs.packing import Packer, run_packed
 from omnibench.jobs.result_store import ResultStore
 
 T = TypeVar("T")
@@ -34,7 +34,7 @@ _LOOK = 1.0  # s between two looks at the scheduler and its workers; chosen
 _SUBMISSIONS = 10  # of a job whose workers died before it began, at most: chosen, as it is no fault of its own
 
 
-class SchedulerLostError(OmnibenchError):
+class SchedulerLostError(BackendError):
     """The scheduler does not answer any more."""
 
     exit_code = 1
@@ -81,7 +81,7 @@ class DaskBackend:
     def order(self, topic: str, number: int, job: Job[Any], store: ResultStore[Any]) -> tuple[Order, list[Any]]:
         """A job as it travels, and the futures of data that it shares with others, the requirements first."""
         packed, shared = self._packer.pack(job)
-        plain = Job(job.key, carry_out, None, job.seconds, job.memory_mb, job.timed)
+        plain = replace(job, function=run_packed, argument=None, shared=())
         data = {"requirements": self.requirements} | shared
         return Order(topic, number, plain, store, packed, tuple(shared)), [
             self._future(name, value) for name, value in data.items()
@@ -176,7 +176,7 @@ class _Run:
         if future.status != "error":
             raise SchedulerLostError(f"the Dask scheduler {self._client.scheduler.address} is lost")
         error = future.exception()
-        if isinstance(error, OmnibenchError):  # a worker that joined later is unfit
+        if isinstance(error, BackendError):  # a worker that joined later is unfit
             raise error
         if not isinstance(error, KilledWorker):
             raise error

@@ -87,7 +87,7 @@ def _joined(address: str, tls: TlsFiles | None) -> Any:
     except Exception as error:  # of sockets, TLS, or the protocol of another version
         reason = one_line(str(error) or type(error).__name__)
         raise ConfigError(
-            f"no Dask scheduler answers at {address} ({reason}); start one there (dask scheduler), or correct the address"
+            f"no Dask scheduler answers at {address} ({reason}); start one there (dask scheduler) or correct the address"
         ) from None
 
 

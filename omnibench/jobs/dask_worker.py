@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from multiprocessing.connection import wait
 from pathlib import Path
@@ -20,11 +20,11 @@ from typing import Any
 
 import distributed
 
-from omnibench.errors import DataError, OmnibenchError
+from omnibench.errors import DataError
 from omnibench.files import write_text
-from omnibench.jobs.job import Job
+from omnibench.jobs.job import BackendError, Job
 from omnibench.jobs.job_process import JobEnd, JobProcess
-from omnibench.jobs.packing import PackedJob, run_packed
+from omnibench.jobs.packing import PackedJob
 from omnibench.jobs.result_store import ResultStore
 from omnibench.jobs.software import differences, software
 from omnibench.processes import one_thread_processes
@@ -36,7 +36,7 @@ _LARGEST = 200_000  # bytes of an event: the scheduler keeps a thousand of them,
 _PROBE = 1_000_000  # bytes that a worker must be able to write: a plug-in's file and what a job notes down (chosen)
 
 
-class UnfitWorkerError(OmnibenchError):
+class UnfitWorkerError(BackendError):
     """A worker on which results could differ from the client's, or that cannot run jobs."""
 
 
@@ -82,7 +82,7 @@ def carry_out(order: Order, requirements: bytes, *shared: bytes) -> Told | None:
     worker = distributed.get_worker()
     plugins = prepare(requirements, worker)
     packed = PackedJob(order.content, dict(zip(order.names, shared, strict=True)), plugins)
-    job = Job(order.job.key, run_packed, packed, order.job.seconds, order.job.memory_mb)
+    job = replace(order.job, argument=packed)
     with _slots(worker.state.nthreads if job.timed else 1, worker.state.nthreads):
         _tell(worker, order, Told(order.number, worker.address))
         process = _process_for(job, pickle.loads(requirements).preload)

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
+from omnibench.errors import OmnibenchError
 from omnibench.jobs.result_store import ResultStore
 from omnibench.progress import Progress, Reporter
 
@@ -41,6 +42,10 @@ class Job(Generic[T]):
     def run(self, store: ResultStore[T], report: Reporter) -> None:
         """Do the work here and write the result's file."""
         store.put(self.key, self.function(self.argument, report))
+
+
+class BackendError(OmnibenchError):
+    """The machines that run jobs are lost, or one of them is unfit; results so far are in the store."""
 
 
 @dataclass(frozen=True)

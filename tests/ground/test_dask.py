@@ -10,12 +10,21 @@ from pathlib import Path
 
 import pytest
 from job_samples import Answer, Notes, jobs_of, run, squared, tried
-from test_jobs import asleep, crashed, ended_with, killed, killed_once, many_small_objects, two_is_wrong, with_jobs_of_its_own, wrong_in_two_parts
+from test_jobs import (
+    asleep,
+    ended_with,
+    killed,
+    killed_once,
+    many_small_objects,
+    two_is_wrong,
+    with_jobs_of_its_own,
+    wrong_in_two_parts,
+)
 
 from omnibench.jobs.backend_choice import BackendChoice, open_backend
-from omnibench.jobs.job import Backend, Failure, Job, run_jobs
+from omnibench.jobs.job import Backend, Job, run_jobs
 from omnibench.jobs.result_store import ResultStore
-from omnibench.progress import Progress, Reporter
+from omnibench.progress import Progress
 
 
 @pytest.fixture(scope="module")
@@ -42,34 +51,43 @@ def test_gives(dask, tmp_path):
 def test_raise(dask, tmp_path):
     notes = run(tmp_path, jobs_of(two_is_wrong, range(4)), dask)
     assert notes.reason(2) == "DataError: two is wrong"
-    assert run(tmp_path/"b", jobs_of(wrong_in_two_parts, [0]), dask).reason() == "TwoPartError: one and another"
+    assert run(tmp_path / "b", jobs_of(wrong_in_two_parts, [0]), dask).reason() == "TwoPartError: one and another"
     notes = run(tmp_path, jobs_of(ended_with, [3]), dask)
     print(notes.endings)
-    notes = run(tmp_path/"k", jobs_of(killed_once, [tmp_path]), dask)
+    notes = run(tmp_path / "k", jobs_of(killed_once, [tmp_path]), dask)
     print(notes.endings)
-    notes = run(tmp_path/"kk", jobs_of(killed, [(tmp_path, signal.SIGKILL)]), dask)
+    notes = run(tmp_path / "kk", jobs_of(killed, [(tmp_path, signal.SIGKILL)]), dask)
     print(notes.endings)
-    notes = run(tmp_path/"kkk", [Job("x", asleep, 0, seconds=1.0), Job("y", many_small_objects, tmp_path, memory_mb=400)], dask)
+    notes = run(
+        tmp_path / "kkk",
+        [Job("x", asleep, 0, seconds=1.0), Job("y", many_small_objects, tmp_path, memory_mb=400)],
+        dask,
+    )
     print(notes.endings)
-    notes = run(tmp_path/"kkkk", jobs_of(with_jobs_of_its_own, [tmp_path]), dask)
+    notes = run(tmp_path / "kkkk", jobs_of(with_jobs_of_its_own, [tmp_path]), dask)
     print(notes.endings)
+
 
 def kills_worker(folder, _):
     if tried(folder, "n") < 3:
         os.kill(os.getppid(), 0)
         import psutil
+
         psutil.Process().parent().parent().kill()
         time.sleep(10)
     return Answer(1)
 
+
 def kills_worker_always(folder, _):
     tried(folder, "m")
     import psutil
+
     psutil.Process().parent().parent().kill()
     time.sleep(10)
 
+
 def test_kill(dask, tmp_path):
-    notes = run(tmp_path/"k", [Job("x", kills_worker, tmp_path), *jobs_of(squared, range(20))], dask)
+    notes = run(tmp_path / "k", [Job("x", kills_worker, tmp_path), *jobs_of(squared, range(20))], dask)
     print(notes.endings)
-    notes = run(tmp_path/"kz", [Job("x", kills_worker_always, tmp_path), *jobs_of(squared, range(20))], dask)
-    print(notes.endings[0], (tmp_path/"m").stat())
+    notes = run(tmp_path / "kz", [Job("x", kills_worker_always, tmp_path), *jobs_of(squared, range(20))], dask)
+    print(notes.endings[0], (tmp_path / "m").stat())
