@@ -14,7 +14,7 @@ from omnibench.cli.terminal.console import warn
 from omnibench.errors import ConfigError, PluginError
 
 if TYPE_CHECKING:
-    from omnibench.jobs.backend_choice import TlsFiles
+    from omnibench.jobs.scheduler_tls import TlsFiles
     from omnibench.registry import PluginFailure
     from omnibench.report.blocks import Document
 
@@ -81,7 +81,7 @@ def tls_files(ca: Path | None, cert: Path | None, key: Path | None) -> TlsFiles 
         return None
     if ca is None or cert is None or key is None:
         raise ConfigError("TLS needs three files: --tls-ca, --tls-cert and --tls-key")
-    from omnibench.jobs.backend_choice import TlsFiles
+    from omnibench.jobs.scheduler_tls import TlsFiles
 
     return TlsFiles(ca=ca.resolve(), cert=cert.resolve(), key=key.resolve())
 

@@ -15,7 +15,7 @@ from omnibench.fit.problem import Budget
 from omnibench.fit.shrinkage.prior import MountChoice
 from omnibench.fit.span import Unidentified
 from omnibench.fit.uncertainty.ratio_intervals import Bootstrap
-from omnibench.jobs.backend_choice import TlsFiles
+from omnibench.jobs.scheduler_tls import TlsFiles
 from omnibench.robot.odometry import Integration
 from omnibench.simulate.dataset_source import DatasetSource
 

@@ -7,22 +7,15 @@ from contextlib import contextmanager
 from importlib.util import find_spec
 from urllib.parse import urlsplit
 
-from omnibench.config import Model, RelativePath
+from omnibench.config import Model
 from omnibench.errors import ConfigError, nearest
 from omnibench.jobs.job import Backend
 from omnibench.jobs.local_backends import Processes
+from omnibench.jobs.scheduler_tls import TlsFiles
 from omnibench.progress import Reporter, no_progress
 
 _NAMES = ("processes", "dask")
 _SCHEMES = ("tcp", "tls")
-
-
-class TlsFiles(Model):
-    """Files in PEM for a scheduler at tls://: the authority's certificate, and this client's with its key."""
-
-    ca: RelativePath
-    cert: RelativePath
-    key: RelativePath
 
 
 class BackendChoice(Model):

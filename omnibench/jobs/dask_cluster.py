@@ -13,9 +13,9 @@ import dask
 import distributed
 
 from omnibench.errors import ConfigError, one_line
-from omnibench.jobs.backend_choice import TlsFiles
 from omnibench.jobs.dask_worker import Requirements, UnfitWorkerError, check
 from omnibench.jobs.software import software
+from omnibench.jobs.scheduler_tls import TlsFiles
 from omnibench.processes import interrupts_blocked, main_module_hidden
 from omnibench.progress import Progress, Reporter
 from omnibench.registry import loaded_plugin_files, plugin_text
@@ -67,7 +67,7 @@ def _local_cluster(workers: int) -> Iterator[Any]:
                 n_workers=workers,
                 threads_per_worker=1,
                 memory_limit=None,
-                dashboard_address=":8787" if find_spec("bokeh") else None,
+                dashboard_address="127.0.0.1:8787",
                 silence_logs=logging.CRITICAL,
             )
         try:
@@ -87,7 +87,7 @@ def _joined(address: str, tls: TlsFiles | None) -> Any:
     except Exception as error:  # of sockets, TLS, or the protocol of another version
         reason = one_line(str(error) or type(error).__name__)
         raise ConfigError(
-            f"no Dask scheduler answers at {address} ({reason}); start one there (dask scheduler) or correct the address"
+            f"no Dask scheduler answers at {address} ({reason}); start one (dask scheduler), or correct the address"
         ) from None
 
 
@@ -117,8 +117,10 @@ def _wait_for_worker(client: Any, address: str, report: Reporter) -> None:
 
 
 def _say(client: Any, place: str, report: Reporter) -> None:
-    dashboard = f", dashboard {client.dashboard_link}" if "dashboard" in client.scheduler_info()["services"] else ""
-    report(Progress("dask", result=f"dask: workers of {place}: {len(client.nthreads())}{dashboard}"))
+    page = client.dashboard_link
+    if find_spec("bokeh") is None:  # which the dashboard needs; these pages do not
+        page = page.replace("/status", "/info/main/workers.html")
+    report(Progress("dask", result=f"dask: workers of {place}: {len(client.nthreads())}, dashboard {page}"))
 
 
 def checked_requirements(client: Any, preload: Sequence[str]) -> bytes:

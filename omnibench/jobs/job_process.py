@@ -12,7 +12,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
-from signal import SIG_DFL, SIGABRT, SIGHUP, SIGINT, SIGKILL, SIGSEGV, SIGTERM, Signals
+from signal import SIG_DFL, SIG_IGN, SIGABRT, SIGHUP, SIGINT, SIGKILL, SIGSEGV, SIGTERM, Signals
 from typing import Any
 
 from omnibench.errors import one_line
@@ -24,6 +24,7 @@ from omnibench.progress import Progress
 # s after its start in which a process takes further jobs: to start one costs 20 ms (tests/benchmarks/job_overhead.py),
 # 2 % of that; what jobs leave behind in it (memory, caches) is that of a second.
 _YOUNG = 1.0
+_CLOSED = 1.0  # s in which a process dies whose end of the connection is closed; chosen
 _FROM_OUTSIDE = (SIGKILL, SIGTERM, SIGHUP, SIGINT)  # signals by which people and the system end processes
 
 _in_job = False  # True in a process of jobs
@@ -98,21 +99,25 @@ class JobProcess:
             if self.connection.poll():
                 message: Progress | JobEnd = self.connection.recv()
                 return message
-        except (EOFError, OSError):
-            self._process.join()
+        except (EOFError, OSError):  # it is about to die, or a plug-in has closed its end
+            self._process.join(_CLOSED)
+            return self._death()
         if not self._process.is_alive():
-            try:  # what it sent before it died
+            with suppress(EOFError, OSError):  # what it sent before it died
                 if self.connection.poll():
-                    return self.connection.recv()
-            except (EOFError, OSError):
-                pass
-            code = self._process.exitcode or 0
-            self.end()
-            return JobEnd(exit_code=code, out_of_memory=code == -SIGKILL and oom_kills() > self._kills)
+                    last: Progress | JobEnd = self.connection.recv()
+                    return last
+            return self._death()
         if self.deadline is not None and time.monotonic() >= self.deadline:
             self.end()
             return JobEnd(over_time=True)
         return None
+
+    def _death(self) -> JobEnd:
+        """The end of a job whose process has died; of one that cannot be heard any more, too, which is ended."""
+        code = 1 if self._process.is_alive() else self._process.exitcode or 0
+        self.end()
+        return JobEnd(exit_code=code, out_of_memory=code == -SIGKILL and oom_kills() > self._kills)
 
     def end(self) -> None:
         """End the process and all that its jobs started."""
@@ -131,6 +136,7 @@ def _serve(connection: Connection) -> None:
     """Do the jobs that come through the connection."""
     global _in_job
     _in_job = True
+    signal.signal(SIGINT, SIG_IGN)  # the parent ends it
     signal.signal(SIGTERM, SIG_DFL)  # end at once: Python's handlers would wait for compiled code
     os.setpgid(0, 0)  # all that a plug-in starts can be ended with the process
     threading.Thread(target=end_with_parent, daemon=True).start()
@@ -149,7 +155,10 @@ def _serve(connection: Connection) -> None:
             for stream in (sys.stdout, sys.stderr):
                 with suppress(OSError, ValueError):  # closed by a plug-in
                     stream.flush()
-            connection.send(JobEnd(answer, error_sent, reusable=reusable))
+            try:
+                connection.send(JobEnd(answer, error_sent, reusable=reusable))
+            except OSError:  # a plug-in has closed it
+                os._exit(1)
 
 
 def _do(

@@ -16,6 +16,8 @@ from omnibench.processes import one_thread, one_thread_processes
 
 T = TypeVar("T")
 
+_LONGEST = 3600.0  # s of one wait: the system takes no infinite time
+
 
 def local_backend(workers: int, preload: Sequence[str] = ()) -> Backend:
     """This process for one worker, else that many processes; for jobs of our own code, which needs no isolation."""
@@ -96,7 +98,7 @@ def _ends(active: dict[JobProcess, tuple[int, Job[Any]]], watch: JobWatch[Any]) 
     deadlines = [process.deadline for process in active if process.deadline is not None]
     wait(
         [sign for process in active for sign in process.signs],
-        timeout=max(min(deadlines) - time.monotonic(), 0.0) if deadlines else None,
+        timeout=min(max(min(deadlines) - time.monotonic(), 0.0), _LONGEST) if deadlines else None,
     )
     ended = []
     for process, (number, _) in active.items():
