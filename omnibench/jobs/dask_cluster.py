@@ -14,8 +14,8 @@ import distributed
 
 from omnibench.errors import ConfigError, one_line
 from omnibench.jobs.dask_worker import Requirements, UnfitWorkerError, check
-from omnibench.jobs.software import software
 from omnibench.jobs.scheduler_tls import TlsFiles
+from omnibench.jobs.software import software
 from omnibench.processes import interrupts_blocked, main_module_hidden
 from omnibench.progress import Progress, Reporter
 from omnibench.registry import loaded_plugin_files, plugin_text
@@ -26,6 +26,8 @@ _SETTINGS = {
     "distributed.scheduler.allowed-failures": 100,  # tries are counted by the backend, which knows which jobs had begun
     "distributed.admin.large-graph-warning-threshold": "100 GB",  # data of jobs are kept by the scheduler on purpose
     "distributed.worker.memory.terminate": False,  # limits are those of jobs
+    "distributed.worker.profile.enabled": False,  # nobody looks at it, and quick jobs pay for it
+    "distributed.admin.tick.interval": "500 ms",
     "distributed.comm.timeouts.connect": f"{_ANSWER} s",
 }
 

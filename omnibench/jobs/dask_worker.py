@@ -32,6 +32,7 @@ from omnibench.progress import Progress, Reporter
 from omnibench.registry import PluginFailure, import_copies
 
 _PERIOD = 0.2  # s between two reports of a job, and two looks whether it is still wanted; chosen
+_TOGETHER, _MOST_TOGETHER = 0.05, 50  # s and ends that wait for each other; chosen
 _LARGEST = 200_000  # bytes of an event: the scheduler keeps a thousand of them, and a run's result has 2 to 50 kB
 _PROBE = 1_000_000  # bytes that a worker must be able to write: a plug-in's file and what a job notes down (chosen)
 
@@ -52,24 +53,37 @@ class Requirements:
 
 @dataclass(frozen=True)
 class Order:
-    """A job as it travels. topic: of the events that tell of it. content: see ``Packer``; names: of what it shares."""
+    """A job as it travels. content: see ``Packer``; names: of what it shares with others."""
 
-    topic: str
     number: int
     job: Job[Any]
-    store: ResultStore[Any]
     content: bytes
     names: tuple[str, ...]
 
 
 @dataclass(frozen=True)
+class Parcel:
+    """Jobs that travel together, quick ones. topic: of the events that tell of them. names: of what they share."""
+
+    topic: str
+    store: ResultStore[Any]
+    orders: tuple[Order, ...]
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class Told:
-    """Event of a job: it begins (neither progress nor end), reports, or ends, perhaps with a last report."""
+    """Event of a job: it begins (neither progress nor end), reports, or ends, perhaps with a last report.
+
+    seconds: that it took. fetch: ends that are too large for an event are the result of the parcel's task.
+    """
 
     number: int
     worker: str
     progress: Progress | None = None
     end: JobEnd | None = None
+    seconds: float = 0.0
+    fetch: bool = False
 
 
 def content(data: bytes) -> bytes:
@@ -77,27 +91,37 @@ def content(data: bytes) -> bytes:
     return data
 
 
-def carry_out(order: Order, requirements: bytes, *shared: bytes) -> Told | None:
-    """Task of one job. All that is told goes to the order's topic; a large end is returned."""
+def carry_out(parcel: Parcel, requirements: bytes, *shared: bytes) -> list[Told]:
+    """Task of a parcel's jobs, one after the other. Their ends are told together, those of quick ones; large ones stay.
+
+    UnfitWorkerError: this worker joined after the first job, and is not as it must be.
+    """
     worker = distributed.get_worker()
-    plugins = prepare(requirements, worker)
-    packed = PackedJob(order.content, dict(zip(order.names, shared, strict=True)), plugins)
-    job = replace(order.job, argument=packed)
-    with _slots(worker.state.nthreads if job.timed else 1, worker.state.nthreads):
-        _tell(worker, order, Told(order.number, worker.address))
-        process = _process_for(job, pickle.loads(requirements).preload)
-        process.give(job, order.store.content)
-        try:
-            progress, end = _follow(process, worker, order)
-        except BaseException:
-            process.end()
-            raise
-        if end is None or not end.reusable:
-            process.end()
-        else:
-            _idle.append(process)
-    ended = Told(order.number, worker.address, progress, end)
-    return ended if end is None or not _tell(worker, order, ended) else None
+    plugins, preload = prepare(requirements, worker), pickle.loads(requirements).preload
+    teller = _Teller(worker, parcel)
+    data = dict(zip(parcel.names, shared, strict=True))
+    timed = any(order.job.timed for order in parcel.orders)
+    with _slots(worker.state.nthreads if timed else 1, worker.state.nthreads):
+        teller.tell(*(Told(order.number, worker.address) for order in parcel.orders))
+        for order in parcel.orders:
+            packed = PackedJob(order.content, {name: data[name] for name in order.names}, plugins)
+            job, began = replace(order.job, argument=packed), time.monotonic()
+            process = _process_for(job, preload)
+            try:
+                process.give(job, parcel.store.content)
+                progress, end = _follow(process, teller, order.number)
+            except BaseException:
+                process.end()
+                raise
+            if end is None:  # wanted no more
+                process.end()
+                break
+            if end.reusable:
+                _idle.append(process)
+            else:
+                process.end()
+            teller.ended(Told(order.number, worker.address, progress, end, time.monotonic() - began))
+    return teller.close()
 
 
 def prepare(requirements: bytes, worker: Any) -> dict[Path, Path]:
@@ -169,9 +193,9 @@ def _as_it_is(_: str, result: Any) -> Any:
     return result
 
 
-def _follow(process: JobProcess, worker: Any, order: Order) -> tuple[Progress | None, JobEnd | None]:
+def _follow(process: JobProcess, teller: _Teller, number: int) -> tuple[Progress | None, JobEnd | None]:
     """Wait for a job's end, and report: the last report not yet told, and the end; None if it is wanted no more."""
-    key, told, last = worker.get_current_task(), time.monotonic(), None
+    told, last = time.monotonic(), None
     while True:
         wait(process.signs, timeout=_PERIOD)
         while (event := process.receive()) is not None:
@@ -181,20 +205,50 @@ def _follow(process: JobProcess, worker: Any, order: Order) -> tuple[Progress | 
         if time.monotonic() - told >= _PERIOD:
             told = time.monotonic()
             if last is not None:
-                _tell(worker, order, Told(order.number, worker.address, last))
+                teller.tell(Told(number, teller.worker.address, last))
                 last = None
-            task = worker.state.tasks.get(key)
-            if task is None or task.state == "cancelled":
+            if not teller.wanted:
                 return None, None
 
 
-def _tell(worker: Any, order: Order, event: Told) -> bool:
-    """Send an event to the client by way of the scheduler, which keeps the latest; False where it is too large."""
-    packed = pickle.dumps(event)
-    if len(packed) > _LARGEST:
-        return False
-    worker.log_event(order.topic, packed)
-    return True
+class _Teller:
+    """Tells the client of a parcel's jobs by events, which go by way of the scheduler."""
+
+    def __init__(self, worker: Any, parcel: Parcel) -> None:
+        self.worker = worker
+        self._topic, self._first = parcel.topic, parcel.orders[0].number
+        self._key = worker.get_current_task()
+        self._waiting: list[Told] = []
+        self._large: list[Told] = []
+        self._told = time.monotonic()
+
+    @property
+    def wanted(self) -> bool:
+        """False once the client has cancelled the parcel, or is gone."""
+        task = self.worker.state.tasks.get(self._key)
+        return task is not None and task.state != "cancelled"
+
+    def tell(self, *events: Told) -> None:
+        """Send events."""
+        self.worker.log_event(self._topic, pickle.dumps(events))
+
+    def ended(self, end: Told) -> None:
+        """Send an end, soon."""
+        (self._large if len(pickle.dumps(end)) > _LARGEST else self._waiting).append(end)
+        if time.monotonic() - self._told > _TOGETHER or len(self._waiting) >= _MOST_TOGETHER:
+            self._send()
+
+    def close(self) -> list[Told]:
+        """Send what is left; the ends that are too large for that."""
+        self._send()
+        if self._large:
+            self.tell(Told(self._first, self.worker.address, fetch=True))
+        return self._large
+
+    def _send(self) -> None:
+        if self._waiting:
+            self.tell(*self._waiting)
+        self._waiting, self._told = [], time.monotonic()
 
 
 @contextmanager
