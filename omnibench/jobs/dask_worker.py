@@ -32,7 +32,7 @@ from omnibench.progress import Progress, Reporter
 from omnibench.registry import PluginFailure, import_copies
 
 _PERIOD = 0.2  # s between two reports of a job, and two looks whether it is still wanted; chosen
-_TOGETHER, _MOST_TOGETHER = 0.05, 50  # s and ends that wait for each other; chosen
+_TOGETHER, _MOST_TOGETHER = 0.1, 50  # s and ends that wait for each other; chosen
 _LARGEST = 200_000  # bytes of an event: the scheduler keeps a thousand of them, and a run's result has 2 to 50 kB
 _PROBE = 1_000_000  # bytes that a worker must be able to write: a plug-in's file and what a job notes down (chosen)
 
