@@ -62,11 +62,13 @@ def open_backend(
         yield Processes(choice.workers, preload)
         return
     from omnibench.jobs.dask_backend import DaskBackend
-    from omnibench.jobs.dask_cluster import checked_requirements, dask_client
+    from omnibench.jobs.dask_cluster import checked_requirements, dask_client, say_cluster
 
     address = None if choice.name == "dask" else choice.name
     with dask_client(address, choice.workers, choice.tls, report) as client:
-        yield DaskBackend(client, checked_requirements(client, preload))
+        backend = DaskBackend(client, checked_requirements(client, preload))
+        say_cluster(client, report)
+        yield backend
 
 
 def _has_port(place: str) -> bool:

@@ -1,8 +1,9 @@
 """Backend of a Dask cluster. Results come back to the client, which alone writes the store.
 
 A job's begin, its reports and its end are events from its worker; the future only tells that it is lost. A worker that
-is killed takes its jobs with it: the scheduler gives them to another, and the begins of each are counted here, since
-the scheduler also counts jobs that only waited there.
+is killed takes its jobs with it, and they are given to another. Their begins are counted here, since the scheduler also
+counts jobs that only waited there. (A scheduler that was not started here tries again by itself, by its own setting
+``allowed-failures``: it may begin a job a fourth time before this hears of it.)
 """
 
 from __future__ import annotations

@@ -19,11 +19,12 @@ from omnibench.jobs.software import software
 from omnibench.processes import interrupts_blocked, main_module_hidden
 from omnibench.progress import Progress, Reporter
 from omnibench.registry import loaded_plugin_files, plugin_text
+from omnibench.words import plural
 
 _ANSWER = 10.0  # s in which a scheduler must answer; chosen
 _WORKER = 60.0  # s in which a worker must have joined: those of a batch system start with the first job (chosen)
 _SETTINGS = {
-    "distributed.scheduler.allowed-failures": 100,  # tries are counted by the backend, which knows which jobs had begun
+    "distributed.scheduler.allowed-failures": 0,  # the backend tries again: it knows which jobs had begun
     "distributed.admin.large-graph-warning-threshold": "100 GB",  # data of jobs are kept by the scheduler on purpose
     "distributed.worker.memory.terminate": False,  # limits are those of jobs
     "distributed.worker.profile.enabled": False,  # nobody looks at it, and quick jobs pay for it
@@ -45,14 +46,12 @@ def dask_client(address: str | None, workers: int, tls: TlsFiles | None, report:
         with dask.config.set(_SETTINGS):
             if address is None:
                 with _local_cluster(workers) as cluster, distributed.Client(cluster, set_as_default=False) as client:
-                    _say(client, "this machine", report)
                     yield client
             else:
                 client = _joined(address, tls)
                 try:
                     _check_scheduler(client, address)
                     _wait_for_worker(client, address, report)
-                    _say(client, address, report)
                     yield client
                 finally:
                     client.close(timeout=1)
@@ -118,11 +117,12 @@ def _wait_for_worker(client: Any, address: str, report: Reporter) -> None:
     report(Progress("waiting for a worker", result=""))
 
 
-def _say(client: Any, place: str, report: Reporter) -> None:
+def say_cluster(client: Any, report: Reporter) -> None:
+    """Report how many workers there are, and the page on which they can be watched."""
     page = client.dashboard_link
     if find_spec("bokeh") is None:  # which the dashboard needs; these pages do not
         page = page.replace("/status", "/info/main/workers.html")
-    report(Progress("dask", result=f"dask: workers of {place}: {len(client.nthreads())}, dashboard {page}"))
+    report(Progress("dask", result=f"{plural(len(client.nthreads()), 'worker')} of Dask, dashboard {page}"))
 
 
 def checked_requirements(client: Any, preload: Sequence[str]) -> bytes:
