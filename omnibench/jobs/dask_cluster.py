@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import pickle
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
@@ -43,7 +44,8 @@ def dask_client(address: str | None, workers: int, tls: TlsFiles | None, report:
     level = logger.level
     logger.setLevel(logging.CRITICAL + 1)  # what goes wrong is said once, in words
     try:
-        with dask.config.set(_SETTINGS):
+        with warnings.catch_warnings(), dask.config.set(_SETTINGS):
+            warnings.filterwarnings("ignore", module="distributed")
             if address is None:
                 with _local_cluster(workers) as cluster, distributed.Client(cluster, set_as_default=False) as client:
                     yield client

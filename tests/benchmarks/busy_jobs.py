@@ -5,7 +5,10 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 
-from omnibench.progress import Reporter
+import numpy as np
+from numpy.typing import NDArray
+
+from omnibench.progress import Progress, Reporter
 
 
 @dataclass(frozen=True)
@@ -22,3 +25,21 @@ def busy(order: tuple[int, float], _: Reporter) -> Done:
     while time.perf_counter() < end:
         pass
     return Done(number)
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """Result of a job that draws from data: its number, and the mean of what it drew."""
+
+    number: int
+    mean: float
+
+
+def draw(order: tuple[int, float, NDArray[np.float64]], report: Reporter) -> Drawn:
+    """Keep the processor busy for so many seconds, then draw from the data by a seed of the job's own."""
+    number, seconds, data = order
+    end = time.perf_counter() + seconds
+    while (left := end - time.perf_counter()) > 0:
+        report(Progress("drawing", int(1000 * (seconds - left))))
+        np.sort(data)
+    return Drawn(number, float(np.random.default_rng(number).choice(data, 10_000).mean()))

@@ -24,6 +24,7 @@ def program(
             stdout=output,
             stderr=output,
             env={**IMPORTING_THIS, **(environment or {})},
+            cwd=log.parent,  # not where omnibench lies
             start_new_session=True,
         )
     try:

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from importlib.metadata import version
+from importlib.metadata import distribution, version
 from pathlib import Path
 
 import pytest
@@ -64,7 +64,7 @@ def test_a_scheduler_that_nobody_started_is_one_line_soon(tmp_path: Path) -> Non
     began = time.monotonic()
     run = omnibench("compare", write_config(tmp_path), "-o", tmp_path / "out", "--backend", "tcp://127.0.0.1:9")
     assert_refused(run, "no Dask scheduler answers at tcp://127.0.0.1:9", "start one (dask scheduler)")
-    assert time.monotonic() - began < 20
+    assert time.monotonic() - began < 60
 
 
 def test_without_dask_one_line_names_the_extra(tmp_path: Path) -> None:
@@ -93,8 +93,9 @@ def test_a_worker_with_other_code_is_refused_before_the_first_job(address: str, 
 def pretended(folder: Path, name: str, number: str) -> Path:
     """A folder whose metadata say that a package has another version."""
     metadata = folder / f"{name}-{number}.dist-info"
-    metadata.mkdir(parents=True)
-    (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {number}\n")
+    shutil.copytree(next(iter(Path(str(distribution(name).locate_file(""))).glob(f"{name}-*.dist-info"))), metadata)
+    text = (metadata / "METADATA").read_text(encoding="utf-8")
+    (metadata / "METADATA").write_text(text.replace(f"Version: {version(name)}\n", f"Version: {number}\n", 1))
     return folder
 
 
@@ -174,7 +175,7 @@ from omnibench.compare.read_config import read_compare_config
 config = read_compare_config(sys.argv[1]).model_copy(update={"backend": sys.argv[3]})
 
 def move(event):  # once the client has read it, no machine has the file where it was
-    if event.task == "comparing" and config.plugins[0].exists():
+    if event.task.endswith("needs seed 1") and config.plugins[0].exists():
         config.plugins[0].rename(sys.argv[4])
 
 omnibench.run_comparison(config, Path(sys.argv[2]), move)
@@ -229,15 +230,15 @@ from omnibench.jobs.backend_choice import BackendChoice, open_backend
 from omnibench.jobs.job import run_jobs
 from omnibench.jobs.result_store import ResultStore
 with open_backend(BackendChoice(name=sys.argv[1])) as backend:
-    run_jobs(jobs_of(sleeping, [Path(sys.argv[2])] * 5), ResultStore(Path(sys.argv[2], "store"), Answer), backend, Notes())
+    folder = Path(sys.argv[2])
+    run_jobs(jobs_of(sleeping, [folder] * 5), ResultStore(folder / "store", Answer), backend, Notes())
 """
 
 
 def sleeping(folder: Path, _: Reporter) -> Answer:
-    (folder / "begun").touch()
     while not (folder / "go_on").exists():
-        time.sleep(0.05)
         (folder / "alive").touch()
+        time.sleep(0.05)
     return Answer(1)
 
 
@@ -245,7 +246,7 @@ def test_when_the_client_is_killed_its_jobs_end_and_it_goes_on_when_started_agai
     command = [sys.executable, "-c", CLIENT, address, str(tmp_path)]
     with worker(address, tmp_path / "worker"):
         client = subprocess.Popen(command, env=IMPORTING_THIS)
-        wait_for((tmp_path / "begun").exists)
+        wait_for((tmp_path / "alive").exists)
         client.kill()
         client.wait()
         wait_for(lambda: time.time() - (tmp_path / "alive").stat().st_mtime > 1)
