@@ -14,7 +14,6 @@ from __future__ import annotations
 import heapq
 import math
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import get_args
 
@@ -202,8 +201,8 @@ def prove(
 ) -> Proof:
     """A lower bound of the cost over the problem's box, within ``gap`` of the best cost known unless the limits end it.
 
-    known (n,): a good vector in the box. seconds, parts, backend: as in certify_optimum. ConfigError when the problem has no
-    such bound (see LowerBounds).
+    known (n,): a good vector in the box. seconds, parts, backend: as in certify_optimum. ConfigError when the problem
+    has no such bound (see LowerBounds).
     """
     began = time.perf_counter()
     with one_thread():
@@ -223,7 +222,7 @@ def prove(
             if finished or spent > seconds or count >= (parts or math.inf):
                 return proof
             if backend is None:
-                cut, made = bounds.split(heapq.heappop(boxes)[2]), 2
+                cut, made = [*bounds.split(heapq.heappop(boxes)[2])], 2
             else:
                 cut, made = _cut_at_once(boxes, bounds, (1 - gap) * best_cost, (parts or math.inf) - count, backend)
             for part in cut:
@@ -237,7 +236,7 @@ def prove(
 
 def _cut_at_once(
     boxes: list[tuple[float, int, Node]], bounds: LowerBounds, wanted: float, left: float, backend: Backend
-) -> tuple[Sequence[Node], int]:
+) -> tuple[list[Node], int]:
     """Take the lowest parts and cut each as a job: the parts that they become, and how many were bounded for that.
 
     wanted: bound from which on a part needs no cut. left: parts that may still be bounded.
@@ -248,6 +247,27 @@ def _cut_at_once(
     cuts = int(min(_CUTS, max(left // (2 * len(taken)), 1)))
     branches = gathered(backend, _branch, [(bounds, node, wanted, cuts) for node in taken], _Branch, shared=(bounds,))
     return [node for branch in branches for node in branch.nodes()], sum(branch.made for branch in branches)
+
+
+@dataclass(frozen=True, eq=False)
+class _Branch:
+    """The parts (P) that a node was cut into: deviations, good matrices, loosenesses (P, 3, r) and bounds (P,).
+
+    made: parts that were bounded on the way.
+    """
+
+    lower: JsonArray
+    upper: JsonArray
+    good: JsonArray
+    looseness: JsonArray
+    bound: JsonArray
+    made: int
+
+    def nodes(self) -> Iterator[Node]:
+        """The parts."""
+        fields = (self.lower, self.upper, self.bound, self.good, self.looseness)
+        for low, high, bound, good, loose in zip(*fields, strict=True):
+            yield Node(low, high, float(bound), good, loose)
 
 
 def _branch(order: tuple[LowerBounds, Node, float, int], _: Reporter) -> _Branch:

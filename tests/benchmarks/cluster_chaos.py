@@ -64,7 +64,7 @@ def chaos(arguments: argparse.Namespace) -> None:
     folder = Path(tempfile.mkdtemp(prefix="omnibench-chaos-"))
     store, port = folder / "store", _free_port()
     address = f"tcp://127.0.0.1:{port}"
-    environment = os.environ | {"PYTHONPATH": str(_HERE), "OMP_NUM_THREADS": "1"}
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(_HERE), *sys.path]), "OMP_NUM_THREADS": "1"}
 
     def started(*command: str, log: str) -> subprocess.Popen[bytes]:
         with (folder / log).open("ab") as output:
