@@ -14,6 +14,7 @@ from __future__ import annotations
 import heapq
 import math
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import get_args
 
@@ -33,7 +34,7 @@ from omnibench.processes import one_thread
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.registry import calibrators, costs
 from omnibench.robot.calibration import Calibration
-from omnibench.robot.kinematics import Array
+from omnibench.robot.kinematics import Array, JsonArray
 from omnibench.views import Brief
 
 _TIMED = 3  # parts whose mean time stands for that of all: the whole box and its first two parts
