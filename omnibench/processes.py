@@ -58,7 +58,7 @@ def one_thread_processes(preload: Sequence[str]) -> Iterator[Any]:
     context.set_forkserver_preload([__name__, *preload])
     try:
         resource_tracker.ensure_running()  # the fork server would start it, and unblock what is blocked
-        with interrupts_deferred(), _interrupts_blocked():  # processes inherit the block: the parent ends them
+        with interrupts_deferred(), interrupts_blocked():  # processes inherit the block: the parent ends them
             forkserver.ensure_running()
         yield context
     finally:
@@ -70,7 +70,8 @@ def one_thread_processes(preload: Sequence[str]) -> Iterator[Any]:
 
 
 @contextmanager
-def _interrupts_blocked() -> Iterator[None]:
+def interrupts_blocked() -> Iterator[None]:
+    """Keep Ctrl-C from this thread, and from threads and processes that start in the block for as long as they live."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT,))
     try:
         yield

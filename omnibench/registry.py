@@ -142,6 +142,7 @@ importers: Registry[Any] = Registry("importer", "omnibench.data.importers")
 REGISTRIES: tuple[Registry[Any], ...] = (calibrators, costs, effects, importers)
 
 _loaded: dict[Path, PluginFailure | None] = {}
+_copies: dict[Path, Path] = {}  # of plug-in files that another machine sent, by their paths there
 
 
 def load_plugins(folders: Path | str | Iterable[Path | str] = (), installed: bool = True) -> list[PluginFailure]:
@@ -156,10 +157,30 @@ def load_plugins(folders: Path | str | Iterable[Path | str] = (), installed: boo
 
 def load_plugin_file(path: Path) -> PluginFailure | None:
     """Import one plug-in file, once a process; returns the failure, None if it was imported."""
-    path = path.resolve()
+    path = path if path in _copies else path.resolve()
     if path not in _loaded:
         _loaded[path] = _attempt(str(path), lambda: _import_file(path))
     return _loaded[path]
+
+
+def loaded_plugin_files() -> dict[Path, PluginFailure | None]:
+    """The plug-in files that this process has tried to import, with their failures."""
+    return dict(_loaded)
+
+
+def import_copies(copies: Mapping[Path, Path]) -> list[PluginFailure]:
+    """Import plug-in files of another machine from their copies here, by the names that they have there.
+
+    Loading their folders finds them, whether or not the folders are here. Returns the failures of those that fail.
+    """
+    _copies.update(copies)
+    return [failure for path in copies if (failure := load_plugin_file(path)) is not None]
+
+
+def plugin_text(path: Path) -> str:
+    """The text of a plug-in file, empty if there is none."""
+    file = _copies.get(path, path)
+    return file.read_text(encoding="utf-8", errors="replace") if file.is_file() else ""
 
 
 def registered_from(path: Path) -> list[tuple[Registry[Any], Entry[Any]]]:
@@ -169,6 +190,8 @@ def registered_from(path: Path) -> list[tuple[Registry[Any], Entry[Any]]]:
 
 
 def _load_folder(folder: Path) -> list[PluginFailure]:
+    if copied := [path for path in _copies if path.parent in (folder, folder.resolve())]:
+        return [failure for path in sorted(copied) if (failure := load_plugin_file(path)) is not None]
     if folder.is_file():
         raise PluginError(f"plug-in folder {folder} is a file; name the folder that it lies in with --plugins")
     if not folder.is_dir():
@@ -199,7 +222,7 @@ def _attempt(origin: str, load: Callable[[], object]) -> PluginFailure | None:
 def _import_file(path: Path) -> None:
     digest = hashlib.sha256(str(path).encode()).hexdigest()[:8]
     name = f"omnibench_plugin_{path.stem}_{digest}"
-    spec = importlib.util.spec_from_file_location(name, path)
+    spec = importlib.util.spec_from_file_location(name, _copies.get(path, path))
     if spec is None or spec.loader is None:
         raise PluginError(f"{path} is not a Python file")
     module = importlib.util.module_from_spec(spec)

@@ -154,7 +154,8 @@ def summary(output: Path) -> dict[str, Any]:
 
 
 def without_seconds(output: Path) -> list[dict[str, Any]]:
-    return [{name: value for name, value in run.items() if name != "seconds"} for run in summary(output)["runs"]]
+    timed = ("seconds", "reference_seconds")
+    return [{name: value for name, value in run.items() if name not in timed} for run in summary(output)["runs"]]
 
 
 def files_of(folder: Path) -> dict[str, tuple[int, bytes]]:

@@ -6,10 +6,15 @@ from typing import Annotated
 import typer
 
 from omnibench.cli.options import (
+    BackendName,
     Figures,
     Force,
+    TlsAuthority,
+    TlsCertificate,
+    TlsKey,
     output_option,
     refuse_figures_without_browser,
+    tls_files,
     write_asked_figures,
 )
 from omnibench.cli.terminal.console import make_console, print_ending, print_verdict, warn
@@ -34,6 +39,13 @@ def compare(
             "--data", metavar="[NAME=]PATH", help="Where the recordings of the config's data set NAME are on this disk."
         ),
     ] = None,
+    backend: BackendName = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Processes, or Dask workers started here. Default: the config's.")
+    ] = None,
+    tls_ca: TlsAuthority = None,
+    tls_cert: TlsCertificate = None,
+    tls_key: TlsKey = None,
     figures: Figures = None,
     force: Force = False,
     plugins: Annotated[
@@ -65,7 +77,11 @@ def compare(
     else:
         comparison = read_compare_config(config, _named_paths(data))
     folders = [*comparison.plugins, *(folder.resolve() for folder in plugins or [])]
-    comparison = comparison.model_copy(update={"plugins": tuple(dict.fromkeys(folders))})
+    given = {"backend": backend, "workers": workers, "tls": tls_files(tls_ca, tls_cert, tls_key)}
+    comparison = comparison.model_copy(
+        update={"plugins": tuple(dict.fromkeys(folders))}
+        | {name: value for name, value in given.items() if value is not None}
+    )
     with ProgressDisplay() as watch:
         result = run_comparison(comparison, output, watch, force=force)
         if figures is not None:

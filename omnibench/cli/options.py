@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from omnibench.cli.terminal.console import warn
-from omnibench.errors import PluginError
+from omnibench.errors import ConfigError, PluginError
 
 if TYPE_CHECKING:
+    from omnibench.jobs.scheduler_tls import TlsFiles
     from omnibench.registry import PluginFailure
     from omnibench.report.blocks import Document
 
@@ -56,10 +57,37 @@ Plugins = Annotated[
 ]
 
 
+BackendName = Annotated[
+    str | None,
+    typer.Option(
+        "--backend",
+        metavar="NAME",
+        help="Where many jobs are run: processes; dask (a cluster started here); tcp://HOST:PORT or tls://HOST:PORT, "
+        "a scheduler of Dask.",
+    ),
+]
+TlsAuthority = Annotated[
+    Path | None, typer.Option("--tls-ca", metavar="FILE", help="For tls://: the authority's certificate.")
+]
+TlsCertificate = Annotated[
+    Path | None, typer.Option("--tls-cert", metavar="FILE", help="For tls://: this client's certificate.")
+]
+TlsKey = Annotated[Path | None, typer.Option("--tls-key", metavar="FILE", help="For tls://: this client's key.")]
 PluginFiles = Annotated[
     list[Path] | None,
     typer.Option("--plugin", metavar="FILE", help="One plug-in file to load; may be repeated."),
 ]
+
+
+def tls_files(ca: Path | None, cert: Path | None, key: Path | None) -> TlsFiles | None:
+    """The files of the options; None without any. ConfigError: some are given, not all."""
+    if ca is None and cert is None and key is None:
+        return None
+    if ca is None or cert is None or key is None:
+        raise ConfigError("TLS needs three files: --tls-ca, --tls-cert and --tls-key")
+    from omnibench.jobs.scheduler_tls import TlsFiles
+
+    return TlsFiles(ca=ca.resolve(), cert=cert.resolve(), key=key.resolve())
 
 
 def refuse_figures_without_browser(folder: Path | None) -> None:

@@ -15,6 +15,7 @@ from omnibench.fit.problem import Budget
 from omnibench.fit.shrinkage.prior import MountChoice
 from omnibench.fit.span import Unidentified
 from omnibench.fit.uncertainty.ratio_intervals import Bootstrap
+from omnibench.jobs.scheduler_tls import TlsFiles
 from omnibench.robot.odometry import Integration
 from omnibench.simulate.dataset_source import DatasetSource
 
@@ -116,6 +117,12 @@ class CompareConfig(Model):
     calibrators: tuple[CalibratorEntry, ...] = Field(min_length=1)
     plugins: tuple[RelativePath, ...] = Field((), description="folders of plug-ins; relative to the config file")
     workers: int | None = Field(None, gt=0, description="processes; default: the processors")
+    backend: str = Field(
+        "processes",
+        description="where runs are made: processes, dask, or a scheduler of Dask: tcp://HOST:PORT, tls://...",
+    )
+    tls: TlsFiles | None = Field(None, description="files for a scheduler at tls://; relative to the config file")
+    timing: bool = Field(True, description="no: the runs' seconds are not compared, and may be those of a busy machine")
     memory_mb: float | None = Field(
         None, ge=_LEAST_MEMORY, description="memory of each run's process, 10^6 bytes; default: no limit"
     )

@@ -11,7 +11,7 @@ from omnibench.compare.config import CalibratorEntry, CompareConfig
 from omnibench.config import validate
 from omnibench.errors import ConfigError, OmnibenchError, PluginError
 from omnibench.fit.calibrator import unloadable
-from omnibench.registry import PluginFailure, calibrators, costs, load_plugins
+from omnibench.registry import PluginFailure, calibrators, costs, load_plugins, plugin_text
 
 
 def load_calibrators(config: CompareConfig) -> list[PluginFailure]:
@@ -27,7 +27,7 @@ def load_calibrators(config: CompareConfig) -> list[PluginFailure]:
 
 def _names_in(plugin: Path) -> set[str]:
     """Calibrators that a plug-in file would register: the file's name, and names in its text."""
-    text = plugin.read_text(encoding="utf-8", errors="replace") if plugin.is_file() else ""
+    text = plugin_text(plugin)
     return {plugin.stem, *re.findall(r"""calibrators\s*\.\s*register\(\s*["']([^"']+)["']""", text)}
 
 

@@ -2,28 +2,31 @@
 
 from __future__ import annotations
 
+import platform
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 from omnibench.compare.effective_config import load_calibrators
 from omnibench.compare.plan import PlannedRun, RunTask
 from omnibench.errors import DataError
-from omnibench.fit.calibrator import Outcome, RunResult, describe_error, run_calibrator
+from omnibench.fit.calibrator import Outcome, RunResult, Timing, describe_error, run_calibrator
+from omnibench.fit.problem import CalibrationProblem
 from omnibench.fit.shrinkage.shrinkage import shrunk
-from omnibench.jobs.job import Failure, Job, JobWatch, run_jobs
-from omnibench.jobs.local_backends import Processes
+from omnibench.jobs.job import Backend, Failure, Job, JobWatch, run_jobs
 from omnibench.jobs.result_store import ResultStore
 from omnibench.progress import Progress, Reporter
 from omnibench.registry import calibrators
 from omnibench.words import plural
 
 _GRACE = 10.0  # s after the budget's time: a run that has not stopped by then is killed (chosen)
+_REFERENCES = 5  # evaluations that a machine is measured by: the best is one that nothing disturbed (chosen)
 # Modules that the processes share, so that they need not be imported for every run.
 PRELOAD = ("omnibench.compare.execute", "omnibench.fit.loss.sum_of_norms", "nlopt")
 
 
 def execute(
-    plan: Sequence[PlannedRun], store: ResultStore[RunResult], report: Reporter, workers: int
+    plan: Sequence[PlannedRun], store: ResultStore[RunResult], report: Reporter, backend: Backend
 ) -> list[RunResult]:
     """Execute the runs, except those whose results are stored: the result of every run, in the plan's order.
 
@@ -31,9 +34,20 @@ def execute(
     KeyboardInterrupt passes through after the running processes are ended; what had ended is in the store.
     """
     runs = _Runs(plan, store, report)
-    jobs = (Job(run.key, _solve, run.task, run.config.budget.seconds + _GRACE, run.config.memory_mb) for run in plan)
-    run_jobs(jobs, store, Processes(workers, PRELOAD), runs)
+    run_jobs(map(_job, plan), store, backend, runs)
     return [runs.results[number] for number in range(len(plan))]
+
+
+def _job(run: PlannedRun) -> Job[RunResult]:
+    return Job(
+        run.key,
+        _solve,
+        run.task,
+        seconds=run.config.budget.seconds + _GRACE,
+        memory_mb=run.config.memory_mb,
+        timed=run.config.timing,
+        shared=(run.training,),
+    )
 
 
 class _RunFailed(Exception):  # noqa: N818 (not an error: the outcome of a run that leaves no file)
@@ -47,11 +61,23 @@ def _solve(task: RunTask, report: Reporter) -> RunResult:
         calibrator = calibrators.create(task.entry.name, task.entry.options)
         problem = task.problem(report)
         result = shrunk(problem, run_calibrator(calibrator, problem), fitted=calibrator.bounded)
+        if task.config.timing and result.matrix is not None:
+            result = replace(result, timing=Timing(_reference_seconds(problem), platform.node()))
     except BaseException as error:  # whatever a plug-in raises, wherever, is this run's outcome
         result = _without_answer(Outcome.FAILED, describe_error(error))
     if result.outcome is Outcome.FAILED:
         raise _RunFailed(result)
     return result
+
+
+def _reference_seconds(problem: CalibrationProblem) -> float:
+    """Wall time in s of one evaluation of the start's cost by direct integration, the best of a few."""
+    spent = []
+    for _ in range(_REFERENCES):
+        began = time.perf_counter()
+        problem.values(problem.start[None])
+        spent.append(time.perf_counter() - began)
+    return min(spent)
 
 
 def _without_answer(outcome: Outcome, reason: str, evaluations: int = 0, seconds: float = 0.0) -> RunResult:
@@ -108,7 +134,8 @@ class _Runs(JobWatch[RunResult]):
             return result
         if isinstance(failure.error, DataError):
             raise failure.error
-        spent = self._evaluations.get(number, 0), time.monotonic() - self._began[number]
+        now = time.monotonic()
+        spent = self._evaluations.get(number, 0), now - self._began.get(number, now)
         if not failure.over_time:
             return _without_answer(Outcome.FAILED, failure.reason, *spent)
         run = self._plan[number]

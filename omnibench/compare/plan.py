@@ -75,13 +75,15 @@ class RunTask:
 class PlannedRun:
     """One run: an entry of the config on one data set with one seed.
 
-    box: the entry's box of matrix elements, or else the config's; a geometry does not use it. box_name: the name of
-    the bounds that are searched, or ``UNBOUNDED``.
+    training: the data set's training runs, the same object for all runs on it. box: the entry's box of matrix elements,
+    or else the config's; a geometry does not use it. box_name: the name of the bounds that are searched, or
+    ``UNBOUNDED``.
     """
 
     config: CompareConfig
     dataset_name: str
     dataset: Dataset
+    training: tuple[Trajectory, ...]
     entry: CalibratorEntry
     label: str
     parameterisation: ParameterisationName
@@ -111,7 +113,7 @@ class PlannedRun:
         return RunTask(
             config=self.config.model_copy(update={"datasets": {}}),
             robot=self.dataset.robot,
-            trajectories=self.dataset.split("train"),
+            trajectories=self.training,
             entry=self.entry,
             parameterisation=self.parameterisation,
             box=self.box,
@@ -138,6 +140,7 @@ def make_plan(config: CompareConfig, datasets: Mapping[str, Dataset]) -> list[Pl
     plan = []
     for name, dataset in datasets.items():
         labels: set[str] = set()
+        training = dataset.split("train")
         for entry in config.calibrators:
             cls = calibrators.entry(entry.name).cls
             parameterisation = entry.parameterisation or cls.parameterisation
@@ -146,7 +149,8 @@ def make_plan(config: CompareConfig, datasets: Mapping[str, Dataset]) -> list[Pl
             label = _label(config, entry, parameterisation, box_name, labels)
             seeds = config.seeds if cls.stochastic else config.seeds[:1]
             plan += [
-                PlannedRun(config, name, dataset, entry, label, parameterisation, box, box_name, seed) for seed in seeds
+                PlannedRun(config, name, dataset, training, entry, label, parameterisation, box, box_name, seed)
+                for seed in seeds
             ]
     return plan
 

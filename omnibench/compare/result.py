@@ -33,7 +33,8 @@ class RunRecord(Model):
 
     held: elements that keep their start value, because the box or the cost leaves no choice. gap: train_cost divided by
     that of closed_form in the box ``gap_box``, minus 1. proven_gap: the share of train_cost
-    that a matrix of the box could save at most, by proof.
+    that a matrix of the box could save at most, by proof. reference_seconds: one evaluation of the start's cost on the
+    run's machine took so long; None where seconds are not to be compared.
     """
 
     dataset: str
@@ -57,6 +58,8 @@ class RunRecord(Model):
     validation_heading_rad: float | None
     evaluations: int
     seconds: float
+    reference_seconds: float | None = None
+    machine: str | None = None
     matrix: tuple[Row, Row, Row] | None
     parameters: tuple[FittedParameter, ...] | None
     at_bounds: tuple[str, ...]
@@ -136,7 +139,8 @@ class EntryStatistics:
     typical: the run of median training cost, to which intervals and differences refer. train_spread: interquartile
     range of the training cost over seeds. splits: the typical run by split; empty without an answer. difference: paired
     mean difference in validation cost (training cost where there is no validation split) from the best entry.
-    practically_equal: None where the difference has no interval.
+    practically_equal: None where the difference has no interval. reference_evaluations_median: time in evaluations of
+    the start's cost on the machine of each run, which machines of different speed have in common; None if not known.
     """
 
     dataset: str
@@ -157,6 +161,7 @@ class EntryStatistics:
     proven_gap_median: float | None
     evaluations_median: float | None
     seconds_median: float | None
+    reference_evaluations_median: float | None
 
     def cost(self, split: Split) -> Interval | None:
         """The mean cost on a split; None without an answer, or without such a split."""

@@ -29,6 +29,8 @@ from omnibench.environment import environment
 from omnibench.errors import ConfigError, Interrupted, UnknownNameError, require_type
 from omnibench.fit.calibrator import RunResult
 from omnibench.fit.uncertainty.unidentified import warnings_of_calibration
+from omnibench.jobs.backend_choice import BackendChoice, open_backend
+from omnibench.jobs.job import BackendError
 from omnibench.jobs.result_store import ResultStore
 from omnibench.processes import one_thread_processes
 from omnibench.progress import Reporter, no_progress
@@ -54,13 +56,17 @@ def run_comparison(
     failures = load_calibrators(config)
     with _naming_failed_plugins(failures):
         config = effective_config(config)
-        with one_thread_processes(_preload(config)):  # processes started for simulation serve the calibrators, too
+        with (
+            open_backend(_backend(config), PRELOAD, progress) as backend,
+            one_thread_processes(_preload(config)),  # processes started for simulation serve the calibrators, too
+        ):
             datasets = load_datasets(config, progress)
-    plan = make_plan(config, datasets)
-    folder = prepare_output(config, output, force=force)
-    store = ResultStore(folder / "runs", RunResult)
+            plan = make_plan(config, datasets)
+            folder = prepare_output(config, output, force=force)
+            store = ResultStore(folder / "runs", RunResult)
+            with _resumable(plan, store, folder):
+                results = execute(plan, store, progress, backend)
     with _resumable(plan, store, folder):
-        results = execute(plan, store, progress, config.workers or os.cpu_count() or 1)
         scored = score(plan, results, datasets)
         runs, certificates = certify(plan, scored)
         statistics = entry_statistics(runs, config.bootstrap)
@@ -84,6 +90,10 @@ def run_comparison(
     return result
 
 
+def _backend(config: CompareConfig) -> BackendChoice:
+    return BackendChoice(name=config.backend, workers=config.workers or os.cpu_count() or 1, tls=config.tls)
+
+
 def _preload(config: CompareConfig) -> tuple[str, ...]:
     """Modules for the processes of calibrators, and for those of SLAM where a robot's scans are simulated."""
     scans = any(isinstance(source.simulate, RobotConfig) for source in config.datasets.values())
@@ -101,13 +111,15 @@ def _naming_failed_plugins(failures: Sequence[PluginFailure]) -> Iterator[None]:
 
 @contextmanager
 def _resumable(plan: Sequence[PlannedRun], store: ResultStore[RunResult], folder: Path) -> Iterator[None]:
-    """Turn Ctrl-C into an error that says which runs are kept and how to continue."""
+    """Let Ctrl-C and a lost cluster end in a line that says which runs are kept and how to continue."""
     try:
         yield
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, BackendError) as error:
         kept = sum(store.get(run.key) is not None for run in plan)
-        message = f"interrupted; {kept} of {len(plan)} runs are kept in {folder}: run again with -o {folder}"
-        raise Interrupted(message) from None
+        way = f"{kept} of {len(plan)} runs are kept in {folder}: run again with -o {folder}"
+        if isinstance(error, BackendError):
+            raise type(error)(f"{error}; {way}") from None
+        raise Interrupted(f"interrupted; {way}") from None
 
 
 def _warnings(

@@ -148,6 +148,8 @@ def _scored(
         **_columns("validation", scores, design),
         evaluations=result.evaluations,
         seconds=result.seconds,
+        reference_seconds=None if result.timing is None else result.timing.reference_seconds,
+        machine=None if result.timing is None else result.timing.machine,
         matrix=None if result.matrix is None else matrix_rows(result.matrix),
         parameters=_parameters(run, result),
         at_bounds=result.at_bounds,

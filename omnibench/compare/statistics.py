@@ -7,7 +7,7 @@ from operator import itemgetter
 
 import numpy as np
 
-from omnibench.compare.result import EntryStatistics, EntryVerdict, ScoredRun, SplitScore, SplitStatistics
+from omnibench.compare.result import EntryStatistics, EntryVerdict, RunRecord, ScoredRun, SplitScore, SplitStatistics
 from omnibench.data.dataset import Dataset, Split
 from omnibench.fit.held_out import judge, nothing_held_out
 from omnibench.fit.sessions.session_differences import compare_sessions
@@ -131,7 +131,13 @@ def _statistics(
         proven_gap_median=float(np.median(proven)) if proven else None,
         evaluations_median=float(np.median([run.record.evaluations for run in group])),
         seconds_median=float(np.median([run.record.seconds for run in group])),
+        reference_evaluations_median=_median_of_references([run.record for run in group]),
     )
+
+
+def _median_of_references(records: Sequence[RunRecord]) -> float | None:
+    ratios = [each.seconds / each.reference_seconds for each in records if each.reference_seconds]
+    return float(np.median(ratios)) if ratios else None
 
 
 def _by_split(run: ScoredRun, intervals: RatioIntervals) -> dict[Split, SplitStatistics]:

@@ -34,6 +34,7 @@ from omnibench.fit.uncertainty.physical import inseparable_in_words
 from omnibench.fit.uncertainty.ratio_intervals import FEWEST, Units, units_of
 from omnibench.fit.uncertainty.uncertainty import NoCovarianceError, Uncertainty, uncertainty_of
 from omnibench.fit.uncertainty.unidentified import kept_motions, warnings_of_calibration
+from omnibench.jobs.job import Backend
 from omnibench.progress import Reporter, no_progress, renamed
 from omnibench.registry import calibrators, costs
 from omnibench.robot.calibration import (
@@ -99,6 +100,7 @@ def calibrate(
     steering: SteeringChoice = "known",
     tolerance: float | None = None,
     watch: Reporter = no_progress,
+    backend: Backend | None = None,
 ) -> CalibrationRun:
     """Fit the odometry model of a data set's training split.
 
@@ -113,7 +115,8 @@ def calibrate(
     design, of the given tolerance (see shrinkage.py). The run's warnings name them. mount: ``known``, or ``fit`` where
     the tracked point stands. Default of these and of the cost: by the robot (see prior.py). steering: ``fit`` first
     finds gain, play and coupling of the steering and a car's zero (see steering_fit.py), effects from then on.
-    watch: told the evaluations and the best cost so far, at most every 0.1 s.
+    watch: told the evaluations and the best cost so far, at most every 0.1 s. backend: solves the resamples of
+    ``intervals`` as jobs; default: this process.
 
     Raises UnknownNameError or ConfigError for wrong arguments, DataError for an empty training split, and ConfigError
     when the calibrator gives no answer.
@@ -190,7 +193,7 @@ def calibrate(
     units = units_of(training)
     drawn = None
     if intervals and units.count >= FEWEST and uncertainty:
-        drawn = bootstrap_intervals(problem, result.vector, units=units, rng=problem.rng)
+        drawn = bootstrap_intervals(problem, result.vector, units=units, rng=problem.rng, backend=backend)
     return CalibrationRun(
         calibration=calibration,
         result=result,

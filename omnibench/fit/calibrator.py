@@ -87,13 +87,21 @@ class Shrinkage:
     source: str
 
 
+@dataclass(frozen=True)
+class Timing:
+    """The machine of a run. reference_seconds: it took for one evaluation of the start's cost beside the run."""
+
+    reference_seconds: float
+    machine: str
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class RunResult(Brief):
     """Result of one calibrator on one problem. ``vector``, ``matrix`` and ``cost`` are None if there is no answer.
 
     at_bounds, held: names of elements on a bound of the box, and of those kept at their start values.
     covariance (n, n), degrees_of_freedom (n,), noise: as in Solution, None if the calibrator does not estimate them.
-    shrinkage: None where the answer is the calibrator's own.
+    shrinkage: None where the answer is the calibrator's own. timing: None where the seconds are not to be compared.
     """
 
     outcome: Outcome
@@ -110,6 +118,7 @@ class RunResult(Brief):
     noise: Noise | None = None
     degrees_of_freedom: JsonArray | None = None
     shrinkage: Shrinkage | None = None
+    timing: Timing | None = None
 
 
 def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunResult:

@@ -14,8 +14,11 @@ from __future__ import annotations
 import heapq
 import math
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import get_args
+
+import numpy as np
 
 from omnibench.config import Model
 from omnibench.data.dataset import Dataset
@@ -25,11 +28,13 @@ from omnibench.fit.bounds.stamp_sums import QUADRATURE
 from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.parameterisation import Box, BoxName, ExplicitBox
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation, training_split
+from omnibench.jobs.gathering import gathered
+from omnibench.jobs.job import Backend
 from omnibench.processes import one_thread
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.registry import calibrators, costs
 from omnibench.robot.calibration import Calibration
-from omnibench.robot.kinematics import Array
+from omnibench.robot.kinematics import Array, JsonArray
 from omnibench.views import Brief
 
 _TIMED = 3  # parts whose mean time stands for that of all: the whole box and its first two parts
@@ -37,6 +42,9 @@ _TIMED = 3  # parts whose mean time stands for that of all: the whole box and it
 # the real omni3 in the box paper. A tenth of the gap takes about twice as many (tests/benchmarks/proof_parts.py).
 _PARTS, _FEW_PARTS, _MANY_PARTS = 150, 60, 900
 _PARTS_GAP = 1e-3
+# Parts that are cut at once by a backend, and how often each, however many workers it has: a cut takes 10 to 20 ms, to
+# send what it needs as much again (chosen).
+_AT_ONCE, _CUTS = 8, 32
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -92,6 +100,7 @@ def certify_optimum(
     seconds: float = 60.0,
     parts: int | None = None,
     watch: Reporter = no_progress,
+    backend: Backend | None = None,
 ) -> CertifiedCalibration:
     """Bound how much better than a calibration any matrix of the box could be, on a data set's training split.
 
@@ -99,7 +108,8 @@ def certify_optimum(
     certified, found anew, and what shrinking costs is said. box: default the one that was searched, or ``row``.
     watch: told early about how long the proof takes, then of every part.
     gap: stop when the best known matrix is proven to be this close to the optimum. seconds, parts: stop after this time
-    or after so many parts of the box; the number ends a proof at the same place on every machine.
+    or after so many parts of the box; the number ends a proof at the same place on every machine. backend: bounds parts
+    as jobs, several at once; the proof is then the same on every backend, and has other parts than without one.
     Raises DataError when the wheels differ, the calibration has effects or was fitted with a robust loss, or the
     training split is empty, ConfigError for a cost that is no sum of norms.
     """
@@ -153,7 +163,8 @@ def certify_optimum(
             each = (time.perf_counter() - began) / _TIMED
             watch(Progress("duration", result=_duration_in_words(gap, each, seconds, parts)))
 
-    proof = prove(problem, vector if inside else problem.start, gap=gap, seconds=seconds, parts=parts, watch=foretell)
+    known = vector if inside else problem.start
+    proof = prove(problem, known, gap=gap, seconds=seconds, parts=parts, watch=foretell, backend=backend)
     return CertifiedCalibration(
         Certificate(
             cost=cost,
@@ -187,16 +198,17 @@ def prove(
     seconds: float = 60.0,
     parts: int | None = None,
     watch: Reporter = no_progress,
+    backend: Backend | None = None,
 ) -> Proof:
     """A lower bound of the cost over the problem's box, within ``gap`` of the best cost known unless the limits end it.
 
-    known (n,): a good vector in the box. seconds, parts: as in certify_optimum. ConfigError when the problem has no
-    such bound (see LowerBounds).
+    known (n,): a good vector in the box. seconds, parts, backend: as in certify_optimum. ConfigError when the problem
+    has no such bound (see LowerBounds).
     """
     began = time.perf_counter()
     with one_thread():
         bounds = LowerBounds(problem)
-        count = 1
+        count, order = 1, 0
         best_cost, best_vector = float(problem.values(known[None])[0]), known
         root = bounds.root(known)
         boxes: list[tuple[float, int, Node]] = [(root.bound, 0, root)]
@@ -210,13 +222,66 @@ def prove(
             watch(Progress("proof", count, None, "part", best_cost, f"bound {proven:.6f}"))
             if finished or spent > seconds or count >= (parts or math.inf):
                 return proof
-            heapq.heappop(boxes)
-            for part in bounds.split(node):
+            if backend is None:
+                cut, made = [*bounds.split(heapq.heappop(boxes)[2])], 2
+            else:
+                cut, made = _cut_at_once(boxes, bounds, (1 - gap) * best_cost, (parts or math.inf) - count, backend)
+            for part in cut:
                 vector = bounds.vector(part.good)
                 if problem.inside(vector[None])[0] and (cost := float(problem.values(vector[None])[0])) < best_cost:
                     best_cost, best_vector = cost, vector
-                heapq.heappush(boxes, (part.bound, count, part))  # count breaks ties: nodes cannot be compared
-                count += 1
+                order += 1
+                heapq.heappush(boxes, (part.bound, order, part))  # order breaks ties: nodes cannot be compared
+            count += made
+
+
+def _cut_at_once(
+    boxes: list[tuple[float, int, Node]], bounds: LowerBounds, wanted: float, left: float, backend: Backend
+) -> tuple[list[Node], int]:
+    """Take the lowest parts and cut each as a job: the parts that they become, and how many were bounded for that.
+
+    wanted: bound from which on a part needs no cut. left: parts that may still be bounded.
+    """
+    taken = [heapq.heappop(boxes)[2]]
+    while boxes and len(taken) < _AT_ONCE and boxes[0][0] < wanted and boxes[0][2].looseness.any():
+        taken.append(heapq.heappop(boxes)[2])
+    cuts = int(min(_CUTS, max(left // (2 * len(taken)), 1)))
+    branches = gathered(backend, _branch, [(bounds, node, wanted, cuts) for node in taken], _Branch, shared=(bounds,))
+    return [node for branch in branches for node in branch.nodes()], sum(branch.made for branch in branches)
+
+
+@dataclass(frozen=True, eq=False)
+class _Branch:
+    """The parts (P) that a node was cut into: deviations, good matrices, loosenesses (P, 3, r) and bounds (P,).
+
+    made: parts that were bounded on the way.
+    """
+
+    lower: JsonArray
+    upper: JsonArray
+    good: JsonArray
+    looseness: JsonArray
+    bound: JsonArray
+    made: int
+
+    def nodes(self) -> Iterator[Node]:
+        """The parts."""
+        fields = (self.lower, self.upper, self.bound, self.good, self.looseness)
+        for low, high, bound, good, loose in zip(*fields, strict=True):
+            yield Node(low, high, float(bound), good, loose)
+
+
+def _branch(order: tuple[LowerBounds, Node, float, int], _: Reporter) -> _Branch:
+    """Cut a node in a job, its lowest part first, until all bounds reach the wanted one, or so many times."""
+    bounds, node, wanted, cuts = order
+    boxes, made = [(node.bound, 0, node)], 0
+    while made < 2 * cuts and boxes[0][0] < wanted and boxes[0][2].looseness.any():
+        for part in bounds.split(heapq.heappop(boxes)[2]):
+            made += 1
+            heapq.heappush(boxes, (part.bound, made, part))
+    parts = [part for _, _, part in boxes]
+    names = ("lower", "upper", "good", "looseness", "bound")
+    return _Branch(**{name: np.array([getattr(part, name) for part in parts]) for name in names}, made=made)
 
 
 def _duration_in_words(gap: float, each: float, seconds: float, parts: int | None) -> str:

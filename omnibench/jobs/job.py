@@ -11,12 +11,13 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
+from omnibench.errors import OmnibenchError
 from omnibench.jobs.result_store import ResultStore
 from omnibench.progress import Progress, Reporter
 
 T = TypeVar("T")
 
-_TRIES = 3  # how often a job whose worker is killed is begun: two chances that memory is free again; chosen
+TRIES = 3  # how often a job whose worker is killed is begun: two chances that memory is free again; chosen
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,9 @@ class Job(Generic[T]):
 
     key: names everything that the result depends on, see ``content_key``. function: from the top of a module; called
     with the argument and a function that reports progress. seconds, memory_mb: limits of its wall time and of its
-    process's memory (10^6 bytes), None for no limit.
+    process's memory (10^6 bytes), None for no limit. timed: its seconds are compared, so that on another machine it has
+    the worker to itself. shared: objects within the argument that other jobs hold, too; to another machine each travels
+    once.
     """
 
     key: str
@@ -33,10 +36,16 @@ class Job(Generic[T]):
     argument: Any
     seconds: float | None = None
     memory_mb: float | None = None
+    timed: bool = False
+    shared: tuple[Any, ...] = ()
 
     def run(self, store: ResultStore[T], report: Reporter) -> None:
         """Do the work here and write the result's file."""
         store.put(self.key, self.function(self.argument, report))
+
+
+class BackendError(OmnibenchError):
+    """The machines that run jobs are lost, or one of them is unfit; results so far are in the store."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +102,7 @@ def run_jobs(jobs: Iterable[Job[T]], store: ResultStore[T], backend: Backend, wa
     """
     store = replace(store, folder=store.folder.absolute())  # a job may change its working folder
     waiting = _not_stored(jobs, store, watch)
-    for tried in range(1, _TRIES + 1):
+    for tried in range(1, TRIES + 1):
         killed: list[tuple[int, Job[T]]] = []
         for number, job, failure in backend.run(waiting, store, watch):
             result = store.get(job.key)
@@ -101,7 +110,7 @@ def run_jobs(jobs: Iterable[Job[T]], store: ResultStore[T], backend: Backend, wa
                 watch.ended(number, result, reused=False)
             elif failure is None:
                 watch.ended(number, Failure(f"its result cannot be read: {store.file(job.key)}"), reused=False)
-            elif failure.killed and tried < _TRIES:
+            elif failure.killed and tried < TRIES:
                 killed.append((number, job))
             else:
                 watch.ended(number, _after(failure, tried), reused=False)

@@ -59,8 +59,15 @@ class ResultStore(Generic[T]):
 
     def put(self, key: str, result: T) -> None:
         """Store a result, whole or not at all. DataError when it cannot be written, ValueError for a wrong type."""
-        content = _adapter(self).dump_python(result, mode="json", warnings="error")
-        write_text(self.file(key), json.dumps(content))
+        self.put_content(key, self.content(key, result))
+
+    def content(self, key: str, result: T) -> str:  # noqa: ARG002 (as ``put``)
+        """What the result's file will hold. ValueError for a wrong type."""
+        return json.dumps(_adapter(self).dump_python(result, mode="json", warnings="error"))
+
+    def put_content(self, key: str, content: str) -> None:
+        """Store a result that another process made the content of. DataError when it cannot be written."""
+        write_text(self.file(key), content)
 
     def file(self, key: str) -> Path:
         """The result's file."""

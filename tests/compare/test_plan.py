@@ -42,7 +42,10 @@ COMPARISONS = [path for path in sorted(CONFIGS.glob("*.yaml")) if "calibrators:"
 @pytest.mark.parametrize(
     ("changes", "parts"),
     [
-        ({"calibrtors": []}, ["unknown key 'calibrtors'; did you mean 'calibrators'? known: bootstrap, box, budget"]),
+        (
+            {"calibrtors": []},
+            ["unknown key 'calibrtors'; did you mean 'calibrators'? known: backend, bootstrap, box, budget"],
+        ),
         ({"budget": {"evalutions": 3}}, ["unknown key 'budget.evalutions'; did you mean 'evaluations'?"]),
         (
             {"calibrators": [{"name": "crs", "optoins": {}}]},

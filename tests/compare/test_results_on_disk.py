@@ -67,6 +67,8 @@ FURTHER = {
     "gap": float,
     "gap_box": str,
     "proven_gap": (float, type(None)),
+    "reference_seconds": (float, type(None)),
+    "machine": (str, type(None)),
 }
 
 

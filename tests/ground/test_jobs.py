@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import signal
 import subprocess
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -215,12 +216,51 @@ def test_what_a_job_started_ends_with_it(end: str, tmp_path: Path) -> None:
         time.sleep(0.01)
 
 
-def test_every_job_has_a_process_of_one_thread(tmp_path: Path) -> None:
-    answers = run(tmp_path, jobs_of(squared, range(4)), Processes(2)).endings.values()
-    processes = {answer.process for answer in answers if isinstance(answer, Answer)}
-    assert len(processes) == 4
-    assert os.getpid() not in processes
-    assert {answer.threads for answer in answers if isinstance(answer, Answer)} == {"1"}
+def processes_of(notes: Notes) -> list[int]:
+    answers = [notes.endings[number] for number in sorted(notes.endings)]
+    return [answer.process for answer in answers if isinstance(answer, Answer)]
+
+
+@pytest.mark.parametrize("limit", ["seconds", "memory_mb"])
+def test_a_job_with_a_limit_has_a_process_of_one_thread_for_itself(limit: str, tmp_path: Path) -> None:
+    notes = run(tmp_path, jobs_of(squared, range(4), **{limit: 1000.0}), Processes(2))
+    assert len(set(processes_of(notes))) == 4
+    assert os.getpid() not in processes_of(notes)
+    assert {answer.threads for answer in notes.endings.values() if isinstance(answer, Answer)} == {"1"}
+
+
+def test_quick_jobs_share_a_process_while_it_is_young(tmp_path: Path) -> None:
+    assert len(set(processes_of(run(tmp_path, jobs_of(squared, range(9)), Processes(2))))) == 2
+    slow = run(tmp_path / "slow", jobs_of(slowly, [1.2] * 2), Processes(1))
+    assert len(set(processes_of(slow))) == 2
+
+
+def slowly(seconds: float, _: Reporter) -> Answer:
+    time.sleep(seconds)
+    return Answer(0, os.getpid())
+
+
+def leaves_behind(what: str, _: Reporter) -> Answer:
+    if what == "variable":
+        os.environ["LEFT"] = "behind"
+    elif what == "handler":
+        signal.signal(signal.SIGUSR1, signal.SIG_IGN)
+    elif what == "thread":
+        threading.Thread(target=time.sleep, args=(60,), daemon=True).start()
+    elif what == "child":
+        subprocess.Popen(["sleep", "60"])
+    elif what == "folder":
+        os.chdir("/")
+    elif what == "error":
+        raise DataError("wrong")
+    return Answer(0, os.getpid())
+
+
+@pytest.mark.parametrize("what", ["variable", "handler", "thread", "child", "folder", "error", "nothing"])
+def test_a_job_that_leaves_something_behind_shares_its_process_with_no_later_one(what: str, tmp_path: Path) -> None:
+    first = Job("first", leaves_behind, what)
+    processes = processes_of(run(tmp_path, [Job("before", squared, 1), first, Job("after", squared, 2)], Processes(1)))
+    assert (processes[0] == processes[-1]) == (what == "nothing")
 
 
 def test_one_worker_is_this_process_where_no_isolation_is_needed(tmp_path: Path) -> None:

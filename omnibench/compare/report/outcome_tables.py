@@ -44,7 +44,10 @@ def entry_table(view: DatasetView) -> Table:
                 f"{entry.answers} of {entry.runs}",
                 Cell(fixed(entry.train_median, digits), _spread(entry)),
                 Cell(gap(entry.gap_median), proven(entry.proven_gap_median)),
-                Cell(count(entry.evaluations_median), seconds(entry.seconds_median)),
+                Cell(
+                    count(entry.evaluations_median),
+                    view.time_in_words(entry.seconds_median, entry.reference_evaluations_median),
+                ),
                 _difference(entry),
                 _verdict(view, entry),
                 role="best" if entry.is_best else "plain" if entry.answers else "failed",
@@ -69,7 +72,7 @@ def entry_table(view: DatasetView) -> Table:
         f"{interval_basis(view, view.scored)}. Not told apart: that interval contains zero, "
         "or the difference is below a tenth of the standard error of the best entry's cost; undecided: there is no "
         "interval. Best: the lowest training cost of the entries that are not known to differ from the one of lowest "
-        f"{SPLIT_NAMES[view.scored]} cost.{_held_in_words(view)}",
+        f"{SPLIT_NAMES[view.scored]} cost.{_held_in_words(view)}{_time_in_words(view)}",
     )
 
 
@@ -168,6 +171,18 @@ def _verdict(view: DatasetView, entry: EntryStatistics) -> Cell:
     return Cell("lower cost here", "higher training cost")
 
 
+def _time_in_words(view: DatasetView) -> str:
+    """A sentence on times that are no seconds; empty where they are."""
+    if not view.config.timing:
+        return " The runs were not timed."
+    if view.times_compare:
+        return ""
+    return (
+        " Time: wall time of a run divided by that of one evaluation of the start's cost beside it, since the machines "
+        "differ."
+    )
+
+
 def _held_in_words(view: DatasetView) -> str:
     """A sentence on elements that a box holds, and on the entries concerned; empty where there are none."""
     held: dict[tuple[str, ...], list[str]] = {}
@@ -187,7 +202,12 @@ def _run_row(view: DatasetView, record: RunRecord) -> Row:
         fixed(record.train_cost, 6),
         fixed(record.validation_cost, 6),
         Cell(gap(record.gap), proven(record.proven_gap)),
-        Cell(count(record.evaluations), seconds(record.seconds)),
+        Cell(
+            count(record.evaluations),
+            view.time_in_words(
+                record.seconds, record.seconds / record.reference_seconds if record.reference_seconds else None
+            ),
+        ),
         ", ".join(on_bounds(record)) if answered and on_bounds(record) else NOTHING,
         role="plain" if answered else "failed",
     )

@@ -160,7 +160,7 @@ def _effort_tables(view: DatasetView) -> tuple[Table, ...]:
         for result in view.config.published_results
         if result.seconds is not None and result.entry in entries
     ]
-    if not pairs:
+    if not (pairs and view.times_compare):
         return ()
     rows = [
         Row.of(

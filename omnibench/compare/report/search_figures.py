@@ -62,7 +62,7 @@ def search_section(view: DatasetView) -> Section:
         return Section("searches", "Searches", (Paragraph(words, "note"),), about=_ABOUT, folded=True)
     searches = _Searches(drawn, max(24, _POINTS // len(drawn)), Counter(run.record.label for run in view.runs))
     targets = FigureGrid(
-        tuple(_targets(searches, axis) for axis in AXES),
+        tuple(_targets(searches, axis) for axis in (AXES if view.times_compare else AXES[:1])),
         tuple({course.style.key: course.style for course in drawn}.values()),
         2,
         "Targets are relative gaps above the best known cost in the same box, from 1 down to 1e-8 in equal steps of "

@@ -22,6 +22,7 @@ from omnibench.fit.observations.reference_errors import measured_parts
 from omnibench.fit.uncertainty.ratio_intervals import Interval, Units, units_of
 from omnibench.registry import calibrators
 from omnibench.report.blocks import LegendItem
+from omnibench.report.numbers import NOTHING, count, seconds
 from omnibench.report.style import REFERENCE, SYMBOLS, THEORETICAL, colours
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
@@ -66,6 +67,19 @@ class DatasetView:
     units: Mapping[Split, Units]
     held_out: EntryVerdict | None
     sessions: tuple[str, ...]
+
+    @property
+    def times_compare(self) -> bool:
+        """True if the seconds of runs may be compared: the config times them, and on one machine."""
+        return self.config.timing and len({run.record.machine for run in self.runs if run.record.machine}) < 2
+
+    def time_in_words(self, spent: float | None, references: float | None) -> str:
+        """A time in s; where machines differ, in evaluations of the start's cost there; none of untimed runs."""
+        if not self.config.timing:
+            return NOTHING
+        if self.times_compare:
+            return seconds(spent)
+        return NOTHING if references is None else f"{count(references)} of the start"
 
     @property
     def splits(self) -> tuple[Split, ...]:

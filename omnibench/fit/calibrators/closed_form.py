@@ -134,13 +134,20 @@ def cone_program(problem: CalibrationProblem, objective: SumOfNorms, vector: Arr
     """A program for the best step from ``vector``: the cost with the poses linearised there."""
     from omnibench.fit.loss.sum_of_norms import SumOfNormsProgram
 
+    return SumOfNormsProgram(*program_data(problem, objective, vector))
+
+
+def program_data(
+    problem: CalibrationProblem, objective: SumOfNorms, vector: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Residuals (S, k), jacobian (S, k, n) and bounds (n,) of the step, of which a SumOfNormsProgram is made."""
     matrix = problem.matrix(vector)
     used = np.flatnonzero(objective.weights)
     scale = np.array(objective.weights)[used]
     residuals = (problem.odometry.poses(matrix[None])[0] - problem.reference)[:, used] * scale
     jacobian = (problem.odometry.jacobian(matrix)[:, used] * scale[:, None, None]).reshape(*residuals.shape, -1)
     jacobian = jacobian @ problem.parameterisation.slopes(vector)
-    return SumOfNormsProgram(residuals, jacobian, problem.lower - vector, problem.upper - vector)
+    return residuals, jacobian, problem.lower - vector, problem.upper - vector
 
 
 def _descend(problem: CalibrationProblem, vector: Array, cost: float, step: Array) -> tuple[Array, float, bool]:

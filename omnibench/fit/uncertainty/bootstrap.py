@@ -21,13 +21,34 @@ import numpy as np
 from scipy.special import ndtr, stdtrit
 
 from omnibench.errors import ConfigError
-from omnibench.fit.calibrators.closed_form import cone_program
+from omnibench.fit.calibrators.closed_form import program_data
 from omnibench.fit.cost import SumOfNorms
 from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.fit.uncertainty.intervals import INTERVAL, depending
 from omnibench.fit.uncertainty.ratio_intervals import BOOTSTRAPPED, FEWEST, Units, units_of
-from omnibench.robot.kinematics import Array
+from omnibench.jobs.gathering import gathered
+from omnibench.jobs.job import Backend
+from omnibench.progress import Reporter
+from omnibench.robot.kinematics import Array, JsonArray
+
+_TOGETHER = 25  # resamples of a job, some 0.1 s; fixed, so that every backend solves the same programs
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """Steps (B, n) from the optimum to those of resamples."""
+
+    steps: JsonArray
+
+
+def resampled_steps(part: tuple[tuple[Array, ...], Array], _: Reporter) -> Steps:
+    """Solve resamples, each by its weights of the units; with them the program's data, the stamps' shares and units."""
+    from omnibench.fit.loss.sum_of_norms import SumOfNormsProgram
+
+    (residuals, jacobian, lower, upper, shares, of_stamp), drawn = part
+    program = SumOfNormsProgram(residuals, jacobian, lower, upper)
+    return Steps(np.array([program.step(shares * weights[of_stamp]) for weights in drawn]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,12 +66,14 @@ def bootstrap_intervals(
     units: Units | None = None,
     resamples: int = 400,
     rng: np.random.Generator,
+    backend: Backend | None = None,
 ) -> ElementIntervals:
     """Intervals of the matrix elements about closed_form's ``optimum`` (n,), from three units or more.
 
     units: what is resampled; default: the runs. The optimum of every resample is found with the poses linearised about
     ``optimum``: the error of that is far below the width of the intervals. Elements that depend on a number that the
-    box holds, on a bound of it or stopped by one in the resamples have none. ConfigError for another parameterisation,
+    box holds, on a bound of it or stopped by one in the resamples have none. backend: solves the resamples, which are
+    drawn here, as jobs; the intervals are the same to the bit. ConfigError for another parameterisation,
     another cost than a sum of norms, or fewer units.
     """
     objective = problem.objective
@@ -60,12 +83,14 @@ def bootstrap_intervals(
     count = units.count
     if count < FEWEST:
         raise ConfigError(f"{units.words}: {FEWEST} are needed")
-    program = cone_program(problem, objective, optimum)
     owner = problem.odometry.trajectory
     shares, of_stamp = objective.shares(owner), units.of_run[owner]
     few = count < BOOTSTRAPPED
     drawn = 1 - np.eye(count) if few else rng.multinomial(count, np.full(count, 1 / count), size=resamples)
-    vectors = np.array([optimum + program.step(shares * weights[of_stamp]) for weights in drawn])
+    data = (*program_data(problem, objective, optimum), shares, of_stamp)
+    parts = [(data, drawn[first : first + _TOGETHER]) for first in range(0, len(drawn), _TOGETHER)]
+    steps = gathered(backend, resampled_steps, parts, Steps, shared=(data,))
+    vectors = optimum + np.concatenate([part.steps for part in steps])
     moved = problem.parameterisation.matrices(vectors)
     quantile = float(stdtrit(count - 1, (1 + INTERVAL) / 2))
     if few:

@@ -1,0 +1,243 @@
+"""Backend of a Dask cluster. Results come back to the client, which alone writes the store.
+
+A job's begin, its reports and its end are events from its worker; the future only tells that it is lost. A worker that
+is killed takes its jobs with it, and they are given to another. Their begins are counted here, since the scheduler also
+counts jobs that only waited there. (A scheduler that was not started here tries again by itself, by its own setting
+``allowed-failures``: it may begin a job a fourth time before this hears of it.)
+"""
+
+from __future__ import annotations
+
+import pickle
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from errno import EDQUOT, ENOSPC
+from itertools import islice
+from queue import Empty, SimpleQueue
+from typing import Any, TypeVar
+from uuid import uuid4
+
+from distributed import KilledWorker
+
+from omnibench.errors import DataError
+from omnibench.jobs.dask_worker import Order, Parcel, Told, carry_out, content
+from omnibench.jobs.job import TRIES, BackendError, Ended, Failure, Job, JobWatch
+from omnibench.jobs.job_process import JobEnd, in_job
+from omnibench.jobs.local_backends import InPlace
+from omnibench.jobs.packing import Packer, run_packed
+from omnibench.jobs.result_store import ResultStore
+
+T = TypeVar("T")
+
+_AHEAD = 2  # jobs a slot that are with the cluster: one at work, one that waits for it (chosen)
+_FULL = (ENOSPC, EDQUOT)
+_LOOK = 1.0  # s between two looks at the scheduler and its workers; chosen
+_PARCEL = 0.2  # s of work that travel together: a task costs scheduler, client and worker 5 ms in all, 3 % of that
+_LARGEST_PARCEL = 50  # jobs; chosen
+_WEIGHT = 0.1  # of the latest job's time in the running mean; chosen
+_SUBMISSIONS = 10  # of a job whose workers died before it began, at most: chosen, as it is no fault of its own
+
+
+class SchedulerLostError(BackendError):
+    """The scheduler does not answer any more."""
+
+    exit_code = 1
+
+
+@dataclass(eq=False)
+class _Pending:
+    """A job that is with the cluster, in a parcel: the key of its task."""
+
+    number: int
+    job: Job[Any]
+    parcel: str = ""
+    submissions: int = 0
+    begins: int = 0
+    worker: str = "-"
+
+
+@dataclass
+class DaskBackend:
+    """Runs jobs on the workers of a cluster. requirements: see ``checked_requirements``."""
+
+    client: Any
+    requirements: bytes
+    _packer: Packer = field(default_factory=Packer)
+    _data: dict[str, Any] = field(default_factory=dict)
+
+    def run(self, jobs: Iterable[tuple[int, Job[T]]], store: ResultStore[T], watch: JobWatch[T]) -> Iterator[Ended]:
+        """Run the jobs, see Backend. SchedulerLostError, or UnfitWorkerError of a worker that joined later."""
+        if in_job():
+            yield from InPlace().run(jobs, store, watch)
+            return
+        run = _Run(self, store, watch)
+        waiting = iter(jobs)
+        try:
+            while True:
+                while run.room and (items := [_Pending(*item) for item in islice(waiting, run.parcel_size)]):
+                    run.submit(items)
+                if not run.pending:
+                    return
+                yield from run.ends()
+        finally:
+            run.close()
+
+    def order(self, number: int, job: Job[Any]) -> tuple[Order, dict[str, bytes]]:
+        """A job as it travels, and by their names the data that it shares with others."""
+        packed, shared = self._packer.pack(job)
+        return Order(number, replace(job, function=run_packed, argument=None, shared=()), packed, tuple(shared)), shared
+
+    def data(self, name: str, value: bytes) -> Any:
+        """The future of data, which go to the scheduler once, and from there to each worker that needs them."""
+        if name not in self._data:
+            self._data[name] = self.client.submit(content, value, key=f"omnibench-data-{name}-{uuid4().hex[:8]}")
+        return self._data[name]
+
+
+class _Run:
+    """The jobs of one call of ``run``. pending: those with the cluster, by their numbers."""
+
+    def __init__(self, backend: DaskBackend, store: ResultStore[Any], watch: JobWatch[Any]) -> None:
+        self.pending: dict[int, _Pending] = {}
+        self._backend, self._client, self._store, self._watch = backend, backend.client, store, watch
+        self._topic = f"omnibench-{uuid4().hex[:12]}"
+        self._events: SimpleQueue[bytes] = SimpleQueue()  # of Told, pickled
+        self._client.subscribe_topic(self._topic, lambda event: self._events.put(event[1]))
+        self._futures: dict[str, Any] = {}
+        self._numbers: dict[str, set[int]] = {}  # of the jobs of a parcel that have not ended
+        self._seconds = _PARCEL  # of a job, about
+        self._slots = self._count_slots()
+        self._looked = time.monotonic()
+
+    @property
+    def room(self) -> bool:
+        """True if the cluster is to be given more."""
+        return len(self._futures) < _AHEAD * self._slots
+
+    @property
+    def parcel_size(self) -> int:
+        """Number of jobs that travel together, by the time that those before took."""
+        return min(max(int(_PARCEL / max(self._seconds, 1e-6)), 1), _LARGEST_PARCEL)
+
+    def submit(self, items: Sequence[_Pending]) -> None:
+        """Give jobs to the cluster, in one parcel."""
+        orders: list[Order] = []
+        shared: dict[str, bytes] = {}
+        for item in items:
+            order, data = self._backend.order(item.number, item.job)
+            orders.append(order)
+            shared |= data
+        key = f"{self._topic}-{uuid4().hex[:12]}"
+        futures = [self._backend.data(name, value) for name, value in shared.items()]
+        self._futures[key] = self._client.submit(
+            carry_out,
+            Parcel(self._topic, self._store, tuple(orders), tuple(shared)),
+            self._backend.data("requirements", self._backend.requirements),
+            *futures,
+            key=key,
+            pure=False,
+        )
+        self._numbers[key] = {item.number for item in items}
+        for item in items:
+            item.parcel = key
+            item.submissions += 1
+            self.pending[item.number] = item
+
+    def ends(self) -> Iterator[Ended]:
+        """Wait a moment for events, which are passed on; the jobs that have ended."""
+        events: list[bytes] = []
+        with suppress(Empty):
+            events.append(self._events.get(timeout=_LOOK))
+            while True:
+                events.append(self._events.get_nowait())
+        for event in events:
+            for told in pickle.loads(event):
+                yield from self._told(told)
+        if time.monotonic() - self._looked >= _LOOK:
+            self._slots, self._looked = self._count_slots(), time.monotonic()
+            for key in [*self._futures]:
+                yield from self._lost(key)
+
+    def close(self) -> None:
+        """Cancel what is left."""
+        if self._client.status == "running":
+            self._client.unsubscribe_topic(self._topic)
+            if self._futures:
+                self._client.cancel([*self._futures.values()], force=True)
+
+    def _told(self, told: Told) -> Iterator[Ended]:
+        item = self.pending.get(told.number)
+        if item is None:
+            return
+        if told.fetch:
+            for each in self._futures[item.parcel].result():
+                yield from self._told(each)
+            return
+        if told.progress is not None:
+            self._watch.moved(item.number, told.progress)
+        if told.end is not None:
+            yield self._ended(item, told, told.end)
+        elif told.progress is None:
+            item.begins += 1
+            if item.begins > TRIES:
+                yield self._given_up(item)
+            else:
+                item.worker = told.worker
+                self._watch.began(item.number)
+
+    def _ended(self, item: _Pending, told: Told, end: JobEnd) -> Ended:
+        self._forget(item)
+        self._seconds += _WEIGHT * (told.seconds - self._seconds)
+        failure = end.failure(item.job)
+        if failure is None:
+            self._store.put_content(item.job.key, end.answer)
+        elif isinstance(failure.error, OSError) and failure.error.errno in _FULL:
+            raise DataError(f"worker {told.worker}: {failure.error}; free space there")
+        return Ended(item.number, item.job, failure)
+
+    def _given_up(self, item: _Pending) -> Ended:
+        """The end of a job whose workers were killed too often."""
+        self._forget(item)
+        tries = f"in each of {TRIES} tries" if item.begins >= TRIES else "each time before it began"
+        return Ended(item.number, item.job, Failure(f"its worker was killed {tries} (the last: {item.worker})"))
+
+    def _forget(self, item: _Pending) -> None:
+        """The job is with the cluster no more; nor is its parcel, if it was the last."""
+        del self.pending[item.number]
+        self._numbers[item.parcel].discard(item.number)
+        if not self._numbers[item.parcel]:
+            self._close_parcel(item.parcel)
+
+    def _close_parcel(self, key: str) -> None:
+        del self._numbers[key]
+        future = self._futures.pop(key)
+        if not future.done():  # it would go on with what was given up
+            future.cancel()
+
+    def _lost(self, key: str) -> Iterator[Ended]:
+        """Look whether a parcel's workers were killed so often that the scheduler gave up; its jobs then go alone."""
+        future = self._futures.get(key)
+        if future is None or future.status in ("pending", "finished"):  # whose ends are under way
+            return
+        if future.status != "error":
+            raise SchedulerLostError(f"the Dask scheduler {self._client.scheduler.address} is lost")
+        error = future.exception()
+        if not isinstance(error, KilledWorker):
+            raise error  # of a worker that joined later and is unfit
+        items = [self.pending[number] for number in sorted(self._numbers[key])]
+        self._close_parcel(key)
+        for item in items:
+            if item.begins >= TRIES or item.submissions >= _SUBMISSIONS:
+                self._numbers[item.parcel] = {item.number}
+                self._futures[item.parcel] = future
+                yield self._given_up(item)
+            else:
+                self.submit([item])
+
+    def _count_slots(self) -> int:
+        """Threads of all workers, at least one. SchedulerLostError."""
+        if self._client.status != "running":
+            raise SchedulerLostError(f"the Dask scheduler {self._client.scheduler.address} is lost")
+        return max(sum(self._client.nthreads().values()), 1)

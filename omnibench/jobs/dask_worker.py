@@ -1,0 +1,282 @@
+"""The worker's side of the Dask backend: jobs run in processes of their own beneath the Dask worker.
+
+So limits, isolation and threads are those of the processes of one machine, and results are equal to the bit.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import multiprocessing
+import pickle
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from functools import cache
+from multiprocessing.connection import wait
+from pathlib import Path
+from typing import Any
+
+import distributed
+
+from omnibench.errors import DataError
+from omnibench.files import write_text
+from omnibench.jobs.job import BackendError, Job
+from omnibench.jobs.job_process import JobEnd, JobProcess
+from omnibench.jobs.packing import PackedJob
+from omnibench.jobs.result_store import ResultStore
+from omnibench.jobs.software import differences, software
+from omnibench.processes import one_thread_processes
+from omnibench.progress import Progress, Reporter
+from omnibench.registry import PluginFailure, import_copies
+
+_PERIOD = 0.2  # s between two reports of a job, and two looks whether it is still wanted; chosen
+_TOGETHER, _MOST_TOGETHER = 0.1, 50  # s and ends that wait for each other; chosen
+_LARGEST = 200_000  # bytes of an event: the scheduler keeps a thousand of them, and a run's result has 2 to 50 kB
+_PROBE = 1_000_000  # bytes that a worker must be able to write: a plug-in's file and what a job notes down (chosen)
+
+
+class UnfitWorkerError(BackendError):
+    """A worker on which results could differ from the client's, or that cannot run jobs."""
+
+
+@dataclass(frozen=True)
+class Requirements:
+    """What a worker must have. software: the client's. plugins: text of its plug-in files by path, and which fail."""
+
+    software: Mapping[str, str]
+    plugins: Mapping[Path, str]
+    failing: frozenset[str]
+    preload: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Order:
+    """A job as it travels. content: see ``Packer``; names: of what it shares with others."""
+
+    number: int
+    job: Job[Any]
+    content: bytes
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Parcel:
+    """Jobs that travel together, quick ones. topic: of the events that tell of them. names: of what they share."""
+
+    topic: str
+    store: ResultStore[Any]
+    orders: tuple[Order, ...]
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Told:
+    """Event of a job: it begins (neither progress nor end), reports, or ends, perhaps with a last report.
+
+    seconds: that it took. fetch: ends that are too large for an event are the result of the parcel's task.
+    """
+
+    number: int
+    worker: str
+    progress: Progress | None = None
+    end: JobEnd | None = None
+    seconds: float = 0.0
+    fetch: bool = False
+
+
+def content(data: bytes) -> bytes:
+    """Task that holds data for jobs: where all workers that hold it are lost, the scheduler runs it again."""
+    return data
+
+
+def carry_out(parcel: Parcel, requirements: bytes, *shared: bytes) -> list[Told]:
+    """Task of a parcel's jobs, one after the other. Their ends are told together, those of quick ones; large ones stay.
+
+    UnfitWorkerError: this worker joined after the first job, and is not as it must be.
+    """
+    worker = distributed.get_worker()
+    plugins, preload = prepare(requirements, worker), pickle.loads(requirements).preload
+    teller = _Teller(worker, parcel)
+    data = dict(zip(parcel.names, shared, strict=True))
+    timed = any(order.job.timed for order in parcel.orders)
+    with _slots(worker.state.nthreads if timed else 1, worker.state.nthreads):
+        teller.tell(*(Told(order.number, worker.address) for order in parcel.orders))
+        for order in parcel.orders:
+            packed = PackedJob(order.content, {name: data[name] for name in order.names}, plugins)
+            job, began = replace(order.job, argument=packed), time.monotonic()
+            process = _process_for(job, preload)
+            try:
+                process.give(job, parcel.store.content)
+                progress, end = _follow(process, teller, order.number)
+            except BaseException:
+                process.end()
+                raise
+            if end is None:  # wanted no more
+                process.end()
+                break
+            if end.reusable:
+                _idle.append(process)
+            else:
+                process.end()
+            teller.ended(Told(order.number, worker.address, progress, end, time.monotonic() - began))
+    return teller.close()
+
+
+def prepare(requirements: bytes, worker: Any) -> dict[Path, Path]:
+    """Check a worker, once for the same requirements: copies of plug-in files there. UnfitWorkerError in one line."""
+    with _preparing:
+        return _prepared(requirements, worker.address, Path(worker.local_directory))
+
+
+def check(requirements: bytes, dask_worker: Any) -> str | None:
+    """Why a worker is unfit; None if it is fit."""
+    try:
+        prepare(requirements, dask_worker)
+    except UnfitWorkerError as error:
+        return str(error)
+    return None
+
+
+_preparing = threading.Lock()
+_free = threading.Condition()
+_taken = 0  # slots of this worker
+_idle: list[JobProcess] = []
+_open = ExitStack()
+
+
+@cache
+def _prepared(requirements: bytes, address: str, folder: Path) -> dict[Path, Path]:
+    wanted: Requirements = pickle.loads(requirements)
+    if wrong := differences(software(), wanted.software):
+        raise UnfitWorkerError(
+            f"worker {address} has {', '.join(wrong)}: results could differ; install the same on the worker, or work "
+            "with workers that have it"
+        )
+    copies = folder / f"omnibench-{hashlib.sha256(requirements).hexdigest()[:10]}"
+    plugins = {path: copies / str(number) / path.name for number, path in enumerate(wanted.plugins)}
+    try:
+        write_text(copies / "probe", " " * _PROBE)
+        (copies / "probe").unlink()
+        for path, copy in plugins.items():
+            write_text(copy, wanted.plugins[path])
+    except (OSError, DataError) as error:
+        raise UnfitWorkerError(f"worker {address}: {error}") from None
+    if plugins:
+        failures = _failures(plugins, wanted.preload)
+        for failure in failures:
+            if failure.origin not in wanted.failing:
+                raise UnfitWorkerError(
+                    f"worker {address}: plug-in {failure.origin} cannot be imported there: {failure.error}; install "
+                    "on the worker what it needs"
+                )
+    return plugins
+
+
+def _failures(plugins: Mapping[Path, Path], preload: tuple[str, ...]) -> list[PluginFailure]:
+    """Plug-ins that cannot be imported here, by a process of jobs."""
+    process = JobProcess(_context(preload))
+    process.give(Job("plug-ins", _import_all, plugins), _as_it_is)
+    wait(process.signs)
+    end = process.receive()
+    process.end()
+    assert isinstance(end, JobEnd)
+    return end.answer or []
+
+
+def _import_all(plugins: Mapping[Path, Path], _: Reporter) -> list[PluginFailure]:
+    return import_copies(plugins)
+
+
+def _as_it_is(_: str, result: Any) -> Any:
+    return result
+
+
+def _follow(process: JobProcess, teller: _Teller, number: int) -> tuple[Progress | None, JobEnd | None]:
+    """Wait for a job's end, and report: the last report not yet told, and the end; None if it is wanted no more."""
+    told, last = time.monotonic(), None
+    while True:
+        wait(process.signs, timeout=_PERIOD)
+        while (event := process.receive()) is not None:
+            if isinstance(event, JobEnd):
+                return last, event
+            last = event
+        if time.monotonic() - told >= _PERIOD:
+            told = time.monotonic()
+            if last is not None:
+                teller.tell(Told(number, teller.worker.address, last))
+                last = None
+            if not teller.wanted:
+                return None, None
+
+
+class _Teller:
+    """Tells the client of a parcel's jobs by events, which go by way of the scheduler."""
+
+    def __init__(self, worker: Any, parcel: Parcel) -> None:
+        self.worker = worker
+        self._topic, self._first = parcel.topic, parcel.orders[0].number
+        self._key = worker.get_current_task()
+        self._waiting: list[Told] = []
+        self._large: list[Told] = []
+        self._told = time.monotonic()
+
+    @property
+    def wanted(self) -> bool:
+        """False once the client has cancelled the parcel, or is gone."""
+        task = self.worker.state.tasks.get(self._key)
+        return task is not None and task.state != "cancelled"
+
+    def tell(self, *events: Told) -> None:
+        """Send events."""
+        self.worker.log_event(self._topic, pickle.dumps(events))
+
+    def ended(self, end: Told) -> None:
+        """Send an end, soon."""
+        (self._large if len(pickle.dumps(end)) > _LARGEST else self._waiting).append(end)
+        if time.monotonic() - self._told > _TOGETHER or len(self._waiting) >= _MOST_TOGETHER:
+            self._send()
+
+    def close(self) -> list[Told]:
+        """Send what is left; the ends that are too large for that."""
+        self._send()
+        if self._large:
+            self.tell(Told(self._first, self.worker.address, fetch=True))
+        return self._large
+
+    def _send(self) -> None:
+        if self._waiting:
+            self.tell(*self._waiting)
+        self._waiting, self._told = [], time.monotonic()
+
+
+@contextmanager
+def _slots(wanted: int, all_slots: int) -> Iterator[None]:
+    """Wait for free slots of this worker, all of them for a job that is timed, and take them."""
+    global _taken
+    with _free:
+        _free.wait_for(lambda: _taken + wanted <= all_slots)
+        _taken += wanted
+    try:
+        yield
+    finally:
+        with _free:
+            _taken -= wanted
+            _free.notify_all()
+
+
+def _process_for(job: Job[Any], preload: tuple[str, ...]) -> JobProcess:
+    while _idle:
+        process = _idle.pop()
+        if process.takes(job):
+            return process
+        process.end()
+    return JobProcess(_context(preload))
+
+
+@cache
+def _context(preload: tuple[str, ...]) -> Any:
+    """The context of processes of jobs, for as long as this worker lives."""
+    multiprocessing.current_process().daemon = False  # a nanny's workers may not start processes otherwise
+    return _open.enter_context(one_thread_processes((JobProcess.__module__, __name__, *preload)))

@@ -1,0 +1,236 @@
+"""A process that does jobs, one at a time, and the end of a job as it can travel to whoever asked for it."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from signal import SIG_DFL, SIG_IGN, SIGABRT, SIGHUP, SIGINT, SIGKILL, SIGSEGV, SIGTERM, Signals
+from typing import Any
+
+from omnibench.errors import one_line
+from omnibench.jobs.job import Failure, Job
+from omnibench.jobs.memory import limited_memory, oom_kills
+from omnibench.processes import end_with_parent, interrupts_deferred, main_module_hidden, one_thread
+from omnibench.progress import Progress
+
+# s after its start in which a process takes further jobs: to start one costs 20 ms (tests/benchmarks/job_overhead.py),
+# 2 % of that; what jobs leave behind in it (memory, caches) is that of a second.
+_YOUNG = 1.0
+_CLOSED = 1.0  # s in which a process dies whose end of the connection is closed; chosen
+_FROM_OUTSIDE = (SIGKILL, SIGTERM, SIGHUP, SIGINT)  # signals by which people and the system end processes
+
+_in_job = False  # True in a process of jobs
+
+
+def in_job() -> bool:
+    """True in a process that does a job: there are no further processes beneath."""
+    return _in_job
+
+
+@dataclass(frozen=True)
+class JobEnd:
+    """The end of a job, in parts that any process can read.
+
+    answer: what ``keep`` returned. error: what the job raised, pickled. exit_code: of a process that died without an
+    answer, as of multiprocessing (minus the signal). out_of_memory: the system killed a process meanwhile for lack of
+    memory. over_time: it was ended at its limit. reusable: the process is as it was before the job.
+    """
+
+    answer: Any = None
+    error: bytes | None = None
+    exit_code: int | None = None
+    out_of_memory: bool = False
+    over_time: bool = False
+    reusable: bool = False
+
+    def failure(self, job: Job[Any]) -> Failure | None:
+        """Why the job has no result; None where it has ended well."""
+        if self.over_time:
+            return Failure(f"over time (limit {job.seconds:g} s)", over_time=True)
+        if self.exit_code is not None:
+            return _death(job, self.exit_code, self.out_of_memory)
+        return None if self.error is None else raised(job, pickle.loads(self.error))
+
+
+class JobProcess:
+    """The near end of a process that does jobs. context: of multiprocessing.
+
+    Quick jobs share a process, see ``takes``. Ended, it takes with it all that its jobs started.
+    """
+
+    def __init__(self, context: Any) -> None:
+        self.connection, far = context.Pipe()
+        self._process = context.Process(target=_serve, args=(far,), daemon=True)
+        with interrupts_deferred(), main_module_hidden():
+            self._process.start()
+        far.close()
+        self._since = time.monotonic()
+        self._kills = 0
+        self._fresh = True
+        self.deadline: float | None = None  # of the job, by time.monotonic
+
+    @property
+    def signs(self) -> tuple[Connection, int]:
+        """What multiprocessing's ``wait`` takes: ready when ``receive`` has something to tell."""
+        return self.connection, self._process.sentinel
+
+    def takes(self, job: Job[Any]) -> bool:
+        """True if it may do the job: a job with a limit gets a fresh process, others one that is young."""
+        return self._fresh or not (_alone(job) or time.monotonic() - self._since > _YOUNG)
+
+    def give(self, job: Job[Any], keep: Callable[[str, Any], Any]) -> None:
+        """Begin a job. keep: called there with the key and the result; what it returns is the end's ``answer``."""
+        self._fresh, self._kills = False, oom_kills()
+        self.deadline = None if job.seconds is None else time.monotonic() + job.seconds
+        with suppress(BrokenPipeError, ConnectionResetError):  # it died: ``receive`` tells how
+            self.connection.send((job, keep))
+
+    def receive(self) -> Progress | JobEnd | None:
+        """A report or the end of the job, None if there is none yet. After an end by force the process is gone."""
+        try:
+            if self.connection.poll():
+                message: Progress | JobEnd = self.connection.recv()
+                return message
+        except (EOFError, OSError):  # it is about to die, or a plug-in has closed its end
+            self._process.join(_CLOSED)
+            return self._death()
+        if not self._process.is_alive():
+            with suppress(EOFError, OSError):  # what it sent before it died
+                if self.connection.poll():
+                    last: Progress | JobEnd = self.connection.recv()
+                    return last
+            return self._death()
+        if self.deadline is not None and time.monotonic() >= self.deadline:
+            self.end()
+            return JobEnd(over_time=True)
+        return None
+
+    def _death(self) -> JobEnd:
+        """The end of a job whose process has died; of one that cannot be heard any more, too, which is ended."""
+        code = 1 if self._process.is_alive() else self._process.exitcode or 0
+        self.end()
+        return JobEnd(exit_code=code, out_of_memory=code == -SIGKILL and oom_kills() > self._kills)
+
+    def end(self) -> None:
+        """End the process and all that its jobs started."""
+        with suppress(OSError):  # there is none
+            os.killpg(self._process.pid, SIGKILL)
+        self._process.kill()
+        self._process.join()
+        self.connection.close()
+
+
+def _alone(job: Job[Any]) -> bool:
+    return job.seconds is not None or job.memory_mb is not None
+
+
+def _serve(connection: Connection) -> None:
+    """Do the jobs that come through the connection."""
+    global _in_job
+    _in_job = True
+    signal.signal(SIGINT, SIG_IGN)  # the parent ends it
+    signal.signal(SIGTERM, SIG_DFL)  # end at once: Python's handlers would wait for compiled code
+    os.setpgid(0, 0)  # all that a plug-in starts can be ended with the process
+    threading.Thread(target=end_with_parent, daemon=True).start()
+    process, before = os.getpid(), _condition()
+    with one_thread():
+        while True:
+            try:
+                job, keep = connection.recv()
+            except EOFError:
+                return
+            except Exception as error:  # whatever unpickling raises: a module that is missing here
+                connection.send(JobEnd(error=_sendable(error)))
+                return
+            answer, error_sent = _do(job, keep, connection, process)
+            reusable = error_sent is None and not _alone(job) and _condition() == before and not _has_children()
+            for stream in (sys.stdout, sys.stderr):
+                with suppress(OSError, ValueError):  # closed by a plug-in
+                    stream.flush()
+            try:
+                connection.send(JobEnd(answer, error_sent, reusable=reusable))
+            except OSError:  # a plug-in has closed it
+                os._exit(1)
+
+
+def _do(
+    job: Job[Any], keep: Callable[[str, Any], Any], connection: Connection, process: int
+) -> tuple[Any, bytes | None]:
+    """The answer to a job, or the error that it raised."""
+
+    def report(event: Progress) -> None:
+        with suppress(OSError):  # a plug-in may have closed it
+            connection.send(event)
+
+    try:
+        with limited_memory(job.memory_mb):
+            result = job.function(job.argument, report)
+            if os.getpid() != process:  # a plug-in forked: its copy of this process has no answer to give
+                os._exit(0)
+            return keep(job.key, result), None
+    except BaseException as error:
+        if os.getpid() != process:
+            os._exit(1)
+        return None, _sendable(error)
+
+
+def _condition() -> tuple[Any, ...]:
+    """What a job may change in its process for those that follow."""
+    try:
+        folder = os.getcwd()
+    except OSError:  # it has been removed
+        folder = ""
+    handlers = [signal.getsignal(number) for number in signal.valid_signals()]
+    return folder, dict(os.environ), handlers, threading.active_count(), list(sys.path)
+
+
+def _has_children() -> bool:
+    try:
+        os.waitpid(-1, os.WNOHANG)
+    except ChildProcessError:
+        return False
+    return True
+
+
+class _InWordsError(Exception):
+    """An error in words, in the place of one that cannot be pickled."""
+
+
+def _sendable(error: BaseException) -> bytes:
+    try:
+        content = pickle.dumps(error)
+        pickle.loads(content)
+    except Exception:  # whatever the error's class raises
+        return pickle.dumps(_InWordsError(_in_words(error)))
+    return content
+
+
+def raised(job: Job[Any], error: BaseException) -> Failure:
+    """The failure of a job that raised an error."""
+    if isinstance(error, MemoryError):
+        return Failure(
+            "out of memory" if job.memory_mb is None else f"out of memory (limit {job.memory_mb:g} MB)", error
+        )
+    return Failure(str(error) if isinstance(error, _InWordsError) else _in_words(error), error)
+
+
+def _in_words(error: BaseException) -> str:
+    return one_line(f"{type(error).__name__}: {error}")
+
+
+def _death(job: Job[Any], code: int, out_of_memory: bool) -> Failure:
+    """A process died: by exit code, by a signal of a crash, or by one that came from outside."""
+    how = f"exit code {code}" if code >= 0 else f"killed by {Signals(-code).name}"
+    if out_of_memory:
+        how += ": the system was out of memory"
+    elif code in (-SIGABRT, -SIGSEGV) and job.memory_mb is not None:  # compiled code may end so without memory
+        how += f"; its memory was limited to {job.memory_mb:g} MB"
+    return Failure(f"the process died without an answer ({how})", killed=-code in _FROM_OUTSIDE)

@@ -1,0 +1,175 @@
+"""Dask as a backend: a cluster of this machine keeps what every backend promises, and workers may be killed."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from multiprocessing import parent_process
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from job_samples import Answer, Notes, jobs_of, squared, tried
+from test_jobs import (
+    asleep,
+    killed,
+    killed_once,
+    many_small_objects,
+    two_is_wrong,
+    with_jobs_of_its_own,
+    wrong_in_two_parts,
+)
+
+from omnibench.errors import DataError
+from omnibench.jobs.backend_choice import BackendChoice, open_backend
+from omnibench.jobs.dask_backend import DaskBackend
+from omnibench.jobs.job import Failure, Job, run_jobs
+from omnibench.jobs.packing import Packer
+from omnibench.jobs.result_store import ResultStore
+from omnibench.progress import Progress, Reporter
+
+
+@pytest.fixture(scope="module")
+def dask() -> Iterator[DaskBackend]:
+    said: list[Progress] = []
+    with open_backend(BackendChoice(name="dask", workers=2), report=said.append) as backend:
+        assert [event.result.partition(" http://")[0] for event in said if event.result] == [
+            "2 workers of Dask, dashboard"
+        ]
+        assert isinstance(backend, DaskBackend)
+        yield backend
+
+
+def run(folder: Path, jobs: list[Job[Answer]], backend: DaskBackend) -> Notes:
+    notes = Notes()
+    run_jobs(jobs, ResultStore(folder, Answer), backend, notes)
+    return notes
+
+
+def test_every_job_has_its_result_and_its_progress(dask: DaskBackend, tmp_path: Path) -> None:
+    notes = run(tmp_path, jobs_of(squared, range(7)), dask)
+    assert notes.answers() == {number: number**2 for number in range(7)}
+    assert sorted(notes.began_numbers) == list(range(7))
+    assert dict(notes.moves) == {number: Progress("squaring", number) for number in range(7)}
+    assert {file.name for file in tmp_path.iterdir()} == {f"job-{number}.json" for number in range(7)}
+    assert {answer.threads for answer in notes.endings.values() if isinstance(answer, Answer)} == {"1"}
+    assert run(tmp_path, jobs_of(squared, [0] * 7), dask).reused == set(range(7))
+
+
+def test_what_a_job_raised_comes_back(dask: DaskBackend, tmp_path: Path) -> None:
+    notes = run(tmp_path, [*jobs_of(two_is_wrong, range(4)), Job("two", wrong_in_two_parts, 0)], dask)
+    failure = notes.endings[2]
+    assert isinstance(failure, Failure)
+    assert isinstance(failure.error, DataError)
+    assert (notes.reason(2), notes.reason(4)) == ("DataError: two is wrong", "TwoPartError: one and another")
+    assert [notes.answers()[number] for number in (0, 1, 3)] == [0, 1, 3]
+
+
+def test_limits_hold_on_workers(dask: DaskBackend, tmp_path: Path) -> None:
+    jobs = [Job("time", asleep, 0, seconds=1.0), Job("memory", many_small_objects, tmp_path, memory_mb=400)]
+    notes = run(tmp_path, jobs, dask)
+    assert notes.endings[0] == Failure("over time (limit 1 s)", over_time=True)
+    assert notes.reason(1) == "out of memory (limit 400 MB)"
+    assert (tmp_path / "many_small_objects").stat().st_size == 1
+
+
+def test_within_a_job_there_are_no_further_processes(dask: DaskBackend, tmp_path: Path) -> None:
+    (answer,) = run(tmp_path, jobs_of(with_jobs_of_its_own, [tmp_path]), dask).endings.values()
+    assert isinstance(answer, Answer)
+    assert (answer.number, str(answer.process)) == (3, answer.threads)
+
+
+def moving(_: object, report: Reporter) -> Answer:
+    for step in range(12):
+        report(Progress("moving", step))
+        time.sleep(0.1)
+    return Answer(12)
+
+
+def test_progress_comes_while_a_job_is_at_work_and_not_too_often(dask: DaskBackend, tmp_path: Path) -> None:
+    moves = run(tmp_path, jobs_of(moving, [0]), dask).moves
+    assert 3 <= len(moves) <= 8
+    assert moves[-1] == (0, Progress("moving", 11))
+
+
+def many_numbers(_: object, __: Reporter) -> list[float]:
+    return np.linspace(0, 1, 50_000).tolist()
+
+
+def test_a_result_too_large_for_an_event_arrives(dask: DaskBackend, tmp_path: Path) -> None:
+    store: ResultStore[Any] = ResultStore(tmp_path, list[float])
+    run_jobs([Job(f"large-{number}", many_numbers, number) for number in range(2)], store, dask, Notes())
+    assert [len(store.get(f"large-{number}") or ()) for number in range(2)] == [50_000] * 2
+
+
+def total(shared: tuple[int, np.ndarray], _: Reporter) -> Answer:
+    return Answer(shared[0] + int(shared[1].sum()))
+
+
+def test_data_that_jobs_share_are_pickled_once_and_go_with_none_of_them(dask: DaskBackend, tmp_path: Path) -> None:
+    data = np.ones(1_000_000)
+    jobs = [Job(f"job-{number}", total, (number, data), shared=(data,)) for number in range(30)]
+    assert run(tmp_path, jobs, dask).answers() == {number: 1_000_000 + number for number in range(30)}
+    packer = Packer()
+    packed = [packer.pack(job) for job in jobs]
+    assert max(len(content) for content, _ in packed) < 200
+    assert len({id(value) for _, shared in packed for value in shared.values()}) == 1
+
+
+class TestWorkersThatDie:
+    def test_a_job_whose_process_is_killed_is_tried_three_times(self, dask: DaskBackend, tmp_path: Path) -> None:
+        jobs = [Job("always", killed, (tmp_path, signal.SIGKILL)), Job("once", killed_once, tmp_path)]
+        notes = run(tmp_path / "results", jobs, dask)
+        assert notes.reason(0).endswith("in each of 3 tries")
+        assert (tmp_path / "killed").stat().st_size == 3
+        assert notes.answers()[1] == 2
+
+    def test_a_worker_that_is_killed_loses_nothing(self, dask: DaskBackend, tmp_path: Path) -> None:
+        jobs = [Job("always", kills_its_worker, (tmp_path, 9)), Job("once", kills_its_worker, (tmp_path / "once", 1))]
+        (tmp_path / "once").mkdir()
+        notes = run(tmp_path / "results", [*jobs, *jobs_of(squared, range(20))], dask)
+        assert notes.reason(0).startswith("its worker was killed in each of 3 tries (the last: tcp://127.0.0.1:")
+        assert (tmp_path / "kills").stat().st_size == 3
+        assert [notes.answers()[number] for number in range(1, 22)] == [2, *(number**2 for number in range(20))]
+
+
+def kills_its_worker(order: tuple[Path, int], _: Reporter) -> Answer:
+    """Kill the Dask worker above, so many times."""
+    folder, times = order
+    count = tried(folder, "kills")
+    if count <= times:
+        parent = parent_process()
+        assert parent is not None
+        os.kill(parent.pid, signal.SIGKILL)
+        time.sleep(60)
+    return Answer(count)
+
+
+def noting(folder: Path, _: Reporter) -> Answer:
+    (folder / str(os.getpid())).touch()
+    time.sleep(60)
+    raise AssertionError
+
+
+def test_ctrl_c_ends_what_is_at_work_and_what_waits(dask: DaskBackend, tmp_path: Path) -> None:
+    notes = tmp_path / "notes"
+    notes.mkdir()
+
+    def interrupt() -> None:
+        while len(list(notes.iterdir())) < 2:
+            time.sleep(0.05)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt).start()
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "results", jobs_of(noting, [notes] * 10), dask)
+    deadline = time.monotonic() + 20
+    while any(Path("/proc", file.name).exists() for file in notes.iterdir()):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    assert len(list(notes.iterdir())) == 2
+    assert run(tmp_path, jobs_of(squared, range(3)), dask).answers() == {0: 0, 1: 1, 2: 4}

@@ -1,0 +1,304 @@
+"""Clusters of Dask that an address joins: machines that differ, faults of scheduler and client, TLS."""
+
+from __future__ import annotations
+
+import datetime
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from importlib.metadata import distribution, version
+from pathlib import Path
+
+import pytest
+from commands import ENVIRONMENT, assert_refused, compared, omnibench, search, summary, write_config, write_plugin
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import NameOID
+from dask_samples import program, scheduler, searched_first, worker
+from job_samples import IMPORTING_THIS, Answer, Notes, jobs_of, wait_for
+
+import omnibench as package
+from omnibench.errors import ConfigError, OmnibenchError
+from omnibench.jobs.backend_choice import BackendChoice, check_backend, open_backend
+from omnibench.jobs.job import BackendError, JobWatch, run_jobs
+from omnibench.jobs.result_store import ResultStore
+from omnibench.jobs.scheduler_tls import TlsFiles
+from omnibench.progress import Reporter
+
+PACKAGE = Path(package.__file__).parent
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """A scheduler that runs for all tests here."""
+    with scheduler(tmp_path_factory.mktemp("scheduler")) as (place, _):
+        yield place
+
+
+def refusal(name: str, **others: object) -> str:
+    """The one line of a backend that cannot be opened."""
+    with pytest.raises(OmnibenchError) as refused, open_backend(BackendChoice(name=name, **others)):
+        pass
+    assert refused.value.exit_code == 2
+    return str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("dusk", "unknown backend 'dusk'; did you mean 'dask'? known: processes, dask, tcp://HOST:PORT, tls://HOST:PO"),
+        ("tcp://127.0.0.1", "unknown backend 'tcp://127.0.0.1'; known:"),
+        ("tls://127.0.0.1:8786", "name the files of TLS, ca, cert and key (--tls-ca, --tls-cert, --tls-key)"),
+    ],
+)
+def test_a_wrong_backend_is_named(name: str, message: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        check_backend(name)
+    assert message in str(refused.value)
+
+
+def test_a_scheduler_that_nobody_started_is_one_line_soon(tmp_path: Path) -> None:
+    began = time.monotonic()
+    run = omnibench("compare", write_config(tmp_path), "-o", tmp_path / "out", "--backend", "tcp://127.0.0.1:9")
+    assert_refused(run, "no Dask scheduler answers at tcp://127.0.0.1:9", "start one (dask scheduler)")
+    assert time.monotonic() - began < 60
+
+
+def test_without_dask_one_line_names_the_extra(tmp_path: Path) -> None:
+    without = "import sys; sys.modules['distributed'] = None; from omnibench.__main__ import main; main()"
+    command = [sys.executable, "-c", without, "compare", str(write_config(tmp_path)), "--backend", "dask"]
+    run = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert_refused(run, 'backend dask: Dask is not installed; pip install "omnibench[dask]"')
+
+
+def test_dask_is_imported_only_where_it_is_asked_for() -> None:
+    program = "import sys, omnibench.compare.run, omnibench.cli.app; print('distributed' in sys.modules)"
+    run = subprocess.run([sys.executable, "-c", program], env=ENVIRONMENT, capture_output=True, text=True, check=True)
+    assert run.stdout == "False\n"
+
+
+def test_a_worker_with_other_code_is_refused_before_the_first_job(address: str, tmp_path: Path) -> None:
+    shutil.copytree(PACKAGE, tmp_path / "other" / "omnibench", ignore=shutil.ignore_patterns("__pycache__"))
+    with (tmp_path / "other" / "omnibench" / "words.py").open("a") as file:
+        file.write("# another version\n")
+    with worker(address, tmp_path / "worker", environment=searched_first(tmp_path / "other")):
+        run = omnibench("compare", write_config(tmp_path), "-o", tmp_path / "out", "--backend", address)
+    assert_refused(run, "error: worker tcp://127.0.0.1:", " has omnibench's code ", "install the same on the worker")
+    assert not list((tmp_path / "out").glob("runs/*"))
+
+
+def pretended(folder: Path, name: str, number: str) -> Path:
+    """A folder whose metadata say that a package has another version."""
+    metadata = folder / f"{name}-{number}.dist-info"
+    shutil.copytree(next(iter(Path(str(distribution(name).locate_file(""))).glob(f"{name}-*.dist-info"))), metadata)
+    text = (metadata / "METADATA").read_text(encoding="utf-8")
+    (metadata / "METADATA").write_text(text.replace(f"Version: {version(name)}\n", f"Version: {number}\n", 1))
+    return folder
+
+
+@pytest.mark.parametrize("name", ["scipy", "dask"])
+def test_a_worker_with_another_version_of_a_package_is_refused(name: str, address: str, tmp_path: Path) -> None:
+    environment = searched_first(pretended(tmp_path / "other", name, "1.2.3"))
+    with worker(address, tmp_path / "worker", environment=environment):
+        assert f"has {name} 1.2.3 (here: {version(name)}): results could differ" in refusal(address)
+
+
+def test_a_scheduler_of_another_version_is_refused(tmp_path: Path) -> None:
+    environment = searched_first(pretended(tmp_path / "other", "distributed", "2024.1.0"))
+    with scheduler(tmp_path, environment=environment) as (place, _), worker(place, tmp_path / "worker"):
+        assert f"scheduler {place} has distributed 2024.1.0 (here: {version('distributed')})" in refusal(place)
+
+
+def test_a_full_disk_of_a_worker_is_one_line(address: str, tmp_path: Path) -> None:
+    starts = "import resource as r; r.setrlimit(r.RLIMIT_FSIZE, (500_000, 500_000)); "
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "sitecustomize.py").write_text(starts)
+    with worker(address, tmp_path / "worker", environment=searched_first(tmp_path / "full")):
+        line = refusal(address)
+    assert line.startswith("worker tcp://127.0.0.1:")
+    assert str(tmp_path / "worker") in line
+    assert "cannot be written: File too large; free space" in line
+
+
+NEEDS = """
+import only_here
+
+@calibrators.register("needs")
+class Needs(Calibrator):
+    "Needs a package."
+
+    def calibrate(self, problem):
+        return Solution(problem.start, only_here.REASON)
+"""
+
+
+class TestPlugins:
+    @pytest.fixture
+    def config(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+        """A comparison with a plug-in that imports a package which only this machine has."""
+        (tmp_path / "packages").mkdir()
+        (tmp_path / "packages" / "only_here.py").write_text("REASON = 'from a package'\n")
+        monkeypatch.setitem(ENVIRONMENT, "PYTHONPATH", searched_first(tmp_path / "packages")["PYTHONPATH"])
+        plugins = write_plugin(tmp_path / "plugins", "needs", NEEDS)
+        return write_config(tmp_path, plugins=[str(plugins)], calibrators=["theoretical", "needs"])
+
+    def test_a_package_that_a_worker_lacks_is_named_before_the_first_job(
+        self, config: Path, address: str, tmp_path: Path
+    ) -> None:
+        with worker(address, tmp_path / "worker"):
+            run = omnibench("compare", config, "-o", tmp_path / "out", "--backend", address)
+        assert_refused(run, "needs.py cannot be imported there: ModuleNotFoundError: No module named 'only_here'")
+        assert not list((tmp_path / "out").glob("runs/*"))
+
+    def test_a_plugin_file_travels_to_a_machine_that_does_not_have_it(
+        self, config: Path, address: str, tmp_path: Path
+    ) -> None:
+        hidden = tmp_path / "elsewhere"
+        with worker(address, tmp_path / "worker", environment=searched_first(tmp_path / "packages")):
+            process = subprocess.Popen(
+                [sys.executable, "-c", MOVES, str(config), str(tmp_path / "out"), address, str(hidden)], env=ENVIRONMENT
+            )
+            assert process.wait(timeout=60) == 0
+        (row,) = [run for run in summary(tmp_path / "out")["runs"] if run["calibrator"] == "needs"]
+        assert (row["outcome"], row["reason"]) == ("converged", "from a package")
+
+
+MOVES = """
+import sys
+from pathlib import Path
+import omnibench
+from omnibench.compare.read_config import read_compare_config
+
+config = read_compare_config(sys.argv[1]).model_copy(update={"backend": sys.argv[3]})
+
+def move(event):  # once the client has read it, no machine has the file where it was
+    if event.task.endswith("needs seed 1") and config.plugins[0].exists():
+        config.plugins[0].rename(sys.argv[4])
+
+omnibench.run_comparison(config, Path(sys.argv[2]), move)
+"""
+
+
+def slow(number: int, _: Reporter) -> Answer:
+    time.sleep(0.5)
+    return Answer(number)
+
+
+class After(JobWatch[Answer]):
+    """Does something when the first job has begun."""
+
+    def __init__(self, action: Callable[[], object]) -> None:
+        self._action, self._done = action, False
+
+    def began(self, number: int) -> None:  # noqa: ARG002
+        if not self._done:
+            self._done = True
+            self._action()
+
+
+def test_a_scheduler_that_is_killed_is_one_line(tmp_path: Path) -> None:
+    with scheduler(tmp_path) as (place, process), worker(place, tmp_path / "worker"):
+        store = ResultStore(tmp_path / "results", Answer)
+        with (
+            pytest.raises(BackendError, match=f"the Dask scheduler {place} is lost"),
+            open_backend(BackendChoice(name=place)) as backend,
+        ):
+            run_jobs(jobs_of(slow, range(100)), store, backend, After(process.kill))
+
+
+def test_a_worker_that_joins_later_is_checked(address: str, tmp_path: Path) -> None:
+    environment = searched_first(pretended(tmp_path / "other", "polars", "0.1"))
+    with (
+        worker(address, tmp_path / "first"),
+        program(tmp_path / "log", "worker", address, "--nthreads", "1", environment=environment) as late,
+        open_backend(BackendChoice(name=address)) as backend,
+    ):
+        assert late.poll() is None  # it takes longer to start than the check of those that are there
+        with pytest.raises(BackendError, match=r"has polars 0.1 \(here: "):
+            run_jobs(jobs_of(slow, range(100)), ResultStore(tmp_path / "results", Answer), backend, Notes())
+
+
+CLIENT = """
+import sys
+from pathlib import Path
+from job_samples import Answer, Notes, jobs_of
+from test_dask_clusters import sleeping
+from omnibench.jobs.backend_choice import BackendChoice, open_backend
+from omnibench.jobs.job import run_jobs
+from omnibench.jobs.result_store import ResultStore
+with open_backend(BackendChoice(name=sys.argv[1])) as backend:
+    folder = Path(sys.argv[2])
+    run_jobs(jobs_of(sleeping, [folder] * 5), ResultStore(folder / "store", Answer), backend, Notes())
+"""
+
+
+def sleeping(folder: Path, _: Reporter) -> Answer:
+    while not (folder / "go_on").exists():
+        (folder / "alive").touch()
+        time.sleep(0.05)
+    return Answer(1)
+
+
+def test_when_the_client_is_killed_its_jobs_end_and_it_goes_on_when_started_again(address: str, tmp_path: Path) -> None:
+    command = [sys.executable, "-c", CLIENT, address, str(tmp_path)]
+    with worker(address, tmp_path / "worker"):
+        client = subprocess.Popen(command, env=IMPORTING_THIS)
+        wait_for((tmp_path / "alive").exists)
+        client.kill()
+        client.wait()
+        wait_for(lambda: time.time() - (tmp_path / "alive").stat().st_mtime > 1)
+        (tmp_path / "go_on").touch()
+        subprocess.run(command, env=IMPORTING_THIS, check=True, timeout=60)
+    assert len(list((tmp_path / "store").glob("*.json"))) == 5
+
+
+def test_a_comparison_over_tls_equals_one_by_processes(tmp_path: Path) -> None:
+    ca, cert, key = certificates(tmp_path)
+    tls = ("--tls-ca-file", str(ca), "--tls-cert", str(cert), "--tls-key", str(key))
+    config = write_config(tmp_path, calibrators=["theoretical", "closed_form", search(candidates=100)])
+    with scheduler(tmp_path, *tls) as (place, _), worker(place, tmp_path / "worker", *tls):
+        assert place.startswith("tls://")
+        files = ("--tls-ca", ca, "--tls-cert", cert, "--tls-key", key)
+        compared(config, tmp_path / "tls", "--backend", place, *files)
+        other = certificates(tmp_path / "other")
+        line = refusal(place, tls=TlsFiles(ca=other[0], cert=other[1], key=other[2]))
+        assert line.startswith(f"no Dask scheduler answers at {place} (")
+    compared(config, tmp_path / "processes")
+    assert without_times(tmp_path / "tls") == without_times(tmp_path / "processes")
+
+
+def without_times(output: Path) -> list[dict[str, object]]:
+    timed = ("seconds", "reference_seconds")
+    return [{name: value for name, value in run.items() if name not in timed} for run in summary(output)["runs"]]
+
+
+def certificates(folder: Path) -> tuple[Path, Path, Path]:
+    """An authority's certificate, and one of its own with the key, for scheduler, workers and client."""
+    folder.mkdir(exist_ok=True)
+    authority_key, key = (ec.generate_private_key(ec.SECP256R1()) for _ in range(2))
+    authority = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "test authority")])
+    now = datetime.datetime.now(datetime.UTC)
+
+    def certificate(subject: x509.Name, of_key: ec.EllipticCurvePrivateKey, *, is_ca: bool) -> x509.Certificate:
+        builder = x509.CertificateBuilder().subject_name(subject).issuer_name(authority).public_key(of_key.public_key())
+        builder = builder.serial_number(x509.random_serial_number())
+        builder = builder.not_valid_before(now - datetime.timedelta(days=1))
+        builder = builder.not_valid_after(now + datetime.timedelta(days=1))
+        builder = builder.add_extension(x509.BasicConstraints(ca=is_ca, path_length=None), critical=True)
+        return builder.sign(authority_key, hashes.SHA256())
+
+    contents = {
+        "ca.pem": certificate(authority, authority_key, is_ca=True).public_bytes(serialization.Encoding.PEM),
+        "cert.pem": certificate(
+            x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "cluster")]), key, is_ca=False
+        ).public_bytes(serialization.Encoding.PEM),
+        "key.pem": key.private_bytes(
+            serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+        ),
+    }
+    for name, content in contents.items():
+        (folder / name).write_bytes(content)
+    return folder / "ca.pem", folder / "cert.pem", folder / "key.pem"
