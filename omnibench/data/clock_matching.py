@@ -23,7 +23,7 @@ that are summed over blocks, as slip lasts.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -117,19 +117,16 @@ def match_clocks(robot: Robot, runs: Sequence[Streams], search: float = _SEARCH)
     return [None if each is None else next(matches) for each in windows]
 
 
-def match_each_clock(
-    robot: Robot, some: Sequence[Streams], runs: Iterable[Streams], search: float = _SEARCH
-) -> list[ClockMatch | None]:
-    """The clock of the reference in every one of many runs, as match_clocks, one run at a time.
+def fitted_together(robot: Robot, runs: Sequence[Streams], search: float = _SEARCH) -> list[Array] | None:
+    """The coefficients h and s of Eq. (2) and (3) that fit some runs best; None where these tell nothing."""
+    usable = [each for each in (_Windows.of(robot, run) for run in runs) if each is not None]
+    return _fitted_together(usable, search)[0] if usable else None
 
-    h and s of Eq. (2) and (3) are those that fit ``some`` of them.
-    """
-    usable = [each for each in (_Windows.of(robot, run) for run in some) if each is not None]
-    if not usable:
-        return [None for _ in runs]
-    fitted, _ = _fitted_together(usable, search)
-    windows = (_Windows.of(robot, run) for run in runs)
-    return [None if each is None else each.match(fitted, each.settled(fitted, search), search) for each in windows]
+
+def match_clock(robot: Robot, run: Streams, fitted: Sequence[Array], search: float = _SEARCH) -> ClockMatch | None:
+    """The clock of the reference in one run, as match_clocks, by coefficients that fit runs of the same robot."""
+    windows = _Windows.of(robot, run)
+    return None if windows is None else windows.match(fitted, windows.settled(fitted, search), search)
 
 
 def _fitted_together(windows: Sequence[_Windows], search: float) -> tuple[list[Array], list[Clock]]:

@@ -4,20 +4,28 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
+from typing import Any, TypeVar
 
 import numpy as np
 
-from omnibench.robot.kinematics import Array
+from omnibench.jobs.gathering import gathered
+from omnibench.jobs.job import Backend
+from omnibench.progress import Reporter
+from omnibench.robot.kinematics import Array, JsonArray
 from omnibench.robot.odometry import Complex, Integration, OdometryBatch, RunSamples, WheelLog
 from omnibench.robot.path_sums import path_sums
 
 # Samples up to which an OdometryBatch holds them, in 0.1 kB each of three wheels (chosen: beyond, reading them anew and
 # summing in compiled code takes a tenth of the time, too).
 _HELD = 1_000_000
+Sampled = TypeVar("Sampled", bound=Any)  # a log, or a run
 _TOGETHER = 500_000  # samples that are read together (chosen: as many as a block of a stored table)
+_PARTS_OF_A_JOB = 4  # read together one after another: some 0.1 s of work (chosen)
 _MATRICES = 3  # whose poses are kept: a descent goes on from one of the last (chosen)
 
 
@@ -31,11 +39,11 @@ def are_many(logs: Sequence[WheelLog]) -> bool:
     return sum(len(log.times) for log in logs) > _HELD
 
 
-def together(logs: Iterable[WheelLog], samples: int = _TOGETHER) -> Iterator[list[WheelLog]]:
-    """Logs in parts of about so many samples."""
-    part, count = list[WheelLog](), 0
+def together(logs: Iterable[Sampled], samples: int | None = None) -> Iterator[list[Sampled]]:
+    """Logs, or runs, in parts of about so many samples, as many as are read at a time by default."""
+    part, count = list[Sampled](), 0
     for log in logs:
-        if part and count + len(log.times) > samples:
+        if part and count + len(log.times) > (samples or _TOGETHER):
             yield part
             part, count = [], 0
         part.append(log)
@@ -45,12 +53,39 @@ def together(logs: Iterable[WheelLog], samples: int = _TOGETHER) -> Iterator[lis
 
 
 @dataclass(frozen=True, eq=False)
-class _AtStamps:
-    """Sums at the stamps for one matrix, see path_sums; slopes: None where they were not asked for."""
+class AtStamps:
+    """Sums at the stamps for one matrix, see path_sums. slopes (2, S, 2 M): real and imaginary parts of row_12 and of
+    row_3 by turns; None where they were not asked for.
+    """
 
-    moved: Array
-    driven: Array
-    slopes: tuple[Complex, Complex] | None
+    moved: JsonArray
+    driven: JsonArray
+    slopes: JsonArray | None
+
+
+@dataclass(frozen=True, eq=False)
+class AtStampsOfMatrices:
+    """Sums at the stamps for each of some matrices."""
+
+    sums: tuple[AtStamps, ...]
+
+
+_WORKERS: ContextVar[Backend | None] = ContextVar("workers", default=None)
+
+
+def workers() -> Backend | None:
+    """The backend whose workers read many logs; None: this process does."""
+    return _WORKERS.get()
+
+
+@contextmanager
+def read_by(backend: Backend | None) -> Iterator[None]:
+    """Let the workers of a backend read and sum the samples of many logs, which gives the same to the bit."""
+    before = _WORKERS.set(backend)
+    try:
+        yield
+    finally:
+        _WORKERS.reset(before)
 
 
 class StoredOdometry(OdometryBatch):
@@ -67,7 +102,7 @@ class StoredOdometry(OdometryBatch):
         starts = np.array([log.start for log in logs])[self.trajectory]
         self._start, self._turn = starts, np.exp(1j * starts[:, 2])
         self._signals = logs[0].signals.shape[1]
-        self._kept: OrderedDict[bytes, _AtStamps] = OrderedDict()
+        self._kept: OrderedDict[bytes, AtStamps] = OrderedDict()
         self._descends = False
 
     @cached_property
@@ -91,7 +126,8 @@ class StoredOdometry(OdometryBatch):
         self._descends = True
         sums = self._of(matrix, slopes=True)
         assert sums.slopes is not None  # they were asked for
-        return self._as_jacobian(*sums.slopes, sums.driven)
+        row_12, row_3 = np.ascontiguousarray(sums.slopes).view(complex)
+        return self._as_jacobian(row_12, row_3, sums.driven)
 
     def position_design(self, headings: Iterable[Array]) -> Complex:
         """Regressors (S, M) of positions for given headings, see OdometryBatch."""
@@ -103,7 +139,7 @@ class StoredOdometry(OdometryBatch):
             ]
         )
 
-    def _of(self, matrix: Array, slopes: bool) -> _AtStamps:
+    def _of(self, matrix: Array, slopes: bool) -> AtStamps:
         key = np.ascontiguousarray(matrix, dtype=float).tobytes()
         kept = self._kept.get(key)
         if kept is None or (slopes and kept.slopes is None):
@@ -113,39 +149,61 @@ class StoredOdometry(OdometryBatch):
             self._kept[key] = kept
         return kept
 
-    def _of_all(self, matrices: Sequence[Array] | Array, slopes: bool) -> list[_AtStamps]:
+    def _of_all(self, matrices: Sequence[Array] | Array, slopes: bool) -> list[AtStamps]:
         """The sums for some matrices, by one reading of the samples."""
-        parts = [[_sums(*part, matrix, self.integration, slopes) for matrix in matrices] for part in self._read()]
+        tasks = [(part, list(matrices), self.integration, slopes) for part in together(self._logs, self._of_a_job)]
+        parts = [part.sums for part in gathered(workers(), sums_of_logs, tasks, AtStampsOfMatrices)]
         return [_joined([of_part[index] for of_part in parts]) for index in range(len(matrices))]
 
-    def _read(self) -> Iterator[tuple[RunSamples, Array, list[Array]]]:
-        """Samples, signals (F, M) and stamps of the logs, some at a time."""
-        for part in together(self._logs):
-            samples = RunSamples.of([np.asarray(log.times) for log in part])
-            signals = np.concatenate([np.asarray(log.signals) for log in part])
-            yield samples, signals, [log.stamps for log in part]
+    @property
+    def _of_a_job(self) -> int:
+        """Samples that are summed in a job, or at a time here."""
+        return _TOGETHER if workers() is None else _PARTS_OF_A_JOB * _TOGETHER
 
 
-def _sums(
-    samples: RunSamples, signals: Array, stamps: Sequence[Array], matrix: Array, integration: Integration, slopes: bool
-) -> _AtStamps:
-    edges = np.cumsum([0, *map(len, stamps)])
-    count, size = int(edges[-1]), signals.shape[1]
+def sums_of_logs(
+    task: tuple[Sequence[WheelLog], Sequence[Array], Integration, bool], _: Reporter
+) -> AtStampsOfMatrices:
+    """The sums of some logs for some matrices. The task: logs, matrices, integration, and whether slopes are wanted."""
+    logs, matrices, integration, slopes = task
+    parts = [[_sums(part, matrix, integration, slopes) for matrix in matrices] for part in _read(logs)]
+    return AtStampsOfMatrices(tuple(_joined([of_part[index] for of_part in parts]) for index in range(len(matrices))))
+
+
+@dataclass(frozen=True, eq=False)
+class _Read:
+    """Samples, signals (F, M) and stamps of some logs."""
+
+    samples: RunSamples
+    signals: Array
+    stamps: list[Array]
+
+
+def _read(logs: Sequence[WheelLog]) -> Iterator[_Read]:
+    """The logs, some at a time."""
+    for part in together(logs):
+        samples = RunSamples.of([np.asarray(log.times) for log in part])
+        signals = np.concatenate([np.asarray(log.signals) for log in part])
+        yield _Read(samples, signals, [log.stamps for log in part])
+
+
+def _sums(part: _Read, matrix: Array, integration: Integration, slopes: bool) -> AtStamps:
+    edges = np.cumsum([0, *map(len, part.stamps)])
+    count, size = int(edges[-1]), part.signals.shape[1]
     moved, driven = np.empty((count, 2)), np.empty((count, size))
-    row_12, row_3 = (np.empty((count if slopes else 1, size), dtype=complex) for _ in range(2))
+    rows = np.empty((2, count if slopes else 1, size), dtype=complex)
     path_sums(
-        samples.times, signals, samples.edges, np.concatenate(stamps), edges, np.ascontiguousarray(matrix),
-        integration == "arc", slopes, moved, row_12, row_3, driven,
+        part.samples.times, part.signals, part.samples.edges, np.concatenate(part.stamps), edges,
+        np.ascontiguousarray(matrix), integration == "arc", slopes, moved, rows[0], rows[1], driven,
     )  # fmt: skip
-    return _AtStamps(moved, driven, (row_12, row_3) if slopes else None)
+    return AtStamps(moved, driven, rows.view(float) if slopes else None)
 
 
-def _joined(parts: Sequence[_AtStamps]) -> _AtStamps:
+def _joined(parts: Sequence[AtStamps]) -> AtStamps:
     """The sums of parts one after another."""
     slopes = [part.slopes for part in parts if part.slopes is not None]
-    row_12, row_3 = ([each[row] for each in slopes] for row in range(2))
-    return _AtStamps(
+    return AtStamps(
         np.concatenate([part.moved for part in parts]),
         np.concatenate([part.driven for part in parts]),
-        (np.concatenate(row_12), np.concatenate(row_3)) if slopes else None,
+        np.concatenate(slopes, axis=1) if slopes else None,
     )

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from omnibench.data.checks.finding import Finding, Severity
 from omnibench.data.checks.stream_faults import runs_in_words
-from omnibench.data.clock_matching import ClockMatch, Streams, match_clocks, match_each_clock
+from omnibench.data.clock_matching import ClockMatch, Streams, fitted_together, match_clock, match_clocks
 from omnibench.data.dataset import Trajectory
 from omnibench.data.stored.drawn_runs import MOST_DRAWN, drawn_runs
+from omnibench.jobs.gathering import gathered
+from omnibench.progress import Reporter
 from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.odometry_of_stored import together, workers
 
 # s that a clock must be off, and in standard errors, to be told (chosen: simulated runs, whose clocks are right, are
 # below); from _SPOILS, s, on it spoils a fit.
@@ -24,12 +28,31 @@ _USUAL = 500
 _TOGETHER = 600_000  # wheel samples of the runs by which coefficients of very many are found: 100 of a minute (chosen)
 
 
+@dataclass(frozen=True)
+class Clocks:
+    """The clock of the reference of each of some runs; None where it does not show."""
+
+    of_runs: tuple[ClockMatch | None, ...]
+
+
 def clocks_of(robot: Robot, runs: Sequence[Trajectory]) -> list[ClockMatch | None]:
-    """The clock of every run's reference; None where it does not show."""
+    """The clock of every run's reference; None where it does not show.
+
+    Of very many runs those that chance has drawn tell what all have in common, and then each is matched by itself.
+    """
     if sum(len(run.times) for run in runs) <= MOST_DRAWN:
         return match_clocks(robot, [Streams.of_run(run) for run in runs])
-    some = [Streams.of_run(run) for run in drawn_runs(runs, _TOGETHER)]
-    return match_each_clock(robot, some, map(Streams.of_run, runs))
+    fitted = fitted_together(robot, [Streams.of_run(run) for run in drawn_runs(runs, _TOGETHER)])
+    if fitted is None:
+        return [None] * len(runs)
+    tasks = [(robot, part, fitted) for part in together(runs)]
+    return [clock for part in gathered(workers(), clocks_of_part, tasks, Clocks) for clock in part.of_runs]
+
+
+def clocks_of_part(task: tuple[Robot, Sequence[Trajectory], Sequence[Array]], _: Reporter) -> Clocks:
+    """The clocks of some runs, of which the task names the robot, the runs and the coefficients."""
+    robot, runs, fitted = task
+    return Clocks(tuple(match_clock(robot, Streams.of_run(run), fitted) for run in runs))
 
 
 def clock_findings(runs: Sequence[Trajectory], clocks: Sequence[ClockMatch | None]) -> Iterator[Finding]:
