@@ -8,16 +8,24 @@ from typing import Annotated, Literal
 import typer
 
 from omnibench.cli.options import (
+    BackendName,
     CalibrationFile,
     DatasetFolders,
     Force,
     Json,
     Plugins,
     Settings,
+    TlsAuthority,
+    TlsCertificate,
+    TlsKey,
+    Workers,
+    asked_backend,
     load_given_plugins,
     output_option,
+    tls_files,
 )
 from omnibench.cli.terminal.console import make_console, print_ending, print_json, print_verdict, warn
+from omnibench.errors import ConfigError
 
 calibration_app = typer.Typer()
 
@@ -81,6 +89,11 @@ def calibrate(
     steering: Annotated[
         Literal["known", "fit"], typer.Option(help="fit: first find its gain, play and coupling, and a car's zero.")
     ] = "known",
+    backend: BackendName = None,
+    workers: Workers = None,
+    tls_ca: TlsAuthority = None,
+    tls_cert: TlsCertificate = None,
+    tls_key: TlsKey = None,
     settings: Settings = None,
     force: Force = False,
     plugins: Plugins = None,
@@ -107,7 +120,14 @@ def calibrate(
         costs.entry(cost, "--cost")
     refuse_existing(output, force=force)
     recordings = load_dataset(dataset)
-    with redirect_stdout(sys.stderr), ProgressDisplay() as watch:
+    tls, preload = tls_files(tls_ca, tls_cert, tls_key), ("omnibench.fit.uncertainty.bootstrap",)
+    if backend is not None and not intervals:
+        raise ConfigError("--backend is for the resamples of --intervals; give both, or leave it out")
+    with (
+        redirect_stdout(sys.stderr),
+        ProgressDisplay() as watch,
+        asked_backend(backend, workers, tls, preload, watch) as jobs,
+    ):
         run = fit(
             recordings,
             calibrator,
@@ -125,6 +145,7 @@ def calibrate(
             mount=mount,
             steering=steering,
             watch=watch,
+            backend=jobs,
         )
     calibration, result = run.calibration, run.result
     if output is not None:
@@ -195,6 +216,11 @@ def certify(
     parts: Annotated[
         int | None, typer.Option(min=1, help="Stop after so many parts of the box: a limit that no machine changes.")
     ] = None,
+    backend: BackendName = None,
+    workers: Workers = None,
+    tls_ca: TlsAuthority = None,
+    tls_cert: TlsCertificate = None,
+    tls_key: TlsKey = None,
     plugins: Plugins = None,
     as_json: Json = False,
 ) -> None:
@@ -210,9 +236,17 @@ def certify(
 
     load_given_plugins(plugins)
     recordings = load_dataset(dataset)
-    with ProgressDisplay() as watch:
+    tls, preload = tls_files(tls_ca, tls_cert, tls_key), ("omnibench.fit.certify",)
+    with ProgressDisplay() as watch, asked_backend(backend, workers, tls, preload, watch) as jobs:
         certified = certify_optimum(
-            read_calibration(calibration), recordings, box=box, gap=gap, seconds=seconds, parts=parts, watch=watch
+            read_calibration(calibration),
+            recordings,
+            box=box,
+            gap=gap,
+            seconds=seconds,
+            parts=parts,
+            watch=watch,
+            backend=jobs,
         )
     warn(recordings.warnings)
     if not certified.inside:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import sys
-from collections.abc import Sequence
-from contextlib import redirect_stdout
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -14,7 +15,9 @@ from omnibench.cli.terminal.console import warn
 from omnibench.errors import ConfigError, PluginError
 
 if TYPE_CHECKING:
+    from omnibench.jobs.job import Backend
     from omnibench.jobs.scheduler_tls import TlsFiles
+    from omnibench.progress import Reporter
     from omnibench.registry import PluginFailure
     from omnibench.report.blocks import Document
 
@@ -72,6 +75,9 @@ TlsAuthority = Annotated[
 TlsCertificate = Annotated[
     Path | None, typer.Option("--tls-cert", metavar="FILE", help="For tls://: this client's certificate.")
 ]
+Workers = Annotated[
+    int | None, typer.Option(min=1, help="For --backend: processes, or Dask workers started here. Default: processors.")
+]
 TlsKey = Annotated[Path | None, typer.Option("--tls-key", metavar="FILE", help="For tls://: this client's key.")]
 PluginFiles = Annotated[
     list[Path] | None,
@@ -88,6 +94,23 @@ def tls_files(ca: Path | None, cert: Path | None, key: Path | None) -> TlsFiles 
     from omnibench.jobs.scheduler_tls import TlsFiles
 
     return TlsFiles(ca=ca.resolve(), cert=cert.resolve(), key=key.resolve())
+
+
+@contextmanager
+def asked_backend(
+    name: str | None, workers: int | None, tls: TlsFiles | None, preload: Sequence[str], report: Reporter
+) -> Iterator[Backend | None]:
+    """The backend of ``--backend``, open in the block; None where none was given: this process does the work."""
+    if name is None:
+        if workers is not None or tls is not None:
+            raise ConfigError("--workers and the files of TLS are for --backend; name one")
+        yield None
+        return
+    from omnibench.jobs.backend_choice import BackendChoice, open_backend
+
+    choice = BackendChoice(name=name, workers=workers or os.cpu_count() or 1, tls=tls)
+    with open_backend(choice, preload, report) as backend:
+        yield backend
 
 
 def refuse_figures_without_browser(folder: Path | None) -> None:

@@ -40,25 +40,21 @@ def dask_client(address: str | None, workers: int, tls: TlsFiles | None, report:
 
     Its workers are not checked yet. ConfigError: nobody answers there, or a scheduler of another version.
     """
-    logger = logging.getLogger("distributed")
-    level = logger.level
-    logger.setLevel(logging.CRITICAL + 1)  # what goes wrong is said once, in words
-    try:
-        with warnings.catch_warnings(), dask.config.set(_SETTINGS):
-            warnings.filterwarnings("ignore", module="distributed")
-            if address is None:
-                with _local_cluster(workers) as cluster, distributed.Client(cluster, set_as_default=False) as client:
-                    yield client
-            else:
-                client = _joined(address, tls)
-                try:
-                    _check_scheduler(client, address)
-                    _wait_for_worker(client, address, report)
-                    yield client
-                finally:
-                    client.close(timeout=1)
-    finally:
-        logger.setLevel(level)
+    # What goes wrong is said once, in words. The client of a lost scheduler goes on complaining until the process ends.
+    logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)
+    with warnings.catch_warnings(), dask.config.set(_SETTINGS):
+        warnings.filterwarnings("ignore", module="distributed")
+        if address is None:
+            with _local_cluster(workers) as cluster, distributed.Client(cluster, set_as_default=False) as client:
+                yield client
+        else:
+            client = _joined(address, tls)
+            try:
+                _check_scheduler(client, address)
+                _wait_for_worker(client, address, report)
+                yield client
+            finally:
+                client.close(timeout=1)
 
 
 @contextmanager

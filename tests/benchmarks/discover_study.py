@@ -19,8 +19,8 @@ from hidden.sets import LEVELS
 from hidden.tasks import GROUPS, Result, Task, carry_out, tasks
 
 import omnibench
+from omnibench.jobs.backend_choice import BackendChoice, open_backend
 from omnibench.jobs.job import Failure, Job, JobWatch, run_jobs
-from omnibench.jobs.local_backends import local_backend
 from omnibench.jobs.result_store import ResultStore, code_digest, content_key
 
 ROOMS = ("data", "discover", "fit", "robot")  # the code that a result depends on, beside the makers of sets
@@ -32,14 +32,16 @@ def main() -> None:
     store = ResultStore(arguments.out, Result)
     wanted = _wanted(arguments)
     if not arguments.table:
-        carry_out_all(wanted, store, arguments.jobs)
+        carry_out_all(wanted, store, arguments.jobs, arguments.backend)
     results = every_result(store) if arguments.any_code else results_of(wanted, store)
     print_tables([each for each in results if _matches(each.task, arguments.only)], other_code=arguments.any_code)
 
 
-def carry_out_all(wanted: Sequence[Task], store: ResultStore[Result], workers: int) -> None:
+def carry_out_all(wanted: Sequence[Task], store: ResultStore[Result], workers: int, backend: str = "processes") -> None:
     """Carry out the tasks that have no result by this code yet."""
-    run_jobs([_job(task) for task in wanted], store, local_backend(workers, ("hidden.tasks",)), _Said(wanted))
+    choice = BackendChoice(name=backend, workers=workers)
+    with open_backend(choice, ("hidden.tasks",)) as opened:
+        run_jobs([_job(task) for task in wanted], store, opened, _Said(wanted))
 
 
 def results_of(wanted: Iterable[Task], store: ResultStore[Result]) -> list[Result]:
@@ -123,6 +125,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--levels", nargs="+", choices=list(LEVELS), default=list(LEVELS))
     parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--backend", default="processes", help="processes, dask, or a scheduler's tcp://HOST:PORT")
     parser.add_argument("--table", action="store_true", help="print the tables of what is there")
     parser.add_argument("--any-code", action="store_true", help="take results of other versions of the code, too")
     parser.add_argument("--quick", action="store_true", help="one seed, strong effects only")

@@ -17,8 +17,8 @@ from discover_study import discovering_code
 from foreign_judging import Result, carry_out
 from scipy.stats import binomtest
 
+from omnibench.jobs.backend_choice import BackendChoice, open_backend
 from omnibench.jobs.job import Failure, Job, JobWatch, run_jobs
-from omnibench.jobs.local_backends import local_backend
 from omnibench.jobs.result_store import ResultStore, content_key
 
 KINDS = ("cross_wheel_coupling", "slippery_patch", "belt_ripple", "swinging_payload", "tether_pull")
@@ -30,7 +30,9 @@ def main() -> None:
     store = ResultStore(arguments.out, Result)
     jobs = [_job(kind, seed) for seed in arguments.seeds for kind in arguments.only or KINDS]
     if not arguments.table:
-        run_jobs(jobs, store, local_backend(arguments.jobs, ("foreign_judging",)), _Said())
+        choice = BackendChoice(name=arguments.backend, workers=arguments.jobs)
+        with open_backend(choice, ("foreign_judging",)) as backend:
+            run_jobs(jobs, store, backend, _Said())
     print("\n".join(table([result for job in jobs if (result := store.get(job.key)) is not None])))
 
 
@@ -82,6 +84,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--seeds", type=int, nargs="+", default=[])
     parser.add_argument("--only", action="append", choices=KINDS, help="one kind; may be given again")
     parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--backend", default="processes", help="processes, dask, or a scheduler's tcp://HOST:PORT")
     parser.add_argument("--table", action="store_true", help="print the table of what is there")
     return parser.parse_args()
 

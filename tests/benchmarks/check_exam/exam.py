@@ -7,7 +7,6 @@ import json
 import math
 import tempfile
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -18,6 +17,10 @@ from check_exam.judging import applies, table
 from check_exam.motion import misfit
 from check_exam.recordings import DATA, NAMES, Recording, recording
 from check_exam.sitting import UNTOUCHED, Result, chosen_runs, generator, sit, sit_untouched
+from omnibench.jobs.backend_choice import BackendChoice, open_backend
+from omnibench.jobs.job import Failure, Job, JobWatch, run_jobs
+from omnibench.jobs.result_store import ResultStore
+from omnibench.progress import Reporter
 
 QUICK = (
     ("omni3", "wheels_swapped"), ("diff", "wheel_negated"), ("omni4", "wheel_scale"), ("tricyc", "steering_zero"),
@@ -76,6 +79,29 @@ def sit_case(case: Case, scratch: Path) -> Result:
     if case.kind == UNTOUCHED:
         return sit_untouched(case.part, part_of(case), case.seed, scratch)
     return sit(case.robot, case.kind, case.seed, scratch)
+
+
+def sit_job(order: tuple[Case, Path], _: Reporter) -> Result:
+    case, scratch = order
+    return sit_case(case, scratch)
+
+
+class _Sat(JobWatch[Result]):
+    """Adds the results, in memory and as lines of the output, as cases end."""
+
+    def __init__(self, cases: Sequence[Case], results: dict[str, Result], output: Path) -> None:
+        self._cases, self._results, self._output, self._ended = cases, results, output, 0
+
+    def ended(self, number: int, ending: Result | Failure, reused: bool) -> None:  # noqa: ARG002
+        self._ended += 1
+        case = self._cases[number]
+        if isinstance(ending, Failure):
+            ending = Result(case.robot, case.kind, case.seed, reason=ending.reason)
+        self._results[case.key] = ending
+        with self._output.open("a") as file:
+            file.write(json.dumps({"case": case.key} | asdict(ending)) + "\n")
+        state = "passed" if ending.passed else f"FAILED {ending.reason}"
+        print(f"[{self._ended}/{len(self._cases)}] {case.key} ({ending.seconds:g} s): {state[:200]}", flush=True)
 
 
 def read_results(file: Path) -> dict[str, Result]:
@@ -148,6 +174,7 @@ def main(description: str | None) -> int:
     parser.add_argument("--again", action="store_true", help="sit cases again that have results")
     parser.add_argument("--failed", action="store_true", help="sit cases again that failed")
     parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--backend", default="processes", help="processes, dask, or a scheduler's tcp://HOST:PORT")
     parser.add_argument("--output", type=Path, default=Path(tempfile.gettempdir()) / "check_exam.jsonl")
     given = parser.parse_args()
     if not DATA.is_dir():
@@ -161,14 +188,9 @@ def main(description: str | None) -> int:
     results = {} if given.again else read_results(given.output)
     waiting = [case for case in chosen if case.key not in results or (given.failed and not results[case.key].passed)]
     scratch = given.output.with_suffix(".files")
-    with ThreadPoolExecutor(given.jobs) as pool:
-        for number, (case, result) in enumerate(
-            zip(waiting, pool.map(lambda case: sit_case(case, scratch), waiting), strict=True), 1
-        ):
-            results[case.key] = result
-            with given.output.open("a") as file:
-                file.write(json.dumps({"case": case.key} | asdict(result)) + "\n")
-            state = "passed" if result.passed else f"FAILED {result.reason}"
-            print(f"[{number}/{len(waiting)}] {case.key} ({result.seconds:g} s): {state[:200]}", flush=True)
+    choice = BackendChoice(name=given.backend, workers=given.jobs)
+    with tempfile.TemporaryDirectory() as folder, open_backend(choice, (__name__,)) as backend:
+        jobs = [Job(str(number), sit_job, (case, scratch)) for number, case in enumerate(waiting)]
+        run_jobs(jobs, ResultStore(Path(folder), Result), backend, _Sat(waiting, results, given.output))
     print(shown([results[case.key] for case in chosen if case.key in results]))
     return 0
