@@ -6,7 +6,10 @@ may go on at the same time; a task is known by its name.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -47,6 +50,45 @@ def renamed(report: Reporter, task: str) -> Reporter:
 
 def _report_as(report: Reporter, task: str, event: Progress) -> None:
     report(replace(event, task=task))
+
+
+_PERIOD = 0.2  # s between two reports of reading, at least; chosen
+
+
+class _Reading:
+    """What is told of the reading of data sets that do not fit in memory: samples, or parts that workers have read."""
+
+    def __init__(self, report: Reporter) -> None:
+        self.report = report
+        self.done: dict[str, int] = {}
+        self.told = time.monotonic()
+
+
+_READING: ContextVar[_Reading | None] = ContextVar("reading", default=None)
+
+
+@contextmanager
+def reading_told_to(report: Reporter) -> Iterator[None]:
+    """Report what is read of data sets larger than memory while the block is open; of others nothing is said."""
+    before = _READING.set(_Reading(report))
+    try:
+        yield
+    finally:
+        reading = _READING.get()
+        _READING.reset(before)
+        for unit in reading.done if reading else ():
+            report(Progress(f"reading {unit}s", result=""))
+
+
+def tell_reading(count: int, unit: str) -> None:
+    """Samples, or other things, have been read."""
+    reading = _READING.get()
+    if reading is None:
+        return
+    reading.done[unit] = reading.done.get(unit, 0) + count
+    if time.monotonic() - reading.told > _PERIOD:
+        reading.told = time.monotonic()
+        reading.report(Progress(f"reading {unit}s", reading.done[unit], None, unit))
 
 
 class Stages:

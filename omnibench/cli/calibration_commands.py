@@ -25,7 +25,6 @@ from omnibench.cli.options import (
     tls_files,
 )
 from omnibench.cli.terminal.console import make_console, print_ending, print_json, print_verdict, warn
-from omnibench.errors import ConfigError
 
 calibration_app = typer.Typer()
 
@@ -119,15 +118,13 @@ def calibrate(
     if cost is not None:
         costs.entry(cost, "--cost")
     refuse_existing(output, force=force)
-    recordings = load_dataset(dataset)
     tls, preload = tls_files(tls_ca, tls_cert, tls_key), ("omnibench.fit.uncertainty.bootstrap",)
-    if backend is not None and not intervals:
-        raise ConfigError("--backend is for the resamples of --intervals; give both, or leave it out")
     with (
         redirect_stdout(sys.stderr),
         ProgressDisplay() as watch,
         asked_backend(backend, workers, tls, preload, watch) as jobs,
     ):
+        recordings = load_dataset(dataset)
         run = fit(
             recordings,
             calibrator,
@@ -174,6 +171,11 @@ def calibrate(
 def evaluate(
     calibration: CalibrationFile,
     dataset: DatasetFolders,
+    backend: BackendName = None,
+    workers: Workers = None,
+    tls_ca: TlsAuthority = None,
+    tls_cert: TlsCertificate = None,
+    tls_key: TlsKey = None,
     plugins: Plugins = None,
     as_json: Json = False,
 ) -> None:
@@ -182,14 +184,17 @@ def evaluate(
     On each split: the cost, and the errors of the final pose, beside those of the robot's design values.
     """
     from omnibench.cli.terminal.calibration_tables import print_evaluation, print_verdict_ending
+    from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.data.storage import load_dataset
     from omnibench.fit.evaluate import evaluate as evaluate_calibration
     from omnibench.robot.calibration import read_calibration
 
     load_given_plugins(plugins)
-    recordings = load_dataset(dataset)
-    evaluated = read_calibration(calibration)
-    evaluation = evaluate_calibration(evaluated, recordings)
+    tls = tls_files(tls_ca, tls_cert, tls_key)
+    with ProgressDisplay() as watch, asked_backend(backend, workers, tls, (), watch):
+        recordings = load_dataset(dataset)
+        evaluated = read_calibration(calibration)
+        evaluation = evaluate_calibration(evaluated, recordings)
     warnings = [*recordings.warnings, *evaluation.warnings]
     warn(warnings)
     if as_json:
@@ -235,9 +240,9 @@ def certify(
     from omnibench.robot.calibration import read_calibration
 
     load_given_plugins(plugins)
-    recordings = load_dataset(dataset)
     tls, preload = tls_files(tls_ca, tls_cert, tls_key), ("omnibench.fit.certify",)
     with ProgressDisplay() as watch, asked_backend(backend, workers, tls, preload, watch) as jobs:
+        recordings = load_dataset(dataset)
         certified = certify_optimum(
             read_calibration(calibration),
             recordings,

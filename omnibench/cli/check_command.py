@@ -6,11 +6,18 @@ from typing import Annotated
 import typer
 
 from omnibench.cli.options import (
+    BackendName,
     Figures,
     Force,
     Json,
     Settings,
+    TlsAuthority,
+    TlsCertificate,
+    TlsKey,
+    Workers,
+    asked_backend,
     refuse_figures_without_browser,
+    tls_files,
     write_asked_figures,
 )
 
@@ -40,6 +47,11 @@ def check(
     plugin: Annotated[
         list[Path] | None, typer.Option("--plugin", metavar="FILE", help="A plug-in with an importer; may be repeated.")
     ] = None,
+    backend: BackendName = None,
+    workers: Workers = None,
+    tls_ca: TlsAuthority = None,
+    tls_cert: TlsCertificate = None,
+    tls_key: TlsKey = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -49,6 +61,7 @@ def check(
     """
     from omnibench.cli.terminal.check_summary import print_check
     from omnibench.cli.terminal.console import make_console, print_json
+    from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.config import parse_settings
     from omnibench.errors import PluginError
     from omnibench.files import refuse_existing
@@ -63,8 +76,10 @@ def check(
     for file in plugin or ():
         if (failure := load_plugin_file(file)) is not None:
             raise PluginError(f"plug-in {failure.origin} cannot be imported: {failure.error}")
-    read = read_source(source, importer, parse_settings(settings), robot)
-    checked = check_recording(read)
+    tls = tls_files(tls_ca, tls_cert, tls_key)
+    with ProgressDisplay() as watch, asked_backend(backend, workers, tls, (), watch):
+        read = read_source(source, importer, parse_settings(settings), robot)
+        checked = check_recording(read)
     if report is not None or figures is not None:
         from omnibench.report.recording.check_document import check_document
         from omnibench.report.render import write_document

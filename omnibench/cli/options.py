@@ -60,6 +60,7 @@ Plugins = Annotated[
 ]
 
 
+_READING = ("omnibench.data.checks.clock_findings", "omnibench.robot.path_sums_loaded")  # what reading jobs need
 BackendName = Annotated[
     str | None,
     typer.Option(
@@ -100,16 +101,23 @@ def tls_files(ca: Path | None, cert: Path | None, key: Path | None) -> TlsFiles 
 def asked_backend(
     name: str | None, workers: int | None, tls: TlsFiles | None, preload: Sequence[str], report: Reporter
 ) -> Iterator[Backend | None]:
-    """The backend of ``--backend``, open in the block; None where none was given: this process does the work."""
+    """The backend of ``--backend``, open in the block; None where none was given: this process does the work.
+
+    In the block its workers read data sets larger than memory, of which ``report`` is told.
+    """
+    from omnibench.progress import reading_told_to
+
     if name is None:
         if workers is not None or tls is not None:
             raise ConfigError("--workers and the files of TLS are for --backend; name one")
-        yield None
+        with reading_told_to(report):
+            yield None
         return
     from omnibench.jobs.backend_choice import BackendChoice, open_backend
+    from omnibench.robot.odometry_of_stored import read_by
 
     choice = BackendChoice(name=name, workers=workers or os.cpu_count() or 1, tls=tls)
-    with open_backend(choice, preload, report) as backend:
+    with open_backend(choice, (*_READING, *preload), report) as backend, read_by(backend), reading_told_to(report):
         yield backend
 
 

@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from omnibench.cli.options import (
+    BackendName,
     DatasetFolders,
     Figures,
     Force,
@@ -13,10 +14,16 @@ from omnibench.cli.options import (
     Plugins,
     Settings,
     TableFormat,
+    TlsAuthority,
+    TlsCertificate,
+    TlsKey,
     WhichDataset,
+    Workers,
+    asked_backend,
     load_given_plugins,
     output_option,
     refuse_figures_without_browser,
+    tls_files,
     write_asked_figures,
 )
 from omnibench.cli.terminal.console import make_console, print_ending, print_json, warn
@@ -34,11 +41,17 @@ def inspect(
         typer.Option(metavar="FILE.html", help="Write a page: paths, motions driven, wheel rates, runs step by step."),
     ] = None,
     figures: Figures = None,
+    backend: BackendName = None,
+    workers: Workers = None,
+    tls_ca: TlsAuthority = None,
+    tls_cert: TlsCertificate = None,
+    tls_key: TlsKey = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Show what a data set holds, and what can be identified from it."""
     from omnibench.cli.terminal.inspection_summary import print_inspection
+    from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.data.storage import load_dataset
     from omnibench.files import refuse_existing
     from omnibench.fit.inspect import inspect_dataset
@@ -47,8 +60,10 @@ def inspect(
 
     refuse_existing(report, force=force)
     refuse_figures_without_browser(figures)
-    recordings = load_dataset(dataset)
-    inspection = inspect_dataset(recordings)
+    tls = tls_files(tls_ca, tls_cert, tls_key)
+    with ProgressDisplay() as watch, asked_backend(backend, workers, tls, (), watch):
+        recordings = load_dataset(dataset)
+        inspection = inspect_dataset(recordings)
     if report is not None or figures is not None:
         document = inspection_document(recordings, inspection)
         if report is not None:

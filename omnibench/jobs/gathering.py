@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from omnibench.errors import DataError
 from omnibench.jobs.job import Backend, Failure, Job, JobWatch, run_jobs
 from omnibench.jobs.result_store import ResultStore
-from omnibench.progress import Reporter, no_progress
+from omnibench.progress import Reporter, no_progress, tell_reading
 
 T = TypeVar("T")
 
@@ -44,6 +44,7 @@ class _Results(JobWatch[T]):
     def ended(self, number: int, ending: T | Failure, reused: bool) -> None:  # noqa: ARG002
         if not isinstance(ending, Failure):
             self.found[number] = ending
+            tell_reading(1, "part")
         elif ending.error is not None:
             raise ending.error
         else:

@@ -19,6 +19,7 @@ import numpy as np
 import polars as pl
 
 from omnibench.errors import DataError
+from omnibench.progress import tell_reading
 from omnibench.robot.kinematics import Array
 
 MOST_IN_MEMORY = 5_000_000  # wheel samples that are kept: 200 MB of three wheels' (chosen)
@@ -99,6 +100,7 @@ class _Blocks:
             while len(self.kept) >= _BLOCKS_KEPT:  # before the next is read: memory never holds one more
                 self.kept.popitem(last=False)
             values = self.kept[key] = file.read(columns, block)
+            tell_reading(len(values), "sample")
             return values
 
 
