@@ -23,7 +23,7 @@ import distributed
 from omnibench.errors import DataError
 from omnibench.files import write_text
 from omnibench.jobs.job import BackendError, Job
-from omnibench.jobs.job_process import JobEnd, JobProcess
+from omnibench.jobs.job_process import PRELOAD, JobEnd, JobProcess
 from omnibench.jobs.packing import PackedJob
 from omnibench.jobs.result_store import ResultStore
 from omnibench.jobs.software import differences, software
@@ -279,4 +279,4 @@ def _process_for(job: Job[Any], preload: tuple[str, ...]) -> JobProcess:
 def _context(preload: tuple[str, ...]) -> Any:
     """The context of processes of jobs, for as long as this worker lives."""
     multiprocessing.current_process().daemon = False  # a nanny's workers may not start processes otherwise
-    return _open.enter_context(one_thread_processes((JobProcess.__module__, __name__, *preload)))
+    return _open.enter_context(one_thread_processes((*PRELOAD, __name__, *preload)))

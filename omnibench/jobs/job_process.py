@@ -24,6 +24,8 @@ from omnibench.progress import Progress
 # s after its start in which a process takes further jobs: to start one costs 20 ms (tests/benchmarks/job_overhead.py),
 # 2 % of that; what jobs leave behind in it (memory, caches) is that of a second.
 _YOUNG = 1.0
+# What every process of jobs needs; pydantic imports these when a result is first written, which takes 60 ms.
+PRELOAD = (__name__, "pydantic.fields", "pydantic.dataclasses")
 _CLOSED = 1.0  # s in which a process dies whose end of the connection is closed; chosen
 _FROM_OUTSIDE = (SIGKILL, SIGTERM, SIGHUP, SIGINT)  # signals by which people and the system end processes
 

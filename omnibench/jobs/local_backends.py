@@ -10,7 +10,7 @@ from multiprocessing.connection import wait
 from typing import Any, TypeVar
 
 from omnibench.jobs.job import Backend, Ended, Job, JobWatch
-from omnibench.jobs.job_process import JobEnd, JobProcess, in_job, raised
+from omnibench.jobs.job_process import PRELOAD, JobEnd, JobProcess, in_job, raised
 from omnibench.jobs.result_store import ResultStore
 from omnibench.processes import one_thread, one_thread_processes
 
@@ -61,7 +61,7 @@ class Processes:
         waiting = iter(jobs)
         active: dict[JobProcess, tuple[int, Job[Any]]] = {}
         idle: list[JobProcess] = []
-        with one_thread_processes((JobProcess.__module__, *self.preload)) as context:
+        with one_thread_processes((*PRELOAD, *self.preload)) as context:
             try:
                 while True:
                     while len(active) < self.workers and (item := next(waiting, None)) is not None:

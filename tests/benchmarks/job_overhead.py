@@ -3,7 +3,7 @@
     python tests/benchmarks/job_overhead.py [--jobs 10000] [--workers 2] [--backend processes --backend dask]
 
 A job keeps a processor busy for --milliseconds (default 10). Overhead: wall time a job, less the jobs' own time divided
-by the workers.
+by the workers. Some file systems take a millisecond to make a file in a large /tmp: TMPDIR chooses another folder.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from omnibench.jobs.result_store import ResultStore
 
 def main() -> None:
     """Print a line for each backend."""
+    os.environ["PYTHONPATH"] = str(Path(__file__).parent)  # so that processes share busy_jobs, as an installed module
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--jobs", type=int, default=10_000)
     parser.add_argument("--milliseconds", type=float, default=10.0)
