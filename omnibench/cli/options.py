@@ -60,7 +60,7 @@ Plugins = Annotated[
 ]
 
 
-_READING = ("omnibench.data.checks.clock_findings", "omnibench.robot.path_sums_loaded")  # what reading jobs need
+_READING = ("omnibench.data.checks.clock_findings", "omnibench.robot.stored.path_sums_loaded")  # what reading jobs need
 BackendName = Annotated[
     str | None,
     typer.Option(
@@ -114,7 +114,7 @@ def asked_backend(
             yield None
         return
     from omnibench.jobs.backend_choice import BackendChoice, open_backend
-    from omnibench.robot.odometry_of_stored import read_by
+    from omnibench.robot.stored.odometry_of_stored import read_by
 
     choice = BackendChoice(name=name, workers=workers or os.cpu_count() or 1, tls=tls)
     with open_backend(choice, (*_READING, *preload), report) as backend, read_by(backend), reading_told_to(report):

@@ -24,7 +24,7 @@ from omnibench.registry import calibrators, costs
 from omnibench.robot.calibration import matrix_rows
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration
-from omnibench.robot.odometry_of_stored import odometry_of
+from omnibench.robot.stored.odometry_of_stored import odometry_of
 
 
 class SplitScorer:

@@ -32,16 +32,14 @@ from numpy.typing import NDArray
 from omnibench.data.dataset import Trajectory
 from omnibench.robot.kinematics import Array, Robot
 
-_WINDOW = (
-    1.0  # s between the stamps of Eq. (2): long beside the noise of a pose, short beside the drift by slip; chosen
-)
+_WINDOW = 1.0  # s between the stamps of Eq. (2): long beside a pose's noise, short beside the drift by slip; chosen
 _BIN = 0.2  # s: poses within are averaged, so that dense ones cost no more than sparse ones; chosen
 _BLOCK = 2.0  # s: residuals that are nearer count as correlated; chosen, twice the window
-_SEARCH = 2.0  # s: offsets are looked for within this on either side, unless the caller says more; chosen
+SEARCH = 2.0  # s: offsets are looked for within this on either side, unless the caller says more; chosen
 _COARSE = 0.1  # s between the offsets that are tried first, a tenth of the window
 _MOST_BINS = 40_000  # offsets times bins that are looked at together; chosen: some MB
 _HUBER = 1.5  # standard deviations from which on a residual counts less
-_ROUNDS = 30  # at most so many alternations of the fit of h and s with that of the clocks; chosen
+ROUNDS = 30  # at most so many alternations of the fit of h and s with that of the clocks; chosen
 _STEPS = 4  # at most so many Gauss-Newton steps of a clock in each round; chosen
 _SETTLED = 1e-4  # s: steps of the clocks that are shorter change nothing; below _CHORDS
 _FEWEST = 10  # windows of a run, below which its clock is not told; chosen
@@ -103,36 +101,24 @@ class ClockMatch:
         return times
 
 
-def match_clocks(robot: Robot, runs: Sequence[Streams], search: float = _SEARCH) -> list[ClockMatch | None]:
+def match_clocks(robot: Robot, runs: Sequence[Streams], search: float = SEARCH) -> list[ClockMatch | None]:
     """The clock of the reference in every run; None where a run is too short or too even to tell.
 
     search: s, the largest offset that is looked for. Runs of one robot are told better together than alone.
     """
-    windows = [_Windows.of(robot, run) for run in runs]
+    windows = [Windows.of(robot, run) for run in runs]
     usable = [each for each in windows if each is not None]
     if not usable:
         return [None] * len(runs)
-    fitted, clocks = _fitted_together(usable, search)
+    fitted, clocks = fitted_together(usable, search)
     matches = iter([each.match(fitted, clock, search) for each, clock in zip(usable, clocks, strict=True)])
     return [None if each is None else next(matches) for each in windows]
 
 
-def fitted_together(robot: Robot, runs: Sequence[Streams], search: float = _SEARCH) -> list[Array] | None:
-    """The coefficients h and s of Eq. (2) and (3) that fit some runs best; None where these tell nothing."""
-    usable = [each for each in (_Windows.of(robot, run) for run in runs) if each is not None]
-    return _fitted_together(usable, search)[0] if usable else None
-
-
-def match_clock(robot: Robot, run: Streams, fitted: Sequence[Array], search: float = _SEARCH) -> ClockMatch | None:
-    """The clock of the reference in one run, as match_clocks, by coefficients that fit runs of the same robot."""
-    windows = _Windows.of(robot, run)
-    return None if windows is None else windows.match(fitted, windows.settled(fitted, search), search)
-
-
-def _fitted_together(windows: Sequence[_Windows], search: float) -> tuple[list[Array], list[Clock]]:
+def fitted_together(windows: Sequence[Windows], search: float) -> tuple[list[Array], list[Clock]]:
     """The coefficients h and s, and the clocks, that fit runs best together."""
     clocks = [each.scanned(search) for each in windows]
-    for _ in range(_ROUNDS):
+    for _ in range(ROUNDS):
         fitted, before = _coefficients(windows, clocks), clocks
         clocks = [each.improved(fitted, clock) for each, clock in zip(windows, clocks, strict=True)]
         pairs = zip(windows, before, clocks, strict=True)
@@ -146,7 +132,7 @@ Clock = tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
-class _Windows:
+class Windows:
     """The windows of a run: first and last (W,) of its bins, and what the reference shows between them.
 
     edges (F + 1,), counted (F + 1, C): times, s, and integrals of the signals, then of the design's speed and of the
@@ -164,7 +150,7 @@ class _Windows:
     shown: Array
 
     @classmethod
-    def of(cls, robot: Robot, run: Streams) -> _Windows | None:
+    def of(cls, robot: Robot, run: Streams) -> Windows | None:
         """The windows of a run; None if there are too few, or the wheels or the reference stand."""
         if len(run.pose_times) < _FEWEST or len(run.edges) < _FEWEST:
             return None
@@ -223,10 +209,6 @@ class _Windows:
     def channels(self) -> tuple[slice, slice]:
         """The columns that tell the heading, and those that tell the way."""
         return slice(0, self.heading), slice(self.heading, None)
-
-    def settled(self, fitted: Sequence[Array], search: float) -> Clock:
-        """The clock by which the run fits given coefficients best."""
-        return self.improved(fitted, self.scanned(search, fitted), _ROUNDS)
 
     def scanned(self, search: float, fitted: Sequence[Array] | None = None) -> Clock:
         """The offset by which the run itself fits best, with coefficients of its own unless some are given."""
@@ -340,7 +322,7 @@ class _Windows:
         return ClockMatch(clock[0], float(errors[0]), clock[1], drift_error, self.length)
 
 
-def _coefficients(windows: Sequence[_Windows], clocks: Sequence[Clock]) -> list[Array]:
+def _coefficients(windows: Sequence[Windows], clocks: Sequence[Clock]) -> list[Array]:
     """The coefficients h and s of Eq. (2) and (3) that fit all runs best by their clocks."""
     fitted = []
     told = [

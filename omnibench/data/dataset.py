@@ -14,13 +14,13 @@ from omnibench.data.checks.finding import findings_of
 from omnibench.data.checks.implausible import implausible
 from omnibench.data.header import Imported
 from omnibench.data.headings import unwrap
-from omnibench.data.periods import median_period
 from omnibench.data.references.reference_flaws import reference_flaw
 from omnibench.data.references.reference_headings import with_whole_turns
 from omnibench.data.references.reference_units import odd_references
 from omnibench.data.references.run_references import References
 from omnibench.data.run_checks import check_sample_period, pose_times_flaw, reach_flaw, values_flaw, wheel_times_flaw
 from omnibench.data.scans import Scans
+from omnibench.data.stored.periods import median_period
 from omnibench.errors import DataError, nearest, require_type
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import WheelLog, kept_with_samples

@@ -10,7 +10,6 @@ from functools import partial
 from pathlib import Path
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.data.dataset_folders import dataset_folders
 from omnibench.data.header import Header, read_header
 from omnibench.data.joining import SCANS_LEFT_OUT, check_fits, distinct_runs
 from omnibench.data.references.reference_table import REFERENCE_COLUMNS, TABLE
@@ -18,6 +17,7 @@ from omnibench.data.run_checks import stored_pose_times_flaw
 from omnibench.data.scan_files import ScansOnDisk, write_scans
 from omnibench.data.scans import Scans
 from omnibench.data.splits import complete
+from omnibench.data.stored.dataset_folders import dataset_folders
 from omnibench.data.stored.stored_rows import MOST_IN_MEMORY, count_rows
 from omnibench.data.stored.stored_wheels import StoredWheels, WholeTableError
 from omnibench.data.tables.dataset_tables import POSE_COLUMNS, DatasetTables, tables_of

@@ -17,7 +17,7 @@ from omnibench.registry import Options, costs
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog
-from omnibench.robot.odometry_of_stored import odometry_of
+from omnibench.robot.stored.odometry_of_stored import odometry_of
 
 NO_ERROR = 1e-9  # m, rad: smaller errors are rounding
 

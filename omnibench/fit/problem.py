@@ -35,7 +35,7 @@ from omnibench.fit.span import Unidentified, directions_kept, driven_span
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import Integration, OdometryBatch
-from omnibench.robot.odometry_of_stored import StoredOdometry
+from omnibench.robot.stored.odometry_of_stored import StoredOdometry
 
 _PROGRESS_PERIOD = 0.1  # s, least time between two reports of progress: ten a second are all that a reader sees
 # Evaluations from which on the fast evaluator repays the time it takes to build. Both ways give the same costs to 1e-11

@@ -15,9 +15,9 @@ from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect
 from omnibench.robot.effects.term import Term
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import Integration, OdometryStream, RunSamples, WheelLog, split_by
-from omnibench.robot.odometry_of_stored import StoredOdometry, are_many
 from omnibench.robot.path import PathBatch
 from omnibench.robot.signals import SignalStream, signals_of_runs
+from omnibench.robot.stored.odometry_of_stored import StoredOdometry, are_many
 
 _BLOCK = 30_000  # samples that are evaluated at once: 1,000 to 100,000 take within 10 % as long each
 

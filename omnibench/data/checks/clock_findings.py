@@ -10,13 +10,13 @@ import numpy as np
 
 from omnibench.data.checks.finding import Finding, Severity
 from omnibench.data.checks.stream_faults import runs_in_words
-from omnibench.data.clock_matching import ClockMatch, Streams, fitted_together, match_clock, match_clocks
+from omnibench.data.clock_matching import ROUNDS, SEARCH, ClockMatch, Streams, Windows, fitted_together, match_clocks
 from omnibench.data.dataset import Trajectory
 from omnibench.data.stored.drawn_runs import MOST_DRAWN, drawn_runs
 from omnibench.jobs.gathering import gathered
 from omnibench.progress import Reporter
 from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.odometry_of_stored import together, workers
+from omnibench.robot.stored.odometry_of_stored import together, workers
 
 # s that a clock must be off, and in standard errors, to be told (chosen: simulated runs, whose clocks are right, are
 # below); from _SPOILS, s, on it spoils a fit.
@@ -42,9 +42,11 @@ def clocks_of(robot: Robot, runs: Sequence[Trajectory]) -> list[ClockMatch | Non
     """
     if sum(len(run.times) for run in runs) <= MOST_DRAWN:
         return match_clocks(robot, [Streams.of_run(run) for run in runs])
-    fitted = fitted_together(robot, [Streams.of_run(run) for run in drawn_runs(runs, _TOGETHER)])
-    if fitted is None:
+    drawn = (Windows.of(robot, Streams.of_run(run)) for run in drawn_runs(runs, _TOGETHER))
+    usable = [windows for windows in drawn if windows is not None]
+    if not usable:
         return [None] * len(runs)
+    fitted, _ = fitted_together(usable, SEARCH)
     tasks = [(robot, part, fitted) for part in together(runs)]
     return [clock for part in gathered(workers(), clocks_of_part, tasks, Clocks) for clock in part.of_runs]
 
@@ -52,7 +54,14 @@ def clocks_of(robot: Robot, runs: Sequence[Trajectory]) -> list[ClockMatch | Non
 def clocks_of_part(task: tuple[Robot, Sequence[Trajectory], Sequence[Array]], _: Reporter) -> Clocks:
     """The clocks of some runs, of which the task names the robot, the runs and the coefficients."""
     robot, runs, fitted = task
-    return Clocks(tuple(match_clock(robot, Streams.of_run(run), fitted) for run in runs))
+    return Clocks(tuple(_matched(Windows.of(robot, Streams.of_run(run)), fitted) for run in runs))
+
+
+def _matched(windows: Windows | None, fitted: Sequence[Array]) -> ClockMatch | None:
+    """The clock by which a run fits given coefficients best; None where it does not show."""
+    if windows is None:
+        return None
+    return windows.match(fitted, windows.improved(fitted, windows.scanned(SEARCH, fitted), ROUNDS), SEARCH)
 
 
 def clock_findings(runs: Sequence[Trajectory], clocks: Sequence[ClockMatch | None]) -> Iterator[Finding]:

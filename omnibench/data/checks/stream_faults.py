@@ -11,7 +11,7 @@ from omnibench.data.checks.misreading import wheels_in_words
 from omnibench.data.checks.reference_jumps import reference_jumps
 from omnibench.data.checks.steering_readings import frozen_steering
 from omnibench.data.dataset import Trajectory
-from omnibench.data.periods import median_period
+from omnibench.data.stored.periods import median_period
 from omnibench.robot.kinematics import Array, Robot, wheel_equations
 from omnibench.robot.model import OdometryModel
 from omnibench.words import plural, some

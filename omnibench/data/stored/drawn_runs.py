@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from omnibench.data.periods import Sampled
+from omnibench.data.stored.periods import Sampled
 from omnibench.data.stored.stored_rows import StoredRows
 
 Run = TypeVar("Run", bound=Sampled)

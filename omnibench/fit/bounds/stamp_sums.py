@@ -35,7 +35,7 @@ from omnibench.fit.evaluator.impulses import Path, cut, impulses, make_path, qua
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Complex, Integration, WheelLog
-from omnibench.robot.odometry_of_stored import are_many
+from omnibench.robot.stored.odometry_of_stored import are_many
 
 # m: error of the quadrature of arcs, which bounds subtract: a millionth of the millimetre that poses are known to.
 # Half of it and twice move a bound by 6e-6 of the gap that is asked for (tests/benchmarks/constants_fit.py).

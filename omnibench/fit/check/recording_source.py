@@ -12,10 +12,10 @@ import numpy as np
 from omnibench.data.checks.finding import Finding
 from omnibench.data.checks.misread_search import Recorded
 from omnibench.data.dataset import Dataset
-from omnibench.data.dataset_folders import dataset_folders
 from omnibench.data.importer import Importer
-from omnibench.data.periods import median_period
 from omnibench.data.storage import load_dataset
+from omnibench.data.stored.dataset_folders import dataset_folders
+from omnibench.data.stored.periods import median_period
 from omnibench.errors import ConfigError, DataError
 from omnibench.registry import importers
 

@@ -13,7 +13,7 @@ from omnibench.fit.evaluator.element_box import ElementBox
 from omnibench.fit.evaluator.evaluator import PoseEvaluator, make_evaluator
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog
-from omnibench.robot.odometry_of_stored import together
+from omnibench.robot.stored.odometry_of_stored import together
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from typing import Any, Self
 import numpy as np
 
 from omnibench.data.dataset import Trajectory
-from omnibench.data.periods import median_period
+from omnibench.data.stored.periods import median_period
 from omnibench.fit.least_squares.nuisances import (
     Nuisances,
     Weighting,

@@ -27,7 +27,7 @@ from omnibench.fit.uncertainty.unidentified import open_directions
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import Integration
-from omnibench.robot.odometry_of_stored import odometry_of
+from omnibench.robot.stored.odometry_of_stored import odometry_of
 
 ROWS = ("x", "y", "heading")
 # Standard deviation, as a share of a row's largest element, above which the row counts as rough along a direction:

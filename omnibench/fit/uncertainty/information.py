@@ -15,7 +15,7 @@ from omnibench.fit.loss.losses import LossName
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog, split_by
-from omnibench.robot.odometry_of_stored import StoredOdometry, are_many, together
+from omnibench.robot.stored.odometry_of_stored import StoredOdometry, are_many, together
 
 Stamps = Literal["reference", "final"]
 

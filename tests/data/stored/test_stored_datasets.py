@@ -15,13 +15,13 @@ from hypothesis import strategies as st
 from sample_robots import APR_02, MECANUM
 from wheeled_samples import CAR, DIFF, SWERVE, driven
 
-import omnibench.data.periods as periods
+import omnibench.data.stored.periods as periods
 import omnibench.data.stored.stored_wheels as stored_wheels
-import omnibench.robot.odometry_of_stored as odometry_of_stored
+import omnibench.robot.stored.odometry_of_stored as odometry_of_stored
 from omnibench.data.dataset import Dataset
-from omnibench.data.periods import median_period
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.data.stored.drawn_runs import drawn_runs, in_memory
+from omnibench.data.stored.periods import median_period
 from omnibench.data.stored.stored_rows import StoredRows
 from omnibench.errors import DataError
 from omnibench.fit.bounds.lower_bound import LowerBounds

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from omnibench.robot.path_sums import path_sums
+from omnibench.robot.stored.path_sums import path_sums
 
 _edges = np.array([0, 1])
 _sums = np.empty((2, 1, 1), dtype=complex)

@@ -18,7 +18,7 @@ from omnibench.jobs.job import Backend
 from omnibench.progress import Reporter
 from omnibench.robot.kinematics import Array, JsonArray
 from omnibench.robot.odometry import Complex, Integration, OdometryBatch, RunSamples, WheelLog
-from omnibench.robot.path_sums import path_sums
+from omnibench.robot.stored.path_sums import path_sums
 
 # Samples up to which an OdometryBatch holds them, in 0.1 kB each of three wheels (chosen: beyond, reading them anew and
 # summing in compiled code takes a tenth of the time, too).

@@ -1,0 +1,1 @@
+"""Odometry of runs whose samples are read where they are used."""
