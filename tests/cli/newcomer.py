@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from tricycle_samples import TRICYCLE, tricycle_drive
 from typed_pages import shell_commands, terminal
 
 from omnibench.cli.handbook_topics import HANDBOOK
+from omnibench.data.storage import load_dataset, save_dataset
 
 PAGES = {page.stem: page for page in sorted(HANDBOOK.rglob("*.md")) if shell_commands(page.read_text(encoding="utf-8"))}
 # Long commands of a page that are typed word for word on a page of their own.
@@ -61,11 +63,19 @@ def cloned_recordings(folder: Path) -> None:
     (folder / "optiodom" / "data").symlink_to(RECORDINGS / "optiodom")
 
 
+def fleet_of_days(folder: Path) -> None:
+    """The runs of the reader's robot in two folders, as of two days."""
+    dataset = load_dataset(folder / "data" / "robot")
+    for day in range(2):
+        save_dataset(replace(dataset, trajectories=dataset.trajectories[day::2]), folder / "fleet" / f"day{day}")
+
+
 # What a reader has, or does, before he types a command that begins so.
 BEFORE: dict[str, Callable[[Path], None]] = {
     "omnibench import csv raw": log_of_ticks,
     "omnibench import csv log.txt": log_of_text,
     "omnibench compare configs/omni3.yaml": cloned_recordings,
+    "omnibench check fleet/day": fleet_of_days,
 }
 
 

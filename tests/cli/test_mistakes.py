@@ -64,7 +64,7 @@ from omnibench.data.storage import load_dataset
         ),
         (["calibrate", "DATA", "-o", "DATA"], ["cannot be written: is a folder; name a file"]),
         (["calibrate", "DATA", "-o", "CONFIG/x"], ["cannot be written", "small.yaml is not a folder"]),
-        (["evaluate", "CALIBRATION"], ["Missing argument 'dataset'"]),
+        (["evaluate", "CALIBRATION"], ["Missing argument 'DATASET...'"]),
         (["evaluate", "CONFIG", "DATA"], ["format is None, expected 'omnibench-calibration/1'"]),
         (["evaluate", "nowhere.yaml", "DATA"], ["nowhere.yaml: no such file"]),
         (["evaluate", "CALIBRATION", "nowhere"], ["nowhere: no such folder"]),
