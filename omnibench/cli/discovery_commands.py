@@ -52,7 +52,7 @@ def discover(
     from omnibench.cli.terminal.discovery_summary import print_discovery
     from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.config import to_yaml
-    from omnibench.data.storage import load_dataset
+    from omnibench.data.storage import load_whole
     from omnibench.discover.discover import discover_effects
     from omnibench.discover.output import DiscoverOptions, check_output, write_discovery
     from omnibench.discover.report.discovery_report import discovery_report
@@ -75,7 +75,7 @@ def discover(
     )
     check_output(output, options, force=force)
     start = None if model is None else read_calibration(model)
-    recordings = load_dataset(dataset)
+    recordings = load_whole(dataset)
     with redirect_stdout(sys.stderr), ProgressDisplay() as watch:
         discovery = discover_effects(
             recordings,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -68,6 +69,11 @@ def load_dataset(path: Path | str | Sequence[Path | str], *, most_in_memory: int
     if len(recorded) > 1 and any(each.scans is not None for each in recorded):
         dataset = replace(dataset, warnings=(*dataset.warnings, SCANS_LEFT_OUT))
     return replace(dataset, imported=first.imported if len(recorded) == 1 else None)
+
+
+def load_whole(path: Path | str) -> Dataset:
+    """Read a data set as load_dataset does, into memory whatever its size: for work that needs all samples at once."""
+    return load_dataset(path, most_in_memory=sys.maxsize)
 
 
 def _all_of(texts: Sequence[str]) -> str:

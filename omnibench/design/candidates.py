@@ -10,7 +10,7 @@ import numpy as np
 
 from omnibench.config import read_yaml, validate
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.data.storage import load_dataset
+from omnibench.data.storage import load_whole
 from omnibench.design.config import DesignConfig
 from omnibench.design.d_optimality import Counts
 from omnibench.errors import ConfigError, DataError, OmnibenchError, UnknownNameError
@@ -93,7 +93,7 @@ def read_candidates(
     path = Path(source)
     if path.is_dir():
         refuse_choice(dataset, path)
-        return candidates_of_dataset(load_dataset(path), integration or "arc", str(path))
+        return candidates_of_dataset(load_whole(path), integration or "arc", str(path))
     content = read_yaml(path)
     if isinstance(content, Mapping) and "datasets" in content:
         compared = validate(ComparedData, content, str(path), path.resolve().parent)

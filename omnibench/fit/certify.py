@@ -245,7 +245,7 @@ def _cut_at_once(
     taken = [heapq.heappop(boxes)[2]]
     while boxes and len(taken) < _AT_ONCE and boxes[0][0] < wanted and boxes[0][2].looseness.any():
         taken.append(heapq.heappop(boxes)[2])
-    cuts = int(min(_CUTS, max(left // (2 * len(taken)), 1)))
+    cuts = _CUTS if math.isinf(left) else int(min(_CUTS, max(left // (2 * len(taken)), 1)))
     branches = gathered(backend, _branch, [(bounds, node, wanted, cuts) for node in taken], _Branch, shared=(bounds,))
     return [node for branch in branches for node in branch.nodes()], sum(branch.made for branch in branches)
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
 import plotly.graph_objects as go
 import polars as pl
 
@@ -93,7 +94,9 @@ class TrajectoryView(View):
 
     def _wheels(self) -> pl.DataFrame:
         run = self.shown
-        columns = {"t": run.times} | {f"omega_{index + 1}": rates for index, rates in enumerate(run.rates.T)}
+        columns = {"t": np.asarray(run.times)} | {
+            f"omega_{index + 1}": rates for index, rates in enumerate(run.rates.T)
+        }
         steering = () if run.steering is None else run.steering.T
         return pl.DataFrame(columns | {f"steer_{index + 1}": angles for index, angles in enumerate(steering)})
 

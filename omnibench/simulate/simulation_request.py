@@ -9,7 +9,7 @@ from pathlib import Path
 
 from omnibench.config import to_json, to_yaml
 from omnibench.data.dataset import Dataset
-from omnibench.data.storage import check_dataset_folder, load_dataset, save_dataset
+from omnibench.data.storage import check_dataset_folder, load_whole, save_dataset
 from omnibench.data.true_poses import POSES_FILE, TRUTH_FILE, write_true_poses
 from omnibench.errors import ConfigError
 from omnibench.files import TableFormat, refuse_existing, remove, resolved, write_text
@@ -93,7 +93,7 @@ class SimulationRequest:
             assert self.like is not None
             assert self.model is not None
             calibration = read_calibration(self.model)
-            dataset = simulate_like(load_dataset(self.like), calibration, (self.seed or 0) if self.noise else None)
+            dataset = simulate_like(load_whole(self.like), calibration, (self.seed or 0) if self.noise else None)
             save_dataset(dataset, self.output, table_format, overwrite=self.force)
             return WrittenSimulation(dataset)
         check_effect_options(self.effects)

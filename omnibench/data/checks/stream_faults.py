@@ -216,7 +216,8 @@ def _frozen_steering(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Findi
     angles = [run.steering for run in runs if run.steering is not None]
     if not angles:
         return
-    spans = np.ptp(np.concatenate(angles), axis=0)
+    ends = np.array([(of_run.min(axis=0), of_run.max(axis=0)) for of_run in angles])
+    spans = ends[:, 1].max(axis=0) - ends[:, 0].min(axis=0)
     bends = np.concatenate([_bends(robot, run) for run in runs])
     if len(bends) < _FEWEST or np.subtract(*np.quantile(bends, [0.9, 0.1])) < _BENDS:
         return

@@ -17,7 +17,7 @@ from omnibench.data.importers.runs.reference_options import RADIANS, SECONDS, He
 from omnibench.data.importers.runs.reread_runs import Columns, in_seconds, reread_runs, scans_of
 from omnibench.data.joining import joined
 from omnibench.data.splits import Names, complete
-from omnibench.data.storage import load_dataset, read_recorded
+from omnibench.data.storage import load_whole, read_recorded
 from omnibench.errors import DataError
 from omnibench.registry import importers
 
@@ -76,7 +76,7 @@ class DatasetFolder(Importer):
         return {"robot": file, **options}
 
     def read(self, source: Path) -> Dataset:
-        """The data set as the options say. DataError as for ``load_dataset``."""
+        """The data set as the options say. DataError as for ``load_whole``."""
         options, warnings = self.options, list[str]()
         recorded = read_recorded(source)
         header = recorded.header
@@ -108,4 +108,4 @@ class DatasetFolder(Importer):
                 f"{residual:.1g} rad a second; record an independent one"
             )
         dataset = replace(dataset, warnings=(*warnings, *dataset.warnings))
-        return joined(dataset, [load_dataset(folder) for folder in options.join])
+        return joined(dataset, [load_whole(folder) for folder in options.join])

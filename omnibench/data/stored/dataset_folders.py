@@ -14,11 +14,14 @@ _MAGIC = "*?["
 def dataset_folders(places: Path | str | Sequence[Path | str]) -> list[Path]:
     """The folders that places name: each a data set folder or a glob, whose folders come in the order of their names.
 
-    DataError: a glob matches no data set folder.
+    DataError: a glob matches no data set folder, or nothing is named.
     """
     if isinstance(places, Path | str):
         places = [places]
-    return list(dict.fromkeys(folder for place in places for folder in _named(Path(place))))
+    folders = {folder.resolve(): folder for place in places for folder in _named(Path(place))}
+    if not folders:
+        raise DataError("no data set folder is named")
+    return list(folders.values())
 
 
 def _named(place: Path) -> list[Path]:

@@ -16,13 +16,18 @@ Data = TypeVar("Data", bound=Any)
 
 MOST_DRAWN = 3_000_000  # wheel samples by which a recording is judged: 500 runs of a minute at 100 Hz (chosen)
 
+_FEWEST = 20  # runs that are drawn at least (chosen)
+
 
 def drawn_runs(runs: Sequence[Run], most: int = MOST_DRAWN) -> list[Run]:
-    """All runs, or of more than ``most`` wheel samples some, in memory, that chance has drawn: always the same ones."""
+    """All runs, or of more than ``most`` wheel samples some, in memory, that chance has drawn: the same ones each time.
+
+    They have about so many samples, unless runs are so long that twenty have more.
+    """
     samples = sum(len(run.times) for run in runs)
-    if samples <= most:
+    count = max(_FEWEST, len(runs) * most // max(samples, 1))
+    if count >= len(runs):
         return list(runs)
-    count = max(1, len(runs) * most // samples)
     chosen = np.sort(np.random.default_rng(0).choice(len(runs), count, replace=False))
     return [in_memory(runs[index]) for index in chosen.tolist()]
 

@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 import threading
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -23,8 +24,8 @@ from omnibench.progress import tell_reading
 from omnibench.robot.kinematics import Array
 
 MOST_IN_MEMORY = 5_000_000  # wheel samples that are kept: 200 MB of three wheels' (chosen)
-BLOCK_ROWS = 500_000  # rows of a block: 16 MB of four columns; half and twice take within 5 % as long (chosen)
-_BLOCKS_KEPT = 4  # of all files together: two tables of neighbouring runs, wheels and poses (chosen)
+BLOCK_ROWS = 500_000  # rows of a block, of whole runs: 16 MB of four columns (chosen)
+_BLOCKS_KEPT = 4  # of all files together: two columns' groups of neighbouring runs (chosen)
 
 
 @dataclass(frozen=True)
@@ -70,16 +71,26 @@ def file_state(file: Path) -> tuple[int, int]:
 
 def read_rows(file: Path, columns: Sequence[str], first: int, count: int) -> pl.DataFrame:
     """Some rows of a Parquet file. DataError: it cannot be read."""
-    try:
+    with _readable(file):
         return pl.scan_parquet(file).select(columns).slice(first, count).collect()
-    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as error:
-        raise DataError(f"{file}: cannot be read: {error}") from None
 
 
 def count_rows(file: Path) -> int:
     """The number of rows of a Parquet file. DataError: it cannot be read."""
-    try:
+    with _readable(file):
         return int(pl.scan_parquet(file).select(pl.len()).collect().item())
+
+
+def types_of(file: Path) -> pl.Schema:
+    """The types of the columns of a Parquet file, by their names. DataError: it cannot be read."""
+    with _readable(file):
+        return pl.scan_parquet(file).collect_schema()
+
+
+@contextmanager
+def _readable(file: Path) -> Iterator[None]:
+    try:
+        yield
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as error:
         raise DataError(f"{file}: cannot be read: {error}") from None
 
@@ -100,8 +111,8 @@ class _Blocks:
             while len(self.kept) >= _BLOCKS_KEPT:  # before the next is read: memory never holds one more
                 self.kept.popitem(last=False)
             values = self.kept[key] = file.read(columns, block)
-            tell_reading(len(values), "sample")
-            return values
+        tell_reading(len(values), "sample")
+        return values
 
 
 _BLOCKS = _Blocks()
@@ -143,7 +154,7 @@ class StoredRows(np.lib.mixins.NDArrayOperatorsMixin):
 
     def followed_by(self, row: Array) -> StoredRows:
         """The rows and one more."""
-        return replace(self, more=(*self.more, row), last=float(row) if self.flat else None)
+        return replace(self, more=(*self.more, np.array(row)), last=float(row) if self.flat else None)
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:
         rows = self.file.rows(self.columns, self.first, self.count)
@@ -156,12 +167,15 @@ class StoredRows(np.lib.mixins.NDArrayOperatorsMixin):
         return values.copy() if copy else values  # a view would keep the whole block
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:
+        if any(isinstance(each, StoredRows) for each in options.get("out", ())):
+            raise TypeError("samples that stand in a file cannot be changed; take a copy with np.array")
         return getattr(ufunc, method)(*(_read(each) for each in inputs), **options)
 
     def __getitem__(self, key: Any) -> Any:
         if self.last is not None and isinstance(key, int) and key in (-1, len(self) - 1):
             return self.last
-        return np.asarray(self)[key]
+        values = np.asarray(self)[key]
+        return values.copy() if isinstance(key, int) and not self.flat else values  # one row would keep its block
 
     def __iter__(self) -> Any:
         return iter(np.asarray(self))

@@ -11,7 +11,7 @@ import numpy as np
 import polars as pl
 
 from omnibench.data.run_checks import wheel_times_flaw
-from omnibench.data.stored.stored_rows import BLOCK_ROWS, BlockFile, StoredRows, file_state, read_rows
+from omnibench.data.stored.stored_rows import BLOCK_ROWS, BlockFile, StoredRows, file_state, read_rows, types_of
 from omnibench.data.tables.rows_of_runs import no_rows, refuse_unknown
 from omnibench.data.tables.table import Table, check_columns, checked_table
 from omnibench.data.tables.wheel_table import WheelArrays, check_steering, wheel_columns
@@ -45,8 +45,8 @@ class StoredWheels:
 
         DataError names the table, the row and what is wrong. WholeTableError: read the table whole.
         """
-        state = file_state(self.file)
-        types = pl.read_parquet_schema(self.file)
+        file = self.file.absolute()  # workers, and jobs that change their folder, find it, too
+        state, types = file_state(file), types_of(file)
         named = wheel_columns(robot)
         check_columns(self.file, list(types), ("trajectory", *named["times"], *named["rates"]))
         check_steering(self.file, list(types), robot)
@@ -55,7 +55,7 @@ class StoredWheels:
         if not all(types[column].is_numeric() for column in columns):
             raise WholeTableError
         rows = self._rows_of_runs(runs, columns)
-        blocks = BlockFile(self.file, _block_edges(rows), state)
+        blocks = BlockFile(file, _block_edges(rows), state)
         together = [column for name in ("times", "rates", "steering") for column in wanted.get(name, ())]
         return [WheelArrays(**_arrays(blocks, wanted, together, of_run)) for of_run in rows]
 

@@ -279,7 +279,7 @@ def _run_row(trajectory: Trajectory) -> dict[str, Any]:
 
 
 def _wheel_frame(trajectory: Trajectory, robot: Robot) -> pl.DataFrame:
-    columns: dict[str, Any] = {"trajectory": [trajectory.id] * len(trajectory.times), "t": trajectory.times}
+    columns: dict[str, Any] = {"trajectory": [trajectory.id] * len(trajectory.times), "t": np.asarray(trajectory.times)}
     for prefix, wheels, values in (
         ("omega", robot.wheel_names, trajectory.rates),
         ("steer", robot.drive.steered, trajectory.steering),

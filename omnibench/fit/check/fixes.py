@@ -54,8 +54,7 @@ def next_command(read: RecordingSource) -> str:
 def _command(read: RecordingSource, changes: Sequence[Mapping[str, Any]]) -> str:
     """The command line; by way of a data set where the importer cannot."""
     if read.places:
-        each = _import("dataset", Path("EACH"), mended_options(read, "dataset", {}, changes), Path("EACH_mended"))
-        return f"for each in {shlex.join(map(str, read.places))}; do {each.replace('EACH', '${each}')}; done"
+        return f'for each in {shlex.join(map(str, read.places))}; do omnibench check "$each"; done'
     try:
         return _import(
             read.importer, read.source, mended_options(read, read.importer, read.options, changes), _target(read)

@@ -32,6 +32,7 @@ _MOST_PREPARED = 5000
 # the sum, after which one more step reaches rounding, as convergence is quadratic; the least part of a step. Chosen:
 # where they stop too early, the cone program decides.
 _MOST_STEPS, _VANISHING, _NO_GAIN, _LEAST_PART = 30, 1e-9, 1e-16, 1e-6
+_SINGULAR = 1e-12  # share of the largest curvature: less is rounding (chosen)
 
 
 class SolverError(OmnibenchError):
@@ -85,10 +86,10 @@ class SumOfNormsProgram:
             spread = (columns * weighted[:, None, None]).reshape(-1, len(unit))
             reach = along * weighted[:, None]
             slope, curvature = shares @ along, spread.T @ spread - reach.T @ reach
-            try:
-                change = -np.linalg.solve(curvature, slope)
-            except np.linalg.LinAlgError:
+            strengths = np.linalg.eigvalsh(curvature)
+            if strengths[0] <= _SINGULAR * strengths[-1]:  # a direction that nothing determines
                 return None
+            change = -np.linalg.solve(curvature, slope)
             gain = -float(slope @ change)
             if gain <= _NO_GAIN * value:
                 found = np.zeros(len(free))

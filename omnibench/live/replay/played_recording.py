@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from omnibench.data.dataset import Dataset
-from omnibench.data.storage import load_dataset
+from omnibench.data.storage import load_whole
 from omnibench.data.true_poses import TruePath
 from omnibench.errors import ConfigError
 from omnibench.progress import Reporter, no_progress
@@ -43,4 +43,4 @@ def load_recording(path: Path, dataset: str | None = None, watch: Reporter = no_
         return Recording(simulation.dataset, simulation.truth, simulation.paths)
     if dataset is not None:
         raise ConfigError(f"--dataset {dataset}: {path} is a folder with one data set; leave --dataset out")
-    return Recording(load_dataset(path))
+    return Recording(load_whole(path))

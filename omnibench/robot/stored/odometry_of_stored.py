@@ -142,6 +142,8 @@ class StoredOdometry(OdometryBatch):
     def _of(self, matrix: Array, slopes: bool) -> AtStamps:
         key = np.ascontiguousarray(matrix, dtype=float).tobytes()
         kept = self._kept.get(key)
+        if kept is not None:
+            self._kept.move_to_end(key)
         if kept is None or (slopes and kept.slopes is None):
             while len(self._kept) >= _MATRICES:
                 self._kept.popitem(last=False)
@@ -183,7 +185,7 @@ def _read(logs: Sequence[WheelLog]) -> Iterator[_Read]:
     """The logs, some at a time."""
     for part in together(logs):
         samples = RunSamples.of([np.asarray(log.times) for log in part])
-        signals = np.concatenate([np.asarray(log.signals) for log in part])
+        signals = np.ascontiguousarray(np.concatenate([np.asarray(log.signals) for log in part]))
         yield _Read(samples, signals, [log.stamps for log in part])
 
 

@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+
 from omnibench.robot.compiled import compiled
 
 # h, rad, below which sin(h)/h and its derivative are summed by their series: the first term left out is 1e-17 there.
@@ -27,7 +29,8 @@ def path_sums(
     row_12, row_3 (S, M), complex: derivatives of x + iy by m1 + i m2 and by m3, if ``with_slopes``; driven (S, M), rad.
     """
     size = signals.shape[1]
-    before, piece, along, across = driven[0] * 0.0, driven[0] * 0.0, row_12[0] * 0.0, row_3[0] * 0.0
+    before, piece = np.zeros(size), np.zeros(size)
+    along, across = np.zeros(size, dtype=np.complex128), np.zeros(size, dtype=np.complex128)
     for run in range(len(edges) - 1):
         before[:], along[:], across[:] = 0.0, 0.0, 0.0
         x = y = begin = 0.0

@@ -219,9 +219,9 @@ class load_like:  # noqa: N801 (a run of which only the times matter)
 
 def test_some_runs_are_drawn_always_the_same_and_into_memory(folder: Path) -> None:
     runs = load_dataset(folder, most_in_memory=0).trajectories
-    some = drawn_runs(runs, most=400)
-    assert len(some) == 5
-    assert [run.id for run in some] == [run.id for run in drawn_runs(runs, most=400)]
+    some = drawn_runs(runs, most=1840)
+    assert len(some) == 23
+    assert [run.id for run in some] == [run.id for run in drawn_runs(runs, most=1840)]
     assert all(isinstance(run.rates, np.ndarray) and run.rates.base is None for run in some)
     assert list(runs) == drawn_runs(runs, most=10**6)
     assert in_memory(runs[0]).fingerprint == runs[0].fingerprint
