@@ -60,7 +60,8 @@ Plugins = Annotated[
 ]
 
 
-_READING = ("omnibench.data.checks.clock_findings", "omnibench.robot.stored.path_sums_loaded")  # what reading jobs need
+# Modules that jobs which read a data set share.
+_READING = ("omnibench.data.checks.clock_findings", "omnibench.robot.stored.path_sums_loaded")
 BackendName = Annotated[
     str | None,
     typer.Option(

@@ -44,7 +44,7 @@ def joined(first: Dataset, others: Sequence[Dataset]) -> Dataset:
 
 
 class _Described(Protocol):
-    """What a data set says of itself."""
+    """A data set, or its header: name, robot and sample period."""
 
     @property
     def name(self) -> str: ...

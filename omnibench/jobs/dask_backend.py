@@ -36,8 +36,8 @@ _FULL = (ENOSPC, EDQUOT)
 _LOOK = 1.0  # s between two looks at the scheduler and its workers; chosen
 _PARCEL = 0.2  # s of work that travel together: a task costs scheduler, client and worker 5 ms in all, 3 % of that
 _LARGEST_PARCEL = 50  # jobs; chosen
-_WEIGHT = 0.1  # of the latest job's time in the running mean; chosen
-_SUBMISSIONS = 10  # of a job whose workers died before it began, at most: chosen, as it is no fault of its own
+_WEIGHT = 0.1  # weight of the latest job's time in the running mean; chosen
+_SUBMISSIONS = 10  # times that a job is sent whose workers die before it begins: chosen, as it is no fault of its own
 
 
 class SchedulerLostError(BackendError):
@@ -103,11 +103,11 @@ class _Run:
         self.pending: dict[int, _Pending] = {}
         self._backend, self._client, self._store, self._watch = backend, backend.client, store, watch
         self._topic = f"omnibench-{uuid4().hex[:12]}"
-        self._events: SimpleQueue[bytes] = SimpleQueue()  # of Told, pickled
+        self._events: SimpleQueue[bytes] = SimpleQueue()  # pickled tuples of Told
         self._client.subscribe_topic(self._topic, lambda event: self._events.put(event[1]))
         self._futures: dict[str, Any] = {}
-        self._numbers: dict[str, set[int]] = {}  # of the jobs of a parcel that have not ended
-        self._seconds = _PARCEL  # of a job, about
+        self._numbers: dict[str, set[int]] = {}  # jobs of each parcel that have not ended
+        self._seconds = _PARCEL  # a job takes about so long
         self._slots = self._count_slots()
         self._looked = time.monotonic()
 
@@ -225,7 +225,7 @@ class _Run:
             raise SchedulerLostError(f"the Dask scheduler {self._client.scheduler.address} is lost")
         error = future.exception()
         if not isinstance(error, KilledWorker):
-            raise error  # of a worker that joined later and is unfit
+            raise error  # a worker joined later and is unfit
         items = [self.pending[number] for number in sorted(self._numbers[key])]
         self._close_parcel(key)
         for item in items:

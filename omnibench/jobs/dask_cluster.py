@@ -83,7 +83,7 @@ def _joined(address: str, tls: TlsFiles | None) -> Any:
         )
     try:
         return distributed.Client(address, timeout=_ANSWER, set_as_default=False, security=security)
-    except Exception as error:  # of sockets, TLS, or the protocol of another version
+    except Exception as error:  # sockets, TLS and the protocol of another version raise what they like
         reason = one_line(str(error) or type(error).__name__)
         raise ConfigError(
             f"no Dask scheduler answers at {address} ({reason}); start one (dask scheduler), or correct the address"

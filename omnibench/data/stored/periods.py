@@ -10,7 +10,7 @@ import numpy as np
 from omnibench.robot.kinematics import Array
 
 _TOGETHER = 5_000_000  # periods whose median is taken at once; of more it is found bit by bit (chosen)
-_BITS = 20  # of a float's 63 that are counted at a time: twice, which leaves 2^-29 of the median open (chosen)
+_BITS = 20  # bits that are counted at a time: twice, which leaves 2^-29 of the median open (chosen)
 _MASK = (1 << _BITS) - 1
 
 

@@ -25,7 +25,7 @@ from omnibench.robot.kinematics import Array
 
 MOST_IN_MEMORY = 5_000_000  # wheel samples that are kept: 200 MB of three wheels' (chosen)
 BLOCK_ROWS = 500_000  # rows of a block, of whole runs: 16 MB of four columns (chosen)
-_BLOCKS_KEPT = 4  # of all files together: two columns' groups of neighbouring runs (chosen)
+_BLOCKS_KEPT = 4  # blocks in memory, those of all files together (chosen)
 
 
 @dataclass(frozen=True)

@@ -106,7 +106,7 @@ class _Paths:
 
 @dataclass(frozen=True, eq=False)
 class _Columns:
-    """What the sums of each run are made of, computed whenever it is gone through.
+    """Terms of the sums of each run, computed whenever it is gone through.
 
     headings: of the runs' starts, rad. row: the largest magnitudes of row 3. Else as in StampSums.
     """
