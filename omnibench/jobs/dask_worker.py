@@ -102,7 +102,7 @@ def carry_out(parcel: Parcel, requirements: bytes, *shared: bytes) -> list[Told]
     data = dict(zip(parcel.names, shared, strict=True))
     timed = any(order.job.timed for order in parcel.orders)
     with _slots(worker.state.nthreads if timed else 1, worker.state.nthreads):
-        teller.tell(*(Told(order.number, worker.address) for order in parcel.orders))
+        teller.begins(*(Told(order.number, worker.address) for order in parcel.orders))
         for order in parcel.orders:
             packed = PackedJob(order.content, {name: data[name] for name in order.names}, plugins)
             job, began = replace(order.job, argument=packed), time.monotonic()
@@ -227,6 +227,11 @@ class _Teller:
         """False once the client has cancelled the parcel, or is gone."""
         task = self.worker.state.tasks.get(self._key)
         return task is not None and task.state != "cancelled"
+
+    def begins(self, *events: Told) -> None:
+        """Send begins, and wait until the scheduler has them: one that died with its worker would not be counted."""
+        log_event = self.worker.scheduler.log_event
+        distributed.utils.sync(self.worker.loop, log_event, topic=self._topic, msg=pickle.dumps(events))
 
     def tell(self, *events: Told) -> None:
         """Send events."""
