@@ -20,7 +20,8 @@ from omnibench.data.references.reference_units import odd_references
 from omnibench.data.references.run_references import References
 from omnibench.data.run_checks import check_sample_period, pose_times_flaw, reach_flaw, values_flaw, wheel_times_flaw
 from omnibench.data.scans import Scans
-from omnibench.data.stored.periods import median_period
+from omnibench.data.stored.periods import median_period, period_of
+from omnibench.data.stored.stored_rows import in_file, noted
 from omnibench.errors import DataError, nearest, require_type
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import WheelLog, kept_with_samples
@@ -132,14 +133,16 @@ class Trajectory(Shown):
 
         The first 8 begin the SHA-256 of the wheel samples, the others that of the reference poses.
         """
-        wheels, reference = hashlib.sha256(), hashlib.sha256()
-        sampled = (self.times, self.rates) if self.steering is None else (self.times, self.rates, self.steering)
-        for digest, arrays in ((wheels, sampled), (reference, (self.pose_times, self.poses))):
-            for array in arrays:
-                digest.update(np.ascontiguousarray(array, dtype=float).tobytes())
+        reference = _digest(self.pose_times, self.poses)
         if self.references is not None:
             reference.update(repr(self.references.content).encode())
-        return wheels.hexdigest()[:WHEEL_DIGITS] + reference.hexdigest()[:8]
+        return self.wheel_digits + reference.hexdigest()[:8]
+
+    @property
+    def wheel_digits(self) -> str:
+        """The first half of the fingerprint."""
+        sampled = (self.times, self.rates) if self.steering is None else (self.times, self.rates, self.steering)
+        return noted(self.times, "wheel_digits", lambda: _digest(*sampled).hexdigest()[:WHEEL_DIGITS])
 
     def log(self, stamps: Sequence[float] | Array) -> WheelLog:
         """The wheel rates from the start pose, with poses wanted at ``stamps`` (s)."""
@@ -243,12 +246,17 @@ def make_dataset(
     raw = tuple(_with_drive(trajectory, robot) for trajectory in trajectories)
     if not raw:
         raise DataError(f"data set {name}: it has no trajectory")
+    matrix, standing = robot.inverse_kinematic_matrix, list[str]()
     seen: set[str] = set()
     for trajectory in raw:
         if trajectory.id in seen:
             raise DataError(f"data set {name}: trajectory {trajectory.id} is there twice; give each its own id")
         seen.add(trajectory.id)
         _check_run(f"data set {name}", robot, trajectory)
+        if _moves_unseen(matrix, trajectory):
+            standing.append(trajectory.id)
+        if in_file(trajectory.times):  # its samples are at hand now, and would be read again
+            _ = trajectory.wheel_digits, period_of(trajectory)
     median = median_period(raw)
     check_sample_period(f"data set {name}", sample_period, median)
     logs = [trajectory.log(trajectory.pose_times) for trajectory in raw]
@@ -263,7 +271,7 @@ def make_dataset(
             f"headings of {plural(len(ambiguous), 'trajectory')} may be unwrapped wrongly (reference too sparse): "
             f"{shown}"
         ]
-    warnings += [] if warnings else _standing(robot, raw)  # in other units all runs seem to move too far
+    warnings += [] if warnings else _standing(standing, raw)  # in other units all runs seem to move too far
     warnings += _late_references(raw) + _other_periods(median, sample_period)
     unwrapped = [
         replace(trajectory, poses=np.column_stack([trajectory.poses[:, :2], heading]))
@@ -311,9 +319,10 @@ def _check_run(place: str, robot: Robot, trajectory: Trajectory) -> None:
         hint = nearest(str(trajectory.split), SPLITS)
         raise DataError(f"{where}: split is {trajectory.split!r}; {hint}it must be train or validation")
     _check_shapes(where, robot, trajectory)
+    arrays = {name: array for name in _ARRAYS if (array := getattr(trajectory, name)) is not None}
     for name, flaw in (
-        *((name, values_flaw(array)) for name in _ARRAYS if (array := getattr(trajectory, name)) is not None),
-        ("times", wheel_times_flaw(trajectory.times, trajectory.id)),
+        *((name, values_flaw(array)) for name, array in arrays.items() if not in_file(array)),
+        ("times", None if in_file(trajectory.times) else wheel_times_flaw(trajectory.times, trajectory.id)),
         ("pose_times", pose_times_flaw(trajectory.pose_times, trajectory.id)),
     ):
         if flaw is not None:
@@ -341,10 +350,8 @@ def _check_shapes(where: str, robot: Robot, trajectory: Trajectory) -> None:
         raise DataError(f"{where}: it has no {'reference poses' if samples[0] else 'wheel samples'}")
 
 
-def _standing(robot: Robot, trajectories: Sequence[Trajectory]) -> list[str]:
+def _standing(standing: Sequence[str], trajectories: Sequence[Trajectory]) -> list[str]:
     """Warning of runs in which the reference moves and the wheels do not, where other runs drive."""
-    matrix = robot.inverse_kinematic_matrix
-    standing = [run.id for run in trajectories if _moves_unseen(matrix, run)]
     if not 0 < len(standing) < len(trajectories):
         return []  # another warning says that no run drives
     count, shown = len(standing), ", ".join(standing[:5])
@@ -356,10 +363,20 @@ def _standing(robot: Robot, trajectories: Sequence[Trajectory]) -> list[str]:
 
 def _moves_unseen(matrix: Array, run: Trajectory) -> bool:
     """True if the reference moves in a run while the wheels, by the design matrix (3, N), travel hardly any of it."""
-    driven = np.abs(run.signals @ matrix.T) * np.diff(run.times, prepend=0.0)[:, None]
     moved = np.abs(run.poses - run.poses[0]).max(axis=0)
     far = moved > (_MOVED, _MOVED, _TURNED)
-    return bool(far.any() and (driven.sum(axis=0).max() < _HARDLY * moved[far].max()))
+    if not far.any():
+        return False
+    driven = np.abs(run.signals @ matrix.T) * np.diff(run.times, prepend=0.0)[:, None]
+    return bool(driven.sum(axis=0).max() < _HARDLY * moved[far].max())
+
+
+def _digest(*arrays: Array) -> hashlib._Hash:
+    """SHA-256 of arrays one after another."""
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(np.ascontiguousarray(array, dtype=float).tobytes())
+    return digest
 
 
 def _late_references(trajectories: Sequence[Trajectory]) -> list[str]:

@@ -41,7 +41,8 @@ def dask_client(address: str | None, workers: int, tls: TlsFiles | None, report:
     Its workers are not checked yet. ConfigError: nobody answers there, or a scheduler of another version.
     """
     # What goes wrong is said once, in words. The client of a lost scheduler goes on complaining until the process ends.
-    logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)
+    for name in [name for name in logging.root.manager.loggerDict if name.startswith("distributed")]:
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)  # each has a level of its own
     with warnings.catch_warnings(), dask.config.set(_SETTINGS):
         warnings.filterwarnings("ignore", module="distributed")
         if address is None:

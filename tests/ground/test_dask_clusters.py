@@ -7,7 +7,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from importlib.metadata import distribution, version
 from pathlib import Path
 
@@ -23,7 +23,7 @@ from job_samples import IMPORTING_THIS, Answer, Notes, jobs_of, wait_for
 import omnibench as package
 from omnibench.errors import ConfigError, OmnibenchError
 from omnibench.jobs.backend_choice import BackendChoice, check_backend, open_backend
-from omnibench.jobs.job import BackendError, JobWatch, run_jobs
+from omnibench.jobs.job import BackendError, run_jobs
 from omnibench.jobs.result_store import ResultStore
 from omnibench.jobs.scheduler_tls import TlsFiles
 from omnibench.progress import Reporter
@@ -187,28 +187,6 @@ def slow(number: int, _: Reporter) -> Answer:
     return Answer(number)
 
 
-class After(JobWatch[Answer]):
-    """Does something when the first job has begun."""
-
-    def __init__(self, action: Callable[[], object]) -> None:
-        self._action, self._done = action, False
-
-    def began(self, number: int) -> None:  # noqa: ARG002
-        if not self._done:
-            self._done = True
-            self._action()
-
-
-def test_a_scheduler_that_is_killed_is_one_line(tmp_path: Path) -> None:
-    with scheduler(tmp_path) as (place, process), worker(place, tmp_path / "worker"):
-        store = ResultStore(tmp_path / "results", Answer)
-        with (
-            pytest.raises(BackendError, match=f"the Dask scheduler {place} is lost"),
-            open_backend(BackendChoice(name=place)) as backend,
-        ):
-            run_jobs(jobs_of(slow, range(100)), store, backend, After(process.kill))
-
-
 def test_a_worker_that_joins_later_is_checked(address: str, tmp_path: Path) -> None:
     environment = searched_first(pretended(tmp_path / "other", "polars", "0.1"))
     with (
@@ -227,11 +205,14 @@ from pathlib import Path
 from job_samples import Answer, Notes, jobs_of
 from test_dask_clusters import sleeping
 from omnibench.jobs.backend_choice import BackendChoice, open_backend
-from omnibench.jobs.job import run_jobs
+from omnibench.jobs.job import BackendError, run_jobs
 from omnibench.jobs.result_store import ResultStore
-with open_backend(BackendChoice(name=sys.argv[1])) as backend:
-    folder = Path(sys.argv[2])
-    run_jobs(jobs_of(sleeping, [folder] * 5), ResultStore(folder / "store", Answer), backend, Notes())
+try:
+    with open_backend(BackendChoice(name=sys.argv[1])) as backend:
+        folder = Path(sys.argv[2])
+        run_jobs(jobs_of(sleeping, [folder] * 5), ResultStore(folder / "store", Answer), backend, Notes())
+except BackendError as error:
+    sys.exit(str(error))
 """
 
 
@@ -253,6 +234,15 @@ def test_when_the_client_is_killed_its_jobs_end_and_it_goes_on_when_started_agai
         (tmp_path / "go_on").touch()
         subprocess.run(command, env=IMPORTING_THIS, check=True, timeout=60)
     assert len(list((tmp_path / "store").glob("*.json"))) == 5
+
+
+def test_a_scheduler_that_is_killed_is_one_line(tmp_path: Path) -> None:
+    with scheduler(tmp_path) as (place, process), worker(place, tmp_path / "worker"):
+        command = [sys.executable, "-c", CLIENT, place, str(tmp_path)]
+        client = subprocess.Popen(command, env=IMPORTING_THIS, stderr=subprocess.PIPE, text=True)
+        wait_for((tmp_path / "alive").exists)
+        process.kill()
+        assert client.communicate(timeout=60)[1] == f"the Dask scheduler {place} is lost\n"
 
 
 def test_a_comparison_over_tls_equals_one_by_processes(tmp_path: Path) -> None:

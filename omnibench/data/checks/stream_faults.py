@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,8 +13,11 @@ from omnibench.data.checks.reference_jumps import reference_jumps
 from omnibench.data.checks.steering_readings import frozen_steering
 from omnibench.data.dataset import Trajectory
 from omnibench.data.stored.periods import median_period
-from omnibench.robot.kinematics import Array, Robot, wheel_equations
+from omnibench.jobs.gathering import gathered
+from omnibench.progress import Reporter
+from omnibench.robot.kinematics import Array, JsonArray, Robot, wheel_equations
 from omnibench.robot.model import OdometryModel
+from omnibench.robot.stored.odometry_of_stored import together, workers
 from omnibench.words import plural, some
 
 # Gaps that are told, s, and as a multiple of the usual period (chosen: a Robotino's log has gaps of 0.24 s at 31 ms).
@@ -38,25 +42,87 @@ _FEWEST, _STEP, _BENDS = 10, 3.0, 0.3
 _SAME = 1e-4  # m and rad: a pose that is repeated, below the noise of any reference; chosen
 
 
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What a run shows by itself; None or nothing where it has no poses, or steers no wheel.
+
+    fast: number of samples that are faster than any wheel turns. wheel_gaps, reference_gaps: lengths of what is missing
+    while the robot drives, s. standing: s in which the reference stands while the wheels drive. counted, expected (N,):
+    angles that the wheels count, and that the reference asks of them, rad. steering (2, S): least and largest angles,
+    rad. bends: see ``_bends``. moves_at_once: wheels and reference move from the first sample on.
+    """
+
+    run: str
+    samples: int
+    fast: int
+    wheel_gaps: tuple[float, ...]
+    reference_gaps: tuple[float, ...] = ()
+    standing: float = 0.0
+    counted: JsonArray | None = None
+    expected: JsonArray | None = None
+    steering: JsonArray | None = None
+    bends: JsonArray | None = None
+    moves_at_once: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Looks:
+    """What each of some runs shows."""
+
+    of_runs: tuple[Look, ...]
+
+
 def stream_faults(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Finding]:
     """Faults of runs, of which those without poses have only their wheels looked at.
 
     Jumps of the reference are told by wheels that are read rightly.
     """
     posed = [run for run in runs if run.has_poses]
-    yield from _restarts(robot, runs)
-    usual = median_period(runs)
-    yield from _gaps_of(robot, runs, "wheel_dropout", usual, lambda run: np.append(0.0, run.times), "wheel samples")
-    if not posed:
+    of_wheels = median_period(runs)
+    of_reference = float(np.median(np.concatenate([np.diff(run.pose_times) for run in posed]))) if posed else np.inf
+    tasks = [(robot, part, of_wheels, of_reference) for part in together(runs)]
+    looks = [look for part in gathered(workers(), looks_at, tasks, Looks) for look in part.of_runs]
+    yield from _restarts(looks)
+    yield from _missing("wheel_dropout", of_wheels, {look.run: look.wheel_gaps for look in looks}, "wheel samples")
+    looks = [look for run, look in zip(runs, looks, strict=True) if run.has_poses]
+    if not looks:
         return
-    usual = float(np.median(np.concatenate([np.diff(run.pose_times) for run in posed])))
-    yield from _gaps_of(robot, posed, "reference_dropout", usual, lambda run: run.pose_times, "reference poses")
-    frozen = _standing(robot, posed)
+    gaps = {look.run: look.reference_gaps for look in looks}
+    yield from _missing("reference_dropout", of_reference, gaps, "reference poses")
+    frozen = {look.run: look.standing for look in looks if look.standing}
     yield from _frozen(posed, frozen)
-    yield from dead_wheels(robot, posed)
-    yield from _frozen_steering(robot, posed)
+    yield from _dead_wheels(robot, looks)
+    yield from _frozen_steering(robot, looks)
     yield from _jumps(robot, [run for run in posed if run.id not in frozen])
-    yield from _moving_starts(robot, posed)
+    yield from _moving_starts(looks)
+
+
+def looks_at(task: tuple[Robot, Sequence[Trajectory], float, float], _: Reporter) -> Looks:
+    """What runs show. The task: robot, runs, and the usual periods of wheel samples and of reference poses, s."""
+    robot, runs, *periods = task
+    matrix = robot.inverse_kinematic_matrix
+    return Looks(tuple(_look(robot, run, _ways(matrix, robot.reach, run), *periods) for run in runs))
+
+
+def _look(robot: Robot, run: Trajectory, ways: Array, of_wheels: float, of_reference: float) -> Look:
+    """What a run shows. ways (F + 1,): see ``_ways``. of_wheels, of_reference: usual periods, s."""
+    fast = int((np.abs(run.rates) * robot.radii > _FASTEST).any(axis=1).sum())
+    wheel_gaps = _gaps(robot, run, ways, np.append(0.0, run.times), of_wheels)
+    if not run.has_poses:
+        return Look(run.id, len(run.times), fast, wheel_gaps)
+    return Look(
+        run.id,
+        len(run.times),
+        fast,
+        wheel_gaps,
+        _gaps(robot, run, ways, run.pose_times, of_reference),
+        _standing(robot, run, ways),
+        np.abs(run.rates).T @ np.diff(run.times, prepend=0.0),
+        _expected_angles(robot, run),
+        None if run.steering is None else np.array([run.steering.min(axis=0), run.steering.max(axis=0)]),
+        None if run.steering is None else _bends(robot, run),
+        _moves_at_once(robot, run, ways),
+    )
 
 
 def runs_in_words(runs: Sequence[str], every: int) -> str:
@@ -66,69 +132,54 @@ def runs_in_words(runs: Sequence[str], every: int) -> str:
     return f"run{'' if len(runs) == 1 else 's'} {some(list(runs), 5)}"
 
 
-def _restarts(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Finding]:
-    found = []
-    for run in runs:
-        fast = np.abs(run.rates) * robot.radii > _FASTEST
-        count = int(fast.any(axis=1).sum())
-        if 0 < count <= max(1.0, _RARE * len(fast)):
-            found.append(run.id)
+def _restarts(looks: Sequence[Look]) -> Iterator[Finding]:
+    found = [look.run for look in looks if 0 < look.fast <= max(1.0, _RARE * look.samples)]
     if found:
         yield Finding(
             kind="counter_restart",
             what=f"single wheel rates of {plural(len(found), 'run')} are faster than any wheel turns, as where a "
             "counter begins again",
-            where=runs_in_words(found, len(runs)),
+            where=runs_in_words(found, len(looks)),
             severity="error",
             fix="import the positions of the encoders, which are then counted on; or leave these runs out",
             changes={"leave_out": found},
         )
 
 
-def _gaps_of(
-    robot: Robot,
-    runs: Sequence[Trajectory],
-    kind: Kind,
-    usual: float,
-    times_of: Callable[[Trajectory], Array],
-    what: str,
-) -> Iterator[Finding]:
-    """Samples or poses, ``what``, that are missing for long while the robot drives. usual: their period, s."""
-    found, lengths = [], []
-    least = max(_LEAST_GAP, _PERIODS * usual)
-    for run in runs:
-        times = times_of(run)
-        gaps = np.flatnonzero(np.diff(times) > least)
-        gaps = (
-            gaps[[_moved_about(robot, run, times[gap], times[gap + 1]) > _DRIVEN for gap in gaps]]
-            if len(gaps)
-            else gaps
-        )
-        if len(gaps):
-            found.append(run.id)
-            lengths += np.diff(times)[gaps].tolist()
+def _gaps(robot: Robot, run: Trajectory, ways: Array, times: Array, usual: float) -> tuple[float, ...]:
+    """Lengths, s, of the gaps between times of samples or poses in which the robot drives. usual: their period, s."""
+    spacings = np.diff(times)
+    gaps = np.flatnonzero(spacings > max(_LEAST_GAP, _PERIODS * usual))
+    driven = [gap for gap in gaps if _moved_about(robot, run, ways, times[gap], times[gap + 1]) > _DRIVEN]
+    return tuple(spacings[driven].tolist())
+
+
+def _missing(kind: Kind, usual: float, gaps: Mapping[str, Sequence[float]], what: str) -> Iterator[Finding]:
+    """Samples or poses, ``what``, that are missing for long. gaps: their lengths, s, by run. usual: their period, s."""
+    found = [run for run, of_run in gaps.items() if of_run]
     if found:
+        lengths = [length for of_run in gaps.values() for length in of_run]
         longest = float(f"{max(2 * usual, 0.5 * min(lengths)):.2g}")
         yield Finding(
             kind=kind,
             what=f"{what} are missing {plural(len(lengths), 'time')} while the robot drives, for up to "
             f"{max(lengths):.1f} s; what it did then is not known",
-            where=runs_in_words(found, len(runs)),
+            where=runs_in_words(found, len(gaps)),
             severity="error",
             changes={"longest_gap": longest},
         )
 
 
-def _ways(robot: Robot, run: Trajectory) -> Array:
-    """Ways (F + 1,) that the wheels' design drives up to each sample's end, m; turning counts at the robot's size."""
-    twists = run.signals @ robot.inverse_kinematic_matrix.T
-    speeds = np.hypot(twists[:, 0], twists[:, 1]) + robot.reach * np.abs(twists[:, 2])
+def _ways(matrix: Array, reach: float, run: Trajectory) -> Array:
+    """Ways (F + 1,) that the wheels' design (3, M) drives up to each sample's end, m; turning counts at ``reach``."""
+    twists = run.signals @ matrix.T
+    speeds = np.hypot(twists[:, 0], twists[:, 1]) + reach * np.abs(twists[:, 2])
     return np.append(0.0, np.cumsum(speeds * np.diff(run.times, prepend=0.0)))
 
 
-def _moved_about(robot: Robot, run: Trajectory, begin: float, end: float) -> float:
+def _moved_about(robot: Robot, run: Trajectory, ways: Array, begin: float, end: float) -> float:
     """Way of the robot, m, between two times by the larger of wheels and reference."""
-    wheels = np.interp([begin, end], np.append(0.0, run.times), _ways(robot, run))
+    wheels = np.interp([begin, end], np.append(0.0, run.times), ways)
     at = np.searchsorted(run.pose_times, [begin - 1e-9, end + 1e-9])
     first, last = max(int(at[0]) - 1, 0), min(int(at[1]), len(run.poses) - 1)
     moved = run.poses[last] - run.poses[first]
@@ -136,23 +187,19 @@ def _moved_about(robot: Robot, run: Trajectory, begin: float, end: float) -> flo
     return max(float(wheels[1] - wheels[0]), seen)
 
 
-def _standing(robot: Robot, runs: Sequence[Trajectory]) -> dict[str, float]:
-    """Seconds in which the reference of a run stands, without even scattering, while its wheels drive, by run."""
-    found = {}
-    for run in runs:
-        changes = np.abs(np.diff(run.poses, axis=0)).max(axis=1) > _SAME
-        edges = np.flatnonzero(np.concatenate([[True], changes, [True]]))  # bounds of stretches of equal poses
-        first, last = edges[:-1], edges[1:] - 1
-        seconds = run.pose_times[last] - run.pose_times[first]
-        moved = run.poses[last] - run.poses[first]
-        seen = np.hypot(moved[:, 0], moved[:, 1]) + robot.reach * np.abs(moved[:, 2])
-        driven = np.interp(run.pose_times, np.append(0.0, run.times), _ways(robot, run))
-        wheels = driven[last] - driven[first]
-        long = seconds >= max(_STANDING, 3 * float(np.median(np.diff(run.pose_times))))
-        still = long & (wheels > _DRIVEN) & (seen < _STILL * wheels)
-        if still.any():
-            found[run.id] = float(seconds[still].sum())
-    return found
+def _standing(robot: Robot, run: Trajectory, ways: Array) -> float:
+    """Seconds in which the reference of a run stands, without even scattering, while its wheels drive."""
+    changes = np.abs(np.diff(run.poses, axis=0)).max(axis=1) > _SAME
+    edges = np.flatnonzero(np.concatenate([[True], changes, [True]]))  # bounds of stretches of equal poses
+    first, last = edges[:-1], edges[1:] - 1
+    seconds = run.pose_times[last] - run.pose_times[first]
+    moved = run.poses[last] - run.poses[first]
+    seen = np.hypot(moved[:, 0], moved[:, 1]) + robot.reach * np.abs(moved[:, 2])
+    driven = np.interp(run.pose_times, np.append(0.0, run.times), ways)
+    wheels = driven[last] - driven[first]
+    long = seconds >= max(_STANDING, 3 * float(np.median(np.diff(run.pose_times))))
+    still = long & (wheels > _DRIVEN) & (seen < _STILL * wheels)
+    return float(seconds[still].sum())
 
 
 def _frozen(runs: Sequence[Trajectory], frozen: dict[str, float]) -> Iterator[Finding]:
@@ -181,44 +228,43 @@ def _frozen(runs: Sequence[Trajectory], frozen: dict[str, float]) -> Iterator[Fi
         )
 
 
-def dead_wheels(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Finding]:
+def _dead_wheels(robot: Robot, looks: Sequence[Look]) -> Iterator[Finding]:
     """Wheels that count nothing though the reference shows that they turn."""
     dead: dict[str, list[str]] = {}
     counts = np.zeros(len(robot.wheel_names), dtype=bool)
-    for run in runs:
-        expected = expected_angles(robot, run)
-        counted = np.abs(run.rates).T @ np.diff(run.times, prepend=0.0)
+    for look in looks:
+        assert look.expected is not None  # it has poses
+        assert look.counted is not None
         # Shares of the wheel that moves most, so that units which are misread do not matter.
-        still = counted <= _DEAD * counted.max()
+        still = look.counted <= _DEAD * look.counted.max()
         counts |= ~still
-        still &= expected > max(_EXPECTED, _ASKED * expected.max())
+        still &= look.expected > max(_EXPECTED, _ASKED * look.expected.max())
         if still.all() and len(still) > 1:
             continue  # a reference that moves by itself is told otherwise
         for name, is_dead in zip(robot.wheel_names, still.tolist(), strict=True):
             if is_dead:
-                dead.setdefault(name, []).append(run.id)
+                dead.setdefault(name, []).append(look.run)
     for name, names in dead.items():
-        every = len(names) > 0.8 * len(runs) or not counts[robot.wheel_names.index(name)]
+        every = len(names) > 0.8 * len(looks) or not counts[robot.wheel_names.index(name)]
         where = wheels_in_words([name])
-        at = "" if every else f" in {runs_in_words(names, len(runs))}"
+        at = "" if every else f" in {runs_in_words(names, len(looks))}"
         yield Finding(
             kind="wheel_dead",
             what=f"{where} never turns{at}, though the reference shows that it must: its encoder or column is dead",
-            where=where if every else f"{where} in {runs_in_words(names, len(runs))}",
+            where=where if every else f"{where} in {runs_in_words(names, len(looks))}",
             severity="error",
             fix="check its cable and the column that is read, and record again" if every else "",
             changes={} if every else {"leave_out": names},
         )
 
 
-def _frozen_steering(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Finding]:
+def _frozen_steering(robot: Robot, looks: Sequence[Look]) -> Iterator[Finding]:
     """Steering angles that never change though the robot's turns do."""
-    angles = [run.steering for run in runs if run.steering is not None]
-    if not angles:
+    ends = [look.steering for look in looks if look.steering is not None]
+    if not ends:
         return
-    ends = np.array([(of_run.min(axis=0), of_run.max(axis=0)) for of_run in angles])
-    spans = ends[:, 1].max(axis=0) - ends[:, 0].min(axis=0)
-    bends = np.concatenate([_bends(robot, run) for run in runs])
+    spans = np.max([most for _, most in ends], axis=0) - np.min([least for least, _ in ends], axis=0)
+    bends = np.concatenate([look.bends for look in looks if look.bends is not None])
     if len(bends) < _FEWEST or np.subtract(*np.quantile(bends, [0.9, 0.1])) < _BENDS:
         return
     for name in [name for name, span in zip(robot.drive.steered, spans.tolist(), strict=True) if span < _SAME]:
@@ -239,7 +285,7 @@ def _bends(robot: Robot, run: Trajectory) -> Array:
     return bends
 
 
-def expected_angles(robot: Robot, run: Trajectory) -> Array:
+def _expected_angles(robot: Robot, run: Trajectory) -> Array:
     """Angles (N,), rad, by which wheels must turn for the reference's motion, at least about."""
     every = max(1, round(0.5 / float(np.median(np.diff(run.pose_times)))))
     poses = run.poses[::every]
@@ -281,23 +327,23 @@ def _jumps(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Finding]:
         )
 
 
-def _moving_starts(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Finding]:
-    found = [run.id for run in runs if _starts_moving(robot, run)]
+def _moving_starts(looks: Sequence[Look]) -> Iterator[Finding]:
+    found = [look.run for look in looks if look.moves_at_once]
     if found:
-        severity: Severity = "warning" if len(found) > len(runs) / 2 else "note"
+        severity: Severity = "warning" if len(found) > len(looks) / 2 else "note"
         yield Finding(
             kind="not_at_rest",
             what=f"{plural(len(found), 'run')} {'begins' if len(found) == 1 else 'begin'} while the robot drives: the "
             "start pose is uncertain then, and what was driven before the first sample is lost",
-            where=runs_in_words(found, len(runs)),
+            where=runs_in_words(found, len(looks)),
             severity=severity,
             fix="let the robot stand for a second at the begin of every run, with recording on",
         )
 
 
-def _starts_moving(robot: Robot, run: Trajectory) -> bool:
+def _moves_at_once(robot: Robot, run: Trajectory, ways: Array) -> bool:
     """True if wheels and reference move from the first sample on nearly as fast as they ever do, or as they go on."""
-    edges, ways = np.append(0.0, run.times), _ways(robot, run)
+    edges = np.append(0.0, run.times)
     seen = np.append(
         0.0, np.cumsum(np.hypot(*np.diff(run.poses[:, :2], axis=0).T) + robot.reach * np.abs(np.diff(run.poses[:, 2])))
     )

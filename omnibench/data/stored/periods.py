@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
 
+from omnibench.data.stored.stored_rows import MOST_IN_MEMORY, noted
 from omnibench.robot.kinematics import Array
-
-_TOGETHER = 5_000_000  # periods whose median is taken at once; of more it is found bit by bit (chosen)
-_BITS = 20  # bits that are counted at a time: twice, which leaves 2^-29 of the median open (chosen)
-_MASK = (1 << _BITS) - 1
 
 
 class Sampled(Protocol):
@@ -24,35 +21,24 @@ class Sampled(Protocol):
 def median_period(runs: Sequence[Sampled]) -> float:
     """The median time between the wheel samples of runs, the start being the first, s.
 
-    It is robust to jitter and gaps. Of very many samples it is one of the middle periods, to 2e-9 of itself.
+    It is robust to jitter and gaps. Of very many samples it is the period of the run in the middle: the median of the
+    runs' medians, each of which counts as often as it has samples.
     """
-    count = sum(len(run.times) for run in runs)
-    if count <= _TOGETHER:
-        return float(np.median(np.concatenate(list(_periods(runs)))))
-    prefix, rank = 0, count // 2
-    for shift in (63 - _BITS, 63 - 2 * _BITS):  # positive floats are ordered as their bits are
-        counts = np.zeros(1 << _BITS, dtype=np.int64)
-        for periods in _joined(_periods(runs)):
-            bits = np.maximum(periods, 0.0).view(np.int64) >> shift
-            counts += np.bincount(bits[bits >> _BITS == prefix] & _MASK, minlength=len(counts))
-        place = int(np.searchsorted(np.cumsum(counts), rank, side="right"))
-        prefix, rank = prefix << _BITS | place, rank - int(counts[:place].sum())
-    return float(np.array(prefix << shift, dtype=np.int64).view(float))
+    counts = np.array([len(run.times) for run in runs])
+    if counts.sum() <= MOST_IN_MEMORY:
+        return float(np.median(np.concatenate([_periods(run) for run in runs])))
+    medians = np.array([period_of(run) for run in runs])
+    order = np.argsort(medians, kind="stable")
+    passed = np.cumsum(counts[order])
+    return float(medians[order][np.searchsorted(passed, passed[-1] / 2)])
 
 
-def _joined(parts: Iterator[Array]) -> Iterator[Array]:
-    """Values in larger parts, beside which the counts of one part are few."""
-    kept, count = list[Array](), 0
-    for part in parts:
-        kept, count = [*kept, part], count + len(part)
-        if count > 1 << _BITS:
-            yield np.concatenate(kept)
-            kept, count = [], 0
-    if kept:
-        yield np.concatenate(kept)
+def period_of(run: Sampled) -> float:
+    """The median time between the wheel samples of a run, s."""
+    return noted(run.times, "period", lambda: float(np.median(_periods(run))))
 
 
-def _periods(runs: Sequence[Sampled]) -> Iterator[Array]:
-    """The periods (F,) of each run, s."""
-    for run in runs:
-        yield np.diff(run.times, prepend=0.0)
+def _periods(run: Sampled) -> Array:
+    """The periods (F,) of a run, s."""
+    periods: Array = np.diff(run.times, prepend=0.0)
+    return periods

@@ -9,12 +9,12 @@ from __future__ import annotations
 import math
 import threading
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import polars as pl
@@ -26,6 +26,8 @@ from omnibench.robot.kinematics import Array
 MOST_IN_MEMORY = 5_000_000  # wheel samples that are kept: 200 MB of three wheels' (chosen)
 BLOCK_ROWS = 500_000  # rows of a block, of whole runs: 16 MB of four columns (chosen)
 _BLOCKS_KEPT = 4  # blocks in memory, those of all files together (chosen)
+
+Value = TypeVar("Value")
 
 
 @dataclass(frozen=True)
@@ -123,7 +125,7 @@ class StoredRows(np.lib.mixins.NDArrayOperatorsMixin):
     """Rows of a run that behave like their array: (count, n), or (count,) where ``flat``. Whatever uses it reads it.
 
     columns: those that are read together. chosen: the places of this array's among them. last: the last value of a
-    flat one, which is known without reading. more: rows that follow those of the file.
+    flat one, which is known without reading. more: rows that follow those of the file. notes: see ``noted``.
     """
 
     file: BlockFile
@@ -134,6 +136,7 @@ class StoredRows(np.lib.mixins.NDArrayOperatorsMixin):
     flat: bool = False
     last: float | None = None
     more: tuple[Array, ...] = ()
+    notes: dict[str, Any] = field(default_factory=dict, init=False)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -184,6 +187,24 @@ class StoredRows(np.lib.mixins.NDArrayOperatorsMixin):
         if name.startswith("__"):  # protocols of copy and pickle, not of arrays
             raise AttributeError(name)
         return getattr(np.asarray(self), name)
+
+
+def in_file(rows: object) -> bool:
+    """True if rows are read where they are used, and were checked where their file was opened."""
+    return isinstance(rows, StoredRows)
+
+
+def noted(rows: Any, name: str, find: Callable[[], Value]) -> Value:
+    """A value that is found from rows, by its name: found once, and noted with them, where they stand in a file.
+
+    Whoever reads the samples first has many such values found while these are at hand.
+    """
+    if not isinstance(rows, StoredRows):
+        return find()
+    if name not in rows.notes:
+        rows.notes[name] = find()
+    found: Value = rows.notes[name]
+    return found
 
 
 def _read(value: Any) -> Any:

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import os
 import pickle
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from sample_robots import APR_02, MECANUM
 from wheeled_samples import CAR, DIFF, SWERVE, driven
 
@@ -200,21 +198,20 @@ def test_a_file_that_changes_under_the_data_set_is_not_read_on(tmp_path: Path) -
         pickled.rates.file.read(pickled.rates.columns, 0)
 
 
-@given(periods_of=st.lists(st.floats(1e-4, 10.0), min_size=3, max_size=60))
-def test_the_median_of_very_many_periods_is_one_of_the_middle_ones(periods_of: list[float]) -> None:
-    runs = [load_like(np.cumsum(part)) for part in (periods_of[:2], periods_of[2:])]
-    spacings = np.sort(np.concatenate([np.diff(run.times, prepend=0.0) for run in runs]))
-    before, periods._TOGETHER = periods._TOGETHER, 0
-    try:
-        median = median_period(runs)
-    finally:
-        periods._TOGETHER = before
-    assert median == pytest.approx(spacings[len(spacings) // 2], rel=3e-9)
+@dataclass
+class Sampled:
+    """A run of which only the times matter."""
+
+    times: np.ndarray
 
 
-class load_like:  # noqa: N801 (a run of which only the times matter)
-    def __init__(self, times: np.ndarray) -> None:
-        self.times = times
+def test_the_usual_period_of_very_many_samples_is_that_of_the_run_in_their_middle(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    runs = [Sampled(np.arange(1, 1 + count) * period) for count, period in ((400, 0.1), (900, 0.01), (600, 0.02))]
+    monkeypatch.setattr(periods, "MOST_IN_MEMORY", 0)
+    assert median_period(runs) == pytest.approx(0.02)
+    assert median_period([*runs, Sampled(np.array([5.0, 99.0]))]) == pytest.approx(0.02)
 
 
 def test_some_runs_are_drawn_always_the_same_and_into_memory(folder: Path) -> None:
