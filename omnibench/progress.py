@@ -56,11 +56,15 @@ _PERIOD = 0.2  # s between two reports of reading, at least; chosen
 
 
 class _Reading:
-    """What is told of the reading of data sets that do not fit in memory: samples, or parts that workers have read."""
+    """What is told of the reading of data sets that do not fit in memory: samples, or parts that workers have read.
+
+    done, expected: by unit, how many have been read, and how many one pass reads.
+    """
 
     def __init__(self, report: Reporter) -> None:
         self.report = report
         self.done: dict[str, int] = {}
+        self.expected: dict[str, int] = {}
         self.told = time.monotonic()
 
 
@@ -80,15 +84,23 @@ def reading_told_to(report: Reporter) -> Iterator[None]:
             report(Progress(f"reading {unit}s", result=""))
 
 
+def expect_reading(count: int, unit: str) -> None:
+    """So many samples, or other things, are read from now on, perhaps in several passes."""
+    if (reading := _READING.get()) is not None:
+        reading.done[unit], reading.expected[unit] = 0, count
+
+
 def tell_reading(count: int, unit: str) -> None:
     """Samples, or other things, have been read."""
     reading = _READING.get()
-    if reading is None:
+    if reading is None or unit not in reading.expected:
         return
-    reading.done[unit] = reading.done.get(unit, 0) + count
+    reading.done[unit] += count
     if time.monotonic() - reading.told > _PERIOD:
         reading.told = time.monotonic()
-        reading.report(Progress(f"reading {unit}s", reading.done[unit], None, unit))
+        passes, done = divmod(reading.done[unit], reading.expected[unit])
+        note = f"pass {passes + 1}" if passes and done else ""
+        reading.report(Progress(f"reading {unit}s", done, reading.expected[unit], unit, note=note))
 
 
 class Stages:

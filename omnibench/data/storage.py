@@ -26,6 +26,7 @@ from omnibench.data.tables.table import Table, read_table, table_file
 from omnibench.data.tables.wheel_table import WheelTable
 from omnibench.errors import DataError, require_type
 from omnibench.files import FileContent, TableFormat, encode_table, remove, resolved, write_files
+from omnibench.progress import expect_reading
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +47,10 @@ def load_dataset(path: Path | str | Sequence[Path | str], *, most_in_memory: int
     DataError names the file, the row (1 is the first after the header) and what is wrong.
     """
     folders = dataset_folders(path)
-    left = sum(_stored_samples(folder) for folder in folders) > most_in_memory
+    samples = sum(_stored_samples(folder) for folder in folders)
+    left = samples > most_in_memory
+    if left:
+        expect_reading(samples, "sample")
     recorded = [read_recorded(folder, left_in_files=left) for folder in folders]
     headers = [each.header for each in recorded]
     first, last = headers[0], headers[-1]

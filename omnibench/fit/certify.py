@@ -34,7 +34,7 @@ from omnibench.processes import one_thread
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.registry import calibrators, costs
 from omnibench.robot.calibration import Calibration
-from omnibench.robot.kinematics import Array, JsonArray
+from omnibench.robot.kinematics import Array
 from omnibench.views import Brief
 
 _TIMED = 3  # parts whose mean time stands for that of all: the whole box and its first two parts
@@ -246,7 +246,7 @@ def _cut_at_once(
     while boxes and len(taken) < _AT_ONCE and boxes[0][0] < wanted and boxes[0][2].looseness.any():
         taken.append(heapq.heappop(boxes)[2])
     cuts = _CUTS if math.isinf(left) else int(min(_CUTS, max(left // (2 * len(taken)), 1)))
-    branches = gathered(backend, _branch, [(bounds, node, wanted, cuts) for node in taken], _Branch, shared=(bounds,))
+    branches = gathered(backend, _branch, [(bounds, node, wanted, cuts) for node in taken], shared=(bounds,))
     return [node for branch in branches for node in branch.nodes()], sum(branch.made for branch in branches)
 
 
@@ -257,11 +257,11 @@ class _Branch:
     made: parts that were bounded on the way.
     """
 
-    lower: JsonArray
-    upper: JsonArray
-    good: JsonArray
-    looseness: JsonArray
-    bound: JsonArray
+    lower: Array
+    upper: Array
+    good: Array
+    looseness: Array
+    bound: Array
     made: int
 
     def nodes(self) -> Iterator[Node]:

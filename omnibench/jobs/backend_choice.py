@@ -59,7 +59,11 @@ def open_backend(
     """
     check_backend(choice.name, choice.tls)
     if choice.name == "processes":
-        yield Processes(choice.workers, preload)
+        processes = Processes(choice.workers, preload, lasting=True)
+        try:
+            yield processes
+        finally:
+            processes.close()
         return
     from omnibench.jobs.dask_backend import DaskBackend
     from omnibench.jobs.dask_cluster import checked_requirements, dask_client, say_cluster

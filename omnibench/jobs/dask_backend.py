@@ -27,7 +27,7 @@ from omnibench.jobs.job import TRIES, BackendError, Ended, Failure, Job, JobWatc
 from omnibench.jobs.job_process import JobEnd, in_job
 from omnibench.jobs.local_backends import InPlace
 from omnibench.jobs.packing import Packer, run_packed
-from omnibench.jobs.result_store import ResultStore
+from omnibench.jobs.result_store import Store
 
 T = TypeVar("T")
 
@@ -67,7 +67,7 @@ class DaskBackend:
     _packer: Packer = field(default_factory=Packer)
     _data: dict[str, Any] = field(default_factory=dict)
 
-    def run(self, jobs: Iterable[tuple[int, Job[T]]], store: ResultStore[T], watch: JobWatch[T]) -> Iterator[Ended]:
+    def run(self, jobs: Iterable[tuple[int, Job[T]]], store: Store[T], watch: JobWatch[T]) -> Iterator[Ended]:
         """Run the jobs, see Backend. SchedulerLostError, or UnfitWorkerError of a worker that joined later."""
         if in_job():
             yield from InPlace().run(jobs, store, watch)
@@ -99,7 +99,7 @@ class DaskBackend:
 class _Run:
     """The jobs of one call of ``run``. pending: those with the cluster, by their numbers."""
 
-    def __init__(self, backend: DaskBackend, store: ResultStore[Any], watch: JobWatch[Any]) -> None:
+    def __init__(self, backend: DaskBackend, store: Store[Any], watch: JobWatch[Any]) -> None:
         self.pending: dict[int, _Pending] = {}
         self._backend, self._client, self._store, self._watch = backend, backend.client, store, watch
         self._topic = f"omnibench-{uuid4().hex[:12]}"

@@ -25,7 +25,7 @@ from omnibench.files import write_text
 from omnibench.jobs.job import BackendError, Job
 from omnibench.jobs.job_process import PRELOAD, JobEnd, JobProcess
 from omnibench.jobs.packing import PackedJob
-from omnibench.jobs.result_store import ResultStore
+from omnibench.jobs.result_store import Store
 from omnibench.jobs.software import differences, software
 from omnibench.processes import one_thread_processes
 from omnibench.progress import Progress, Reporter
@@ -66,7 +66,7 @@ class Parcel:
     """Jobs that travel together, quick ones. topic: of the events that tell of them. names: of what they share."""
 
     topic: str
-    store: ResultStore[Any]
+    store: Store[Any]
     orders: tuple[Order, ...]
     names: tuple[str, ...]
 
@@ -104,9 +104,10 @@ def carry_out(parcel: Parcel, requirements: bytes, *shared: bytes) -> list[Told]
     with _slots(worker.state.nthreads if timed else 1, worker.state.nthreads):
         teller.begins(*(Told(order.number, worker.address) for order in parcel.orders))
         for order in parcel.orders:
-            packed = PackedJob(order.content, {name: data[name] for name in order.names}, plugins)
+            held = {name: data[name] for name in order.names}
+            packed = PackedJob(order.content, held, plugins, kept=order.job.own)
             job, began = replace(order.job, argument=packed), time.monotonic()
-            process = _process_for(job, preload)
+            process = _process_for(job, requirements, preload)
             try:
                 process.give(job, parcel.store.content)
                 progress, end = _follow(process, teller, order.number)
@@ -117,7 +118,7 @@ def carry_out(parcel: Parcel, requirements: bytes, *shared: bytes) -> list[Told]
                 process.end()
                 break
             if end.reusable:
-                _idle.append(process)
+                _idle.append((requirements, process))
             else:
                 process.end()
             teller.ended(Told(order.number, worker.address, progress, end, time.monotonic() - began))
@@ -142,7 +143,7 @@ def check(requirements: bytes, dask_worker: Any) -> str | None:
 _preparing = threading.Lock()
 _free = threading.Condition()
 _taken = 0  # slots of this worker
-_idle: list[JobProcess] = []
+_idle: list[tuple[bytes, JobProcess]] = []  # with the requirements of the client that they served
 _open = ExitStack()
 
 
@@ -271,10 +272,10 @@ def _slots(wanted: int, all_slots: int) -> Iterator[None]:
             _free.notify_all()
 
 
-def _process_for(job: Job[Any], preload: tuple[str, ...]) -> JobProcess:
+def _process_for(job: Job[Any], requirements: bytes, preload: tuple[str, ...]) -> JobProcess:
     while _idle:
-        process = _idle.pop()
-        if process.takes(job):
+        served, process = _idle.pop()
+        if served == requirements and process.takes(job):
             return process
         process.end()
     return JobProcess(_context(preload))

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 from omnibench.errors import DataError
 from omnibench.jobs.job import Backend, Failure, Job, JobWatch, run_jobs
-from omnibench.jobs.result_store import ResultStore
-from omnibench.progress import Reporter, no_progress, tell_reading
+from omnibench.progress import Reporter, expect_reading, no_progress, tell_reading
 
 T = TypeVar("T")
 
@@ -19,20 +18,51 @@ def gathered(
     backend: Backend | None,
     function: Callable[[Any, Reporter], T],
     arguments: Sequence[Any],
-    kind: type[T],
     shared: tuple[Any, ...] = (),
 ) -> list[T]:
     """Results of ``function`` (from the top of a module) for every argument, in their order; None: without jobs.
 
-    kind, shared: see ResultStore and Job. DataError, or what the function raised: one of them has no result.
+    shared: see Job. DataError, or what the function raised: one of them has no result.
     """
     if backend is None:
         return [function(argument, no_progress) for argument in arguments]
     results: _Results[T] = _Results()
-    with TemporaryDirectory(prefix="omnibench-") as folder:
-        jobs = (Job(str(number), function, argument, shared=shared) for number, argument in enumerate(arguments))
-        run_jobs(jobs, ResultStore(Path(folder), kind), backend, results)
+    expect_reading(len(arguments), "part")
+    jobs = (Job(str(number), function, argument, shared=shared, own=True) for number, argument in enumerate(arguments))
+    run_jobs(jobs, _InMemory[T](), backend, results)
     return [results.found[number] for number in range(len(arguments))]
+
+
+class _InMemory(Generic[T]):
+    """Results in memory, pickled until they are asked for, which is once."""
+
+    def __init__(self) -> None:
+        self._contents: dict[str, bytes] = {}
+
+    def __reduce__(self) -> tuple[type[Self], tuple[()]]:
+        return type(self), ()  # where results are made nobody needs the others
+
+    def anchored(self) -> Self:
+        return self
+
+    def get(self, key: str) -> T | None:
+        content = self._contents.pop(key, None)
+        return None if content is None else pickle.loads(content)
+
+    def keep(self, key: str, result: T) -> bytes:
+        return self.content(key, result)
+
+    def content(self, _: str, result: T) -> bytes:
+        return pickle.dumps(result, pickle.HIGHEST_PROTOCOL)
+
+    def put(self, key: str, result: T) -> None:
+        self.put_content(key, self.content(key, result))
+
+    def put_content(self, key: str, content: bytes) -> None:
+        self._contents[key] = content
+
+    def file(self, key: str) -> Path:
+        return Path(key)
 
 
 class _Results(JobWatch[T]):

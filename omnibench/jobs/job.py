@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 from omnibench.errors import OmnibenchError
-from omnibench.jobs.result_store import ResultStore
+from omnibench.jobs.result_store import Store
 from omnibench.progress import Progress, Reporter
 
 T = TypeVar("T")
@@ -28,7 +28,8 @@ class Job(Generic[T]):
     with the argument and a function that reports progress. seconds, memory_mb: limits of its wall time and of its
     process's memory (10^6 bytes), None for no limit. timed: its seconds are compared, so that on another machine it has
     the worker to itself. shared: objects within the argument that other jobs hold, too; to another machine each travels
-    once.
+    once. own: it runs omnibench's own code alone, which leaves nothing behind: such jobs have a process together for
+    longer, and within it what they share.
     """
 
     key: str
@@ -38,8 +39,9 @@ class Job(Generic[T]):
     memory_mb: float | None = None
     timed: bool = False
     shared: tuple[Any, ...] = ()
+    own: bool = False
 
-    def run(self, store: ResultStore[T], report: Reporter) -> None:
+    def run(self, store: Store[T], report: Reporter) -> None:
         """Do the work here and write the result's file."""
         store.put(self.key, self.function(self.argument, report))
 
@@ -86,21 +88,21 @@ class JobWatch(Generic[T]):
 class Backend(Protocol):
     """Place where jobs are run: this process, processes of this machine, or other machines that share the store."""
 
-    def run(self, jobs: Iterable[tuple[int, Job[T]]], store: ResultStore[T], watch: JobWatch[T]) -> Iterator[Ended]:
+    def run(self, jobs: Iterable[tuple[int, Job[T]]], store: Store[T], watch: JobWatch[T]) -> Iterator[Ended]:
         """Run jobs, which are taken as workers become free, and yield them as they end.
 
         When the iterator is closed or interrupted, workers are ended at once.
         """
 
 
-def run_jobs(jobs: Iterable[Job[T]], store: ResultStore[T], backend: Backend, watch: JobWatch[T]) -> None:
+def run_jobs(jobs: Iterable[Job[T]], store: Store[T], backend: Backend, watch: JobWatch[T]) -> None:
     """Run the jobs whose results are not in the store; ``watch`` hears of every end, results come from the store.
 
     A job whose worker was killed is tried again after all others, at most three times in all: what killed it (the
     system, which lacked memory; a person) may be gone by then. A job that raised, was over its time or memory limit, or
     crashed would do so again. Whatever ``watch`` raises ends the work.
     """
-    store = replace(store, folder=store.folder.absolute())  # a job may change its working folder
+    store = store.anchored()
     waiting = _not_stored(jobs, store, watch)
     for tried in range(1, TRIES + 1):
         killed: list[tuple[int, Job[T]]] = []
@@ -117,7 +119,7 @@ def run_jobs(jobs: Iterable[Job[T]], store: ResultStore[T], backend: Backend, wa
         waiting = iter(killed)
 
 
-def _not_stored(jobs: Iterable[Job[T]], store: ResultStore[T], watch: JobWatch[T]) -> Iterator[tuple[int, Job[T]]]:
+def _not_stored(jobs: Iterable[Job[T]], store: Store[T], watch: JobWatch[T]) -> Iterator[tuple[int, Job[T]]]:
     """The jobs that have to be run, with their numbers."""
     for number, job in enumerate(jobs):
         result = store.get(job.key)

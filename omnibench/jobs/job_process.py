@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from signal import SIG_DFL, SIG_IGN, SIGABRT, SIGHUP, SIGINT, SIGKILL, SIGSEGV, SIGTERM, Signals
 from typing import Any
@@ -18,12 +18,14 @@ from typing import Any
 from omnibench.errors import one_line
 from omnibench.jobs.job import Failure, Job
 from omnibench.jobs.memory import limited_memory, oom_kills
+from omnibench.jobs.packing import PackedJob
 from omnibench.processes import end_with_parent, interrupts_deferred, main_module_hidden, one_thread
 from omnibench.progress import Progress
 
 # s after its start in which a process takes further jobs: to start one costs 20 ms (tests/benchmarks/job_overhead.py),
 # 2 % of that; what jobs leave behind in it (memory, caches) is that of a second.
 _YOUNG = 1.0
+_OWN = 60.0  # s, for jobs of our own code, which leave nothing behind but what they share: data need not go again
 # What every process of jobs needs; pydantic imports these when a result is first written, which takes 60 ms.
 PRELOAD = (__name__, "pydantic.fields", "pydantic.dataclasses")
 _CLOSED = 1.0  # s in which a process dies whose end of the connection is closed; chosen
@@ -77,6 +79,7 @@ class JobProcess:
         self._since = time.monotonic()
         self._kills = 0
         self._fresh = True
+        self._sent: set[str] = set()
         self.deadline: float | None = None  # of the job, by time.monotonic
 
     @property
@@ -86,11 +89,15 @@ class JobProcess:
 
     def takes(self, job: Job[Any]) -> bool:
         """True if it may do the job: a job with a limit gets a fresh process, others one that is young."""
-        return self._fresh or not (_alone(job) or time.monotonic() - self._since > _YOUNG)
+        return self._fresh or not (_alone(job) or time.monotonic() - self._since > (_OWN if job.own else _YOUNG))
 
     def give(self, job: Job[Any], keep: Callable[[str, Any], Any]) -> None:
         """Begin a job. keep: called there with the key and the result; what it returns is the end's ``answer``."""
         self._fresh, self._kills = False, oom_kills()
+        if isinstance(job.argument, PackedJob) and job.argument.kept:
+            names = job.argument.shared.keys()
+            job = replace(job, argument=job.argument.without(self._sent))
+            self._sent |= names
         self.deadline = None if job.seconds is None else time.monotonic() + job.seconds
         with suppress(BrokenPipeError, ConnectionResetError):  # it died: ``receive`` tells how
             self.connection.send((job, keep))

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing.connection import wait
 from typing import Any, TypeVar
 
 from omnibench.jobs.job import Backend, Ended, Job, JobWatch
 from omnibench.jobs.job_process import PRELOAD, JobEnd, JobProcess, in_job, raised
-from omnibench.jobs.result_store import ResultStore
+from omnibench.jobs.packing import Packer
+from omnibench.jobs.result_store import Store
 from omnibench.processes import one_thread, one_thread_processes
 
 T = TypeVar("T")
@@ -27,7 +28,7 @@ def local_backend(workers: int, preload: Sequence[str] = ()) -> Backend:
 class InPlace:
     """Runs jobs one after the other in this process. Their limits are not enforced."""
 
-    def run(self, jobs: Iterable[tuple[int, Job[T]]], store: ResultStore[T], watch: JobWatch[T]) -> Iterator[Ended]:
+    def run(self, jobs: Iterable[tuple[int, Job[T]]], store: Store[T], watch: JobWatch[T]) -> Iterator[Ended]:
         """Run the jobs, see Backend."""
         for number, job in jobs:
             watch.began(number)
@@ -45,42 +46,55 @@ class Processes:
     """Runs jobs in processes of one thread, up to ``workers`` of them at a time.
 
     A job with a limit of time or memory, one that begins when a process is a second old, and one after a job that
-    raised or left something behind (a working folder, threads, children) has a fresh process; quick jobs share one.
+    raised or left something behind (a working folder, threads, children) has a fresh process; quick jobs share one, and
+    those of our own code share it for a minute.
     preload: modules that the processes share, so that they need not be imported for every job. Within a job there are
-    no further processes: it runs its jobs itself.
+    no further processes: it runs its jobs itself. lasting: processes that have nothing to do wait for the next run,
+    until ``close``.
     """
 
     workers: int
     preload: Sequence[str] = ()
+    lasting: bool = False
+    _idle: list[JobProcess] = field(default_factory=list, init=False, repr=False, compare=False)
 
-    def run(self, jobs: Iterable[tuple[int, Job[T]]], store: ResultStore[T], watch: JobWatch[T]) -> Iterator[Ended]:
+    def run(self, jobs: Iterable[tuple[int, Job[T]]], store: Store[T], watch: JobWatch[T]) -> Iterator[Ended]:
         """Run the jobs, see Backend."""
         if in_job():
             yield from InPlace().run(jobs, store, watch)
             return
         waiting = iter(jobs)
         active: dict[JobProcess, tuple[int, Job[Any]]] = {}
-        idle: list[JobProcess] = []
+        idle, packer = self._idle, Packer()
         with one_thread_processes((*PRELOAD, *self.preload)) as context:
             try:
                 while True:
                     while len(active) < self.workers and (item := next(waiting, None)) is not None:
                         process = _process_for(item[1], idle, context)
                         active[process] = item
-                        process.give(item[1], store.put)
+                        process.give(packer.packed(item[1]), store.keep)
                         watch.began(item[0])
                     if not active:
                         return
                     for process, end in _ends(active, watch):
                         number, job = active.pop(process)
+                        if end.answer is not None:
+                            store.put_content(job.key, end.answer)
                         if end.reusable:
                             idle.append(process)
                         else:
                             process.end()
                         yield Ended(number, job, end.failure(job))
             finally:
-                for process in (*active, *idle):
+                for process in active:
                     process.end()
+                if not self.lasting:
+                    self.close()
+
+    def close(self) -> None:
+        """End the processes that wait."""
+        while self._idle:
+            self._idle.pop().end()
 
 
 def _process_for(job: Job[Any], idle: list[JobProcess], context: Any) -> JobProcess:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import pickle
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,13 @@ class Packer:
         _Pickler(stream, {key: name for key, (_, name, _) in shared.items()}).dump((job.function, job.argument))
         return stream.getvalue(), {name: content for _, name, content in shared.values()}
 
+    def packed(self, job: Job[Any]) -> Job[Any]:
+        """A job of our own code packed for a process of this machine, to which what jobs share goes once; any other."""
+        if not (job.own and job.shared):
+            return job
+        content, shared = self.pack(job)
+        return replace(job, function=run_packed, argument=PackedJob(content, shared, {}, kept=True), shared=())
+
     def _content(self, value: Any) -> tuple[Any, str, bytes]:
         if id(value) not in self._known:
             content = pickle.dumps(value, pickle.HIGHEST_PROTOCOL)
@@ -47,12 +54,11 @@ class _Pickler(pickle.Pickler):
 
 
 class _Unpickler(pickle.Unpickler):
-    """shared: what the objects that were left out are pickled as, by their names."""
+    """shared: what the objects that were left out are pickled as, by their names. made: those that were unpickled."""
 
-    def __init__(self, content: bytes, shared: Mapping[str, bytes]) -> None:
+    def __init__(self, content: bytes, shared: Mapping[str, bytes], made: dict[str, Any]) -> None:
         super().__init__(BytesIO(content))
-        self._shared = shared
-        self._made: dict[str, Any] = {}
+        self._shared, self._made = shared, made
 
     def persistent_load(self, name: str) -> Any:
         if name not in self._made:
@@ -62,15 +68,26 @@ class _Unpickler(pickle.Unpickler):
 
 @dataclass(frozen=True)
 class PackedJob:
-    """A job's function and argument as bytes. plugins: copies of plug-in files here, by their paths at home."""
+    """A job's function and argument as bytes. plugins: copies of plug-in files here, by their paths at home.
+
+    kept: what the job shares with others is kept in its process, whose next jobs need not be sent it.
+    """
 
     content: bytes
     shared: Mapping[str, bytes]
     plugins: Mapping[Path, Path]
+    kept: bool = False
+
+    def without(self, sent: Collection[str]) -> PackedJob:
+        """The job for a process that has kept what was sent, by its names."""
+        return replace(self, shared={name: value for name, value in self.shared.items() if name not in sent})
+
+
+_KEPT: dict[str, Any] = {}  # what jobs of this process have shared, by names
 
 
 def run_packed(packed: PackedJob, report: Reporter) -> Any:
     """Unpack a job in its process and run it."""
     import_copies(packed.plugins)
-    function, argument = _Unpickler(packed.content, packed.shared).load()
+    function, argument = _Unpickler(packed.content, packed.shared, _KEPT if packed.kept else {}).load()
     return function(argument, report)

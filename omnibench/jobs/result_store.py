@@ -6,10 +6,10 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Protocol, Self, TypeVar
 
 from pydantic import BaseModel, TypeAdapter
 
@@ -40,6 +40,31 @@ def code_digest(package: Path, files: Iterable[Path]) -> str:
     return digest.hexdigest()
 
 
+class Store(Protocol[T]):
+    """Where results of jobs are kept, by key."""
+
+    def anchored(self) -> Self:
+        """The store, to be found by a job that changes its working folder, too."""
+
+    def get(self, key: str) -> T | None:
+        """The stored result; None where there is none."""
+
+    def keep(self, key: str, result: T) -> Any:
+        """Keep a result where it was made; what this returns, if anything, is then given to ``put_content`` at home."""
+
+    def content(self, key: str, result: T) -> Any:
+        """The result as ``put_content`` takes it from a machine that does not reach the store."""
+
+    def put(self, key: str, result: T) -> None:
+        """Store a result."""
+
+    def put_content(self, key: str, content: Any) -> None:
+        """Store a result that another process made the content of."""
+
+    def file(self, key: str) -> Path:
+        """Where the result stands, in words of a message."""
+
+
 @dataclass(frozen=True)
 class ResultStore(Generic[T]):
     """Results by key, each in a JSON file in ``folder``.
@@ -49,6 +74,10 @@ class ResultStore(Generic[T]):
 
     folder: Path
     kind: type[T]
+
+    def anchored(self) -> Self:
+        """The store by its folder's absolute path."""
+        return replace(self, folder=self.folder.absolute())
 
     def get(self, key: str) -> T | None:
         """The stored result; None where there is none, or its file is damaged."""
@@ -60,6 +89,10 @@ class ResultStore(Generic[T]):
     def put(self, key: str, result: T) -> None:
         """Store a result, whole or not at all. DataError when it cannot be written, ValueError for a wrong type."""
         self.put_content(key, self.content(key, result))
+
+    def keep(self, key: str, result: T) -> None:
+        """Store a result, as ``put``: a job whose file is there has done its work, whatever becomes of its parent."""
+        self.put(key, result)
 
     def content(self, key: str, result: T) -> str:  # noqa: ARG002 (as ``put``)
         """What the result's file will hold. ValueError for a wrong type."""

@@ -92,7 +92,8 @@ def check_plugin_apart(path: Path, sample: Path | None = None, seconds: float = 
     watch = _CheckWatch(path)
     job = Job("report", _check_apart, (path.absolute(), sample), seconds)
     with TemporaryDirectory() as folder:
-        run_jobs([job], ResultStore(Path(folder), CheckReport), Processes(1, (__name__,)), watch)
+        store = ResultStore(Path(folder), CheckReport)
+        run_jobs([job], store, Processes(1, (__name__,)), watch)
     assert watch.report is not None  # run_jobs tells of every end
     return watch.report
 

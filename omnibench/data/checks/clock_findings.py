@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -28,13 +27,6 @@ _USUAL = 500
 _TOGETHER = 600_000  # wheel samples of the runs by which coefficients of very many are found: 100 of a minute (chosen)
 
 
-@dataclass(frozen=True)
-class Clocks:
-    """The clock of the reference of each of some runs; None where it does not show."""
-
-    of_runs: tuple[ClockMatch | None, ...]
-
-
 def clocks_of(robot: Robot, runs: Sequence[Trajectory]) -> list[ClockMatch | None]:
     """The clock of every run's reference; None where it does not show.
 
@@ -48,13 +40,13 @@ def clocks_of(robot: Robot, runs: Sequence[Trajectory]) -> list[ClockMatch | Non
         return [None] * len(runs)
     fitted, _ = fitted_together(usable, SEARCH)
     tasks = [(robot, part, fitted) for part in together(runs)]
-    return [clock for part in gathered(workers(), clocks_of_part, tasks, Clocks) for clock in part.of_runs]
+    return [clock for part in gathered(workers(), clocks_of_part, tasks) for clock in part]
 
 
-def clocks_of_part(task: tuple[Robot, Sequence[Trajectory], Sequence[Array]], _: Reporter) -> Clocks:
+def clocks_of_part(task: tuple[Robot, Sequence[Trajectory], Sequence[Array]], _: Reporter) -> list[ClockMatch | None]:
     """The clocks of some runs, of which the task names the robot, the runs and the coefficients."""
     robot, runs, fitted = task
-    return Clocks(tuple(_matched(Windows.of(robot, Streams.of_run(run)), fitted) for run in runs))
+    return [_matched(Windows.of(robot, Streams.of_run(run)), fitted) for run in runs]
 
 
 def _matched(windows: Windows | None, fitted: Sequence[Array]) -> ClockMatch | None:

@@ -15,7 +15,7 @@ from omnibench.data.dataset import Trajectory
 from omnibench.data.stored.periods import median_period
 from omnibench.jobs.gathering import gathered
 from omnibench.progress import Reporter
-from omnibench.robot.kinematics import Array, JsonArray, Robot, wheel_equations
+from omnibench.robot.kinematics import Array, Robot, wheel_equations
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.stored.odometry_of_stored import together, workers
 from omnibench.words import plural, some
@@ -58,18 +58,11 @@ class Look:
     wheel_gaps: tuple[float, ...]
     reference_gaps: tuple[float, ...] = ()
     standing: float = 0.0
-    counted: JsonArray | None = None
-    expected: JsonArray | None = None
-    steering: JsonArray | None = None
-    bends: JsonArray | None = None
+    counted: Array | None = None
+    expected: Array | None = None
+    steering: Array | None = None
+    bends: Array | None = None
     moves_at_once: bool = False
-
-
-@dataclass(frozen=True, eq=False)
-class Looks:
-    """What each of some runs shows."""
-
-    of_runs: tuple[Look, ...]
 
 
 def stream_faults(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Finding]:
@@ -81,7 +74,7 @@ def stream_faults(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Finding]
     of_wheels = median_period(runs)
     of_reference = float(np.median(np.concatenate([np.diff(run.pose_times) for run in posed]))) if posed else np.inf
     tasks = [(robot, part, of_wheels, of_reference) for part in together(runs)]
-    looks = [look for part in gathered(workers(), looks_at, tasks, Looks) for look in part.of_runs]
+    looks = [look for part in gathered(workers(), looks_at, tasks) for look in part]
     yield from _restarts(looks)
     yield from _missing("wheel_dropout", of_wheels, {look.run: look.wheel_gaps for look in looks}, "wheel samples")
     looks = [look for run, look in zip(runs, looks, strict=True) if run.has_poses]
@@ -97,11 +90,11 @@ def stream_faults(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Finding]
     yield from _moving_starts(looks)
 
 
-def looks_at(task: tuple[Robot, Sequence[Trajectory], float, float], _: Reporter) -> Looks:
+def looks_at(task: tuple[Robot, Sequence[Trajectory], float, float], _: Reporter) -> list[Look]:
     """What runs show. The task: robot, runs, and the usual periods of wheel samples and of reference poses, s."""
     robot, runs, *periods = task
     matrix = robot.inverse_kinematic_matrix
-    return Looks(tuple(_look(robot, run, _ways(matrix, robot.reach, run), *periods) for run in runs))
+    return [_look(robot, run, _ways(matrix, robot.reach, run), *periods) for run in runs]
 
 
 def _look(robot: Robot, run: Trajectory, ways: Array, of_wheels: float, of_reference: float) -> Look:

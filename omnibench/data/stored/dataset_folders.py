@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import glob
+import os
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -24,13 +26,26 @@ def dataset_folders(places: Path | str | Sequence[Path | str]) -> list[Path]:
     return list(folders.values())
 
 
+def in_few_words(folders: Sequence[Path]) -> str:
+    """The folders as words of a shell: a glob that names just these, where there is one, else one by one."""
+    begin = os.path.commonprefix([str(folder) for folder in folders])  # noqa: RUF071 (a glob's begin is no path)
+    in_one_folder = len(folders) > 2 and begin.startswith(f"{folders[0].parent}/")
+    if in_one_folder and _found(f"{glob.escape(begin)}*") == list(folders):
+        return f"{shlex.quote(begin)}*"
+    return shlex.join(map(str, folders))
+
+
 def _named(place: Path) -> list[Path]:
     pattern = str(place)
     if place.exists() or not any(sign in pattern for sign in _MAGIC):
         return [place]
-    matching = [Path(match) for match in sorted(glob.glob(pattern, recursive=True))]
-    folders = [match for match in matching if (match / "dataset.yaml").is_file()]
-    if not folders:
+    if not (folders := _found(pattern)):
+        matching = sorted(glob.glob(pattern, recursive=True))
         seen = f"; {matching[0]} has no dataset.yaml" if matching else ""
         raise DataError(f"{place}: no data set folder matches{seen}")
     return folders
+
+
+def _found(pattern: str) -> list[Path]:
+    matching = [Path(match) for match in sorted(glob.glob(pattern, recursive=True))]
+    return [match for match in matching if (match / "dataset.yaml").is_file()]

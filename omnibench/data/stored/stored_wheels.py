@@ -16,6 +16,7 @@ from omnibench.data.tables.rows_of_runs import no_rows, refuse_unknown
 from omnibench.data.tables.table import Table, check_columns, checked_table
 from omnibench.data.tables.wheel_table import WheelArrays, check_steering, wheel_columns
 from omnibench.errors import DataError
+from omnibench.progress import tell_reading
 from omnibench.robot.kinematics import Robot
 
 _ROWS = 1_000_000  # rows that are checked at a time, of which the names take 16 MB (chosen)
@@ -97,6 +98,7 @@ class StoredWheels:
             frame = read_rows(self.file, ["trajectory", *columns], first, _ROWS)
             if first and frame.is_empty():
                 return
+            tell_reading(len(frame), "sample")
             yield checked_table(self.file, frame, ("trajectory", *columns), first)
             if len(frame) < _ROWS:
                 return

@@ -10,6 +10,7 @@ from typing import Any
 
 from omnibench.data.checks.finding import Finding
 from omnibench.data.checks.option_words import as_yaml
+from omnibench.data.stored.dataset_folders import in_few_words
 from omnibench.fit.check.recording_source import RecordingSource
 from omnibench.registry import importers
 
@@ -47,14 +48,14 @@ def next_command(read: RecordingSource) -> str:
     """The command line that goes on where nothing is to be mended: a data set is calibrated, a log imported first."""
     places = read.places or ([read.folder] if read.folder and (read.folder / "dataset.yaml").is_file() else [])
     if places:
-        return shlex.join(["omnibench", "calibrate", *map(str, places), "-o", "calibration.yaml"])
+        return f"omnibench calibrate {in_few_words(places)} -o calibration.yaml"
     return _import(read.importer, read.source, read.options, _target(read))
 
 
 def _command(read: RecordingSource, changes: Sequence[Mapping[str, Any]]) -> str:
     """The command line; by way of a data set where the importer cannot."""
     if read.places:
-        return f'for each in {shlex.join(map(str, read.places))}; do omnibench check "$each"; done'
+        return f'for each in {in_few_words(read.places)}; do omnibench check "$each"; done'
     try:
         return _import(
             read.importer, read.source, mended_options(read, read.importer, read.options, changes), _target(read)

@@ -30,25 +30,24 @@ from omnibench.fit.uncertainty.ratio_intervals import BOOTSTRAPPED, FEWEST, Unit
 from omnibench.jobs.gathering import gathered
 from omnibench.jobs.job import Backend
 from omnibench.progress import Reporter
-from omnibench.robot.kinematics import Array, JsonArray
+from omnibench.robot.kinematics import Array
 
 _TOGETHER = 25  # resamples of a job, some 0.1 s; fixed, so that every backend solves the same programs
 
 
-@dataclass(frozen=True, eq=False)
-class Steps:
-    """Steps (B, n) from the optimum to those of resamples."""
+def resampled_steps(part: tuple[tuple[Array, ...], Array], _: Reporter) -> Array:
+    """Steps (B, n) from the optimum to those of resamples, each given by its weights of the units.
 
-    steps: JsonArray
-
-
-def resampled_steps(part: tuple[tuple[Array, ...], Array], _: Reporter) -> Steps:
-    """Solve resamples, each by its weights of the units; with them the program's data, the stamps' shares and units."""
+    With them come the program's data, the stamps' shares and units, and the weights of the first resample of all: the
+    solver scales by what it solves first, so that only after the same one all parts have the same steps as the whole.
+    """
     from omnibench.fit.loss.sum_of_norms import SumOfNormsProgram
 
-    (residuals, jacobian, lower, upper, shares, of_stamp), drawn = part
+    (residuals, jacobian, lower, upper, shares, of_stamp, first), drawn = part
     program = SumOfNormsProgram(residuals, jacobian, lower, upper)
-    return Steps(np.array([program.step(shares * weights[of_stamp]) for weights in drawn]))
+    if not np.array_equal(first, drawn[0]):
+        program.step(shares * first[of_stamp])
+    return np.array([program.step(shares * weights[of_stamp]) for weights in drawn])
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,10 +86,9 @@ def bootstrap_intervals(
     shares, of_stamp = objective.shares(owner), units.of_run[owner]
     few = count < BOOTSTRAPPED
     drawn = 1 - np.eye(count) if few else rng.multinomial(count, np.full(count, 1 / count), size=resamples)
-    data = (*program_data(problem, objective, optimum), shares, of_stamp)
+    data = (*program_data(problem, objective, optimum), shares, of_stamp, drawn[0])
     parts = [(data, drawn[first : first + _TOGETHER]) for first in range(0, len(drawn), _TOGETHER)]
-    steps = gathered(backend, resampled_steps, parts, Steps, shared=(data,))
-    vectors = optimum + np.concatenate([part.steps for part in steps])
+    vectors = optimum + np.concatenate(gathered(backend, resampled_steps, parts, shared=(data,)))
     moved = problem.parameterisation.matrices(vectors)
     quantile = float(stdtrit(count - 1, (1 + INTERVAL) / 2))
     if few:

@@ -16,7 +16,7 @@ import numpy as np
 from omnibench.jobs.gathering import gathered
 from omnibench.jobs.job import Backend
 from omnibench.progress import Reporter
-from omnibench.robot.kinematics import Array, JsonArray
+from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Complex, Integration, OdometryBatch, RunSamples, WheelLog
 from omnibench.robot.stored.path_sums import path_sums
 
@@ -58,16 +58,9 @@ class AtStamps:
     row_3 by turns; None where they were not asked for.
     """
 
-    moved: JsonArray
-    driven: JsonArray
-    slopes: JsonArray | None
-
-
-@dataclass(frozen=True, eq=False)
-class AtStampsOfMatrices:
-    """Sums at the stamps for each of some matrices."""
-
-    sums: tuple[AtStamps, ...]
+    moved: Array
+    driven: Array
+    slopes: Array | None
 
 
 _WORKERS: ContextVar[Backend | None] = ContextVar("workers", default=None)
@@ -154,7 +147,7 @@ class StoredOdometry(OdometryBatch):
     def _of_all(self, matrices: Sequence[Array] | Array, slopes: bool) -> list[AtStamps]:
         """The sums for some matrices, by one reading of the samples."""
         tasks = [(part, list(matrices), self.integration, slopes) for part in together(self._logs, self._of_a_job)]
-        parts = [part.sums for part in gathered(workers(), sums_of_logs, tasks, AtStampsOfMatrices)]
+        parts = gathered(workers(), sums_of_logs, tasks)
         return [_joined([of_part[index] for of_part in parts]) for index in range(len(matrices))]
 
     @property
@@ -163,13 +156,11 @@ class StoredOdometry(OdometryBatch):
         return _TOGETHER if workers() is None else _PARTS_OF_A_JOB * _TOGETHER
 
 
-def sums_of_logs(
-    task: tuple[Sequence[WheelLog], Sequence[Array], Integration, bool], _: Reporter
-) -> AtStampsOfMatrices:
+def sums_of_logs(task: tuple[Sequence[WheelLog], Sequence[Array], Integration, bool], _: Reporter) -> list[AtStamps]:
     """The sums of some logs for some matrices. The task: logs, matrices, integration, and whether slopes are wanted."""
     logs, matrices, integration, slopes = task
     parts = [[_sums(part, matrix, integration, slopes) for matrix in matrices] for part in _read(logs)]
-    return AtStampsOfMatrices(tuple(_joined([of_part[index] for of_part in parts]) for index in range(len(matrices))))
+    return [_joined([of_part[index] for of_part in parts]) for index in range(len(matrices))]
 
 
 @dataclass(frozen=True, eq=False)
