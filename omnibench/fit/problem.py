@@ -38,6 +38,7 @@ from omnibench.robot.odometry import Integration, OdometryBatch
 from omnibench.robot.stored.odometry_of_stored import StoredOdometry
 
 _PROGRESS_PERIOD = 0.1  # s, least time between two reports of progress: ten a second are all that a reader sees
+_MOST_POSES = 4_000_000  # poses of candidates that are held together, 0.1 GB (chosen)
 # Evaluations from which on the fast evaluator repays the time it takes to build. Both ways give the same costs to 1e-11
 # m; half of it and twice change no estimate (tests/benchmarks/constants_fit.py).
 _WORTH_BUILDING = 50
@@ -186,7 +187,8 @@ class CalibrationProblem:
     def values(self, candidates: Array) -> Array:
         """Costs (P,) of candidates (P, n) by direct integration, not counted: for scoring an answer."""
         with np.errstate(all="ignore"):
-            return self._costs_of_poses(self.odometry.poses(self.parameterisation.matrices(candidates)))
+            matrices = self.parameterisation.matrices(candidates)
+            return np.concatenate([self._costs_of_poses(self.odometry.poses(part)) for part in self._parts(matrices)])
 
     def build_evaluator(self) -> PoseEvaluator | PartedEvaluator | None:
         """The fast evaluator, which ``cost`` uses from now on; None where direct integration is faster.
@@ -265,14 +267,22 @@ class CalibrationProblem:
         """Costs (P,) by the fast evaluator for candidates in its box, by direct integration for the others."""
         with np.errstate(all="ignore"):
             matrices = self.parameterisation.matrices(candidates)
-            seen = matrices if self._frame is None else self._frame.seen(matrices)
-            covered = evaluator.covers(seen)
-            if covered.all():
-                return self._costs_of_poses(evaluator.poses(seen))
-            values = np.empty(len(candidates))
-            values[covered] = self._costs_of_poses(evaluator.poses(seen[covered]))
-            values[~covered] = self._costs_of_poses(self.odometry.poses(matrices[~covered]))
-            return values
+            return np.concatenate([self._fast_costs(part, evaluator) for part in self._parts(matrices)])
+
+    def _fast_costs(self, matrices: Array, evaluator: PoseEvaluator | PartedEvaluator) -> Array:
+        seen = matrices if self._frame is None else self._frame.seen(matrices)
+        covered = evaluator.covers(seen)
+        if covered.all():
+            return self._costs_of_poses(evaluator.poses(seen))
+        values = np.empty(len(matrices))
+        values[covered] = self._costs_of_poses(evaluator.poses(seen[covered]))
+        values[~covered] = self._costs_of_poses(self.odometry.poses(matrices[~covered]))
+        return values
+
+    def _parts(self, matrices: Array) -> list[Array]:
+        """Matrices in parts, whose poses are held together."""
+        count = max(_MOST_POSES // max(len(self.odometry.trajectory), 1), 1)
+        return [matrices[first : first + count] for first in range(0, max(len(matrices), 1), count)]
 
     def _costs_of_poses(self, poses: Array) -> Array:
         """Costs (P,) of poses (P, S, 3) at the cost's stamps; ``poses`` is overwritten."""

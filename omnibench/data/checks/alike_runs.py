@@ -15,15 +15,17 @@ from omnibench.words import plural
 # Poses in a row that two runs must share, changes among them, and share of the later run's rows (chosen: a reference
 # scatters, so that no two drives share any; wheel rates as commanded are alike in all repetitions).
 _ROWS, _CHANGES, _SHARED = 12, 8, 0.3
+_MOST_KEYS = 2_000_000  # stretches of poses that are kept, some 0.2 GB; of more every second, or third... (chosen)
 _DIGIT = 1e-7  # m, to which positions are compared; below the noise of any reference
 
 
 def copied_runs(runs: Sequence[Trajectory]) -> Iterator[Finding]:
     """Runs that repeat an earlier one."""
+    every = -(-sum(len(run.pose_times) for run in runs) // _MOST_KEYS)
     seen: dict[int, str] = {}
     copies: dict[str, str] = {}
     for run in runs:
-        keys = set(_keys(run))
+        keys = {key for key in _keys(run) if key % every == 0}
         shared = [seen[key] for key in keys if key in seen]
         if keys and len(shared) > _SHARED * len(keys):
             copies[run.id] = max(set(shared), key=shared.count)

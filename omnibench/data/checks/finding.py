@@ -46,6 +46,7 @@ Kind = Literal[
     "sample_period",
     "late_reference",
     "reference_foreign",
+    "runs_drawn",
 ]
 
 UNITS: tuple[Kind, ...] = ("wheel_unit", "steering_unit", "heading_unit", "position_unit", "time_unit")

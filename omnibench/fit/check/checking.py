@@ -19,7 +19,7 @@ from omnibench.data.clock_matching import ClockMatch
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.importers.copied_reference import follows_the_wheels
 from omnibench.data.references.reference_units import odd_references
-from omnibench.data.stored.drawn_runs import drawn_runs
+from omnibench.data.stored.drawn_runs import count_drawn, drawn_runs
 from omnibench.fit.check.expected_gain import Gain, expected_gain
 from omnibench.fit.check.fixes import command, with_fixes
 from omnibench.fit.check.foreign_reference import foreign_reference
@@ -82,7 +82,7 @@ def check_recording(read: RecordingSource) -> CheckReport:
     found += off
     measured = any(run.references is not None for run in dataset.trajectories)
     found += _left_open(dataset) if measured else missing_motions(robot, drawn_runs(aligned))
-    found += too_few(dataset.trajectories)
+    found += [*too_few(dataset.trajectories), *_drawn(dataset.trajectories)]
     findings = with_fixes(read, sorted(_distinct(found), key=lambda finding: _ORDER[finding.severity]))
     clocks_agree = not any(finding.severity == "error" for finding in off)
     gain = Gain(None, "") if misread or odd or foreign or spoiled else expected_gain(dataset, clocks_agree=clocks_agree)
@@ -186,6 +186,19 @@ def _odometry(dataset: Dataset, runs: Sequence[Trajectory]) -> Iterator[Finding]
         severity="error",
         fix="record an independent reference, such as motion capture, SLAM, or a tape measure (omnibench guide data)",
     )
+
+
+def _drawn(runs: Sequence[Trajectory]) -> Iterator[Finding]:
+    """A note where not all runs are looked at together."""
+    if (count := count_drawn(runs)) < len(runs):
+        yield Finding(
+            kind="runs_drawn",
+            what=f"what concerns the recording as a whole is judged by {count:,} of {len(runs):,} runs, which chance "
+            "has drawn, some of every session and command first; every run by itself is looked at",
+            where="the recording",
+            severity="note",
+            fix="nothing: so many tell as much as all",
+        )
 
 
 _TOLD = 12  # restarts that are told one by one; chosen

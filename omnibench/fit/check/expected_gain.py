@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.data.stored.drawn_runs import in_memory
+from omnibench.data.stored.drawn_runs import drawn_runs, in_memory
 from omnibench.fit.check.missing_motions import command_names
 from omnibench.fit.evaluate import final_errors
 from omnibench.fit.held_out import judge
@@ -19,8 +19,8 @@ from omnibench.fit.span import directions_kept, driven_span
 from omnibench.robot.arrays import Array
 from omnibench.robot.kinematics import Robot
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.odometry import OdometryBatch
 from omnibench.robot.planar import wrapped
+from omnibench.robot.stored.odometry_of_stored import odometry_of
 from omnibench.words import plural
 
 _PARTS = 5  # of the commands, each held out once
@@ -47,7 +47,7 @@ def expected_gain(dataset: Dataset, *, clocks_agree: bool = True) -> Gain:
     off that a gain which is not significant says nothing.
     """
     robot, every = dataset.robot, dataset.trajectories
-    chosen = [in_memory(run) for run in every[:: -(-len(every) // _MOST)]]
+    chosen = [in_memory(run) for run in drawn_runs(every[:: -(-len(every) // _MOST)])]
     unknown = "whether a calibration is needed cannot be told from"
     if len(chosen) < _FEWEST:
         return Gain(None, f"{unknown} {plural(len(chosen), 'run')}; {_FEWEST} are needed")
@@ -88,7 +88,7 @@ def _fitted(robot: Robot, runs: Sequence[Trajectory], walk: Walk) -> Array:
     posed = [run for run in runs if run.has_poses]
     if not posed:
         return _by_references(robot, runs, walk)
-    odometry = OdometryBatch([run.reference_log for run in posed], "arc")
+    odometry = odometry_of([run.reference_log for run in posed], "arc")
     reference = np.concatenate([run.poses[1:] for run in posed])
     span = driven_span(posed)
     kept = directions_kept(robot, span, "shrink")

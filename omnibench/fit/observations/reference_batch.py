@@ -7,7 +7,8 @@ import numpy as np
 from omnibench.fit.observations.reference_rows import ReferenceRows
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.odometry import Integration, OdometryBatch, locate
+from omnibench.robot.odometry import Integration, WheelLog, kept_with_samples, locate
+from omnibench.robot.stored.odometry_of_stored import odometry_of
 
 _BLOCK = 200_000  # speeds at a time (candidates x samples), 2 MB, as in odometry.py
 _STANDING = 1e-12  # m: a sample that is shorter has no direction, and its length no derivative
@@ -22,8 +23,8 @@ class ReferenceBatch:
     def __init__(self, rows: ReferenceRows, integration: Integration) -> None:
         self.rows = rows
         self.trajectory = rows.trajectory
-        self._odometry = OdometryBatch(rows.logs, integration)
-        self._ways = [_Ways(log.times, log.signals, log.stamps) for log in rows.logs] if rows.needs_lengths else []
+        self._odometry = odometry_of(rows.logs, integration)
+        self._ways = [_Ways(log) for log in rows.logs] if rows.needs_lengths else []
 
     def poses(self, matrices: Array) -> Array:
         """Predictions (P, S, 3) in m, m, rad of candidate matrices (P, 3, M)."""
@@ -55,26 +56,33 @@ class ReferenceBatch:
 class _Ways:
     """The way along the path of one run, up to its stamps, which depends on rows 1 and 2 alone."""
 
-    def __init__(self, times: Array, signals: Array, stamps: Array) -> None:
-        self._angles = signals * np.diff(times, prepend=0.0)[:, None]
-        self._sample, self._share = locate(times, stamps)
+    def __init__(self, log: WheelLog) -> None:
+        self._log, self.rates = log, log.rates
+        self._sample, self._share = locate(log.times, log.stamps)
+
+    @kept_with_samples
+    def _angles(self) -> Array:
+        """Integrals (F, M) of the signals over each sample, rad."""
+        angles: Array = self._log.signals * np.diff(self._log.times, prepend=0.0)[:, None]
+        return angles
 
     def lengths(self, matrices: Array) -> Array:
         """Distances (P, T) of matrices (P, 3, M), m."""
-        result = np.empty((len(matrices), len(self._sample)))
-        step = max(1, _BLOCK // len(self._angles))
+        result, angles = np.empty((len(matrices), len(self._sample))), self._angles
+        step = max(1, _BLOCK // len(angles))
         for first in range(0, len(matrices), step):
             part = slice(first, first + step)
-            moved = np.einsum("fm,pam->paf", self._angles, matrices[part, :2])
+            moved = np.einsum("fm,pam->paf", angles, matrices[part, :2])
             result[part] = self._at_stamps(np.hypot(moved[:, 0], moved[:, 1]).T).T
         return result
 
     def slopes(self, matrix: Array) -> Array:
         """Derivatives (T, 2M) of the distances by rows 1 and 2 of one matrix."""
-        moved = self._angles @ matrix[:2].T
+        angles = self._angles
+        moved = angles @ matrix[:2].T
         length = np.linalg.norm(moved, axis=1)
         units = moved / np.where(length > _STANDING, length, np.inf)[:, None]
-        by_elements = units[:, :, None] * self._angles[:, None]
+        by_elements = units[:, :, None] * angles[:, None]
         return self._at_stamps(by_elements.reshape(len(moved), -1))
 
     def _at_stamps(self, of_samples: Array) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -12,10 +12,12 @@ from omnibench.fit.least_squares.noise import NoiseEstimate, Whitener, estimate_
 from omnibench.fit.least_squares.repetitions import differences_between_repetitions
 from omnibench.fit.loss.jumps import without_jumps
 from omnibench.fit.loss.losses import LossName
+from omnibench.jobs.gathering import gathered
+from omnibench.progress import Reporter, no_progress
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog, split_by
-from omnibench.robot.stored.odometry_of_stored import StoredOdometry, are_many, together
+from omnibench.robot.stored.odometry_of_stored import StoredOdometry, are_many, together, workers
 
 Stamps = Literal["reference", "final"]
 
@@ -66,20 +68,23 @@ def information_of_runs(
 ) -> Array:
     """Fisher information (Z, 3N, 3N) of each run; their sum is that of all runs together."""
     logs = [run if isinstance(run, WheelLog) else _log(run, stamps) for run in runs]
-    information = np.empty((len(runs), matrix.size, matrix.size))
-    for of_run, log, jacobian in zip(information, logs, _jacobians(logs, matrix, integration), strict=True):
+    if are_many(logs):
+        tasks = [(StoredOdometry, part, matrix, integration, noise) for part in together(logs)]
+        return np.concatenate(gathered(workers(), informations, tasks))
+    one_by_one = [informations((OdometryBatch, [log], matrix, integration, noise), no_progress) for log in logs]
+    return np.reshape(one_by_one, (len(logs), matrix.size, matrix.size))
+
+
+def informations(task: tuple[type[OdometryBatch], Sequence[WheelLog], Array, Integration, Noise], _: Reporter) -> Array:
+    """Fisher information (Z, 3N, 3N) of logs. The task: class of the odometry, logs, matrix, integration and noise."""
+    odometry, logs, matrix, integration, noise = task
+    information = np.empty((len(logs), matrix.size, matrix.size))
+    jacobians = split_by(odometry(logs, integration).jacobian(matrix), [log.stamps for log in logs])
+    for of_run, log, jacobian in zip(information, logs, jacobians, strict=True):
         whitened = Whitener(noise, log.stamps)(jacobian.reshape(len(jacobian), 3, -1))
         columns = whitened.reshape(-1, whitened.shape[-1])
         of_run[:] = columns.T @ columns
     return information
-
-
-def _jacobians(logs: Sequence[WheelLog], matrix: Array, integration: Integration) -> Iterator[Array]:
-    """Derivatives (K, 3, 3, N) of the poses of each log."""
-    of_stored = are_many(logs)
-    for part in together(logs) if of_stored else ([log] for log in logs):
-        odometry = (StoredOdometry if of_stored else OdometryBatch)(part, integration)
-        yield from split_by(odometry.jacobian(matrix), [log.stamps for log in part])
 
 
 def _log(run: Trajectory, stamps: Stamps) -> WheelLog:

@@ -40,14 +40,17 @@ def are_many(logs: Sequence[WheelLog]) -> bool:
 
 
 def together(logs: Iterable[Sampled], samples: int | None = None) -> Iterator[list[Sampled]]:
-    """Logs, or runs, in parts of about so many samples, as many as are read at a time by default."""
-    part, count = list[Sampled](), 0
+    """Logs, or runs, in parts of about so many samples, as many as are read at a time by default.
+
+    Each log counts as the longest of its part, as long as it is in an array of them all.
+    """
+    part, longest = list[Sampled](), 0
     for log in logs:
-        if part and count + len(log.times) > (samples or _TOGETHER):
+        longest = max(longest, len(log.times))
+        if part and (len(part) + 1) * longest > (samples or _TOGETHER):
             yield part
-            part, count = [], 0
+            part, longest = [], len(log.times)
         part.append(log)
-        count += len(log.times)
     if part:
         yield part
 

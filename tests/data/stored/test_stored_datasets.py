@@ -18,6 +18,7 @@ import omnibench.data.stored.stored_wheels as stored_wheels
 import omnibench.robot.stored.odometry_of_stored as odometry_of_stored
 from omnibench.data.dataset import Dataset
 from omnibench.data.storage import load_dataset, save_dataset
+from omnibench.data.stored.dataset_folders import in_few_words
 from omnibench.data.stored.drawn_runs import drawn_runs, in_memory
 from omnibench.data.stored.periods import median_period
 from omnibench.data.stored.stored_rows import StoredRows
@@ -113,12 +114,14 @@ def test_bounds_of_all_costs_are_proven_as_in_memory(folder: Path, cost: str, mo
 
 
 def bounds_of(dataset: Dataset, cost: str) -> LowerBounds:
+    return LowerBounds(problem_of(dataset, cost))
+
+
+def problem_of(dataset: Dataset, cost: str) -> CalibrationProblem:
     runs = dataset.split("train")
     searched = make_parameterisation("matrix", dataset.robot, runs)
-    return LowerBounds(
-        CalibrationProblem(
-            dataset.robot, runs, costs.create(cost), searched, integration="arc", budget=Budget(), seed=0
-        )
+    return CalibrationProblem(
+        dataset.robot, runs, costs.create(cost), searched, integration="arc", budget=Budget(), seed=0
     )
 
 
@@ -133,6 +136,26 @@ def test_a_search_by_the_evaluators_of_parts_finds_what_it_finds_by_one(
     assert stored.cost == pytest.approx(calibrate(load_dataset(folder), "genetic", **options).result.cost, rel=1e-3)
 
 
+def test_costs_of_candidates_whose_poses_are_held_in_parts_are_the_same(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = problem_of(load_dataset(folder), "trajectory")
+    candidates = problem.start * np.linspace(0.98, 1.02, 7)[:, None]
+    whole = problem.values(candidates)
+    monkeypatch.setattr("omnibench.fit.problem._MOST_POSES", 3 * len(problem.odometry.trajectory))
+    assert problem.values(candidates) == pytest.approx(whole, rel=1e-14)
+    assert [len(part) for part in problem._parts(candidates)] == [3, 3, 1]
+
+
+def test_a_long_run_among_short_ones_is_put_with_few(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(odometry_of_stored, "_TOGETHER", 1000)
+    runs = [Sampled(np.ones(count)) for count in (100, 100, 900, *[10] * 200)]
+    parts = [[len(run.times) for run in part] for part in odometry_of_stored.together(runs)]
+    assert [count for part in parts for count in part] == [len(run.times) for run in runs]
+    assert max(len(part) * max(part) for part in parts) <= 1000
+    assert [len(part) for part in parts] == [2, 1, 100, 100]
+
+
 def test_several_folders_or_a_glob_are_one_data_set(tmp_path: Path) -> None:
     whole = recorded()
     for day in range(3):
@@ -143,6 +166,8 @@ def test_several_folders_or_a_glob_are_one_data_set(tmp_path: Path) -> None:
     assert by_name.name == by_glob.name == "day0 to day2"
     assert [run.id for run in by_glob.trajectories] == [run.id for run in whole.trajectories]
     assert by_name.hash == by_glob.hash
+    assert in_few_words([tmp_path / f"day{day}" for day in range(3)]) == f"{tmp_path}/day*"
+    assert in_few_words([tmp_path / "day0", tmp_path / "day2"]) == f"{tmp_path}/day0 {tmp_path}/day2"
     together = calibrate(replace(by_glob, name=whole.name)).calibration.matrix_array
     assert together == pytest.approx(calibrate(whole).calibration.matrix_array, rel=1e-12)
 
@@ -221,4 +246,6 @@ def test_some_runs_are_drawn_always_the_same_and_into_memory(folder: Path) -> No
     assert [run.id for run in some] == [run.id for run in drawn_runs(runs, most=1840)]
     assert all(isinstance(run.rates, np.ndarray) and run.rates.base is None for run in some)
     assert list(runs) == drawn_runs(runs, most=10**6)
+    rare = [replace(run, command="rare" if number in (9, 31) else "usual") for number, run in enumerate(runs)]
+    assert {"run-9", "run-31"} <= {run.id for run in drawn_runs(rare, most=1)}
     assert in_memory(runs[0]).fingerprint == runs[0].fingerprint

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from sample_robots import APR_02
 
+import omnibench.robot.stored.odometry_of_stored as odometry_of_stored
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.references.run_references import Reference, References
+from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import ConfigError, DataError
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.certify import certify_optimum
@@ -21,6 +23,7 @@ from omnibench.fit.observations.reference_batch import ReferenceBatch
 from omnibench.fit.observations.reference_fit import ReferenceFit
 from omnibench.fit.observations.reference_rows import reference_rows
 from omnibench.robot.odometry import Integration
+from omnibench.robot.stored.odometry_of_stored import StoredOdometry
 
 STUDY = Path(__file__).parents[2] / "benchmarks"
 TIMES = 0.1 * np.arange(1, 101)
@@ -46,6 +49,24 @@ def every_kind(seed: int) -> list[Reference]:
         *(Reference("position", tuple(rng.normal(size=2)), (0.02, 0.05), t1=t) for t in (1.0, 3.3, 5.0, 9.0)),
         *(Reference("heading", float(rng.normal()), 0.1, t1=t) for t in (2.0, 5.0, 8.0)),
     ]
+
+
+def test_references_of_samples_that_stay_in_their_file_are_predicted_alike(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held = [a_run(seed, every_kind(seed)) for seed in range(3)]
+    save_dataset(make_dataset("measured", APR_02, 0.1, held), tmp_path / "saved")
+    batches = []
+    for most in (10**6, 0):
+        monkeypatch.setattr(odometry_of_stored, "_HELD", most)
+        runs = load_dataset(tmp_path / "saved", most_in_memory=most).trajectories
+        batches.append(ReferenceBatch(reference_rows(runs, "reference"), "arc"))
+    matrices = APR_02.inverse_kinematic_matrix * np.array([1.0, 1.03])[:, None, None]
+    np.testing.assert_allclose(batches[1].poses(matrices), batches[0].poses(matrices), rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(
+        batches[1].jacobian(matrices[1]), batches[0].jacobian(matrices[1]), rtol=1e-12, atol=1e-12
+    )
+    assert isinstance(batches[1]._odometry, StoredOdometry)
 
 
 @pytest.mark.parametrize("integration", ["arc", "euler"])
