@@ -71,7 +71,7 @@ def inspection_document(dataset: Dataset, inspection: Inspection) -> Document:
 def _answer(dataset: Dataset, inspection: Inspection, motions: list[DrivenMotion]) -> Section:
     splits = inspection.splits
     names = {"train": "to train", "validation": "held out"}
-    parts = " and ".join(f"{of_split.trajectories} {names[name]}" for name, of_split in splits.items())
+    parts = " and ".join(f"{of_split.trajectories:,} {names[name]}" for name, of_split in splits.items())
     missing = missing_in_words(motions)
     lacks = f"To train, it was never driven {missing}." if missing else "Every kind of motion was driven to train."
     open_ones = inspection.identifiability.sentences
@@ -82,7 +82,11 @@ def _answer(dataset: Dataset, inspection: Inspection, motions: list[DrivenMotion
     tiles = (
         Fact("Runs", count(inspection.trajectories), parts),
         Fact("Driven", f"{significant(metres, 3)} m", f"in {fixed(seconds / 60, 1)} min"),
-        Fact("Wheel samples", f"every {1e3 * inspection.sample_period_s:.3g} ms", f"{count(inspection.wheel_samples)}"),
+        Fact(
+            "Wheel samples",
+            f"every {significant(1e3 * inspection.sample_period_s)} ms",
+            count(inspection.wheel_samples),
+        ),
         _reference_tile(inspection),
     )
     return answer_section(
@@ -99,7 +103,7 @@ def _reference_tile(inspection: Inspection) -> Fact:
     kinds = ", ".join(f"{number} of {kind}" for kind, number in inspection.references.items())
     if inspection.pose_period_s is None:
         return Fact("References", count(sum(inspection.references.values())), kinds)
-    every = f"every {1e3 * inspection.pose_period_s:.3g} ms"
+    every = f"every {significant(1e3 * inspection.pose_period_s)} ms"
     beside = f"; beside them {kinds}" if kinds else ""
     return Fact("Reference poses", every, f"{count(inspection.reference_poses)}{beside}")
 
