@@ -23,7 +23,6 @@ _SHARED = (
     "robot/**/*.py",
     "fit/**/*.py",
     "data/dataset.py",
-    "data/periods.py",
     "data/references/*.py",
     "data/stored/*.py",
     "compare/plan.py",

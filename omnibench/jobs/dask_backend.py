@@ -1,6 +1,7 @@
 """Backend of a Dask cluster. Results come back to the client, which alone writes the store.
 
-A job's begin, its reports and its end are events from its worker; the future only tells that it is lost. A worker that
+A job's begin, its reports and its end are events from its worker; the future tells that it is lost, and holds ends that
+are too large for an event. A worker that
 is killed takes its jobs with it, and they are given to another. Their begins are counted here, since the scheduler also
 counts jobs that only waited there. (A scheduler that was not started here tries again by itself, by its own setting
 ``allowed-failures``: it may begin a job a fourth time before this hears of it.)
@@ -14,18 +15,18 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from errno import EDQUOT, ENOSPC
-from itertools import islice
+from itertools import count, islice
 from queue import Empty, SimpleQueue
 from typing import Any, TypeVar
 from uuid import uuid4
 
 from distributed import KilledWorker
+from distributed.client import FutureCancelledError
 
-from omnibench.errors import DataError
+from omnibench.errors import DataError, OmnibenchError, one_line
 from omnibench.jobs.dask_worker import Order, Parcel, Told, carry_out, content
 from omnibench.jobs.job import TRIES, BackendError, Ended, Failure, Job, JobWatch
-from omnibench.jobs.job_process import JobEnd, in_job
-from omnibench.jobs.local_backends import InPlace
+from omnibench.jobs.job_process import JobEnd
 from omnibench.jobs.packing import Packer, run_packed
 from omnibench.jobs.result_store import Store
 
@@ -66,13 +67,17 @@ class DaskBackend:
     requirements: bytes
     _packer: Packer = field(default_factory=Packer)
     _data: dict[str, Any] = field(default_factory=dict)
+    topic: str = field(default_factory=lambda: f"omnibench-{uuid4().hex[:12]}")
+    events: SimpleQueue[bytes] = field(default_factory=SimpleQueue)
+    _runs: Iterator[int] = field(default_factory=count)
+
+    def __post_init__(self) -> None:
+        put = self.events.put  # the client keeps what handles a topic, even when it is heard no more
+        self.client.subscribe_topic(self.topic, lambda event: put(event[1]))
 
     def run(self, jobs: Iterable[tuple[int, Job[T]]], store: Store[T], watch: JobWatch[T]) -> Iterator[Ended]:
         """Run the jobs, see Backend. SchedulerLostError, or UnfitWorkerError of a worker that joined later."""
-        if in_job():
-            yield from InPlace().run(jobs, store, watch)
-            return
-        run = _Run(self, store, watch)
+        run = _Run(self, next(self._runs), store, watch)
         waiting = iter(jobs)
         try:
             while True:
@@ -97,14 +102,12 @@ class DaskBackend:
 
 
 class _Run:
-    """The jobs of one call of ``run``. pending: those with the cluster, by their numbers."""
+    """The jobs of one call of ``run``. number: of the call. pending: those with the cluster, by their numbers."""
 
-    def __init__(self, backend: DaskBackend, store: Store[Any], watch: JobWatch[Any]) -> None:
+    def __init__(self, backend: DaskBackend, number: int, store: Store[Any], watch: JobWatch[Any]) -> None:
         self.pending: dict[int, _Pending] = {}
+        self._number = number
         self._backend, self._client, self._store, self._watch = backend, backend.client, store, watch
-        self._topic = f"omnibench-{uuid4().hex[:12]}"
-        self._events: SimpleQueue[bytes] = SimpleQueue()  # pickled tuples of Told
-        self._client.subscribe_topic(self._topic, lambda event: self._events.put(event[1]))
         self._futures: dict[str, Any] = {}
         self._numbers: dict[str, set[int]] = {}  # jobs of each parcel that have not ended
         self._seconds = _PARCEL  # a job takes about so long
@@ -129,11 +132,11 @@ class _Run:
             order, data = self._backend.order(item.number, item.job)
             orders.append(order)
             shared |= data
-        key = f"{self._topic}-{uuid4().hex[:12]}"
+        key = f"{self._backend.topic}-{uuid4().hex[:12]}"
         futures = [self._backend.data(name, value) for name, value in shared.items()]
         self._futures[key] = self._client.submit(
             carry_out,
-            Parcel(self._topic, self._store, tuple(orders), tuple(shared)),
+            Parcel(self._backend.topic, self._number, self._store, tuple(orders), tuple(shared)),
             self._backend.data("requirements", self._backend.requirements),
             *futures,
             key=key,
@@ -149,11 +152,12 @@ class _Run:
         """Wait a moment for events, which are passed on; the jobs that have ended."""
         events: list[bytes] = []
         with suppress(Empty):
-            events.append(self._events.get(timeout=_LOOK))
+            events.append(self._backend.events.get(timeout=_LOOK))
             while True:
-                events.append(self._events.get_nowait())
+                events.append(self._backend.events.get_nowait())
         for event in events:
-            for told in pickle.loads(event):
+            number, all_told = pickle.loads(event)
+            for told in all_told if number == self._number else ():  # others are of a call that was interrupted
                 yield from self._told(told)
         if time.monotonic() - self._looked >= _LOOK:
             self._slots, self._looked = self._count_slots(), time.monotonic()
@@ -162,18 +166,21 @@ class _Run:
 
     def close(self) -> None:
         """Cancel what is left."""
-        if self._client.status == "running":
-            self._client.unsubscribe_topic(self._topic)
-            if self._futures:
-                self._client.cancel([*self._futures.values()], force=True)
+        if self._client.status == "running" and self._futures:
+            self._client.cancel([*self._futures.values()], force=True)
 
     def _told(self, told: Told) -> Iterator[Ended]:
         item = self.pending.get(told.number)
         if item is None:
             return
         if told.fetch:
-            for each in self._futures[item.parcel].result():
-                yield from self._told(each)
+            with suppress(KilledWorker):  # of which ``_lost`` tells
+                try:
+                    ends = self._futures[item.parcel].result()
+                except FutureCancelledError:
+                    raise self._scheduler_lost from None
+                for each in ends:
+                    yield from self._told(each)
             return
         if told.progress is not None:
             self._watch.moved(item.number, told.progress)
@@ -222,10 +229,12 @@ class _Run:
         if future is None or future.status in ("pending", "finished"):  # whose ends are under way
             return
         if future.status != "error":
-            raise SchedulerLostError(f"the Dask scheduler {self._client.scheduler.address} is lost")
+            raise self._scheduler_lost
         error = future.exception()
-        if not isinstance(error, KilledWorker):
+        if isinstance(error, OmnibenchError):
             raise error  # a worker joined later and is unfit
+        if not isinstance(error, KilledWorker):
+            raise BackendError(f"a Dask worker failed ({one_line(f'{type(error).__name__}: {error}')}); start it again")
         items = [self.pending[number] for number in sorted(self._numbers[key])]
         self._close_parcel(key)
         for item in items:
@@ -236,8 +245,12 @@ class _Run:
             else:
                 self.submit([item])
 
+    @property
+    def _scheduler_lost(self) -> SchedulerLostError:
+        return SchedulerLostError(f"the Dask scheduler {self._client.scheduler.address} is lost")
+
     def _count_slots(self) -> int:
         """Threads of all workers, at least one. SchedulerLostError."""
         if self._client.status != "running":
-            raise SchedulerLostError(f"the Dask scheduler {self._client.scheduler.address} is lost")
+            raise self._scheduler_lost
         return max(sum(self._client.nthreads().values()), 1)

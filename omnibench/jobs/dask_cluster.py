@@ -29,6 +29,7 @@ _SETTINGS = {
     "distributed.admin.large-graph-warning-threshold": "100 GB",  # data of jobs are kept by the scheduler on purpose
     "distributed.worker.memory.terminate": False,  # limits are those of jobs
     "distributed.worker.profile.enabled": False,  # nobody looks at it, and quick jobs pay for it
+    "distributed.admin.low-level-log-length": 10,  # copies of messages, which nobody reads
     "distributed.admin.tick.interval": "500 ms",
     "distributed.comm.timeouts.connect": f"{_ANSWER} s",
 }

@@ -33,7 +33,7 @@ from omnibench.registry import PluginFailure, import_copies
 
 _PERIOD = 0.2  # s between two reports of a job, and two looks whether it is still wanted; chosen
 _TOGETHER, _MOST_TOGETHER = 0.1, 50  # s and ends that wait for each other; chosen
-_LARGEST = 200_000  # bytes of an event: the scheduler keeps a thousand of them, and a run's result has 2 to 50 kB
+_LARGEST = 50_000  # bytes of an event, about: the scheduler keeps a thousand of them, and a run's result has 2 to 20 kB
 _PROBE = 1_000_000  # bytes that a worker must be able to write: a plug-in's file and what a job notes down (chosen)
 
 
@@ -63,9 +63,13 @@ class Order:
 
 @dataclass(frozen=True)
 class Parcel:
-    """Jobs that travel together, quick ones. topic: of the events that tell of them. names: of what they share."""
+    """Jobs that travel together, quick ones. names: of what they share.
+
+    topic: of the events that tell of them; an event is the pickled ``run`` and a tuple of Told.
+    """
 
     topic: str
+    run: int
     store: Store[Any]
     orders: tuple[Order, ...]
     names: tuple[str, ...]
@@ -165,7 +169,7 @@ def _prepared(requirements: bytes, address: str, folder: Path) -> dict[Path, Pat
     except (OSError, DataError) as error:
         raise UnfitWorkerError(f"worker {address}: {error}") from None
     if plugins:
-        failures = _failures(plugins, wanted.preload)
+        failures = _failures(plugins, address, wanted.preload)
         for failure in failures:
             if failure.origin not in wanted.failing:
                 raise UnfitWorkerError(
@@ -175,15 +179,18 @@ def _prepared(requirements: bytes, address: str, folder: Path) -> dict[Path, Pat
     return plugins
 
 
-def _failures(plugins: Mapping[Path, Path], preload: tuple[str, ...]) -> list[PluginFailure]:
+def _failures(plugins: Mapping[Path, Path], address: str, preload: tuple[str, ...]) -> list[PluginFailure]:
     """Plug-ins that cannot be imported here, by a process of jobs."""
-    process = JobProcess(_context(preload))
-    process.give(Job("plug-ins", _import_all, plugins), _as_it_is)
+    process, job = JobProcess(_context(preload)), Job("plug-ins", _import_all, plugins)
+    process.give(job, _as_it_is)
     wait(process.signs)
     end = process.receive()
     process.end()
     assert isinstance(end, JobEnd)
-    return end.answer or []
+    if (failure := end.failure(job)) is not None:
+        raise UnfitWorkerError(f"worker {address}: its plug-ins cannot be imported there: {failure.reason}")
+    failures: list[PluginFailure] = end.answer
+    return failures
 
 
 def _import_all(plugins: Mapping[Path, Path], _: Reporter) -> list[PluginFailure]:
@@ -199,7 +206,7 @@ def _follow(process: JobProcess, teller: _Teller, number: int) -> tuple[Progress
     told, last = time.monotonic(), None
     while True:
         wait(process.signs, timeout=_PERIOD)
-        while (event := process.receive()) is not None:
+        for event in process.events():
             if isinstance(event, JobEnd):
                 return last, event
             last = event
@@ -217,9 +224,10 @@ class _Teller:
 
     def __init__(self, worker: Any, parcel: Parcel) -> None:
         self.worker = worker
-        self._topic, self._first = parcel.topic, parcel.orders[0].number
+        self._topic, self._run = parcel.topic, parcel.run
         self._key = worker.get_current_task()
         self._waiting: list[Told] = []
+        self._size = 0  # bytes of those that wait
         self._large: list[Told] = []
         self._told = time.monotonic()
 
@@ -232,15 +240,22 @@ class _Teller:
     def begins(self, *events: Told) -> None:
         """Send begins, and wait until the scheduler has them: one that died with its worker would not be counted."""
         log_event = self.worker.scheduler.log_event
-        distributed.utils.sync(self.worker.loop, log_event, topic=self._topic, msg=pickle.dumps(events))
+        distributed.utils.sync(self.worker.loop, log_event, topic=self._topic, msg=pickle.dumps((self._run, events)))
 
     def tell(self, *events: Told) -> None:
         """Send events."""
-        self.worker.log_event(self._topic, pickle.dumps(events))
+        self.worker.log_event(self._topic, pickle.dumps((self._run, events)))
 
     def ended(self, end: Told) -> None:
         """Send an end, soon."""
-        (self._large if len(pickle.dumps(end)) > _LARGEST else self._waiting).append(end)
+        size = len(pickle.dumps(end))
+        if size > _LARGEST:
+            self._large.append(end)
+        else:
+            if self._size + size > _LARGEST:
+                self._send()
+            self._waiting.append(end)
+            self._size += size
         if time.monotonic() - self._told > _TOGETHER or len(self._waiting) >= _MOST_TOGETHER:
             self._send()
 
@@ -248,13 +263,13 @@ class _Teller:
         """Send what is left; the ends that are too large for that."""
         self._send()
         if self._large:
-            self.tell(Told(self._first, self.worker.address, fetch=True))
+            self.tell(*(Told(end.number, self.worker.address, fetch=True) for end in self._large))
         return self._large
 
     def _send(self) -> None:
         if self._waiting:
             self.tell(*self._waiting)
-        self._waiting, self._told = [], time.monotonic()
+        self._waiting, self._size, self._told = [], 0, time.monotonic()
 
 
 @contextmanager
@@ -273,8 +288,11 @@ def _slots(wanted: int, all_slots: int) -> Iterator[None]:
 
 
 def _process_for(job: Job[Any], requirements: bytes, preload: tuple[str, ...]) -> JobProcess:
-    while _idle:
-        served, process = _idle.pop()
+    while True:
+        with _free:
+            if not _idle:
+                break
+            served, process = _idle.pop()
         if served == requirements and process.takes(job):
             return process
         process.end()

@@ -22,7 +22,7 @@ def gathered(
 ) -> list[T]:
     """Results of ``function`` (from the top of a module) for every argument, in their order; None: without jobs.
 
-    shared: see Job. DataError, or what the function raised: one of them has no result.
+    Its results are not None. shared: see Job. DataError, or what the function raised: one of them has no result.
     """
     if backend is None:
         return [function(argument, no_progress) for argument in arguments]

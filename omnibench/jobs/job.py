@@ -1,8 +1,8 @@
 """The protocol of many independent jobs: a picklable specification in, a result file out.
 
-A job's result is the file that its worker wrote into the store, and nothing else: no result is sent back to the
-parent. So a job whose file is there is not run again, whatever became of the parent, and a worker that dies after
-writing has done its work. A backend only runs jobs and says which ended how.
+A job's result is what stands in the store, and nothing else: the file that its worker wrote, or that the client wrote
+for a worker on another machine. So a job whose file is there is not run again, whatever became of the parent, and a
+worker that dies after writing has done its work. A backend only runs jobs and says which ended how.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class JobWatch(Generic[T]):
 
 
 class Backend(Protocol):
-    """Place where jobs are run: this process, processes of this machine, or other machines that share the store."""
+    """Place where jobs are run: this process, processes of this machine, or other machines."""
 
     def run(self, jobs: Iterable[tuple[int, Job[T]]], store: Store[T], watch: JobWatch[T]) -> Iterator[Ended]:
         """Run jobs, which are taken as workers become free, and yield them as they end.
@@ -116,6 +116,8 @@ def run_jobs(jobs: Iterable[Job[T]], store: Store[T], backend: Backend, watch: J
                 killed.append((number, job))
             else:
                 watch.ended(number, _after(failure, tried), reused=False)
+        if not killed:
+            return
         waiting = iter(killed)
 
 

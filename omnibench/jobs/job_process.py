@@ -8,9 +8,10 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import islice
 from multiprocessing.connection import Connection
 from signal import SIG_DFL, SIG_IGN, SIGABRT, SIGHUP, SIGINT, SIGKILL, SIGSEGV, SIGTERM, Signals
 from typing import Any
@@ -28,6 +29,7 @@ _YOUNG = 1.0
 _OWN = 60.0  # s, for jobs of our own code, which leave nothing behind but what they share: data need not go again
 # What every process of jobs needs; pydantic imports these when a result is first written, which takes 60 ms.
 PRELOAD = (__name__, "pydantic.fields", "pydantic.dataclasses")
+_AT_ONCE = 100  # events of a process that are heard before those of others; chosen
 _CLOSED = 1.0  # s in which a process dies whose end of the connection is closed; chosen
 _FROM_OUTSIDE = (SIGKILL, SIGTERM, SIGHUP, SIGINT)  # signals by which people and the system end processes
 
@@ -89,25 +91,33 @@ class JobProcess:
 
     def takes(self, job: Job[Any]) -> bool:
         """True if it may do the job: a job with a limit gets a fresh process, others one that is young."""
-        return self._fresh or not (_alone(job) or time.monotonic() - self._since > (_OWN if job.own else _YOUNG))
+        if self._fresh:
+            return True
+        young = time.monotonic() - self._since <= (_OWN if job.own else _YOUNG)
+        return young and not _alone(job) and self._process.is_alive()
 
     def give(self, job: Job[Any], keep: Callable[[str, Any], Any]) -> None:
         """Begin a job. keep: called there with the key and the result; what it returns is the end's ``answer``."""
         self._fresh, self._kills = False, oom_kills()
         if isinstance(job.argument, PackedJob) and job.argument.kept:
-            names = job.argument.shared.keys()
-            job = replace(job, argument=job.argument.without(self._sent))
-            self._sent |= names
+            packed, self._sent = job.argument.without(self._sent), {*job.argument.shared}
+            job = replace(job, argument=packed)
         self.deadline = None if job.seconds is None else time.monotonic() + job.seconds
         with suppress(BrokenPipeError, ConnectionResetError):  # it died: ``receive`` tells how
             self.connection.send((job, keep))
 
+    def events(self) -> Iterator[Progress | JobEnd]:
+        """What has come: reports and the end. Of a job that reports without pause some, so that others are heard."""
+        return islice(iter(self.receive, None), _AT_ONCE)
+
     def receive(self) -> Progress | JobEnd | None:
         """A report or the end of the job, None if there is none yet. After an end by force the process is gone."""
+        over = self.deadline is not None and time.monotonic() >= self.deadline
         try:
             if self.connection.poll():
                 message: Progress | JobEnd = self.connection.recv()
-                return message
+                if isinstance(message, JobEnd) or not over:
+                    return message
         except (EOFError, OSError):  # it is about to die, or a plug-in has closed its end
             self._process.join(_CLOSED)
             return self._death()
@@ -117,7 +127,7 @@ class JobProcess:
                     last: Progress | JobEnd = self.connection.recv()
                     return last
             return self._death()
-        if self.deadline is not None and time.monotonic() >= self.deadline:
+        if over:
             self.end()
             return JobEnd(over_time=True)
         return None
@@ -153,6 +163,8 @@ def _serve(connection: Connection) -> None:
     with one_thread():
         while True:
             try:
+                if not connection.poll(2 * _OWN):  # nobody gives it a job so late
+                    return
                 job, keep = connection.recv()
             except EOFError:
                 return

@@ -116,7 +116,7 @@ def _ends(active: dict[JobProcess, tuple[int, Job[Any]]], watch: JobWatch[Any]) 
     )
     ended = []
     for process, (number, _) in active.items():
-        while (event := process.receive()) is not None:
+        for event in process.events():
             if isinstance(event, JobEnd):
                 ended.append((process, event))
                 break

@@ -54,40 +54,45 @@ class _Pickler(pickle.Pickler):
 
 
 class _Unpickler(pickle.Unpickler):
-    """shared: what the objects that were left out are pickled as, by their names. made: those that were unpickled."""
+    """shared: the objects that were left out, by their names."""
 
-    def __init__(self, content: bytes, shared: Mapping[str, bytes], made: dict[str, Any]) -> None:
+    def __init__(self, content: bytes, shared: Mapping[str, Any]) -> None:
         super().__init__(BytesIO(content))
-        self._shared, self._made = shared, made
+        self._shared = shared
 
     def persistent_load(self, name: str) -> Any:
-        if name not in self._made:
-            self._made[name] = pickle.loads(self._shared[name])
-        return self._made[name]
+        return self._shared[name]
 
 
 @dataclass(frozen=True)
 class PackedJob:
     """A job's function and argument as bytes. plugins: copies of plug-in files here, by their paths at home.
 
-    kept: what the job shares with others is kept in its process, whose next jobs need not be sent it.
+    kept: what the job shares with others, its ``names``, is kept in its process for the next job.
     """
 
     content: bytes
     shared: Mapping[str, bytes]
     plugins: Mapping[Path, Path]
     kept: bool = False
+    names: tuple[str, ...] = ()
 
     def without(self, sent: Collection[str]) -> PackedJob:
         """The job for a process that has kept what was sent, by its names."""
-        return replace(self, shared={name: value for name, value in self.shared.items() if name not in sent})
+        left = {name: value for name, value in self.shared.items() if name not in sent}
+        return replace(self, shared=left, names=tuple(self.shared))
 
 
-_KEPT: dict[str, Any] = {}  # what jobs of this process have shared, by names
+_KEPT: dict[str, Any] = {}  # what the last job of this process has shared, by names
 
 
 def run_packed(packed: PackedJob, report: Reporter) -> Any:
     """Unpack a job in its process and run it."""
     import_copies(packed.plugins)
-    function, argument = _Unpickler(packed.content, packed.shared, _KEPT if packed.kept else {}).load()
+    shared = {name: pickle.loads(content) for name, content in packed.shared.items()}
+    if packed.kept:
+        shared |= {name: _KEPT[name] for name in packed.names if name not in shared}
+        _KEPT.clear()
+        _KEPT.update(shared)
+    function, argument = _Unpickler(packed.content, shared).load()
     return function(argument, report)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import threading
 import time
+import weakref
 from collections.abc import Iterator
 from multiprocessing import parent_process
 from pathlib import Path
@@ -27,6 +29,7 @@ from test_jobs import (
 from omnibench.errors import DataError
 from omnibench.jobs.backend_choice import BackendChoice, open_backend
 from omnibench.jobs.dask_backend import DaskBackend
+from omnibench.jobs.gathering import gathered
 from omnibench.jobs.job import Failure, Job, run_jobs
 from omnibench.jobs.packing import Packer
 from omnibench.jobs.result_store import ResultStore
@@ -104,6 +107,31 @@ def test_a_result_too_large_for_an_event_arrives(dask: DaskBackend, tmp_path: Pa
     store: ResultStore[Any] = ResultStore(tmp_path, list[float])
     run_jobs([Job(f"large-{number}", many_numbers, number) for number in range(2)], store, dask, Notes())
     assert [len(store.get(f"large-{number}") or ()) for number in range(2)] == [50_000] * 2
+
+
+def of_size(size: int, _: Reporter) -> bytes:
+    return bytes(size)
+
+
+def test_results_of_one_parcel_arrive_whatever_their_sizes(dask: DaskBackend) -> None:
+    sizes = [10] * 40 + [10, 300_000] * 20
+    assert [len(result) for result in gathered(dask, of_size, sizes)] == sizes
+
+
+def test_results_of_ended_calls_are_not_held(dask: DaskBackend) -> None:
+    results = gathered(dask, many_objects, [0, 1])
+    kept = [weakref.ref(result) for result in results]
+    del results
+    gc.collect()
+    assert [reference() for reference in kept] == [None, None]
+
+
+class Many:
+    """A result that can be told to be gone."""
+
+
+def many_objects(_: int, __: Reporter) -> Many:
+    return Many()
 
 
 def total(shared: tuple[int, np.ndarray], _: Reporter) -> Answer:

@@ -22,10 +22,10 @@ _OF_EACH = 2  # runs of every command and session that are drawn before others (
 
 
 def drawn_runs(runs: Sequence[Run], most: int = MOST_DRAWN) -> list[Run]:
-    """All runs, or of more than ``most`` wheel samples some, in memory, that chance has drawn: the same ones each time.
+    """All runs, or of more than ``most`` wheel samples some that chance has drawn, in memory: the same ones each time.
 
-    They have about so many samples, unless runs are so long that twenty have more. Of every session and command that
-    the runs tell some are drawn first.
+    They have about so many samples, unless runs are so long that twenty have more. Some of every session and command
+    that the runs tell are drawn first, as far as so few runs reach.
     """
     count = count_drawn(runs, most)
     if count == len(runs):

@@ -74,19 +74,19 @@ def file_state(file: Path) -> tuple[int, int]:
 def read_rows(file: Path, columns: Sequence[str], first: int, count: int) -> pl.DataFrame:
     """Some rows of a Parquet file. DataError: it cannot be read."""
     with _readable(file):
-        return pl.scan_parquet(file).select(columns).slice(first, count).collect()
+        return pl.scan_parquet(file, glob=False).select(columns).slice(first, count).collect()
 
 
 def count_rows(file: Path) -> int:
     """The number of rows of a Parquet file. DataError: it cannot be read."""
     with _readable(file):
-        return int(pl.scan_parquet(file).select(pl.len()).collect().item())
+        return int(pl.scan_parquet(file, glob=False).select(pl.len()).collect().item())
 
 
 def types_of(file: Path) -> pl.Schema:
     """The types of the columns of a Parquet file, by their names. DataError: it cannot be read."""
     with _readable(file):
-        return pl.scan_parquet(file).collect_schema()
+        return pl.scan_parquet(file, glob=False).collect_schema()
 
 
 @contextmanager

@@ -88,7 +88,7 @@ def read_table(folder: Path, name: str, required: Sequence[str]) -> Table:
         raise DataError(f"{folder}: {name}.parquet (or {name}.csv) is missing")
     try:
         if file.suffix == ".parquet":
-            frame = pl.read_parquet(file)
+            frame = pl.read_parquet(file, glob=False)
         else:
             frame = pl.read_csv(file, infer_schema_length=None, schema_overrides=_TEXTS)
     except (pl.exceptions.PolarsError, OSError) as error:

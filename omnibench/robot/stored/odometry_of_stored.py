@@ -137,21 +137,19 @@ class StoredOdometry(OdometryBatch):
 
     def _of(self, matrix: Array, slopes: bool) -> AtStamps:
         key = np.ascontiguousarray(matrix, dtype=float).tobytes()
-        kept = self._kept.get(key)
-        if kept is not None:
-            self._kept.move_to_end(key)
+        kept = self._kept.pop(key, None)
         if kept is None or (slopes and kept.slopes is None):
             while len(self._kept) >= _MATRICES:
                 self._kept.popitem(last=False)
             (kept,) = self._of_all([matrix], slopes)
-            self._kept[key] = kept
+        self._kept[key] = kept
         return kept
 
     def _of_all(self, matrices: Sequence[Array] | Array, slopes: bool) -> list[AtStamps]:
         """The sums for some matrices, by one reading of the samples."""
         tasks = [(part, list(matrices), self.integration, slopes) for part in together(self._logs, self._of_a_job)]
         parts = gathered(workers(), sums_of_logs, tasks)
-        return [_joined([of_part[index] for of_part in parts]) for index in range(len(matrices))]
+        return _of_each(parts)
 
     @property
     def _of_a_job(self) -> int:
@@ -163,7 +161,7 @@ def sums_of_logs(task: tuple[Sequence[WheelLog], Sequence[Array], Integration, b
     """The sums of some logs for some matrices. The task: logs, matrices, integration, and whether slopes are wanted."""
     logs, matrices, integration, slopes = task
     parts = [[_sums(part, matrix, integration, slopes) for matrix in matrices] for part in _read(logs)]
-    return [_joined([of_part[index] for of_part in parts]) for index in range(len(matrices))]
+    return _of_each(parts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,11 +193,12 @@ def _sums(part: _Read, matrix: Array, integration: Integration, slopes: bool) ->
     return AtStamps(moved, driven, rows.view(float) if slopes else None)
 
 
-def _joined(parts: Sequence[AtStamps]) -> AtStamps:
-    """The sums of parts one after another."""
-    slopes = [part.slopes for part in parts if part.slopes is not None]
-    return AtStamps(
-        np.concatenate([part.moved for part in parts]),
-        np.concatenate([part.driven for part in parts]),
-        np.concatenate(slopes, axis=1) if slopes else None,
-    )
+def _of_each(parts: Sequence[Sequence[AtStamps]]) -> list[AtStamps]:
+    """The sums for each matrix over all parts, each of which has its sums by matrix. They have ``driven`` in common."""
+    driven = np.concatenate([part[0].driven for part in parts])
+    joined = []
+    for of_matrix in zip(*parts, strict=True):
+        slopes = [part.slopes for part in of_matrix if part.slopes is not None]
+        moved = np.concatenate([part.moved for part in of_matrix])
+        joined.append(AtStamps(moved, driven, np.concatenate(slopes, axis=1) if slopes else None))
+    return joined

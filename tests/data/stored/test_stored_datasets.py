@@ -181,6 +181,12 @@ def test_runs_of_the_same_name_get_that_of_their_folder(tmp_path: Path) -> None:
     assert len(set(ids)) == 8
 
 
+@pytest.mark.parametrize("most", [0, 10**6])
+def test_a_folder_with_brackets_in_its_name_is_that_folder(tmp_path: Path, most: int) -> None:
+    save_dataset(recorded(runs=4), tmp_path / "fleet[1]")
+    assert len(load_dataset(tmp_path / "fleet[1]", most_in_memory=most).trajectories[0].rates) > 0
+
+
 def test_a_glob_that_matches_nothing_is_said(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"day\*: no data set folder matches$"):
         load_dataset(tmp_path / "day*")

@@ -1,0 +1,106 @@
+"""Results of many jobs of one function, gathered in memory by processes that last."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+from job_samples import wait_for
+
+import omnibench.jobs.packing as packing
+from omnibench.errors import DataError
+from omnibench.jobs.backend_choice import BackendChoice, open_backend
+from omnibench.jobs.gathering import gathered
+from omnibench.jobs.job import Backend, Failure, Job, JobWatch, run_jobs
+from omnibench.jobs.result_store import ResultStore
+from omnibench.progress import Progress, Reporter
+
+
+@pytest.fixture
+def one_process() -> Iterator[Backend]:
+    with open_backend(BackendChoice(workers=1)) as backend:
+        yield backend
+    assert not psutil.Process().children() or all(
+        "forkserver" in " ".join(child.cmdline()) or "resource_tracker" in " ".join(child.cmdline())
+        for child in psutil.Process().children()
+    )
+
+
+def total(order: tuple[int, np.ndarray], _: Reporter) -> tuple[float, int, int]:
+    number, shared = order
+    return number + float(shared.sum()), os.getpid(), len(packing._KEPT)
+
+
+def test_results_are_those_of_the_function_in_their_order(one_process: Backend) -> None:
+    data = np.arange(5.0)
+    orders = [(number, data) for number in range(7)]
+    by_jobs = gathered(one_process, total, orders, shared=(data,))
+    assert [result for result, *_ in by_jobs] == [result for result, *_ in gathered(None, total, orders)]
+
+
+def test_calls_share_a_process_which_keeps_no_more_than_the_last_jobs_share(one_process: Backend) -> None:
+    found = []
+    for size in range(1, 5):
+        data = np.ones(size)
+        found += gathered(one_process, total, [(0, data), (1, data)], shared=(data,))
+    assert [result for result, *_ in found] == [1, 2, 2, 3, 3, 4, 4, 5]
+    assert {kept for *_, kept in found} == {1}
+    assert len({process for _, process, _ in found}) == 1
+
+
+def nothing_of_it(number: int, _: Reporter) -> int:
+    return number
+
+
+def test_what_no_argument_holds_may_be_shared(one_process: Backend) -> None:
+    other = np.ones(3)
+    found = gathered(one_process, total, [(0, other), (1, np.zeros(2)), (2, other)], shared=(other,))
+    assert [result for result, *_ in found] == [3, 1, 5]
+    assert gathered(one_process, nothing_of_it, [4, 5], shared=(other,)) == [4, 5]
+
+
+def test_a_waiting_process_that_is_killed_costs_no_job_a_try(one_process: Backend) -> None:
+    data = np.ones(3)
+    ((_, process, _),) = gathered(one_process, total, [(0, data)], shared=(data,))
+    os.kill(process, signal.SIGKILL)
+    wait_for(lambda: not psutil.pid_exists(process) or psutil.Process(process).status() == psutil.STATUS_ZOMBIE)
+    ((result, other, _),) = gathered(one_process, total, [(1, data)], shared=(data,))
+    assert result == 4
+    assert other != process
+
+
+def wrong(number: int, _: Reporter) -> int:
+    raise DataError(f"{number} is wrong")
+
+
+def test_the_error_of_a_job_is_raised(one_process: Backend) -> None:
+    with pytest.raises(DataError, match=r"^3 is wrong$"):
+        gathered(one_process, wrong, [3])
+
+
+def reporting_without_pause(_: object, report: Reporter) -> int:
+    began = time.monotonic()
+    while time.monotonic() - began < 30:
+        report(Progress("flood"))
+    return 0
+
+
+class Ending(JobWatch[int]):
+    ending: int | Failure | None = None
+
+    def ended(self, number: int, ending: int | Failure, reused: bool) -> None:  # noqa: ARG002
+        self.ending = ending
+
+
+def test_a_job_that_reports_without_pause_ends_at_its_limit(one_process: Backend, tmp_path: Path) -> None:
+    watch, began = Ending(), time.monotonic()
+    job = Job("flood", reporting_without_pause, None, seconds=0.5)
+    run_jobs([job], ResultStore(tmp_path, int), one_process, watch)
+    assert watch.ending == Failure("over time (limit 0.5 s)", over_time=True)
+    assert time.monotonic() - began < 15
