@@ -13,9 +13,11 @@ from __future__ import annotations
 
 import argparse
 import os
+import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -100,6 +102,16 @@ def write_day(folder: Path, day: int, runs: int) -> None:
     partial.rename(folder)
 
 
+def joined_days(days: Sequence[str], place: Path) -> str:
+    """A data set folder that holds the runs of some days, as if their recording had gone on in it."""
+    folder = place / f"{Path(days[0]).name}-{len(days)}"
+    folder.mkdir(parents=True, exist_ok=True)
+    shutil.copy(Path(days[0]) / "dataset.yaml", folder)
+    for table in ("trajectories", "wheels", "poses"):
+        pl.scan_parquet([f"{day}/{table}.parquet" for day in days]).sink_parquet(folder / f"{table}.parquet")
+    return str(folder)
+
+
 @dataclass(frozen=True)
 class Spent:
     """What a command took: s, and its own peak memory in MB."""
@@ -118,6 +130,11 @@ def spent_on(*arguments: str) -> Spent:
     return Spent(time.perf_counter() - began, used.ru_maxrss / 1000)
 
 
+def calibration_of(places: Sequence[str], found: str) -> list[str]:
+    """The words of the command that calibrates by some folders."""
+    return ["calibrate", *places, "--calibrator", "closed_form", "--intervals", "-o", found, "--force"]
+
+
 def numbers_of(calibration: Path) -> np.ndarray:
     """Matrix and covariance of a calibration file in one row."""
     content = yaml.safe_load(calibration.read_text())
@@ -130,7 +147,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--samples", type=float, default=1e7)
     parser.add_argument("--workers", type=int, default=0)
-    parser.add_argument("--parts", action="store_true", help="also append in ten parts, and merge from two workers")
+    parser.add_argument("--parts", action="store_true", help="also merge from two workers, and in ten folders and one")
     given = parser.parse_args()
     runs = round(given.samples / (SECONDS * RATE))
     days = -(-runs // RUNS_A_DAY)
@@ -145,7 +162,7 @@ def main() -> None:
     total = 0.0
     print(f"{runs * SECONDS * RATE:,} wheel samples (simulated), {runs:,} runs, {days} folders; {' '.join(by)}")
     for words in (
-        ["calibrate", *places, "--calibrator", "closed_form", "--intervals", "-o", found, "--force"],
+        calibration_of(places, found),
         ["check", *places],
         ["evaluate", found, *places],
     ):
@@ -154,14 +171,18 @@ def main() -> None:
         print(f"{words[0]:10} {spent.seconds:8.1f} s  peak {spent.peak_mb:7.0f} MB", flush=True)
     print(f"{'in all':10} {total:8.1f} s  {1e6 * total / (runs * SECONDS * RATE):.2f} us a sample")
     if given.parts:
-        whole = numbers_of(Path(found))
-        other = str(given.folder / "other.yaml")
-        two = ("--backend", "processes", "--workers", "2")
-        spent_on("calibrate", *places, "--intervals", "-o", other, "--force", *two)
-        print(f"merged from 2 workers: differs by {np.abs(numbers_of(Path(other)) / whole - 1).max():.1e} of itself")
-        for tenth in range(1, 11):
-            spent_on("calibrate", *places[: -(-days * tenth // 10)], "--intervals", "-o", other, "--force")
-        print(f"appended in 10 parts: differs by {np.abs(numbers_of(Path(other)) / whole - 1).max():.1e} of itself")
+        whole, other = numbers_of(Path(found)), str(given.folder / "other.yaml")
+        joined = given.folder / "joined"
+        tenths = [joined_days(part.tolist(), joined) for part in np.array_split(places, 10)]
+        for words, folders, options in (
+            ("merged from 2 workers", places, ("--backend", "processes", "--workers", "2")),
+            ("appended in 10 parts", tenths, ()),
+            ("in one folder", [joined_days(places, joined)], ()),
+        ):
+            spent_on(
+                "calibrate", *folders, "--calibrator", "closed_form", "--intervals", "-o", other, "--force", *options
+            )
+            print(f"{words}: differs by {np.abs(numbers_of(Path(other)) / whole - 1).max():.1e} of itself", flush=True)
 
 
 if __name__ == "__main__":
