@@ -79,7 +79,7 @@ class Trajectory(Shown):
             require_type(self.references, References, "References.of([...], end=...)")
         arrays: dict[str, Any] = {}
         for name in _ARRAYS:
-            if (value := getattr(self, name)) is not None:
+            if (value := getattr(self, name)) is not None and not in_file(value):
                 try:
                     arrays[name] = np.asarray(value, dtype=float)
                 except (TypeError, ValueError):

@@ -39,7 +39,7 @@ class BlockFile:
     """
 
     file: Path
-    edges: tuple[int, ...]
+    edges: tuple[int, ...] = field(compare=False)
     state: tuple[int, int]
 
     def rows(self, columns: tuple[str, ...], first: int, count: int) -> Array:
