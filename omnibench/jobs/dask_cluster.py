@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import pickle
 import warnings
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from importlib.util import find_spec
 from typing import Any
 
 import dask
 import distributed
+from distributed.comm.core import connect
 
 from omnibench.errors import ConfigError, one_line
 from omnibench.jobs.dask_worker import Requirements, UnfitWorkerError, check
@@ -84,12 +87,21 @@ def _joined(address: str, tls: TlsFiles | None) -> Any:
             tls_ca_file=str(tls.ca), tls_client_cert=str(tls.cert), tls_client_key=str(tls.key), require_encryption=True
         )
     try:
+        with ThreadPoolExecutor(1) as thread:  # a notebook has a loop of its own in this one
+            thread.submit(asyncio.run, _ask(address, security)).result()
         return distributed.Client(address, timeout=_ANSWER, set_as_default=False, security=security)
     except Exception as error:  # sockets, TLS and the protocol of another version raise what they like
-        reason = one_line(str(error) or type(error).__name__)
+        reason = one_line(str(error) or f"whoever listens there says nothing that Dask knows within {_ANSWER:g} s")
         raise ConfigError(
             f"no Dask scheduler answers at {address} ({reason}); start one (dask scheduler), or correct the address"
         ) from None
+
+
+async def _ask(address: str, security: Any) -> None:
+    """Shake hands with a scheduler. A client waits without end for one that is none, such as a web server."""
+    arguments = {} if security is None else security.get_connection_args("client")
+    comm = await asyncio.wait_for(connect(address, timeout=_ANSWER, **arguments), _ANSWER + 1)
+    await comm.close()
 
 
 def _check_scheduler(client: Any, address: str) -> None:

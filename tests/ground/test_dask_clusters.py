@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import datetime
+import http.server
 import shutil
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from importlib.metadata import distribution, version
@@ -234,6 +236,16 @@ def test_when_the_client_is_killed_its_jobs_end_and_it_goes_on_when_started_agai
         (tmp_path / "go_on").touch()
         subprocess.run(command, env=IMPORTING_THIS, check=True, timeout=60)
     assert len(list((tmp_path / "store").glob("*.json"))) == 5
+
+
+def test_a_web_server_is_no_scheduler() -> None:
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), http.server.SimpleHTTPRequestHandler)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    place = f"tcp://127.0.0.1:{server.server_port}"
+    try:
+        assert refusal(place).startswith(f"no Dask scheduler answers at {place} (whoever listens there says nothing")
+    finally:
+        server.shutdown()
 
 
 def test_a_scheduler_that_is_killed_is_one_line(tmp_path: Path) -> None:
