@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from importlib.util import find_spec
+from multiprocessing import resource_tracker
 from typing import Any
 
 import dask
@@ -65,6 +66,7 @@ def dask_client(address: str | None, workers: int, tls: TlsFiles | None, report:
 @contextmanager
 def _local_cluster(workers: int) -> Iterator[Any]:
     """A cluster of this machine's processes, which leave Ctrl-C to this one."""
+    resource_tracker.ensure_running()  # the first worker would start it, and unblock what is blocked
     with main_module_hidden():  # a worker that died is started again at any time
         with interrupts_blocked():
             cluster = distributed.LocalCluster(

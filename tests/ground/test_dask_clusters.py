@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import datetime
 import http.server
+import os
 import shutil
+import signal
 import subprocess
 import sys
 import threading
@@ -215,6 +217,8 @@ try:
         run_jobs(jobs_of(sleeping, [folder] * 5), ResultStore(folder / "store", Answer), backend, Notes())
 except BackendError as error:
     sys.exit(str(error))
+except KeyboardInterrupt:
+    sys.exit("interrupted")
 """
 
 
@@ -236,6 +240,14 @@ def test_when_the_client_is_killed_its_jobs_end_and_it_goes_on_when_started_agai
         (tmp_path / "go_on").touch()
         subprocess.run(command, env=IMPORTING_THIS, check=True, timeout=60)
     assert len(list((tmp_path / "store").glob("*.json"))) == 5
+
+
+def test_ctrl_c_in_a_terminal_is_left_to_the_client(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", CLIENT, "dask", str(tmp_path)]
+    client = subprocess.Popen(command, env=IMPORTING_THIS, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    wait_for((tmp_path / "alive").exists)
+    os.killpg(client.pid, signal.SIGINT)  # a terminal sends it to all of its processes
+    assert client.communicate(timeout=60)[1] == "interrupted\n"
 
 
 def test_a_web_server_is_no_scheduler() -> None:
