@@ -1,10 +1,10 @@
 """Backend of a Dask cluster. Results come back to the client, which alone writes the store.
 
 A job's begin, its reports and its end are events from its worker; the future tells that it is lost, and holds ends that
-are too large for an event. A worker that
-is killed takes its jobs with it, and they are given to another. Their begins are counted here, since the scheduler also
-counts jobs that only waited there. (A scheduler that was not started here tries again by itself, by its own setting
-``allowed-failures``: it may begin a job a fourth time before this hears of it.)
+are too large for an event. A worker that is killed takes its jobs with it, and they are given to another. Their begins
+are counted here, since the scheduler also counts jobs that only waited there. (A scheduler that was not started here
+tries again by itself, by its own setting ``allowed-failures``: it may begin a job a fourth time before this hears of
+it.)
 """
 
 from __future__ import annotations
