@@ -24,6 +24,7 @@ from distributed import KilledWorker
 from distributed.client import FutureCancelledError
 
 from omnibench.errors import DataError, OmnibenchError, one_line
+from omnibench.jobs.dask_cluster import lost, lost_if_closed
 from omnibench.jobs.dask_worker import Order, Parcel, Told, carry_out, content
 from omnibench.jobs.job import TRIES, BackendError, Ended, Failure, Job, JobWatch
 from omnibench.jobs.job_process import JobEnd
@@ -39,12 +40,6 @@ _PARCEL = 0.2  # s of work that travel together: a task costs scheduler, client 
 _LARGEST_PARCEL = 50  # jobs; chosen
 _WEIGHT = 0.1  # weight of the latest job's time in the running mean; chosen
 _SUBMISSIONS = 10  # times that a job is sent whose workers die before it begins: chosen, as it is no fault of its own
-
-
-class SchedulerLostError(BackendError):
-    """The scheduler does not answer any more."""
-
-    exit_code = 1
 
 
 @dataclass(eq=False)
@@ -77,17 +72,18 @@ class DaskBackend:
 
     def run(self, jobs: Iterable[tuple[int, Job[T]]], store: Store[T], watch: JobWatch[T]) -> Iterator[Ended]:
         """Run the jobs, see Backend. SchedulerLostError, or UnfitWorkerError of a worker that joined later."""
-        run = _Run(self, next(self._runs), store, watch)
         waiting = iter(jobs)
-        try:
-            while True:
-                while run.room and (items := [_Pending(*item) for item in islice(waiting, run.parcel_size)]):
-                    run.submit(items)
-                if not run.pending:
-                    return
-                yield from run.ends()
-        finally:
-            run.close()
+        with lost_if_closed(self.client):
+            run = _Run(self, next(self._runs), store, watch)
+            try:
+                while True:
+                    while run.room and (items := [_Pending(*item) for item in islice(waiting, run.parcel_size)]):
+                        run.submit(items)
+                    if not run.pending:
+                        return
+                    yield from run.ends()
+            finally:
+                run.close()
 
     def order(self, number: int, job: Job[Any]) -> tuple[Order, dict[str, bytes]]:
         """A job as it travels, and by their names the data that it shares with others."""
@@ -178,7 +174,7 @@ class _Run:
                 try:
                     ends = self._futures[item.parcel].result()
                 except FutureCancelledError:
-                    raise self._scheduler_lost from None
+                    raise lost(self._client) from None
                 for each in ends:
                     yield from self._told(each)
             return
@@ -229,7 +225,7 @@ class _Run:
         if future is None or future.status in ("pending", "finished"):  # whose ends are under way
             return
         if future.status != "error":
-            raise self._scheduler_lost
+            raise lost(self._client)
         error = future.exception()
         if isinstance(error, OmnibenchError):
             raise error  # a worker joined later and is unfit
@@ -245,12 +241,8 @@ class _Run:
             else:
                 self.submit([item])
 
-    @property
-    def _scheduler_lost(self) -> SchedulerLostError:
-        return SchedulerLostError(f"the Dask scheduler {self._client.scheduler.address} is lost")
-
     def _count_slots(self) -> int:
         """Threads of all workers, at least one. SchedulerLostError."""
         if self._client.status != "running":
-            raise self._scheduler_lost
+            raise lost(self._client)
         return max(sum(self._client.nthreads().values()), 1)

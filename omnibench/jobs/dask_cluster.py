@@ -15,10 +15,11 @@ from typing import Any
 
 import dask
 import distributed
-from distributed.comm.core import connect
+from distributed.comm.core import CommClosedError, connect
 
 from omnibench.errors import ConfigError, one_line
 from omnibench.jobs.dask_worker import Requirements, UnfitWorkerError, check
+from omnibench.jobs.job import BackendError
 from omnibench.jobs.scheduler_tls import TlsFiles
 from omnibench.jobs.software import software
 from omnibench.processes import interrupts_blocked, main_module_hidden
@@ -39,6 +40,26 @@ _SETTINGS = {
 }
 
 
+class SchedulerLostError(BackendError):
+    """The scheduler does not answer any more."""
+
+    exit_code = 1
+
+
+def lost(client: Any) -> SchedulerLostError:
+    """The error of a client whose scheduler does not answer any more."""
+    return SchedulerLostError(f"the Dask scheduler {client.scheduler.address} is lost")
+
+
+@contextmanager
+def lost_if_closed(client: Any) -> Iterator[None]:
+    """Turn the end of the connection, at whatever question it is seen, into SchedulerLostError."""
+    try:
+        yield
+    except CommClosedError:
+        raise lost(client) from None
+
+
 @contextmanager
 def dask_client(address: str | None, workers: int, tls: TlsFiles | None, report: Reporter) -> Iterator[Any]:
     """A client of the scheduler at ``address``, or of a cluster of so many processes that is started here.
@@ -56,9 +77,10 @@ def dask_client(address: str | None, workers: int, tls: TlsFiles | None, report:
         else:
             client = _joined(address, tls)
             try:
-                _check_scheduler(client, address)
-                _wait_for_worker(client, address, report)
-                yield client
+                with lost_if_closed(client):
+                    _check_scheduler(client, address)
+                    _wait_for_worker(client, address, report)
+                    yield client
             finally:
                 client.close(timeout=1)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import time
@@ -26,10 +27,7 @@ from omnibench.progress import Progress, Reporter
 def one_process() -> Iterator[Backend]:
     with open_backend(BackendChoice(workers=1)) as backend:
         yield backend
-    assert not psutil.Process().children() or all(
-        "forkserver" in " ".join(child.cmdline()) or "resource_tracker" in " ".join(child.cmdline())
-        for child in psutil.Process().children()
-    )
+    assert not multiprocessing.active_children()
 
 
 def total(order: tuple[int, np.ndarray], _: Reporter) -> tuple[float, int, int]:
