@@ -118,6 +118,14 @@ def test_results_of_one_parcel_arrive_whatever_their_sizes(dask: DaskBackend) ->
     assert [len(result) for result in gathered(dask, of_size, sizes)] == sizes
 
 
+def trims_memory(_: int, __: Reporter) -> bool:
+    return "MALLOC_TRIM_THRESHOLD_" in os.environ
+
+
+def test_jobs_do_not_give_memory_back_all_the_time_as_workers_of_dask_do(dask: DaskBackend) -> None:
+    assert gathered(dask, trims_memory, [0]) == [False]
+
+
 def test_results_of_ended_calls_are_not_held(dask: DaskBackend) -> None:
     results = gathered(dask, many_objects, [0, 1])
     kept = [weakref.ref(result) for result in results]
