@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import datetime
-from errno import EACCES, EDQUOT, EFBIG, EIO, EISDIR, ENOSPC, EPERM
+from errno import EACCES, EDQUOT, EFBIG, EIO, EISDIR, ENOSPC, EPERM, EROFS
 from io import BytesIO
 from pathlib import Path
 from typing import Literal
@@ -70,7 +70,7 @@ def refuse_existing(*paths: Path | None, force: bool, folders: bool = False) -> 
     """Check the files (or ``folders``) that a user named for output, before the work; None: none is named.
 
     ConfigError in one line: one is there with content and is not to be replaced (``force``). DataError: it is a folder
-    where a file is wanted, or a link that leads to itself.
+    where a file is wanted, a link that leads to itself, or in a place where nobody may write.
     """
     for path in paths:
         if path is None:
@@ -80,6 +80,20 @@ def refuse_existing(*paths: Path | None, force: bool, folders: bool = False) -> 
         if _holds_something(path) and not force:
             other = "folder" if folders else "file"
             raise ConfigError(f"{path} is there already; choose another {other}, or --force to replace it")
+        check_place(path)
+
+
+def check_place(path: Path) -> None:
+    """DataError in one line when a file or a folder cannot be made there; devices and pipes are not made."""
+    target = resolved(path)
+    if target.exists() and not target.is_file() and not target.is_dir():
+        return
+    existing = target if target.is_dir() else next(each for each in target.parents if each.exists())
+    if not existing.is_dir():
+        raise DataError(f"{path}: cannot be written: {existing} is not a folder; choose another place")
+    if not os.access(existing, os.W_OK | os.X_OK):
+        code = EROFS if os.statvfs(existing).f_flag & os.ST_RDONLY else EACCES
+        raise _refused(path, OSError(code, os.strerror(code)))
 
 
 def resolved(path: Path) -> Path:

@@ -15,6 +15,7 @@ from omnibench.fit.problem import Budget
 from omnibench.fit.shrinkage.prior import MountChoice
 from omnibench.fit.span import Unidentified
 from omnibench.fit.uncertainty.ratio_intervals import Bootstrap
+from omnibench.jobs.backend_choice import name_flaw
 from omnibench.jobs.scheduler_tls import TlsFiles
 from omnibench.robot.odometry import Integration
 from omnibench.simulate.dataset_source import DatasetSource
@@ -116,7 +117,7 @@ class CompareConfig(Model):
     seeds: tuple[int, ...] = Field((1,), min_length=1, description="one run of every search for each")
     calibrators: tuple[CalibratorEntry, ...] = Field(min_length=1)
     plugins: tuple[RelativePath, ...] = Field((), description="folders of plug-ins; relative to the config file")
-    workers: int | None = Field(None, gt=0, description="processes; default: the processors")
+    workers: int | None = Field(None, gt=0, strict=True, description="processes; default: the processors")
     backend: str = Field(
         "processes",
         description="where runs are made: processes, dask, or a scheduler of Dask: tcp://HOST:PORT, tls://...",
@@ -146,6 +147,13 @@ class CompareConfig(Model):
     @classmethod
     def _name_stands_for_cost(cls, cost: Any) -> Any:
         return {"name": cost} if isinstance(cost, str) else cost
+
+    @field_validator("backend")
+    @classmethod
+    def _backend_is_known(cls, backend: str) -> str:
+        if flaw := name_flaw(backend):
+            raise ValueError(flaw)
+        return backend
 
     @field_validator("seeds")
     @classmethod

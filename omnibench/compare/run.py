@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from omnibench.compare.certificates import certify
@@ -56,15 +56,15 @@ def run_comparison(
     failures = load_calibrators(config)
     with _naming_failed_plugins(failures):
         config = effective_config(config)
-        with (
-            open_backend(_backend(config), PRELOAD, progress) as backend,
-            one_thread_processes(_preload(config)),  # processes started for simulation serve the calibrators, too
-        ):
+        with ExitStack() as opened:
+            backend = opened.enter_context(open_backend(_backend(config), PRELOAD, progress))
+            # Processes that are started for simulation serve the calibrators, too.
+            opened.enter_context(one_thread_processes(_preload(config)))
             datasets = load_datasets(config, progress)
             plan = make_plan(config, datasets)
             folder = prepare_output(config, output, force=force)
             store = ResultStore(folder / "runs", RunResult)
-            with _resumable(plan, store, folder):
+            with _resumable(plan, store, folder), opened.pop_all():  # Ctrl-C while they close is resumable, too
                 results = execute(plan, store, progress, backend)
     with _resumable(plan, store, folder):
         scored = score(plan, results, datasets)

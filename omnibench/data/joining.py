@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Protocol
+from typing import Any, Protocol
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.splits import complete
@@ -54,19 +54,33 @@ class _Described(Protocol):
     def sample_period(self) -> float: ...
 
 
-def check_fits(first: _Described, other: _Described) -> None:
-    """DataError: another robot or sample period than the first's."""
+def check_fits(first: _Described, other: _Described, names: tuple[str, str] | None = None) -> None:
+    """DataError: another robot or sample period than the first's. names: of both in messages, as their folders."""
+    one, another = names or (first.name, other.name)
     robots = [dataset.robot.model_dump(exclude={"name"}) for dataset in (first, other)]
-    if robots[0] != robots[1]:
+    if different := _first_difference(robots[0], robots[1]):
         raise DataError(
-            f"data set {other.name}: its robot is not that of {first.name}; give both the same robot.yaml "
+            f"data set {another}: its robot is not that of {one} ({different}); give both the same robot.yaml "
             "(omnibench import dataset FOLDER --set robot=FILE)"
         )
     if abs(other.sample_period / first.sample_period - 1) > _SAME_PERIOD:
         raise DataError(
-            f"data set {other.name}: its wheels were sampled every {other.sample_period:g} s, those of {first.name} "
-            f"every {first.sample_period:g} s; take each by itself"
+            f"data set {another}: its wheels were sampled every {other.sample_period:g} s, those of {one} every "
+            f"{first.sample_period:g} s; take each by itself"
         )
+
+
+def _first_difference(one: Any, other: Any, place: str = "") -> str:
+    """The first difference of two documents in words, such as ``wheels.0.radius: 0.06 and 0.05``; empty if none."""
+    pairs: list[tuple[str, Any, Any]]
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        pairs = [(name, one.get(name), other.get(name)) for name in dict.fromkeys([*one, *other])]
+    elif isinstance(one, list | tuple) and isinstance(other, list | tuple) and len(one) == len(other):
+        pairs = [(str(index), mine, theirs) for index, (mine, theirs) in enumerate(zip(one, other, strict=True))]
+    else:
+        return "" if one == other else f"{place}: {other} and {one}"
+    found = (_first_difference(mine, theirs, f"{place}.{name}".lstrip(".")) for name, mine, theirs in pairs)
+    return next(filter(None, found), "")
 
 
 def distinct_runs(recordings: Sequence[tuple[str, Sequence[Trajectory]]]) -> list[Trajectory]:

@@ -49,7 +49,9 @@ class ScansOnDisk(Scans):
     def of(self, trajectory: str) -> TrajectoryScans:
         rows, times = self._indexed(trajectory)
         if self._file_state() != self._state:
-            raise DataError(f"{self.file}: the file has changed since it was opened; load the data set again")
+            raise DataError(
+                f"{self.file}: the file has changed since it was opened; load it, or run the command, again"
+            )
         ranges = np.empty((len(rows), self.scanner.rays), np.float32)
         for part in _parts(rows, _MOST_ROWS if self.file.suffix == ".parquet" else _ROWS_OF_CSV):
             ranges[part] = self._read(rows[part], f"trajectory {trajectory}", times[part])

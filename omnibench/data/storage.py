@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
@@ -25,8 +24,9 @@ from omnibench.data.tables.dataset_tables import POSE_COLUMNS, DatasetTables, ta
 from omnibench.data.tables.table import Table, read_table, table_file
 from omnibench.data.tables.wheel_table import WheelTable
 from omnibench.errors import DataError, require_type
-from omnibench.files import FileContent, TableFormat, encode_table, remove, resolved, write_files
+from omnibench.files import FileContent, TableFormat, check_place, encode_table, remove, resolved, write_files
 from omnibench.progress import expect_reading
+from omnibench.words import plural, some
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +54,8 @@ def load_dataset(path: Path | str | Sequence[Path | str], *, most_in_memory: int
     recorded = [read_recorded(folder, left_in_files=left) for folder in folders]
     headers = [each.header for each in recorded]
     first, last = headers[0], headers[-1]
-    for other in headers[1:]:
-        check_fits(first, other)
+    for folder, other in zip(folders[1:], headers[1:], strict=True):
+        check_fits(first, other, (str(folders[0]), str(folder)))
     runs = recorded[0].trajectories
     if len(recorded) > 1:
         runs = complete(distinct_runs([(each.header.name, each.trajectories) for each in recorded]))
@@ -70,14 +70,24 @@ def load_dataset(path: Path | str | Sequence[Path | str], *, most_in_memory: int
         simulated=any(header.simulated for header in headers),
         scans=recorded[0].scans if len(recorded) == 1 else None,
     )
-    if len(recorded) > 1 and any(each.scans is not None for each in recorded):
-        dataset = replace(dataset, warnings=(*dataset.warnings, SCANS_LEFT_OUT))
+    if len(recorded) > 1:
+        left_out = [SCANS_LEFT_OUT] if any(each.scans is not None for each in recorded) else []
+        dataset = replace(dataset, warnings=(*dataset.warnings, *left_out, *_there_twice(dataset.trajectories)))
     return replace(dataset, imported=first.imported if len(recorded) == 1 else None)
 
 
 def load_whole(path: Path | str) -> Dataset:
     """Read a data set as load_dataset does, into memory whatever its size: for work that needs all samples at once."""
     return load_dataset(path, most_in_memory=sys.maxsize)
+
+
+def _there_twice(runs: Sequence[Trajectory]) -> list[str]:
+    """Warning of runs of several folders that hold the same recording."""
+    first: dict[str, str] = {}
+    copies = [run.id for run in runs if first.setdefault(run.fingerprint, run.id) != run.id]
+    if not copies:
+        return []
+    return [f"{plural(len(copies), 'run')} of another folder there twice, counted as repetitions: {some(copies, 5)}"]
 
 
 def _all_of(texts: Sequence[str]) -> str:
@@ -169,11 +179,7 @@ def check_dataset_folder(folder: Path) -> None:
         raise DataError(f"{folder}: is a file; name a folder for the data set")
     if folder.is_dir() and any(folder.iterdir()) and not (folder / "dataset.yaml").is_file():
         raise DataError(f"{folder}: holds other files; name an empty or new folder for the data set")
-    existing = next(each for each in (folder.absolute(), *folder.absolute().parents) if each.exists())
-    if not existing.is_dir():
-        raise DataError(f"{folder}: cannot be written: {existing} is not a folder; choose another place")
-    if not os.access(existing, os.W_OK | os.X_OK):
-        raise DataError(f"{folder}: cannot be written: {existing} is read-only; choose another place")
+    check_place(folder)
 
 
 def _check_origin(folder: Path, dataset: Dataset) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ssl
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
@@ -29,22 +30,27 @@ class BackendChoice(Model):
     tls: TlsFiles | None = None
 
 
+def name_flaw(name: str) -> str:
+    """What is wrong with the name of a backend; empty if nothing is."""
+    scheme, _, place = name.partition("://")
+    if name in _NAMES or (scheme in _SCHEMES and _has_host_and_port(place)):
+        return ""
+    return f"unknown backend {name!r}; {nearest(name, _NAMES)}known: processes, dask, tcp://HOST:PORT, tls://HOST:PORT"
+
+
 def check_backend(name: str, tls: TlsFiles | None = None) -> None:
     """ConfigError in one line: no such backend, Dask is not installed, or files of TLS are missing or of no use."""
-    scheme, _, place = name.partition("://")
-    if name not in _NAMES and not (scheme in _SCHEMES and _has_port(place)):
-        raise ConfigError(
-            f"unknown backend {name!r}; {nearest(name, _NAMES)}known: processes, dask, tcp://HOST:PORT, tls://HOST:PORT"
-        )
+    if flaw := name_flaw(name):
+        raise ConfigError(flaw)
+    scheme = name.partition("://")[0]
     if (scheme == "tls") != (tls is not None):
         raise ConfigError(
             f"backend {name}: name the files of TLS, ca, cert and key (--tls-ca, --tls-cert, --tls-key)"
             if tls is None
             else f"backend {name}: files of TLS are for a scheduler at tls://HOST:PORT; leave them out"
         )
-    for file in () if tls is None else (tls.ca, tls.cert, tls.key):
-        if not file.is_file():
-            raise ConfigError(f"backend {name}: {file}: no such file")
+    if tls is not None:
+        _check_files(name, tls)
     if name != "processes" and find_spec("distributed") is None:
         raise ConfigError(f'backend {name}: Dask is not installed; pip install "omnibench[dask]"')
 
@@ -70,13 +76,29 @@ def open_backend(
 
     address = None if choice.name == "dask" else choice.name
     with dask_client(address, choice.workers, choice.tls, report) as client:
-        backend = DaskBackend(client, checked_requirements(client, preload))
+        backend = DaskBackend(client, checked_requirements(client, preload), report)
         say_cluster(client, report)
         yield backend
 
 
-def _has_port(place: str) -> bool:
+def _has_host_and_port(place: str) -> bool:
+    address = urlsplit(f"//{place}")
     try:
-        return urlsplit(f"//{place}").port is not None
-    except ValueError:
+        return bool(address.hostname) and address.port is not None
+    except ValueError:  # a port that is no number, or too large a one
         return False
+
+
+def _check_files(name: str, tls: TlsFiles) -> None:
+    """ConfigError names the file of TLS that is missing, or holds no certificate or key."""
+    for what, file in (("ca", tls.ca), ("cert", tls.cert), ("key", tls.key)):
+        if not file.is_file():
+            raise ConfigError(f"backend {name}: {what}: {file}: {'is a folder' if file.is_dir() else 'no such file'}")
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    what = f"ca: {tls.ca}: holds no certificate in PEM"
+    try:
+        context.load_verify_locations(tls.ca)
+        what = f"cert and key: {tls.cert}, {tls.key}: are no certificate in PEM with its key"
+        context.load_cert_chain(tls.cert, tls.key)
+    except OSError as error:  # ssl.SSLError is one
+        raise ConfigError(f"backend {name}: {what} ({error})") from None

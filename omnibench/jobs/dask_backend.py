@@ -24,12 +24,13 @@ from distributed import KilledWorker
 from distributed.client import FutureCancelledError
 
 from omnibench.errors import DataError, OmnibenchError, one_line
-from omnibench.jobs.dask_cluster import lost, lost_if_closed
+from omnibench.jobs.dask_cluster import WAIT, ClusterLostError, count_slots, lost, lost_if_closed
 from omnibench.jobs.dask_worker import Order, Parcel, Told, carry_out, content
 from omnibench.jobs.job import TRIES, BackendError, Ended, Failure, Job, JobWatch
 from omnibench.jobs.job_process import JobEnd
 from omnibench.jobs.packing import Packer, run_packed
 from omnibench.jobs.result_store import Store
+from omnibench.progress import Progress, Reporter, no_progress
 
 T = TypeVar("T")
 
@@ -39,6 +40,7 @@ _LOOK = 1.0  # s between two looks at the scheduler and its workers; chosen
 _PARCEL = 0.2  # s of work that travel together: a task costs scheduler, client and worker 5 ms in all, 3 % of that
 _LARGEST_PARCEL = 50  # jobs; chosen
 _WEIGHT = 0.1  # weight of the latest job's time in the running mean; chosen
+_WAITING = "waiting for a worker"
 _SUBMISSIONS = 10  # times that a job is sent whose workers die before it begins: chosen, as it is no fault of its own
 
 
@@ -56,10 +58,11 @@ class _Pending:
 
 @dataclass
 class DaskBackend:
-    """Runs jobs on the workers of a cluster. requirements: see ``checked_requirements``."""
+    """Runs jobs on the workers of a cluster. requirements: see ``checked_requirements``. report: told of waiting."""
 
     client: Any
     requirements: bytes
+    report: Reporter = no_progress
     _packer: Packer = field(default_factory=Packer)
     _data: dict[str, Any] = field(default_factory=dict)
     topic: str = field(default_factory=lambda: f"omnibench-{uuid4().hex[:12]}")
@@ -71,7 +74,7 @@ class DaskBackend:
         self.client.subscribe_topic(self.topic, lambda event: put(event[1]))
 
     def run(self, jobs: Iterable[tuple[int, Job[T]]], store: Store[T], watch: JobWatch[T]) -> Iterator[Ended]:
-        """Run the jobs, see Backend. SchedulerLostError, or UnfitWorkerError of a worker that joined later."""
+        """Run the jobs, see Backend. ClusterLostError, or UnfitWorkerError of a worker that joined later."""
         waiting = iter(jobs)
         with lost_if_closed(self.client):
             run = _Run(self, next(self._runs), store, watch)
@@ -107,7 +110,8 @@ class _Run:
         self._futures: dict[str, Any] = {}
         self._numbers: dict[str, set[int]] = {}  # jobs of each parcel that have not ended
         self._seconds = _PARCEL  # a job takes about so long
-        self._slots = self._count_slots()
+        self._slots = max(count_slots(self._client), 1)
+        self._without: float | None = None  # time since which there has been no worker
         self._looked = time.monotonic()
 
     @property
@@ -156,21 +160,22 @@ class _Run:
             for told in all_told if number == self._number else ():  # others are of a call that was interrupted
                 yield from self._told(told)
         if time.monotonic() - self._looked >= _LOOK:
-            self._slots, self._looked = self._count_slots(), time.monotonic()
+            self._look()
             for key in [*self._futures]:
                 yield from self._lost(key)
 
     def close(self) -> None:
         """Cancel what is left."""
         if self._client.status == "running" and self._futures:
-            self._client.cancel([*self._futures.values()], force=True)
+            with suppress(OSError):  # a scheduler that does not answer in time
+                self._client.cancel([*self._futures.values()], force=True)
 
     def _told(self, told: Told) -> Iterator[Ended]:
         item = self.pending.get(told.number)
         if item is None:
             return
         if told.fetch:
-            with suppress(KilledWorker):  # of which ``_lost`` tells
+            with suppress(KilledWorker):  # ``_lost`` tells of such jobs
                 try:
                     ends = self._futures[item.parcel].result()
                 except FutureCancelledError:
@@ -198,6 +203,8 @@ class _Run:
             self._store.put_content(item.job.key, end.answer)
         elif isinstance(failure.error, OSError) and failure.error.errno in _FULL:
             raise DataError(f"worker {told.worker}: {failure.error}; free space there")
+        elif item.job.own and isinstance(failure.error, DataError):
+            raise DataError(f"worker {told.worker}: {failure.error} (workers must see the files of a large data set)")
         return Ended(item.number, item.job, failure)
 
     def _given_up(self, item: _Pending) -> Ended:
@@ -241,8 +248,20 @@ class _Run:
             else:
                 self.submit([item])
 
-    def _count_slots(self) -> int:
-        """Threads of all workers, at least one. SchedulerLostError."""
-        if self._client.status != "running":
-            raise lost(self._client)
-        return max(sum(self._client.nthreads().values()), 1)
+    def _look(self) -> None:
+        """Count the slots. ClusterLostError: the scheduler is lost, or there has been no worker for long."""
+        slots, self._looked = count_slots(self._client), time.monotonic()
+        self._slots = max(slots, 1)
+        if slots:
+            if self._without is not None:
+                self._backend.report(Progress(_WAITING, result=""))
+            self._without = None
+        elif self._without is None:
+            self._without = self._looked
+            self._backend.report(Progress(_WAITING))
+        elif self._looked - self._without > WAIT:
+            address = self._client.scheduler.address
+            raise ClusterLostError(
+                f"no worker has been left at the Dask scheduler {address} for {WAIT:g} s; start some "
+                f"(dask worker {address}), then the same command"
+            )

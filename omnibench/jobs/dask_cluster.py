@@ -8,14 +8,16 @@ import pickle
 import warnings
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.util import find_spec
 from multiprocessing import resource_tracker
 from typing import Any
+from urllib.parse import urlsplit
 
 import dask
 import distributed
 from distributed.comm.core import CommClosedError, connect
+from distributed.core import send_recv
 
 from omnibench.errors import ConfigError, one_line
 from omnibench.jobs.dask_worker import Requirements, UnfitWorkerError, check
@@ -27,8 +29,11 @@ from omnibench.progress import Progress, Reporter
 from omnibench.registry import loaded_plugin_files, plugin_text
 from omnibench.words import plural
 
+_CLIENT_CLOSED, _CLUSTER_CLOSED = 1.0, 5.0  # s in which they must have closed; chosen
 _ANSWER = 10.0  # s in which a scheduler must answer; chosen
-_WORKER = 60.0  # s in which a worker must have joined: those of a batch system start with the first job (chosen)
+# s in which a worker must have joined, or be there again, and a scheduler at work must answer: workers of a batch
+# system start with the first job (chosen).
+WAIT = 60.0
 _SETTINGS = {
     "distributed.scheduler.allowed-failures": 0,  # the backend tries again: it knows which jobs had begun
     "distributed.admin.large-graph-warning-threshold": "100 GB",  # data of jobs are kept by the scheduler on purpose
@@ -40,24 +45,37 @@ _SETTINGS = {
 }
 
 
-class SchedulerLostError(BackendError):
-    """The scheduler does not answer any more."""
+class ClusterLostError(BackendError):
+    """The scheduler does not answer any more, or no worker is left."""
 
     exit_code = 1
 
 
-def lost(client: Any) -> SchedulerLostError:
+def lost(client: Any) -> ClusterLostError:
     """The error of a client whose scheduler does not answer any more."""
-    return SchedulerLostError(f"the Dask scheduler {client.scheduler.address} is lost")
+    return ClusterLostError(
+        f"the Dask scheduler {client.scheduler.address} is lost; start it again, then the same command"
+    )
 
 
 @contextmanager
 def lost_if_closed(client: Any) -> Iterator[None]:
-    """Turn the end of the connection, at whatever question it is seen, into SchedulerLostError."""
+    """Turn the end of the connection, at whatever question it is seen, into ClusterLostError."""
     try:
         yield
     except CommClosedError:
         raise lost(client) from None
+
+
+def count_slots(client: Any) -> int:
+    """Threads of all workers. ClusterLostError: the scheduler does not answer."""
+    if client.status != "running":
+        raise lost(client)
+    try:
+        threads: dict[str, int] = client.sync(client.scheduler.ncores, callback_timeout=WAIT)
+    except TimeoutError:  # it is frozen, or its machine is gone
+        raise lost(client) from None
+    return sum(threads.values())
 
 
 @contextmanager
@@ -72,17 +90,26 @@ def dask_client(address: str | None, workers: int, tls: TlsFiles | None, report:
     with warnings.catch_warnings(), dask.config.set(_SETTINGS):
         warnings.filterwarnings("ignore", module="distributed")
         if address is None:
-            with _local_cluster(workers) as cluster, distributed.Client(cluster, set_as_default=False) as client:
+            with (
+                _local_cluster(workers) as cluster,
+                _closing(distributed.Client(cluster, set_as_default=False), _CLIENT_CLOSED) as client,
+            ):
                 yield client
         else:
-            client = _joined(address, tls)
-            try:
-                with lost_if_closed(client):
-                    _check_scheduler(client, address)
-                    _wait_for_worker(client, address, report)
-                    yield client
-            finally:
-                client.close(timeout=1)
+            with _closing(_joined(address, tls), _CLIENT_CLOSED) as client, lost_if_closed(client):
+                _check_scheduler(client, address)
+                _wait_for_worker(client, address, report)
+                yield client
+
+
+@contextmanager
+def _closing(opened: Any, seconds: float) -> Iterator[Any]:
+    """Close a client or a cluster after the block, whose end counts: that they do not close in time is not told."""
+    try:
+        yield opened
+    finally:
+        with suppress(OSError):  # TimeoutError and CommClosedError are some
+            opened.close(timeout=seconds)
 
 
 @contextmanager
@@ -98,10 +125,8 @@ def _local_cluster(workers: int) -> Iterator[Any]:
                 dashboard_address="127.0.0.1:8787",
                 silence_logs=logging.CRITICAL,
             )
-        try:
+        with _closing(cluster, _CLUSTER_CLOSED):
             yield cluster
-        finally:
-            cluster.close(timeout=5)
 
 
 def _joined(address: str, tls: TlsFiles | None) -> Any:
@@ -114,6 +139,8 @@ def _joined(address: str, tls: TlsFiles | None) -> Any:
         with ThreadPoolExecutor(1) as thread:  # a notebook has a loop of its own in this one
             thread.submit(asyncio.run, _ask(address, security)).result()
         return distributed.Client(address, timeout=_ANSWER, set_as_default=False, security=security)
+    except ConfigError:
+        raise
     except Exception as error:  # sockets, TLS and the protocol of another version raise what they like
         reason = one_line(str(error) or f"whoever listens there says nothing that Dask knows within {_ANSWER:g} s")
         raise ConfigError(
@@ -122,10 +149,20 @@ def _joined(address: str, tls: TlsFiles | None) -> Any:
 
 
 async def _ask(address: str, security: Any) -> None:
-    """Shake hands with a scheduler. A client waits without end for one that is none, such as a web server."""
+    """Ask who listens. A client waits without end where it is no scheduler, but a web server or a worker.
+
+    ConfigError: a worker, or another part of Dask.
+    """
+    place = urlsplit(address)
+    await asyncio.get_running_loop().getaddrinfo(place.hostname, place.port)  # an unknown host is said at once
     arguments = {} if security is None else security.get_connection_args("client")
     comm = await asyncio.wait_for(connect(address, timeout=_ANSWER, **arguments), _ANSWER + 1)
-    await comm.close()
+    try:
+        identity = await asyncio.wait_for(send_recv(comm, op="identity", reply=True), _ANSWER)
+    finally:
+        comm.abort()
+    if (kind := identity["type"]) != "Scheduler":
+        raise ConfigError(f"{address} is a {kind.lower()} of Dask; give the address of its scheduler")
 
 
 def _check_scheduler(client: Any, address: str) -> None:
@@ -145,10 +182,10 @@ def _wait_for_worker(client: Any, address: str, report: Reporter) -> None:
         return
     report(Progress("waiting for a worker"))
     try:
-        client.wait_for_workers(1, timeout=_WORKER)
+        client.wait_for_workers(1, timeout=WAIT)
     except TimeoutError:
         raise ConfigError(
-            f"no worker has joined the scheduler {address} for {_WORKER:g} s; start some (dask worker {address})"
+            f"no worker has joined the scheduler {address} for {WAIT:g} s; start some (dask worker {address})"
         ) from None
     report(Progress("waiting for a worker", result=""))
 

@@ -129,7 +129,7 @@ def test_a_data_set_is_saved_over_itself(folder: Path, table_format: Format) -> 
 def test_a_file_that_changes_under_an_open_data_set_is_refused(folder: Path) -> None:
     scans = scans_of(folder)
     write_frame(folder, "scans", read_frame(folder, "scans")[1:])
-    with pytest.raises(DataError, match="the file has changed since it was opened; load the data set again"):
+    with pytest.raises(DataError, match="the file has changed since it was opened; load it, or run the command, again"):
         scans.of("run-1")
     table_file(folder, "scans").unlink()
     with pytest.raises(DataError, match="cannot be read: No such file"):

@@ -25,12 +25,14 @@ from dask_samples import program, scheduler, searched_first, worker
 from job_samples import IMPORTING_THIS, Answer, Notes, jobs_of, wait_for
 
 import omnibench as package
+import omnibench.jobs.dask_backend as dask_backend
+import omnibench.jobs.dask_cluster as dask_cluster
 from omnibench.errors import ConfigError, OmnibenchError
 from omnibench.jobs.backend_choice import BackendChoice, check_backend, open_backend
-from omnibench.jobs.job import BackendError, run_jobs
+from omnibench.jobs.job import BackendError, JobWatch, run_jobs
 from omnibench.jobs.result_store import ResultStore
 from omnibench.jobs.scheduler_tls import TlsFiles
-from omnibench.progress import Reporter
+from omnibench.progress import Progress, Reporter
 
 PACKAGE = Path(package.__file__).parent
 
@@ -55,6 +57,7 @@ def refusal(name: str, **others: object) -> str:
     [
         ("dusk", "unknown backend 'dusk'; did you mean 'dask'? known: processes, dask, tcp://HOST:PORT, tls://HOST:PO"),
         ("tcp://127.0.0.1", "unknown backend 'tcp://127.0.0.1'; known:"),
+        ("tcp://:8786", "unknown backend 'tcp://:8786'; known:"),
         ("tls://127.0.0.1:8786", "name the files of TLS, ca, cert and key (--tls-ca, --tls-cert, --tls-key)"),
     ],
 )
@@ -266,7 +269,60 @@ def test_a_scheduler_that_is_killed_is_one_line(tmp_path: Path) -> None:
         client = subprocess.Popen(command, env=IMPORTING_THIS, stderr=subprocess.PIPE, text=True)
         wait_for((tmp_path / "alive").exists)
         process.kill()
-        assert client.communicate(timeout=60)[1] == f"the Dask scheduler {place} is lost\n"
+        told = client.communicate(timeout=60)[1]
+    assert told == f"the Dask scheduler {place} is lost; start it again, then the same command\n"
+
+
+def test_a_scheduler_that_freezes_is_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dask_cluster, "WAIT", 3.0)
+    with scheduler(tmp_path) as (place, process), worker(place, tmp_path / "worker"):
+        store, choice = ResultStore(tmp_path / "results", Answer), BackendChoice(name=place)
+        with pytest.raises(BackendError, match="is lost; start it again"), open_backend(choice) as backend:
+            run_jobs(jobs_of(slow, range(100)), store, backend, Freezing(process))
+        process.send_signal(signal.SIGCONT)
+
+
+class Freezing(JobWatch[Answer]):
+    """Stops a process when the first job has begun."""
+
+    def __init__(self, process: subprocess.Popen[bytes]) -> None:
+        self._process = process
+
+    def began(self, number: int) -> None:  # noqa: ARG002
+        self._process.send_signal(signal.SIGSTOP)
+
+
+def test_where_no_worker_is_left_it_is_said_and_ends(
+    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dask_backend, "WAIT", 3.0)
+    said: list[Progress] = []
+    store = ResultStore(tmp_path / "results", Answer)
+    with worker(address, tmp_path / "w") as only, open_backend(BackendChoice(name=address), report=said.append) as on:
+        only.terminate()
+        with pytest.raises(BackendError, match=r"no worker has been left at .*; start some \(dask worker tcp://"):
+            run_jobs(jobs_of(slow, range(100)), store, on, Notes())
+    assert Progress("waiting for a worker") in said
+
+
+def test_the_address_of_a_worker_is_refused(address: str, tmp_path: Path) -> None:
+    with worker(address, tmp_path / "worker"), open_backend(BackendChoice(name=address)) as backend:
+        assert isinstance(backend, dask_backend.DaskBackend)
+        (of_worker,) = backend.client.nthreads()
+        assert refusal(of_worker) == f"{of_worker} is a worker of Dask; give the address of its scheduler"
+
+
+def test_a_file_of_tls_that_is_none_is_named(tmp_path: Path) -> None:
+    ca, cert, key = certificates(tmp_path)
+    text = tmp_path / "text"
+    text.write_text("no certificate")
+    place = "tls://127.0.0.1:1"
+    for files, line in (
+        (TlsFiles(ca=text, cert=cert, key=key), f"ca: {text}: holds no certificate in PEM"),
+        (TlsFiles(ca=ca, cert=cert, key=text), f"cert and key: {cert}, {text}: are no certificate in PEM with its key"),
+        (TlsFiles(ca=ca, cert=tmp_path, key=key), f"cert: {tmp_path}: is a folder"),
+    ):
+        assert refusal(place, tls=files).startswith(f"backend {place}: {line}")
 
 
 def test_a_comparison_over_tls_equals_one_by_processes(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
+from omnibench.data.tables.table import table_file
 from omnibench.errors import DataError
 
 _MAGIC = "*?["
@@ -16,7 +17,8 @@ _MAGIC = "*?["
 def dataset_folders(places: Path | str | Sequence[Path | str]) -> list[Path]:
     """The folders that places name: each a data set folder or a glob, whose folders come in the order of their names.
 
-    DataError: a glob matches no data set folder, or nothing is named.
+    A folder that is named twice counts once. DataError: a glob matches no data set folder, or one without dataset.yaml
+    that has wheel samples; or nothing is named.
     """
     if isinstance(places, Path | str):
         places = [places]
@@ -48,4 +50,7 @@ def _named(place: Path) -> list[Path]:
 
 def _found(pattern: str) -> list[Path]:
     matching = [Path(match) for match in sorted(glob.glob(pattern, recursive=True))]
+    for match in matching:
+        if table_file(match, "wheels") is not None and not (match / "dataset.yaml").is_file():
+            raise DataError(f"{match}: it has wheel samples, but no dataset.yaml; write one there, or name the others")
     return [match for match in matching if (match / "dataset.yaml").is_file()]

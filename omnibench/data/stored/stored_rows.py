@@ -51,7 +51,9 @@ class BlockFile:
     def read(self, columns: tuple[str, ...], block: int) -> Array:
         """Values (rows, n) of some columns of a block. DataError: the file has changed, or cannot be read."""
         if file_state(self.file) != self.state:
-            raise DataError(f"{self.file}: the file has changed since it was opened; load the data set again")
+            raise DataError(
+                f"{self.file}: the file has changed since it was opened; load it, or run the command, again"
+            )
         begin, end = self.edges[block : block + 2]
         values = read_rows(self.file, columns, begin, end - begin).cast(pl.Float64).to_numpy()
         values.flags.writeable = False

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -192,6 +193,32 @@ def test_a_glob_that_matches_nothing_is_said(tmp_path: Path) -> None:
         load_dataset(tmp_path / "day*")
 
 
+def test_a_glob_names_the_folder_that_lacks_its_header(tmp_path: Path) -> None:
+    for day in range(2):
+        save_dataset(recorded(runs=4), tmp_path / f"day{day}")
+    (tmp_path / "day1" / "dataset.yaml").unlink()
+    (tmp_path / "day.txt").touch()
+    with pytest.raises(DataError, match=r"day1: it has wheel samples, but no dataset\.yaml"):
+        load_dataset(tmp_path / "day*")
+
+
+def test_a_folder_that_does_not_fit_is_named_and_so_is_what_differs(tmp_path: Path) -> None:
+    for day in range(2):
+        save_dataset(recorded(runs=4), tmp_path / f"day{day}")
+    header = tmp_path / "day1" / "dataset.yaml"
+    header.write_text(header.read_text().replace(f"radius: {APR_02.wheels[0].radius}", "radius: 0.5", 1))
+    with pytest.raises(DataError, match=r"day1: its robot is not that of .*day0 \(wheels\.0\.radius: 0\.5 and 0\."):
+        load_dataset(tmp_path / "day*")
+
+
+def test_a_recording_that_two_folders_hold_is_warned_of(tmp_path: Path) -> None:
+    save_dataset(recorded(runs=4), tmp_path / "day")
+    shutil.copytree(tmp_path / "day", tmp_path / "day-copy")
+    warnings = load_dataset([tmp_path / "day", tmp_path / "day-copy"]).warnings
+    assert any("4 runs of another folder there twice" in warning for warning in warnings)
+    assert load_dataset([tmp_path / "day", tmp_path / "day" / ".." / "day"]).hash == load_dataset(tmp_path / "day").hash
+
+
 def test_a_folder_of_data_sets_says_how_to_name_them(tmp_path: Path) -> None:
     save_dataset(recorded(runs=4), tmp_path / "one")
     with pytest.raises(DataError, match=r"its folders are some: give '.*/\*'"):
@@ -225,7 +252,7 @@ def test_a_file_that_changes_under_the_data_set_is_not_read_on(tmp_path: Path) -
     file = tmp_path / "saved" / "wheels.parquet"
     os.utime(file, (1, 1))
     pickled = pickle.loads(pickle.dumps(stored.trajectories[5]))  # another process has no block in memory
-    with pytest.raises(DataError, match="the file has changed since it was opened; load the data set again"):
+    with pytest.raises(DataError, match="the file has changed since it was opened; load it, or run the command, again"):
         pickled.rates.file.read(pickled.rates.columns, 0)
 
 
