@@ -56,7 +56,7 @@ _PERIOD = 0.2  # s between two reports of reading, at least; chosen
 
 
 class _Reading:
-    """What is told of the reading of data sets that do not fit in memory: samples, or parts that workers have read.
+    """Counts of the samples, or of the parts by workers, that were read of data sets that do not fit in memory.
 
     done, expected: by unit, how many have been read, and how many one pass reads.
     """

@@ -24,7 +24,7 @@ import distributed
 from omnibench.errors import DataError
 from omnibench.files import write_text
 from omnibench.jobs.job import BackendError, Job
-from omnibench.jobs.job_process import PRELOAD, JobEnd, JobProcess
+from omnibench.jobs.job_process import PRELOAD, JobEnd, JobProcess, process_for
 from omnibench.jobs.packing import PackedJob
 from omnibench.jobs.result_store import Store
 from omnibench.jobs.software import differences, software
@@ -104,6 +104,7 @@ def carry_out(parcel: Parcel, requirements: bytes, *shared: bytes) -> list[Told]
     worker = distributed.get_worker()
     plugins, preload = prepare(requirements, worker), pickle.loads(requirements).preload
     teller = _Teller(worker, parcel)
+    idle = _idle.setdefault(requirements, [])
     data = dict(zip(parcel.names, shared, strict=True))
     timed = any(order.job.timed for order in parcel.orders)
     with _slots(worker.state.nthreads if timed else 1, worker.state.nthreads):
@@ -112,7 +113,7 @@ def carry_out(parcel: Parcel, requirements: bytes, *shared: bytes) -> list[Told]
             held = {name: data[name] for name in order.names}
             packed = PackedJob(order.content, held, plugins, kept=order.job.own)
             job, began = replace(order.job, argument=packed), time.monotonic()
-            process = _process_for(job, requirements, preload)
+            process = process_for(job, idle, _context(preload))
             try:
                 process.give(job, parcel.store.content)
                 progress, end = _follow(process, teller, order.number)
@@ -123,7 +124,7 @@ def carry_out(parcel: Parcel, requirements: bytes, *shared: bytes) -> list[Told]
                 process.end()
                 break
             if end.reusable:
-                _idle.append((requirements, process))
+                idle.append(process)
             else:
                 process.end()
             teller.ended(Told(order.number, worker.address, progress, end, time.monotonic() - began))
@@ -148,7 +149,7 @@ def check(requirements: bytes, dask_worker: Any) -> str | None:
 _preparing = threading.Lock()
 _free = threading.Condition()
 _taken = 0  # slots of this worker
-_idle: list[tuple[bytes, JobProcess]] = []  # with the requirements of the client that they served
+_idle: dict[bytes, list[JobProcess]] = {}  # processes that wait, by the requirements of the clients that they serve
 _open = ExitStack()
 
 
@@ -286,18 +287,6 @@ def _slots(wanted: int, all_slots: int) -> Iterator[None]:
         with _free:
             _taken -= wanted
             _free.notify_all()
-
-
-def _process_for(job: Job[Any], requirements: bytes, preload: tuple[str, ...]) -> JobProcess:
-    while True:
-        with _free:
-            if not _idle:
-                break
-            served, process = _idle.pop()
-        if served == requirements and process.takes(job):
-            return process
-        process.end()
-    return JobProcess(_context(preload))
 
 
 @cache

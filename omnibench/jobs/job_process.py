@@ -107,7 +107,7 @@ class JobProcess:
             self.connection.send((job, keep))
 
     def events(self) -> Iterator[Progress | JobEnd]:
-        """What has come: reports and the end. Of a job that reports without pause some, so that others are heard."""
+        """Reports of the job that have come, and its end; of one that reports without pause some: others wait, too."""
         return islice(iter(self.receive, None), _AT_ONCE)
 
     def receive(self) -> Progress | JobEnd | None:
@@ -145,6 +145,16 @@ class JobProcess:
         self._process.kill()
         self._process.join()
         self.connection.close()
+
+
+def process_for(job: Job[Any], idle: list[JobProcess], context: Any) -> JobProcess:
+    """An idle process that may take the job, or a new one; in place of an idle one that may not, which is ended."""
+    with suppress(IndexError):  # another thread has taken the last
+        process = idle.pop()
+        if process.takes(job):
+            return process
+        process.end()
+    return JobProcess(context)
 
 
 def _alone(job: Job[Any]) -> bool:

@@ -10,7 +10,7 @@ from multiprocessing.connection import wait
 from typing import Any, TypeVar
 
 from omnibench.jobs.job import Backend, Ended, Job, JobWatch
-from omnibench.jobs.job_process import PRELOAD, JobEnd, JobProcess, in_job, raised
+from omnibench.jobs.job_process import PRELOAD, JobEnd, JobProcess, in_job, process_for, raised
 from omnibench.jobs.packing import Packer
 from omnibench.jobs.result_store import Store
 from omnibench.processes import one_thread, one_thread_processes
@@ -70,7 +70,7 @@ class Processes:
             try:
                 while True:
                     while len(active) < self.workers and (item := next(waiting, None)) is not None:
-                        process = _process_for(item[1], idle, context)
+                        process = process_for(item[1], idle, context)
                         active[process] = item
                         process.give(packer.packed(item[1]), store.keep)
                         watch.began(item[0])
@@ -95,16 +95,6 @@ class Processes:
         """End the processes that wait."""
         while self._idle:
             self._idle.pop().end()
-
-
-def _process_for(job: Job[Any], idle: list[JobProcess], context: Any) -> JobProcess:
-    """An idle process that may take the job, or a new one; in place of an idle one that may not, which is ended."""
-    if idle:
-        process = idle.pop()
-        if process.takes(job):
-            return process
-        process.end()
-    return JobProcess(context)
 
 
 def _ends(active: dict[JobProcess, tuple[int, Job[Any]]], watch: JobWatch[Any]) -> list[tuple[JobProcess, JobEnd]]:

@@ -83,7 +83,7 @@ class PackedJob:
         return replace(self, shared=left, names=tuple(self.shared))
 
 
-_KEPT: dict[str, Any] = {}  # what the last job of this process has shared, by names
+_KEPT: dict[str, Any] = {}  # objects that the last job of this process shared, by their names
 
 
 def run_packed(packed: PackedJob, report: Reporter) -> Any:

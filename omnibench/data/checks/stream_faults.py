@@ -44,7 +44,7 @@ _SAME = 1e-4  # m and rad: a pose that is repeated, below the noise of any refer
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """What a run shows by itself; None or nothing where it has no poses, or steers no wheel.
+    """Faults and motions that one run shows; those of its reference are None or 0 where it has no poses.
 
     fast: number of samples that are faster than any wheel turns. wheel_gaps, reference_gaps: lengths of what is missing
     while the robot drives, s. standing: s in which the reference stands while the wheels drive. counted, expected (N,):
@@ -91,14 +91,14 @@ def stream_faults(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Finding]
 
 
 def looks_at(task: tuple[Robot, Sequence[Trajectory], float, float], _: Reporter) -> list[Look]:
-    """What runs show. The task: robot, runs, and the usual periods of wheel samples and of reference poses, s."""
+    """The looks at some runs. The task: robot, runs, usual periods of wheel samples and of reference poses, s."""
     robot, runs, *periods = task
     matrix = robot.inverse_kinematic_matrix
     return [_look(robot, run, _ways(matrix, robot.reach, run), *periods) for run in runs]
 
 
 def _look(robot: Robot, run: Trajectory, ways: Array, of_wheels: float, of_reference: float) -> Look:
-    """What a run shows. ways (F + 1,): see ``_ways``. of_wheels, of_reference: usual periods, s."""
+    """The look at a run. ways (F + 1,): see ``_ways``. of_wheels, of_reference: usual periods, s."""
     fast = int((np.abs(run.rates) * robot.radii > _FASTEST).any(axis=1).sum())
     wheel_gaps = _gaps(robot, run, ways, np.append(0.0, run.times), of_wheels)
     if not run.has_poses:
