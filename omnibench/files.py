@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import shutil
+import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import datetime
@@ -23,6 +25,7 @@ FileContent = bytes | Callable[[Path], None]
 _IS_A_FOLDER = "is a folder; name a file"
 _MORE_SPACE = "free space or choose another place"
 _MORE_RIGHTS = "get permission to write there or choose another place"
+_LEAST_SPACE = 1 << 16  # bytes: a calibration or the tables of a small comparison
 _WAYS_OUT = {
     ENOSPC: _MORE_SPACE,
     EDQUOT: _MORE_SPACE,
@@ -70,7 +73,7 @@ def refuse_existing(*paths: Path | None, force: bool, folders: bool = False) -> 
     """Check the files (or ``folders``) that a user named for output, before the work; None: none is named.
 
     ConfigError in one line: one is there with content and is not to be replaced (``force``). DataError: it is a folder
-    where a file is wanted, a link that leads to itself, or in a place where nobody may write.
+    where a file is wanted, a link that leads to itself, or in a place where nobody may write or no space is left.
     """
     for path in paths:
         if path is None:
@@ -94,6 +97,9 @@ def check_place(path: Path) -> None:
     if not os.access(existing, os.W_OK | os.X_OK):
         code = EROFS if os.statvfs(existing).f_flag & os.ST_RDONLY else EACCES
         raise _refused(path, OSError(code, os.strerror(code)))
+    disk = shutil.disk_usage(existing)
+    if disk.total and disk.free < _LEAST_SPACE:  # a total of 0: a file system that does not count
+        raise _refused(path, OSError(ENOSPC, os.strerror(ENOSPC)))
 
 
 def resolved(path: Path) -> Path:
@@ -123,6 +129,21 @@ def write_text(path: Path, text: str) -> None:
     """Write a text file, whole or not at all. DataError when the disk refuses."""
     with replacing(path) as partial:
         partial.write_text(text, encoding="utf-8")
+
+
+def write_result(path: Path, text: str) -> None:
+    """Write what took long to find. What the disk refuses goes to the folder of temporary files, as DataError says."""
+    try:
+        write_text(path, text)
+    except DataError as refused:
+        try:
+            with tempfile.NamedTemporaryFile(
+                "w", encoding="utf-8", prefix="omnibench-", suffix=path.suffix, delete=False
+            ) as kept:
+                kept.write(text)
+        except OSError:  # that disk refuses, too
+            raise refused from None
+        raise DataError(f"{refused}; meanwhile the result is in {kept.name}") from None
 
 
 def write_table(path: Path, table: pl.DataFrame) -> None:

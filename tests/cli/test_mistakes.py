@@ -209,6 +209,28 @@ def test_a_file_that_the_disk_does_not_take_is_not_there(
     assert [file for file in Path().rglob("*") if file.is_file()] == []
 
 
+def test_a_calibration_that_cannot_be_written_in_the_end_is_kept_where_the_line_says(
+    command: Command, prepared: Prepared
+) -> None:
+    too_long = "x" * 245 + ".yaml"  # with what is added while it is written
+    run = command("calibrate", prepared.data, "-o", too_long)
+    assert_refused(run, too_long, "File name too long; choose another place; meanwhile the result is in ")
+    kept = Path(run.stderr.rsplit(" ", 1)[1].strip())
+    run = command("evaluate", kept, prepared.data)
+    kept.unlink()
+    assert run.returncode in (0, 1), run.stderr
+
+
+def test_a_disk_that_is_full_is_said_before_the_work(prepared: Prepared, tmp_path: Path) -> None:
+    mounted = ["unshare", "--map-root-user", "--mount", "sh", "-c", 'mount -t tmpfs -o size=16k none "$0" && exec "$@"']
+    mounted.append(str(tmp_path))
+    if subprocess.run([*mounted, "true"], capture_output=True, check=False).returncode:
+        pytest.skip("a small disk cannot be mounted here")
+    calibrate = [*COMMAND, "calibrate", prepared.data, "-o", tmp_path / "c.yaml", "--plugins", "none"]
+    run = subprocess.run([*mounted, *calibrate], capture_output=True, text=True, env=ENVIRONMENT, check=False)
+    assert_refused(run, f"{tmp_path}/c.yaml: cannot be written: No space left on device; free space or choose")
+
+
 def test_a_data_set_that_does_not_fit_leaves_the_one_that_was_there(
     command: Command, prepared: Prepared, tmp_path: Path
 ) -> None:
