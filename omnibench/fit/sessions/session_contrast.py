@@ -30,14 +30,16 @@ and Hotelling's statistic where the sessions do not differ the distribution
 
     t' V^-1 t (v - d + 1) / (v d) ~ F(d, v - d + 1).                                                      (6)
 
-A run that its session does not repeat has the term E_k in V.
+A run that its session does not repeat has the term of the others of its command in V, in proportion to E_k, and adds
+its E_k to theirs in (5). A command that no session repeats is left out: nothing says how much its runs scatter.
 
 Where the validation split drives no command of the training, J and S come from the estimates of both, with
 I_A = sum of H_z in A, in which whatever the model lacks counts, too:
 
     J = (I_A^-1 + I_B^-1)^-1,    u_z = R'J I_B^-1 s_z in B,    u_z = -R'J I_A^-1 s_z in A.                (7)
 
-A deviation then says that sessions or commands differ, and not which.
+A deviation then says that sessions or commands differ, and not which. A run of a command that its split does not
+repeat has the term E_k, by the s of all other runs of its split.
 """
 
 from __future__ import annotations
@@ -135,8 +137,9 @@ class SessionScores:
         """The contrast between a session and the others, Eq. (2)."""
         weights = np.zeros(len(self.runs))
         for members in grouped([run.command for run in self.runs]):
-            inside = np.array([self.sessions[index] == session for index in members])
-            if inside.any() and not inside.all():
+            driven = [self.sessions[index] for index in members]
+            inside = np.array(driven) == session
+            if inside.any() and not inside.all() and len(set(driven)) < len(driven):
                 share = np.where(inside, (~inside).sum(), -inside.sum()) / len(inside)
                 weights[list(members)] = share
         used = np.flatnonzero(weights)
@@ -223,20 +226,44 @@ class Contrast:
         expected = np.array([roots.T @ self.spreads[list(members)].sum(axis=0) @ roots for members in groups])
         apart = [pulls[list(members)] - pulls[list(members)].mean(axis=0) for members in groups]
         seen = np.array([count / max(count - 1, 1) * each.T @ each for count, each in zip(counts, apart, strict=True)])
-        of_groups = np.array([self.sessions[members[0]] for members in groups])
+        of_session, of_command = (
+            np.array([names[members[0]] for members in groups], dtype=object)
+            for names in (self.sessions, [run.command for run in self.runs])
+        )
         repeated = counts > 1
         if not repeated.any():
             return pulls.sum(axis=0), seen.sum(axis=0), 0.0
         traces = [np.trace(each, axis1=1, axis2=2) * (counts - 1) for each in (seen, expected)]
         for name in dict.fromkeys(self.sessions):  # s^2 of each session, or of all where one repeats nothing
-            inside = of_groups == name
+            inside = of_session == name
             known = inside if repeated[inside].any() else repeated
             expected[inside] *= max(traces[0][known].sum() / max(traces[1][known].sum(), 1e-300), _ROUNDING)
-        seen[~repeated] = expected[~repeated]
+        shares = _shares(counts, of_command, of_session)
+        sizes = np.trace(expected, axis1=1, axis2=2)
+        units = seen / np.maximum(sizes, 1e-300)[:, None, None]
+        for index in np.flatnonzero(~repeated):
+            told = np.flatnonzero(shares[index])
+            seen[index] = expected[index]
+            if of_command[told[0]] == of_command[index]:
+                seen[index] = sizes[index] * np.tensordot(shares[index], units, 1)
+        known_by = expected + np.tensordot(shares.T, expected, 1)
         freedom = _size(expected.sum(axis=0)) / np.sum(
-            [_size(each) / (count - 1) for each, count in zip(expected[repeated], counts[repeated], strict=True)]
+            [_size(each) / (count - 1) for each, count in zip(known_by[repeated], counts[repeated], strict=True)]
         )
         return pulls.sum(axis=0), seen.sum(axis=0) + _ROUNDING * np.eye(len(roots.T)), float(freedom)
+
+
+def _shares(counts: Array, of_command: NDArray[np.object_], of_session: NDArray[np.object_]) -> Array:
+    """Shares (K, K) of the groups that say how much the run of a group without repetitions, a row, scatters.
+
+    Those of its command do, else those of its session, else all.
+    """
+    shares = np.zeros((len(counts), len(counts)))
+    for index in np.flatnonzero(counts == 1):
+        alike = (names == names[index] for names in (of_command, of_session, np.ones(len(counts))))
+        told = next(each for each in ((counts > 1) & those for those in alike) if each.any())
+        shares[index, told] = (counts[told] - 1) / (counts[told] - 1).sum()
+    return shares
 
 
 def _size(covariance: Array) -> float:

@@ -163,11 +163,13 @@ def _untested(runs: Sequence[Trajectory]) -> str:
 
 
 def _uncomparable(names: Sequence[str], comparable: Sequence[str]) -> str:
-    """The sessions that share no command with another one, in words; empty if there are none."""
+    """The sessions that share no command that one of them repeats with another one, in words; empty if all do."""
     left = [name for name in dict.fromkeys(names) if name not in comparable]
     if not comparable:
-        return "the sessions share no command"
-    return f"no run of {_listed(left)} drives a command of another session" if left else ""
+        return "the sessions share no command that one of them repeats"
+    if not left:
+        return ""
+    return f"no run of {_listed(left)} drives a command of another session that one of them repeats"
 
 
 def _differences(data: SessionScores) -> Iterator[SessionDifference]:

@@ -19,6 +19,13 @@ def compared(dataset: Dataset, **changes: object) -> SessionComparison:
     return compare_sessions(model, [replace(run, **changes) for run in dataset.trajectories])
 
 
+def alone(dataset: Dataset, lone: int) -> SessionComparison:
+    """The comparison of one run with all others, as two sessions."""
+    names = ["lone" if index == lone else "others" for index in range(len(dataset.trajectories))]
+    runs = tuple(replace(run, session=name) for run, name in zip(dataset.trajectories, names, strict=True))
+    return compared(replace(dataset, trajectories=runs))
+
+
 @pytest.mark.parametrize(("wheels", "kind"), [("abc", "all wheels"), ("b", "one wheel")])
 def test_a_session_with_larger_wheels_is_said_to_differ_and_by_how_much(wheels: str, kind: str) -> None:
     found = compared(session_set("small", 3, change=0.01, wheels=wheels))
@@ -47,6 +54,23 @@ def test_of_several_sessions_the_one_that_differs_is_named() -> None:
 @pytest.mark.parametrize(("noise", "seed"), [("plain", 0), ("correlated", 1), ("mixed", 2), ("slip", 3)])
 def test_sessions_that_are_alike_are_not_said_to_differ(noise: str, seed: int) -> None:
     assert compared(session_set("small", seed, noise=noise)) == SessionComparison()
+
+
+@pytest.mark.parametrize("lone", [23, 101, 104, 108])  # those that the noise model alone would have said to differ
+def test_a_run_that_is_a_session_of_its_own_is_judged_by_the_scatter_of_its_command(lone: int) -> None:
+    assert alone(session_set("small", 1, noise="mixed"), lone) == SessionComparison()
+
+
+def test_a_run_of_a_real_robot_that_is_a_session_of_its_own_is_not_said_to_differ(omni3: Dataset) -> None:
+    assert alone(omni3, 32).differences == ()
+
+
+def test_a_single_run_with_much_larger_wheels_is_said_to_differ() -> None:
+    dataset = session_set("small", 2, change=0.05)
+    runs = [run for run in dataset.trajectories if run.split == "train"]
+    lone = next(run for run in dataset.trajectories if run.split == "validation")
+    (difference,) = compared(replace(dataset, trajectories=(*runs, lone))).differences
+    assert (difference.session, difference.runs, difference.commands) == ("s2", 1, 1)
 
 
 def test_what_the_model_lacks_in_both_sessions_is_no_difference_between_them() -> None:
@@ -95,7 +119,10 @@ def test_a_session_that_shares_no_command_with_the_others_is_named() -> None:
         replace(run, command=f"{run.command}, other") if run.session == "s2" else run for run in dataset.trajectories
     ]
     (sentence,) = compared(replace(dataset, trajectories=tuple(renamed))).doubts
-    assert sentence == "Whether the sessions differ cannot be said: no run of s2 drives a command of another session."
+    assert sentence == (
+        "Whether the sessions differ cannot be said: no run of s2 drives a command of another session that one of them "
+        "repeats."
+    )
 
 
 def test_repetitions_that_agree_exactly_show_what_differs_and_nothing_else() -> None:
