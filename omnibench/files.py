@@ -136,14 +136,23 @@ def write_result(path: Path, text: str) -> None:
     try:
         write_text(path, text)
     except DataError as refused:
-        try:
-            with tempfile.NamedTemporaryFile(
-                "w", encoding="utf-8", prefix="omnibench-", suffix=path.suffix, delete=False
-            ) as kept:
-                kept.write(text)
-        except OSError:  # that disk refuses, too
-            raise refused from None
-        raise DataError(f"{refused}; meanwhile the result is in {kept.name}") from None
+        kept = _kept_meanwhile(text, path.suffix)
+        raise (DataError(f"{refused}; meanwhile the result is in {kept}") if kept else refused) from None
+
+
+def _kept_meanwhile(text: str, suffix: str) -> Path | None:
+    """A new file in the folder of temporary files; None where that takes it neither."""
+    try:
+        descriptor, name = tempfile.mkstemp(prefix="omnibench-", suffix=suffix)
+    except OSError:
+        return None
+    try:
+        with os.fdopen(descriptor, "w", encoding="utf-8") as kept:
+            kept.write(text)
+    except OSError:
+        Path(name).unlink()
+        return None
+    return Path(name)
 
 
 def write_table(path: Path, table: pl.DataFrame) -> None:

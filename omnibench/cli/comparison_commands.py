@@ -1,7 +1,8 @@
 """``compare``: several calibrators on equal terms."""
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -20,14 +21,20 @@ from omnibench.cli.options import (
 from omnibench.cli.terminal.console import make_console, print_ending, print_verdict, warn
 from omnibench.errors import ConfigError
 
+if TYPE_CHECKING:
+    from omnibench.compare.config import CompareConfig
+
 comparison_app = typer.Typer()
 
 
 @comparison_app.command()
 def compare(
     config: Annotated[
-        Path,
-        typer.Argument(metavar="CONFIG|DATASET", help="Comparison config (YAML), or a data set folder: a quick one."),
+        list[Path],
+        typer.Argument(
+            metavar="CONFIG|DATASET",
+            help="Comparison config (YAML), or a data set, its folders or a glob: a quick one.",
+        ),
     ],
     output: Annotated[
         Path | None,
@@ -60,22 +67,12 @@ def compare(
     """
     from omnibench.cli.terminal.comparison_tables import print_comparison_ending, print_result
     from omnibench.cli.terminal.progress_display import ProgressDisplay
-    from omnibench.compare.read_config import read_compare_config
-    from omnibench.compare.recording_config import config_in_words, recording_config
     from omnibench.compare.report.comparison_report import comparison_document
     from omnibench.compare.run import run_comparison
     from omnibench.progress import Progress
 
     refuse_figures_without_browser(figures)
-    if config.is_dir() and not (config / "dataset.yaml").is_file():
-        raise ConfigError(f"{config}: is a folder without dataset.yaml; name a config, or the folder of a data set")
-    if config.is_dir():
-        if data:
-            raise ConfigError(f"--data is for a config, and {config} is a data set; leave it out")
-        comparison = recording_config(config, plugins or ())
-        make_console(error=True).print(config_in_words(comparison), soft_wrap=True)
-    else:
-        comparison = read_compare_config(config, _named_paths(data))
+    comparison = _asked_comparison(config, data, plugins or ())
     folders = [*comparison.plugins, *(folder.resolve() for folder in plugins or [])]
     given = {"backend": backend, "workers": workers, "tls": tls_files(tls_ca, tls_cert, tls_key)}
     comparison = comparison.model_copy(
@@ -98,6 +95,30 @@ def compare(
         )
         raise typer.Exit(1)
     print_comparison_ending(result)
+
+
+def _asked_comparison(given: Sequence[Path], data: list[str] | None, plugins: Sequence[Path]) -> "CompareConfig":
+    """The config that is given, or one for the data set that is: its folders, or a glob."""
+    from omnibench.compare.read_config import read_compare_config
+    from omnibench.compare.recording_config import config_in_words, recording_config
+    from omnibench.data.stored.dataset_folders import is_glob
+
+    first = given[0]
+    of_recordings = all(place.is_dir() or is_glob(place) for place in given)
+    if len(given) > 1 and not of_recordings:
+        raise ConfigError(
+            f"unexpected extra argument {given[1]}; compare takes one config, or the folders of one data set "
+            "(see omnibench compare --help)"
+        )
+    if not of_recordings:
+        return read_compare_config(first, _named_paths(data))
+    if first.is_dir() and not (any(first.glob("dataset.yaml")) or any(first.glob("*/dataset.yaml"))):
+        raise ConfigError(f"{first}: is a folder without dataset.yaml; name a config, or the folder of a data set")
+    if data:
+        raise ConfigError(f"--data is for a config, and {first} is a data set; leave it out")
+    comparison = recording_config(given, plugins)
+    make_console(error=True).print(config_in_words(comparison), soft_wrap=True)
+    return comparison
 
 
 def _named_paths(data: list[str] | None) -> dict[str, Path]:

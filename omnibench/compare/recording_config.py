@@ -12,6 +12,7 @@ from omnibench.compare.result import THEORETICAL_NAME
 from omnibench.config import validate
 from omnibench.data.dataset import Dataset
 from omnibench.data.storage import load_dataset
+from omnibench.data.stored.dataset_folders import dataset_folders, in_few_words
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import Calibrator
 from omnibench.fit.problem import make_parameterisation, training_split
@@ -22,25 +23,28 @@ _EVALUATIONS, _SECONDS = 10_000, 30.0  # of each run; s; chosen: on two cores a 
 _LONGEST_NAME = 60  # letters, of a config's name
 
 
-def recording_config(folder: Path, plugins: Sequence[Path] = ()) -> CompareConfig:
-    """A quick comparison on a data set folder, with cost and treatment of what is hardly driven as ``calibrate`` has.
+def recording_config(places: Path | Sequence[Path], plugins: Sequence[Path] = ()) -> CompareConfig:
+    """A quick comparison on a data set, with cost and treatment of what is hardly driven as ``calibrate`` has.
 
-    plugins: folders of plug-ins, whose calibrators take part. DataError: the data set cannot be read, or has no run to
-    train. PluginError: a folder of plug-ins is not there.
+    places: its folder, or several, named one by one or by a glob. plugins: folders of plug-ins, whose calibrators
+    take part. DataError: the data set cannot be read, or has no run to train. PluginError: a folder of plug-ins is not
+    there.
     """
-    dataset = load_dataset(folder)
+    folders = dataset_folders(places)
+    dataset = load_dataset(folders)
     load_plugins(plugins)
     name = re.sub(r"[^A-Za-z0-9_.-]+", "_", dataset.name).strip("_.-")[:_LONGEST_NAME] or "dataset"
+    paths = [str(folder.resolve()) for folder in folders]
     content: dict[str, Any] = {
         "name": name,
-        "datasets": {name: {"path": str(folder.resolve())}},
+        "datasets": {name: {"path": paths if len(paths) > 1 else paths[0]}},
         "cost": default_cost(dataset.robot, len(training_split(dataset))),
         "unidentified": default_unidentified(dataset.robot),
         "budget": {"evaluations": _EVALUATIONS, "seconds": _SECONDS},
         "calibrators": suitable_calibrators(dataset),
         "plugins": [str(path.resolve()) for path in plugins],
     }
-    return validate(CompareConfig, content, f"comparison on {folder}")
+    return validate(CompareConfig, content, f"comparison on {in_few_words(folders)}")
 
 
 def suitable_calibrators(dataset: Dataset) -> list[str]:

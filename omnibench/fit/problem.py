@@ -168,6 +168,7 @@ class CalibrationProblem:
 
         A candidate that cannot be evaluated costs NaN. BudgetSpent is raised when the budget is spent; of a population
         that is larger than the remaining budget the first candidates are evaluated, and count, before it is raised.
+        Where runs are read from files that holds for the time, too.
         """
         candidates = np.array(candidates, dtype=float, ndmin=2)
         if candidates.shape[1:] != self.start.shape:
@@ -175,13 +176,17 @@ class CalibrationProblem:
         self._check_budget()
         asked = len(candidates)
         candidates = candidates[: self.remaining]
-        worth = _WORTH_BUILDING_OF_STORED if isinstance(self.odometry, StoredOdometry) else _WORTH_BUILDING
-        if self.evaluations + len(candidates) >= worth and not self._evaluator_tried:
+        if not self._evaluator_tried and self._repays_building(len(candidates)):
             self.build_evaluator()
-        values = self._fast_values(candidates, self._evaluator) if self._evaluator else self.values(candidates)
-        self._record(candidates, values)
-        if len(candidates) < asked:
-            self._check_budget()
+        values, count = np.empty(len(candidates)), 0
+        while count < len(candidates):
+            part = candidates[count : count + self._in_time]
+            costs = self._fast_values(part, self._evaluator) if self._evaluator else self.values(part)
+            values[count : count + len(part)] = costs
+            self._record(part, costs)
+            count += len(part)
+            if count < asked:
+                self._check_budget()
         return values
 
     def values(self, candidates: Array) -> Array:
@@ -262,6 +267,21 @@ class CalibrationProblem:
             return vector
         elements = self.matrix(vector).ravel()
         return elements if bool(self.inside(elements[None])[0]) else vector
+
+    def _repays_building(self, asked: int) -> bool:
+        """True if the fast evaluator saves time, with ``asked`` candidates more, and can be built in the time left."""
+        if not isinstance(self.odometry, StoredOdometry):
+            return self.evaluations + asked >= _WORTH_BUILDING
+        worth = _WORTH_BUILDING_OF_STORED
+        return self.evaluations > 0 and self.evaluations + asked >= worth and self._in_time >= worth
+
+    @property
+    def _in_time(self) -> int:
+        """Candidates that are evaluated together: of runs in memory all, of others so many as the time left is for."""
+        if self._evaluator or not isinstance(self.odometry, StoredOdometry):
+            return self.budget.evaluations
+        left = self.budget.seconds - self.seconds
+        return max(int(left / self.seconds * self.evaluations), 1)
 
     def _fast_values(self, candidates: Array, evaluator: PoseEvaluator | PartedEvaluator) -> Array:
         """Costs (P,) by the fast evaluator for candidates in its box, by direct integration for the others."""

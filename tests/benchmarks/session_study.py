@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +37,11 @@ DESIGNS = ("flower", "small", "sessions")  # 36 commands, 12 commands, 36 comman
 
 @dataclass(frozen=True)
 class Case:
-    """One row of the table. held: True if the model holds the effect. validation: a design of other commands."""
+    """One row of the table.
+
+    held: True if the model holds the effect. validation: a design of other commands. single: one run is all that the
+    validation session has.
+    """
 
     name: str
     times: int = 1
@@ -49,6 +53,7 @@ class Case:
     noises: tuple[str, ...] = ("plain",)
     repetitions: int = 5
     validation: str = ""
+    single: bool = False
 
 
 @dataclass(frozen=True)
@@ -75,6 +80,9 @@ def cases() -> Iterator[Case]:
         yield Case(f"two repetitions of 12, {100 * change:g} % of all", 1, ("small",), change, repetitions=2)
     yield Case("nothing differs", 4, noises=NULL_KINDS)
     yield Case("nothing differs, two repetitions of 12", 4, ("small",), repetitions=2, noises=NULL_KINDS)
+    yield Case("nothing differs, a single run to validate", 8, noises=NULL_KINDS, single=True)
+    for change in (0.02, 0.05):
+        yield Case(f"a single run, {100 * change:g} % of all", change=change, single=True)
     yield Case("effect alike, in the model", 2, ("flower",), effects=EFFECTS, held=True)
     yield Case("effect alike, not in the model", 2, effects=EFFECTS)
     yield Case("effect in the model, 1 % of all radii", 1, ("flower",), 0.01, effects=EFFECTS, held=True)
@@ -97,6 +105,10 @@ def answer(case: Case, seed: int) -> Answer:
         repetitions=case.repetitions,
         validation=case.validation,
     )
+    if case.single:
+        held_out = dataset.split("validation")
+        runs = (*dataset.split("train"), held_out[seed % len(held_out)])
+        dataset = replace(dataset, trajectories=runs)
     found = _with_effect(dataset, effect) if case.held else _by_design(dataset)
     changed = [each for each in found.differences if each.session == dataset.trajectories[-1].session]
     kind = "all wheels" if len(case.wheels) > 1 else "one wheel"

@@ -7,6 +7,7 @@ import os
 import resource
 import shutil
 import subprocess
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -201,8 +202,9 @@ def test_a_full_disk_is_one_line_and_leaves_no_half_file(prepared: Prepared, tmp
 
 @pytest.mark.parametrize("arguments", [["calibrate", "DATA", "-o", "new/c.yaml"], ["plugin", "new", "mine"]])
 def test_a_file_that_the_disk_does_not_take_is_not_there(
-    arguments: list[str], command: Command, prepared: Prepared
+    arguments: list[str], command: Command, prepared: Prepared, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(Path.cwd()))
     with disk_that_takes(600):  # the line on standard error
         run = command(*(str(prepared.data) if argument == "DATA" else argument for argument in arguments))
     assert_refused(run, FULL)

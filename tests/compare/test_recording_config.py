@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -51,6 +52,25 @@ calibrators.register("mine")(Mine)
     with registries_restored():
         config = recording_config(prepared.data, [write_plugin(tmp_path / "plugins", "mine", body)])
     assert "mine" in [entry.name for entry in config.calibrators]
+
+
+def test_folders_of_a_data_set_are_compared_as_one(
+    command: Command, prepared: Prepared, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("omnibench.compare.recording_config.suitable_calibrators", lambda _: ["theoretical"])
+    for day in ("day1", "day2"):
+        shutil.copytree(prepared.data, day)
+    by_glob = command("compare", "day*", "-o", "by_glob")
+    one_by_one = command("compare", "day1", "day2", "-o", "one_by_one")
+    assert (by_glob.returncode, one_by_one.returncode) == (0, 0), by_glob.stderr + one_by_one.stderr
+    (named,) = yaml.safe_load(Path("by_glob/config.yaml").read_text())["datasets"].values()
+    assert [Path(path).name for path in named["path"]] == ["day1", "day2"]
+    assert summary(Path("by_glob"))["runs"][0]["train_cost"] == summary(Path("one_by_one"))["runs"][0]["train_cost"]
+
+
+def test_one_config_is_compared_at_a_time(command: Command, prepared: Prepared) -> None:
+    printed = command("compare", prepared.config, prepared.data)
+    assert_refused(printed, f"unexpected extra argument {prepared.data}; compare takes one config, or the folders of")
 
 
 def test_data_is_for_a_config(command: Command, prepared: Prepared) -> None:

@@ -28,6 +28,11 @@ def dataset_folders(places: Path | str | Sequence[Path | str]) -> list[Path]:
     return list(folders.values())
 
 
+def is_glob(place: Path) -> bool:
+    """True for a pattern, which no file or folder has as its name."""
+    return any(sign in str(place) for sign in _MAGIC) and not place.exists()
+
+
 def in_few_words(folders: Sequence[Path]) -> str:
     """The folders as words of a shell: a glob that names just these, where there is one, else one by one."""
     begin = os.path.commonprefix([str(folder) for folder in folders])  # noqa: RUF071 (a glob's begin is no path)
@@ -38,9 +43,9 @@ def in_few_words(folders: Sequence[Path]) -> str:
 
 
 def _named(place: Path) -> list[Path]:
-    pattern = str(place)
-    if place.exists() or not any(sign in pattern for sign in _MAGIC):
+    if not is_glob(place):
         return [place]
+    pattern = str(place)
     if not (folders := _found(pattern)):
         matching = sorted(glob.glob(pattern, recursive=True))
         seen = f"; {matching[0]} has no dataset.yaml" if matching else ""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pickle
 import shutil
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -30,7 +31,7 @@ from omnibench.fit.certify import certify_optimum
 from omnibench.fit.check.checking import check
 from omnibench.fit.evaluate import evaluate
 from omnibench.fit.inspect import inspect_dataset
-from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
+from omnibench.fit.problem import Budget, BudgetSpent, CalibrationProblem, make_parameterisation
 from omnibench.registry import costs
 from omnibench.robot.kinematics import Robot
 
@@ -118,11 +119,11 @@ def bounds_of(dataset: Dataset, cost: str) -> LowerBounds:
     return LowerBounds(problem_of(dataset, cost))
 
 
-def problem_of(dataset: Dataset, cost: str) -> CalibrationProblem:
+def problem_of(dataset: Dataset, cost: str, budget: Budget | None = None) -> CalibrationProblem:
     runs = dataset.split("train")
     searched = make_parameterisation("matrix", dataset.robot, runs)
     return CalibrationProblem(
-        dataset.robot, runs, costs.create(cost), searched, integration="arc", budget=Budget(), seed=0
+        dataset.robot, runs, costs.create(cost), searched, integration="arc", budget=budget or Budget(), seed=0
     )
 
 
@@ -135,6 +136,32 @@ def test_a_search_by_the_evaluators_of_parts_finds_what_it_finds_by_one(
     stored = calibrate(load_dataset(folder, most_in_memory=0), "genetic", **options).result
     monkeypatch.setattr(odometry_of_stored, "_HELD", 10**9)
     assert stored.cost == pytest.approx(calibrate(load_dataset(folder), "genetic", **options).result.cost, rel=1e-3)
+
+
+@pytest.mark.usefixtures("nothing_held")
+@pytest.mark.parametrize(("seconds", "built"), [(0.5, False), (600.0, True)])
+def test_an_evaluator_of_parts_is_built_where_the_time_left_is_enough(
+    seconds: float, built: bool, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("omnibench.fit.problem._WORTH_BUILDING_OF_STORED", 20_000)  # some 20 s of evaluations
+    problem = problem_of(load_dataset(folder, most_in_memory=0), "final_pose", Budget(seconds=seconds))
+    problem.cost(problem.start)
+    with suppress(BudgetSpent):
+        problem.cost(np.tile(problem.start, (20_000, 1)))
+    assert (problem._evaluator is not None) == built
+
+
+@pytest.mark.usefixtures("nothing_held")
+def test_a_population_that_takes_longer_than_the_time_left_is_cut_there(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("omnibench.fit.problem._WORTH_BUILDING_OF_STORED", 10**9)
+    problem = problem_of(load_dataset(folder, most_in_memory=0), "final_pose", Budget(seconds=0.5))
+    alone = [problem.cost(problem.start * scale)[0] for scale in (0.98, 0.99)]
+    with pytest.raises(BudgetSpent, match="time budget"):
+        problem.cost(np.tile(problem.start, (50_000, 1)))
+    assert 2 < problem.evaluations < 50_000
+    assert problem.best_cost < min(alone)
 
 
 def test_costs_of_candidates_whose_poses_are_held_in_parts_are_the_same(
