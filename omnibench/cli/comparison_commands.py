@@ -14,6 +14,7 @@ from omnibench.cli.options import (
     TlsCertificate,
     TlsKey,
     output_option,
+    plugin_folders,
     refuse_figures_without_browser,
     tls_files,
     write_asked_figures,
@@ -72,8 +73,9 @@ def compare(
     from omnibench.progress import Progress
 
     refuse_figures_without_browser(figures)
-    comparison = _asked_comparison(config, data, plugins or ())
-    folders = [*comparison.plugins, *(folder.resolve() for folder in plugins or [])]
+    asked = plugin_folders(plugins or [])
+    comparison = _asked_comparison(config, data, asked)
+    folders = [*comparison.plugins, *(folder.resolve() for folder in asked)]
     given = {"backend": backend, "workers": workers, "tls": tls_files(tls_ca, tls_cert, tls_key)}
     comparison = comparison.model_copy(
         update={"plugins": tuple(dict.fromkeys(folders))}

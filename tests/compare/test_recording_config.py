@@ -73,6 +73,14 @@ def test_one_config_is_compared_at_a_time(command: Command, prepared: Prepared) 
     assert_refused(printed, f"unexpected extra argument {prepared.data}; compare takes one config, or the folders of")
 
 
+def test_no_plugins_may_be_asked_for_as_of_other_commands(
+    command: Command, prepared: Prepared, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("omnibench.compare.recording_config.suitable_calibrators", lambda _: ["theoretical"])
+    printed = command("compare", prepared.data, "--plugins", "none", "-o", "out")
+    assert printed.returncode == 0, printed.stderr
+
+
 def test_data_is_for_a_config(command: Command, prepared: Prepared) -> None:
     printed = command("compare", prepared.data, "--data", prepared.data)
     assert_refused(printed, "--data is for a config", "leave it out")
