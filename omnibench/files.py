@@ -150,7 +150,8 @@ def _kept_meanwhile(text: str, suffix: str) -> Path | None:
         with os.fdopen(descriptor, "w", encoding="utf-8") as kept:
             kept.write(text)
     except OSError:
-        Path(name).unlink()
+        with suppress(OSError):
+            Path(name).unlink()
         return None
     return Path(name)
 

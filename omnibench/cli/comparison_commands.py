@@ -20,7 +20,7 @@ from omnibench.cli.options import (
     write_asked_figures,
 )
 from omnibench.cli.terminal.console import make_console, print_ending, print_verdict, warn
-from omnibench.errors import ConfigError
+from omnibench.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
     from omnibench.compare.config import CompareConfig
@@ -34,7 +34,7 @@ def compare(
         list[Path],
         typer.Argument(
             metavar="CONFIG|DATASET",
-            help="Comparison config (YAML), or a data set, its folders or a glob: a quick one.",
+            help="Comparison config (YAML), or a data set (its folder, several, a glob) for a quick comparison.",
         ),
     ],
     output: Annotated[
@@ -108,6 +108,9 @@ def _asked_comparison(given: Sequence[Path], data: list[str] | None, plugins: Se
     first = given[0]
     of_recordings = all(place.is_dir() or is_glob(place) for place in given)
     if len(given) > 1 and not of_recordings:
+        missing = next((place for place in given if not place.exists() and not is_glob(place)), None)
+        if missing is not None and any(place.is_dir() for place in given):
+            raise DataError(f"{missing}: no such folder; compare takes one config, or the folders of one data set")
         raise ConfigError(
             f"unexpected extra argument {given[1]}; compare takes one config, or the folders of one data set "
             "(see omnibench compare --help)"

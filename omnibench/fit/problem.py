@@ -168,7 +168,7 @@ class CalibrationProblem:
 
         A candidate that cannot be evaluated costs NaN. BudgetSpent is raised when the budget is spent; of a population
         that is larger than the remaining budget the first candidates are evaluated, and count, before it is raised.
-        Where runs are read from files that holds for the time, too.
+        Where runs are read from files, and no fast evaluator is built, that holds for the time, too.
         """
         candidates = np.array(candidates, dtype=float, ndmin=2)
         if candidates.shape[1:] != self.start.shape:
@@ -176,10 +176,10 @@ class CalibrationProblem:
         self._check_budget()
         asked = len(candidates)
         candidates = candidates[: self.remaining]
-        if not self._evaluator_tried and self._repays_building(len(candidates)):
-            self.build_evaluator()
         values, count = np.empty(len(candidates)), 0
         while count < len(candidates):
+            if not self._evaluator_tried and self._repays_building(len(candidates) - count):
+                self.build_evaluator()
             part = candidates[count : count + self._in_time]
             costs = self._fast_values(part, self._evaluator) if self._evaluator else self.values(part)
             values[count : count + len(part)] = costs
@@ -277,11 +277,13 @@ class CalibrationProblem:
 
     @property
     def _in_time(self) -> int:
-        """Candidates that are evaluated together: of runs in memory all, of others so many as the time left is for."""
+        """Candidates that are evaluated together: of runs in memory all, of others as many as the time left allows."""
         if self._evaluator or not isinstance(self.odometry, StoredOdometry):
             return self.budget.evaluations
+        if not self.evaluations:
+            return 1  # which tells the time that one takes
         left = self.budget.seconds - self.seconds
-        return max(int(left / self.seconds * self.evaluations), 1)
+        return max(int(min(left / self.seconds * self.evaluations, self.budget.evaluations)), 1)
 
     def _fast_values(self, candidates: Array, evaluator: PoseEvaluator | PartedEvaluator) -> Array:
         """Costs (P,) by the fast evaluator for candidates in its box, by direct integration for the others."""

@@ -73,6 +73,10 @@ def test_one_config_is_compared_at_a_time(command: Command, prepared: Prepared) 
     assert_refused(printed, f"unexpected extra argument {prepared.data}; compare takes one config, or the folders of")
 
 
+def test_a_folder_that_is_not_there_is_named_beside_one_that_is(command: Command, prepared: Prepared) -> None:
+    assert_refused(command("compare", prepared.data, "nope"), "nope: no such folder; compare takes one config")
+
+
 def test_no_plugins_may_be_asked_for_as_of_other_commands(
     command: Command, prepared: Prepared, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -30,16 +30,17 @@ and Hotelling's statistic where the sessions do not differ the distribution
 
     t' V^-1 t (v - d + 1) / (v d) ~ F(d, v - d + 1).                                                      (6)
 
-A run that its session does not repeat has the term of the others of its command in V, in proportion to E_k, and adds
-its E_k to theirs in (5). A command that no session repeats is left out: nothing says how much its runs scatter.
+A run that its session does not repeat has the terms of the groups of its command in V, by shares n_k - 1 and in
+proportion to the noise model's E_k, and adds its E_k to theirs in (5). A command that no session repeats is left out:
+nothing says how much its runs scatter.
 
 Where the validation split drives no command of the training, J and S come from the estimates of both, with
 I_A = sum of H_z in A, in which whatever the model lacks counts, too:
 
     J = (I_A^-1 + I_B^-1)^-1,    u_z = R'J I_B^-1 s_z in B,    u_z = -R'J I_A^-1 s_z in A.                (7)
 
-A deviation then says that sessions or commands differ, and not which. A run of a command that its split does not
-repeat has the term E_k, by the s of all other runs of its split.
+A deviation then says that sessions or commands differ, and not which. A run of a command that no session repeats has
+the term E_k, by the s of its session's repetitions, or of all where it has none.
 """
 
 from __future__ import annotations
@@ -234,18 +235,20 @@ class Contrast:
         if not repeated.any():
             return pulls.sum(axis=0), seen.sum(axis=0), 0.0
         traces = [np.trace(each, axis1=1, axis2=2) * (counts - 1) for each in (seen, expected)]
+        plain = np.trace(expected, axis1=1, axis2=2)
         for name in dict.fromkeys(self.sessions):  # s^2 of each session, or of all where one repeats nothing
             inside = of_session == name
             known = inside if repeated[inside].any() else repeated
             expected[inside] *= max(traces[0][known].sum() / max(traces[1][known].sum(), 1e-300), _ROUNDING)
         shares = _shares(counts, of_command, of_session)
-        sizes = np.trace(expected, axis1=1, axis2=2)
-        units = seen / np.maximum(sizes, 1e-300)[:, None, None]
+        seen_units, expected_units = (each / np.maximum(plain, 1e-300)[:, None, None] for each in (seen, expected))
         for index in np.flatnonzero(~repeated):
             told = np.flatnonzero(shares[index])
-            seen[index] = expected[index]
-            if of_command[told[0]] == of_command[index]:
-                seen[index] = sizes[index] * np.tensordot(shares[index], units, 1)
+            if of_command[told[0]] == of_command[index]:  # with their s: that of its session may rest on two runs
+                seen[index] = plain[index] * np.tensordot(shares[index], seen_units, 1)
+                expected[index] = plain[index] * np.tensordot(shares[index], expected_units, 1)
+            else:
+                seen[index] = expected[index]
         known_by = expected + np.tensordot(shares.T, expected, 1)
         freedom = _size(expected.sum(axis=0)) / np.sum(
             [_size(each) / (count - 1) for each, count in zip(known_by[repeated], counts[repeated], strict=True)]

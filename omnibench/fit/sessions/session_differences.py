@@ -163,13 +163,13 @@ def _untested(runs: Sequence[Trajectory]) -> str:
 
 
 def _uncomparable(names: Sequence[str], comparable: Sequence[str]) -> str:
-    """The sessions that share no command that one of them repeats with another one, in words; empty if all do."""
+    """The sessions that share with another one no command that either repeats, in words; empty if there are none."""
     left = [name for name in dict.fromkeys(names) if name not in comparable]
     if not comparable:
-        return "the sessions share no command that one of them repeats"
+        return "the sessions share no command that any of them repeats"
     if not left:
         return ""
-    return f"no run of {_listed(left)} drives a command of another session that one of them repeats"
+    return f"no run of {_listed(left)} drives a command of another session that either repeats"
 
 
 def _differences(data: SessionScores) -> Iterator[SessionDifference]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import pickle
 import shutil
@@ -139,13 +140,12 @@ def test_a_search_by_the_evaluators_of_parts_finds_what_it_finds_by_one(
 
 
 @pytest.mark.usefixtures("nothing_held")
-@pytest.mark.parametrize(("seconds", "built"), [(0.5, False), (600.0, True)])
+@pytest.mark.parametrize(("seconds", "built"), [(0.5, False), (600.0, True), (math.inf, True)])
 def test_an_evaluator_of_parts_is_built_where_the_time_left_is_enough(
     seconds: float, built: bool, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("omnibench.fit.problem._WORTH_BUILDING_OF_STORED", 20_000)  # some 20 s of evaluations
     problem = problem_of(load_dataset(folder, most_in_memory=0), "final_pose", Budget(seconds=seconds))
-    problem.cost(problem.start)
     with suppress(BudgetSpent):
         problem.cost(np.tile(problem.start, (20_000, 1)))
     assert (problem._evaluator is not None) == built

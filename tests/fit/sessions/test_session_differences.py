@@ -120,7 +120,7 @@ def test_a_session_that_shares_no_command_with_the_others_is_named() -> None:
     ]
     (sentence,) = compared(replace(dataset, trajectories=tuple(renamed))).doubts
     assert sentence == (
-        "Whether the sessions differ cannot be said: no run of s2 drives a command of another session that one of them "
+        "Whether the sessions differ cannot be said: no run of s2 drives a command of another session that either "
         "repeats."
     )
 
