@@ -281,7 +281,7 @@ class CalibrationProblem:
         if self._evaluator or not isinstance(self.odometry, StoredOdometry):
             return self.budget.evaluations
         if not self.evaluations:
-            return 1  # which tells the time that one takes
+            return 1  # the first candidate tells the time that one takes
         left = self.budget.seconds - self.seconds
         return max(int(min(left / self.seconds * self.evaluations, self.budget.evaluations)), 1)
 
