@@ -44,6 +44,10 @@ class PluginError(OmnibenchError):
     """A plug-in cannot be loaded or does not keep the contract."""
 
 
+class NotApplicableError(OmnibenchError):
+    """A method is not for this robot, or not for such paths; the message says what it is for."""
+
+
 class Interrupted(OmnibenchError):  # noqa: N818 (the user's wish, not a mistake)
     """Ctrl-C; the message says what is kept and how to go on."""
 

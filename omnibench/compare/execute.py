@@ -60,7 +60,7 @@ def _solve(task: RunTask, report: Reporter) -> RunResult:
         load_calibrators(task.config)
         calibrator = calibrators.create(task.entry.name, task.entry.options)
         problem = task.problem(report)
-        result = shrunk(problem, run_calibrator(calibrator, problem), fitted=calibrator.bounded)
+        result = shrunk(problem, run_calibrator(calibrator, problem), fitted=calibrator.fitted)
         if task.config.timing and result.matrix is not None:
             result = replace(result, timing=Timing(_reference_seconds(problem), platform.node()))
     except BaseException as error:  # whatever a plug-in raises, wherever, is this run's outcome

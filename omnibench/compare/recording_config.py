@@ -17,7 +17,7 @@ from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import Calibrator
 from omnibench.fit.problem import make_parameterisation, training_split
 from omnibench.fit.shrinkage.prior import default_cost, default_unidentified
-from omnibench.registry import calibrators, load_plugins
+from omnibench.registry import Entry, calibrators, load_plugins
 
 _EVALUATIONS, _SECONDS = 10_000, 30.0  # of each run; s; chosen: on two cores a first look takes a minute or two
 _LONGEST_NAME = 60  # letters, of a config's name
@@ -52,7 +52,7 @@ def suitable_calibrators(dataset: Dataset) -> list[str]:
 
     A matrix that is not fitted, such as a published one, is another robot's and is left out.
     """
-    entries = [entry for entry in calibrators.entries() if _suits(entry.cls, dataset)]
+    entries = [entry for entry in calibrators.entries() if _suits(entry, dataset)]
     return [THEORETICAL_NAME, *(entry.name for entry in entries if entry.name != THEORETICAL_NAME)]
 
 
@@ -65,8 +65,9 @@ def config_in_words(config: CompareConfig) -> str:
     )
 
 
-def _suits(calibrator: type[Calibrator], dataset: Dataset) -> bool:
-    if not calibrator.bounded:
+def _suits(entry: Entry[Calibrator], dataset: Dataset) -> bool:
+    calibrator = entry.cls
+    if not calibrator.fitted or not calibrators.create(entry.name).applies(dataset.robot):
         return False
     try:
         make_parameterisation(calibrator.parameterisation, dataset.robot, training_split(dataset))

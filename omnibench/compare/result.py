@@ -205,7 +205,7 @@ class ComparisonResult(Shown):
     @property
     def every_search_failed(self) -> bool:
         """True if none of the calibrators that fit to data, or none of all if there are no such, gave an answer."""
-        fitted = [run for run in self.runs if calibrators.entry(run.record.calibrator).cls.bounded]
+        fitted = [run for run in self.runs if calibrators.entry(run.record.calibrator).cls.fitted]
         return all(run.matrix is None for run in fitted or self.runs)
 
     @property

@@ -64,7 +64,7 @@ def held_out_verdicts(
         fitted = [
             (not entry.is_best, _judged_cost(entry.typical), entry.label, entry.typical)
             for entry in statistics
-            if entry.dataset == name and entry.typical is not None and calibrators.entry(entry.calibrator).cls.bounded
+            if entry.dataset == name and entry.typical is not None and calibrators.entry(entry.calibrator).cls.fitted
         ]
         if fitted:
             _, _, label, run = min(fitted, key=itemgetter(0, 1))

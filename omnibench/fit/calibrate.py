@@ -177,7 +177,7 @@ def calibrate(
         shrinks=unidentified == "shrink",
         watch=renamed(watch, calibrator),
     )
-    result = shrunk(problem, run_calibrator(chosen, problem), fitted=chosen.bounded)
+    result = shrunk(problem, run_calibrator(chosen, problem), fitted=chosen.fitted)
     if result.matrix is None or result.vector is None:
         raise ConfigError(f"calibrator {calibrator!r} gave no answer ({result.outcome}): {result.reason}")
     uncertainty, untold = _uncertainty(problem, result, chosen)
@@ -304,7 +304,7 @@ class _Fit:
 
 def _inseparable(problem: CalibrationProblem, calibrator: Calibrator) -> tuple[str, ...]:
     """Sentences on numbers of a fitted geometry that the data cannot tell apart; none of a matrix."""
-    if not isinstance(problem.parameterisation, WheelGeometry) or not calibrator.bounded:
+    if not isinstance(problem.parameterisation, WheelGeometry) or not calibrator.fitted:
         return ()
     kept = unidentified_directions(problem.robot, driven_span(problem.trajectories))
     known = MatrixElements(problem.robot, "row", kept, known_mount=False)
@@ -338,7 +338,7 @@ def _uncertainty(
     problem: CalibrationProblem, result: RunResult, calibrator: Calibrator
 ) -> tuple[Uncertainty | None, tuple[str, ...]]:
     """The uncertainty of an answer, or a warning why it has none; neither if nothing was fitted."""
-    if not calibrator.bounded:
+    if not calibrator.fitted:
         return None, ()
     try:
         return uncertainty_of(problem, result), ()

@@ -10,13 +10,14 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import BaseModel
 
-from omnibench.errors import OmnibenchError, PluginError, one_line
+from omnibench.errors import NotApplicableError, OmnibenchError, PluginError, one_line
 from omnibench.fit.parameterisation import ParameterisationName
 from omnibench.fit.problem import BudgetSpent, CalibrationProblem, Improvement
 from omnibench.jobs.memory import memory_limit
 from omnibench.registry import AnyOptions, Options, PluginFailure, calibrators
-from omnibench.robot.calibration import Noise, matrix_flaw
-from omnibench.robot.kinematics import Array, JsonArray
+from omnibench.robot.calibration import ModelExtension, Noise, extended_model, matrix_flaw
+from omnibench.robot.kinematics import Array, JsonArray, Robot
+from omnibench.robot.model import OdometryModel
 from omnibench.views import Brief
 
 
@@ -28,6 +29,7 @@ class Outcome(StrEnum):
     TIME = "time"  # the seconds were spent
     FAILED = "failed"  # it raised, died, or cannot solve this problem
     INVALID = "invalid"  # its answer is no calibration: NaN, wrong shape, outside the box
+    NOT_APPLICABLE = "not applicable"  # it is not for this robot, or not for such paths
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,7 @@ class Solution:
     converged: False when the calibrator hit a limit of its own (generations, programs) before its stopping rule held.
     Calibrators that estimate them also give the covariance (n, n) of the vector, the degrees_of_freedom of its
     variances (one number, or (n,)), by which intervals are made, and the noise of the reference poses.
+    extension: effects that were fitted beside the matrix; the answer's cost is that of the model with these.
     """
 
     vector: Array
@@ -45,13 +48,17 @@ class Solution:
     covariance: Array | None = None
     noise: Noise | None = None
     degrees_of_freedom: Array | float | None = None
+    extension: ModelExtension | None = None
 
 
 class Calibrator(ABC):
     """Finds a vector of low cost. Made with validated options; ``calibrate`` may be called more than once.
 
     parameterisation: the one it searches unless the config names another.
-    bounded: False if the answer does not depend on the box (a published matrix).
+    bounded: False if the answer does not depend on the box (a published matrix, a closed form of an article).
+    fitted: False if the answer does not depend on the runs (the design values, a published matrix).
+    per_session: True if its article calibrates from the runs of one session, so that it refuses those of several.
+    only_for: the robots that it is for, in words, where these are not all; then override ``applies``.
     stochastic: False if the seed makes no difference, so that one run is enough.
     exact: True if a converged answer is a minimum to rounding, against which others are measured; that it is the
     optimum of the box is not said by this but by a proof (certify.py).
@@ -61,18 +68,25 @@ class Calibrator(ABC):
     name: ClassVar[str]
     parameterisation: ClassVar[ParameterisationName] = "matrix"
     bounded: ClassVar[bool] = True
+    fitted: ClassVar[bool] = True
+    per_session: ClassVar[bool] = False
+    only_for: ClassVar[str] = ""
     stochastic: ClassVar[bool] = True
     exact: ClassVar[bool] = False
 
     def __init__(self, options: Any) -> None:
         self.options = options
 
+    def applies(self, robot: Robot) -> bool:  # noqa: ARG002
+        """True for a robot that the method is for."""
+        return True
+
     @abstractmethod
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """Minimise ``problem.cost`` within the box and return the best vector.
 
         ``problem.cost`` raises BudgetSpent when the budget is spent: do not catch it. Raise OmnibenchError when the
-        calibrator cannot solve such a problem.
+        calibrator cannot solve such a problem, NotApplicableError when it is not for paths as these.
         """
 
 
@@ -102,6 +116,7 @@ class RunResult(Brief):
     at_bounds, held: names of elements on a bound of the box, and of those kept at their start values.
     covariance (n, n), degrees_of_freedom (n,), noise: as in Solution, None if the calibrator does not estimate them.
     shrinkage: None where the answer is the calibrator's own. timing: None where the seconds are not to be compared.
+    extension: effects that belong to the answer beside the matrix, None for none.
     """
 
     outcome: Outcome
@@ -119,6 +134,7 @@ class RunResult(Brief):
     degrees_of_freedom: JsonArray | None = None
     shrinkage: Shrinkage | None = None
     timing: Timing | None = None
+    extension: ModelExtension | None = None
 
 
 def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunResult:
@@ -126,6 +142,7 @@ def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunRe
     answer: Any = None
     solution: Solution | None = None
     try:
+        check_applicable(calibrator, problem)
         solution = calibrator.calibrate(problem)
         if not isinstance(solution, Solution):
             raise PluginError(f"calibrate returned {type(solution).__name__}, expected a Solution")
@@ -138,17 +155,19 @@ def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunRe
         else:
             outcome, reason = Outcome.INVALID, f"{reason}, and no candidate in the box had a finite cost"
     except OmnibenchError as error:
-        outcome, reason = Outcome.FAILED, str(error)
+        outcome = Outcome.NOT_APPLICABLE if isinstance(error, NotApplicableError) else Outcome.FAILED
+        reason = str(error)
     except (Exception, SystemExit) as error:  # whatever a plug-in raises is this run's outcome
         outcome, reason = Outcome.FAILED, describe_error(error)
     seconds = problem.seconds
     vector, cost = None, None
     freedom: Array | None = None
-    if outcome not in (Outcome.FAILED, Outcome.INVALID):
+    extension = None if solution is None else solution.extension
+    if outcome not in (Outcome.FAILED, Outcome.INVALID, Outcome.NOT_APPLICABLE):
         try:
             if solution is not None and solution.degrees_of_freedom is not None:
                 freedom = np.broadcast_to(np.asarray(solution.degrees_of_freedom, dtype=float), problem.size)
-            vector, cost, flaw = _examine(calibrator, problem, answer, freedom)
+            vector, cost, flaw = _examine(calibrator, problem, answer, freedom, extension)
             if flaw:
                 outcome, reason = Outcome.INVALID, flaw
         except Exception as error:  # a cost may be a plug-in's, too
@@ -168,7 +187,22 @@ def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunRe
         covariance=estimate.covariance if estimate is not None else None,
         noise=estimate.noise if estimate is not None else None,
         degrees_of_freedom=freedom if estimate is not None else None,
+        extension=estimate.extension if estimate is not None else None,
     )
+
+
+def check_applicable(calibrator: Calibrator, problem: CalibrationProblem) -> None:
+    """NotApplicableError: a calibrator is not for a problem's robot, or not for runs of several sessions."""
+    if not calibrator.applies(problem.robot):
+        raise NotApplicableError(f"it is for {calibrator.only_for}, and {problem.robot.name} is none")
+    sessions = {run.session for run in problem.trajectories}
+    if calibrator.per_session and len(sessions) > 1:
+        raise NotApplicableError(f"its article calibrates from one session, and these are {len(sessions)}")
+
+
+def model_of_answer(problem: CalibrationProblem, matrix: Array, extension: ModelExtension | None) -> OdometryModel:
+    """The odometry model of a matrix (3, M), with what extends it. OmnibenchError: an effect does not fit the robot."""
+    return extended_model(problem.robot, matrix, problem.integration, problem.sample_period, extension)
 
 
 def describe_error(error: BaseException) -> str:
@@ -197,7 +231,11 @@ def unloadable(failure: PluginFailure) -> type[Calibrator]:
 
 
 def _examine(
-    calibrator: Calibrator, problem: CalibrationProblem, answer: Any, freedom: Array | None
+    calibrator: Calibrator,
+    problem: CalibrationProblem,
+    answer: Any,
+    freedom: Array | None,
+    extension: ModelExtension | None,
 ) -> tuple[Array | None, float | None, str]:
     """The answer as a vector (n,), its cost, and its flaw in words; vector and cost are None if there is a flaw."""
     try:
@@ -219,7 +257,11 @@ def _examine(
         return None, None, f"degrees_of_freedom of the answer's variances must be above 0, found {freedom.min():g}"
     if flaw := matrix_flaw(problem.matrix(vector)):
         return None, None, f"the answer's matrix holds {flaw}"
-    cost = float(problem.values(vector[None])[0])
+    if extension is None:
+        cost = float(problem.values(vector[None])[0])
+    else:
+        model = model_of_answer(problem, problem.matrix(vector), extension)
+        cost = problem.objective.of_model(model, problem.trajectories)
     if not np.isfinite(cost):
         return None, None, "the answer's cost is not finite"
     return vector, cost, ""

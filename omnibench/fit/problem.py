@@ -13,6 +13,7 @@ from pydantic import Field
 
 from omnibench.config import Model
 from omnibench.data.dataset import Dataset, Trajectory
+from omnibench.data.stored.periods import median_period
 from omnibench.errors import DataError
 from omnibench.fit.cost import Cost
 from omnibench.fit.evaluator.driven_frame import DrivenFrame
@@ -148,6 +149,11 @@ class CalibrationProblem:
         return len(self.start)
 
     @property
+    def sample_period(self) -> float:
+        """The median time between wheel samples, s."""
+        return median_period(self.trajectories)
+
+    @property
     def moved_ends(self) -> tuple[str, ...]:
         """A sentence on the runs whose start or end has jumped; none where none has."""
         last = self.objective.stamps == "final"
@@ -162,6 +168,17 @@ class CalibrationProblem:
     def seconds(self) -> float:
         """Wall time since the problem was made."""
         return time.perf_counter() - self._began
+
+    @property
+    def seconds_left(self) -> float:
+        """Wall time that the budget still allows, s; for methods that ask for no costs."""
+        return self.budget.seconds - self.seconds
+
+    def report(self, done: int, total: int, unit: str, best: float | None = None) -> None:
+        """Report the progress of a method that asks for no costs, which are reported by themselves."""
+        if self.seconds - self._shown > _PROGRESS_PERIOD:
+            self._shown = self.seconds
+            self._watch(Progress("search", done, total, unit, best))
 
     def cost(self, candidates: Array) -> Array:
         """Costs (P,) of candidates (P, n), counted against the budget.
@@ -334,9 +351,7 @@ class CalibrationProblem:
         """Count evaluated candidates (P, n) with their costs (P,), keep the best one and report progress."""
         self._note_improvements(candidates, values)
         self.evaluations += len(candidates)
-        if self.seconds - self._shown > _PROGRESS_PERIOD:
-            self._shown = self.seconds
-            self._watch(Progress("search", self.evaluations, self.budget.evaluations, "evaluation", self.best_cost))
+        self.report(self.evaluations, self.budget.evaluations, "evaluation", self.best_cost)
 
     def _note_improvements(self, candidates: Array, values: Array) -> None:
         """Append to the history every candidate in the box that is better than all before it."""

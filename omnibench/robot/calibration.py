@@ -114,6 +114,40 @@ class Provenance(Model):
     held_out: HeldOutVerdict | None = None
 
 
+class ModelExtension(Model):
+    """Effects beside a matrix (3, M), and how they fade outside the motions that they were fitted to.
+
+    driven, plain, covariance: as in ``Calibration``; without them the effects do not fade.
+    """
+
+    effects: tuple[EffectTerm, ...]
+    driven: tuple[tuple[FiniteFloat, FiniteFloat, FiniteFloat], ...] | None = None
+    plain: tuple[Row, Row, Row] | None = None
+    covariance: tuple[Row, ...] | None = None
+
+
+def extended_model(
+    robot: Robot,
+    matrix: Array,
+    integration: Integration,
+    sample_period: float,
+    extension: ModelExtension | None,
+    where: str = "",
+) -> OdometryModel:
+    """The odometry model of a matrix (3, M) with effects. OmnibenchError: an effect or a parameter is unknown.
+
+    sample_period: nominal, s. where: what messages begin with.
+    """
+    if extension is None:
+        return OdometryModel(robot, matrix, integration, (), sample_period)
+    terms = tuple(make_term(term.name, term.parameters, robot, where) for term in extension.effects)
+    model = OdometryModel(robot, matrix, integration, terms, sample_period)
+    if extension.plain is None or extension.driven is None or extension.covariance is None or not terms:
+        return model
+    change, driven = matrix - np.array(extension.plain), np.array(extension.driven)
+    return replace(model, fade=Fade(robot, change, driven, terms, np.array(extension.covariance)))
+
+
 def _signal_names(content: dict[str, Any]) -> tuple[str, ...] | None:
     """Names of the drive signals of a calibration's robot; None where they are its wheels."""
     robot: Robot | None = content.get("robot")  # missing if it is wrong
@@ -183,13 +217,11 @@ class Calibration(Shown, Model):
     @property
     def model(self) -> OdometryModel:
         """The odometry model of the file. OmnibenchError: an effect or one of its parameters is unknown."""
+        extension = ModelExtension(
+            effects=self.effects, driven=self.driven, plain=self.plain, covariance=self.covariance
+        )
         where = f"calibration {self.name!r}"
-        terms = tuple(make_term(term.name, term.parameters, self.robot, where) for term in self.effects)
-        model = OdometryModel(self.robot, self.matrix_array, self.integration, terms, self.sample_period)
-        if self.plain is None or not terms:
-            return model
-        change, driven = self.matrix_array - np.array(self.plain), np.array(self.driven)
-        return replace(model, fade=Fade(self.robot, change, driven, terms, np.array(self.covariance)))
+        return extended_model(self.robot, self.matrix_array, self.integration, self.sample_period, extension, where)
 
     @property
     def matrix_array(self) -> Array:

@@ -18,7 +18,7 @@ from omnibench.fit.calibrator import Calibrator, Outcome, RunResult, Solution, r
 from omnibench.fit.parameterisation import ParameterisationName
 from omnibench.fit.problem import BudgetSpent, CalibrationProblem
 from omnibench.registry import calibrators
-from omnibench.robot.kinematics import Array
+from omnibench.robot.kinematics import Array, Robot
 from omnibench.testing.conformance import Conformance, global_random_fingerprint, global_random_state, require
 from omnibench.testing.synthetic import ObservedProblem, Runaway, synthetic_problem
 from omnibench.words import plural
@@ -154,7 +154,7 @@ class CalibratorConformance(Conformance):
 
     def test_synthetic_problem_is_solved_or_honestly_reported(self) -> None:
         """If it claims convergence, the answer costs at most the share ``solved`` of the start."""
-        if not self.make().bounded:
+        if not self.make().fitted:
             raise SkipTest("its answer does not depend on the problem")
         problem = self.problem(evaluations=self.evaluations)
         start = float(problem.values(problem.start[None])[0])
@@ -199,6 +199,9 @@ class _Watching(Calibrator):
         self.solution: Any = None
         self.error: Exception | None = None
         self.uncounted = 0
+
+    def applies(self, robot: Robot) -> bool:
+        return self.inner.applies(robot)
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         assert isinstance(problem, ObservedProblem)

@@ -36,6 +36,7 @@ class Published(Calibrator):
     Options = PublishedOptions
     options: PublishedOptions
     bounded = False
+    fitted = False
     stochastic = False
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:

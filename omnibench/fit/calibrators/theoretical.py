@@ -10,6 +10,7 @@ class Theoretical(Calibrator):
     """The design values, unchanged, against which every calibration is measured."""
 
     bounded = False
+    fitted = False
     stochastic = False
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
