@@ -1,8 +1,8 @@
 """``compare``: several calibrators on equal terms."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -44,7 +44,9 @@ def compare(
     data: Annotated[
         list[str] | None,
         typer.Option(
-            "--data", metavar="[NAME=]PATH", help="Where the recordings of the config's data set NAME are on this disk."
+            "--data",
+            metavar="[NAME=]PATH",
+            help="Where the recordings of the config's data set NAME are on this disk; of a study, the folder of all.",
         ),
     ] = None,
     backend: BackendName = None,
@@ -63,8 +65,9 @@ def compare(
 ) -> None:
     """Run calibrators on equal terms, score them, write a report.
 
-    All calibrators of the config, or all that suit the data set, get the same data and the same budget. Run again
-    with the same -o, it goes on where it was stopped.
+    All calibrators of the config, or all that suit the data set, get the same data and the same budget. A config that
+    names robots is a study: every method on several robots and kinds of path. Run again with the same -o, it goes on
+    where it was stopped.
     """
     from omnibench.cli.terminal.comparison_tables import print_comparison_ending, print_result
     from omnibench.cli.terminal.progress_display import ProgressDisplay
@@ -74,13 +77,13 @@ def compare(
 
     refuse_figures_without_browser(figures)
     asked = plugin_folders(plugins or [])
+    given = {"backend": backend, "workers": workers, "tls": tls_files(tls_ca, tls_cert, tls_key)}
+    given = {name: value for name, value in given.items() if value is not None}
+    if _is_study(config):
+        return _study(config[0], _named_paths(data), asked, given, output, figures, force=force)
     comparison = _asked_comparison(config, data, asked)
     folders = [*comparison.plugins, *(folder.resolve() for folder in asked)]
-    given = {"backend": backend, "workers": workers, "tls": tls_files(tls_ca, tls_cert, tls_key)}
-    comparison = comparison.model_copy(
-        update={"plugins": tuple(dict.fromkeys(folders))}
-        | {name: value for name, value in given.items() if value is not None}
-    )
+    comparison = comparison.model_copy(update={"plugins": tuple(dict.fromkeys(folders))} | given)
     with ProgressDisplay() as watch:
         result = run_comparison(comparison, output, watch, force=force)
         if figures is not None:
@@ -96,7 +99,47 @@ def compare(
             f"every search failed, the first: {result.failures[0]}", "mend what its reason names, and run again"
         )
         raise typer.Exit(1)
-    print_comparison_ending(result)
+    return print_comparison_ending(result)
+
+
+def _is_study(given: Sequence[Path]) -> bool:
+    """True if the one argument is the config of a study."""
+    from omnibench.study.read_study import is_study
+
+    return len(given) == 1 and given[0].is_file() and is_study(given[0])
+
+
+def _study(
+    file: Path,
+    data: Mapping[str, Path],
+    plugins: Sequence[Path],
+    given: Mapping[str, Any],
+    output: Path | None,
+    figures: Path | None,
+    *,
+    force: bool,
+) -> None:
+    """Run a study and print its answer. The exit code is 1 if a recording cannot be read, or no method answered."""
+    from omnibench.cli.terminal.progress_display import ProgressDisplay
+    from omnibench.cli.terminal.study_tables import print_study, print_study_ending
+    from omnibench.progress import Progress
+    from omnibench.study.read_study import read_study_config
+    from omnibench.study.report.study_report import study_document
+    from omnibench.study.study import run_study
+
+    config = read_study_config(file, data)
+    folders = (*config.plugins, *(folder.resolve() for folder in plugins))
+    config = config.model_copy(update={"plugins": tuple(dict.fromkeys(folders))} | dict(given))
+    with ProgressDisplay() as watch:
+        result = run_study(config, output, watch, force=force)
+        if figures is not None:
+            watch(Progress("drawing the figures"))
+            write_asked_figures(study_document(result), figures)
+    warn(result.warnings)
+    print_study(make_console(), result)
+    typer.echo(f"report: {result.output / 'report.html'}")
+    if not print_study_ending(result):
+        raise typer.Exit(1)
 
 
 def _asked_comparison(given: Sequence[Path], data: list[str] | None, plugins: Sequence[Path]) -> "CompareConfig":

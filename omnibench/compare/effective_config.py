@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from pathlib import Path
 
 from pydantic import BaseModel
@@ -14,10 +15,13 @@ from omnibench.fit.calibrator import unloadable
 from omnibench.registry import PluginFailure, calibrators, costs, load_plugins, plugin_text
 
 
-def load_calibrators(config: CompareConfig) -> list[PluginFailure]:
-    """Load the config's plug-ins. The runs of one that cannot be imported fail with its error, the others run."""
-    failures = load_plugins(config.plugins)
-    missing = {entry.name for entry in config.calibrators} - {entry.name for entry in calibrators.entries()}
+def load_calibrators(plugins: Iterable[Path], names: Iterable[str]) -> list[PluginFailure]:
+    """Load a config's plug-ins. The runs of one that cannot be imported fail with its error, the others run.
+
+    names: the calibrators that the config names.
+    """
+    failures = load_plugins(plugins)
+    missing = set(names) - {entry.name for entry in calibrators.entries()}
     for failure in failures:
         for name in missing & _names_in(Path(failure.origin)):
             calibrators.register(name)(unloadable(failure))

@@ -57,7 +57,7 @@ class _RunFailed(Exception):  # noqa: N818 (not an error: the outcome of a run t
 def _solve(task: RunTask, report: Reporter) -> RunResult:
     """Solve one run's problem in a worker process."""
     try:
-        load_calibrators(task.config)
+        load_calibrators(task.config.plugins, [task.entry.name])
         calibrator = calibrators.create(task.entry.name, task.entry.options)
         problem = task.problem(report)
         result = shrunk(problem, run_calibrator(calibrator, problem), fitted=calibrator.fitted)

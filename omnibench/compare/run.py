@@ -53,7 +53,7 @@ def run_comparison(
     """
     require_type(config, CompareConfig, "read_compare_config")
     check_output(output, config, force=force)
-    failures = load_calibrators(config)
+    failures = load_calibrators(config.plugins, [entry.name for entry in config.calibrators])
     with _naming_failed_plugins(failures):
         config = effective_config(config)
         with ExitStack() as opened:

@@ -24,7 +24,7 @@ AWAY = {"lower": [[0.5] * 3] * 3, "upper": [[1.0] * 3] * 3}
 def planned(folder: Path, **changes: Any) -> list[PlannedRun]:
     """Everything that a comparison does before it runs anything."""
     config = read_compare_config(write_config(folder, **changes))
-    load_calibrators(config)
+    load_calibrators(config.plugins, [entry.name for entry in config.calibrators])
     config = effective_config(config)
     return make_plan(config, load_datasets(config))
 
@@ -179,7 +179,7 @@ def test_the_schema_refuses_what_reading_refuses(mistake: dict[str, Any], schema
 @pytest.mark.parametrize("config", COMPARISONS, ids=lambda path: path.stem)
 def test_a_config_that_we_ship_is_read_with_all_its_calibrators(config: Path) -> None:
     chosen = read_compare_config(config)
-    assert load_calibrators(chosen) == []
+    assert load_calibrators(chosen.plugins, [entry.name for entry in chosen.calibrators]) == []
     assert CompareConfig.model_validate(yaml.safe_load(to_yaml(effective_config(chosen)))) == effective_config(chosen)
 
 

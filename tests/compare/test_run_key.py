@@ -27,7 +27,7 @@ NEUTRAL = {
 def keys(**changes: Any) -> list[str]:
     """The keys of a small comparison's runs."""
     config = CompareConfig.model_validate(small(**changes))
-    load_calibrators(config)
+    load_calibrators(config.plugins, [entry.name for entry in config.calibrators])
     config = effective_config(config)
     return [run.key for run in make_plan(config, load_datasets(config))]
 

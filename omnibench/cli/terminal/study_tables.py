@@ -1,0 +1,89 @@
+"""A study's results on a terminal: cell by cell, the reference method beside the best published one."""
+
+from __future__ import annotations
+
+from rich.console import Console
+
+from omnibench.cli.terminal.console import print_ending
+from omnibench.cli.terminal.tables import print_table
+from omnibench.report.blocks import Column, Row, Table
+from omnibench.report.numbers import NOTHING, fixed
+from omnibench.study.report.study_view import cell_words
+from omnibench.study.study_result import StudyResult
+from omnibench.words import plural
+
+_SHOWN = 10  # failures that are listed; the others are counted (chosen: half a terminal)
+
+
+def print_study(console: Console, result: StudyResult) -> None:
+    """Print the table of cells, the recordings that cannot be read and the fits that failed."""
+    console.print()
+    print_table(console, _cells(result))
+    console.print()
+    for name, reason in result.broken.items():
+        console.print(f"cannot be read: {name}: {reason}", soft_wrap=True)
+    for failure in result.failures[:_SHOWN]:
+        console.print(f"no answer: {failure}", soft_wrap=True)
+    if len(result.failures) > _SHOWN:
+        console.print(f"and {len(result.failures) - _SHOWN} more without an answer, see study.parquet", soft_wrap=True)
+
+
+def print_study_ending(result: StudyResult) -> bool:
+    """Print the last sentence of a study; False where a recording cannot be read or no method answered."""
+    report = result.output / "report.html"
+    if result.nothing_answered:
+        first = result.failures[0] if result.failures else "no method is for these robots"
+        print_ending(f"no method gave an answer, the first: {first}", "mend what its reason names, and run again")
+        return False
+    if result.broken:
+        ending = f"{plural(len(result.broken), 'robot')} left out, whose recordings cannot be read"
+        print_ending(ending, "say where they are with --data, or take them out of the config, and run again")
+        return False
+    compared = result.against_best
+    if not compared or result.geometric_mean is None:
+        print_ending(f"{plural(len(result.judged_cells), 'cell')} judged", f"read {report}")
+        return True
+    worse = sum(each.ratio.verdict == "worse" for each in compared)
+    print_ending(
+        f"the error of {result.config.reference} is {result.geometric_mean:.2f} times that of the best published method "
+        f"of each cell ({plural(len(compared), 'cell')}, worse beyond chance in {worse})",
+        f"read {report}",
+    )
+    return True
+
+
+def _cells(result: StudyResult) -> Table:
+    """The least error of each cell beside the design's and the reference method's."""
+    ratios = {id(each.cell): each for each in result.against_best}
+    reference = result.config.reference
+    rows = []
+    for cell in result.judged_cells:
+        answered = [each for each in cell.methods.values() if each.errors is not None]
+        best = min(answered, key=lambda each: each.mean("cost") or 0.0, default=None)
+        ours = cell.methods.get(reference or "")
+        mean = None if ours is None else ours.mean("cost")
+        beside = ratios.get(id(cell))
+        rows.append(
+            Row.of(
+                cell.key.robot,
+                cell_words(cell),
+                fixed(float(cell.design["cost"].mean()), 4),
+                NOTHING if best is None else f"{fixed(best.mean('cost'), 4)} {best.method}",
+                fixed(mean, 4),
+                NOTHING if beside is None else f"{fixed(beside.ratio.value, 2)} {beside.best}",
+                NOTHING if beside is None else beside.ratio.verdict,
+            )
+        )
+    return Table(
+        "Mean error of runs that did not train, Eq. (6)",
+        (
+            Column("Robot", numeric=False),
+            Column("Training → judged", numeric=False),
+            Column("Design"),
+            Column("Least", numeric=False),
+            Column(reference or "Reference"),
+            Column("Beside the best published", numeric=False),
+            Column("Verdict", numeric=False),
+        ),
+        tuple(rows),
+    )

@@ -1,0 +1,165 @@
+"""Every cell of a study: a picture of all ratios to the design values, and a table for each cell."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import plotly.graph_objects as go
+
+from omnibench.report.blocks import (
+    Block,
+    Cell,
+    Choice,
+    Column,
+    Figure,
+    FigureGrid,
+    Row,
+    Section,
+    Table,
+)
+from omnibench.report.numbers import NOTHING, fixed, seconds
+from omnibench.report.style import INK, plot, text, wrapped
+from omnibench.study.cell_intervals import CellRatio
+from omnibench.study.cells import MethodInCell, StudyCell
+from omnibench.study.report.study_view import StudyView, cell_words
+from omnibench.words import plural
+
+_COLUMNS = (
+    Column("Method", numeric=False),
+    Column("Position", "mm"),
+    Column("Heading", "°"),
+    Column("Eq. (6) / design"),
+    Column("Verdict", numeric=False),
+    Column("Time", priority=1),
+    Column("What it found", numeric=False, priority=2),
+)
+# Blue where the design values' error falls, white where it stays, red where it grows: log2 of the ratio, cut at a
+# quarter and four times (chosen).
+_SCALE = [[0.0, "#2c6fa6"], [0.5, "#ffffff"], [1.0, "#c8102e"]]
+_CUT = 2.0
+
+
+def robot_cells(view: StudyView, robot: str) -> Section:
+    """All cells of one robot."""
+    cells = view.plain(robot)
+    judged = len(view.result.judged_cells)
+    tables: dict[str, tuple[Block, ...]] = {}
+    for cell in cells:
+        name = f"{cell_words(cell)}{' (training errors)' if cell.key.fitted else ''}"
+        tables[name] = (cell_table(cell, view, judged),)
+    return Section(
+        f"cells-{robot}",
+        robot,
+        (heat_map(view, robot), Choice("Cell", tables)),
+        about="Method by cell, against the design.",
+    )
+
+
+def heat_map(view: StudyView, robot: str) -> FigureGrid:
+    """Ratio of every method's error to the design values' in every cell of a robot."""
+    cells = view.plain(robot)
+    methods = [name for name in view.methods if any(name in cell.methods for cell in cells)]
+    values = [[_ratio(cell, name) for cell in cells] for name in methods]
+    logs = [[_log(value) for value in row] for row in values]
+    words = [[NOTHING if value is None else fixed(value, 2) for value in row] for row in values]
+    columns = [text(wrapped(_column(cell), 18)) for cell in cells]
+    trace = go.Heatmap(
+        z=logs,
+        x=list(range(len(cells))),
+        y=list(range(len(methods))),
+        text=words,
+        texttemplate="%{text}",
+        textfont={"size": 12, "color": INK},
+        colorscale=_SCALE,
+        zmin=-_CUT,
+        zmax=_CUT,
+        showscale=False,
+        xgap=2,
+        ygap=2,
+        hoverinfo="skip",
+    )
+    figure = plot(trace)
+    figure.update_xaxes(
+        tickvals=list(range(len(cells))), ticktext=columns, side="top", showgrid=False, ticks="", tickangle=0
+    )
+    figure.update_yaxes(
+        tickvals=list(range(len(methods))), ticktext=[text(name) for name in methods], autorange="reversed", ticks="",
+        showgrid=False, tickfont_color=INK,
+    )  # fmt: skip
+    title = f"{robot}: error as a share of the design values'"
+    described = "; ".join(
+        f"{_column(cell)}: " + ", ".join(f"{name} {words[row][column]}" for row, name in enumerate(methods))
+        for column, cell in enumerate(cells)
+    )
+    caption = (
+        "Columns: training → judged kind. Eq. (6); below 1 the design values' error falls. Training errors: the judged "
+        f"runs trained. {NOTHING}: no answer, or not asked (see the tables)."
+    )
+    height = 120 + 24 * len(methods)
+    return FigureGrid((Figure(title, figure, described, height),), (), 1, caption, f"cells-{robot}")
+
+
+def cell_table(cell: StudyCell, view: StudyView, judged: int) -> Table:
+    """Every method in one cell, the least error first, those without an answer last. judged: cells of the family."""
+    rows = sorted(cell.methods.values(), key=lambda each: (each.errors is None, each.mean("cost") or 0.0))
+    answered = [each for each in rows if each.errors is not None]
+    best = answered[0].method if answered else ""
+    runs = len(set(cell.pairs.runs.tolist()))
+    folds = len(set(cell.pairs.folds.tolist()))
+    size = (
+        f"{plural(runs, 'run')} of {plural(cell.pairs.sessions, 'session')} judge {plural(folds, 'calibration')} each"
+    )
+    ratios = [ratio for each in answered if (ratio := cell.against_design(each.method, judged)) is not None]
+    unit = f"; intervals by {ratios[0].units}" if ratios else ""
+    return Table(
+        f"{cell.key.robot}: {cell_words(cell)}",
+        _COLUMNS,
+        tuple(_row(each, cell, view, judged, each.method == best) for each in rows),
+        f"Mean final errors; {size}{unit}. Small print under the ratio: 95 % interval of this cell; the verdict "
+        f"is that of {plural(judged, 'cell')} together."
+        + (" Training errors, on which no verdict rests." if cell.key.fitted else ""),
+    )
+
+
+def _row(each: MethodInCell, cell: StudyCell, view: StudyView, judged: int, best: bool) -> Row:
+    name = Cell(each.method, view.family(each.method))
+    position, heading = each.mean("position"), each.mean("heading")
+    if position is None or heading is None:
+        return Row.of(name, NOTHING, NOTHING, NOTHING, each.status, NOTHING, each.reason, role="failed")
+    ratio = cell.against_design(each.method, judged)
+    assert ratio is not None  # it has an answer
+    partly = "" if each.answers == each.fits else f"{each.status}; else the design"
+    return Row.of(
+        name,
+        fixed(1e3 * position, 1),
+        fixed(math.degrees(heading), 2),
+        Cell(fixed(ratio.value, 3), _interval(ratio)),
+        Cell("" if cell.key.fitted else _verdict(ratio), partly),
+        seconds(each.seconds),
+        each.numbers,
+        role="best" if best else "plain",
+    )
+
+
+def _interval(ratio: CellRatio) -> str:
+    known = ratio.alone.known
+    return "no interval" if known is None else f"{fixed(known[0], 2)} to {fixed(known[1], 2)}"
+
+
+def _verdict(ratio: CellRatio) -> str:
+    return {"better": "better", "worse": "worse", "undecided": "undecided"}[ratio.verdict]
+
+
+def _ratio(cell: StudyCell, method: str) -> float | None:
+    mean = cell.methods[method].mean("cost") if method in cell.methods else None
+    design = float(cell.design["cost"].mean())
+    return None if mean is None or design == 0 else mean / design
+
+
+def _log(ratio: float | None) -> float | None:
+    return None if ratio is None else float(np.clip(np.log2(max(ratio, 1e-9)), -_CUT, _CUT))
+
+
+def _column(cell: StudyCell) -> str:
+    return f"{cell_words(cell)}{' (training errors)' if cell.key.fitted else ''}"

@@ -1,0 +1,101 @@
+"""A study, from the config to the report: each step is a line of ``run_study``."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+from omnibench.compare.effective_config import load_calibrators
+from omnibench.compare.execute import PRELOAD, execute
+from omnibench.environment import environment
+from omnibench.errors import DataError, Interrupted, require_type
+from omnibench.fit.calibrator import RunResult
+from omnibench.jobs.backend_choice import BackendChoice, open_backend
+from omnibench.jobs.job import BackendError
+from omnibench.jobs.result_store import ResultStore
+from omnibench.processes import one_thread_processes
+from omnibench.progress import Reporter, no_progress
+from omnibench.registry import PluginFailure, calibrators
+from omnibench.report.render import write_document
+from omnibench.study.cells import make_cells
+from omnibench.study.config import StudyConfig
+from omnibench.study.judging import judge_fits
+from omnibench.study.report.study_report import study_document
+from omnibench.study.study_output import check_output, prepare_output, write_results
+from omnibench.study.study_plan import PlannedFit, load_robots, plan_fits
+from omnibench.study.study_result import StudyResult
+
+
+def run_study(
+    config: StudyConfig, output: Path | None = None, progress: Reporter = no_progress, *, force: bool = False
+) -> StudyResult:
+    """Fit every method on every training set of every robot, judge the answers, and write table and report.
+
+    output: the folder of results; fits whose results are there are not repeated. progress: told of reading, of every
+    fit and of judging. force: write into a folder with other files.
+
+    ConfigError or DataError: the config or the folder is unfit, no robot's recordings can be read, or the disk refuses.
+    Interrupted: Ctrl-C; the results of all fits that had ended are kept.
+    """
+    require_type(config, StudyConfig, "study.read_study_config")
+    check_output(output, config, force=force)
+    failures = _load_methods(config)
+    robots, broken = load_robots(config, progress)
+    if not robots:
+        name, reason = next(iter(broken.items()))
+        raise DataError(f"no robot's recordings can be read, the first: {name}: {reason}")
+    fits = plan_fits(config, robots)
+    folder = prepare_output(config, output, force=force)
+    store = ResultStore(folder / "runs", RunResult)
+    asked = [index for index, fit in enumerate(fits) if fit.run is not None]
+    with _resumable(fits, store, folder), ExitStack() as opened:
+        backend = opened.enter_context(open_backend(_backend(config), PRELOAD, progress))
+        opened.enter_context(one_thread_processes(PRELOAD))
+        plan = [run for index in asked if (run := fits[index].run) is not None]
+        results = dict(zip(asked, execute(plan, store, progress, backend), strict=True))
+    judged, design = judge_fits(fits, results, config.integration, progress)
+    result = StudyResult(
+        config=config,
+        output=folder,
+        robots=robots,
+        broken=broken,
+        fits=judged,
+        cells=make_cells(judged, design),
+        environment=environment(),
+        warnings=(
+            *(f"plug-in {each.origin} cannot be imported: {each.error}" for each in failures),
+            *(f"{robot.name}: {warning}" for robot in robots for warning in robot.dataset.warnings),
+        ),
+    )
+    write_results(result)
+    write_document(study_document(result), folder / "report.html")
+    return result
+
+
+def _load_methods(config: StudyConfig) -> list[PluginFailure]:
+    """Load the plug-ins; the fits of one that cannot be imported fail with its error. ConfigError: an unknown name."""
+    failures = load_calibrators(config.plugins, [method.name for method in config.methods])
+    for index, method in enumerate(config.methods):
+        place = f"config {config.name}: methods.{index}"
+        calibrators.create(calibrators.entry(method.name, place).name, method.options, place)
+    return failures
+
+
+def _backend(config: StudyConfig) -> BackendChoice:
+    return BackendChoice(name=config.backend, workers=config.workers or os.cpu_count() or 1, tls=config.tls)
+
+
+@contextmanager
+def _resumable(fits: Sequence[PlannedFit], store: ResultStore[RunResult], folder: Path) -> Iterator[None]:
+    """Let Ctrl-C and a lost cluster end in a line that says which fits are kept and how to continue."""
+    try:
+        yield
+    except (KeyboardInterrupt, BackendError) as error:
+        runs = [fit.run for fit in fits if fit.run is not None]
+        kept = sum(store.get(run.key) is not None for run in runs)
+        way = f"{kept} of {len(runs)} fits are kept in {folder}: run again with -o {folder}"
+        if isinstance(error, BackendError):
+            raise type(error)(f"{error}; {way}") from None
+        raise Interrupted(f"interrupted; {way}") from None

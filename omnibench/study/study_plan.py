@@ -1,0 +1,142 @@
+"""The fits of a study: robots x trainings x regimes x folds x methods x seeds, as runs of a comparison."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+
+from omnibench.compare.config import CompareConfig, CostChoice
+from omnibench.compare.plan import UNBOUNDED, PlannedRun
+from omnibench.data.dataset import Dataset, Trajectory
+from omnibench.errors import ConfigError, OmnibenchError
+from omnibench.fit.problem import make_parameterisation
+from omnibench.fit.shrinkage.prior import default_cost, default_unidentified
+from omnibench.progress import Progress, Reporter
+from omnibench.registry import calibrators
+from omnibench.study.config import MethodChoice, RegimeChoice, StudyConfig
+from omnibench.study.regimes import AS_RECORDED, in_regime
+from omnibench.study.trainings import Fold, Training, divide
+
+
+@dataclass(frozen=True, eq=False)
+class StudiedRobot:
+    """A robot of the study with its runs and how they are divided."""
+
+    name: str
+    dataset: Dataset
+    trainings: tuple[Training, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedFit:
+    """One fit. run: as a comparison makes it; None where the method cannot be asked, for the ``reason``."""
+
+    robot: StudiedRobot
+    training: Training
+    fold: Fold
+    regime: str
+    method: MethodChoice
+    seed: int
+    run: PlannedRun | None
+    reason: str = ""
+
+
+def load_robots(config: StudyConfig, progress: Reporter) -> tuple[tuple[StudiedRobot, ...], dict[str, str]]:
+    """The robots whose recordings can be read, and why not of the others, by name."""
+    robots, broken = [], {}
+    for number, (name, choice) in enumerate(config.robots.items()):
+        progress(Progress("reading the recordings", number, len(config.robots), "robot", note=name))
+        try:
+            dataset = choice.source(config.data).load(name)
+            rules = choice.trainings or config.trainings
+            robots.append(StudiedRobot(name, dataset, divide(dataset, choice, rules, f"robot {name}")))
+        except ConfigError:
+            raise
+        except OmnibenchError as error:
+            broken[name] = str(error)
+    progress(Progress("reading the recordings", len(config.robots), len(config.robots), "robot"))
+    return tuple(robots), broken
+
+
+def plan_fits(config: StudyConfig, robots: tuple[StudiedRobot, ...]) -> list[PlannedFit]:
+    """All fits of the study; those of one training set share it."""
+    regimes = {AS_RECORDED: RegimeChoice(), **config.regimes}
+    return [
+        fit for robot in robots for name, regime in regimes.items() for fit in _of_robot(config, robot, name, regime)
+    ]
+
+
+def _of_robot(config: StudyConfig, robot: StudiedRobot, name: str, regime: RegimeChoice) -> Iterator[PlannedFit]:
+    for training in robot.trainings:
+        if not _named(training.name, regime.trainings):
+            continue
+        for fold in training.folds:
+            runs = tuple(replace(run, split="train") for run in fold.training)
+            runs = in_regime(runs, regime, config.seeds[0])
+            dataset = replace(robot.dataset, trajectories=runs, scans=None)
+            for method in config.methods:
+                if _named(training.name, method.trainings):
+                    for seed in _seeds(config, method):
+                        run, reason = _planned(config, robot, method, dataset, seed, f"{training.name} {fold.name}")
+                        yield PlannedFit(robot, training, fold, name, method, seed, run, reason)
+
+
+def _named(name: str, patterns: tuple[str, ...]) -> bool:
+    return any(fnmatchcase(name, pattern) for pattern in patterns)
+
+
+def _seeds(config: StudyConfig, method: MethodChoice) -> tuple[int, ...]:
+    return config.seeds if calibrators.entry(method.name).cls.stochastic else config.seeds[:1]
+
+
+def _planned(
+    config: StudyConfig, robot: StudiedRobot, method: MethodChoice, dataset: Dataset, seed: int, what: str
+) -> tuple[PlannedRun | None, str]:
+    """A fit as a run of a comparison, or why the method cannot be asked."""
+    calibrator = calibrators.entry(method.name).cls
+    settings = comparison_of(config, robot, method, dataset.trajectories)
+    parameterisation = method.parameterisation or calibrator.parameterisation
+    box, box_name = method.box or config.box, UNBOUNDED
+    if calibrator.bounded:
+        try:
+            searched = make_parameterisation(
+                parameterisation, dataset.robot, dataset.trajectories, box=box, limits=method.limits
+            )
+            box_name = searched.bounds.name
+        except ConfigError as error:  # the robot has no such parameters
+            return None, str(error)
+    entry, training = settings.calibrators[0], dataset.trajectories
+    label = f"{what.strip()}, {method.shown}"
+    run = PlannedRun(settings, robot.name, dataset, training, entry, label, parameterisation, box, box_name, seed)
+    return run, ""
+
+
+def comparison_of(
+    config: StudyConfig, robot: StudiedRobot, method: MethodChoice, training: tuple[Trajectory, ...]
+) -> CompareConfig:
+    """The config of a comparison of one method on one training set; cost and treatment of the undriven by default."""
+    design = robot.dataset.robot
+    choice = config.robots[robot.name]
+    return CompareConfig(
+        name=config.name,
+        datasets={robot.name: choice.source(config.data)},
+        cost=method.cost or CostChoice(name=default_cost(design, len(training))),
+        loss=method.loss,
+        integration=config.integration,
+        box=config.box,
+        unidentified=method.unidentified or default_unidentified(design),
+        mount=method.mount,
+        tolerance=method.tolerance,
+        budget=config.budget,
+        seeds=config.seeds,
+        calibrators=(method.entry,),
+        plugins=config.plugins,
+        timing=config.timing,
+        memory_mb=config.memory_mb,
+    )
+
+
+def costs_of(fits: list[PlannedFit]) -> Mapping[str, str]:
+    """The cost that each method minimised, by its name in tables."""
+    return {fit.method.shown: fit.run.config.objective for fit in fits if fit.run is not None}

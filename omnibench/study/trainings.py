@@ -1,0 +1,206 @@
+"""Division of a robot's runs: which train, fold by fold, and which judge."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+
+from omnibench.data.dataset import Dataset, Trajectory
+from omnibench.data.splits import repetitions
+from omnibench.errors import ConfigError, nearest
+from omnibench.study.config import RobotChoice, TrainingChoice
+from omnibench.words import plural
+
+ONE_KIND = "all paths"  # the kind of every run, where the config names none
+
+
+@dataclass(frozen=True, eq=False)
+class Fold:
+    """One training set. training: its runs. judged: by kind, the indices of the data set's runs that judge it.
+
+    session: of the training runs, where they are of one. fitted: the kind of the training runs, whose own errors are
+    training errors.
+    """
+
+    name: str
+    training: tuple[Trajectory, ...]
+    judged: Mapping[str, tuple[int, ...]]
+    session: str | None = None
+    fitted: Mapping[str, tuple[int, ...]] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Training:
+    """A rule of division applied to a robot's runs: one fold, or one for each session or command."""
+
+    name: str
+    folds: tuple[Fold, ...]
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The kinds that it is judged on, in the order of the folds."""
+        return tuple(dict.fromkeys(kind for fold in self.folds for kind, runs in fold.judged.items() if runs))
+
+    @property
+    def fitted_kinds(self) -> tuple[str, ...]:
+        """The kinds of whose training errors are known."""
+        return tuple(dict.fromkeys(kind for fold in self.folds for kind in fold.fitted or ()))
+
+
+@dataclass(frozen=True, eq=False)
+class _Runs:
+    """A data set's runs with their kinds; None: a run that is left out."""
+
+    dataset: Dataset
+    kinds: tuple[str | None, ...]
+
+    def of(self, kind: str) -> tuple[int, ...]:
+        return tuple(index for index, each in enumerate(self.kinds) if each == kind)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(kind for kind in self.kinds if kind is not None))
+
+    def runs(self, indices: Sequence[int]) -> tuple[Trajectory, ...]:
+        return tuple(self.dataset.trajectories[index] for index in indices)
+
+    def session(self, index: int) -> str | None:
+        return self.dataset.trajectories[index].session
+
+    def others(self, training: Sequence[int]) -> dict[str, tuple[int, ...]]:
+        """All runs outside a training set that are not copies of runs in it, by kind."""
+        within = set(training)
+        copies = {self.dataset.trajectories[index].fingerprint for index in training}
+        return {
+            kind: tuple(
+                index
+                for index in self.of(kind)
+                if index not in within and self.dataset.trajectories[index].fingerprint not in copies
+            )
+            for kind in self.names
+        }
+
+
+def divide(dataset: Dataset, robot: RobotChoice, rules: Sequence[TrainingChoice], place: str) -> tuple[Training, ...]:
+    """The trainings of a robot's runs; those that nothing judges are left out.
+
+    place: what messages begin with. ConfigError: a pattern matches no run, a run is of two kinds, a rule names an
+    unknown kind, or two rules give the same training.
+    """
+    runs = _Runs(dataset, _kinds_of(dataset.trajectories, robot.kinds, place))
+    trainings: dict[str, Training] = {}
+    for rule in rules:
+        for kind in rule.kinds:
+            if kind not in runs.names:
+                hint = nearest(kind, runs.names)
+                raise ConfigError(f"{place}: no kind {kind!r} to train on; {hint}known: {', '.join(runs.names)}")
+        for training in _trainings(runs, rule):
+            if training.name in trainings:
+                raise ConfigError(f"{place}: two trainings are {training.name!r}; leave one out")
+            if training.folds and training.kinds:
+                trainings[training.name] = training
+    if not trainings:
+        raise ConfigError(f"{place}: no run is left to judge by; give it another training")
+    return tuple(trainings.values())
+
+
+def _kinds_of(runs: Sequence[Trajectory], kinds: Mapping[str, Sequence[str]], place: str) -> tuple[str | None, ...]:
+    if not kinds:
+        return (ONE_KIND,) * len(runs)
+    matched: list[list[str]] = [
+        [kind for kind, patterns in kinds.items() if any(fnmatchcase(run.id, pattern) for pattern in patterns)]
+        for run in runs
+    ]
+    for kind, patterns in kinds.items():
+        if not any(kind in of_run for of_run in matched):
+            found = ", ".join(run.id for run in runs[:4])
+            raise ConfigError(f"{place}: no run is of kind {kind} ({', '.join(patterns)}); runs are: {found}, ...")
+    for run, of_run in zip(runs, matched, strict=True):
+        if len(of_run) > 1:
+            raise ConfigError(f"{place}: run {run.id} is of kinds {' and '.join(of_run)}; make the patterns differ")
+    return tuple(of_run[0] if of_run else None for of_run in matched)
+
+
+def _trainings(runs: _Runs, rule: TrainingChoice) -> Iterator[Training]:
+    if rule.by == "split":
+        yield _own_split(runs)
+    elif rule.leave_out == "kind":
+        yield from _kinds_left_out(runs)
+    else:
+        for kind in rule.kinds or runs.names:
+            if rule.by == "session":
+                yield _each_session(runs, kind)
+            elif rule.by == "kind":
+                yield from _whole_kind(runs, kind, rule.runs_per_command)
+            elif rule.leave_out is not None:
+                yield _left_out(runs, kind, rule.leave_out)
+
+
+def _own_split(runs: _Runs) -> Training:
+    train = [index for index, run in enumerate(runs.dataset.trajectories) if run.split == "train" and runs.kinds[index]]
+    judged = runs.others(train)
+    fold = Fold("", runs.runs(train), judged, fitted=_by_kind(runs, train))
+    return Training("own split", (fold,) if train else ())
+
+
+def _whole_kind(runs: _Runs, kind: str, curve: Sequence[int]) -> Iterator[Training]:
+    """All runs of a kind train; on a learning curve the first of each command, judged by what never trains."""
+    members = runs.of(kind)
+    if not curve:
+        yield Training(kind, (Fold("", runs.runs(members), runs.others(members), fitted={kind: members}),))
+        return
+    used = _first_of_commands(runs, members, max(curve))
+    for count in curve:
+        train = _first_of_commands(runs, members, count)
+        fold = Fold("", runs.runs(train), runs.others(used), fitted={kind: tuple(train)})
+        yield Training(f"{kind}, {plural(count, 'run')} a command", (fold,))
+
+
+def _first_of_commands(runs: _Runs, members: Sequence[int], count: int) -> list[int]:
+    chosen = runs.runs(members)
+    numbers = repetitions([run.command or run.id for run in chosen])
+    return [index for index, number in zip(members, numbers, strict=True) if number <= count]
+
+
+def _each_session(runs: _Runs, kind: str) -> Training:
+    folds = []
+    for session, members in _grouped(runs, runs.of(kind), "session").items():
+        judged = {
+            name: tuple(index for index in indices if name != kind or runs.session(index) != session)
+            for name, indices in runs.others(members).items()
+        }
+        folds.append(Fold(session, runs.runs(members), judged, session))
+    return Training(f"{kind}, one session", tuple(folds))
+
+
+def _left_out(runs: _Runs, kind: str, what: str) -> Training:
+    members = runs.of(kind)
+    folds = []
+    groups = _grouped(runs, members, what)
+    for name, judged in groups.items():
+        training = [index for index in members if index not in set(judged)]
+        if training:
+            folds.append(Fold(f"without {name}", runs.runs(training), {kind: tuple(judged)}))
+    return Training(f"{kind}, a {what} left out", tuple(folds) if len(groups) > 1 else ())
+
+
+def _kinds_left_out(runs: _Runs) -> Iterator[Training]:
+    for kind in runs.names:
+        training = [index for index, each in enumerate(runs.kinds) if each not in (kind, None)]
+        if training:
+            yield Training(f"all but {kind}", (Fold("", runs.runs(training), {kind: runs.of(kind)}),))
+
+
+def _grouped(runs: _Runs, members: Sequence[int], what: str) -> dict[str, list[int]]:
+    """Indices by session or command; runs without one are a group each."""
+    groups: dict[str, list[int]] = {}
+    for index in members:
+        run = runs.dataset.trajectories[index]
+        groups.setdefault((run.session if what == "session" else run.command) or run.id, []).append(index)
+    return groups
+
+
+def _by_kind(runs: _Runs, members: Sequence[int]) -> dict[str, tuple[int, ...]]:
+    kinds = dict.fromkeys(runs.kinds[index] for index in members)
+    return {kind: tuple(i for i in members if runs.kinds[i] == kind) for kind in kinds if kind is not None}
