@@ -76,8 +76,8 @@ def _rank_words(ranked: Ranking) -> str:
     return (
         f"Methods that answered in all {plural(ranked.cells, 'cell')}. Bars join methods whose mean ranks differ by "
         f"less than the critical difference, {fixed(ranked.critical_difference, 2)} (Nemenyi, 95 %); Friedman's "
-        f"test that all are alike: p = {significant(ranked.p_value, 2)}. Cells of one robot share runs, so that the true "
-        "critical difference is larger."
+        f"test that all are alike: p = {significant(ranked.p_value, 2)}. Cells of one robot share runs, so that the "
+        "true critical difference is larger."
     )
 
 
