@@ -1,0 +1,102 @@
+"""Which runs train and which judge."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from sample_robots import DIFFERENTIAL
+from studied import robot_dataset
+
+from omnibench.data.dataset import Dataset, make_dataset
+from omnibench.errors import ConfigError
+from omnibench.study.config import RobotChoice, TrainingChoice
+from omnibench.study.trainings import Training, divide
+
+KINDS = {"line": ("line_*",), "arc": ("arc_*",)}
+
+
+@pytest.fixture(scope="module")
+def dataset() -> Dataset:
+    return robot_dataset(DIFFERENTIAL, "two wheels", 1)
+
+
+def divided(dataset: Dataset, *rules: TrainingChoice, kinds: dict[str, tuple[str, ...]] = KINDS) -> dict[str, Training]:
+    choice = RobotChoice(path=("x",), kinds=kinds)
+    return {training.name: training for training in divide(dataset, choice, rules, "robot two")}
+
+
+@pytest.mark.parametrize(
+    "rule",
+    [
+        TrainingChoice(by="kind"),
+        TrainingChoice(by="session"),
+        TrainingChoice(by="kind", runs_per_command=(1, 2)),
+        TrainingChoice(leave_out="session"),
+        TrainingChoice(leave_out="command"),
+        TrainingChoice(leave_out="kind"),
+    ],
+    ids=str,
+)
+def test_no_run_judges_what_it_trained(dataset: Dataset, rule: TrainingChoice) -> None:
+    for training in divided(dataset, rule).values():
+        for fold in training.folds:
+            trained = {run.id for run in fold.training}
+            judging = {dataset.trajectories[index].id for indices in fold.judged.values() for index in indices}
+            assert trained
+            assert judging
+            assert not trained & judging
+
+
+def test_one_session_trains_and_all_other_sessions_and_kinds_judge(dataset: Dataset) -> None:
+    training = divided(dataset, TrainingChoice(by="session"))["arc, one session"]
+    fold = training.folds[0]
+    assert {run.session for run in fold.training} == {fold.session} == {"arc day 0"}
+    of_kinds = {kind: {dataset.trajectories[index].session for index in runs} for kind, runs in fold.judged.items()}
+    assert of_kinds == {"line": {f"line day {day}" for day in range(3)}, "arc": {"arc day 1", "arc day 2"}}
+
+
+def test_a_learning_curve_is_judged_by_the_same_runs_at_every_length(dataset: Dataset) -> None:
+    trainings = divided(dataset, TrainingChoice(by="kind", kinds=("arc",), runs_per_command=(1, 2)))
+    short, long = (trainings[f"arc, {words} a command"].folds[0] for words in ("1 run", "2 runs"))
+    assert (len(short.training), len(long.training)) == (2, 4)
+    assert short.judged == long.judged
+
+
+def test_without_a_session_the_kind_judges_that_session_alone(dataset: Dataset) -> None:
+    fold = divided(dataset, TrainingChoice(leave_out="session"))["line, a session left out"].folds[1]
+    assert {dataset.trajectories[index].session for index in fold.judged["line"]} == {"line day 1"}
+    assert {run.session for run in fold.training} == {"line day 0", "line day 2"}
+
+
+def test_a_copy_of_a_training_run_does_not_judge(dataset: Dataset) -> None:
+    runs = dataset.trajectories
+    copied = make_dataset("copied", DIFFERENTIAL, dataset.sample_period, [*runs, replace(runs[0], id="arc_copy")])
+    fold = divided(copied, TrainingChoice(by="kind"))["line"].folds[0]
+    assert "arc_copy" not in {copied.trajectories[index].id for index in fold.judged["arc"]}
+
+
+def test_a_data_sets_own_split_is_kept(dataset: Dataset) -> None:
+    runs = [replace(run, split="validation" if "_2_" in run.id else "train") for run in dataset.trajectories]
+    halved = make_dataset("halved", DIFFERENTIAL, dataset.sample_period, runs)
+    fold = divided(halved, TrainingChoice(by="split"), kinds={})["own split"].folds[0]
+    judging = {halved.trajectories[index].id for index in fold.judged["all paths"]}
+    assert judging == {run.id for run in runs if run.split == "validation"}
+
+
+@pytest.mark.parametrize(
+    ("kinds", "rule", "words"),
+    [
+        ({"arc": ("arcs_*",)}, TrainingChoice(by="kind"), "no run is of kind arc (arcs_*)"),
+        ({"arc": ("arc_*",), "all": ("*",)}, TrainingChoice(by="kind"), "is of kinds arc and all"),
+        (KINDS, TrainingChoice(by="kind", kinds=("arcs",)), "no kind 'arcs' to train on; did you mean 'arc'?"),
+        (KINDS, TrainingChoice(by="split"), "no run is left to judge by"),
+    ],
+)
+def test_a_division_that_cannot_be_made_is_one_clear_line(
+    dataset: Dataset, kinds: dict[str, tuple[str, ...]], rule: TrainingChoice, words: str
+) -> None:
+    with pytest.raises(ConfigError) as raised:
+        divided(dataset, rule, kinds=kinds)
+    assert words in str(raised.value)
+    assert str(raised.value).startswith("robot two: ")
