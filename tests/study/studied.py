@@ -39,8 +39,8 @@ def robot_dataset(robot: Robot, name: str, seed: int, spoil: float = 0.05) -> Da
         for session in range(3):
             for number, twist in enumerate(twists):
                 for repetition in (1, 2):
-                    name = f"{kind}_{session}_{number}_{repetition}"
-                    run = _run(robot, shares, np.array(twist), rng, name)
+                    run_id = f"{kind}_{session}_{number}_{repetition}"
+                    run = _run(robot, shares, np.array(twist), rng, run_id)
                     runs.append(
                         replace(run, command=f"{kind}{number}", repetition=repetition, session=f"{kind} day {session}")
                     )
