@@ -10,6 +10,7 @@ from omnibench.compare.config import CalibratorEntry, CompareConfig
 from omnibench.compare.run_key import run_key
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.errors import ConfigError
+from omnibench.fit.calibrator import as_answered
 from omnibench.fit.geometry import GeometryLimits
 from omnibench.fit.loss.robust_cost import with_loss
 from omnibench.fit.parameterisation import Box, ParameterisationName
@@ -49,6 +50,8 @@ class RunTask:
 
     def problem(self, watch: Reporter = no_progress) -> CalibrationProblem:
         """The calibration problem; ``watch`` is told the evaluations so far and the best cost."""
+        calibrator = calibrators.entry(self.entry.name).cls
+        unidentified, mount = as_answered(calibrator, self.config.unidentified, self.config.mount)
         return CalibrationProblem(
             self.robot,
             self.trajectories,
@@ -59,14 +62,14 @@ class RunTask:
                 self.trajectories,
                 box=self.box,
                 limits=self.entry.limits,
-                unidentified=self.config.unidentified,
-                mount=self.config.mount,
+                unidentified=unidentified,
+                mount=mount,
                 tolerance=self.config.tolerance,
             ),
             integration=self.config.integration,
             budget=self.config.budget,
             seed=self.seed,
-            shrinks=self.config.unidentified == "shrink",
+            shrinks=unidentified == "shrink",
             watch=watch,
         )
 

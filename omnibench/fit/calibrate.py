@@ -9,7 +9,7 @@ from typing import Any, get_args
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.environment import package_versions
 from omnibench.errors import ConfigError, require_choice, require_range, require_type
-from omnibench.fit.calibrator import Calibrator, RunResult, run_calibrator
+from omnibench.fit.calibrator import Calibrator, RunResult, as_answered, run_calibrator
 from omnibench.fit.cost import Cost
 from omnibench.fit.evaluate import verdict_on
 from omnibench.fit.geometry import FittedParameter, GeometryLimits, WheelGeometry, fitted_parameters
@@ -148,7 +148,7 @@ def calibrate(
     cost = cost or default_cost(dataset.robot, len(training))
     plain: Cost = costs.create(cost)
     objective = with_loss(plain, loss)
-    unidentified = unidentified or default_unidentified(dataset.robot)
+    unidentified, mount = as_answered(chosen, unidentified or default_unidentified(dataset.robot), mount)
     _check_choices(chosen, loss, unidentified, tolerance, intervals)
     terms: tuple[Term, ...] = ()
     driven = training

@@ -13,6 +13,8 @@ from pydantic import BaseModel
 from omnibench.errors import NotApplicableError, OmnibenchError, PluginError, one_line
 from omnibench.fit.parameterisation import ParameterisationName
 from omnibench.fit.problem import BudgetSpent, CalibrationProblem, Improvement
+from omnibench.fit.shrinkage.prior import MountChoice
+from omnibench.fit.span import Unidentified
 from omnibench.jobs.memory import memory_limit
 from omnibench.registry import AnyOptions, Options, PluginFailure, calibrators
 from omnibench.robot.calibration import ModelExtension, Noise, extended_model, matrix_flaw
@@ -91,6 +93,13 @@ class Calibrator(ABC):
 
 
 calibrators.contract = Calibrator
+
+
+def as_answered(
+    calibrator: type[Calibrator] | Calibrator, unidentified: Unidentified, mount: MountChoice | None
+) -> tuple[Unidentified, MountChoice | None]:
+    """How answers are treated: as asked for, but those that keep to no box, such as an article's, stand as they are."""
+    return (unidentified, mount) if calibrator.bounded else ("fit", "fit")
 
 
 @dataclass(frozen=True)
