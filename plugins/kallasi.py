@@ -44,7 +44,7 @@ from omnibench.robot.robot_class import class_of
 from omnibench.words import plural
 
 # Of the larger singular value of Eq. (2): below it the steering angle was the same all the time, and noise alone would
-# tell offset and scale apart. Chosen: it is 0.2 on circles.
+# tell offset and scale apart. Chosen: it is 0.2 on OptiOdom's circles.
 _MISSING = 0.01
 _TURNED = 0.1  # rad: paths that turn by less in all segments are straight; chosen
 

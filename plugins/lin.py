@@ -42,7 +42,7 @@ from omnibench.robot.robot_class import class_of
 
 _UNDRIVEN = 1e-6  # of the largest singular value: smaller ones are rounding
 # The same, for the third one of the wheels' angles: below it the paths lack a motion, which noise alone would fit.
-# Chosen: it is 0.3 on circles and squares.
+# Chosen: it is 0.5 on OptiOdom's circles.
 _MISSING = 0.01
 
 
@@ -87,8 +87,9 @@ class Lin(Calibrator):
         position = moved[:, 0] + 1j * moved[:, 1]
         factors = 1 + _least_squares(_real(columns), _real(position - columns.sum(axis=1)))  # Eq. (2)
         matrix = np.vstack([design[:2] * factors, turning])
+        vector = matrix.ravel()
         reason = f"on {len(poses)} segments: factors of rows 1 and 2 {_listed(factors, problem.robot)}; "
-        return Solution(matrix.ravel(), f"{reason}row 3 {_listed(turning, problem.robot)}")
+        return Solution(vector, f"{reason}row 3 {_listed(problem.matrix(vector)[2], problem.robot)}")
 
 
 def _segment_ends(run: Trajectory, design: Array, length: float) -> Array:
@@ -106,7 +107,7 @@ def _segment_ends(run: Trajectory, design: Array, length: float) -> Array:
 
 
 def _headings(run: Trajectory, turning: Array, integration: Integration) -> Array:
-    """Headings psi (F,) by row 3 of the matrix (N,), rad: in the middle of every sample, for Euler steps at its begin."""
+    """Headings psi (F,) by row 3 of the matrix (N,), rad: in the middle of a sample, for Euler steps at its begin."""
     turns = (run.signals @ turning) * np.diff(run.times, prepend=0.0)
     headings: Array = run.start[2] + np.cumsum(turns) - turns * (0.5 if integration == "arc" else 1.0)
     return headings

@@ -1,36 +1,40 @@
-"""OptiOdom after Sousa et al.: wheel distance and wheel diameters by resilient propagation on positions.
+"""OptiOdom after Sousa et al.: a length and the wheels' diameters by resilient propagation on positions.
 
 R. B. Sousa, M. R. Petry, P. G. Costa, A. P. Moreira, "OptiOdom: a generic approach for odometry calibration of wheeled
 mobile robots", J. Intell. Robot. Syst. 105:39 (2022), doi 10.1007/s10846-022-01630-3, and the authors' program.
 
-For differential drives, tricycles, omni robots with three wheels and mecanum bases with four, on any paths on which the
-robot drives and turns. Parameters p (n,): a length l (m: the distance between the wheels of a differential drive, of the
-wheel from the axle of a tricycle, else the mean lever arm of the wheels), the diameters D_i (m), and of a tricycle the
-steering offset a (rad). With l0, D0_i and C (3, M) the design, and T (3, 3) the place of the tracked point, the matrix is
+For differential drives, tricycles, omni robots with three wheels and mecanum bases with four, on any paths that turn.
+The parameters p (n,) are a length l, m (the distance between the wheels of a differential drive, of the wheel from the
+axle of a tricycle, else the mean lever arm of the wheels), the diameters D_i, m, and of a tricycle the steering offset
+a, rad. With l0, D0_i and C (3, M) as designed, and T (3, 3) the place of the tracked point, the matrix is
 
-    K = T diag(1, 1, l0 / l) C diag(D_1 / D0_1, ...),                                                  (1)
+    K = T diag(1, 1, l0/l) C diag(D_1/D0_1, D_2/D0_2, ...),                                           (1)
+    K = T diag(1, 1, l0/l) C (D/D0) [[cos a, -sin a], [sin a, cos a]]   of a tricycle.                  (2)
 
-for a tricycle K = T diag(1, 1, l0 / l) C (D / D0) [[cos a, -sin a], [sin a, cos a]]. Every run is cut into path segments
-that begin at its start and end after every 0.5 m of the path that the design drives, and at its end. With z(s) the
-position x + i y that the odometry has at the end s of a segment, and g(s) that of the reference, the objective is
+Every run is cut into path segments that begin at its start and end after every 0.5 m of the path that the design
+drives, and at its end. With z(s) the position x + i y by odometry at the end s of a segment, and g(s) that of the
+reference, the objective is
 
-    E = sum_s |z(s) - g(s)|^2,                                                                        (2)
+    E = sum_s |z(s) - g(s)|^2,                                                                       (3)
 
-without headings. Odometry adds up steps v(k) f(k), v(k) = (K1 + i K2) . d(k) with the wheels' angles d(k) (M,), rad, and
-f(k) = sin(h)/h exp(i K3 . c(k)) with c(k) the angles driven up to the middle of the sample and h = K3 . d(k) / 2. Let
-e(k) be the sum of the errors z(s) - g(s) at all s of the run from sample k on. Then
+without headings. Let d(k) (M,) be the angles driven in sample k, rad, c(k) those driven up to its middle, v = (K1 + i
+K2) . d, h = K3 . d / 2 and f = sin(h)/h exp(i K3 . c), so that odometry adds up steps v f; and e(k) the sum of the
+errors z(s) - g(s) at all s of the run from sample k on. Then
 
-    dE/dK1 = 2 sum_k Re(e* f) d,  dE/dK2 = -2 sum_k Im(e* f) d,                                         (3)
-    dE/dK3 = 2 sum_k (-Im(e* v f) c + Re(e* v f') d / 2),  f' = df/dh at a fixed direction.                  (4)
+    dE/dK1 = 2 sum_k Re(e* f) d,    dE/dK2 = -2 sum_k Im(e* f) d,                                     (4)
+    dE/dK3 = 2 sum_k (-Im(e* v f) c + Re(e* v exp(i K3 . c)) d(sin(h)/h)/dh d / 2).                    (5)
 
-iRprop- (Igel and Huesken 2003) changes each parameter by its own step, against the sign of its derivative: the step grows
-by a factor of 1.005 while the sign stays, and is halved when it turns, after which the parameter rests once. Smallest
-and largest steps and the rule that ends the search are the authors' of each robot, below; the first steps are the smallest.
+iRprop- (Igel and Huesken 2003) changes each parameter by a step of its own against the sign of its derivative. The step
+grows by a factor of 1.005 while the sign stays, and is halved when it turns, after which the parameter rests once. The
+smallest and largest steps and the rule that ends the search are the authors' for each robot. The first steps are the
+smallest ones.
 
-Differences from the authors' program. The odometry is the one that judges the outcome (arcs, or Euler steps), while the
-authors turn every step of an omni robot's exact arc by another half of the sample's turn. The answer is the best
-parameters of all steps, not those of the last. A mecanum base has one length in the place of two, l = (l1 + l2) / 2,
-whose derivatives are the same. Lengths and diameters are searched to the smallest step, 0.01 mm, and no further.
+Differences from the authors' program. The odometry is the one that judges the outcome, while the authors turn every
+step of an omni robot, an exact arc already, by another half of the sample's turn; the steering angle is that in the
+middle of a sample, not at its end; the answer is the best of all steps, not the last; a mecanum base has one length,
+(l1 + l2) / 2, in the place of two with the same derivatives. Where the rule ends the search before the minimum, such
+details count: on OptiOdom's tricycle the search rests at 72 mm rms, the minimum has 54 mm, and the angle at the end
+alone changes the mean final error by 4 %. On its omni robot the authors' step changes it by 2 %.
 """
 
 from __future__ import annotations
@@ -51,6 +55,7 @@ from omnibench.registry import Options, calibrators
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import Integration, chord_shares
 from omnibench.robot.robot_class import RobotClass, class_of
+from omnibench.words import plural
 
 _GROWTH, _CUT = 1.005, 0.5  # factors on a step when the derivative keeps its sign, and when it does not
 _TURNED = 0.2  # rad: least turn of a run away from its start; chosen, to tell a length from diameters at all
@@ -102,7 +107,7 @@ class OptiOdom(Calibrator):
         return _WHEELS.get(class_of(robot)) == len(robot.measured)
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
-        """Step until the objective of Eq. (2) rests."""
+        """Step until the objective of Eq. (3) rests."""
         if problem.parameterisation.name != "matrix":
             raise OmnibenchError("optiodom answers with a matrix; use the parameterisation matrix")
         runs = [run for run in problem.trajectories if run.has_poses and len(run.pose_times) > 1]
@@ -112,12 +117,10 @@ class OptiOdom(Calibrator):
             raise NotApplicableError("it is for paths that turn, and these are straight")
         geometry, rule = Geometry.of(problem.robot), _RULES[class_of(problem.robot)]
         segments = Segments(runs, geometry.design, self.options.segment, problem.integration)
-        smallest, largest = geometry.spread(rule.smallest), geometry.spread(rule.largest)
-        parameters, steps, before = geometry.start, smallest, np.zeros(len(smallest))
-        costs, best = list[float](), (math.inf, parameters)
-        end = f"{self.options.steps} steps"
-        converged = False
-        while len(costs) < self.options.steps:
+        search = Rprop(geometry.spread(rule.smallest), geometry.spread(rule.largest))
+        parameters, costs, best = geometry.start, list[float](), (math.inf, geometry.start)
+        end, converged = "", False
+        while not end:
             matrix, slopes = geometry.matrix(parameters)
             cost, gradient = segments.cost(matrix)
             costs.append(cost)
@@ -125,18 +128,30 @@ class OptiOdom(Calibrator):
             problem.report(len(costs), self.options.steps, "step", math.sqrt(best[0] / len(segments)))
             if converged := _rests(costs, rule):
                 end = f"at rest after {len(costs)} steps"
-                break
-            if problem.seconds_left <= 0:
-                end = f"time budget of {problem.budget.seconds:g} s spent after {len(costs)} steps"
-                break
-            now = np.tensordot(slopes, gradient, 2)
-            same = now * before
-            steps = np.where(same > 0, np.minimum(steps * _GROWTH, largest), steps)
-            steps = np.where(same < 0, np.maximum(steps * _CUT, smallest), steps)
-            before = np.where(same < 0, 0.0, now)
-            parameters = parameters - np.sign(before) * steps
+            elif problem.seconds_left <= 0:
+                end = f"time budget of {problem.budget.seconds:g} s spent after {plural(len(costs), 'step')}"
+            elif len(costs) == self.options.steps:
+                end = f"not at rest after {plural(len(costs), 'step')}"
+            parameters = search.step(parameters, np.tensordot(slopes, gradient, 2))
         reason = f"{end}, {1e3 * math.sqrt(best[0] / len(segments)):.1f} mm rms: {geometry.in_words(best[1])}"
         return Solution(geometry.matrix(best[1])[0].ravel(), reason, converged)
+
+
+class Rprop:
+    """iRprop-: a step of its own for each parameter, by the sign of its derivative."""
+
+    def __init__(self, smallest: Array, largest: Array) -> None:
+        self._smallest, self._largest = smallest, largest
+        self._steps, self._before = smallest, np.zeros(len(smallest))
+
+    def step(self, parameters: Array, derivatives: Array) -> Array:
+        """The parameters (n,) after a step against the signs of the objective's derivatives (n,) by them."""
+        agreement = derivatives * self._before
+        grown = np.minimum(self._steps * _GROWTH, self._largest)
+        cut = np.maximum(self._steps * _CUT, self._smallest)
+        self._steps = np.where(agreement > 0, grown, np.where(agreement < 0, cut, self._steps))
+        self._before = np.where(agreement < 0, 0.0, derivatives)
+        return parameters - np.sign(self._before) * self._steps
 
 
 def _rests(costs: list[float], rule: Rule) -> bool:
@@ -149,7 +164,10 @@ def _rests(costs: list[float], rule: Rule) -> bool:
 
 @dataclass(frozen=True)
 class Geometry:
-    """The parameters of a robot and the matrix of Eq. (1). diameters: number of them; steered: they end in an offset."""
+    """The parameters of a robot, and its matrix by Eq. (1) or (2).
+
+    start (n,): their values as designed. diameters: number of these. steered: True if an offset is the last parameter.
+    """
 
     robot: Robot
     start: Array
@@ -179,7 +197,7 @@ class Geometry:
         return np.array([values[0], *[values[1]] * self.diameters, *[values[2]] * self.steered])
 
     def matrix(self, parameters: Array) -> tuple[Array, Array]:
-        """The matrix (3, M) of parameters (n,), and its derivatives (n, 3, M)."""
+        """The matrix (3, M) of parameters (n,), and its derivatives (n, 3, M) by them."""
         place = np.eye(3) if self.robot.mount is None else self.robot.mount.twist
         length, ratios = parameters[0], parameters[1 : 1 + self.diameters] / self.start[1 : 1 + self.diameters]
         centre = self.robot.centre_matrix * np.array([[1.0], [1.0], [self.start[0] / length]]) * ratios
@@ -211,26 +229,27 @@ class Segments:
         self._up_to = before + self._driven / 2 if self._arc else before  # c (F, M)
         self._samples = np.concatenate([samples for _, samples, _ in cut])  # of each segment's last piece, (S,)
         self._first = np.cumsum(self._samples) - self._samples
-        self._runs = np.repeat(np.arange(len(runs)), [len(samples) for _, samples, _ in cut])
+        edges = np.cumsum([0, *(len(samples) for _, samples, _ in cut)])
+        self._begin, self._last = (np.repeat(edge, np.diff(edges)) for edge in (edges[:-1], edges[1:] - 1))
         self._reference = np.concatenate([moved for _, _, moved in cut])  # g (S,)
-        self._edges = np.searchsorted(self._runs, np.arange(len(runs) + 1))
 
     def __len__(self) -> int:
         return len(self._reference)
 
     def cost(self, matrix: Array) -> tuple[float, Array]:
-        """The objective of Eq. (2), m2, and its derivatives (3, M) by the elements of a matrix (3, M)."""
+        """The objective of Eq. (3), m2, and its derivatives (3, M) by the elements of a matrix (3, M)."""
         speed = self._driven @ matrix[0] + 1j * (self._driven @ matrix[1])
         direction, half = self._up_to @ matrix[2], self._driven @ matrix[2] / 2
         turn = np.cos(direction) + 1j * np.sin(direction)
         share = chord_shares(half) if self._arc else np.ones(len(half))
         moved = np.add.reduceat(speed * turn * share, self._first)
         errors = self._summed(moved) - self._reference
-        tails = self._summed(errors[::-1], backwards=True)[::-1]
-        pulled = np.repeat(tails.conj(), self._samples) * turn  # e* f / share
-        by_position = (pulled * share) @ self._driven  # Eq. (3)
+        sums = self._summed(errors)
+        tails = sums[self._last] - sums + errors  # e of each segment
+        pulled = np.repeat(tails.conj(), self._samples) * turn  # e* exp(i K3 . c)
+        by_position = (pulled * share) @ self._driven  # Eq. (4)
         pulled *= speed
-        by_heading = -(pulled.imag * share) @ self._up_to  # Eq. (4)
+        by_heading = -(pulled.imag * share) @ self._up_to  # Eq. (5)
         if self._arc:
             small = np.abs(half) < _SMALL
             slope = np.where(small, -half / 3, (np.cos(half) - share) / np.where(small, 1.0, half))
@@ -238,20 +257,17 @@ class Segments:
         gradient = 2 * np.array([by_position.real, -by_position.imag, by_heading])
         return float((errors.real**2 + errors.imag**2).sum()), gradient
 
-    def _summed(self, values: NDArray[np.complex128], backwards: bool = False) -> NDArray[np.complex128]:
-        """Sums (S,) of values (S,) from the first segment of each run on; backwards: the segments are in turned order."""
+    def _summed(self, values: NDArray[np.complex128]) -> NDArray[np.complex128]:
+        """Sums (S,) of values (S,) from the first segment of each run on."""
         sums = np.cumsum(values)
-        edges = len(values) - self._edges[::-1] if backwards else self._edges
-        counts = np.diff(edges)
-        before = np.append(0.0, sums)[edges[:-1]]
-        summed: NDArray[np.complex128] = sums - np.repeat(before, counts)
+        summed: NDArray[np.complex128] = sums - np.append(0.0, sums)[self._begin]
         return summed
 
 
 def _cut(run: Trajectory, design: Array, length: float) -> tuple[Array, NDArray[np.intp], NDArray[np.complex128]]:
-    """A run as pieces of constant rates: their angles (F, M), pieces in each segment (S,), and positions (S,) at the ends.
+    """A run as pieces of constant rates: their angles (F, M), pieces in each segment (S,), positions (S,) at the ends.
 
-    Samples are cut at the ends of segments; pieces in which no wheel turns are left out.
+    Samples are cut at the ends of the segments. Pieces in which no wheel turns are left out.
     """
     knots = np.append(0.0, run.times)
     driven = np.cumsum(run.signals * np.diff(knots)[:, None], axis=0)
