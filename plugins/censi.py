@@ -2,8 +2,8 @@
 
 A. Censi, A. Franchi, L. Marchionni, G. Oriolo, "Simultaneous calibration of odometry and sensor parameters for mobile
 robots", IEEE Transactions on Robotics 29:475-492 (2013). Wheels of radius r_L and r_R on an axle b turn at the rates
-omega_L and omega_R; the sensor stands at the pose l = (l_x, l_y, l_theta) in the frame in the axle's middle. Of the six
-parameters only the wheel rates and the sensor's own motion s = (s_x, s_y, s_theta) in each of many intervals are needed:
+omega_L and omega_R; the sensor stands at the pose l = (l_x, l_y, l_theta) in the frame in the axle's middle. These six
+parameters follow from the wheel rates and the sensor's own motions s = (s_x, s_y, s_theta) in many intervals of time:
 
     J_21 = -r_L / b,    J_22 = r_R / b.                                                                   (1)
 
@@ -12,9 +12,9 @@ parameters only the wheel rates and the sensor's own motion s = (s_x, s_y, s_the
     s_theta = J_21 phi_L + J_22 phi_R                                                                   (2)
 
    is linear, and least squares over the intervals give J_21 and J_22.
-2. These give the turn within each interval, and thereby the robot's displacement b (c_x, c_y), which the odometry
-   measures with an axle of length 1. As the sensor goes along, l + R(l_theta) s = b c + R(s_theta) l, with R(a) the turn
-   by a; for theta = J_21 phi_L + J_22 phi_R these are two equations Q p = 0 of an interval in
+2. These give the turn theta = J_21 phi_L + J_22 phi_R within each interval, and thereby the robot's displacement
+   b (c_x, c_y), which the odometry measures with an axle of length 1. The sensor goes along, so that
+   l + R(l_theta) s = b c + R(theta) l, with R(a) the turn by a. These are two equations Q p = 0 of an interval in
    p = (b, l_x, l_y, cos l_theta, sin l_theta),
 
     Q = [ -c_x   1 - cos theta   sin theta       s_x   -s_y ]
@@ -28,8 +28,8 @@ parameters only the wheel rates and the sensor's own motion s = (s_x, s_y, s_the
    with the smaller eigenvalue, and the others are -A^-1 B times these; of the two signs that one counts which makes
    b > 0. That is the article's solution by a Lagrange multiplier, the root of a quadratic equation.
 
-The answer is the matrix of the tracked point at l. Where the problem holds the tracked point at its design place (mount:
-known, the default for this class of robot), only what such a point can do is kept of it, and the reason names l.
+The answer is the matrix of the tracked point at l. Where the problem holds the tracked point at its design place
+(mount: known, the default for this class of robot), what such a point cannot do is taken from it; the reason names l.
 
 From the article's public program (AndreaCensi/calibration) are (2) and (3). Different here:
 
@@ -56,13 +56,14 @@ from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
 from omnibench.robot.kinematics import Array, Mount, Robot
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.planar import relative, rotated
+from omnibench.robot.planar import relative
 from omnibench.robot.robot_class import class_of
 from omnibench.words import plural
 
-_WORST_CONDITION = (
-    1e10  # of the normal equations, in units of their diagonals: rounding would be seen above it (chosen)
-)
+# Of the normal equations, in units of their diagonals: rounding would be seen above it (chosen).
+_WORST_CONDITION = 1e10
+_WORST_SPREAD = 0.1  # share of the axle: a tape measure does better than a larger standard error (chosen)
+_LACKING = "it needs runs that both drive and turn, and these leave parameters open"
 
 
 class CensiOptions(Options):
@@ -88,22 +89,23 @@ class Censi(Calibrator):
         """Steps 1 and 2. NotApplicableError: the runs leave some of the six parameters open."""
         if problem.parameterisation.name != "matrix":
             raise ConfigError("censi gives a matrix; say parameterisation: matrix")
-        ends = [_ends(run, self.options.interval) for run in problem.trajectories if run.has_poses]
-        cut = [run for run in problem.trajectories if run.has_poses]
-        turned = np.concatenate([np.diff(_angles(run)[kept], axis=0) for run, kept in zip(cut, ends, strict=True)])
-        sensor = np.concatenate([_motions(run.poses[kept]) for run, kept in zip(cut, ends, strict=True)])
-        rates = _solved(turned.T @ turned, turned.T @ sensor[:, 2], "turns of the robot")  # Eq. (2)
+        runs = [run for run in problem.trajectories if run.has_poses]
+        ends = [_ends(run, self.options.interval) for run in runs]
+        turned = np.concatenate(
+            [np.diff(run.angles_at_poses[kept], axis=0) for run, kept in zip(runs, ends, strict=True)]
+        )
+        sensor = np.concatenate([_motions(run.poses[kept]) for run, kept in zip(runs, ends, strict=True)])
+        rates = _solved(turned.T @ turned, turned.T @ sensor[:, 2], "the two wheels")  # Eq. (2)
         unit = _unit_axle(problem.robot, rates)
-        logs = [run.log(run.pose_times[kept]) for run, kept in zip(cut, ends, strict=True)]
+        logs = [run.log(run.pose_times[kept]) for run, kept in zip(runs, ends, strict=True)]
         paths = OdometryModel(problem.robot, unit, problem.integration).poses(logs)
         robot = np.concatenate([_motions(path) for path in paths])
         axle, mount = _axle_and_mount(robot, sensor)
         matrix = mount.twist @ (unit * [[axle], [axle], [1.0]])
-        signs = _signs(problem.robot)
         radii = ", ".join(
             f"{name} {1000 * axle * abs(rate):.3f}" for name, rate in zip(problem.robot.wheel_names, rates, strict=True)
         )
-        if not (rates * signs > 0).all():
+        if not (rates * problem.robot.centre_matrix[2] > 0).all():
             raise NotApplicableError(f"the wheels turn the robot the wrong way (radii {radii} mm); check the recording")
         return Solution(
             matrix.ravel(),
@@ -122,11 +124,15 @@ def _axle_and_mount(robot: Array, sensor: Array) -> tuple[float, Mount]:
     )
     squares = equations.T @ equations
     a, b, d = squares[:3, :3], squares[:3, 3:], squares[3:, 3:]
-    solved = _solved(a, b, "driving and turns together")
+    solved = _solved(a, b, "the axle and the mount")
     direction = np.linalg.eigh(d - b.T @ solved)[1][:, 0]  # Eq. (4): the smaller eigenvalue is first
     axle, l_x, l_y = -solved @ direction
     if axle < 0:
         axle, l_x, l_y, direction = -axle, -l_x, -l_y, -direction
+    residuals = equations @ [axle, l_x, l_y, *direction]
+    spread = math.sqrt(residuals @ residuals / max(len(residuals) - 4, 1) * np.linalg.inv(a)[0, 0])
+    if spread > _WORST_SPREAD * axle:
+        raise NotApplicableError(f"{_LACKING} (the axle's standard error is {100 * spread / axle:.0f} %)")
     return float(axle), Mount(x=float(l_x), y=float(l_y), yaw=math.atan2(direction[1], direction[0]))
 
 
@@ -134,23 +140,18 @@ def _solved(squares: Array, right: Array, what: str) -> Array:
     """Solution of normal equations. NotApplicableError names what the runs lack if they leave it open."""
     scale = np.sqrt(np.diag(squares))
     if not (scale > 0).all() or np.linalg.cond(squares / np.outer(scale, scale)) > _WORST_CONDITION:
-        raise NotApplicableError(f"it needs runs on curves of several kinds, and these leave it open ({what})")
+        raise NotApplicableError(f"{_LACKING} ({what} cannot be told apart)")
     solution: Array = np.linalg.solve(squares, right)
     return solution
 
 
 def _ends(run: Trajectory, interval: float) -> list[int]:
-    """Indices of the reference poses that bound intervals no shorter than ``interval`` (s)."""
+    """Indices of the reference poses that bound intervals of ``interval`` (s) or more; the last ends with the run."""
     kept = [0]
     for index, time in enumerate(run.pose_times):
         if time - run.pose_times[kept[-1]] >= interval * (1 - 1e-9):
             kept.append(index)
-    return kept
-
-
-def _angles(run: Trajectory) -> Array:
-    """Angles (K, 2) by which the wheels have turned at each reference pose, rad."""
-    return run.angles_at_poses
+    return [*(kept[:-1] if len(kept) > 1 else kept), len(run.pose_times) - 1]
 
 
 def _motions(poses: Array) -> Array:
@@ -158,12 +159,7 @@ def _motions(poses: Array) -> Array:
     return relative(poses[:-1], poses[1:])
 
 
-def _signs(robot: Robot) -> Array:
-    """The signs (2,) of the wheels' parts in the rate of turn: 1 for the right wheel, -1 for the left one."""
-    return np.sign(robot.inverse_kinematic_matrix[2])
-
-
 def _unit_axle(robot: Robot, rates: Array) -> Array:
-    """The matrix (3, 2) of the axle's middle for an axle of length 1 and given row 3, Eq. (1)."""
-    ahead = np.abs(rates) / 2 * np.sign(rates * _signs(robot))
-    return np.array([ahead, np.zeros(2), rates])
+    """The matrix (3, 2) of the axle's middle for an axle of length 1 and the row 3 of Eq. (1)."""
+    ahead = np.sign(robot.motions[0][:2] @ robot.centre_matrix[:2])  # 1: a positive rate of the wheel drives ahead
+    return np.array([ahead * np.abs(rates) / 2, np.zeros(2), rates])

@@ -105,7 +105,7 @@ class JungChung(Calibrator):
             raise NotApplicableError(f"it is for closed squares driven both ways from a corner (found: {which})")
         side = float(np.mean([square.side for square in squares]))
         axle = _axle(problem.robot)
-        wheelbase, diameters = errors_of(_mean_turn(clockwise), _mean_turn(counter), side, axle)
+        wheelbase, diameters = errors_of(self.mean_error(clockwise), self.mean_error(counter), side, axle)
         corrected = corrected_robot(problem.robot, wheelbase, diameters)
         left, right = _left_and_right(corrected)
         return Solution(
@@ -114,6 +114,10 @@ class JungChung(Calibrator):
             f"(E_d {diameters:.4f}), from {len(clockwise)} clockwise and {len(counter)} counter-clockwise squares of "
             f"{side:.2f} m",
         )
+
+    def mean_error(self, squares: Sequence[Square]) -> float:
+        """Mean error of the final heading of squares one way, rad."""
+        return float(np.mean([square.error[2] for square in squares]))
 
 
 def errors_of(turn_clockwise: float, turn_counter: float, side: float, axle: float) -> tuple[float, float]:
@@ -162,10 +166,6 @@ def _square(robot: Robot, run: Trajectory, path: Array) -> Square | None:
         return None
     truth = _of_axle(robot, run.poses[[0, -1]])
     return Square(float(side), way, relative(truth[0], truth[1]) - odometry[-1])
-
-
-def _mean_turn(squares: Sequence[Square]) -> float:
-    return float(np.mean([square.error[2] for square in squares]))
 
 
 def _middle(robot: Robot) -> Array:
