@@ -1,7 +1,7 @@
 """Steering offset and driving scale of a tricycle after Kallasi et al., from the headings of path segments.
 
 F. Kallasi, D. Lodi Rizzini, F. Oleari, M. Magnani, S. Caselli, "A novel calibration method for industrial AGVs",
-Robotics and Autonomous Systems 94:75-88 (2017), doi 10.1016/j.robot.2017.04.019.
+Robotics and Autonomous Systems (2017), doi 10.1016/j.robot.2017.04.019.
 
 For tricycles with one driven and steered wheel, on any paths that turn. The wheel rolls by u(k) in sample k, rad, at
 the measured steering angle alpha(k), rad; a is the steering offset, s the driving scale, m per rad (the radius of the

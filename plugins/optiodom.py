@@ -24,7 +24,7 @@ errors z(s) - g(s) at all s of the run from sample k on. Then
     dE/dK1 = 2 sum_k Re(e* f) d,    dE/dK2 = -2 sum_k Im(e* f) d,                                     (4)
     dE/dK3 = 2 sum_k (-Im(e* v f) c + Re(e* v exp(i K3 . c)) d(sin(h)/h)/dh d / 2).                    (5)
 
-iRprop- (Igel and Huesken 2003) changes each parameter by a step of its own against the sign of its derivative. The step
+iRprop- (Igel and Huesken) changes each parameter by a step of its own against the sign of its derivative. The step
 grows by a factor of 1.005 while the sign stays, and is halved when it turns, after which the parameter rests once. The
 smallest and largest steps and the rule that ends the search are the authors' for each robot. The first steps are the
 smallest ones.
@@ -34,7 +34,7 @@ step of an omni robot, an exact arc already, by another half of the sample's tur
 middle of a sample, not at its end; the answer is the best of all steps, not the last; a mecanum base has one length,
 (l1 + l2) / 2, in the place of two with the same derivatives. Where the rule ends the search before the minimum, such
 details count: on OptiOdom's tricycle the search rests at 72 mm rms, the minimum has 54 mm, and the angle at the end
-alone changes the mean final error by 4 %. On its omni robot the authors' step changes it by 2 %.
+alone changes the mean final error by 4 %. On its omni robot the authors' step changes it by 2 % (m) and 5 % (deg).
 """
 
 from __future__ import annotations
