@@ -152,9 +152,10 @@ def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunRe
     solution: Solution | None = None
     try:
         check_applicable(calibrator, problem)
-        solution = calibrator.calibrate(problem)
-        if not isinstance(solution, Solution):
-            raise PluginError(f"calibrate returned {type(solution).__name__}, expected a Solution")
+        given: Any = calibrator.calibrate(problem)
+        if not isinstance(given, Solution):
+            raise PluginError(f"calibrate returned {type(given).__name__}, expected a Solution")
+        solution = given
         outcome = Outcome.CONVERGED if solution.converged else Outcome.BUDGET
         answer, reason = solution.vector, one_line(str(solution.reason))
     except BudgetSpent as spent:

@@ -19,8 +19,14 @@ from omnibench.fit.parameterisation import ParameterisationName
 from omnibench.fit.problem import BudgetSpent, CalibrationProblem
 from omnibench.registry import calibrators
 from omnibench.robot.kinematics import Array, Robot
-from omnibench.testing.conformance import Conformance, global_random_fingerprint, global_random_state, require
-from omnibench.testing.synthetic import ObservedProblem, Runaway, synthetic_problem
+from omnibench.testing.conformance import (
+    Conformance,
+    Nonconformance,
+    global_random_fingerprint,
+    global_random_state,
+    require,
+)
+from omnibench.testing.synthetic import ObservedProblem, Runaway, synthetic_problem, synthetic_robot, synthetic_robots
 from omnibench.words import plural
 
 
@@ -45,6 +51,10 @@ class CalibratorConformance(Conformance):
     solved: on a problem whose least cost is zero, largest share of the start's cost at which it may claim convergence.
     The default only demands an answer no worse than the start; set it to, say, 1e-3 for an optimiser.
     evaluations: budget of that problem.
+
+    The problems are of the first synthetic robot to which the calibrator applies: on omni wheels, on mecanum wheels,
+    a differential drive, a skid-steered robot, a tricycle, a car, a swerve drive. On the problem above it must answer;
+    override ``problem`` where none of the synthetic runs is a path that it is for.
     """
 
     registry = calibrators
@@ -53,7 +63,10 @@ class CalibratorConformance(Conformance):
 
     def problem(self, parameterisation: ParameterisationName | None = None, **changes: Any) -> ObservedProblem:
         """A synthetic problem in the calibrator's own parameterisation; see ``synthetic_problem``."""
-        return synthetic_problem(parameterisation or self.make().parameterisation, **changes)
+        calibrator = self.make()
+        if "wheels" not in changes:
+            changes = {"robot": _first_robot(calibrator)} | changes
+        return synthetic_problem(parameterisation or calibrator.parameterisation, **changes)
 
     def attempt(self, problem: ObservedProblem, calibrator: Calibrator | None = None) -> Attempt:
         """Run the calibrator; Nonconformance if it raises a forbidden exception or does not end."""
@@ -160,6 +173,11 @@ class CalibratorConformance(Conformance):
         start = float(problem.values(problem.start[None])[0])
         result = self.attempt(problem).result
         require(result.outcome not in (Outcome.FAILED, Outcome.INVALID), f"it ended {result.outcome}: {result.reason}")
+        require(
+            result.outcome is not Outcome.NOT_APPLICABLE,
+            f"it is not applicable to the runs of {problem.robot.name} ({result.reason}), so no case has seen an "
+            "answer; override problem() with runs that it is for",
+        )
         if result.outcome is Outcome.CONVERGED:
             share = (np.inf if result.cost is None else result.cost) / start
             require(share <= 1 + 1e-12, f"it claims to have converged, at {share:.4g} times the cost of the start")
@@ -176,6 +194,8 @@ class CalibratorConformance(Conformance):
 
     def test_four_wheels_work(self) -> None:
         """The number of elements may differ from nine."""
+        if not self.make().applies(synthetic_robot(4)):
+            raise SkipTest(f"it is for {self.make().only_for or 'other robots'}")
         attempt = self.attempt(self.problem(wheels=4))
         if self.make().bounded:
             require(attempt.result.outcome is not Outcome.INVALID, f"with four wheels: {attempt.result.reason}")
@@ -223,6 +243,15 @@ class _WatchingUnbounded(_Watching):
 
 def _watching(calibrator: Calibrator) -> _Watching:
     return _Watching(calibrator) if calibrator.bounded else _WatchingUnbounded(calibrator)
+
+
+def _first_robot(calibrator: Calibrator) -> Robot:
+    """The first synthetic robot to which a calibrator applies; Nonconformance if there is none."""
+    for robot in synthetic_robots():
+        if calibrator.applies(robot):
+            return robot
+    names = ", ".join(robot.name for robot in synthetic_robots())
+    raise Nonconformance(f"applies() is false for every synthetic robot ({names}), so nothing can be tested")
 
 
 def _outer_shell(points: Array) -> NDArray[np.bool_]:

@@ -22,7 +22,6 @@ from omnibench.testing.effect_inputs import (
     arrays,
     changes,
     driven_signals,
-    every_robot,
     motor_input,
     one_row,
     results,
@@ -33,6 +32,7 @@ from omnibench.testing.effect_inputs import (
     trials,
     without,
 )
+from omnibench.testing.synthetic import synthetic_robots
 
 _KINDS = {
     "MotionEffect": (MotionEffect, ("wheel", "steering", "clock", "body", "world")),
@@ -69,7 +69,7 @@ class EffectConformance(Conformance):
         """It applies to one of the trial robots, and says for which it is where it does not apply to all."""
         effect = self.make()
         require(bool(robots(effect)), "applies is False for robots on omni, mecanum, fixed and steered wheels")
-        everywhere = all(effect.applies(robot) for robot in every_robot())
+        everywhere = all(effect.applies(robot) for robot in synthetic_robots())
         require(everywhere or bool(effect.only_for), "only_for is missing: say in words to which robots it applies")
 
     def test_needs_are_known(self) -> None:

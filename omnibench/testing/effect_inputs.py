@@ -13,7 +13,7 @@ from omnibench.robot.effects.effect import ActuatorEffect, Effect, MotionEffect,
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.signals import Caster, Signals, SteeringGears
 from omnibench.robot.wheels.drive import in_the_middle
-from omnibench.testing.synthetic import synthetic_robot, synthetic_wheeled_robots
+from omnibench.testing.synthetic import synthetic_robot, synthetic_robots
 
 PERIOD: Final = 0.01  # s, of the wheel samples
 SAMPLES: Final = 200
@@ -62,13 +62,8 @@ def _poses(twists: Array, elapsed: Array) -> Array:
 
 def robots(effect: Effect) -> tuple[Robot, ...]:
     """A robot on three omni wheels and one on four; robots on other wheels for an effect that applies to neither."""
-    applies = tuple(robot for robot in every_robot() if effect.applies(robot))
+    applies = tuple(robot for robot in synthetic_robots() if effect.applies(robot))
     return tuple(robot for robot in applies if robot.name in _OMNI) or applies
-
-
-def every_robot() -> tuple[Robot, ...]:
-    """Robots on omni and mecanum wheels, and others on fixed and steered ones."""
-    return synthetic_robot(3), synthetic_robot(4), *synthetic_wheeled_robots()
 
 
 def trial_values(effect: Effect, robot: Robot, seed: int = 0) -> Iterator[Values]:

@@ -19,6 +19,8 @@ from omnibench.registry import Options
 from omnibench.robot.kinematics import Array, Robot, Wheel, wheel_equations
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, WheelLog
+from omnibench.robot.robot_class import class_of
+from omnibench.robot.wheels.drive import CarDrive
 from omnibench.robot.wheels.wheel import WheelType
 
 PERIOD = 0.2  # s between wheel samples
@@ -28,6 +30,12 @@ _SPEED = 0.25  # m/s
 # so that the answer lies in every box that omnibench offers.
 _RADII = (1.04, 0.97, 1.02, 0.99)
 _DISTANCE = 1.06
+# The same of robots on fixed and steered wheels. They are milder: methods for these take errors as small.
+_WHEELED_RADII = (1.012, 0.992, 1.004, 0.996)
+_WHEELED_PLACE = 1.03
+_STRAIGHT, _QUARTER, _HALF = 19, 11, 23  # wheel samples of a metre, a quarter and a half turn; one before each stands
+_SECOND_START = (0.4, -0.3, 0.8)  # m, m, rad: start of the second repetition
+Leg = tuple[tuple[float, float, float], int]  # metres ahead and to the left and rad to the left, in so many samples
 _PATIENCE = 100  # calls after BudgetSpent that are refused before the run is stopped
 
 
@@ -67,8 +75,22 @@ def synthetic_wheeled_robots() -> tuple[Robot, ...]:
     )
 
 
+def synthetic_robots() -> tuple[Robot, ...]:
+    """Robots on omni and mecanum wheels, and others on fixed and steered ones."""
+    return synthetic_robot(3), synthetic_robot(4), *synthetic_wheeled_robots()
+
+
+def _on_rollers(robot: Robot) -> bool:
+    return all(wheel.kind in ("omni", "mecanum") for wheel in robot.wheels)
+
+
 def true_robot(robot: Robot) -> Robot:
-    """The true robot: radii 3 % below to 4 % above the design, distances 6 % above."""
+    """The true robot: radii 3 % below to 4 % above the design, distances 6 % above.
+
+    On fixed and steered wheels: radii 0.8 % below to 1.2 % above the design, distances 3 % above.
+    """
+    if not _on_rollers(robot):
+        return _true_wheeled_robot(robot)
     wheels = (
         wheel.model_copy(update={"radius": wheel.radius * share, "distance": wheel.lever * _DISTANCE})
         for wheel, share in zip(robot.wheels, _RADII, strict=False)
@@ -76,8 +98,23 @@ def true_robot(robot: Robot) -> Robot:
     return robot.model_copy(update={"wheels": tuple(wheels)})
 
 
+def _true_wheeled_robot(robot: Robot) -> Robot:
+    wheels = []
+    for number, wheel in enumerate(robot.wheels):
+        x, y = (_WHEELED_PLACE * value for value in wheel.position)
+        share = _WHEELED_RADII[number % len(_WHEELED_RADII)]
+        wheels.append(wheel.model_copy(update={"radius": wheel.radius * share, "x": x, "y": y}))
+    return robot.model_copy(update={"wheels": tuple(wheels)})
+
+
 def synthetic_trajectories(robot: Robot, integration: Integration = "arc") -> tuple[Trajectory, ...]:
-    """Twelve runs of 4 s: four directions, straight and turning either way; reference poses every 0.8 s, exact."""
+    """Runs of the true robot that is driven by its design; reference poses every 0.8 s, exact.
+
+    Robots on omni and mecanum wheels: twelve of 4 s, four directions, straight and turning either way. Others: two
+    repetitions of each motion that they can make; see ``synthetic_motions``.
+    """
+    if not _on_rollers(robot):
+        return _wheeled_trajectories(robot, integration)
     model = OdometryModel(robot, true_robot(robot).inverse_kinematic_matrix, integration)
     times: Array = (PERIOD * np.arange(1, _SAMPLES + 1)).astype(float)
     stamps = np.append(0.0, times[3::4])
@@ -88,6 +125,70 @@ def synthetic_trajectories(robot: Robot, integration: Integration = "arc") -> tu
         poses = model.poses([WheelLog(times, rates, np.zeros(3), stamps)])[0]
         runs.append(Trajectory(f"{len(runs) + 1:02d}", "train", times, rates, stamps, poses))
     return tuple(runs)
+
+
+def synthetic_motions(robot: Robot) -> dict[str, tuple[Leg, ...]]:
+    """Legs of every motion that a robot on fixed or steered wheels is driven through, by the motion's name.
+
+    Straight lines both ways and curves; of a robot other than a car also turns on the spot and closed squares of 1 m,
+    both ways; of one that can move aside that, too.
+    """
+    curves = {"curve": 0.6, "tight curve": 1.4}  # rad to a metre
+    motions: dict[str, tuple[Leg, ...]] = {
+        "forward": (((1.0, 0.0, 0.0), _STRAIGHT),),
+        "backward": (((-1.0, 0.0, 0.0), _STRAIGHT),),
+    }
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        for name, turn in curves.items():
+            motions[f"{name} {side}"] = (((1.0, 0.0, sign * turn), _STRAIGHT),)
+        if class_of(robot) == "car":
+            continue
+        motions[f"turn {side}"] = (((0.0, 0.0, sign * math.pi), _HALF),)
+        motions[f"square {side}"] = 4 * (((1.0, 0.0, 0.0), _STRAIGHT), ((0.0, 0.0, sign * math.pi / 2), _QUARTER))
+        if len(robot.motions) == 3:
+            motions[f"aside {side}"] = (((0.0, sign, 0.0), _STRAIGHT),)
+    return motions
+
+
+def _wheeled_trajectories(robot: Robot, integration: Integration) -> tuple[Trajectory, ...]:
+    model = OdometryModel(robot, true_robot(robot).inverse_kinematic_matrix, integration)
+    drive = None if robot.drive.direct else robot.drive
+    runs: list[Trajectory] = []
+    for command, legs in synthetic_motions(robot).items():
+        parts = [_commanded(robot, *leg) for leg in legs]
+        rates = np.concatenate([rates for rates, _ in parts])
+        steering = None if drive is None else np.concatenate([angles for _, angles in parts])
+        times: Array = PERIOD * np.arange(1, len(rates) + 1)
+        stamps = np.append(0.0, times[3::4])
+        for repetition, start in enumerate((np.zeros(3), np.array(_SECOND_START)), start=1):
+            log = WheelLog(times, rates, start, stamps, steering=steering, drive=drive)
+            run = Trajectory(
+                id=f"{len(runs) + 1:02d}",
+                split="train",
+                times=times,
+                rates=rates,
+                pose_times=stamps,
+                poses=model.poses([log])[0],
+                command=command,
+                repetition=repetition,
+                steering=steering,
+                drive=drive,
+            )
+            runs.append(run)
+    return tuple(runs)
+
+
+def _commanded(robot: Robot, motion: tuple[float, float, float], samples: int) -> tuple[Array, Array]:
+    """Wheel rates (samples + 1, N) and steering angles (samples + 1, S) of a leg, before which the robot steers."""
+    twist = np.array(motion) / (samples * PERIOD)
+    rates, steering = robot.drive.commands((robot.signal_equations @ twist)[None])
+    if not isinstance(robot.drive, CarDrive):  # a wheel rolls backwards rather than be steered by more than a quarter
+        back = np.abs(steering) > math.pi / 2 + 1e-9
+        steering = np.where(back, steering - np.copysign(math.pi, steering), steering)
+        for wheel, pair in enumerate(robot.drive.pairs):
+            rates[:, wheel] *= -1.0 if pair >= 0 and back[0, pair] else 1.0
+    standing = np.zeros_like(rates)
+    return np.vstack([standing, np.repeat(rates, samples, axis=0)]), np.repeat(steering, samples + 1, axis=0)
 
 
 def synthetic_dataset(wheels: Literal[3, 4] = 3) -> Dataset:
@@ -146,6 +247,7 @@ class ObservedProblem(CalibrationProblem):
 def synthetic_problem(
     parameterisation: ParameterisationName = "matrix",
     *,
+    robot: Robot | None = None,
     wheels: Literal[3, 4] = 3,
     fixed: bool = False,
     seed: int = 0,
@@ -156,9 +258,10 @@ def synthetic_problem(
 ) -> ObservedProblem:
     """The problem of Eq. (6) on the recordings; its least cost is 0, up to rounding.
 
+    robot: default: the synthetic robot on ``wheels`` omni or mecanum wheels.
     fixed: use a box that fixes some elements (zeros of the matrix, or the wheels' angles).
     """
-    robot = synthetic_robot(wheels)
+    robot = robot or synthetic_robot(wheels)
     runs = synthetic_trajectories(robot) if trajectories is None else tuple(trajectories)
     limits = GeometryLimits(angle_deg=0.0) if fixed else GeometryLimits()
     return ObservedProblem(

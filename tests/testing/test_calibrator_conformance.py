@@ -10,19 +10,23 @@ import numpy as np
 import pytest
 from conformance_suites import failures, suite
 
-from omnibench.errors import ConfigError, PluginError
+from omnibench.data.dataset import make_dataset
+from omnibench.errors import ConfigError, NotApplicableError, PluginError
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.problem import BudgetSpent, CalibrationProblem
 from omnibench.registry import Options
-from omnibench.robot.kinematics import Array
+from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.robot_class import RobotClass, class_of
 from omnibench.testing import (
     CalibratorConformance,
     Nonconformance,
     load_plugin,
+    run_cases,
     synthetic_problem,
     synthetic_robot,
+    synthetic_trajectories,
 )
-from omnibench.testing.synthetic import true_robot
+from omnibench.testing.synthetic import PERIOD, synthetic_robots, synthetic_wheeled_robots, true_robot
 
 
 class Honest(Calibrator):
@@ -302,6 +306,7 @@ def test_an_answer_that_does_not_depend_on_the_box_need_not_keep_it() -> None:
         """A fixed answer."""
 
         bounded = False
+        fitted = False
 
     assert failures(CalibratorConformance, Published) == {}
 
@@ -333,6 +338,65 @@ def test_the_synthetic_problem_can_be_solved_to_zero_within_its_box(parameterisa
     assert problem.values(vector[None])[0] < 1e-12
     assert problem.values(problem.start[None])[0] > 0.05
     assert (problem.free.sum() < problem.size) == (fixed and (parameterisation, wheels) != ("matrix", 4))
+
+
+def only_for(kind: RobotClass) -> type[Honest]:
+    class OnlyForOne(Honest):
+        """Searches, for one class of robots."""
+
+        only_for = f"{kind} robots"
+
+        def applies(self, robot: Robot) -> bool:
+            return class_of(robot) == kind
+
+    return OnlyForOne
+
+
+@pytest.mark.parametrize("kind", ["mecanum", "differential", "skid", "tricycle", "car", "swerve"])
+def test_a_calibrator_for_one_class_of_robots_is_tested_on_it(kind: RobotClass) -> None:
+    tested = suite(CalibratorConformance, only_for(kind))
+    assert class_of(tested.problem().robot) == kind
+    results = run_cases(tested)
+    assert [result for result in results if not result.passed] == []
+    skipped = {result.case: result.message for result in results if result.outcome == "skipped"}
+    expected = {} if kind == "mecanum" else {"four wheels work": f"it is for {kind} robots"}
+    assert {case: skipped[case] for case in skipped if case == "four wheels work"} == expected
+
+
+def test_a_calibrator_for_no_synthetic_robot_fails_in_one_line() -> None:
+    found = failures(CalibratorConformance, only_for("mixed"))
+    assert "applies() is false for every synthetic robot (synthetic omni, " in found["budget is kept"]
+
+
+def test_a_calibrator_that_answers_on_no_synthetic_path_fails_one_case() -> None:
+    class ForSpirals(Honest):
+        """Wants paths that are not there."""
+
+        def calibrate(self, problem: CalibrationProblem) -> Solution:  # noqa: ARG002
+            raise NotApplicableError("it is for spirals, and none was driven")
+
+    (case,) = failures(CalibratorConformance, ForSpirals).items()
+    assert case[0] == "synthetic problem is solved or honestly reported"
+    assert "not applicable to the runs of synthetic omni (it is for spirals, and none was driven)" in case[1]
+
+
+@pytest.mark.parametrize("robot", synthetic_wheeled_robots(), ids=lambda robot: robot.name)
+def test_the_problem_on_fixed_and_steered_wheels_can_be_solved_to_zero_within_its_box(robot: Robot) -> None:
+    problem = synthetic_problem(robot=robot)
+    vector = true_robot(robot).inverse_kinematic_matrix.ravel()
+    assert problem.inside(vector[None]).all()
+    assert problem.values(vector[None])[0] < 1e-12
+    assert problem.values(problem.start[None])[0] > 0.02
+    assert make_dataset("synthetic", robot, PERIOD, problem.trajectories).warnings == ()
+
+
+def test_a_differential_drive_is_driven_along_lines_turns_and_squares_both_ways() -> None:
+    robot = next(robot for robot in synthetic_robots() if class_of(robot) == "differential")
+    ends = {run.command: run.poses[-1] for run in synthetic_trajectories(robot) if run.repetition == 1}
+    for sign, line, side in ((1, "forward", "left"), (-1, "backward", "right")):
+        assert ends[line] == pytest.approx([sign, 0, 0], abs=0.1)
+        assert ends[f"turn {side}"] == pytest.approx([0, 0, sign * np.pi], abs=0.15)
+        assert ends[f"square {side}"] == pytest.approx([0, 0, sign * 2 * np.pi], abs=0.4)
 
 
 def test_a_class_that_cannot_be_made_fails_each_case_in_one_line() -> None:
