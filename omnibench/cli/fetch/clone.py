@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 import re
+import select
 import shutil
 import signal
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +28,7 @@ _LEFT_OUT = ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE", "GIT_ASKPASS", "SSH_A
 _COMMIT = re.compile(rf"{NEWEST}|[0-9a-fA-F]{{4,40}}")
 _REMOTE = re.compile(r"github\.com[:/]+([^/]+/[^/]+?)(?:\.git)?/?$")
 _STEP = re.compile(r"(Receiving objects|Resolving deltas|Updating files): +\d+% \((\d+)/(\d+)\)(?:, ([\d.]+ \w+))?")
-_ELSEWHERE = "a clone made elsewhere can be imported, too: omnibench guide data"
+_ELSEWHERE = "import a clone made elsewhere (omnibench guide data)"
 # Git's words, and what they mean to a user; the first that fits counts.
 _CAUSES = (
     (r"no space left|quota exceeded", "no space is left on the disk; free space, or fetch in another folder"),
@@ -57,6 +58,8 @@ def open_clone(repository: str, folder: Path, commit: str, report: Reporter) -> 
     ConfigError or DataError in one line: no such repository or commit, no git, no network, no space, or the folder
     holds something else or a clone that was changed.
     """
+    if shutil.which("git") is None:
+        raise DataError(f"git is not installed, or not on the PATH; install it, or {_ELSEWHERE}")
     if not _COMMIT.fullmatch(commit):
         raise ConfigError(f"commit {commit!r}: expected 4 to 40 hexadecimal digits, or {NEWEST} for the newest")
     if folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
@@ -126,14 +129,15 @@ def _environment() -> dict[str, str]:
 
 def _ask(folder: Path, *arguments: str) -> str:
     """What git answers of a clone; empty if it has no answer."""
-    command = ["git", "-C", str(folder), *arguments]
-    try:
-        answer = subprocess.run(
-            command, env=_environment(), stdin=subprocess.DEVNULL, capture_output=True, text=True, errors="replace",
-            check=False,
-        )  # fmt: skip
-    except FileNotFoundError:
-        raise _no_git() from None
+    answer = subprocess.run(
+        ["git", "-C", str(folder), *arguments],
+        env=_environment(),
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        errors="replace",
+        check=False,
+    )
     return answer.stdout.strip() if answer.returncode == 0 else ""
 
 
@@ -142,21 +146,21 @@ def _work(repository: str, arguments: Sequence[str], folder: Path | None, report
     command = ["git", *_STALLED, *(() if folder is None else ("-C", str(folder))), *arguments]
     task = f"git {arguments[0]}: {repository}"
     report(Progress(task))
-    try:
-        process = subprocess.Popen(
-            command, env=_environment(), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
-            text=True, errors="replace", start_new_session=True,
-        )  # fmt: skip
-    except FileNotFoundError:
-        raise _no_git() from None
+    process = subprocess.Popen(
+        command,
+        env=_environment(),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+    )
     said: list[str] = []
     try:
-        assert process.stderr is not None
-        for line in process.stderr:
+        for line in _lines(process):
             if (step := _STEP.search(line)) is not None:
                 report(Progress(step[1].lower(), int(step[2]), int(step[3]), "object", note=step[4] or ""))
             else:
-                said.append(line.strip())
+                said.append(line)
         failed = process.wait() != 0
     except BaseException:
         _end(process)
@@ -166,7 +170,25 @@ def _work(repository: str, arguments: Sequence[str], folder: Path | None, report
     report(Progress(task, result=""))
 
 
-def _end(process: subprocess.Popen[str]) -> None:
+def _lines(process: subprocess.Popen[bytes]) -> Iterator[str]:
+    """What a program says on standard error, line by line; bars that it draws end in a carriage return.
+
+    Ctrl-C ends the wait for the next line, which is a ``select``; reads that it interrupts begin anew once polars is
+    imported, since its handler of the signal restarts them (SA_RESTART).
+    """
+    assert process.stderr is not None
+    begun, stream = "", process.stderr.fileno()
+    while True:
+        select.select([stream], [], [])
+        part = os.read(stream, 1 << 16)
+        *lines, begun = re.split(r"[\r\n]+", begun + part.decode(errors="replace"))
+        yield from (line.strip() for line in lines)
+        if not part:
+            yield from filter(None, [begun.strip()])
+            return
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
     """End git and the programs that it has started."""
     for number in (signal.SIGTERM, signal.SIGKILL):
         with suppress(ProcessLookupError):
@@ -184,7 +206,3 @@ def _failure(repository: str, said: Sequence[str]) -> DataError:
         if re.search(pattern, " ".join(said), re.IGNORECASE):
             return DataError(f"{repository}: {meaning} (git: {words})")
     return DataError(f"{repository}: git could not clone it: {words}")
-
-
-def _no_git() -> DataError:
-    return DataError(f"git is not installed, or not on the PATH; install it, or {_ELSEWHERE}")
