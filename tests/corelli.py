@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Any
 
@@ -10,36 +9,13 @@ import numpy as np
 import pytest
 from commands import RECORDINGS
 
+from omnibench.cli.fetch.catalogue import find_recording
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.slam.import_dataset import import_dataset
 
 CORELLI = RECORDINGS / "tricycle_corelli" / "dataset.txt"
-REAR = {"type": "fixed", "radius": 0.1, "x": 0, "measured": False}
-# Its authors' first guesses: 0.0106141 m for a revolution of the
-# traction encoder of 5000 ticks, which is a wheel of 0.0106141 / (2 pi) = 0.00168929 m on the encoder's axle; a tenth
-# of the steering encoder's angle; 1.4 m between the axles; a tracked point 1.5 m ahead of the rear one.
-CORELLI_OPTIONS: dict[str, Any] = {
-    "robot": {
-        "name": "corelli",
-        "mount": {"x": 1.5},
-        "wheels": [
-            {"name": "front", "type": "steered", "radius": 0.0106141 / (2 * math.pi), "x": 1.4, "y": 0},
-            {"name": "left", "y": 0.3, **REAR},
-            {"name": "right", "y": -0.3, **REAR},
-        ],
-    },
-    "separator": "blanks",
-    "header_lines": 0,
-    "wheel_time_column": 2,
-    "wheel_columns": 5,
-    "wheel_unit": "ticks",
-    "ticks_per_turn": 5000,
-    "steering_columns": 4,
-    "steering_unit": "ticks",
-    "steering_ticks_per_turn": 8192,
-    "steering_scale": 0.1,
-    "pose_columns": [11, 12, 13],
-}
+# The authors' first guesses, as ``omnibench fetch corelli`` imports the drive.
+CORELLI_OPTIONS: dict[str, Any] = find_recording("corelli").datasets[0].options
 
 
 def corelli_dataset(**options: Any) -> Dataset:

@@ -13,6 +13,7 @@ from omnibench.cli.calibration_commands import calibration_app
 from omnibench.cli.check_command import check_app
 from omnibench.cli.comparison_commands import comparison_app
 from omnibench.cli.discovery_commands import discovery_app
+from omnibench.cli.fetch_command import fetch_app
 from omnibench.cli.guide_commands import guide_app
 from omnibench.cli.import_command import import_app
 from omnibench.cli.live_commands import live_app
@@ -22,7 +23,7 @@ from omnibench.cli.recording_commands import recording_app
 # Headings of the help and the families under them, in the order in which a newcomer needs them.
 FAMILIES = (
     ("Calibrate and compare", (comparison_app, calibration_app, discovery_app)),
-    ("Recordings", (import_app, check_app, recording_app)),
+    ("Recordings", (import_app, fetch_app, check_app, recording_app)),
     ("Live", (live_app,)),
     ("Learn and extend", (guide_app, plugin_app)),
 )

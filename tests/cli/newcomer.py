@@ -59,8 +59,13 @@ def cloned_recordings(folder: Path) -> None:
     """OptiOdom's recordings, as ``git clone`` would have brought them; without them the page ends here."""
     if not (RECORDINGS / "optiodom").is_dir():
         pytest.skip(f"the recordings are not at {RECORDINGS / 'optiodom'}")
-    (folder / "optiodom").mkdir()
+    (folder / "optiodom").mkdir(parents=True)
     (folder / "optiodom" / "data").symlink_to(RECORDINGS / "optiodom")
+
+
+def fetched_recordings(folder: Path) -> None:
+    """OptiOdom's recordings, where ``omnibench fetch`` would have cloned them."""
+    cloned_recordings(folder / "clones" / "sousarbarb")
 
 
 def fleet_of_days(folder: Path) -> None:
@@ -74,7 +79,8 @@ def fleet_of_days(folder: Path) -> None:
 BEFORE: dict[str, Callable[[Path], None]] = {
     "omnibench import csv raw": log_of_ticks,
     "omnibench import csv log.txt": log_of_text,
-    "omnibench compare configs/omni3.yaml": cloned_recordings,
+    "omnibench compare configs/omni3.yaml": fetched_recordings,
+    "omnibench import optiodom": cloned_recordings,
     "omnibench check fleet/day": fleet_of_days,
 }
 

@@ -51,8 +51,8 @@ def test_an_output_can_be_written_short_or_long(name: str) -> None:
     spellings = [{*parameter.opts} for parameter in commands()[name].params]
     for options in spellings:
         assert ("-o" in options) == ("--output" in options)
-    writes = {"compare", "calibrate", "export", "discover", "import", "design", "slam", "simulate", "record", "example"}
-    assert any("-o" in options for options in spellings) == (name in {*writes, "plugin new"})
+    writes = {"compare", "calibrate", "export", "discover", "import", "fetch", "design", "slam", "simulate", "record"}
+    assert any("-o" in options for options in spellings) == (name in {*writes, "example", "plugin new"})
 
 
 def test_the_version_is_printed_and_nothing_else(command: Command) -> None:
