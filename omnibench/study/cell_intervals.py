@@ -39,7 +39,7 @@ from omnibench.words import plural
 
 UnitOfCell = Literal["session", "run"]
 Members = NDArray[np.bool_]
-_ALIKE = 1e-12  # share of the sums: smaller differences between ratios are rounding
+_ALIKE = 1e-9  # share of the sums: smaller differences between ratios are rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,9 +92,14 @@ class CellRatio:
     units: str
 
     @property
+    def equal(self) -> bool:
+        """True if the two differ by rounding alone."""
+        return abs(self.value - 1) < _ALIKE
+
+    @property
     def verdict(self) -> Literal["better", "worse", "undecided"]:
         """The verdict of the family's interval: which side of 1 it lies on."""
-        if self.in_family.known is None or self.in_family.holds(1.0):
+        if self.equal or self.in_family.known is None or self.in_family.holds(1.0):
             return "undecided"
         return "better" if self.value < 1 else "worse"
 

@@ -36,7 +36,7 @@ _COLUMNS = (
 )
 # Blue where the design values' error falls, white where it stays, red where it grows: log2 of the ratio, cut at a
 # quarter and four times (chosen).
-_SCALE = [[0.0, "#2c6fa6"], [0.5, "#ffffff"], [1.0, "#c8102e"]]
+_SCALE = [[0.0, "#7fb2dc"], [0.5, "#ffffff"], [1.0, "#f0919d"]]
 _CUT = 2.0
 
 
@@ -57,17 +57,16 @@ def robot_cells(view: StudyView, robot: str) -> Section:
 
 
 def heat_map(view: StudyView, robot: str) -> FigureGrid:
-    """Ratio of every method's error to the design values' in every cell of a robot."""
+    """Ratio of every method's error to the design values' in every cell of a robot: a row a cell, a column a method."""
     cells = view.plain(robot)
-    methods = [name for name in view.methods if any(name in cell.methods for cell in cells)]
-    values = [[_ratio(cell, name) for cell in cells] for name in methods]
-    logs = [[_log(value) for value in row] for row in values]
+    answered = [name for name in view.methods if any(_ratio(cell, name) is not None for cell in cells)]
+    methods = [name for name in answered if view.family(name) != "baseline"]
+    values = [[_ratio(cell, name) for name in methods] for cell in cells]
     words = [[NOTHING if value is None else fixed(value, 2) for value in row] for row in values]
-    columns = [text(wrapped(_column(cell), 18)) for cell in cells]
     trace = go.Heatmap(
-        z=logs,
-        x=list(range(len(cells))),
-        y=list(range(len(methods))),
+        z=[[_log(value) for value in row] for row in values],
+        x=list(range(len(methods))),
+        y=list(range(len(cells))),
         text=words,
         texttemplate="%{text}",
         textfont={"size": 12, "color": INK},
@@ -80,23 +79,27 @@ def heat_map(view: StudyView, robot: str) -> FigureGrid:
         hoverinfo="skip",
     )
     figure = plot(trace)
+    names = [text(wrapped(name, 9)) for name in methods]
     figure.update_xaxes(
-        tickvals=list(range(len(cells))), ticktext=columns, side="top", showgrid=False, ticks="", tickangle=0
-    )
+        tickvals=list(range(len(methods))), ticktext=names, side="top", showgrid=False, ticks="", tickangle=0,
+        tickfont_color=INK,
+    )  # fmt: skip
     figure.update_yaxes(
-        tickvals=list(range(len(methods))), ticktext=[text(name) for name in methods], autorange="reversed", ticks="",
-        showgrid=False, tickfont_color=INK,
+        tickvals=list(range(len(cells))), ticktext=[text(_column(cell)) for cell in cells], autorange="reversed",
+        ticks="", showgrid=False, tickfont_color=INK,
     )  # fmt: skip
     title = f"{robot}: error as a share of the design values'"
     described = "; ".join(
-        f"{_column(cell)}: " + ", ".join(f"{name} {words[row][column]}" for row, name in enumerate(methods))
-        for column, cell in enumerate(cells)
+        f"{_column(cell)}: " + ", ".join(f"{name} {each}" for name, each in zip(methods, row, strict=True))
+        for cell, row in zip(cells, words, strict=True)
     )
+    silent = [name for name in view.methods if name not in answered]
+    without = f" Not for this robot or these paths: {', '.join(silent)}." if silent else ""
     caption = (
-        "Columns: training → judged kind. Eq. (6); below 1 the design values' error falls. Training errors: the judged "
-        f"runs trained. {NOTHING}: no answer, or not asked (see the tables)."
+        "Rows: training → judged kind. Eq. (6); below 1 the design values' error falls. Training errors: the judged "
+        f"runs trained. {NOTHING}: no answer, or not asked (see the tables).{without}"
     )
-    height = 120 + 24 * len(methods)
+    height = 110 + 26 * len(cells)
     return FigureGrid((Figure(title, figure, described, height),), (), 1, caption, f"cells-{robot}")
 
 
@@ -135,7 +138,7 @@ def _row(each: MethodInCell, cell: StudyCell, view: StudyView, judged: int, best
         fixed(1e3 * position, 1),
         fixed(math.degrees(heading), 2),
         Cell(fixed(ratio.value, 3), _interval(ratio)),
-        Cell("" if cell.key.fitted else _verdict(ratio), partly),
+        Cell("" if cell.key.fitted or ratio.equal else ratio.verdict, partly),
         seconds(each.seconds),
         each.numbers,
         role="best" if best else "plain",
@@ -145,10 +148,6 @@ def _row(each: MethodInCell, cell: StudyCell, view: StudyView, judged: int, best
 def _interval(ratio: CellRatio) -> str:
     known = ratio.alone.known
     return "no interval" if known is None else f"{fixed(known[0], 2)} to {fixed(known[1], 2)}"
-
-
-def _verdict(ratio: CellRatio) -> str:
-    return {"better": "better", "worse": "worse", "undecided": "undecided"}[ratio.verdict]
 
 
 def _ratio(cell: StudyCell, method: str) -> float | None:
