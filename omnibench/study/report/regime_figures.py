@@ -126,13 +126,19 @@ def curve_section(view: StudyView) -> tuple[Section, ...]:
         return ()
     figures = tuple(_curve(view, name, points) for name, points in drawn.items())
     shown = [
-        name for name in view.methods if any(name in c.methods for points in drawn.values() for c in points.values())
+        name
+        for name in view.methods
+        if any(_answers(cell, name) for points in drawn.values() for cell in points.values())
     ]
     grid = FigureGrid(
         figures, tuple(view.styles[name] for name in shown), 2,
         "Runs of each command that train, against the mean final error, Eq. (6), of runs that never train.", "curves",
     )  # fmt: skip
     return (Section("curves", "Learning curves", (grid,), about="How many runs a method needs."),)
+
+
+def _answers(cell: StudyCell, method: str) -> bool:
+    return method in cell.methods and cell.methods[method].errors is not None
 
 
 def _curve(view: StudyView, name: str, points: Mapping[int, StudyCell]) -> Figure:
