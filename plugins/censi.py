@@ -38,8 +38,9 @@ From the article's public program (AndreaCensi/calibration) are (2) and (3). Dif
   neighbouring intervals share a pose here, so that the covariance of the article is not that of these data;
 - the article's trimming of outliers is left out: its share was not at hand.
 
-Noise of s is in Q, too, and biases (4) where it is large beside the motion in an interval (chosen: 2 s). It is for two
-measured wheels on one axle, for runs on any paths that hold turns both to and fro and driving; m, rad, SI throughout.
+Noise of s is in Q, too, and biases (4) where it is large beside the motion in an interval. Of intervals of 2 to 16 s on
+OptiOdom's circles all give the same errors of the final poses within 2 %, of 0.5 s errors larger by a third. It is for
+two measured wheels on one axle, for runs on any paths that both drive and turn; m, rad, SI throughout.
 """
 
 from __future__ import annotations
@@ -90,6 +91,8 @@ class Censi(Calibrator):
         if problem.parameterisation.name != "matrix":
             raise ConfigError("censi gives a matrix; say parameterisation: matrix")
         runs = [run for run in problem.trajectories if run.has_poses]
+        if not runs:
+            raise NotApplicableError("it needs reference poses, and these runs have none after the start")
         ends = [_ends(run, self.options.interval) for run in runs]
         turned = np.concatenate(
             [np.diff(run.angles_at_poses[kept], axis=0) for run, kept in zip(runs, ends, strict=True)]

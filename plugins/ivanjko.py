@@ -23,7 +23,7 @@ two and three parameters. The steps are as the authors of OptiOdom (J. Intell. R
 stop at a change of 0.001. Reconstructed here:
 
 - the least squares of (2) go by SciPy's Levenberg-Marquardt method over the x and y of the ends;
-- a tracked point off the robot's centre is at its design pose;
+- a tracked point off the middle of the axle is at its design pose there;
 - the odometry tells what a run is: a straight line goes as far from its start as its length and keeps its heading; a
   turn on the spot stays near its start and turns by a quarter turn or more. Other runs are not used.
 
@@ -108,9 +108,8 @@ def _paths(problem: CalibrationProblem) -> tuple[list[Trajectory], list[Trajecto
     """The straight lines, turns to the left and turns to the right among the runs. NotApplicableError names missing."""
     lines, lefts, rights = list[Trajectory](), list[Trajectory](), list[Trajectory]()
     runs = [run for run in problem.trajectories if run.has_poses]
-    centre = problem.robot.model_copy(update={"mount": None})
     stamps = [np.append(0.0, run.times[run.times <= run.end]) for run in runs]
-    model, axle = OdometryModel.of_design(centre, problem.integration), _axle(problem.robot)
+    model, axle = OdometryModel.of_design(_on_its_axle(problem.robot), problem.integration), _axle(problem.robot)
     paths = model.poses([run.log(times) for run, times in zip(runs, stamps, strict=True)])
     for run, path in zip(runs, paths, strict=True):
         length = float(np.hypot(*np.diff(path[:, :2], axis=0).T).sum())
@@ -164,6 +163,19 @@ def _changed(robot: Robot, radii: Array, wheelbase: float) -> Robot:
             wheel = wheel.model_copy(update={"radius": wheel.radius * factors[wheel.name], "x": x, "y": y})
         wheels.append(wheel)
     return robot.model_copy(update={"wheels": tuple(wheels)})
+
+
+def _on_its_axle(robot: Robot) -> Robot:
+    """The robot with the middle of its axle as its centre and tracked point."""
+    left, right = (wheel.position for wheel in robot.measured)
+    x, y = (left[0] + right[0]) / 2, (left[1] + right[1]) / 2
+    wheels = [
+        wheel.model_copy(update={"x": wheel.position[0] - x, "y": wheel.position[1] - y})
+        if wheel.kind == "fixed"
+        else wheel
+        for wheel in robot.wheels
+    ]
+    return robot.model_copy(update={"wheels": tuple(wheels), "mount": None})
 
 
 def _axle(robot: Robot) -> float:

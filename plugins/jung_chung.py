@@ -60,9 +60,7 @@ from omnibench.robot.planar import compose, interpolated, relative, rotated
 from omnibench.robot.robot_class import class_of
 from omnibench.words import plural
 
-_OFF_CORNER = (
-    0.15  # share of the side: farthest that the odometry of a square is from a corner; a circle's is 0.3 (chosen)
-)
+_OFF_CORNER = 0.15  # share of the side: farthest of a square's odometry from its corners; a circle's is 1 (chosen)
 _OFF_TURN = 0.5  # rad by which the odometry's whole turn may be off one (chosen: 7 degrees at each corner)
 
 

@@ -9,12 +9,13 @@ from functools import cached_property
 from omnibench.compare.config import CalibratorEntry, CompareConfig
 from omnibench.compare.run_key import run_key
 from omnibench.data.dataset import Dataset, Trajectory
+from omnibench.data.splits import training_split
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import as_answered
 from omnibench.fit.geometry import GeometryLimits
 from omnibench.fit.loss.robust_cost import with_loss
 from omnibench.fit.parameterisation import Box, ParameterisationName
-from omnibench.fit.problem import CalibrationProblem, make_parameterisation, training_split
+from omnibench.fit.problem import CalibrationProblem, make_parameterisation
 from omnibench.progress import Reporter, no_progress
 from omnibench.registry import calibrators, costs
 from omnibench.robot.kinematics import Robot

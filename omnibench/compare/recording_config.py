@@ -11,11 +11,12 @@ from omnibench.compare.config import CompareConfig
 from omnibench.compare.result import THEORETICAL_NAME
 from omnibench.config import validate
 from omnibench.data.dataset import Dataset
+from omnibench.data.splits import training_split
 from omnibench.data.storage import load_dataset
 from omnibench.data.stored.dataset_folders import dataset_folders, in_few_words
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import Calibrator
-from omnibench.fit.problem import make_parameterisation, training_split
+from omnibench.fit.problem import make_parameterisation
 from omnibench.fit.shrinkage.prior import default_cost, default_unidentified
 from omnibench.registry import Entry, calibrators, load_plugins
 

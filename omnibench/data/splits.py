@@ -10,8 +10,8 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator
 
-from omnibench.data.dataset import SPLITS, Split, Trajectory
-from omnibench.errors import ConfigError, nearest
+from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory
+from omnibench.errors import ConfigError, DataError, nearest
 from omnibench.words import plural
 
 _OPTIONAL = ("angles", "targets", "pose_covariances")  # fields of a run that all runs of a data set have, or none
@@ -107,6 +107,16 @@ def _split_of(
     if trains and validates:
         raise ConfigError(f"{kind} {name!r} is in both train and validation; name it once")
     return "train" if trains else "validation" if validates else rest
+
+
+def training_split(dataset: Dataset) -> tuple[Trajectory, ...]:
+    """The training trajectories of a data set; DataError when there are none."""
+    trajectories = dataset.split("train")
+    if not trajectories:
+        raise DataError(
+            f"data set {dataset.name}: the training split is empty; set split to train for some trajectories"
+        )
+    return trajectories
 
 
 def every_second(groups: Sequence[Hashable]) -> list[Split]:

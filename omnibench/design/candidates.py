@@ -10,11 +10,11 @@ import numpy as np
 
 from omnibench.config import read_yaml, validate
 from omnibench.data.dataset import Dataset, Trajectory
+from omnibench.data.splits import training_split
 from omnibench.data.storage import load_whole
 from omnibench.design.config import DesignConfig
 from omnibench.design.d_optimality import Counts
 from omnibench.errors import ConfigError, DataError, OmnibenchError, UnknownNameError
-from omnibench.fit.problem import training_split
 from omnibench.fit.span import aligned, direction_in_words, driven_span, motion_in_words
 from omnibench.fit.uncertainty.identifiability import identifiability
 from omnibench.robot.calibration import Noise

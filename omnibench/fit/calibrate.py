@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, get_args
 
 from omnibench.data.dataset import Dataset, Trajectory
+from omnibench.data.splits import training_split
 from omnibench.environment import package_versions
 from omnibench.errors import ConfigError, require_choice, require_range, require_type
 from omnibench.fit.calibrator import Calibrator, RunResult, as_answered, run_calibrator
@@ -24,7 +25,7 @@ from omnibench.fit.parameterisation import (
     MatrixElements,
     ParameterisationName,
 )
-from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation, training_split
+from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
 from omnibench.fit.shrinkage.prior import MountChoice, default_cost, default_mount, default_unidentified
 from omnibench.fit.shrinkage.shrinkage import shrunk
 from omnibench.fit.span import Unidentified, WheelDirection, driven_span, unidentified_directions

@@ -22,12 +22,13 @@ import numpy as np
 
 from omnibench.config import Model
 from omnibench.data.dataset import Dataset
+from omnibench.data.splits import training_split
 from omnibench.errors import DataError, require_choice, require_range, require_type
 from omnibench.fit.bounds.lower_bound import LowerBounds, Node
 from omnibench.fit.bounds.stamp_sums import QUADRATURE
 from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.parameterisation import Box, BoxName, ExplicitBox
-from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation, training_split
+from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
 from omnibench.jobs.gathering import gathered
 from omnibench.jobs.job import Backend
 from omnibench.processes import one_thread

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from omnibench.config import Model
-from omnibench.data.dataset import Dataset, Trajectory
+from omnibench.data.dataset import Trajectory
 from omnibench.data.stored.periods import median_period
 from omnibench.errors import DataError
 from omnibench.fit.cost import Cost
@@ -363,16 +363,6 @@ class CalibrationProblem:
             self.best_cost = float(eligible[index])
             self.best_vector = _frozen(candidates[index])
             self.history.append(Improvement(self.evaluations + int(index) + 1, self.seconds, self.best_cost))
-
-
-def training_split(dataset: Dataset) -> tuple[Trajectory, ...]:
-    """The training trajectories of a data set; DataError when there are none."""
-    trajectories = dataset.split("train")
-    if not trajectories:
-        raise DataError(
-            f"data set {dataset.name}: the training split is empty; set split to train for some trajectories"
-        )
-    return trajectories
 
 
 def make_parameterisation(

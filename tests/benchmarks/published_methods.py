@@ -123,12 +123,17 @@ METHODS = (
 
 
 def load_methods() -> None:
-    """Register the plug-ins of the methods, and the variant of Jung and Chung's that OptiOdom's program computes."""
+    """Register the plug-ins of the methods."""
     for name in {method.calibrator for method in METHODS}:
         file = ROOT / "plugins" / f"{name}.py"
         if file.exists() and name not in {entry.name for entry in calibrators.entries()}:
             failure = load_plugin_file(file)
             assert failure is None, failure
+    register_divided_twice()
+
+
+def register_divided_twice() -> None:
+    """Register the variant of Jung and Chung's method that OptiOdom's program computes."""
     plain: Any = type(calibrators.create("jung_chung"))
 
     @calibrators.register("jung_chung_divided_twice")
@@ -137,6 +142,11 @@ def load_methods() -> None:
 
         def mean_error(self, squares: Sequence[Any]) -> float:
             return float(super().mean_error(squares)) / len(squares)
+
+
+def method_called(label: str) -> Method:
+    """The row of METHODS with a label."""
+    return next(method for method in METHODS if method.label == label)
 
 
 @cache
