@@ -69,7 +69,7 @@ def compare(
     names robots is a study: every method on several robots and kinds of path. Run again with the same -o, it goes on
     where it was stopped.
     """
-    from omnibench.cli.terminal.comparison_tables import print_comparison_ending, print_result
+    from omnibench.cli.terminal.comparisons.comparison_tables import print_comparison_ending, print_result
     from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.compare.report.comparison_report import comparison_document
     from omnibench.compare.run import run_comparison
@@ -120,8 +120,8 @@ def _study(
     force: bool,
 ) -> None:
     """Run a study and print its answer. The exit code is 1 if a recording cannot be read, or no method answered."""
+    from omnibench.cli.terminal.comparisons.study_tables import print_study, print_study_ending
     from omnibench.cli.terminal.progress_display import ProgressDisplay
-    from omnibench.cli.terminal.study_tables import print_study, print_study_ending
     from omnibench.progress import Progress
     from omnibench.study.read_study import read_study_config
     from omnibench.study.report.study_report import study_document

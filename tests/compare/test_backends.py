@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from commands import CONFIGS, compared_here, registries_restored, small, summary, without_seconds
 
-from omnibench.cli.terminal.comparison_tables import print_result
+from omnibench.cli.terminal.comparisons.comparison_tables import print_result
 from omnibench.cli.terminal.console import make_console
 from omnibench.compare.config import CompareConfig
 from omnibench.compare.plan import load_datasets

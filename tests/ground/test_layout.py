@@ -23,11 +23,25 @@ BELOW = {
     "report": {"robot", "data", "slam", "fit"},
     "design": {"robot", "data", "slam", "simulate", "fit", "report"},
     "compare": {"robot", "data", "slam", "simulate", "fit", "report"},
+    "study": {"robot", "data", "slam", "simulate", "fit", "report", "compare"},
     "discover": {"robot", "data", "simulate", "fit", "report"},
     "live": {"robot", "data", "simulate"},
     "testing": {"robot", "data", "fit"},
     "notebook": {"robot", "data", "slam", "simulate", "fit", "report", "design", "compare", "discover"},
-    "cli": {"robot", "data", "slam", "simulate", "fit", "report", "design", "compare", "discover", "live", "testing"},
+    "cli": {
+        "robot",
+        "data",
+        "slam",
+        "simulate",
+        "fit",
+        "report",
+        "design",
+        "compare",
+        "study",
+        "discover",
+        "live",
+        "testing",
+    },
 }
 GROUND = {"config", "registry", "errors", "files", "processes", "jobs", "environment", "words", "progress", "views"}
 CONVENTIONAL = {"__init__", "config", "output", "result", "tables", "wording"}  # one in a room, the same in each

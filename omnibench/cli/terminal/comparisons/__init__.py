@@ -1,0 +1,1 @@
+"""Comparisons and studies on a terminal."""
