@@ -14,8 +14,10 @@ from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.slam.import_dataset import import_dataset
 
 CORELLI = RECORDINGS / "tricycle_corelli" / "dataset.txt"
-# The authors' first guesses, as ``omnibench fetch corelli`` imports the drive.
-CORELLI_OPTIONS: dict[str, Any] = find_recording("corelli").datasets[0].options
+# The authors' first guesses, as ``omnibench fetch corelli`` imports the drive, but in one run.
+CORELLI_OPTIONS: dict[str, Any] = {
+    key: value for key, value in find_recording("corelli").datasets[0].options.items() if key != "window"
+}
 
 
 def corelli_dataset(**options: Any) -> Dataset:

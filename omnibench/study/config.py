@@ -28,7 +28,8 @@ _RULES = ("split", "kind", "session")
 class RecordingSource(Model):
     """Recordings of one robot: a data set (or a glob, or several), or a folder that an importer reads.
 
-    Paths are relative to the study's ``data``.
+    Paths are relative to the study's ``data``. A data set there that has the robot's name, as ``omnibench fetch`` makes
+    it, is taken where the folder to import is not.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, validate_by_name=True, validate_by_alias=True)
@@ -37,11 +38,13 @@ class RecordingSource(Model):
     format: str | None = Field(None, description="an importer, see omnibench list; then path is its source")
     options: dict[str, Any] = Field({}, description="the importer's")
 
-    def source(self, base: Path) -> DatasetSource:
-        """The source with its paths below a folder."""
+    def source(self, base: Path, name: str) -> DatasetSource:
+        """The source of the robot called ``name``, with its paths below a folder."""
         places = [base / place for place in self.path]
         if self.format is None:
             return DatasetSource(path=tuple(places))
+        if not places[0].exists() and (base / name / "dataset.yaml").is_file():
+            return DatasetSource(path=base / name)
         return DatasetSource.model_validate(
             {"import": {"format": self.format, "source": places[0], "options": self.options}}
         )

@@ -48,7 +48,7 @@ def load_robots(config: StudyConfig, progress: Reporter) -> tuple[tuple[StudiedR
     for number, (name, choice) in enumerate(config.robots.items()):
         progress(Progress("reading the recordings", number, len(config.robots), "robot", note=name))
         try:
-            dataset = choice.source(config.data).load(name)
+            dataset = choice.source(config.data, name).load(name)
             rules = choice.trainings or config.trainings
             robots.append(StudiedRobot(name, dataset, divide(dataset, choice, rules, f"robot {name}")))
         except ConfigError:
@@ -120,7 +120,7 @@ def comparison_of(
     choice = config.robots[robot.name]
     return CompareConfig(
         name=config.name,
-        datasets={robot.name: choice.source(config.data)},
+        datasets={robot.name: choice.source(config.data, robot.name)},
         cost=method.cost or CostChoice(name=default_cost(design, len(training))),
         loss=method.loss,
         integration=config.integration,
