@@ -60,6 +60,7 @@ class Calibrator(ABC):
     per_session: True if its article calibrates from the runs of one session, so that it refuses those of several.
     only_for: the robots that it is for, in words, where these are not all; then override ``applies``.
     stochastic: False if the seed makes no difference, so that one run is enough.
+    extends: True if its answers may hold effects beside the matrix.
     exact: True if a converged answer is a minimum to rounding, against which others are measured; that it is the
     optimum of the box is not said by this but by a proof (certify.py).
     """
@@ -72,6 +73,7 @@ class Calibrator(ABC):
     per_session: ClassVar[bool] = False
     only_for: ClassVar[str] = ""
     stochastic: ClassVar[bool] = True
+    extends: ClassVar[bool] = False
     exact: ClassVar[bool] = False
 
     def __init__(self, options: Any) -> None:
