@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -35,6 +36,7 @@ from pydantic import Field
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import NotApplicableError, PluginError
 from omnibench.fit.calibrator import Calibrator, Outcome, RunResult, Solution, model_of_answer
+from omnibench.fit.observations.motion_windows import MotionWindows, motions_in_windows
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.fit.shrinkage.shrunk_matrix import shrunk_closed_form
 from omnibench.fit.uncertainty.uncertainty import NoCovarianceError, uncertainty_of
@@ -49,11 +51,11 @@ from omnibench.robot.signals import of_centre
 
 _LENGTHS = (2.0, 8.0, np.inf)  # s, of the windows; chosen: whole runs alone tell less, and are few
 _STEP = 0.1  # s: signals are averaged over steps as long as this; chosen, motions change more slowly
-_MOST_STEPS = 12_000  # of all runs together, beyond which steps are longer; chosen for the time it takes
-_FOLDS = 3
+_MOST_STEPS = 10_000  # of all runs together, beyond which steps are longer; chosen for the time it takes
+_FOLDS = 4
 _FEWEST = 4  # sessions, commands or runs that can be dealt into folds
 _CHECK = 5  # epochs between two looks at the runs that are held out
-_PATIENCE = 30  # epochs without a lower loss of these that end the training
+_PATIENCE = 50  # epochs without a lower loss of these that end the training
 _SHARES = np.linspace(0.0, 1.0, 5)
 _SURE = 2.0  # standard errors by which a network must gain on the runs that were held out; chosen
 _ROUNDING = 1e-9  # m, rad: errors as small are rounding
@@ -64,7 +66,7 @@ class LearnedOptions(Options):
     """Size of the network and its training."""
 
     layers: tuple[int, ...] = Field((16,), min_length=1, max_length=3, description="sizes of the hidden layers")
-    epochs: int = Field(100, gt=0, le=100_000, description="most passes over all runs, rounded up to fives")
+    epochs: int = Field(150, gt=0, le=100_000, description="most passes over all runs, rounded up to fives")
     learning_rate: float = Field(0.02, gt=0, le=1, description="of Adam")
     decays: tuple[float, ...] = Field(
         (0.3, 3.0), min_length=1, max_length=8, description="weight decays of which early stopping takes one"
@@ -182,10 +184,8 @@ def _extension(problem: CalibrationProblem, shrunk: RunResult, network: Network,
     assert shrunk.matrix is not None  # there is an answer
     matrix, size = shrunk.matrix, shrunk.matrix.size
     covariance = np.zeros((size + 1, size + 1))
-    try:
+    with suppress(NoCovarianceError):
         covariance[:size, :size] = uncertainty_of(problem, shrunk).covariance
-    except NoCovarianceError:
-        pass
     covariance[size, size] = share**2 / GROWTH
     motions = [motions_of(matrix, run.times, run.signals) for run in problem.trajectories]
     driven = representatives(problem.robot, np.concatenate(motions))
@@ -224,31 +224,17 @@ class _Task:
     @classmethod
     def of(cls, problem: CalibrationProblem, matrix: Array, alone: bool) -> _Task:
         """The task of a problem with a matrix (3, M)."""
-        runs = problem.trajectories
-        step = max(_STEP, sum(float(run.pose_times[-1]) for run in runs) / _MOST_STEPS)
-        parts = [_edges(run.pose_times, step) for run in runs]
-        longest, count = max(len(times) for times, _ in parts) - 1, matrix.shape[1]
-        drive, durations = np.zeros((len(runs), longest, count)), np.zeros((len(runs), longest))
-        windows, truth, lengths = [], [], []
-        for index, (run, (times, posed)) in enumerate(zip(runs, parts, strict=True)):
-            spans = np.diff(times)
-            drive[index, : len(spans)] = _means(run, times)
-            durations[index, : len(spans)] = spans
-            poses = _at(times[posed], run.pose_times, run.poses)
-            for number, length in enumerate(_LENGTHS):
-                for first, last in _pairs(times[posed], length):
-                    windows.append((index, posed[first], posed[last]))
-                    truth.append(_seen_from(poses[first], poses[last]))
-                    lengths.append(number)
-        twists, lasting = drive @ matrix.T, np.array(lengths)
-        moved = _motions(twists, durations, np.array(windows)) - np.array(truth)
+        cut = MotionWindows.of(problem.trajectories, _LENGTHS, _STEP, _MOST_STEPS)
+        drive, durations, lengths = cut.drive, cut.durations, cut.lengths
+        twists, count = drive @ matrix.T, len(np.unique(lengths))
+        moved = motions_in_windows(twists, durations, cut.windows) - cut.motions
         errors, weights = np.zeros_like(moved), np.zeros(len(moved))
-        for number in set(lengths):
-            of_length = lasting == number
+        for number in np.unique(lengths):
+            of_length = lengths == number
             errors[of_length] = np.maximum(np.sqrt(np.square(moved[of_length]).mean(axis=0)), _ROUNDING)
-            weights[of_length] = 1 / (of_length.sum() * len(set(lengths)))
-        shortest = lasting == min(lengths)
-        seconds = np.mean([durations[run, low:high].sum() for run, low, high in np.array(windows)[shortest]])
+            weights[of_length] = 1 / (of_length.sum() * count)
+        shortest = lengths == lengths.min()
+        seconds = np.mean([durations[run, low:high].sum() for run, low, high in cut.windows[shortest]])
         outputs = errors[shortest][0] / seconds
         busy = durations > 0
         if alone:
@@ -258,15 +244,15 @@ class _Task:
         mount = problem.robot.mount
         return cls(
             alone=alone,
-            inputs=np.ascontiguousarray((drive / scales).reshape(-1, count).T),
+            inputs=np.ascontiguousarray((drive / scales).reshape(-1, len(scales)).T),
             scales=scales,
             base=np.zeros_like(twists) if alone else twists,
             of_matrix=twists,
             outputs=outputs,
             to_point=np.eye(3) if mount is None else mount.twist,
             durations=durations,
-            windows=np.array(windows),
-            truth=np.array(truth),
+            windows=cut.windows,
+            truth=cut.motions,
             errors=errors,
             weights=weights,
         )
@@ -291,7 +277,7 @@ class _Task:
 
     def losses_of_matrix(self) -> Array:
         """Eq. (1) of every window (P,) under the matrix."""
-        errors = _motions(self.of_matrix, self.durations, self.windows) - self.truth
+        errors = motions_in_windows(self.of_matrix, self.durations, self.windows) - self.truth
         losses: Array = np.sqrt(1 + np.square(errors / self.errors).sum(axis=-1)) - 1
         return losses
 
@@ -301,62 +287,6 @@ class _Task:
         return Network(self.alone, self.scales, self.outputs, layers, parts[-1])
 
 
-def _edges(stamps: Array, step: float) -> tuple[Array, NDArray[np.intp]]:
-    """Edges (J + 1,) of steps, s, and which of them (K,) are stamps of poses: no two of these are nearer than a step."""
-    cells = np.floor(stamps / step + 1e-6)
-    kept = stamps[np.append(True, np.diff(cells) > 0)]
-    kept = kept if kept[-1] == stamps[-1] else np.append(kept, stamps[-1])
-    pieces = np.maximum(np.ceil(np.diff(kept) / (1.5 * step) - 1e-6), 1).astype(int)
-    posed = np.append(0, np.cumsum(pieces))
-    return np.interp(np.arange(posed[-1] + 1), posed, kept), posed
-
-
-def _at(times: Array, known: Array, values: Array) -> Array:
-    """Values (n, c) at known times, interpolated at others."""
-    return np.column_stack([np.interp(times, known, column) for column in values.T])
-
-
-def _means(run: Trajectory, times: Array) -> Array:
-    """Means (J, M) of a run's drive signals between edges (J + 1,), rad/s."""
-    known = np.append(0.0, run.times)
-    driven = np.cumsum(run.signals * np.diff(known)[:, None], axis=0)
-    of_edges = _at(times, known, np.vstack([np.zeros(driven.shape[1]), driven]))
-    means: Array = np.diff(of_edges, axis=0) / np.diff(times)[:, None]
-    return means
-
-
-def _pairs(times: Array, length: float) -> list[tuple[int, int]]:
-    """First and last pose of windows of a length, s, each of which begins in the middle of the one before."""
-    if length == np.inf:
-        return [(0, len(times) - 1)]
-    firsts = np.searchsorted(times, np.arange(0.0, times[-1] - length + 1e-6, length / 2) - 1e-6)
-    lasts = np.searchsorted(times, times[firsts] + length - 1e-6)
-    return [pair for pair in zip(firsts.tolist(), lasts.tolist(), strict=True) if pair[1] < len(times)]
-
-
-def _seen_from(first: Array, last: Array) -> Array:
-    """Pose (3,) relative to another one (3,)."""
-    cosine, sine = np.cos(first[2]), np.sin(first[2])
-    x, y, turned = last - first
-    return np.array([cosine * x + sine * y, cosine * y - sine * x, turned])
-
-
-def _motions(twists: Any, durations: Any, windows: Any, math: Any = np) -> Any:
-    """Motions (P, 3) in windows of runs with twists (Z, J, 3), by exact arcs. math: numpy, or jax.numpy."""
-    moved = twists * durations[..., None]
-    turned = math.cumsum(moved[..., 2], axis=1)
-    middle, chord = turned - moved[..., 2] / 2, math.sinc(moved[..., 2] / (2 * np.pi))
-    cosine, sine = chord * math.cos(middle), chord * math.sin(middle)
-    steps = (moved[..., 0] * cosine - moved[..., 1] * sine, moved[..., 0] * sine + moved[..., 1] * cosine)
-    x, y, heading = (math.pad(each, ((0, 0), (1, 0))) for each in (*(math.cumsum(s, axis=1) for s in steps), turned))
-    run, first, last = windows.T
-    before = heading[run, first]
-    ahead, aside = x[run, last] - x[run, first], y[run, last] - y[run, first]
-    cosine, sine = math.cos(before), math.sin(before)
-    motion = [cosine * ahead + sine * aside, cosine * aside - sine * ahead, heading[run, last] - before]
-    return math.stack(motion, axis=-1)
-
-
 def _losses(parts: Any, data: Any, math: Any = np) -> Any:
     """Eq. (1) of every window (P,) with a network of weights as in ``_Task.start``; data: ``_Task.data``."""
     active = data["inputs"]
@@ -364,7 +294,7 @@ def _losses(parts: Any, data: Any, math: Any = np) -> Any:
         active = math.tanh(weights @ active + biases[:, None]) - math.tanh(biases)[:, None]
     added = ((data["to_point"] * data["outputs"]) @ (parts[-1] @ active)).T
     twists = data["base"] + added.reshape(data["base"].shape)
-    errors = _motions(twists, data["durations"], data["windows"], math) - data["truth"]
+    errors = motions_in_windows(twists, data["durations"], data["windows"], math) - data["truth"]
     return math.sqrt(1 + math.square(errors / data["errors"]).sum(axis=-1)) - 1
 
 
@@ -383,16 +313,17 @@ def _trainer(name: str) -> Any:
         steps, state = adam.update(slopes, state)
         return jax.tree.map(lambda p, s, b: p - rate * (s + decay * (p - b)), parts, steps, begun), state
 
-    @jax.jit
     def train(parts: Any, state: Any, *given: Any) -> Any:
         every = jax.vmap(epoch, in_axes=(0, 0, None, 0, 0, None, None))
         now, _ = jax.lax.scan(lambda now, _: (every(*now, *given), None), (parts, state), None, length=_CHECK)
         return *now, jax.vmap(lambda parts: _losses(parts, given[-1], jax.numpy))(now[0])
 
+    compiled = jax.jit(train)
+
     def in_double_precision(parts: Any, state: Any, *given: Any) -> Any:
         """Weights and state of Adam after some epochs, and losses (networks, P)."""
         with jax.enable_x64(True):
-            return train(parts, jax.vmap(adam.init)(parts) if state is None else state, *given)
+            return compiled(parts, jax.vmap(adam.init)(parts) if state is None else state, *given)
 
     return in_double_precision
 

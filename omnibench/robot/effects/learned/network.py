@@ -84,7 +84,7 @@ def unpacked(weights: Array, signals: int, prefix: str) -> Network:
     if depth not in range(1, _MOST_LAYERS + 1) or not _are_sizes(sizes.tolist()):
         raise DataError(f"{prefix}: weights have no layers of a network; calibrate again")
     widths = [int(size) for size in sizes]
-    shapes = [(signals,), (3,)]
+    shapes: list[tuple[int, ...]] = [(signals,), (3,)]
     for before, width in zip([signals, *widths], widths, strict=False):
         shapes += [(width, before), (width,)]
     shapes.append((3, widths[-1]))
