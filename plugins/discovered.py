@@ -17,6 +17,8 @@ from omnibench.progress import Progress
 from omnibench.registry import calibrators
 from omnibench.robot.calibration import ModelExtension
 
+_STEPS = 7  # of a discovery that takes them all
+
 
 @calibrators.register("discovered")
 class Discovered(Calibrator):
@@ -40,14 +42,13 @@ class Discovered(Calibrator):
         if not all(run.has_poses for run in problem.trajectories):
             raise NotApplicableError("discover needs reference poses along the path of every run")
         plain = closed_form_result(problem)  # from now on the best vector of the problem
-        began = 0
+        steps = set[str]()
 
         def watch(event: Progress) -> None:
-            nonlocal began
-            began = max(began, event.done)
+            steps.add(event.task)
             if problem.seconds_left <= 0:
-                raise BudgetSpent("time", f"{problem.budget.seconds:g} s spent in step {began} of the discovery")
-            problem.report(event.done, event.total or 1, "step")
+                raise BudgetSpent("time", f"{problem.budget.seconds:g} s spent while {event.task}")
+            problem.report(len(steps), max(len(steps), _STEPS), "step")
 
         runs = [replace(run, split="train") for run in problem.trajectories]
         dataset = make_dataset("training", problem.robot, problem.sample_period, runs)

@@ -51,7 +51,7 @@ from omnibench.robot.signals import of_centre
 
 _LENGTHS = (2.0, 8.0, np.inf)  # s, of the windows; chosen: whole runs alone tell less, and are few
 _STEP = 0.1  # s: signals are averaged over steps as long as this; chosen, motions change more slowly
-_MOST_STEPS = 10_000  # of all runs together, beyond which steps are longer; chosen for the time it takes
+_MOST_STEPS = 8_000  # of all runs together, beyond which steps are longer; chosen for the time it takes
 _FOLDS = 4
 _FEWEST = 4  # sessions, commands or runs that can be dealt into folds
 _CHECK = 5  # epochs between two looks at the runs that are held out
@@ -66,7 +66,7 @@ class LearnedOptions(Options):
     """Size of the network and its training."""
 
     layers: tuple[int, ...] = Field((16,), min_length=1, max_length=3, description="sizes of the hidden layers")
-    epochs: int = Field(150, gt=0, le=100_000, description="most passes over all runs, rounded up to fives")
+    epochs: int = Field(120, gt=0, le=100_000, description="most passes over all runs, rounded up to fives")
     learning_rate: float = Field(0.02, gt=0, le=1, description="of Adam")
     decays: tuple[float, ...] = Field(
         (0.3, 3.0), min_length=1, max_length=8, description="weight decays of which early stopping takes one"

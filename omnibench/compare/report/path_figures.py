@@ -42,7 +42,11 @@ def path_section(view: DatasetView) -> Section:
     """A few trajectories of the scored split: whole paths, each beside the detail of its end."""
     chosen = chosen_trajectories(view.dataset.split(view.scored))
     models = drawn_models(view, chosen)
-    figures = [figure(view, trajectory, models) for trajectory in chosen for figure in (_path_figure, _end_figure)]
+    figures = [
+        figure
+        for trajectory in chosen
+        for figure in (_path_figure(trajectory, models), _end_figure(view, trajectory, models))
+    ]
     several = [each for each in models if len(each.entries) > 1]
     groups = "; ".join(f"{each.style.label}: {listing(list(each.entries[1:]), 20)}" for each in several)
     whence = "As Fig. 5 to 7 of the paper, of" if view.of_the_paper else "Of"
@@ -107,7 +111,7 @@ def _with_command(trajectories: Sequence[Trajectory], degrees: float) -> Traject
     return None
 
 
-def _path_figure(view: DatasetView, trajectory: Trajectory, models: Sequence[DrawnModel]) -> Figure:
+def _path_figure(trajectory: Trajectory, models: Sequence[DrawnModel]) -> Figure:
     reference = trajectory.poses[evenly(len(trajectory.poses), 2 * _POINTS)]
     stamps = np.linspace(0.0, trajectory.end, _POINTS)
     traces = [path(REFERENCE_STYLE, reference, 3.5), _end_mark(REFERENCE_STYLE, reference, 9)]
