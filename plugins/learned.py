@@ -100,6 +100,7 @@ class Learned(Calibrator):
         chosen = training.best()
         share = 1.0 if self.alone else _share(problem, shrunk.matrix, chosen.of_folds, training.folds, units)
         done = f"{training.epochs} epochs on {len(set(units))} {_kind(units, problem.trajectories)}"
+        done += ", when the time was spent" if training.cut else ""
         if not share:
             return _matrix_alone(plain, f"no gain on held-out runs is sure in {done}", ended=training.cut)
         reason = (
@@ -108,7 +109,7 @@ class Learned(Calibrator):
         )
         return Solution(
             np.array(shrunk.vector),
-            f"{reason}; the time was spent" if training.cut else reason,
+            reason,
             converged=not training.cut and plain.outcome is Outcome.CONVERGED,
             noise=shrunk.noise,
             extension=_extension(problem, shrunk, chosen.network, share),
