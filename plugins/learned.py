@@ -51,9 +51,9 @@ from omnibench.robot.signals import of_centre
 
 _LENGTHS = (2.0, 8.0, np.inf)  # s, of the windows; chosen: whole runs alone tell less, and are few
 _STEP = 0.1  # s: signals are averaged over steps as long as this; chosen, motions change more slowly
-_MOST_STEPS = 8_000  # of all runs together, beyond which steps are longer; chosen for the time it takes
-_FOLDS = 4
-_FEWEST = 4  # sessions, commands or runs that can be dealt into folds
+_MOST_STEPS = 7_000  # of all runs together, beyond which steps are longer; chosen for the time it takes
+_FOLDS = 5  # chosen: more take longer
+_FEWEST = 5  # sessions, commands or runs that can be dealt into folds
 _CHECK = 5  # epochs between two looks at the runs that are held out
 _PATIENCE = 50  # epochs without a lower loss of these that end the training
 _SHARES = np.linspace(0.0, 1.0, 5)

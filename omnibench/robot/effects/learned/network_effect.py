@@ -10,6 +10,7 @@ from omnibench.robot.effects.effect import MotionEffect, Parameter, Values
 from omnibench.robot.effects.learned.network import Network, unpacked
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.signals import Signals
+from omnibench.robot.wheels.drive import Drive
 
 
 @effects.register("learned")
@@ -25,12 +26,15 @@ class Learned(MotionEffect):
     form_covariates = ()
     fixed_parameters = (Parameter("share", "1", 0.0, 1.0, "of the network's correction that is used"),)
 
-    def __init__(self, options: Options | None = None, network: Network | None = None) -> None:
+    def __init__(
+        self, options: Options | None = None, network: Network | None = None, drive: Drive | None = None
+    ) -> None:
         super().__init__(options)
-        self.network = network
+        self._network, self._drive = network, drive
 
     def with_weights(self, weights: Array, robot: Robot, prefix: str) -> Learned:
-        return Learned(self.options, unpacked(weights, len(robot.drive.names), prefix))
+        drive = robot.drive  # looked up once, since that takes as long as the network
+        return Learned(self.options, unpacked(weights, len(drive.names), prefix), drive)
 
     def trial_weights(self, robot: Robot) -> Array:
         rng, signals = np.random.default_rng(0), len(robot.drive.names)
@@ -39,7 +43,7 @@ class Learned(MotionEffect):
 
     def correction(self, signals: Signals, values: Values) -> Array:
         """Correction (F, 3): share (net(u) - alone K u), m/s, m/s, rad/s. DataError: the effect has no weights."""
-        if self.network is None:
+        if self._network is None or self._drive is None:
             raise DataError("effect 'learned' has no weights; take it from the calibration file that holds them")
-        twists = self.network.twists(signals.robot.drive.signals(signals.rates, signals.steering))
-        return values["share"] * (twists - signals.twists if self.network.alone else twists)
+        twists = self._network.twists(self._drive.signals(signals.rates, signals.steering))
+        return values["share"] * (twists - signals.twists if self._network.alone else twists)
