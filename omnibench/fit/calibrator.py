@@ -164,7 +164,7 @@ def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunRe
     seconds = problem.seconds
     vector, cost = None, None
     freedom: Array | None = None
-    extension = None if solution is None else solution.extension
+    extension = solution.extension if isinstance(solution, Solution) else None
     if outcome not in (Outcome.FAILED, Outcome.INVALID, Outcome.NOT_APPLICABLE):
         try:
             if solution is not None and solution.degrees_of_freedom is not None:
