@@ -73,7 +73,7 @@ def _with_proven_gap(
     run: PlannedRun, done: ScoredRun, proofs: Sequence[tuple[PlannedRun, BoxCertificate]]
 ) -> ScoredRun:
     cost, matrix = done.record.train_cost, done.matrix
-    if cost is None or matrix is None:
+    if cost is None or matrix is None or done.extension is not None:  # no matrix of a box has effects
         return done
     for owner, proof in proofs:
         if is_comparable(run, matrix, owner):

@@ -28,6 +28,7 @@ from omnibench.files import (
 from omnibench.fit.uncertainty.ratio_intervals import Interval
 from omnibench.robot.calibration import (
     Calibration,
+    ModelExtension,
     Provenance,
     Row,
     covariance_rows,
@@ -161,14 +162,19 @@ def calibration_of(run: ScoredRun, result: ComparisonResult) -> Calibration:
     dataset: Dataset = result.datasets[run.record.dataset]
     assert run.record.matrix is not None  # only runs with an answer are written
     uncertainty = result.uncertainties.get((run.record.dataset, run.record.label))
+    covariance = covariance_rows(uncertainty.covariance) if uncertainty else None
+    extension = run.extension or ModelExtension(effects=(), covariance=covariance)
     return fitted_calibration(
         name=f"{run.record.dataset} {run.record.label}",
         robot=dataset.robot,
         sample_period=dataset.sample_period,
         matrix=run.record.matrix,
         integration=result.config.integration,
-        noise=uncertainty.noise if uncertainty else None,
-        covariance=covariance_rows(uncertainty.covariance) if uncertainty else None,
+        noise=uncertainty.noise if uncertainty else run.noise if run.extension else None,
+        effects=extension.effects,
+        covariance=extension.covariance,
+        driven=extension.driven,
+        plain=extension.plain,
         provenance=Provenance(
             dataset=dataset.name,
             dataset_hash=dataset.hash,

@@ -21,7 +21,7 @@ from omnibench.fit.problem import Improvement
 from omnibench.fit.uncertainty.ratio_intervals import Interval, Units
 from omnibench.fit.uncertainty.uncertainty import Uncertainty
 from omnibench.registry import calibrators
-from omnibench.robot.calibration import HeldOutVerdict, Row
+from omnibench.robot.calibration import HeldOutVerdict, ModelExtension, Noise, Row
 from omnibench.robot.kinematics import Array
 from omnibench.views import Shown
 
@@ -106,7 +106,8 @@ class ScoredRun:
     """A run with its scores.
 
     history: the best cost so far. scores: by split, those with trajectories; empty without an answer. design: scores of
-    the design values, by split.
+    the design values, by split. extension, noise: as in
+    RunResult.
     """
 
     record: RunRecord
@@ -114,6 +115,8 @@ class ScoredRun:
     history: tuple[Improvement, ...]
     scores: Mapping[Split, SplitScore]
     design: Mapping[Split, SplitScore]
+    extension: ModelExtension | None = None
+    noise: Noise | None = None
 
     @property
     def matrix(self) -> Array | None:

@@ -21,14 +21,15 @@ from omnibench.fit.observations.reference_errors import with_mean_errors
 from omnibench.fit.parameterisation import make_bounds
 from omnibench.fit.uncertainty.ratio_intervals import UnitName, units_of
 from omnibench.registry import calibrators, costs
-from omnibench.robot.calibration import matrix_rows
+from omnibench.robot.calibration import extended_model, matrix_rows
 from omnibench.robot.kinematics import Array
+from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
 from omnibench.robot.stored.odometry_of_stored import odometry_of
 
 
 class SplitScorer:
-    """Scores matrices on one split with one cost."""
+    """Scores matrices, and models with effects, on one split with one cost."""
 
     def __init__(
         self, trajectories: Sequence[Trajectory], cost: Cost, integration: Integration, unit: UnitName | None = None
@@ -65,6 +66,19 @@ class SplitScorer:
             self.cost(matrix), self.costs(matrix), self.final_errors(matrix), self._units, self._cost.rounding
         )
 
+    def score_of_model(self, model: OdometryModel) -> SplitScore:
+        """All of these of a model with effects, under which a run without poses has the final errors of its matrix.
+
+        PluginError as ``score``. DataError: the split lacks what an effect needs.
+        """
+        errors, owner = self._cost.errors_of(model, self._trajectories)
+        cost = float(self._checked(1, lambda: self._cost.combine(errors[None], owner))[0])
+        costs = self._checked(len(self._final), lambda: self._cost.of_each(errors, owner))
+        ends = model.reported([trajectory.final_log for trajectory in self._trajectories])
+        of_ends = np.concatenate(ends) - self._final
+        final = with_mean_errors(of_ends, model.matrix, self._trajectories, self._integration)
+        return SplitScore(cost, costs, final, self._units, self._cost.rounding)
+
     def _errors(self, matrix: Array) -> Array:
         return self._odometry.poses(matrix[None])[0] - self._reference
 
@@ -92,7 +106,7 @@ def score(
             scorers[run.dataset_name] = _scorers(run.config, dataset)
             design[run.dataset_name] = _scores(scorers[run.dataset_name], dataset.robot.inverse_kinematic_matrix)
     scored = [
-        _scored(run, result, _scores(scorers[run.dataset_name], result.matrix), design[run.dataset_name])
+        _scored(run, result, _scores_of(run, result, scorers[run.dataset_name]), design[run.dataset_name])
         for run, result in zip(plan, results, strict=True)
     ]
     exact = [(run, done) for run, done in zip(plan, scored, strict=True) if _is_exact(run, done)]
@@ -113,9 +127,22 @@ def _scorers(config: CompareConfig, dataset: Dataset) -> dict[Split, SplitScorer
     }
 
 
-def _scores(scorers: Mapping[Split, SplitScorer], matrix: Array | None) -> dict[Split, SplitScore]:
-    """A matrix's score on each split; none without a matrix."""
-    return {} if matrix is None else {split: scorer.score(matrix) for split, scorer in scorers.items()}
+def _scores(scorers: Mapping[Split, SplitScorer], matrix: Array) -> dict[Split, SplitScore]:
+    """A matrix's score on each split."""
+    return {split: scorer.score(matrix) for split, scorer in scorers.items()}
+
+
+def _scores_of(run: PlannedRun, result: RunResult, scorers: Mapping[Split, SplitScorer]) -> dict[Split, SplitScore]:
+    """The score on each split of a run's answer, with its effects if it has some; none without an answer."""
+    if result.matrix is None:
+        return {}
+    if result.extension is None:
+        return _scores(scorers, result.matrix)
+    dataset = run.dataset
+    model = extended_model(
+        dataset.robot, result.matrix, run.config.integration, dataset.sample_period, result.extension, run.label
+    )
+    return {split: scorer.score_of_model(model) for split, scorer in scorers.items()}
 
 
 def position_error(errors: Array) -> float:
@@ -158,7 +185,7 @@ def _scored(
         gap_box=None,
         proven_gap=None,
     )
-    return ScoredRun(record, run.search_space, result.history, scores, design)
+    return ScoredRun(record, run.search_space, result.history, scores, design, result.extension, result.noise)
 
 
 def _columns(split: Split, scores: Mapping[Split, SplitScore], design: Mapping[Split, SplitScore]) -> dict[str, Any]:
@@ -195,9 +222,12 @@ def _is_exact(run: PlannedRun, scored: ScoredRun) -> bool:
 
 
 def _with_gap(run: PlannedRun, scored: ScoredRun, exact: Sequence[tuple[PlannedRun, ScoredRun]]) -> ScoredRun:
-    """The run with its gap above the first answer of closed_form that it can be compared with."""
+    """The run with its gap above the first answer of closed_form that it can be compared with.
+
+    One with effects has none: no matrix of a box has them.
+    """
     cost, matrix = scored.record.train_cost, scored.matrix
-    if cost is None or matrix is None:
+    if cost is None or matrix is None or scored.extension is not None:
         return scored
     for other, optimum in exact:
         if is_comparable(run, matrix, other):

@@ -42,10 +42,7 @@ def calibration_of(
 
     reason: why the fit ended, in words. plain: the fit of the plain matrix, to which the effects of a model fade.
     """
-    terms = tuple(
-        EffectTerm(name=term.name, parameters={key: float(value) for key, value in term.values.items()})
-        for term in extended.fit.model.terms
-    )
+    terms = tuple(EffectTerm.of(term) for term in extended.fit.model.terms)
     return fitted_calibration(
         name=f"{dataset.name} {name}",
         robot=dataset.robot,

@@ -41,14 +41,15 @@ from omnibench.registry import calibrators, costs
 from omnibench.robot.calibration import (
     Calibration,
     EffectTerm,
+    ModelExtension,
     Provenance,
     covariance_rows,
+    extended_model,
     fitted_calibration,
     matrix_rows,
 )
 from omnibench.robot.effects.term import Term
 from omnibench.robot.kinematics import Robot
-from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
 from omnibench.views import Shown
 
@@ -154,6 +155,10 @@ def calibrate(
     terms: tuple[Term, ...] = ()
     driven = training
     if steering == "fit":
+        if chosen.extends:
+            raise ConfigError(
+                f"calibrator {calibrator!r} adds effects of its own; leave out steering: fit, or take another"
+            )
         settings = (objective, box, mount, integration, seed)
         terms = SteeringFit(dataset.robot, training, dataset.sample_period, *settings, watch).terms()
         driven = corrected_runs(dataset.robot, training, terms, dataset.sample_period)
@@ -266,7 +271,10 @@ class _Fit:
         dataset, problem, result, uncertainty = self.dataset, self.problem, self.result, self.uncertainty
         assert result.matrix is not None  # there is an answer
         robot, validation = dataset.robot, dataset.split("validation")
-        model = OdometryModel(robot, result.matrix, problem.integration, self.terms, dataset.sample_period)
+        extension = result.extension or ModelExtension(effects=tuple(map(EffectTerm.of, self.terms)))
+        covariance = covariance_rows(uncertainty.covariance) if uncertainty and not self.terms else None
+        model = extended_model(robot, result.matrix, problem.integration, dataset.sample_period, extension)
+        noise = uncertainty.noise if uncertainty else result.noise
         squares = loss == "squares"
         return fitted_calibration(
             name=f"{dataset.name} {self.calibrator}",
@@ -274,9 +282,11 @@ class _Fit:
             sample_period=dataset.sample_period,
             matrix=matrix_rows(result.matrix),
             integration=problem.integration,
-            effects=tuple(EffectTerm(name=term.name, parameters=dict(term.values)) for term in self.terms),
-            noise=uncertainty.noise if uncertainty and any(run.has_poses for run in problem.trajectories) else None,
-            covariance=covariance_rows(uncertainty.covariance) if uncertainty and not self.terms else None,
+            effects=extension.effects,
+            noise=noise if any(run.has_poses for run in problem.trajectories) else None,
+            covariance=extension.covariance or covariance,
+            driven=extension.driven,
+            plain=extension.plain,
             provenance=Provenance(
                 dataset=dataset.name,
                 dataset_hash=dataset.hash,

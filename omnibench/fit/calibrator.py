@@ -62,6 +62,7 @@ class Calibrator(ABC):
     per_session: True if its article calibrates from the runs of one session, so that it refuses those of several.
     only_for: the robots that it is for, in words, where these are not all; then override ``applies``.
     stochastic: False if the seed makes no difference, so that one run is enough.
+    extends: True if its answers may hold effects beside the matrix.
     exact: True if a converged answer is a minimum to rounding, against which others are measured; that it is the
     optimum of the box is not said by this but by a proof (certify.py).
     """
@@ -74,6 +75,7 @@ class Calibrator(ABC):
     per_session: ClassVar[bool] = False
     only_for: ClassVar[str] = ""
     stochastic: ClassVar[bool] = True
+    extends: ClassVar[bool] = False
     exact: ClassVar[bool] = False
 
     def __init__(self, options: Any) -> None:
@@ -172,7 +174,7 @@ def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunRe
     seconds = problem.seconds
     vector, cost = None, None
     freedom: Array | None = None
-    extension = None if solution is None else solution.extension
+    extension = solution.extension if isinstance(solution, Solution) else None
     if outcome not in (Outcome.FAILED, Outcome.INVALID, Outcome.NOT_APPLICABLE):
         try:
             if solution is not None and solution.degrees_of_freedom is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -21,7 +22,7 @@ from omnibench.config import Model, NonNegative, parse_yaml, printable, read_yam
 from omnibench.errors import ConfigError, DataError, require_type
 from omnibench.files import write_text
 from omnibench.robot.domain.fade import Fade
-from omnibench.robot.effects.term import make_term
+from omnibench.robot.effects.term import Term, make_term
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
@@ -36,11 +37,35 @@ Fingerprint = Annotated[str, Field(pattern="^[0-9a-f]{16}$")]
 Deviation = Annotated[NonNegative, Field(le=1e3)]
 
 
+def _is_none(value: object) -> bool:
+    return value is None
+
+
 class EffectTerm(Model):
     """An effect by its name, with the values of its parameters."""
 
     name: str
     parameters: dict[str, FiniteFloat] = {}
+    weights: str | None = Field(
+        None, description="of a learned effect: base64 of float32, at most 48 KiB", exclude_if=_is_none
+    )
+
+    @classmethod
+    def of(cls, term: Term) -> EffectTerm:
+        """A term of a model, as a file holds it."""
+        values = {name: float(value) for name, value in term.values.items()}
+        return cls(name=term.name, parameters=values, weights=term.weights)
+
+    @property
+    def numbers_in_words(self) -> Iterator[str]:
+        """The parameters, like ``g 0.1``, and how many weights there are."""
+        yield from (f"{name} {value:.6g}" for name, value in self.parameters.items())
+        if self.weights is not None:
+            yield f"{len(self.weights) * 3 // 16} weights"
+
+    def term(self, robot: Robot, where: str = "") -> Term:
+        """The term of a robot's model. OmnibenchError as ``make_term``; messages begin with ``where``."""
+        return make_term(self.name, self.parameters, robot, where, weights=self.weights)
 
 
 class Noise(Model):
@@ -77,10 +102,6 @@ class HeldOutVerdict(Model):
     method: Literal["bootstrap", "Student's t", "none"] = "none"
     sentence: str
     detail: str
-
-
-def _is_none(value: object) -> bool:
-    return value is None
 
 
 class Provenance(Model):
@@ -140,7 +161,7 @@ def extended_model(
     """
     if extension is None:
         return OdometryModel(robot, matrix, integration, (), sample_period)
-    terms = tuple(make_term(term.name, term.parameters, robot, where) for term in extension.effects)
+    terms = tuple(term.term(robot, where) for term in extension.effects)
     model = OdometryModel(robot, matrix, integration, terms, sample_period)
     if extension.plain is None or extension.driven is None or extension.covariance is None or not terms:
         return model
@@ -236,10 +257,7 @@ class Calibration(Shown, Model):
     @property
     def effects_in_words(self) -> str:
         """The effects with their parameters, like ``steering_gain (g 0.1)``."""
-        return ", ".join(
-            f"{term.name} ({', '.join(f'{name} {value:.6g}' for name, value in term.parameters.items())})"
-            for term in self.effects
-        )
+        return ", ".join(f"{term.name} ({', '.join(term.numbers_in_words)})" for term in self.effects)
 
     def check_wheels(self, robot: Robot, owner: str, place: str = "") -> None:
         """DataError: the calibration is for other wheels than a robot's, or for wheels that drive it in another way.
@@ -318,7 +336,7 @@ def _checked(content: Any, where: str) -> Calibration:
         raise DataError(f"{where}: format is {version!r}, expected {FORMAT!r}; is this a calibration file?")
     calibration = validate(Calibration, content, where)
     for term in calibration.effects:
-        make_term(term.name, term.parameters, calibration.robot, where)
+        term.term(calibration.robot, where)
     return calibration
 
 

@@ -15,7 +15,7 @@ from omnibench.registry import effects
 from omnibench.robot.calibration import EffectTerm, Row, matrix_rows
 from omnibench.robot.corrected import Corrected, check_needs, corrected, needs_of
 from omnibench.robot.effects.effect import ActuatorEffect
-from omnibench.robot.effects.term import Term, check_applies, make_term
+from omnibench.robot.effects.term import Term, check_applies
 from omnibench.robot.kinematics import Array, Mount, Robot, Wheel, inverse_kinematic_matrix
 from omnibench.robot.model import OdometryModel, reported_poses
 from omnibench.robot.odometry import Integration, WheelLog
@@ -192,7 +192,7 @@ class TruthRecord(Model):
         """
         where = _place(self.dataset)
         robot = self.robot if self.mount is None else self.robot.model_copy(update={"mount": self.mount})
-        terms = tuple(make_term(effect.name, effect.parameters, robot, where) for effect in self.effects)
+        terms = tuple(effect.term(robot, where) for effect in self.effects)
         model = OdometryModel(robot, np.array(self.matrix), self.integration, terms, step or self.sample_period)
         return TrueRobot(model, self._contacts)
 

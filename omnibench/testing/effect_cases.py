@@ -193,7 +193,7 @@ class EffectConformance(Conformance):
         bare: dict[str, Any] = dict.fromkeys(unused)
         for robot, values in trials(effect):
             try:
-                effect.correction(replace(driven_signals(robot), **bare), values)
+                results(effect, replace(driven_signals(robot), **bare), values)
             except (TypeError, AttributeError) as error:
                 missing = ", ".join(sorted(unused))
                 require(False, f"without {missing} it raises {type(error).__name__}: {error}; name it in needs")

@@ -109,8 +109,10 @@ def motor_input(robot: Robot, samples: int = SAMPLES, speed: float = 1.0) -> Mot
 
 
 def results(effect: Effect, given: Input, values: Values) -> dict[str, Array]:
-    """Results of the effect's methods, by name."""
+    """Results of the effect's methods, by name; an effect that has weights gets its trial weights."""
     if isinstance(given, Signals):
+        if effect.weighted:
+            effect = effect.with_weights(effect.trial_weights(given.robot), given.robot, f"effect {effect.name!r}")
         assert isinstance(effect, MotionEffect)
         return {"correction": effect.correction(given, values)}
     if len(given) == 2:

@@ -49,9 +49,10 @@ def path_picture(view: DatasetView) -> FigureGrid | None:
     models = [(THEORETICAL_STYLE, view.model(view.design_matrix))]
     best = view.best
     if best is not None and best.calibrator != THEORETICAL_NAME and best.typical is not None:
-        matrix = best.typical.matrix
-        if matrix is not None:
-            models.append((LegendItem("calibrated", f"calibrated by {best.label}", CALIBRATED), view.model(matrix)))
+        run = best.typical
+        if run.matrix is not None:
+            style = LegendItem("calibrated", f"calibrated by {best.label}", CALIBRATED)
+            models.append((style, view.model(run.matrix, run.extension)))
     return paths_before_after(view.dataset.split(view.scored), models, SPLIT_NAMES[view.scored])
 
 

@@ -18,6 +18,7 @@ from omnibench.report.recording.scan_points import evenly
 from omnibench.report.style import plan, text
 from omnibench.report.traces import START, line, marks, path
 from omnibench.robot.kinematics import Array
+from omnibench.robot.model import OdometryModel
 from omnibench.words import plural
 
 _SHOWN = 4  # trajectories that are drawn, as many as in Fig. 6 of the paper
@@ -30,10 +31,10 @@ _PAPER_TURN_RATE = 0.35  # rad/s
 
 @dataclass(frozen=True, eq=False)
 class DrawnModel:
-    """A matrix that stands for every entry whose paths cannot be told from its own. entries: their labels."""
+    """A model that stands for every entry whose paths cannot be told from its own. entries: their labels."""
 
     style: LegendItem
-    matrix: Array
+    model: OdometryModel
     entries: tuple[str, ...] = ()
 
 
@@ -41,7 +42,11 @@ def path_section(view: DatasetView) -> Section:
     """A few trajectories of the scored split: whole paths, each beside the detail of its end."""
     chosen = chosen_trajectories(view.dataset.split(view.scored))
     models = drawn_models(view, chosen)
-    figures = [figure(view, trajectory, models) for trajectory in chosen for figure in (_path_figure, _end_figure)]
+    figures = [
+        figure
+        for trajectory in chosen
+        for figure in (_path_figure(trajectory, models), _end_figure(view, trajectory, models))
+    ]
     several = [each for each in models if len(each.entries) > 1]
     groups = "; ".join(f"{each.style.label}: {listing(list(each.entries[1:]), 20)}" for each in several)
     whence = "As Fig. 5 to 7 of the paper, of" if view.of_the_paper else "Of"
@@ -58,30 +63,26 @@ def path_section(view: DatasetView) -> Section:
 
 
 def drawn_models(view: DatasetView, trajectories: Sequence[Trajectory]) -> list[DrawnModel]:
-    """The design values, then one matrix for each group of entries with the same ends as far as can be seen."""
+    """The design values, then one model for each group of entries with the same ends as far as can be seen."""
     finals = [trajectory.final_log for trajectory in trajectories]
     last = np.array([trajectory.final_pose[:2] for trajectory in trajectories])
     calibrated = sorted(view.calibrated, key=lambda pair: not pair[0].is_best)  # the best one leads its group
-    ends = {
-        entry.label: np.array([poses[-1, :2] for poses in view.model(run.matrix).poses(finals)])
-        for entry, run in calibrated
-        if run.matrix is not None
-    }
+    models = {entry.label: view.model(run.matrix, run.extension) for entry, run in calibrated if run.matrix is not None}
+    ends = {label: np.array([poses[-1, :2] for poses in model.poses(finals)]) for label, model in models.items()}
     off = [1e3 * np.linalg.norm(end - last, axis=1) for end in ends.values()]
     seen = [2e-3 * _SEEN * _window(list(of_run)) for of_run in np.transpose(off)]  # m, of each run
     groups: dict[str, list[str]] = {}
     for label, end in ends.items():
         near = (leader for leader in groups if (np.linalg.norm(end - ends[leader], axis=1) < seen).all())
         groups.setdefault(next(near, label), []).append(label)
-    matrices = {entry.label: run.matrix for entry, run in calibrated if run.matrix is not None}
-    drawn = [_group(view.styles[leader], matrices[leader], members) for leader, members in groups.items()]
-    return [DrawnModel(THEORETICAL_STYLE, view.design_matrix), *reversed(drawn)]  # the best on top
+    drawn = [_group(view.styles[leader], models[leader], members) for leader, members in groups.items()]
+    return [DrawnModel(THEORETICAL_STYLE, view.model(view.design_matrix)), *reversed(drawn)]  # the best on top
 
 
-def _group(style: LegendItem, matrix: Array, members: Sequence[str]) -> DrawnModel:
+def _group(style: LegendItem, model: OdometryModel, members: Sequence[str]) -> DrawnModel:
     if len(members) > 1:
         style = replace(style, label=f"{style.label} and {plural(len(members) - 1, 'other')}")
-    return DrawnModel(style, matrix, tuple(members))
+    return DrawnModel(style, model, tuple(members))
 
 
 def chosen_trajectories(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
@@ -110,12 +111,12 @@ def _with_command(trajectories: Sequence[Trajectory], degrees: float) -> Traject
     return None
 
 
-def _path_figure(view: DatasetView, trajectory: Trajectory, models: Sequence[DrawnModel]) -> Figure:
+def _path_figure(trajectory: Trajectory, models: Sequence[DrawnModel]) -> Figure:
     reference = trajectory.poses[evenly(len(trajectory.poses), 2 * _POINTS)]
     stamps = np.linspace(0.0, trajectory.end, _POINTS)
     traces = [path(REFERENCE_STYLE, reference, 3.5), _end_mark(REFERENCE_STYLE, reference, 9)]
     for each in models:
-        (poses,) = view.model(each.matrix).poses([trajectory.log(stamps)])
+        (poses,) = each.model.poses([trajectory.log(stamps)])
         traces += [path(each.style, poses, 1.8), _end_mark(each.style, poses, 7)]
     traces.append(marks(START, 9, trajectory.start[:1], trajectory.start[1:2], hover="start"))
     title = describe(trajectory)
@@ -131,7 +132,7 @@ def _end_figure(view: DatasetView, trajectory: Trajectory, models: Sequence[Draw
     final = trajectory.final_pose
     duration = trajectory.end
     stamps = np.linspace((1 - _TAIL) * duration, duration, 60)
-    tails = [(each.style, view.model(each.matrix).poses([trajectory.log(stamps)])[0]) for each in models]
+    tails = [(each.style, each.model.poses([trajectory.log(stamps)])[0]) for each in models]
     calibrated = tails[1:] or tails  # the design values come first, and are far away
     half = _window([_distance_mm(poses[-1], final) for _, poses in calibrated])
     late = trajectory.poses[trajectory.pose_times >= min(stamps[0], trajectory.pose_times[-2:][0])]
@@ -165,7 +166,7 @@ def _ends_in_words(view: DatasetView, trajectory: Trajectory) -> str:
     parts = [f"design values {_distance_mm(design[-1], trajectory.final_pose):.0f} mm off"]
     best = view.best
     if best is not None and best.typical is not None and best.typical.matrix is not None:
-        (pose,) = view.model(best.typical.matrix).poses([trajectory.final_log])
+        (pose,) = view.model(best.typical.matrix, best.typical.extension).poses([trajectory.final_log])
         parts.append(f"{best.label} {_distance_mm(pose[-1], trajectory.final_pose):.0f} mm")
     return ", ".join(parts)
 

@@ -24,6 +24,7 @@ from omnibench.registry import calibrators
 from omnibench.report.blocks import LegendItem
 from omnibench.report.numbers import NOTHING, count, seconds
 from omnibench.report.style import REFERENCE, SYMBOLS, THEORETICAL, colours
+from omnibench.robot.calibration import ModelExtension, extended_model
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 
@@ -155,9 +156,10 @@ class DatasetView:
         """True if the runs that are scored have distances, turns and the like, and none has poses."""
         return not any(run.has_poses for run in self.dataset.split(self.scored))
 
-    def model(self, matrix: Array) -> OdometryModel:
-        """The odometry that the comparison used, with another matrix."""
-        return OdometryModel(self.dataset.robot, matrix, self.config.integration)
+    def model(self, matrix: Array, extension: ModelExtension | None = None) -> OdometryModel:
+        """The odometry that the comparison used, with another matrix, and with what extends it."""
+        robot, integration = self.dataset.robot, self.config.integration
+        return extended_model(robot, matrix, integration, self.dataset.sample_period, extension)
 
     @property
     def design_matrix(self) -> Array:

@@ -87,10 +87,13 @@ def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertaint
     parameter that depends on a number that the box holds, or that lies on a bound of it.
 
     NoCovarianceError, with the reason, when there is no answer, the cost is no sum of norms, the answer is no minimum
-    (a published matrix, a search that stopped too early), or the runs are too few.
+    (a published matrix, a search that stopped too early), has effects beside the matrix, or the runs are too few.
     """
     if result.matrix is None or result.vector is None:
         raise NoCovarianceError(f"no covariance without an answer: {result.reason}")
+    if result.extension is not None:
+        names = ", ".join(dict.fromkeys(term.name for term in result.extension.effects))
+        raise NoCovarianceError(f"no intervals: those of a matrix do not hold beside {names}, by which it is corrected")
     answer = covariance_of_answer(problem, result)
     of_vector = answer.of_vector
     slopes = problem.parameterisation.slopes(result.vector)

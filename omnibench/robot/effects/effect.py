@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
+import numpy as np
+
 from omnibench.registry import Options, effects
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.signals import Signals
@@ -48,7 +50,8 @@ class Effect(ABC):
     robots to which it applies, in words, where these are not all; then override ``applies``. form_covariates: with what
     its size may vary (forms.py), by default what follows from shows_in. fixed_parameters: parameters that are the same
     for every robot; otherwise override ``parameters``. in_catalogue: False for a smooth
-    function without physics, which ``discover`` never names.
+    function without physics, which ``discover`` never names. weighted: True if it has weights beside its parameters,
+    many numbers that only training finds; then override ``with_weights`` and ``trial_weights``.
     """
 
     name: ClassVar[str]
@@ -63,6 +66,7 @@ class Effect(ABC):
     only_for: ClassVar[str] = ""
     form_covariates: ClassVar[tuple[str, ...] | None] = None
     fixed_parameters: ClassVar[tuple[Parameter, ...]] = ()
+    weighted: ClassVar[bool] = False
 
     def __init__(self, options: Options | None = None) -> None:
         self.options = options or Options()
@@ -78,6 +82,14 @@ class Effect(ABC):
     def accepts(self, parameter: str) -> bool:  # noqa: ARG002
         """True for a parameter that ``parameters`` does not list but that is valid: one of an unknown session."""
         return False
+
+    def with_weights(self, weights: Array, robot: Robot, prefix: str) -> Effect:  # noqa: ARG002
+        """The effect with weights (n,) for a robot. DataError, which begins with ``prefix``: they do not fit it."""
+        return self
+
+    def trial_weights(self, robot: Robot) -> Array:  # noqa: ARG002
+        """Some weights (n,) for a robot with which the effect changes something, for tests."""
+        return np.empty(0)
 
 
 class MotionEffect(Effect):

@@ -12,6 +12,7 @@ from omnibench.errors import DataError, UnknownNameError
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import Effect, MotionEffect, Parameter, Values
 from omnibench.robot.effects.forms import accepts_form
+from omnibench.robot.effects.weights import decode_weights
 from omnibench.robot.kinematics import Robot
 
 _SCALES = -1e9, 1e9  # range of the values that scale a form's covariate; chosen
@@ -20,10 +21,11 @@ _FAR_OUTSIDE = 1e3  # multiple of the plausible range beyond which a value is re
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Term:
-    """An effect with the values of its parameters, each in its unit."""
+    """An effect with the values of its parameters, each in its unit; weights: as in a calibration file, or None."""
 
     effect: Effect
     values: Values
+    weights: str | None = None
 
     @property
     def name(self) -> str:
@@ -38,12 +40,14 @@ def make_term(
     where: str = "",
     *,
     sessions: tuple[str, ...] = (),
+    weights: str | None = None,
 ) -> Term:
     """The effect called ``name`` with values of its parameters for a robot, in the given order.
 
-    UnknownNameError: no such effect, or no such parameter. DataError: the effect does not apply to the robot, or a
-    parameter is missing, is no finite number, is a thousand times larger than plausible, or has ``choices`` and lies
-    outside its range. Messages begin with ``where``.
+    weights: as in a calibration file, for an effect that has some. UnknownNameError: no such effect, or no such
+    parameter. DataError: the effect does not apply to the robot, or a parameter is missing, is no finite number, is a
+    thousand times larger than plausible, or has ``choices`` and lies outside its range; or the weights are missing, are
+    those of another robot, or are none. Messages begin with ``where``.
     """
     effect = effects.create(name, where=where)
     prefix = f"{where}: effect {name!r}" if where else f"effect {name!r}"
@@ -63,7 +67,19 @@ def make_term(
             raise DataError(
                 f"{prefix}: parameter {parameter.name!r} ({parameter.unit}) is missing; {parameter.description}"
             )
-    return Term(effect, MappingProxyType({given: float(value) for given, value in parameters.items()}))
+    values = MappingProxyType({given: float(value) for given, value in parameters.items()})
+    return Term(_weighted(effect, robot, weights, prefix), values, weights)
+
+
+def _weighted(effect: Effect, robot: Robot, weights: str | None, prefix: str) -> Effect:
+    """The effect with its weights, if it has some."""
+    if weights is None:
+        if effect.weighted:
+            raise DataError(f"{prefix}: weights are missing; take it whole from the file that calibrate wrote")
+        return effect
+    if not effect.weighted:
+        raise DataError(f"{prefix} has no weights; leave them out")
+    return effect.with_weights(decode_weights(weights, f"{prefix}: weights"), robot, prefix)
 
 
 def check_applies(effect: Effect, robot: Robot, prefix: str) -> None:

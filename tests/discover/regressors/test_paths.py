@@ -29,7 +29,12 @@ NAMES = [
     and not entry.cls.run_nuisance
 ]
 
-NAMELESS = [entry.name for entry in effects.entries() if not getattr(entry.cls, "in_catalogue", True)]
+# A learned effect is no candidate: nothing but training finds its weights.
+NAMELESS = [
+    entry.name
+    for entry in effects.entries()
+    if not getattr(entry.cls, "in_catalogue", True) and not getattr(entry.cls, "weighted", False)
+]
 
 
 def on_robot(robot: str) -> Fit:
