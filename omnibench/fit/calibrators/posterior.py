@@ -1,0 +1,205 @@
+"""Most probable matrix and lost wheel rate, by the whole paths and by what is known of the robot's design.
+
+The unknowns are x = (z, d): the matrix K = K0 + L z with a root L of the prior's covariance (physical_prior.py), and
+the rate d that every turning wheel gains or loses (effect ``wheel_dead_zone``), of standard deviation s. A run's path
+is cut into eight stretches and its end. With the medians r = (x, y, heading) of the odometry's errors at the reference
+poses of each stretch, which single poses that have jumped do not move,
+
+    minimise  sum_runs 1/T sum_stretches h((r_x^2 + r_y^2) / p^2 + r_h^2 / q^2)  +  |z|^2 + (d / s)^2,      (1)
+
+T being the run's stretches: a run counts as one observation, since what the model misses in it (slip, its start) is the
+same along it. h is Huber's, so that stretches that are far off pull in proportion and not by their square. p and q are
+the deviations that the errors have at the minimum,
+
+    p^2 = sum w (r_x^2 + r_y^2) / (2 (n - 1)),    q^2 = sum w r_h^2 / (n - 1),                              (2)
+
+with Huber's weights w, scaled to n runs. Gauss-Newton steps solve (1), with p and q taken anew after each. The first
+ones take p and q as 1 cm and 10 mrad: from the errors of the design, data would seem to say nothing.
+
+Source: maximum a posteriori estimate with variances by empirical Bayes, as the shrinkage of shrinkage.py, but along
+the whole path, with a physical prior and with the one effect that all robots here have in common.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from omnibench.config import NonNegative
+from omnibench.data.dataset import Trajectory
+from omnibench.errors import ConfigError, DataError, NotApplicableError
+from omnibench.fit.calibrator import Calibrator, Solution
+from omnibench.fit.problem import CalibrationProblem
+from omnibench.fit.shrinkage.physical_prior import physical_prior_root, physical_tolerance
+from omnibench.fit.steering_fit import corrected_runs
+from omnibench.registry import Options, calibrators
+from omnibench.robot.calibration import EffectTerm, ModelExtension, covariance_rows
+from omnibench.robot.effects.term import Term, make_term
+from omnibench.robot.kinematics import Array
+from omnibench.robot.odometry import OdometryBatch
+
+_EFFECT, _PARAMETER = "wheel_dead_zone", "c"
+_STRETCHES = 8  # of a run's path; 4 and 16 change errors by 2 % (tests/benchmarks/prior_study.py)
+_POSES = 12  # most reference poses of a stretch that are looked at: their median is as steady (chosen)
+_FIRST, _FIRST_STEPS = 0.01, 4  # m and rad, see the module's docstring
+_LEAST = 0.003  # m and rad: smaller deviations are those of motion capture, not of the model (chosen)
+_HUBER = 1.0  # deviations: about half of the stretches lie beyond, if three numbers are normal; twice costs 3 %
+_MOST_STEPS, _RESTING = 40, 1e-5  # steps, and the largest step, in prior deviations, that counts as none
+_STEP = 0.1  # of the prior's deviation, for the derivative by the lost rate
+
+
+class PosteriorOptions(Options):
+    """What is fitted beside the matrix."""
+
+    lost_rate: NonNegative | None = Field(
+        None,
+        description="standard deviation of the rate that turning wheels lose, rad/s; 0: none; default: the class's",
+    )
+
+
+@calibrators.register("posterior")
+class Posterior(Calibrator):
+    """Most probable wheels, track and lost wheel rate, given the whole paths and the design (maximum a posteriori)."""
+
+    Options = PosteriorOptions
+    options: PosteriorOptions
+    bounded = False  # its prior takes the place of the box
+    extends = True
+    stochastic = False
+
+    def calibrate(self, problem: CalibrationProblem) -> Solution:
+        """Gauss-Newton steps on Eq. (1). NotApplicableError: a run has no reference poses."""
+        if problem.parameterisation.name != "matrix":
+            raise ConfigError("posterior finds a matrix by a prior of its own; leave the parameterisation out")
+        if not all(run.has_poses for run in problem.trajectories):
+            raise NotApplicableError("it is for runs with reference poses; take trajectory_ml for other references")
+        tolerance = physical_tolerance(problem.robot)
+        lost = tolerance.lost_rate if self.options.lost_rate is None else self.options.lost_rate
+        fit = _Fit(problem, physical_prior_root(problem.robot, tolerance), lost)
+        unknowns, covariance, steps, rests = fit.minimum()
+        matrix, rate = fit.matrix(unknowns), fit.rate(unknowns)
+        end = f"at rest after {steps} steps" if rests else f"not at rest after {steps} steps"
+        extension, words = None, end
+        if lost:
+            effect = EffectTerm(name=_EFFECT, parameters={_PARAMETER: rate})
+            extension = ModelExtension(effects=(effect,), covariance=covariance_rows(covariance))
+            words = f"{end}; turning wheels {'gain' if rate > 0 else 'lose'} {abs(rate):.4f} rad/s"
+        if not np.isfinite(problem.cost(matrix.reshape(1, -1))).all():
+            raise DataError("the cost of its answer is not finite")
+        return Solution(matrix.ravel(), words, converged=rests, extension=extension)
+
+
+@dataclass(frozen=True, eq=False)
+class _Errors:
+    """Medians (S, 3) of the errors by stretch and their derivatives (S, 3, k) by the unknowns."""
+
+    medians: Array
+    slopes: Array
+
+
+class _Fit:
+    """Eq. (1) for the runs of a problem. root: of the prior (3M, k). lost: deviation of the rate, rad/s; 0: none."""
+
+    def __init__(self, problem: CalibrationProblem, root: Array, lost: float) -> None:
+        self._problem, self._root, self._lost = problem, root, lost
+        self._design = problem.robot.inverse_kinematic_matrix
+        self._chosen = [_poses_looked_at(run) for run in problem.trajectories]
+        stretches = [_stretches(len(chosen)) for chosen in self._chosen]
+        offsets = np.cumsum([0, *(int(of_run.max()) + 1 for of_run in stretches)])
+        self._stretch: NDArray[np.intp] = np.concatenate(
+            [of_run + offset for of_run, offset in zip(stretches, offsets, strict=False)]
+        )
+        counts = np.diff(offsets)
+        self._shares: Array = np.repeat(1 / counts, counts)  # 1/T of Eq. (1)
+        self._runs = len(problem.trajectories)
+        self._reference = np.concatenate(
+            [run.poses[chosen] for run, chosen in zip(problem.trajectories, self._chosen, strict=True)]
+        )
+
+    def matrix(self, unknowns: Array) -> Array:
+        """The matrix (3, M)."""
+        return self._design + (self._root @ unknowns[: self._root.shape[1]]).reshape(self._design.shape)
+
+    def rate(self, unknowns: Array) -> float:
+        """The rate that turning wheels gain, rad/s."""
+        return float(self._lost * unknowns[-1]) if self._lost else 0.0
+
+    def minimum(self) -> tuple[Array, Array, int, bool]:
+        """The unknowns at the minimum, covariance of matrix and rate, steps, and whether they came to rest."""
+        size = self._root.shape[1] + bool(self._lost)
+        unknowns, weights = np.zeros(size), np.ones(len(self._shares))
+        information, steps, rests = np.eye(size), 0, False
+        while steps < _MOST_STEPS and not rests and (self._problem.seconds_left > 0 or not steps):
+            errors = self._errors(unknowns)
+            deviations = self._deviations(errors.medians, weights, steps)
+            squares = (errors.medians / deviations) ** 2
+            weights = 1 / np.maximum(np.sqrt(squares.mean(axis=1)) / _HUBER, 1.0)
+            scaled = errors.slopes / deviations[:, None] * np.sqrt(weights * self._shares)[:, None, None]
+            left = errors.medians / deviations * np.sqrt(weights * self._shares)[:, None]
+            information = np.einsum("sci,scj->ij", scaled, scaled) + np.eye(size)
+            step = np.linalg.solve(information, -np.einsum("sci,sc->i", scaled, left) - unknowns)
+            unknowns, steps = unknowns + step, steps + 1
+            rests = steps > _FIRST_STEPS and bool(np.abs(step).max() < _RESTING)
+            self._problem.report(steps, _MOST_STEPS, "step")
+        root = self._root
+        if self._lost:
+            root = np.block(
+                [[root, np.zeros((len(root), 1))], [np.zeros((1, root.shape[1])), np.array([[self._lost]])]]
+            )
+        return unknowns, root @ np.linalg.solve(information, root.T), steps, rests
+
+    def _deviations(self, medians: Array, weights: Array, steps: int) -> Array:
+        """p, p and q of Eq. (2)."""
+        if steps < _FIRST_STEPS:
+            return np.full(3, _FIRST)
+        shares = weights * self._shares
+        squares = self._runs / shares.sum() * (shares @ medians**2) / max(self._runs - 1, 1)
+        place = (squares[0] + squares[1]) / 2
+        return np.maximum(np.sqrt([place, place, squares[2]]), _LEAST)
+
+    def _errors(self, unknowns: Array) -> _Errors:
+        matrix, rate = self.matrix(unknowns), self.rate(unknowns)
+        odometry = self._odometry(rate)
+        poses = odometry.poses(matrix[None])[0]
+        slopes = odometry.jacobian(matrix).reshape(len(poses), 3, -1) @ self._root
+        if self._lost:
+            further = self._odometry(rate + _STEP * self._lost).poses(matrix[None])[0]
+            slopes = np.concatenate([slopes, ((further - poses) / _STEP)[..., None]], axis=-1)
+        return _Errors(*_by_stretch(poses - self._reference, slopes, self._stretch))
+
+    def _odometry(self, rate: float) -> OdometryBatch:
+        """The odometry at the poses looked at, of wheels that gain a rate, rad/s, when they turn."""
+        problem = self._problem
+        runs: Sequence[Trajectory] = problem.trajectories
+        if rate:
+            term: Term = make_term(_EFFECT, {_PARAMETER: rate}, problem.robot)
+            runs = corrected_runs(problem.robot, runs, [term], problem.sample_period)
+        logs = [run.log(run.pose_times[chosen]) for run, chosen in zip(runs, self._chosen, strict=True)]
+        return OdometryBatch(logs, problem.integration)
+
+
+def _poses_looked_at(run: Trajectory) -> NDArray[np.intp]:
+    """Indices of the reference poses after the start that the fit looks at."""
+    count = len(run.pose_times) - 1
+    spread = np.linspace(1, count, min(_POSES * _STRETCHES, count))
+    return np.unique(np.round(spread).astype(np.intp))
+
+
+def _stretches(count: int) -> NDArray[np.intp]:
+    """The stretch of each of a run's poses; its end, where the robot stands, is one of its own."""
+    stretches = np.arange(count) * _STRETCHES // count
+    stretches[-1] = _STRETCHES
+    return np.unique(stretches, return_inverse=True)[1].astype(np.intp)
+
+
+def _by_stretch(errors: Array, slopes: Array, stretch: NDArray[np.intp]) -> tuple[Array, Array]:
+    """Medians (S, 3) of errors by stretch, and means of their derivatives (S, 3, k)."""
+    edges = np.searchsorted(stretch, np.arange(int(stretch[-1]) + 1))  # poses stand in the stretches' order
+    counts = np.diff([*edges, len(stretch)])
+    medians = np.array([np.median(part, axis=0) for part in np.split(errors, edges[1:])])
+    means: Array = np.add.reduceat(slopes, edges, axis=0) / counts[:, None, None]
+    return medians, means

@@ -1,0 +1,122 @@
+"""Physical prior of a matrix and of the rate that its wheels lose: what is known of a robot before it has been driven.
+
+With the design K0 (3, M), the largest element s_i of its row i, and independent normal numbers of mean 0, the matrix is
+K0 + D with
+
+    D_ij = K0_ij (c_j + g_i) + s_i e_ij + (rotations and shifts below).                             (1)
+
+c_j: the radius of the wheel of column j, which stretches all of the column. g_i: what shortens a whole motion, such as
+rollers that slip (rows 1 and 2) or tyres that scrub in a turn (row 3). e_ij: all else. A driven wheel that is steered
+by a measured angle has two columns, (omega cos phi, omega sin phi), which share its radius and which the offset a of
+the angle turns into each other:
+
+    D = a K0 [0 -1; 1 0] on these two.                                                              (2)
+
+Where the tracked point of a robot is not known (prior.py), it stands at (x, y) from where the robot says, and looks
+into the direction b: the rows of x and y change by
+
+    D_1 = -y K0_3 - b K0_2,    D_2 = x K0_3 + b K0_1.                                               (3)
+
+Every wheel that turns loses the rate -d (effect ``wheel_dead_zone``), d being normal, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnibench.fit.shrinkage.prior import MountChoice, default_mount
+from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.robot_class import RobotClass, class_of
+
+_OFFSET = 0.1  # rad, of a steering angle's zero: a mounted encoder is trued to some degrees
+_POINT, _YAW = 0.05, 0.035  # m, rad: a tracker that is not on the axle's middle; of the corelli tricycle by 0.1 m
+
+
+@dataclass(frozen=True)
+class PhysicalTolerance:
+    """Standard deviations: of radii, each row's factor and elements, Eq. (1), as shares; of the lost rate, rad/s."""
+
+    radius: float
+    rows: tuple[float, float, float]
+    elements: float
+    lost_rate: float
+
+
+# Half of each and twice change the errors on recordings that were left out by less than a tenth, but for the lost rate:
+# of omni wheels, whose rollers creep, it is ten times that of tyres (tests/benchmarks/prior_study.py).
+_TYRES = PhysicalTolerance(0.01, (0.02, 0.02, 0.05), 0.002, 0.004)
+_STEERED = PhysicalTolerance(0.02, (0.02, 0.02, 0.05), 0.005, 0.01)
+_TOLERANCES: Mapping[RobotClass, PhysicalTolerance] = MappingProxyType(
+    {
+        "differential": _TYRES,
+        "skid": PhysicalTolerance(0.02, (0.05, 0.05, 0.2), 0.005, 0.004),
+        "tricycle": _STEERED,
+        "car": _STEERED,
+        "swerve": _STEERED,
+        "omni": PhysicalTolerance(0.02, (0.05, 0.05, 0.05), 0.01, 0.03),
+        "mecanum": PhysicalTolerance(0.02, (0.06, 0.06, 0.06), 0.01, 0.01),
+        "mixed": PhysicalTolerance(0.02, (0.05, 0.05, 0.05), 0.01, 0.01),
+    }
+)
+
+
+def physical_tolerance(robot: Robot) -> PhysicalTolerance:
+    """The tolerance of a robot's class."""
+    return _TOLERANCES[class_of(robot)]
+
+
+def physical_prior_root(robot: Robot, tolerance: PhysicalTolerance, mount: MountChoice | None = None) -> Array:
+    """A root (3M, k) of the covariance of the matrix elements, row by row, about the design: Eq. (1) to (3).
+
+    Rows that no wheel drives (the sideways one of a robot that cannot slide) move with the tracked point alone.
+    """
+    design, scales = robot.inverse_kinematic_matrix, robot.row_scales
+    columns = _wheels_of_columns(robot)
+    roots = [design * np.isin(columns, wheel) * tolerance.radius for wheel in np.unique(columns)]
+    roots += [design * np.eye(3)[:, [row]] * share for row, share in enumerate(tolerance.rows)]
+    for row in np.flatnonzero(np.abs(design).sum(axis=1) > 0):
+        for column in range(design.shape[1]):
+            root = np.zeros_like(design)
+            root[row, column] = scales[row] * tolerance.elements
+            roots.append(root)
+    roots += [_turned(design, pair) * _OFFSET for pair in _pairs(robot, columns)]
+    if (mount or default_mount(robot)) == "fit" and not robot.slides:
+        x, y, heading = design
+        none = np.zeros_like(x)
+        roots += [
+            _POINT * np.array([none, heading, none]),
+            _POINT * np.array([-heading, none, none]),
+            _YAW * np.array([-y, x, none]),
+        ]
+    return np.array([root.ravel() for root in roots]).T
+
+
+def _wheels_of_columns(robot: Robot) -> NDArray[np.intp]:
+    """The wheel (M,) whose radius stretches each column; a car's columns share one."""
+    drive = robot.drive
+    if drive.direct:
+        return np.arange(len(drive.names), dtype=np.intp)
+    if len(drive.names) != sum(1 if pair < 0 else 2 for pair in drive.pairs):  # a car's mean, tangent and difference
+        return np.zeros(len(drive.names), dtype=np.intp)
+    each = [wheel for wheel, pair in enumerate(drive.pairs) for _ in range(1 if pair < 0 else 2)]
+    return np.array(each, dtype=np.intp)
+
+
+def _pairs(robot: Robot, columns: NDArray[np.intp]) -> list[tuple[int, int]]:
+    """The two columns of every driven wheel that steers."""
+    if robot.drive.direct or len(robot.drive.names) != len(columns) or class_of(robot) == "car":
+        return []
+    found = [np.flatnonzero(columns == wheel) for wheel in np.unique(columns)]
+    return [(int(both[0]), int(both[1])) for both in found if len(both) == 2]
+
+
+def _turned(design: Array, pair: tuple[int, int]) -> Array:
+    """Eq. (2) on two columns, for an offset of 1 rad."""
+    turned = np.zeros_like(design)
+    turned[:, list(pair)] = design[:, list(pair)] @ np.array([[0.0, -1.0], [1.0, 0.0]])
+    return turned
