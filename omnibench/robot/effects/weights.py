@@ -11,9 +11,7 @@ import numpy as np
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
 
-MOST_BYTES: Final = (
-    48 * 1024
-)  # decoded; a request to the live node may have 64 KiB, the rest of the calibration included
+MOST_BYTES: Final = 48 * 1024  # decoded: with the rest of a calibration they fit in a request to the live node
 _NUMBER = np.dtype("<f4")
 
 
