@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, ClassVar
@@ -10,6 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import BaseModel
 
+from omnibench.data.dataset import Trajectory
 from omnibench.errors import NotApplicableError, OmnibenchError, PluginError, one_line
 from omnibench.fit.parameterisation import ParameterisationName
 from omnibench.fit.problem import BudgetSpent, CalibrationProblem, Improvement
@@ -153,7 +155,8 @@ def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunRe
     answer: Any = None
     solution: Solution | None = None
     try:
-        check_applicable(calibrator, problem)
+        if refusal := refusal_of(calibrator, problem.robot, problem.trajectories):
+            raise NotApplicableError(refusal)
         given: Any = calibrator.calibrate(problem)
         if not isinstance(given, Solution):
             raise PluginError(f"calibrate returned {type(given).__name__}, expected a Solution")
@@ -203,13 +206,14 @@ def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunRe
     )
 
 
-def check_applicable(calibrator: Calibrator, problem: CalibrationProblem) -> None:
-    """NotApplicableError: a calibrator is not for a problem's robot, or not for runs of several sessions."""
-    if not calibrator.applies(problem.robot):
-        raise NotApplicableError(f"it is for {calibrator.only_for}, and {problem.robot.name} is none")
-    sessions = {run.session for run in problem.trajectories}
+def refusal_of(calibrator: Calibrator, robot: Robot, runs: Sequence[Trajectory]) -> str:
+    """Why a calibrator is not for a robot, or not for runs of several sessions; empty if it is."""
+    if not calibrator.applies(robot):
+        return f"it is for {calibrator.only_for}, and {robot.name} is none"
+    sessions = {run.session for run in runs}
     if calibrator.per_session and len(sessions) > 1:
-        raise NotApplicableError(f"its article calibrates from one session, and these are {len(sessions)}")
+        return f"its article calibrates from one session, and these are {len(sessions)}"
+    return ""
 
 
 def model_of_answer(problem: CalibrationProblem, matrix: Array, extension: ModelExtension | None) -> OdometryModel:

@@ -122,7 +122,7 @@ class MethodChoice(CalibratorEntry):
     """A method: a calibrator with its options and settings.
 
     family: what it is counted under in the answer. cost, unidentified: default, those that ``calibrate`` takes for the
-    robot. trainings: patterns of the trainings that it is run on.
+    robot. trainings, regimes: patterns of those that it is run on, beside the runs as recorded.
     """
 
     family: Literal["ours", "published", "baseline", "other"] = "other"
@@ -132,6 +132,7 @@ class MethodChoice(CalibratorEntry):
     mount: MountChoice | None = None
     tolerance: Positive | None = None
     trainings: Names = ("*",)
+    regimes: Names = ("*",)
 
     @property
     def shown(self) -> str:

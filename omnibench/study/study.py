@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from omnibench.compare.effective_config import load_calibrators
 from omnibench.compare.execute import PRELOAD, execute
 from omnibench.environment import environment
-from omnibench.errors import DataError, Interrupted, require_type
+from omnibench.errors import DataError, Interrupted, PluginError, require_type
 from omnibench.fit.calibrator import RunResult
 from omnibench.jobs.backend_choice import BackendChoice, open_backend
 from omnibench.jobs.job import BackendError
@@ -79,7 +79,9 @@ def _load_methods(config: StudyConfig) -> list[PluginFailure]:
     failures = load_calibrators(config.plugins, [method.name for method in config.methods])
     for index, method in enumerate(config.methods):
         place = f"config {config.name}: methods.{index}"
-        calibrators.create(calibrators.entry(method.name, place).name, method.options, place)
+        calibrators.entry(method.name, place)
+        with suppress(PluginError):  # a constructor that raises is the outcome of its fits
+            calibrators.create(method.name, method.options, place)
     return failures
 
 

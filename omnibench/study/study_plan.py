@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 
 from omnibench.compare.config import CompareConfig, CostChoice
 from omnibench.compare.plan import UNBOUNDED, PlannedRun
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.errors import ConfigError, OmnibenchError
+from omnibench.errors import ConfigError, OmnibenchError, PluginError
+from omnibench.fit.calibrator import refusal_of
 from omnibench.fit.problem import make_parameterisation
 from omnibench.fit.shrinkage.prior import default_cost, default_unidentified
 from omnibench.progress import Progress, Reporter
@@ -76,7 +78,7 @@ def _of_robot(config: StudyConfig, robot: StudiedRobot, name: str, regime: Regim
             runs = in_regime(runs, regime, config.seeds[0])
             dataset = replace(robot.dataset, trajectories=runs, scans=None)
             for method in config.methods:
-                if _named(training.name, method.trainings):
+                if _named(training.name, method.trainings) and (name == AS_RECORDED or _named(name, method.regimes)):
                     for seed in _seeds(config, method):
                         run, reason = _planned(config, robot, method, dataset, seed, f"{training.name} {fold.name}")
                         yield PlannedFit(robot, training, fold, name, method, seed, run, reason)
@@ -95,6 +97,10 @@ def _planned(
 ) -> tuple[PlannedRun | None, str]:
     """A fit as a run of a comparison, or why the method cannot be asked."""
     calibrator = calibrators.entry(method.name).cls
+    with suppress(PluginError):  # a constructor that raises is the outcome of the fit
+        made = calibrators.create(method.name, method.options)
+        if refusal := refusal_of(made, dataset.robot, dataset.trajectories):
+            return None, refusal
     settings = comparison_of(config, robot, method, dataset.trajectories)
     parameterisation = method.parameterisation or calibrator.parameterisation
     box, box_name = method.box or config.box, UNBOUNDED
