@@ -25,6 +25,7 @@ _CONFIGS = {
     "design": ("omnibench.design.config", "DesignConfig"),
     "live": ("omnibench.live.config", "LiveConfig"),
     "simulate": ("omnibench.simulate.source", "SimulationConfig"),
+    "study": ("omnibench.study.config", "StudyConfig"),
 }
 
 
@@ -48,7 +49,7 @@ def list_(plugins: Plugins = None, as_json: Json = False) -> None:
 @plugin_app.command()
 def schema(
     kind: Annotated[
-        Literal["compare", "design", "live", "simulate"], typer.Argument(help="Which command's config.")
+        Literal["compare", "design", "live", "simulate", "study"], typer.Argument(help="Which command's config.")
     ] = "compare",
 ) -> None:
     """Print the JSON schema of a config, for editors."""

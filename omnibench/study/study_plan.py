@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
@@ -141,8 +141,3 @@ def comparison_of(
         timing=config.timing,
         memory_mb=config.memory_mb,
     )
-
-
-def costs_of(fits: list[PlannedFit]) -> Mapping[str, str]:
-    """The cost that each method minimised, by its name in tables."""
-    return {fit.method.shown: fit.run.config.objective for fit in fits if fit.run is not None}

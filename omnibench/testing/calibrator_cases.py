@@ -176,7 +176,8 @@ class CalibratorConformance(Conformance):
         require(
             result.outcome is not Outcome.NOT_APPLICABLE,
             f"it is not applicable to the runs of {problem.robot.name} ({result.reason}), so no case has seen an "
-            "answer; override problem() with runs that it is for",
+            "answer; say in applies(robot) and only_for which robots it is for, and the runs are of such a robot (for "
+            "other paths override problem() in its test, and run pytest)",
         )
         if result.outcome is Outcome.CONVERGED:
             share = (np.inf if result.cost is None else result.cost) / start

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
 from rich.console import Console
 
 from omnibench.cli.terminal.console import print_ending
 from omnibench.cli.terminal.tables import print_table
-from omnibench.report.blocks import Column, Row, Table
+from omnibench.report.blocks import Cell, Column, Row, Table
 from omnibench.report.numbers import NOTHING, fixed
 from omnibench.study.report.study_view import cell_words
 from omnibench.study.study_result import StudyResult
@@ -19,6 +20,8 @@ def print_study(console: Console, result: StudyResult) -> None:
     """Print the table of cells, the recordings that cannot be read and the fits that failed."""
     console.print()
     print_table(console, _cells(result))
+    console.print()
+    print_table(console, _methods(result))
     console.print()
     for name, reason in result.broken.items():
         console.print(f"cannot be read: {name}: {reason}", soft_wrap=True)
@@ -50,6 +53,27 @@ def print_study_ending(result: StudyResult) -> bool:
         f"read {report}",
     )
     return True
+
+
+def _methods(result: StudyResult) -> Table:
+    """Every method on every robot: geometric mean over cells of its error as a share of the design's, or why none."""
+    robots = [robot.name for robot in result.robots]
+    rows = []
+    for method in (choice.shown for choice in result.config.methods):
+        cells = []
+        for robot in robots:
+            mine = [c for c in result.judged_cells if c.key.robot == robot and method in c.methods]
+            ratios = [ratio.value for c in mine if (ratio := c.against_design(method, 1)) is not None]
+            silent = mine[0].methods[method].status if mine else NOTHING
+            mean = float(np.exp(np.mean(np.log(ratios)))) if ratios and min(ratios) > 0 else None
+            cells.append(silent if mean is None else Cell(fixed(mean, 2), plural(len(ratios), "cell")))
+        rows.append(Row.of(method, *cells))
+    return Table(
+        "Error as a share of the design's, geometric mean over cells",
+        (Column("Method", numeric=False), *(Column(name) for name in robots)),
+        tuple(rows),
+        "Every cell and method, with reasons: report.html and study.parquet.",
+    )
 
 
 def _cells(result: StudyResult) -> Table:
