@@ -29,7 +29,7 @@ from scipy.optimize import minimize
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
-from omnibench.robot.kinematics import Array
+from omnibench.robot.kinematics import Array, Robot
 
 _LARGE = 1e300  # replaces a cost that is not finite, of which the simplex could not take differences
 _REACH = 0.5  # largest change of a wheel's factor where the box does not limit it; chosen
@@ -48,6 +48,11 @@ class Maddahi(Calibrator):
     Options = MaddahiOptions
     options: MaddahiOptions
     stochastic = False
+    only_for = "robots whose wheels do not steer"
+
+    def applies(self, robot: Robot) -> bool:
+        """True where each wheel is one column of the matrix."""
+        return robot.drive.direct
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """Find the wheel factors of least cost by a simplex, restarted while the cost falls, and split them."""
