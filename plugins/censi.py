@@ -80,6 +80,7 @@ class Censi(Calibrator):
     Options = CensiOptions
     options: CensiOptions
     bounded = False
+    as_is = True
     stochastic = False
     only_for = "differential drives with two measured wheels"
 

@@ -27,6 +27,7 @@ class Discovered(Calibrator):
     bounded = False
     stochastic = False
     extends = True
+    uses = ("discover", "fit/calibrators/closed_form.py")
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """The matrix with effects. NotApplicableError: Euler steps, a searched geometry, or no reference poses.

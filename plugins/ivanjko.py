@@ -72,6 +72,7 @@ class Ivanjko(Calibrator):
     Options = IvanjkoOptions
     options: IvanjkoOptions
     bounded = False
+    as_is = True
     stochastic = False
     per_session = True
     only_for = "differential drives with two measured wheels"

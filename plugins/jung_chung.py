@@ -81,6 +81,7 @@ class JungChung(Calibrator):
     """Jung and Chung 2012: wheelbase and wheels from the final headings of squares driven both ways."""
 
     bounded = False
+    as_is = True
     stochastic = False
     per_session = True
     only_for = "differential drives with two measured wheels"

@@ -62,6 +62,7 @@ class Kallasi(Calibrator):
     Options = KallasiOptions
     options: KallasiOptions
     bounded = False
+    as_is = True
     stochastic = False
     only_for = "tricycles with one driven and steered wheel"
 

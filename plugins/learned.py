@@ -80,6 +80,7 @@ class Learned(Calibrator):
     Options = LearnedOptions
     options: LearnedOptions
     extends = True
+    uses = ("fit/calibrators/closed_form.py", "jax", "optax")
     alone: ClassVar[bool] = False
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:

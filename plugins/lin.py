@@ -59,6 +59,7 @@ class Lin(Calibrator):
     Options = LinOptions
     options: LinOptions
     bounded = False
+    as_is = True
     stochastic = False
     only_for = "omni robots with three wheels and mecanum bases with four"
 

@@ -100,6 +100,7 @@ class OptiOdom(Calibrator):
     Options = OptiOdomOptions
     options: OptiOdomOptions
     bounded = False
+    as_is = True
     stochastic = False
     only_for = "differential drives, tricycles, omni robots with three wheels and mecanum bases with four"
 

@@ -74,6 +74,7 @@ class Umbmark(Calibrator):
     """UMBmark (Borenstein and Feng 1996): wheelbase and wheels from the ends of squares driven both ways."""
 
     bounded = False
+    as_is = True
     stochastic = False
     per_session = True
     only_for = "differential drives with two measured wheels"

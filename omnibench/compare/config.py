@@ -20,7 +20,14 @@ from omnibench.jobs.scheduler_tls import TlsFiles
 from omnibench.robot.odometry import Integration
 from omnibench.simulate.dataset_source import DatasetSource
 
-_LEAST_MEMORY = 256.0  # 10^6 bytes; a worker process has 200 MB before its run begins (measured, RLIMIT_DATA)
+LEAST_MEMORY = 256.0  # 10^6 bytes; a worker process has 200 MB before its run begins (measured, RLIMIT_DATA)
+
+
+def known_backend(backend: str) -> str:
+    """The name of a backend. ValueError: it is none's."""
+    if flaw := name_flaw(backend):
+        raise ValueError(flaw)
+    return backend
 
 
 def _is_squares(loss: object) -> bool:
@@ -118,14 +125,14 @@ class CompareConfig(Model):
     calibrators: tuple[CalibratorEntry, ...] = Field(min_length=1)
     plugins: tuple[RelativePath, ...] = Field((), description="folders of plug-ins; relative to the config file")
     workers: int | None = Field(None, gt=0, strict=True, description="processes; default: the processors")
-    backend: str = Field(
+    backend: Annotated[str, AfterValidator(known_backend)] = Field(
         "processes",
         description="where runs are made: processes, dask, or a scheduler of Dask: tcp://HOST:PORT, tls://...",
     )
     tls: TlsFiles | None = Field(None, description="files for a scheduler at tls://; relative to the config file")
     timing: bool = Field(True, description="no: the runs' seconds are not compared, and may be those of a busy machine")
     memory_mb: float | None = Field(
-        None, ge=_LEAST_MEMORY, description="memory of each run's process, 10^6 bytes; default: no limit"
+        None, ge=LEAST_MEMORY, description="memory of each run's process, 10^6 bytes; default: no limit"
     )
     bootstrap: Bootstrap = Bootstrap()
     certificate: CertificateChoice | None = Field(CertificateChoice(), description="null: prove nothing")
@@ -147,13 +154,6 @@ class CompareConfig(Model):
     @classmethod
     def _name_stands_for_cost(cls, cost: Any) -> Any:
         return {"name": cost} if isinstance(cost, str) else cost
-
-    @field_validator("backend")
-    @classmethod
-    def _backend_is_known(cls, backend: str) -> str:
-        if flaw := name_flaw(backend):
-            raise ValueError(flaw)
-        return backend
 
     @field_validator("seeds")
     @classmethod

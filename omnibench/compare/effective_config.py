@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 from pydantic import BaseModel
 
-from omnibench.compare.config import CalibratorEntry, CompareConfig
+from omnibench.compare.config import CompareConfig
 from omnibench.config import validate
 from omnibench.errors import ConfigError, OmnibenchError, PluginError
 from omnibench.fit.calibrator import unloadable
@@ -42,7 +43,7 @@ def effective_config(config: CompareConfig) -> CompareConfig:
     entries = []
     for index, entry in enumerate(config.calibrators):
         place = f"config {config.name}: calibrators.{index}"
-        options = _effective_options(entry, place)
+        options = effective_options(entry.name, entry.options, place)
         entries.append(entry.model_copy(update={"options": options.model_dump(mode="json")}))
     return config.model_copy(
         update={
@@ -52,11 +53,12 @@ def effective_config(config: CompareConfig) -> CompareConfig:
     )
 
 
-def _effective_options(entry: CalibratorEntry, place: str) -> BaseModel:
-    calibrator = calibrators.entry(entry.name, place)
-    options = validate(calibrator.options, entry.options, f"{place}: calibrator {entry.name!r}")
+def effective_options(name: str, given: Mapping[str, Any], place: str) -> BaseModel:
+    """The options of a calibrator with every default. ConfigError begins with ``place``: an unknown name or option."""
+    calibrator = calibrators.entry(name, place)
+    options = validate(calibrator.options, given, f"{place}: calibrator {name!r}")
     try:
-        calibrators.create(entry.name, entry.options)  # a constructor may check its options further
+        calibrators.create(name, given)  # a constructor may check its options further
     except PluginError:
         pass  # reported as the outcome of its run
     except OmnibenchError as error:

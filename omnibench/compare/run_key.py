@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import sys
 from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from omnibench.compare.config import CalibratorEntry, CompareConfig
@@ -71,6 +72,21 @@ def named_code(entry: CalibratorEntry, cost: str) -> str:
     classes = [known.cls for known in calibrators.entries() if known.name in named] + [costs.entry(cost).cls]
     modules = {sys.modules.get(base.__module__) for cls in classes for base in cls.__mro__}
     digest = hashlib.sha256()
+    for name in sorted({name for cls in classes for name in getattr(cls, "uses", ())}):
+        digest.update(_code_of(name).encode())
     for file in sorted({file for module in modules if (file := getattr(module, "__file__", None))}):
         digest.update(hashlib.sha256(Path(file).read_bytes()).digest())
     return digest.hexdigest()
+
+
+def _code_of(name: str) -> str:
+    """Hash of a file or a room of the package, as ``discover``; the version of another package."""
+    place = _PACKAGE / name
+    if place.is_dir():
+        return code_digest(_PACKAGE, set(place.rglob("*.py")))
+    if place.is_file():
+        return code_digest(_PACKAGE, {place})
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "not installed"

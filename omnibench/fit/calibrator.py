@@ -60,11 +60,14 @@ class Calibrator(ABC):
 
     parameterisation: the one it searches unless the config names another.
     bounded: False if the answer does not depend on the box (a published matrix, a closed form of an article).
+    as_is: True if its answer stands as it is, as an article's: neither shrunk nor kept to the design.
     fitted: False if the answer does not depend on the runs (the design values, a published matrix).
     per_session: True if its article calibrates from the runs of one session, so that it refuses those of several.
     only_for: the robots that it is for, in words, where these are not all; then override ``applies``.
     stochastic: False if the seed makes no difference, so that one run is enough.
     extends: True if its answers may hold effects beside the matrix.
+    uses: files or rooms of omnibench (``discover``) and packages whose change may change its answers, beside
+    those that all calibrators share; stored runs are then not taken for new ones.
     exact: True if a converged answer is a minimum to rounding, against which others are measured; that it is the
     optimum of the box is not said by this but by a proof (certify.py).
     """
@@ -73,11 +76,13 @@ class Calibrator(ABC):
     name: ClassVar[str]
     parameterisation: ClassVar[ParameterisationName] = "matrix"
     bounded: ClassVar[bool] = True
+    as_is: ClassVar[bool] = False
     fitted: ClassVar[bool] = True
     per_session: ClassVar[bool] = False
     only_for: ClassVar[str] = ""
     stochastic: ClassVar[bool] = True
     extends: ClassVar[bool] = False
+    uses: ClassVar[tuple[str, ...]] = ()
     exact: ClassVar[bool] = False
 
     def __init__(self, options: Any) -> None:
@@ -102,8 +107,8 @@ calibrators.contract = Calibrator
 def as_answered(
     calibrator: type[Calibrator] | Calibrator, unidentified: Unidentified, mount: MountChoice | None
 ) -> tuple[Unidentified, MountChoice | None]:
-    """How answers are treated: as asked for, but those that keep to no box, such as an article's, stand as they are."""
-    return (unidentified, mount) if calibrator.bounded else ("fit", "fit")
+    """How answers are treated: as asked for, unless they stand as they are."""
+    return ("fit", "fit") if calibrator.as_is else (unidentified, mount)
 
 
 @dataclass(frozen=True)

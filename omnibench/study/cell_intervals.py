@@ -56,8 +56,8 @@ class Pairs:
 
     @property
     def sessions(self) -> int:
-        """Number of sessions that judge."""
-        return len(set(self.judged_in))
+        """Number of sessions that judge; 0 where some run names none."""
+        return 0 if None in self.judged_in else len(set(self.judged_in))
 
     def groups(self, unit: UnitOfCell) -> list[list[Members]]:
         """For each group the pairs (n,) of bool that each of its units has a part in."""
@@ -75,7 +75,7 @@ class Pairs:
     @property
     def unit(self) -> UnitOfCell:
         """The units that the interval rests on."""
-        return "session" if min(map(len, self.groups("session"))) >= FEWEST else "run"
+        return "session" if self.sessions and min(map(len, self.groups("session"))) >= FEWEST else "run"
 
 
 @dataclass(frozen=True)

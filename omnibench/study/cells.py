@@ -9,6 +9,9 @@ from typing import Literal
 
 import numpy as np
 
+from omnibench.compare.plan import PlannedRun
+from omnibench.fit.calibrator import Calibrator, as_answered
+from omnibench.registry import calibrators
 from omnibench.robot.kinematics import Array
 from omnibench.study.cell_intervals import CellRatio, Pairs, cell_ratio
 from omnibench.study.judging import JudgedFit
@@ -42,7 +45,8 @@ class MethodInCell:
     """One method in a cell. errors: by measure, (n,) of each pair, means over seeds; the design's where it has none.
 
     fits, answers: how many were asked for and answered; outcomes: how many ended so. reason: of the first without an
-    answer. seconds: median of a fit; numbers: what the method says of its first answer. Both None without an answer.
+    answer. seconds: median of a fit; numbers: what the method says of its first answer. cost, unidentified: what was
+    minimised, and what became of motions that were hardly driven; empty where it was never asked.
     """
 
     method: str
@@ -54,6 +58,8 @@ class MethodInCell:
     seconds: float | None
     numbers: str
     answers: int
+    cost: str = ""
+    unidentified: str = ""
 
     def mean(self, measure: Measure) -> float | None:
         """Mean error over the pairs: Eq. (6), m, or rad."""
@@ -154,6 +160,7 @@ def _method(
                     of_folds[folds[id(each.fit.fold)]] = each.errors
             of_seeds.append(_measured(of_folds, pairs))
         errors = {measure: np.mean([of_one[measure] for of_one in of_seeds], axis=0) for measure in MEASURES}
+    runs = [each.fit.run for each in fits if each.fit.run is not None]
     seconds = [each.result.seconds for each in answered if each.result is not None]
     return MethodInCell(
         method=name,
@@ -165,7 +172,17 @@ def _method(
         seconds=float(np.median(seconds)) if seconds else None,
         numbers=answered[0].reason if answered else "",
         answers=len(answered),
+        cost=", ".join(dict.fromkeys(run.config.objective for run in runs)),
+        unidentified=", ".join(
+            dict.fromkeys(as_answered(_class(run), run.config.unidentified, None)[0] for run in runs)
+        ),
     )
+
+
+def _class(run: PlannedRun) -> type[Calibrator]:
+    """The class of a run's calibrator."""
+    found: type[Calibrator] = calibrators.entry(run.entry.name).cls
+    return found
 
 
 def _measured(errors: Array, pairs: Pairs) -> dict[Measure, Array]:

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, ConfigDict, Field, field_validator, model_validator
 
-from omnibench.compare.config import CalibratorEntry, CompareConfig, CostChoice
+from omnibench.compare.config import LEAST_MEMORY, CalibratorEntry, CostChoice, known_backend
 from omnibench.config import Model, NonNegative, Positive, RelativePath, printable
 from omnibench.data.splits import Names
 from omnibench.fit.loss.losses import LossName
@@ -23,6 +23,7 @@ Label = Annotated[str, Field(min_length=1, max_length=60), AfterValidator(printa
 TrainingRule = Literal["split", "kind", "session"]
 LeftOut = Literal["session", "command", "kind"]
 _RULES = ("split", "kind", "session")
+RECORDED = "as recorded"  # the regime without any change
 
 
 class RecordingSource(Model):
@@ -43,8 +44,11 @@ class RecordingSource(Model):
         places = [base / place for place in self.path]
         if self.format is None:
             return DatasetSource(path=tuple(places))
-        if not places[0].exists() and (base / name / "dataset.yaml").is_file():
-            return DatasetSource(path=base / name)
+        for place in (places[0], base / name):
+            if (place / "dataset.yaml").is_file():
+                return DatasetSource(path=place)
+            if place.exists():
+                break
         return DatasetSource.model_validate(
             {"import": {"format": self.format, "source": places[0], "options": self.options}}
         )
@@ -117,6 +121,11 @@ class RegimeChoice(Model):
     clock_drift: NonNegative = 0.0
     trainings: Names = Field(("*",), description="patterns of the trainings' names that it is applied to")
 
+    @property
+    def of_poses(self) -> bool:
+        """True if reference poses are all that it changes."""
+        return self.runs_per_command is None and self != RegimeChoice(trainings=self.trainings)
+
 
 class MethodChoice(CalibratorEntry):
     """A method: a calibrator with its options and settings.
@@ -165,13 +174,15 @@ class StudyConfig(Model):
     integration: Integration = "arc"
     box: Box = "row"
     budget: Budget = Budget(evaluations=20_000, seconds=60.0)
-    seeds: tuple[int, ...] = Field((1,), min_length=1, description="one run of every stochastic method for each")
+    seeds: tuple[Annotated[int, Field(ge=0)], ...] = Field(
+        (1,), min_length=1, description="one run of every stochastic method for each"
+    )
     plugins: tuple[RelativePath, ...] = Field((), description="folders of plug-ins; relative to the config file")
     workers: int | None = Field(None, gt=0, strict=True, description="processes; default: the processors")
-    backend: str = Field("processes", description="as for a comparison")
+    backend: Annotated[str, AfterValidator(known_backend)] = Field("processes", description="as for a comparison")
     tls: TlsFiles | None = None
     timing: bool = Field(True, description="no: the runs' seconds are not compared")
-    memory_mb: float | None = CompareConfig.model_fields["memory_mb"].default
+    memory_mb: Annotated[float, Field(ge=LEAST_MEMORY)] | None = Field(None, description="as for a comparison")
 
     @field_validator("methods", mode="before", json_schema_input_type=tuple[str | MethodChoice, ...])
     @classmethod
@@ -191,12 +202,17 @@ class StudyConfig(Model):
         twice = next((name for name in shown if shown.count(name) > 1), None)
         if twice is not None:
             raise ValueError(f"two methods are called {twice!r}; give one a label of its own")
+        if len(set(self.seeds)) < len(self.seeds):
+            raise ValueError(f"seeds: one is there twice: {', '.join(map(str, self.seeds))}")
+        if RECORDED in self.regimes:
+            raise ValueError(f"regimes: {RECORDED!r} is the name of the runs without any change; choose another")
         if self.reference is not None and self.reference not in shown:
             raise ValueError(f"reference: no method is called {self.reference!r}; known: {', '.join(shown)}")
         return self
 
 
 def _with_names(choices: Any) -> Any:
+    """Rules by their names alone as ``by``; an unknown name is told by the model."""
     if isinstance(choices, list | tuple):
-        return [{"by": choice} if choice in _RULES else choice for choice in choices]
+        return [{"by": choice} if isinstance(choice, str) else choice for choice in choices]
     return choices

@@ -9,7 +9,7 @@ import numpy as np
 
 from omnibench.errors import OmnibenchError
 from omnibench.fit.calibrator import Outcome, RunResult
-from omnibench.fit.observations.reference_errors import with_mean_errors
+from omnibench.fit.observations.reference_errors import mean_errors, with_mean_errors
 from omnibench.progress import Progress, Reporter
 from omnibench.robot.calibration import extended_model
 from omnibench.robot.kinematics import Array
@@ -98,6 +98,9 @@ class _Judge:
                     self._robot, result.matrix, self._integration, self._period, result.extension, fit.method.shown
                 )
                 errors = np.array([poses[-1] for poses in model.poses(self._logs)]) - self._ends
+                for index, run in enumerate(self._runs):
+                    if not run.has_poses and run.references is not None:
+                        errors[index] = mean_errors(model, run)
             except OmnibenchError as error:
                 outcome, reason = Outcome.FAILED, str(error)
         if errors is not None and not np.isfinite(errors).all():

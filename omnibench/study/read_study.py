@@ -30,7 +30,7 @@ def read_study_config(path: Path | str, data: Mapping[str, Path] | None = None) 
         if name not in robots:
             raise UnknownNameError("robot", name, robots, f"--data of {path}")
         robots[name] = robots[name].model_copy(update={"path": (str(place.resolve()),)})
-    if not base.is_dir():
+    if not base.is_dir() and not all(Path(path).is_absolute() for robot in robots.values() for path in robot.path):
         raise ConfigError(
             f"{path}: the recordings are not at {base}; say where they are with --data DIR (omnibench guide data says "
             "where the public ones come from)"

@@ -13,13 +13,13 @@ from omnibench.data.dataset import Trajectory
 from omnibench.data.splits import repetitions
 from omnibench.robot.kinematics import Array
 from omnibench.robot.planar import interpolated
-from omnibench.study.config import RegimeChoice
+from omnibench.study.config import RECORDED, RegimeChoice
 
-AS_RECORDED = "as recorded"  # the regime without any change
+AS_RECORDED = RECORDED
 
 
 def in_regime(runs: Sequence[Trajectory], regime: RegimeChoice, seed: int) -> tuple[Trajectory, ...]:
-    """The training runs under a regime. Chance hangs on the seed, the regime and each run's content alone.
+    """The training runs under a regime. Chance hangs on the seed and each run's content alone.
 
     Runs without poses are only reduced in number. The first pose of a run is noisy, too, but stays at t = 0.
     """

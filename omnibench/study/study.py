@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 
-from omnibench.compare.effective_config import load_calibrators
+from omnibench.compare.effective_config import effective_options, load_calibrators
 from omnibench.compare.execute import PRELOAD, execute
 from omnibench.environment import environment
-from omnibench.errors import DataError, Interrupted, PluginError, require_type
+from omnibench.errors import DataError, Interrupted, require_type
 from omnibench.fit.calibrator import RunResult
 from omnibench.jobs.backend_choice import BackendChoice, open_backend
 from omnibench.jobs.job import BackendError
 from omnibench.jobs.result_store import ResultStore
 from omnibench.processes import one_thread_processes
 from omnibench.progress import Reporter, no_progress
-from omnibench.registry import PluginFailure, calibrators
+from omnibench.registry import PluginFailure, costs
 from omnibench.report.render import write_document
 from omnibench.study.cells import make_cells
 from omnibench.study.config import StudyConfig
@@ -41,7 +42,7 @@ def run_study(
     """
     require_type(config, StudyConfig, "study.read_study_config")
     check_output(output, config, force=force)
-    failures = _load_methods(config)
+    failures, config = _with_methods(config)
     robots, broken = load_robots(config, progress)
     if not robots:
         name, reason = next(iter(broken.items()))
@@ -50,39 +51,47 @@ def run_study(
     folder = prepare_output(config, output, force=force)
     store = ResultStore(folder / "runs", RunResult)
     asked = [index for index, fit in enumerate(fits) if fit.run is not None]
-    with _resumable(fits, store, folder), ExitStack() as opened:
-        backend = opened.enter_context(open_backend(_backend(config), PRELOAD, progress))
-        opened.enter_context(one_thread_processes(PRELOAD))
-        plan = [run for index in asked if (run := fits[index].run) is not None]
-        results = dict(zip(asked, execute(plan, store, progress, backend), strict=True))
-    judged, design = judge_fits(fits, results, config.integration, progress)
-    result = StudyResult(
-        config=config,
-        output=folder,
-        robots=robots,
-        broken=broken,
-        fits=judged,
-        cells=make_cells(judged, design),
-        environment=environment(),
-        warnings=(
-            *(f"plug-in {each.origin} cannot be imported: {each.error}" for each in failures),
-            *(f"{robot.name}: {warning}" for robot in robots for warning in robot.dataset.warnings),
-        ),
-    )
-    write_results(result)
-    write_document(study_document(result), folder / "report.html")
+    with _resumable(fits, store, folder):
+        with ExitStack() as opened:
+            backend = opened.enter_context(open_backend(_backend(config), PRELOAD, progress))
+            opened.enter_context(one_thread_processes(PRELOAD))
+            plan = [run for index in asked if (run := fits[index].run) is not None]
+            results = dict(zip(asked, execute(plan, store, progress, backend), strict=True))
+        judged, design = judge_fits(fits, results, config.integration, progress)
+        result = StudyResult(
+            config=config,
+            output=folder,
+            robots=robots,
+            broken=broken,
+            fits=judged,
+            cells=make_cells(judged, design),
+            environment=environment(),
+            warnings=(
+                *(f"plug-in {each.origin} cannot be imported: {each.error}" for each in failures),
+                *(f"{robot.name}: {warning}" for robot in robots for warning in robot.dataset.warnings),
+            ),
+        )
+        write_results(result)
+        write_document(study_document(result), folder / "report.html")
     return result
 
 
-def _load_methods(config: StudyConfig) -> list[PluginFailure]:
-    """Load the plug-ins; the fits of one that cannot be imported fail with its error. ConfigError: an unknown name."""
+def _with_methods(config: StudyConfig) -> tuple[list[PluginFailure], StudyConfig]:
+    """Load the plug-ins; the config with every default of every option. ConfigError: an unknown name or option.
+
+    The fits of a plug-in that cannot be imported, or whose constructor raises, fail with that error.
+    """
     failures = load_calibrators(config.plugins, [method.name for method in config.methods])
+    methods = []
     for index, method in enumerate(config.methods):
         place = f"config {config.name}: methods.{index}"
-        calibrators.entry(method.name, place)
-        with suppress(PluginError):  # a constructor that raises is the outcome of its fits
-            calibrators.create(method.name, method.options, place)
-    return failures
+        options = effective_options(method.name, method.options, place)
+        changes: dict[str, Any] = {"options": options.model_dump(mode="json")}
+        if method.cost is not None:
+            made = costs.create(method.cost.name, method.cost.options, place).options
+            changes["cost"] = method.cost.model_copy(update={"options": made.model_dump(mode="json")})
+        methods.append(method.model_copy(update=changes))
+    return failures, config.model_copy(update={"methods": tuple(methods)})
 
 
 def _backend(config: StudyConfig) -> BackendChoice:

@@ -27,6 +27,7 @@ _COLUMNS = {
     "design_heading_deg": pl.Float64, "ratio": pl.Float64, "low": pl.Float64, "high": pl.Float64,
     "family_low": pl.Float64, "family_high": pl.Float64, "unit": pl.String, "units": pl.String, "seconds": pl.Float64,
     "numbers": pl.String,
+    "cost_name": pl.String, "unidentified": pl.String,
 }  # fmt: skip
 
 
@@ -105,8 +106,9 @@ def _row(result: StudyResult, cell: StudyCell, method: MethodInCell) -> dict[str
         "design_heading_deg": math.degrees(float(cell.design["heading"].mean())),
         "ratio": ratio and ratio.value, "low": ratio and ratio.alone.low, "high": ratio and ratio.alone.high,
         "family_low": ratio and ratio.in_family.low, "family_high": ratio and ratio.in_family.high,
-        "unit": ratio and ratio.unit, "units": ratio and ratio.units, "seconds": method.seconds,
-        "numbers": method.numbers,
+        "unit": ratio and ratio.unit, "units": ratio and ratio.units,
+        "seconds": method.seconds if result.config.timing else None,
+        "numbers": method.numbers, "cost_name": method.cost, "unidentified": method.unidentified,
     }  # fmt: skip
 
 

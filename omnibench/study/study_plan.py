@@ -10,7 +10,7 @@ from fnmatch import fnmatchcase
 from omnibench.compare.config import CompareConfig, CostChoice
 from omnibench.compare.plan import UNBOUNDED, PlannedRun
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.errors import ConfigError, OmnibenchError, PluginError
+from omnibench.errors import ConfigError, OmnibenchError, PluginError, nearest
 from omnibench.fit.calibrator import refusal_of
 from omnibench.fit.problem import make_parameterisation
 from omnibench.fit.shrinkage.prior import default_cost, default_unidentified
@@ -62,7 +62,8 @@ def load_robots(config: StudyConfig, progress: Reporter) -> tuple[tuple[StudiedR
 
 
 def plan_fits(config: StudyConfig, robots: tuple[StudiedRobot, ...]) -> list[PlannedFit]:
-    """All fits of the study; those of one training set share it."""
+    """All fits of the study; those of one training set share it. ConfigError: a pattern matches no training."""
+    _check_patterns(config, robots)
     regimes = {AS_RECORDED: RegimeChoice(), **config.regimes}
     return [
         fit for robot in robots for name, regime in regimes.items() for fit in _of_robot(config, robot, name, regime)
@@ -76,12 +77,29 @@ def _of_robot(config: StudyConfig, robot: StudiedRobot, name: str, regime: Regim
         for fold in training.folds:
             runs = tuple(replace(run, split="train") for run in fold.training)
             runs = in_regime(runs, regime, config.seeds[0])
+            if regime.of_poses and not any(run.has_poses for run in runs):
+                continue  # nothing of these runs would change
             dataset = replace(robot.dataset, trajectories=runs, scans=None)
             for method in config.methods:
                 if _named(training.name, method.trainings) and (name == AS_RECORDED or _named(name, method.regimes)):
                     for seed in _seeds(config, method):
                         run, reason = _planned(config, robot, method, dataset, seed, f"{training.name} {fold.name}")
                         yield PlannedFit(robot, training, fold, name, method, seed, run, reason)
+
+
+def _check_patterns(config: StudyConfig, robots: tuple[StudiedRobot, ...]) -> None:
+    """ConfigError: a method's or a regime's pattern is that of no training of any robot, or of no regime."""
+    trainings = list(dict.fromkeys(training.name for robot in robots for training in robot.trainings))
+    given = [(f"method {method.shown}: trainings", method.trainings, trainings) for method in config.methods]
+    given += [(f"regime {name}: trainings", regime.trainings, trainings) for name, regime in config.regimes.items()]
+    given += [(f"method {method.shown}: regimes", method.regimes, list(config.regimes)) for method in config.methods]
+    for place, patterns, names in given:
+        if patterns and patterns != ("*",) and not any(_named(name, patterns) for name in names):
+            shown = ", ".join(patterns)
+            raise ConfigError(
+                f"config {config.name}: {place}: none is called {shown}; {nearest(shown, names)}known: "
+                f"{', '.join(names) or 'none'}"
+            )
 
 
 def _named(name: str, patterns: tuple[str, ...]) -> bool:
@@ -97,6 +115,8 @@ def _planned(
 ) -> tuple[PlannedRun | None, str]:
     """A fit as a run of a comparison, or why the method cannot be asked."""
     calibrator = calibrators.entry(method.name).cls
+    if not dataset.trajectories:
+        return None, "no training run is left"
     with suppress(PluginError):  # a constructor that raises is the outcome of the fit
         made = calibrators.create(method.name, method.options)
         if refusal := refusal_of(made, dataset.robot, dataset.trajectories):

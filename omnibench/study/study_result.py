@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from omnibench.environment import Environment
+from omnibench.registry import calibrators
 from omnibench.study.cell_intervals import CellRatio
 from omnibench.study.cells import MethodInCell, StudyCell
 from omnibench.study.config import StudyConfig
 from omnibench.study.judging import JudgedFit
 from omnibench.study.regimes import AS_RECORDED
-from omnibench.study.study_plan import StudiedRobot
+from omnibench.study.study_plan import PlannedFit, StudiedRobot
 from omnibench.views import Shown
 
 
@@ -73,16 +74,22 @@ class StudyResult(Shown):
     def failures(self) -> tuple[str, ...]:
         """A line for every fit that failed or gave an invalid answer."""
         return tuple(
-            f"{each.fit.robot.name}, {each.fit.training.name} {each.fit.fold.name}, {each.fit.method.shown}: "
-            f"{each.outcome}: {each.reason}"
+            f"{', '.join(filter(None, _place(each.fit)))}: {each.outcome}: {each.reason}"
             for each in self.fits
             if str(each.outcome) in ("failed", "invalid")
         )
 
     @property
     def nothing_answered(self) -> bool:
-        """True if no method gave an answer anywhere."""
-        return not any(each.answered for each in self.fits)
+        """True if no method that is fitted, or none of all if there are no such, gave an answer anywhere."""
+        fitted = [each for each in self.fits if calibrators.entry(each.fit.method.name).cls.fitted]
+        return not any(each.answered for each in fitted or self.fits)
+
+
+def _place(fit: PlannedFit) -> tuple[str, ...]:
+    """Robot, training, fold, regime and method with its seed; empty where there is nothing to say."""
+    regime = "" if fit.regime == AS_RECORDED else fit.regime
+    return fit.robot.name, fit.training.name, fit.fold.name, regime, f"{fit.method.shown} seed {fit.seed}"
 
 
 def _best_published(cell: StudyCell) -> MethodInCell | None:

@@ -8,7 +8,7 @@ from fnmatch import fnmatchcase
 
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.splits import repetitions
-from omnibench.errors import ConfigError, nearest
+from omnibench.errors import ConfigError, DataError, nearest
 from omnibench.study.config import RobotChoice, TrainingChoice
 from omnibench.words import plural
 
@@ -85,8 +85,8 @@ class _Runs:
 def divide(dataset: Dataset, robot: RobotChoice, rules: Sequence[TrainingChoice], place: str) -> tuple[Training, ...]:
     """The trainings of a robot's runs; those that nothing judges are left out.
 
-    place: what messages begin with. ConfigError: a pattern matches no run, a run is of two kinds, a rule names an
-    unknown kind, or two rules give the same training.
+    place: what messages begin with. ConfigError: a run is of two kinds, a rule names an unknown kind, or two rules give
+    the same training. DataError: no run is of a kind, or names its session, or is left to judge by.
     """
     runs = _Runs(dataset, _kinds_of(dataset.trajectories, robot.kinds, place))
     trainings: dict[str, Training] = {}
@@ -95,13 +95,17 @@ def divide(dataset: Dataset, robot: RobotChoice, rules: Sequence[TrainingChoice]
             if kind not in runs.names:
                 hint = nearest(kind, runs.names)
                 raise ConfigError(f"{place}: no kind {kind!r} to train on; {hint}known: {', '.join(runs.names)}")
+        if "session" in (rule.by, rule.leave_out) and not all(run.session for run in dataset.trajectories):
+            raise DataError(
+                f"{place}: some runs name no session, by which they are to be divided; name them, or divide by kind"
+            )
         for training in _trainings(runs, rule):
             if training.name in trainings:
                 raise ConfigError(f"{place}: two trainings are {training.name!r}; leave one out")
             if training.folds and training.kinds:
                 trainings[training.name] = training
     if not trainings:
-        raise ConfigError(f"{place}: no run is left to judge by; give it another training")
+        raise DataError(f"{place}: no run is left to judge by; give it another training")
     return tuple(trainings.values())
 
 
@@ -115,7 +119,7 @@ def _kinds_of(runs: Sequence[Trajectory], kinds: Mapping[str, Sequence[str]], pl
     for kind, patterns in kinds.items():
         if not any(kind in of_run for of_run in matched):
             found = ", ".join(run.id for run in runs[:4])
-            raise ConfigError(f"{place}: no run is of kind {kind} ({', '.join(patterns)}); runs are: {found}, ...")
+            raise DataError(f"{place}: no run is of kind {kind} ({', '.join(patterns)}); runs are: {found}, ...")
     for run, of_run in zip(runs, matched, strict=True):
         if len(of_run) > 1:
             raise ConfigError(f"{place}: run {run.id} is of kinds {' and '.join(of_run)}; make the patterns differ")
@@ -151,7 +155,8 @@ def _whole_kind(runs: _Runs, kind: str, curve: Sequence[int]) -> Iterator[Traini
         yield Training(kind, (Fold("", runs.runs(members), runs.others(members), fitted={kind: members}),))
         return
     used = _first_of_commands(runs, members, max(curve))
-    for count in curve:
+    most = max(repetitions([run.command or run.id for run in runs.runs(members)]), default=0)
+    for count in sorted({min(count, most) for count in curve}):
         train = _first_of_commands(runs, members, count)
         fold = Fold("", runs.runs(train), runs.others(used), fitted={kind: tuple(train)})
         yield Training(f"{kind}, {plural(count, 'run')} a command", (fold,))
@@ -180,8 +185,9 @@ def _left_out(runs: _Runs, kind: str, what: str) -> Training:
     groups = _grouped(runs, members, what)
     for name, judged in groups.items():
         training = [index for index in members if index not in set(judged)]
-        if training:
-            folds.append(Fold(f"without {name}", runs.runs(training), {kind: tuple(judged)}))
+        others = {kind: tuple(index for index in runs.others(training)[kind] if index in set(judged))}
+        if training and others[kind]:
+            folds.append(Fold(f"without {name}", runs.runs(training), others))
     return Training(f"{kind}, a {what} left out", tuple(folds) if len(groups) > 1 else ())
 
 
@@ -189,7 +195,8 @@ def _kinds_left_out(runs: _Runs) -> Iterator[Training]:
     for kind in runs.names:
         training = [index for index, each in enumerate(runs.kinds) if each not in (kind, None)]
         if training:
-            yield Training(f"all but {kind}", (Fold("", runs.runs(training), {kind: runs.of(kind)}),))
+            fold = Fold("", runs.runs(training), {kind: runs.others(training)[kind]})
+            yield Training(f"all but {kind}", (fold,))
 
 
 def _grouped(runs: _Runs, members: Sequence[int], what: str) -> dict[str, list[int]]:

@@ -137,7 +137,15 @@ def test_run_again_nothing_is_fitted_twice_and_the_table_is_the_same(studied: St
         ),
         ({"reference": "deafult"}, "reference: no method is called 'deafult'"),
         ({"data": "nowhere"}, "the recordings are not at"),
-        ({"trainings": [{"by": "kinds"}]}, "trainings.0.by"),
+        ({"trainings": ["kinds"]}, "trainings.0.by"),
+        ({"seeds": [-1]}, "seeds.0"),
+        ({"backend": "dusk"}, "unknown backend 'dusk'; did you mean 'dask'?"),
+        (
+            {"regimes": {"as recorded": {"noise_position": 1}}},
+            "'as recorded' is the name of the runs without any change",
+        ),
+        ({"methods": [{"name": "closed_form", "trainings": "lime"}], "reference": None}, "did you mean 'line'?"),
+        ({"methods": [{"name": "closed_form", "cost": "final_pos"}], "reference": None}, "did you mean 'final_pose'?"),
         ({"robots": {"one": {"format": "csv"}}}, "path is missing"),
     ],
 )
@@ -155,3 +163,20 @@ def test_data_says_where_the_recordings_are(tmp_path: Path) -> None:
     file = write_study(tmp_path, lambda config: config.update({"data": "elsewhere", "trainings": ["kind"]}))
     run = omnibench("compare", file, "-o", tmp_path / "out", "--data", tmp_path / "recordings")
     assert run.returncode == 0, run.stderr
+
+
+def test_nothing_but_the_design_is_exit_code_1(tmp_path: Path) -> None:
+    plugins = tmp_path / "plugins"
+    plugins.mkdir()
+    (plugins / "fails.py").write_text(
+        PLUGIN_IMPORTS + METHOD.format(name="fails", applies="True", body="raise KeyError")
+    )
+
+    def change(config: dict[str, Any]) -> None:
+        config["plugins"] = [str(plugins)]
+        config["methods"] = [{"name": "theoretical", "label": "design"}, {"name": "fails"}]
+        config["reference"], config["trainings"] = None, ["kind"]
+
+    run = omnibench("compare", write_study(tmp_path, change), "-o", tmp_path / "out")
+    assert run.returncode == 1
+    assert "no method gave an answer" in run.stdout + run.stderr

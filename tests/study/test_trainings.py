@@ -9,7 +9,7 @@ from sample_robots import DIFFERENTIAL
 from studied import robot_dataset
 
 from omnibench.data.dataset import Dataset, make_dataset
-from omnibench.errors import ConfigError
+from omnibench.errors import DataError, OmnibenchError
 from omnibench.study.config import RobotChoice, TrainingChoice
 from omnibench.study.trainings import Training, divide
 
@@ -96,7 +96,31 @@ def test_a_data_sets_own_split_is_kept(dataset: Dataset) -> None:
 def test_a_division_that_cannot_be_made_is_one_clear_line(
     dataset: Dataset, kinds: dict[str, tuple[str, ...]], rule: TrainingChoice, words: str
 ) -> None:
-    with pytest.raises(ConfigError) as raised:
+    with pytest.raises(OmnibenchError) as raised:
         divided(dataset, rule, kinds=kinds)
     assert words in str(raised.value)
     assert str(raised.value).startswith("robot two: ")
+
+
+@pytest.mark.parametrize("rule", [TrainingChoice(leave_out="session"), TrainingChoice(leave_out="kind")], ids=str)
+def test_a_copy_of_a_judged_run_does_not_train_for_it(dataset: Dataset, rule: TrainingChoice) -> None:
+    runs = dataset.trajectories
+    copies = [replace(run, id=f"arc_copy_{run.id}", session="another") for run in runs if run.id.startswith("line_0")]
+    copied = make_dataset("copied", DIFFERENTIAL, dataset.sample_period, [*runs, *copies])
+    for training in divided(copied, rule).values():
+        for fold in training.folds:
+            trained = {run.fingerprint for run in fold.training}
+            judging = {copied.trajectories[index].fingerprint for each in fold.judged.values() for index in each}
+            assert not trained & judging
+
+
+def test_a_learning_curve_ends_where_the_runs_do(dataset: Dataset) -> None:
+    rule = TrainingChoice(by="kind", kinds=("arc",), runs_per_command=(1, 6, 50))
+    assert list(divided(dataset, rule)) == ["arc, 1 run a command", "arc, 6 runs a command"]
+
+
+def test_runs_without_sessions_are_not_divided_by_them(dataset: Dataset) -> None:
+    runs = [replace(run, session=None) for run in dataset.trajectories]
+    nameless = make_dataset("nameless", DIFFERENTIAL, dataset.sample_period, runs)
+    with pytest.raises(DataError, match="some runs name no session"):
+        divided(nameless, TrainingChoice(by="session"))

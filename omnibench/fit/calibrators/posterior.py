@@ -68,6 +68,7 @@ class Posterior(Calibrator):
     Options = PosteriorOptions
     options: PosteriorOptions
     bounded = False  # its prior takes the place of the box
+    as_is = True
     extends = True
     stochastic = False
 

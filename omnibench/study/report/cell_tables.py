@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import plotly.graph_objects as go
@@ -34,10 +35,10 @@ _COLUMNS = (
     Column("Time", priority=1),
     Column("What it found", numeric=False, priority=2),
 )
-# Blue where the design values' error falls, white where it stays, red where it grows: log2 of the ratio, cut at a
-# quarter and four times (chosen).
+# Blue where the design values' error falls, white where it stays, red where it grows: log2 of the ratio, cut at an
+# eighth and eight times (chosen).
 _SCALE = [[0.0, "#7fb2dc"], [0.5, "#ffffff"], [1.0, "#f0919d"]]
-_CUT = 2.0
+_CUT = 3.0
 
 
 def robot_cells(view: StudyView, robot: str) -> Section:
@@ -93,7 +94,7 @@ def heat_map(view: StudyView, robot: str) -> FigureGrid:
         f"{_column(cell)}: " + ", ".join(f"{name} {each}" for name, each in zip(methods, row, strict=True))
         for cell, row in zip(cells, words, strict=True)
     )
-    silent = [name for name in view.methods if name not in answered]
+    silent = [name for name in view.methods if _is_for_none(cells, name)]
     without = f" Not for this robot or these paths: {', '.join(silent)}." if silent else ""
     caption = (
         "Rows: training → judged kind. Eq. (6); below 1 the design values' error falls. Training errors: the judged "
@@ -120,7 +121,7 @@ def cell_table(cell: StudyCell, view: StudyView, judged: int) -> Table:
         _COLUMNS,
         tuple(_row(each, cell, view, judged, each.method == best) for each in rows),
         f"Mean final errors; {size}{unit}. Small print under the ratio: 95 % interval of this cell; the verdict "
-        f"is that of {plural(judged, 'cell')} together."
+        f"is that of each method in {plural(judged, 'cell')} together."
         + (" Training errors, on which no verdict rests." if cell.key.fitted else ""),
     )
 
@@ -139,7 +140,7 @@ def _row(each: MethodInCell, cell: StudyCell, view: StudyView, judged: int, best
         fixed(math.degrees(heading), 2),
         Cell(fixed(ratio.value, 3), _interval(ratio)),
         Cell("" if cell.key.fitted or ratio.equal else ratio.verdict, partly),
-        seconds(each.seconds),
+        seconds(each.seconds if view.result.config.timing else None),
         each.numbers,
         role="best" if best else "plain",
     )
@@ -148,6 +149,12 @@ def _row(each: MethodInCell, cell: StudyCell, view: StudyView, judged: int, best
 def _interval(ratio: CellRatio) -> str:
     known = ratio.alone.known
     return "no interval" if known is None else f"{fixed(known[0], 2)} to {fixed(known[1], 2)}"
+
+
+def _is_for_none(cells: Sequence[StudyCell], method: str) -> bool:
+    """True if a method was asked in some cells and is not applicable in any."""
+    asked = [cell.methods[method] for cell in cells if method in cell.methods]
+    return bool(asked) and all(each.status == "not applicable" for each in asked)
 
 
 def _ratio(cell: StudyCell, method: str) -> float | None:

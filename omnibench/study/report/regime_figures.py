@@ -67,7 +67,7 @@ def _breaking_table(view: StudyView, regimes: Sequence[str]) -> Table:
                 continue
             mean = float(np.exp(np.mean(np.log(ratios))))
             broken = sum(ratio > _BROKEN for ratio in ratios)
-            note = f"breaks in {broken} of {plural(len(ratios), 'cell')}, worse than the design in {worse}"
+            note = f"{broken} of {len(ratios)} break; {worse} worse"
             cells.append(Cell(fixed(mean, 2), note))
         if any(cell.text != NOTHING for cell in cells):
             rows.append(Row.of(method, *cells))
@@ -75,7 +75,8 @@ def _breaking_table(view: StudyView, regimes: Sequence[str]) -> Table:
         "Error as a multiple of the method's own as recorded",
         (Column("Method", numeric=False), *(Column(regime) for regime in regimes)),
         tuple(rows),
-        f"Eq. (6), geometric mean over cells. Breaks: more than {_BROKEN:g} times its own error as recorded. "
+        f"Eq. (6), geometric mean over cells. Break: cells with more than {_BROKEN:g} times its own error as recorded; "
+        "worse: with more error than the design. "
         f"{NOTHING}: no answer.",
     )
 

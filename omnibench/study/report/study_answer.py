@@ -77,7 +77,8 @@ def _chart(compared: tuple[AgainstBest, ...], reference: str) -> FigureGrid:
     items = tuple(_STYLES[verdict] for verdict in _VERDICTS if any(e.ratio.verdict == verdict for e in compared))
     caption = (
         "Left of 1: less error. Lines: intervals of all cells together (95 %, Bonferroni), by sessions where three "
-        "or more judge, else by runs; a cell without a line has too few of either."
+        "or more judge, else by runs; a cell without a line has too few of either. A line that "
+        "ends at the frame goes on."
     )
     title = "Beside the best published method, cell by cell"
     picture = "; ".join(_hover(each, reference) for each in compared)
