@@ -89,13 +89,15 @@ class Profile:
 
 
 def profiles(cells: Sequence[StudyCell], methods: Sequence[str]) -> tuple[Profile, ...]:
-    """The profile of every method that answered in some cell."""
+    """The profile of every method that was asked in all cells and answered in some."""
     best = [
         min((mean for each in cell.methods.values() if (mean := each.mean("cost")) is not None), default=math.inf)
         for cell in cells
     ]
     made = []
     for name in methods:
+        if not all(name in cell.methods for cell in cells):
+            continue
         means = [cell.methods[name].mean("cost") if name in cell.methods else None for cell in cells]
         ratios = [
             mean / lowest if lowest > 0 else 1.0 for mean, lowest in zip(means, best, strict=True) if mean is not None

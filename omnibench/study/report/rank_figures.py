@@ -16,6 +16,7 @@ from omnibench.study.report.study_view import StudyView
 from omnibench.words import plural
 
 _ALL = "all robots"
+_ASKED = "cells in which every method was asked"
 _FACTORS = np.geomspace(1.0, 8.0, 80)  # of the best error; chosen
 _BAR = LegendItem("alike", "not told apart", QUIET)
 
@@ -23,8 +24,13 @@ _BAR = LegendItem("alike", "not told apart", QUIET)
 def rank_section(view: StudyView) -> Section:
     """Ranks and profiles over all cells, and robot by robot."""
     choices: dict[str, tuple[Block, ...]] = {}
-    for name in (_ALL, *view.robots) if len(view.robots) > 1 else view.robots:
-        cells = view.judged(None if name == _ALL else name)
+    asked = tuple(cell for cell in view.judged() if all(name in cell.methods for name in view.methods))
+    parts = {_ALL: view.judged(), _ASKED: asked, **{name: view.judged(name) for name in view.robots}}
+    if len(view.robots) == 1:
+        del parts[_ALL]
+    if not asked or len(asked) == len(view.judged()):
+        del parts[_ASKED]
+    for name, cells in parts.items():
         if drawn := (*_diagram(view, cells, name), *_profiles(view, cells, name)):
             choices[name] = drawn
     blocks: tuple[Block, ...] = (Choice("Robots", choices),)
@@ -102,7 +108,8 @@ def _profiles(view: StudyView, cells: Sequence[StudyCell], name: str) -> tuple[B
     words = "; ".join(f"{each.method}: best in {100 * each.share(1.0):.0f} %" for each in drawn)
     caption = (
         "The higher, the more often a method is near the best one of a cell; at 1: how often it is the best. A method "
-        "that is not for a robot has no answer in its cells, which count."
+        "that is not for a robot has no answer in its cells, which count; one that was not asked in all of these cells is "
+        "left out."
     )
     grid = FigureGrid(
         (Figure(f"Performance profiles, {name}", figure, words, 380),),
