@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import os
 import signal
@@ -43,6 +44,14 @@ def end_with_parent() -> None:
         if os.getpgrp() == os.getpid():
             os.killpg(0, signal.SIGKILL)  # with all processes that it started
         os._exit(1)
+
+
+def keep_interrupts_from_callbacks() -> None:
+    """Take JAX's callback off the garbage collector of a process that only waits for others.
+
+    CVXPY imports JAX where it is installed. An exception in such a callback is printed and forgotten, Ctrl-C among them.
+    """
+    gc.callbacks[:] = [each for each in gc.callbacks if getattr(each, "__name__", "") != "_xla_gc_callback"]
 
 
 @contextmanager
