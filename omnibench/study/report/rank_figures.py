@@ -108,8 +108,8 @@ def _profiles(view: StudyView, cells: Sequence[StudyCell], name: str) -> tuple[B
     words = "; ".join(f"{each.method}: best in {100 * each.share(1.0):.0f} %" for each in drawn)
     caption = (
         "The higher, the more often a method is near the best one of a cell; at 1: how often it is the best. A method "
-        "that is not for a robot has no answer in its cells, which count; one that was not asked in all of these is left "
-        "out."
+        "that is not for a robot has no answer in its cells, which count; one that was not asked in all of these is "
+        "left out."
     )
     grid = FigureGrid(
         (Figure(f"Performance profiles, {name}", figure, words, 380),),
