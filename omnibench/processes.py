@@ -49,7 +49,7 @@ def end_with_parent() -> None:
 def keep_interrupts_from_callbacks() -> None:
     """Take JAX's callback off the garbage collector of a process that only waits for others.
 
-    CVXPY imports JAX where it is installed. What is raised in such a callback is printed and forgotten, Ctrl-C among it.
+    CVXPY imports JAX where it is there. What is raised in such a callback is printed and forgotten, Ctrl-C among it.
     """
     gc.callbacks[:] = [each for each in gc.callbacks if getattr(each, "__name__", "") != "_xla_gc_callback"]
 
