@@ -17,6 +17,7 @@ import omnibench
 from omnibench.cli.handbook_topics import HANDBOOK, topics
 from omnibench.compare.config import CompareConfig
 from omnibench.data.importers.robot_option import RobotOption
+from omnibench.study.config import StudyConfig
 
 PAGES = [ROOT / "README.md", *sorted(HANDBOOK.rglob("*.md"))]
 BY_NAME = {topic.name: topic for topic in topics()}
@@ -127,9 +128,10 @@ def test_the_handbook_tells_of_every_public_name() -> None:
     assert [name for name in omnibench.__all__ if f"`{name}`" not in text] == []
 
 
-def test_the_config_that_is_shown_is_right() -> None:
-    (config,) = (block for block in blocks(BY_NAME["compare"].file) if block.startswith("name:"))
+def test_the_configs_that_are_shown_are_right() -> None:
+    config, study = (block for block in blocks(BY_NAME["compare"].file) if block.startswith("name:"))
     CompareConfig.model_validate(yaml.safe_load(config))
+    StudyConfig.model_validate(yaml.safe_load(study))
 
 
 SHOWN = [yaml.safe_load(block[block.index("name:") :]) for block in blocks(BY_NAME["robot"].file) if "name:" in block]
