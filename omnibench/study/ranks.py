@@ -26,7 +26,7 @@ from omnibench.study.cells import StudyCell
 from omnibench.study.study_result import answered_everywhere
 
 _LEVEL = 0.95
-_FEWEST_METHODS = 3  # of Friedman's test
+_FEWEST_METHODS = 3  # methods that Friedman's test compares at least
 _FEWEST_CELLS = 2
 
 

@@ -73,7 +73,7 @@ def address(repository: str) -> str:
 
 
 def find_recording(name: str) -> Asked:
-    """What a name stands for: a recording, a data set, RECORDING/DATASET, or OWNER/REPO on GitHub.
+    """The recording of a name: a recording, a data set, RECORDING/DATASET, or OWNER/REPO on GitHub.
 
     ConfigError names the nearest known name and lists all.
     """

@@ -128,7 +128,7 @@ def _environment() -> dict[str, str]:
 
 
 def _ask(folder: Path, *arguments: str) -> str:
-    """What git answers of a clone; empty if it has no answer."""
+    """Output of a git command in a clone; empty if the command fails."""
     answer = subprocess.run(
         ["git", "-C", str(folder), *arguments],
         env=_environment(),
@@ -171,7 +171,7 @@ def _work(repository: str, arguments: Sequence[str], folder: Path | None, report
 
 
 def _lines(process: subprocess.Popen[bytes]) -> Iterator[str]:
-    """What a program says on standard error, line by line; bars that it draws end in a carriage return.
+    """Lines of a program's standard error; bars that it draws end in a carriage return.
 
     Ctrl-C ends the wait for the next line, which is a ``select``; reads that it interrupts begin anew once polars is
     imported, since its handler of the signal restarts them (SA_RESTART).

@@ -43,17 +43,17 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import OdometryBatch
 
 _EFFECT, _PARAMETER = "wheel_dead_zone", "c"
-_STRETCHES = 8  # of a run's path; 4 and 16 change errors by 2 % (tests/benchmarks/prior_study.py)
+_STRETCHES = 8  # stretches that a run's path is cut into; 4 and 16 change errors by 2 % (prior_study.py)
 _POSES = 12  # most reference poses of a stretch that are looked at: their median is as steady (chosen)
 _FIRST, _FIRST_STEPS = 0.01, 4  # m and rad, see the module's docstring
 _LEAST = 0.003  # m and rad: smaller deviations are those of motion capture, not of the model (chosen)
 _HUBER = 1.0  # deviations: about half of the stretches lie beyond, if three numbers are normal; twice costs 3 %
 _MOST_STEPS, _RESTING = 40, 1e-5  # steps, and the largest step, in prior deviations, that counts as none
-_STEP = 0.1  # of the prior's deviation, for the derivative by the lost rate
+_STEP = 0.1  # share of the prior's deviation by which the lost rate is moved for its derivative
 
 
 class PosteriorOptions(Options):
-    """What is fitted beside the matrix."""
+    """Option: the lost wheel rate that is fitted beside the matrix."""
 
     lost_rate: NonNegative | None = Field(
         None,

@@ -47,8 +47,8 @@ class PhysicalTolerance:
     lost_rate: float
 
 
-# Half of each and twice change the errors on recordings that were left out by less than a tenth, but for the lost rate:
-# of omni wheels, whose rollers creep, it is ten times that of tyres (tests/benchmarks/prior_study.py).
+# Tolerances were chosen once, on OptiOdom's robots; tests/benchmarks/prior_study.py says what half of each and twice
+# change. The lost rate of omni wheels, whose rollers creep, is ten times that of tyres.
 _TYRES = PhysicalTolerance(0.01, (0.02, 0.02, 0.05), 0.002, 0.004)
 _STEERED = PhysicalTolerance(0.02, (0.02, 0.02, 0.05), 0.005, 0.01)
 _TOLERANCES: Mapping[RobotClass, PhysicalTolerance] = MappingProxyType(

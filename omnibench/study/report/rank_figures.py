@@ -17,7 +17,7 @@ from omnibench.words import plural
 
 _ALL = "all robots"
 _ASKED = "cells in which every method was asked"
-_FACTORS = np.geomspace(1.0, 8.0, 80)  # of the best error; chosen
+_FACTORS = np.geomspace(1.0, 8.0, 80)  # multiples of the best error at which profiles are drawn; chosen
 _BAR = LegendItem("alike", "not told apart", QUIET)
 
 
