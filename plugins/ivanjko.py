@@ -42,12 +42,12 @@ from scipy.optimize import least_squares
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import ConfigError, NotApplicableError
 from omnibench.fit.calibrator import Calibrator, Solution
+from omnibench.fit.differential.axle import TWO_WHEELS, axle_length, has_two_wheels, with_axle
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
-from omnibench.robot.robot_class import class_of
 from omnibench.words import plural
 
 _STRAIGHT = 0.95  # share of its length that a straight line goes from its start (chosen)
@@ -75,10 +75,10 @@ class Ivanjko(Calibrator):
     as_is = True
     stochastic = False
     per_session = True
-    only_for = "differential drives with two measured wheels"
+    only_for = TWO_WHEELS
 
     def applies(self, robot: Robot) -> bool:
-        return class_of(robot) == "differential" and len(robot.measured) == 2
+        return has_two_wheels(robot)
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """Repeat steps 1 and 2. NotApplicableError: no straight line, or no turn on the spot, left or right."""
@@ -99,8 +99,9 @@ class Ivanjko(Calibrator):
         wheels = ", ".join(f"{wheel.name} {1000 * wheel.radius:.3f}" for wheel in robot.measured)
         return Solution(
             robot.inverse_kinematic_matrix.ravel(),
-            f"radii {wheels} mm, wheelbase {1000 * _axle(robot):.1f} mm, from {plural(len(lines), 'straight line')}, "
-            f"{plural(len(lefts), 'turn')} to the left and {len(rights)} to the right, after {plural(count, 'round')}",
+            f"radii {wheels} mm, wheelbase {1000 * axle_length(robot):.1f} mm, "
+            f"from {plural(len(lines), 'straight line')}, {plural(len(lefts), 'turn')} to the left and "
+            f"{len(rights)} to the right, after {plural(count, 'round')}",
             converged=change <= self.options.tolerance,
         )
 
@@ -110,7 +111,7 @@ def _paths(problem: CalibrationProblem) -> tuple[list[Trajectory], list[Trajecto
     lines, lefts, rights = list[Trajectory](), list[Trajectory](), list[Trajectory]()
     runs = [run for run in problem.trajectories if run.has_poses]
     stamps = [np.append(0.0, run.times[run.times <= run.end]) for run in runs]
-    model, axle = OdometryModel.of_design(_on_its_axle(problem.robot), problem.integration), _axle(problem.robot)
+    model, axle = OdometryModel.of_design(_on_its_axle(problem.robot), problem.integration), axle_length(problem.robot)
     paths = model.poses([run.log(times) for run, times in zip(runs, stamps, strict=True)])
     for run, path in zip(runs, paths, strict=True):
         length = float(np.hypot(*np.diff(path[:, :2], axis=0).T).sum())
@@ -154,16 +155,8 @@ def _ends(robot: Robot, runs: Sequence[Trajectory], integration: Integration) ->
 
 
 def _changed(robot: Robot, radii: Array, wheelbase: float) -> Robot:
-    """The robot with the radii of its measured wheels, and their distance, times factors."""
-    middle = np.mean([wheel.position for wheel in robot.measured], axis=0)
-    factors = dict(zip(robot.wheel_names, radii.tolist(), strict=True))
-    wheels = []
-    for wheel in robot.wheels:
-        if wheel.name in factors:
-            x, y = (middle + wheelbase * (np.array(wheel.position) - middle)).tolist()
-            wheel = wheel.model_copy(update={"radius": wheel.radius * factors[wheel.name], "x": x, "y": y})
-        wheels.append(wheel)
-    return robot.model_copy(update={"wheels": tuple(wheels)})
+    """The robot with the radii (2,) of its measured wheels, and their distance, times factors."""
+    return with_axle(robot, dict(zip(robot.wheel_names, radii.tolist(), strict=True)), wheelbase)
 
 
 def _on_its_axle(robot: Robot) -> Robot:
@@ -177,9 +170,3 @@ def _on_its_axle(robot: Robot) -> Robot:
         for wheel in robot.wheels
     ]
     return robot.model_copy(update={"wheels": tuple(wheels), "mount": None})
-
-
-def _axle(robot: Robot) -> float:
-    """Distance of the two measured wheels, m."""
-    first, second = (np.array(wheel.position) for wheel in robot.measured)
-    return float(np.hypot(*(first - second)))

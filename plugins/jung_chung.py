@@ -45,35 +45,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from omnibench.data.dataset import Trajectory
-from omnibench.errors import ConfigError, NotApplicableError
+from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import Calibrator, Solution
+from omnibench.fit.differential.axle import TWO_WHEELS, axle_length, has_two_wheels, left_and_right, with_diameter_ratio
+from omnibench.fit.differential.driven_squares import Square, squares_both_ways
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import calibrators
-from omnibench.robot.kinematics import Array, Mount, Robot
-from omnibench.robot.model import OdometryModel
-from omnibench.robot.planar import compose, interpolated, relative, rotated
-from omnibench.robot.robot_class import class_of
-from omnibench.words import plural
-
-_OFF_CORNER = 0.15  # share of the side: farthest of a square's odometry from its corners; a circle's is 1 (chosen)
-_OFF_TURN = 0.5  # rad by which the odometry's whole turn may be off one (chosen: 7 degrees at each corner)
-
-
-@dataclass(frozen=True)
-class Square:
-    """A square that was driven.
-
-    side: m. way: 1 counter-clockwise, -1 clockwise. error (3,): true final pose less the odometry's, m, m, rad.
-    """
-
-    side: float
-    way: int
-    error: Array
+from omnibench.robot.kinematics import Robot
 
 
 @calibrators.register("jung_chung")
@@ -84,34 +65,24 @@ class JungChung(Calibrator):
     as_is = True
     stochastic = False
     per_session = True
-    only_for = "differential drives with two measured wheels"
+    only_for = TWO_WHEELS
 
     def applies(self, robot: Robot) -> bool:
-        return class_of(robot) == "differential" and len(robot.measured) == 2
+        return has_two_wheels(robot)
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """Formulas (1) to (5). NotApplicableError: there are no squares, or they were driven one way only."""
         if problem.parameterisation.name != "matrix":
             raise ConfigError("jung_chung gives a matrix; say parameterisation: matrix")
-        squares = squares_of(problem)
-        clockwise = [square for square in squares if square.way < 0]
-        counter = [square for square in squares if square.way > 0]
-        if not clockwise or not counter:
-            count = f"{plural(len(squares), 'square')} among {plural(len(problem.trajectories), 'run')}"
-            which = (
-                f"{count}, none clockwise" if counter else f"{count}, none counter-clockwise" if clockwise else "none"
-            )
-            raise NotApplicableError(f"it is for closed squares driven both ways from a corner (found: {which})")
-        side = float(np.mean([square.side for square in squares]))
-        axle = _axle(problem.robot)
-        wheelbase, diameters = errors_of(self.mean_error(clockwise), self.mean_error(counter), side, axle)
-        corrected = corrected_robot(problem.robot, wheelbase, diameters)
-        left, right = _left_and_right(corrected)
+        squares = squares_both_ways(problem)
+        clockwise, counter = self.mean_error(squares.clockwise), self.mean_error(squares.counter)
+        wheelbase, diameters = errors_of(clockwise, counter, squares.side, axle_length(problem.robot))
+        corrected = with_diameter_ratio(problem.robot, diameters, wheelbase)
+        left, right = left_and_right(corrected)
         return Solution(
             corrected.inverse_kinematic_matrix.ravel(),
-            f"wheelbase {1000 * _axle(corrected):.1f} mm (E_b {wheelbase:.4f}), radii {left} and {right} mm "
-            f"(E_d {diameters:.4f}), from {len(clockwise)} clockwise and {len(counter)} counter-clockwise squares of "
-            f"{side:.2f} m",
+            f"wheelbase {1000 * axle_length(corrected):.1f} mm (E_b {wheelbase:.4f}), radii {left} and {right} mm "
+            f"(E_d {diameters:.4f}), from {squares.words}",
         )
 
     def mean_error(self, squares: Sequence[Square]) -> float:
@@ -126,75 +97,3 @@ def errors_of(turn_clockwise: float, turn_counter: float, side: float, axle: flo
     wheelbase = (math.pi / 2) / (math.pi / 2 - (alpha + gamma))  # Eq. (3)
     bend = wheelbase * axle * math.sin(beta / 2) / side  # b/2 over R, which is infinite where beta is 0
     return wheelbase, (1 + bend) / (1 - bend)  # Eq. (4)
-
-
-def corrected_robot(robot: Robot, wheelbase: float, diameters: float) -> Robot:
-    """The robot with its axle E_b times as long and wheels of the diameter ratio E_d, Eq. (5)."""
-    sides = _sides(robot)
-    middle = _middle(robot)[:2]
-    share = {wheel.name: 2 / (1 + diameters ** np.sign(sides[wheel.name])) for wheel in robot.measured}
-    wheels = []
-    for wheel in robot.wheels:
-        if wheel.name not in share:
-            wheels.append(wheel)
-            continue
-        x, y = (middle + wheelbase * (np.array(wheel.position) - middle)).tolist()
-        wheels.append(wheel.model_copy(update={"radius": float(wheel.radius * share[wheel.name]), "x": x, "y": y}))
-    return robot.model_copy(update={"wheels": tuple(wheels)})
-
-
-def squares_of(problem: CalibrationProblem) -> list[Square]:
-    """The closed squares among the training runs, by the odometry of the design."""
-    runs = [run for run in problem.trajectories if run.has_poses]
-    stamps = [np.append(run.times[run.times < run.end], run.end) for run in runs]
-    model = OdometryModel.of_design(problem.robot, problem.integration)
-    paths = model.poses([run.log(np.append(0.0, times)) for run, times in zip(runs, stamps, strict=True)])
-    squares = [_square(problem.robot, run, path) for run, path in zip(runs, paths, strict=True)]
-    return [square for square in squares if square is not None]
-
-
-def _square(robot: Robot, run: Trajectory, path: Array) -> Square | None:
-    """A run as a square; None if its odometry (K, 3) from the start to the last reference pose is none."""
-    odometry = _of_axle(robot, path)
-    odometry = relative(odometry[0], odometry)
-    driven = np.append(0.0, np.cumsum(np.hypot(*np.diff(odometry[:, :2], axis=0).T)))
-    side, way = driven[-1] / 4, int(np.sign(odometry[-1, 2]))
-    corners = np.array([[1.0, 0.0], [1.0, way], [0.0, way], [0.0, 0.0]])
-    off = interpolated(side * np.arange(1, 5), driven, odometry[:, :2]) - side * corners
-    if np.hypot(*off.T).max() > _OFF_CORNER * side or abs(abs(odometry[-1, 2]) - 2 * math.pi) > _OFF_TURN:
-        return None
-    truth = _of_axle(robot, run.poses[[0, -1]])
-    return Square(float(side), way, relative(truth[0], truth[1]) - odometry[-1])
-
-
-def _middle(robot: Robot) -> Array:
-    """Pose (3,) of the axle's middle in the robot's frame, looking ahead; m, m, rad."""
-    ahead = robot.motions[0]
-    places = np.mean([wheel.position for wheel in robot.measured], axis=0)
-    return np.array([*places, math.atan2(ahead[1], ahead[0])])
-
-
-def _of_axle(robot: Robot, poses: Array) -> Array:
-    """Poses (K, 3) of the axle's middle, from those of the tracked point."""
-    mount = robot.mount or Mount()
-    return compose(poses, relative(np.array([mount.x, mount.y, mount.yaw]), _middle(robot)))
-
-
-def _sides(robot: Robot) -> dict[str, float]:
-    """Distance of each measured wheel to the left of the axle's middle, m."""
-    middle = _middle(robot)
-    return {
-        wheel.name: float(rotated(np.array(wheel.position) - middle[:2], -middle[2])[1]) for wheel in robot.measured
-    }
-
-
-def _axle(robot: Robot) -> float:
-    """Distance of the two wheels, m."""
-    return sum(abs(side) for side in _sides(robot).values())
-
-
-def _left_and_right(robot: Robot) -> tuple[str, str]:
-    """Name and radius, mm, of the left wheel and of the right one."""
-    sides = _sides(robot)
-    left, right = sorted(robot.measured, key=lambda wheel: -sides[wheel.name])
-    return f"{left.name} {1000 * left.radius:.3f}", f"{right.name} {1000 * right.radius:.3f}"

@@ -16,20 +16,15 @@ from omnibench.compare.report.search_figures import search_section
 from omnibench.compare.report.view import SPLIT_NAMES, DatasetView, views
 from omnibench.compare.report.wording import cost_decimals, cost_in_words, improvement_in_words, level_in_words
 from omnibench.compare.result import ComparisonResult
-from omnibench.config import to_yaml
 from omnibench.errors import DataError
 from omnibench.report.blocks import (
     Badge,
     Block,
     Callout,
     Cell,
-    Code,
     Column,
-    Details,
     Document,
     Fact,
-    Facts,
-    Paragraph,
     Row,
     Section,
     Table,
@@ -38,6 +33,7 @@ from omnibench.report.blocks import (
 )
 from omnibench.report.numbers import NOTHING, count, fixed, listing
 from omnibench.report.recording.section import has_recording, recording_section
+from omnibench.report.reproduction import reproduction_section
 from omnibench.words import plural
 
 
@@ -157,37 +153,15 @@ def _overview_table(datasets: list[DatasetView]) -> Table:
 
 
 def _reproduction(result: ComparisonResult) -> Section:
-    environment, config = result.environment, result.config
-    facts = Facts(
-        (
-            Fact(
-                "Budget of each run",
-                f"{plural(config.budget.evaluations, 'evaluation')} or {config.budget.seconds:g} s",
-            ),
-            Fact("Seeds", listing([str(seed) for seed in config.seeds], 20)),
-            Fact(
-                "Intervals",
-                f"unit {config.bootstrap.unit or 'command where runs repeat commands, else run'}; from ten units on "
-                f"{count(config.bootstrap.resamples)} bootstrap resamples, seed {config.bootstrap.seed}; from three on "
-                "Student's t",
-            ),
-            Fact("Python", environment.python),
-            Fact("Platform", environment.platform),
-            Fact(
-                "Processor", environment.processor or "not known", plural(environment.processors, "logical processor")
-            ),
-            Fact("Versions", ", ".join(f"{name} {version}" for name, version in environment.versions.items())),
-        )
-    )
-    return Section(
-        "reproduction",
-        "How to reproduce",
-        (
-            Paragraph("The effective config lies beside this report. From this folder:"),
-            Code("omnibench compare config.yaml -o again"),
-            facts,
-            Details("Effective config", (Code(to_yaml(config)),)),
+    config = result.config
+    settings = (
+        Fact("Budget of each run", f"{plural(config.budget.evaluations, 'evaluation')} or {config.budget.seconds:g} s"),
+        Fact("Seeds", listing([str(seed) for seed in config.seeds], 20)),
+        Fact(
+            "Intervals",
+            f"unit {config.bootstrap.unit or 'command where runs repeat commands, else run'}; from ten units on "
+            f"{count(config.bootstrap.resamples)} bootstrap resamples, seed {config.bootstrap.seed}; from three on "
+            "Student's t",
         ),
-        about="Config, versions and machine.",
-        folded=True,
     )
+    return reproduction_section(config, settings, result.environment)

@@ -4,25 +4,21 @@ from __future__ import annotations
 
 from collections import Counter
 
-from omnibench.config import to_yaml
 from omnibench.report.blocks import (
     Badge,
     Block,
     Callout,
     Cell,
-    Code,
     Column,
-    Details,
     Document,
     Fact,
-    Facts,
-    Paragraph,
     Row,
     Section,
     Table,
     simulated_badge,
 )
 from omnibench.report.numbers import count, listing, seconds
+from omnibench.report.reproduction import reproduction_section
 from omnibench.study.report.cell_tables import robot_cells
 from omnibench.study.report.rank_figures import rank_section
 from omnibench.study.report.regime_figures import curve_section, regime_section
@@ -148,31 +144,9 @@ def _data_section(result: StudyResult) -> Section:
 
 
 def _reproduction(result: StudyResult) -> Section:
-    environment, config = result.environment, result.config
-    facts = Facts(
-        (
-            Fact(
-                "Budget of each fit",
-                f"{plural(config.budget.evaluations, 'evaluation')} or {config.budget.seconds:g} s",
-            ),
-            Fact("Seeds", listing([str(seed) for seed in config.seeds], 20)),
-            Fact("Python", environment.python),
-            Fact("Platform", environment.platform),
-            Fact(
-                "Processor", environment.processor or "not known", plural(environment.processors, "logical processor")
-            ),
-            Fact("Versions", ", ".join(f"{name} {version}" for name, version in environment.versions.items())),
-        )
+    config = result.config
+    settings = (
+        Fact("Budget of each fit", f"{plural(config.budget.evaluations, 'evaluation')} or {config.budget.seconds:g} s"),
+        Fact("Seeds", listing([str(seed) for seed in config.seeds], 20)),
     )
-    return Section(
-        "reproduction",
-        "How to reproduce",
-        (
-            Paragraph("The effective config lies beside this report. From this folder:"),
-            Code("omnibench compare config.yaml -o again"),
-            facts,
-            Details("Effective config", (Code(to_yaml(config)),)),
-        ),
-        about="Config, versions and machine.",
-        folded=True,
-    )
+    return reproduction_section(config, settings, result.environment)

@@ -1,0 +1,1 @@
+"""Differential drives with two wheels: their axle, and the squares that calibrations drive with them."""
