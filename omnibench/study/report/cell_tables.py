@@ -80,10 +80,10 @@ def heat_map(view: StudyView, robot: str) -> FigureGrid:
         hoverinfo="skip",
     )
     figure = plot(trace)
-    names = [text(wrapped(name, 9)) for name in methods]
+    names = [text(wrapped(name, 10)) for name in methods]
     figure.update_xaxes(
         tickvals=list(range(len(methods))), ticktext=names, side="top", showgrid=False, ticks="", tickangle=0,
-        tickfont_color=INK,
+        tickfont={"color": INK, "size": 11},
     )  # fmt: skip
     figure.update_yaxes(
         tickvals=list(range(len(cells))), ticktext=[text(_column(cell)) for cell in cells], autorange="reversed",
