@@ -26,7 +26,7 @@ from commands import (
 from timing import PATIENCE
 
 from omnibench.data.storage import load_dataset
-from omnibench.robot.calibration import read_calibration
+from omnibench.robot.calibration import EffectTerm, read_calibration, write_calibration
 from omnibench.robot.published_matrices import published_matrix
 from omnibench.testing.synthetic import synthetic_robot
 
@@ -93,6 +93,19 @@ def test_calibrate_and_evaluate_end_with_what_held_out_runs_say(command: Command
     found = document(command("evaluate", "c.yaml", prepared.data, "--json"))["held_out"]
     assert (found["verdict"], found["unit"], found["units"], len(found["runs"])) == ("better", "run", 6, 6)
     assert calibrated[-2:] == [found["sentence"], found["detail"]]
+
+
+def test_what_only_a_live_node_can_run_is_not_said_to_be_exported(
+    command: Command, prepared: Prepared, tmp_path: Path
+) -> None:
+    plain = read_calibration(prepared.calibration)
+    term = EffectTerm(name="wheel_dead_zone", parameters={"c": -0.001})
+    write_calibration(plain.model_copy(update={"effects": (term,), "covariance": None}), tmp_path / "effects.yaml")
+    ending = command("evaluate", tmp_path / "effects.yaml", prepared.data).stderr
+    assert ending.endswith(
+        "; next, name it in the config of a live node, which alone has its effects:\n  omnibench guide live\n"
+    )
+    assert " export " in command("evaluate", prepared.calibration, prepared.data).stderr
 
 
 def test_a_calibration_comes_close_to_the_truth_and_says_where_it_is_from(prepared: Prepared) -> None:

@@ -125,7 +125,8 @@ def test_a_pipe_gets_one_plain_line_for_each_run_and_the_tables(tmp_path: Path) 
         "[1/3] flower theoretical seed 1",
         "[2/3] flower closed_form seed 1",
         "[3/3] flower search seed 1",
-        "3 entries compared; the best on flower, closed_form, beats the design on runs held out; next, use it",
+        "3 entries compared; the best on flower, closed_form, beats the design on runs held out; "
+        "next, use it on the robot",
         f"  omnibench export {tmp_path / 'out' / 'calibrations' / 'flower-closed_form.yaml'} --to ros2_controllers",
     ]
     assert "\x1b" not in run.stdout + run.stderr

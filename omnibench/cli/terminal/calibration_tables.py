@@ -23,6 +23,7 @@ from omnibench.fit.uncertainty.physical import ParameterEstimate
 from omnibench.report.blocks import Cell, Column, Row, Table
 from omnibench.report.numbers import noise_in_words
 from omnibench.robot.calibration import Calibration, HeldOutVerdict
+from omnibench.robot.export.c_header import left_out
 from omnibench.robot.export.formats import export_calibration
 from omnibench.robot.kinematics import Robot
 from omnibench.words import plural
@@ -233,8 +234,7 @@ def print_verdict_ending(
 ) -> None:
     """Print the last sentence of ``calibrate`` and ``evaluate``: use a calibration, record more, or look for faults."""
     if verdict.verdict == "better":
-        use = ("omnibench", "export", file, "--to", _format_for(calibration))
-        print_ending(f"{file} is better than the design on runs that were held out", "use it on the robot", *use)
+        print_ending(f"{file} is better than the design on runs that were held out", *how_to_use(calibration, file))
     elif verdict.verdict == "worse":
         look = ("omnibench", "inspect", *datasets)
         print_ending(f"{file} is worse than the design: do not use it", "see what the recordings lack", *look)
@@ -244,6 +244,13 @@ def print_verdict_ending(
     else:
         other = ("omnibench", "evaluate", file, "DATASET")
         print_ending(f"{file} was not judged by other runs", "try it on a recording that it was not fitted to", *other)
+
+
+def how_to_use(calibration: Calibration, file: Path) -> tuple[str, ...]:
+    """What a calibration is for, in words, and the words to type; no export holds all effects."""
+    if left_out(calibration):
+        return "name it in the config of a live node, which alone has its effects", "omnibench", "guide", "live"
+    return "use it on the robot", "omnibench", "export", str(file), "--to", _format_for(calibration)
 
 
 def _format_for(calibration: Calibration) -> str:

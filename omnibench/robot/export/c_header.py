@@ -93,7 +93,7 @@ static inline void {prefix}_odometry_step({arguments})
 #endif /* {upper}_ODOMETRY_H */
 """
     warnings = []
-    if left := _left_out(calibration):
+    if left := left_out(calibration):
         warnings.append(
             "it holds the matrix, and a steering's gain and zero; other effects of the calibration are left out: "
             f"{left}; the matrix was fitted with{'out' if _is_plain(calibration) else ''} them"
@@ -117,8 +117,8 @@ def _is_plain(calibration: Calibration) -> bool:
     return calibration.plain is not None and any(term.name not in _HELD for term in calibration.effects)
 
 
-def _left_out(calibration: Calibration) -> str:
-    """The effects that the header does not hold, in words."""
+def left_out(calibration: Calibration) -> str:
+    """The effects that the header does not hold, in words, and "" if there are none: a live node has them."""
     plain = _is_plain(calibration)
     others = tuple(term for term in calibration.effects if plain or term.name not in _HELD)
     return calibration.model_copy(update={"effects": others}).effects_in_words
@@ -146,6 +146,6 @@ def _comment(calibration: Calibration) -> str:
         lines += [f"{name} cost {cost:.6g}" for name, cost in costs if cost is not None]
     if calibration.robot.mount is not None:
         lines.append("the pose is that of the tracked point, which is not the robot's centre (mount)")
-    if left := _left_out(calibration):
+    if left := left_out(calibration):
         lines.append(f"left out: effects {left}")
     return "\n".join(f" * {' '.join(line.split())}".replace("*/", "* /") for line in lines)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from rich.console import Console
 
+from omnibench.cli.terminal.calibration_tables import how_to_use
 from omnibench.cli.terminal.console import print_ending
 from omnibench.cli.terminal.tables import print_table
 from omnibench.compare.output import calibration_file
@@ -12,6 +13,7 @@ from omnibench.compare.report.error_figures import final_error_table
 from omnibench.compare.report.outcome_tables import entry_table, run_table
 from omnibench.compare.report.view import views
 from omnibench.compare.result import ComparisonResult
+from omnibench.robot.calibration import read_calibration
 from omnibench.words import plural
 
 
@@ -38,8 +40,8 @@ def print_comparison_ending(result: ComparisonResult) -> None:
     if best is None or file is None:
         print_ending(f"{compared} in {result.output}", "read report.html in that folder")
     elif best.verdict.verdict == "better":
-        use = ("omnibench", "export", file, "--to", "ros2_controllers")
-        print_ending(f"{compared}; the best on {name}, {best.label}, beats the design on runs held out", "use it", *use)
+        outcome = f"{compared}; the best on {name}, {best.label}, beats the design on runs held out"
+        print_ending(outcome, *how_to_use(read_calibration(file), file))
     else:
         unsure = f"{compared}; that the best on {name}, {best.label}, beats the design was not shown by runs held out"
         print_ending(unsure, f"read {result.output / 'report.html'} and record more runs for validation")
