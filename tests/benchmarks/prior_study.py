@@ -19,7 +19,7 @@ import numpy as np
 from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.calibrators import posterior
 from omnibench.fit.shrinkage import physical_prior
-from omnibench.registry import calibrators
+from omnibench.registry import calibrators, load_plugins
 from omnibench.robot.robot_class import class_of
 from omnibench.study.cells import make_cells
 from omnibench.study.config import MethodChoice, TrainingChoice
@@ -57,6 +57,7 @@ def main() -> None:
             "reference": None,
         }
     )
+    load_plugins(config.plugins)
     robots, _ = load_robots(config, lambda _: None)
     print(f"{'':28s}" + "".join(f"{robot.name:>10s}" for robot in robots))
     usual = [errors(config, robot) for robot in robots]
