@@ -51,7 +51,7 @@ import numpy as np
 from pydantic import Field
 
 from omnibench.data.dataset import Trajectory
-from omnibench.errors import ConfigError, NotApplicableError
+from omnibench.errors import NotApplicableError
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
@@ -89,8 +89,7 @@ class Censi(Calibrator):
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """Steps 1 and 2. NotApplicableError: the runs leave some of the six parameters open."""
-        if problem.parameterisation.name != "matrix":
-            raise ConfigError("censi gives a matrix; say parameterisation: matrix")
+        self.needs_matrix(problem)
         runs = [run for run in problem.trajectories if run.has_poses]
         if not runs:
             raise NotApplicableError("it needs reference poses, and these runs have none after the start")

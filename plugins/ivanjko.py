@@ -40,7 +40,7 @@ from pydantic import Field
 from scipy.optimize import least_squares
 
 from omnibench.data.dataset import Trajectory
-from omnibench.errors import ConfigError, NotApplicableError
+from omnibench.errors import NotApplicableError
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.differential.axle import TWO_WHEELS, axle_length, has_two_wheels, with_axle
 from omnibench.fit.problem import CalibrationProblem
@@ -82,8 +82,7 @@ class Ivanjko(Calibrator):
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """Repeat steps 1 and 2. NotApplicableError: no straight line, or no turn on the spot, left or right."""
-        if problem.parameterisation.name != "matrix":
-            raise ConfigError("ivanjko gives a matrix; say parameterisation: matrix")
+        self.needs_matrix(problem)
         lines, lefts, rights = _paths(problem)
         radii, wheelbase, change, count = np.ones(2), 1.0, np.inf, 0
         while change > self.options.tolerance and count < self.options.rounds:

@@ -35,7 +35,7 @@ import numpy as np
 from pydantic import Field
 
 from omnibench.data.dataset import Trajectory
-from omnibench.errors import NotApplicableError, OmnibenchError
+from omnibench.errors import NotApplicableError
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
@@ -71,8 +71,7 @@ class Kallasi(Calibrator):
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """Solve Eq. (2) over the segments of all runs, and make the matrix of Eq. (3)."""
-        if problem.parameterisation.name != "matrix":
-            raise OmnibenchError("kallasi answers with a matrix; use the parameterisation matrix")
+        self.needs_matrix(problem)
         design = problem.robot.inverse_kinematic_matrix
         runs = [run for run in problem.trajectories if run.has_poses and len(run.pose_times) > 1]
         if not runs:

@@ -32,7 +32,7 @@ import numpy as np
 from pydantic import Field
 
 from omnibench.data.dataset import Trajectory
-from omnibench.errors import NotApplicableError, OmnibenchError
+from omnibench.errors import NotApplicableError
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
@@ -68,8 +68,7 @@ class Lin(Calibrator):
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """Solve Eq. (1) for row 3 and Eq. (2) for the factors."""
-        if problem.parameterisation.name != "matrix":
-            raise OmnibenchError("lin answers with a matrix; use the parameterisation matrix")
+        self.needs_matrix(problem)
         runs = [run for run in problem.trajectories if run.has_poses and len(run.pose_times) > 1]
         if not runs:
             raise NotApplicableError("it fits reference poses along the path, and no run has more than one")

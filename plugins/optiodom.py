@@ -48,7 +48,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from omnibench.data.dataset import Trajectory
-from omnibench.errors import NotApplicableError, OmnibenchError
+from omnibench.errors import NotApplicableError
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
@@ -109,8 +109,7 @@ class OptiOdom(Calibrator):
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """Step until the objective of Eq. (3) rests."""
-        if problem.parameterisation.name != "matrix":
-            raise OmnibenchError("optiodom answers with a matrix; use the parameterisation matrix")
+        self.needs_matrix(problem)
         runs = [run for run in problem.trajectories if run.has_poses and len(run.pose_times) > 1]
         if not runs:
             raise NotApplicableError("it fits reference positions along the path, and no run has more than one")

@@ -41,9 +41,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import Calibrator, Solution
-from omnibench.fit.differential.axle import TWO_WHEELS, axle_length, has_two_wheels, left_and_right, with_diameter_ratio
+from omnibench.fit.differential.axle import TWO_WHEELS, axle_length, has_two_wheels
 from omnibench.fit.differential.driven_squares import Square, squares_both_ways
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import calibrators
@@ -65,18 +64,11 @@ class Umbmark(Calibrator):
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """Formulas (1) to (4). NotApplicableError: there are no squares, or they were driven one way only."""
-        if problem.parameterisation.name != "matrix":
-            raise ConfigError("umbmark gives a matrix; say parameterisation: matrix")
+        self.needs_matrix(problem)
         squares = squares_both_ways(problem)
         clockwise, counter = _mean_x(squares.clockwise), _mean_x(squares.counter)
         wheelbase, diameters = errors_of(clockwise, counter, squares.side, axle_length(problem.robot))
-        corrected = with_diameter_ratio(problem.robot, diameters, wheelbase)
-        left, right = left_and_right(corrected)
-        return Solution(
-            corrected.inverse_kinematic_matrix.ravel(),
-            f"wheelbase {1000 * axle_length(corrected):.1f} mm (E_b {wheelbase:.4f}), radii {left} and {right} mm "
-            f"(E_d {diameters:.4f}), from {squares.words}",
-        )
+        return squares.solution(problem.robot, wheelbase, diameters)
 
 
 def errors_of(x_clockwise: float, x_counter: float, side: float, axle: float) -> tuple[float, float]:

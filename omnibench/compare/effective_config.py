@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from omnibench.compare.config import CompareConfig
+from omnibench.compare.config import CompareConfig, CostChoice
 from omnibench.config import validate
 from omnibench.errors import ConfigError, OmnibenchError, PluginError
 from omnibench.fit.calibrator import unloadable
@@ -38,19 +38,19 @@ def _names_in(plugin: Path) -> set[str]:
 
 def effective_config(config: CompareConfig) -> CompareConfig:
     """The config with every default of every option written out. Refuses unknown names and options."""
-    cost = config.cost
-    cost_options = costs.create(cost.name, cost.options, f"config {config.name}").options
+    cost = effective_cost(config.cost, f"config {config.name}")
     entries = []
     for index, entry in enumerate(config.calibrators):
         place = f"config {config.name}: calibrators.{index}"
         options = effective_options(entry.name, entry.options, place)
         entries.append(entry.model_copy(update={"options": options.model_dump(mode="json")}))
-    return config.model_copy(
-        update={
-            "calibrators": tuple(entries),
-            "cost": cost.model_copy(update={"options": cost_options.model_dump(mode="json")}),
-        }
-    )
+    return config.model_copy(update={"calibrators": tuple(entries), "cost": cost})
+
+
+def effective_cost(choice: CostChoice, place: str) -> CostChoice:
+    """A cost with every default of its options. Errors begin with ``place``: an unknown name or option."""
+    options = costs.create(choice.name, choice.options, place).options
+    return choice.model_copy(update={"options": options.model_dump(mode="json")})
 
 
 def effective_options(name: str, given: Mapping[str, Any], place: str) -> BaseModel:

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import platform
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 
 from omnibench.compare.effective_config import load_calibrators
 from omnibench.compare.plan import PlannedRun, RunTask
-from omnibench.errors import DataError
+from omnibench.errors import DataError, Interrupted
 from omnibench.fit.calibrator import Outcome, RunResult, Timing, describe_error, run_calibrator
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.fit.shrinkage.shrinkage import shrunk
-from omnibench.jobs.job import Backend, Failure, Job, JobWatch, run_jobs
+from omnibench.jobs.job import Backend, BackendError, Failure, Job, JobWatch, run_jobs
 from omnibench.jobs.result_store import ResultStore
 from omnibench.processes import keep_interrupts_from_callbacks
 from omnibench.progress import Progress, Reporter
@@ -38,6 +40,21 @@ def execute(
     runs = _Runs(plan, store, report)
     run_jobs(map(_job, plan), store, backend, runs)
     return [runs.results[number] for number in range(len(plan))]
+
+
+@contextmanager
+def resumable(
+    plan: Sequence[PlannedRun], store: ResultStore[RunResult], folder: Path, noun: str = "runs"
+) -> Iterator[None]:
+    """Let Ctrl-C and a lost cluster end in a line that says which runs are kept and how to continue."""
+    try:
+        yield
+    except (KeyboardInterrupt, BackendError) as error:
+        kept = sum(store.get(run.key) is not None for run in plan)
+        way = f"{kept} of {len(plan)} {noun} are kept in {folder}: run again with -o {folder}"
+        if isinstance(error, BackendError):
+            raise type(error)(f"{error}; {way}") from None
+        raise Interrupted(f"interrupted; {way}") from None
 
 
 def _job(run: PlannedRun) -> Job[RunResult]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from omnibench.compare.certificates import certify
 from omnibench.compare.config import CompareConfig
 from omnibench.compare.effective_config import effective_config, load_calibrators
-from omnibench.compare.execute import PRELOAD, execute
+from omnibench.compare.execute import PRELOAD, execute, resumable
 from omnibench.compare.output import check_output, prepare_output, write_results
 from omnibench.compare.plan import UNBOUNDED, PlannedRun, load_datasets, make_plan
 from omnibench.compare.report.comparison_report import comparison_document
@@ -26,11 +26,10 @@ from omnibench.compare.statistics import (
 from omnibench.compare.uncertainties import typical_uncertainties
 from omnibench.data.dataset import Dataset
 from omnibench.environment import environment
-from omnibench.errors import ConfigError, Interrupted, UnknownNameError, require_type
+from omnibench.errors import ConfigError, UnknownNameError, require_type
 from omnibench.fit.calibrator import RunResult
 from omnibench.fit.uncertainty.unidentified import warnings_of_calibration
 from omnibench.jobs.backend_choice import BackendChoice, open_backend
-from omnibench.jobs.job import BackendError
 from omnibench.jobs.result_store import ResultStore
 from omnibench.processes import one_thread_processes
 from omnibench.progress import Reporter, no_progress
@@ -64,9 +63,9 @@ def run_comparison(
             plan = make_plan(config, datasets)
             folder = prepare_output(config, output, force=force)
             store = ResultStore(folder / "runs", RunResult)
-            with _resumable(plan, store, folder), opened.pop_all():  # Ctrl-C while they close is resumable, too
+            with resumable(plan, store, folder), opened.pop_all():  # Ctrl-C while they close is resumable, too
                 results = execute(plan, store, progress, backend)
-    with _resumable(plan, store, folder):
+    with resumable(plan, store, folder):
         scored = score(plan, results, datasets)
         runs, certificates = certify(plan, scored)
         statistics = entry_statistics(runs, config.bootstrap)
@@ -107,19 +106,6 @@ def _naming_failed_plugins(failures: Sequence[PluginFailure]) -> Iterator[None]:
         yield
     except UnknownNameError as error:
         raise ConfigError("; ".join([str(error), *map(_described, failures)])) from None
-
-
-@contextmanager
-def _resumable(plan: Sequence[PlannedRun], store: ResultStore[RunResult], folder: Path) -> Iterator[None]:
-    """Let Ctrl-C and a lost cluster end in a line that says which runs are kept and how to continue."""
-    try:
-        yield
-    except (KeyboardInterrupt, BackendError) as error:
-        kept = sum(store.get(run.key) is not None for run in plan)
-        way = f"{kept} of {len(plan)} runs are kept in {folder}: run again with -o {folder}"
-        if isinstance(error, BackendError):
-            raise type(error)(f"{error}; {way}") from None
-        raise Interrupted(f"interrupted; {way}") from None
 
 
 def _warnings(

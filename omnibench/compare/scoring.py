@@ -15,7 +15,7 @@ from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory
 from omnibench.errors import PluginError
 from omnibench.fit.calibrator import Outcome, RunResult, describe_error
 from omnibench.fit.cost import Cost
-from omnibench.fit.evaluate import positions_and_headings
+from omnibench.fit.evaluate import final_errors, positions_and_headings
 from omnibench.fit.geometry import FittedParameter, WheelGeometry, fitted_parameters
 from omnibench.fit.observations.reference_errors import with_mean_errors
 from omnibench.fit.parameterisation import make_bounds
@@ -67,17 +67,11 @@ class SplitScorer:
         )
 
     def score_of_model(self, model: OdometryModel) -> SplitScore:
-        """All of these of a model with effects, under which a run without poses has the final errors of its matrix.
-
-        PluginError as ``score``. DataError: the split lacks what an effect needs.
-        """
+        """All of these of a model with effects. PluginError as ``score``. DataError: it lacks what an effect needs."""
         errors, owner = self._cost.errors_of(model, self._trajectories)
         cost = float(self._checked(1, lambda: self._cost.combine(errors[None], owner))[0])
         costs = self._checked(len(self._final), lambda: self._cost.of_each(errors, owner))
-        ends = model.reported([trajectory.final_log for trajectory in self._trajectories])
-        of_ends = np.concatenate(ends) - self._final
-        final = with_mean_errors(of_ends, model.matrix, self._trajectories, self._integration)
-        return SplitScore(cost, costs, final, self._units, self._cost.rounding)
+        return SplitScore(cost, costs, final_errors(model, self._trajectories), self._units, self._cost.rounding)
 
     def _errors(self, matrix: Array) -> Array:
         return self._odometry.poses(matrix[None])[0] - self._reference

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from omnibench.data.dataset import Trajectory
-from omnibench.errors import NotApplicableError, OmnibenchError, PluginError, one_line
+from omnibench.errors import ConfigError, NotApplicableError, OmnibenchError, PluginError, one_line
 from omnibench.fit.parameterisation import ParameterisationName
 from omnibench.fit.problem import BudgetSpent, CalibrationProblem, Improvement
 from omnibench.fit.shrinkage.prior import MountChoice
@@ -91,6 +91,11 @@ class Calibrator(ABC):
     def applies(self, robot: Robot) -> bool:  # noqa: ARG002
         """True for a robot that the method is for."""
         return True
+
+    def needs_matrix(self, problem: CalibrationProblem) -> None:
+        """ConfigError: the problem searches a geometry, and the method answers with a matrix."""
+        if problem.parameterisation.name != "matrix":
+            raise ConfigError(f"{self.name} gives a matrix; say parameterisation: matrix")
 
     @abstractmethod
     def calibrate(self, problem: CalibrationProblem) -> Solution:

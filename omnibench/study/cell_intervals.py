@@ -74,7 +74,7 @@ class Pairs:
 
     @property
     def unit(self) -> UnitOfCell:
-        """The units that the interval rests on."""
+        """The units that the interval rests on: sessions where each group has three, else runs."""
         return "session" if self.sessions and min(map(len, self.groups("session"))) >= FEWEST else "run"
 
 
@@ -104,12 +104,9 @@ class CellRatio:
         return "better" if self.value < 1 else "worse"
 
 
-def cell_ratio(errors: Array, others: Array, pairs: Pairs, cells: int, unit: UnitOfCell | None = None) -> CellRatio:
-    """The ratio of the mean of errors (n,) to that of others (n,) over a cell's pairs; cells: size of its family.
-
-    unit: default, sessions where each group has three, else runs.
-    """
-    unit = unit or pairs.unit
+def cell_ratio(errors: Array, others: Array, pairs: Pairs, cells: int) -> CellRatio:
+    """The ratio of the mean of errors (n,) to that of others (n,) over a cell's pairs; cells: size of its family."""
+    unit = pairs.unit
     groups = pairs.groups(unit)
     ratio = float(errors.sum() / others.sum()) if others.sum() > 0 else math.inf
     parts = [_variance(errors, others, group) for group in groups]

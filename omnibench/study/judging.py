@@ -9,7 +9,8 @@ import numpy as np
 
 from omnibench.errors import OmnibenchError
 from omnibench.fit.calibrator import Outcome, RunResult
-from omnibench.fit.observations.reference_errors import mean_errors, with_mean_errors
+from omnibench.fit.evaluate import final_errors
+from omnibench.fit.observations.reference_errors import with_mean_errors
 from omnibench.progress import Progress, Reporter
 from omnibench.robot.calibration import extended_model
 from omnibench.robot.kinematics import Array
@@ -72,9 +73,8 @@ class _Judge:
     def __init__(self, robot: StudiedRobot, integration: Integration) -> None:
         self._robot, self._integration = robot.dataset.robot, integration
         self._period, self._runs = robot.dataset.sample_period, robot.dataset.trajectories
-        self._logs = [run.final_log for run in self._runs]
         self._ends = np.array([run.final_pose for run in self._runs])
-        self._odometry = odometry_of(self._logs, integration)
+        self._odometry = odometry_of([run.final_log for run in self._runs], integration)
 
     def of_matrices(self, matrices: Sequence[Array]) -> list[Array]:
         """Errors (Z, 3) of each matrix (3, M)."""
@@ -97,10 +97,7 @@ class _Judge:
                 model = extended_model(
                     self._robot, result.matrix, self._integration, self._period, result.extension, fit.method.shown
                 )
-                errors = np.array([poses[-1] for poses in model.poses(self._logs)]) - self._ends
-                for index, run in enumerate(self._runs):
-                    if not run.has_poses and run.references is not None:
-                        errors[index] = mean_errors(model, run)
+                errors = final_errors(model, self._runs)
             except OmnibenchError as error:
                 outcome, reason = Outcome.FAILED, str(error)
         if errors is not None and not np.isfinite(errors).all():

@@ -3,29 +3,27 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from omnibench.compare.effective_config import effective_options, load_calibrators
-from omnibench.compare.execute import PRELOAD, execute
+from omnibench.compare.effective_config import effective_cost, effective_options, load_calibrators
+from omnibench.compare.execute import PRELOAD, execute, resumable
 from omnibench.environment import environment
-from omnibench.errors import DataError, Interrupted, require_type
+from omnibench.errors import DataError, require_type
 from omnibench.fit.calibrator import RunResult
 from omnibench.jobs.backend_choice import BackendChoice, open_backend
-from omnibench.jobs.job import BackendError
 from omnibench.jobs.result_store import ResultStore
 from omnibench.processes import one_thread_processes
 from omnibench.progress import Reporter, no_progress
-from omnibench.registry import PluginFailure, costs
+from omnibench.registry import PluginFailure
 from omnibench.report.render import write_document
 from omnibench.study.cells import make_cells
 from omnibench.study.config import StudyConfig
 from omnibench.study.judging import judge_fits
 from omnibench.study.report.study_report import study_document
 from omnibench.study.study_output import check_output, prepare_output, write_results
-from omnibench.study.study_plan import PlannedFit, load_robots, plan_fits
+from omnibench.study.study_plan import load_robots, plan_fits
 from omnibench.study.study_result import StudyResult
 
 
@@ -50,12 +48,12 @@ def run_study(
     fits = plan_fits(config, robots)
     folder = prepare_output(config, output, force=force)
     store = ResultStore(folder / "runs", RunResult)
-    asked = [index for index, fit in enumerate(fits) if fit.run is not None]
-    with _resumable(fits, store, folder):
+    asked = {index: fit.run for index, fit in enumerate(fits) if fit.run is not None}
+    plan = list(asked.values())
+    with resumable(plan, store, folder, "fits"):
         with ExitStack() as opened:
             backend = opened.enter_context(open_backend(_backend(config), PRELOAD, progress))
             opened.enter_context(one_thread_processes(PRELOAD))
-            plan = [run for index in asked if (run := fits[index].run) is not None]
             results = dict(zip(asked, execute(plan, store, progress, backend), strict=True))
         judged, design = judge_fits(fits, results, config.integration, progress)
         result = StudyResult(
@@ -88,25 +86,10 @@ def _with_methods(config: StudyConfig) -> tuple[list[PluginFailure], StudyConfig
         options = effective_options(method.name, method.options, place)
         changes: dict[str, Any] = {"options": options.model_dump(mode="json")}
         if method.cost is not None:
-            made = costs.create(method.cost.name, method.cost.options, place).options
-            changes["cost"] = method.cost.model_copy(update={"options": made.model_dump(mode="json")})
+            changes["cost"] = effective_cost(method.cost, place)
         methods.append(method.model_copy(update=changes))
     return failures, config.model_copy(update={"methods": tuple(methods)})
 
 
 def _backend(config: StudyConfig) -> BackendChoice:
     return BackendChoice(name=config.backend, workers=config.workers or os.cpu_count() or 1, tls=config.tls)
-
-
-@contextmanager
-def _resumable(fits: Sequence[PlannedFit], store: ResultStore[RunResult], folder: Path) -> Iterator[None]:
-    """Let Ctrl-C and a lost cluster end in a line that says which fits are kept and how to continue."""
-    try:
-        yield
-    except (KeyboardInterrupt, BackendError) as error:
-        runs = [fit.run for fit in fits if fit.run is not None]
-        kept = sum(store.get(run.key) is not None for run in runs)
-        way = f"{kept} of {len(runs)} fits are kept in {folder}: run again with -o {folder}"
-        if isinstance(error, BackendError):
-            raise type(error)(f"{error}; {way}") from None
-        raise Interrupted(f"interrupted; {way}") from None

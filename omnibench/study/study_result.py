@@ -67,8 +67,7 @@ class StudyResult(Shown):
     @property
     def geometric_mean(self) -> float | None:
         """Geometric mean over cells of the reference's error as a ratio to the best published one's."""
-        ratios = [each.ratio.value for each in self.against_best]
-        return float(np.exp(np.mean(np.log(ratios)))) if ratios and min(ratios) > 0 else None
+        return mean_ratio([each.ratio.value for each in self.against_best])
 
     @property
     def failures(self) -> tuple[str, ...]:
@@ -84,6 +83,11 @@ class StudyResult(Shown):
         """True if no method that is fitted, or none of all if there are no such, gave an answer anywhere."""
         fitted = [each for each in self.fits if calibrators.entry(each.fit.method.name).cls.fitted]
         return not any(each.answered for each in fitted or self.fits)
+
+
+def mean_ratio(ratios: Sequence[float]) -> float | None:
+    """The geometric mean of some ratios; None of none, or where one is 0."""
+    return float(np.exp(np.mean(np.log(ratios)))) if ratios and min(ratios) > 0 else None
 
 
 def _place(fit: PlannedFit) -> tuple[str, ...]:

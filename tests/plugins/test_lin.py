@@ -105,7 +105,7 @@ def test_runs_without_reference_poses_are_refused() -> None:
 def test_the_geometry_is_refused() -> None:
     problem = synthetic_problem("geometry")
     result = run_calibrator(calibrators.create("lin"), problem)
-    assert (result.outcome, "parameterisation matrix" in result.reason) == (Outcome.FAILED, True)
+    assert (result.outcome, "parameterisation: matrix" in result.reason) == (Outcome.FAILED, True)
 
 
 def test_three_wheels_reach_what_the_authors_of_optiodom_reach_with_it(omni3: Dataset) -> None:

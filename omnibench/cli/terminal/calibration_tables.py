@@ -247,7 +247,7 @@ def print_verdict_ending(
 
 
 def how_to_use(calibration: Calibration, file: Path) -> tuple[str, ...]:
-    """What a calibration is for, in words, and the words to type; no export holds all effects."""
+    """The next step with a calibration in words, then the words to type: an export, or a node if none holds it."""
     if left_out(calibration):
         return "name it in the config of a live node, which alone has its effects", "omnibench", "guide", "live"
     return "use it on the robot", "omnibench", "export", str(file), "--to", _format_for(calibration)

@@ -9,7 +9,8 @@ import numpy as np
 
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import NotApplicableError
-from omnibench.fit.differential.axle import poses_of_axle
+from omnibench.fit.calibrator import Solution
+from omnibench.fit.differential.axle import axle_length, left_and_right, poses_of_axle, with_diameter_ratio
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
@@ -48,6 +49,16 @@ class SquaresBothWays:
     def words(self) -> str:
         """Numbers and side in words."""
         return f"{len(self.clockwise)} clockwise and {len(self.counter)} counter-clockwise squares of {self.side:.2f} m"
+
+    def solution(self, robot: Robot, wheelbase: float, diameters: float) -> Solution:
+        """The robot with the wheelbase times a factor E_b and the wheels' diameters in a ratio E_d, right to left."""
+        corrected = with_diameter_ratio(robot, diameters, wheelbase)
+        left, right = left_and_right(corrected)
+        return Solution(
+            corrected.inverse_kinematic_matrix.ravel(),
+            f"wheelbase {1000 * axle_length(corrected):.1f} mm (E_b {wheelbase:.4f}), radii {left} and {right} mm "
+            f"(E_d {diameters:.4f}), from {self.words}",
+        )
 
 
 def squares_both_ways(problem: CalibrationProblem) -> SquaresBothWays:

@@ -15,6 +15,7 @@ from omnibench.report.traces import line, marks
 from omnibench.study.cells import StudyCell
 from omnibench.study.regimes import AS_RECORDED
 from omnibench.study.report.study_view import StudyView, cell_words
+from omnibench.study.study_result import mean_ratio
 from omnibench.words import plural
 
 _CURVE = re.compile(r"^(?P<kind>.+), (?P<count>\d+) runs? a command$")
@@ -62,10 +63,9 @@ def _breaking_table(view: StudyView, regimes: Sequence[str]) -> Table:
                 for robot in view.robots
                 for of_place in _by_regime(view, robot).values()
             )
-            if not ratios:
+            if (mean := mean_ratio(ratios)) is None:
                 cells.append(Cell(NOTHING))
                 continue
-            mean = float(np.exp(np.mean(np.log(ratios))))
             broken = sum(ratio > _BROKEN for ratio in ratios)
             note = f"{broken} of {len(ratios)} break; {worse} worse"
             cells.append(Cell(fixed(mean, 2), note))

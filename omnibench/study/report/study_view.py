@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from omnibench.report.blocks import LegendItem
 from omnibench.report.style import THEORETICAL, colours
 from omnibench.study.cells import StudyCell
+from omnibench.study.regimes import AS_RECORDED
 from omnibench.study.study_result import StudyResult
 
 _FAMILIES = {"ours": "omnibench", "published": "published", "baseline": "baseline", "other": ""}
@@ -32,13 +33,9 @@ class StudyView:
 
     def plain(self, robot: str) -> tuple[StudyCell, ...]:
         """The cells of a robot as recorded: judged ones, then training errors."""
-        regime = [cell for cell in self.result.cells if cell.key.robot == robot and cell in self._as_recorded]
-        return tuple(sorted(regime, key=lambda cell: cell.key.fitted))
-
-    @property
-    def _as_recorded(self) -> Sequence[StudyCell]:
-        recorded = {cell.key.regime for cell in self.result.judged_cells}
-        return [cell for cell in self.result.cells if cell.key.regime in recorded]
+        keys = [(cell, cell.key) for cell in self.result.cells]
+        mine = [cell for cell, key in keys if key.robot == robot and key.regime == AS_RECORDED]
+        return tuple(sorted(mine, key=lambda cell: cell.key.fitted))
 
     def family(self, method: str) -> str:
         """A method's family in a word."""

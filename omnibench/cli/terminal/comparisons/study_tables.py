@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 from rich.console import Console
 
 from omnibench.cli.terminal.console import print_ending
@@ -10,7 +9,7 @@ from omnibench.cli.terminal.tables import print_table
 from omnibench.report.blocks import Cell, Column, Row, Table
 from omnibench.report.numbers import NOTHING, fixed
 from omnibench.study.report.study_view import cell_words
-from omnibench.study.study_result import StudyResult
+from omnibench.study.study_result import StudyResult, mean_ratio
 from omnibench.words import plural
 
 _SHOWN = 10  # failures that are listed; the others are counted (chosen: half a terminal)
@@ -65,7 +64,7 @@ def _methods(result: StudyResult) -> Table:
             mine = [c for c in result.judged_cells if c.key.robot == robot and method in c.methods]
             ratios = [ratio.value for c in mine if (ratio := c.against_design(method, 1)) is not None]
             silent = mine[0].methods[method].status if mine else NOTHING
-            mean = float(np.exp(np.mean(np.log(ratios)))) if ratios and min(ratios) > 0 else None
+            mean = mean_ratio(ratios)
             cells.append(silent if mean is None else Cell(fixed(mean, 2), plural(len(ratios), "cell")))
         rows.append(Row.of(method, *cells))
     return Table(
