@@ -46,12 +46,19 @@ def end_with_parent() -> None:
         os._exit(1)
 
 
-def keep_interrupts_from_callbacks() -> None:
-    """Take JAX's callback off the garbage collector of a process that only waits for others.
+@contextmanager
+def interrupts_not_in_callbacks() -> Iterator[None]:
+    """Within it JAX's callback of the garbage collector is off: for a process that waits for others.
 
     CVXPY imports JAX where it is there. What is raised in such a callback is printed and forgotten, Ctrl-C among it.
     """
-    gc.callbacks[:] = [each for each in gc.callbacks if getattr(each, "__name__", "") != "_xla_gc_callback"]
+    taken = [each for each in gc.callbacks if getattr(each, "__name__", "") == "_xla_gc_callback"]
+    for each in taken:
+        gc.callbacks.remove(each)
+    try:
+        yield
+    finally:
+        gc.callbacks.extend(taken)
 
 
 @contextmanager

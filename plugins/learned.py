@@ -18,7 +18,8 @@ where there are enough of these, else by command, else one by one. For each fold
 trained on the other runs, and the loss of the fold's runs is followed. The decay and the epoch with the least loss over
 all folds are taken for the answer: the network that was trained on all runs, as it was in that epoch. The share of a
 network beside the matrix that is used has the least cost, the problem's own, on the runs that were held out; without a
-gain of two standard errors it is 0, and the answer is K alone.
+gain of two standard errors it is 0, and the answer is K alone. K, the scales s and the choice of epoch and decay have
+seen these runs, so that the gain is a guard against networks that fit noise, and no estimate for new runs.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from omnibench.fit.problem import CalibrationProblem
 from omnibench.fit.shrinkage.shrinkage import shrunk
 from omnibench.jobs.job import Backend, BackendError, Failure, Job, JobWatch, run_jobs
 from omnibench.jobs.result_store import ResultStore
-from omnibench.processes import keep_interrupts_from_callbacks
+from omnibench.processes import interrupts_not_in_callbacks
 from omnibench.progress import Progress, Reporter
 from omnibench.registry import calibrators
 from omnibench.words import plural
@@ -36,9 +36,9 @@ def execute(
     Failed runs are not stored: what made them fail (a missing package, too little memory) may be gone next time.
     KeyboardInterrupt passes through after the running processes are ended; what had ended is in the store.
     """
-    keep_interrupts_from_callbacks()
     runs = _Runs(plan, store, report)
-    run_jobs(map(_job, plan), store, backend, runs)
+    with interrupts_not_in_callbacks():
+        run_jobs(map(_job, plan), store, backend, runs)
     return [runs.results[number] for number in range(len(plan))]
 
 

@@ -106,8 +106,7 @@ class ScoredRun:
     """A run with its scores.
 
     history: the best cost so far. scores: by split, those with trajectories; empty without an answer. design: scores of
-    the design values, by split. extension, noise: as in
-    RunResult.
+    the design values, by split. extension, noise: as in RunResult.
     """
 
     record: RunRecord

@@ -12,7 +12,7 @@ from omnibench.compare.config import CompareConfig
 from omnibench.compare.plan import PlannedRun
 from omnibench.compare.result import RunRecord, ScoredRun, SplitScore
 from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory
-from omnibench.errors import PluginError
+from omnibench.errors import DataError, PluginError
 from omnibench.fit.calibrator import Outcome, RunResult, describe_error
 from omnibench.fit.cost import Cost
 from omnibench.fit.evaluate import final_errors, positions_and_headings
@@ -99,10 +99,14 @@ def score(
             dataset = datasets[run.dataset_name]
             scorers[run.dataset_name] = _scorers(run.config, dataset)
             design[run.dataset_name] = _scores(scorers[run.dataset_name], dataset.robot.inverse_kinematic_matrix)
-    scored = [
-        _scored(run, result, _scores_of(run, result, scorers[run.dataset_name]), design[run.dataset_name])
-        for run, result in zip(plan, results, strict=True)
-    ]
+    scored = []
+    for run, result in zip(plan, results, strict=True):
+        try:
+            scores = _scores_of(run, result, scorers[run.dataset_name])
+        except DataError as error:  # a run lacks what an effect of the answer needs
+            result = replace(result, outcome=Outcome.FAILED, reason=str(error), vector=None, matrix=None, cost=None)
+            scores = {}
+        scored.append(_scored(run, result, scores, design[run.dataset_name]))
     exact = [(run, done) for run, done in zip(plan, scored, strict=True) if _is_exact(run, done)]
     return tuple(_with_gap(run, done, exact) for run, done in zip(plan, scored, strict=True))
 

@@ -128,12 +128,16 @@ class LegendItem:
 
 @dataclass(frozen=True, eq=False)
 class Figure:
-    """A plot under its own title. ``description``: the picture in words, for readers who cannot see it."""
+    """A plot under its own title.
+
+    description: the picture in words, for readers who cannot see it. least_width: px; on narrower pages it scrolls.
+    """
 
     title: str
     plot: go.Figure
     description: str
     height: int = 380  # px
+    least_width: int = 0
 
 
 @dataclass(frozen=True, eq=False)

@@ -45,8 +45,9 @@ class MethodInCell:
     """One method in a cell. errors: by measure, (n,) of each pair, means over seeds; the design's where it has none.
 
     fits, answers: how many were asked for and answered; outcomes: how many ended so. reason: of the first without an
-    answer. seconds: median of a fit; numbers: what the method says of its first answer. cost, unidentified: what was
-    minimised, and what became of motions that were hardly driven; empty where it was never asked.
+    answer. seconds: median of a fit; numbers: what the method says of its first answer, matrix (3, M): that answer's.
+    cost, unidentified: what was minimised, and what became of motions that were hardly driven; empty where it was never
+    asked.
     """
 
     method: str
@@ -60,6 +61,7 @@ class MethodInCell:
     answers: int
     cost: str = ""
     unidentified: str = ""
+    matrix: Array | None = None
 
     def mean(self, measure: Measure) -> float | None:
         """Mean error over the pairs: Eq. (6), m, or rad."""
@@ -84,17 +86,17 @@ class StudyCell:
     design: Mapping[Measure, Array]
     methods: Mapping[str, MethodInCell]
 
-    def against_design(self, method: str, cells: int, measure: Measure = "cost") -> CellRatio | None:
-        """A method's mean error as a ratio to the design values'; None without an answer."""
+    def against_design(self, method: str, cells: int) -> CellRatio | None:
+        """A method's mean error, Eq. (6), as a ratio to the design values'; None without an answer."""
         errors = self.methods[method].errors if method in self.methods else None
-        return None if errors is None else cell_ratio(errors[measure], self.design[measure], self.pairs, cells)
+        return None if errors is None else cell_ratio(errors["cost"], self.design["cost"], self.pairs, cells)
 
-    def between(self, method: str, other: str, cells: int, measure: Measure = "cost") -> CellRatio | None:
-        """The ratio of two methods' mean errors; None where one has no answer."""
+    def between(self, method: str, other: str, cells: int) -> CellRatio | None:
+        """The ratio of two methods' mean errors, Eq. (6); None where one has no answer."""
         one, two = self.methods[method].errors, self.methods[other].errors
         if one is None or two is None:
             return None
-        return cell_ratio(one[measure], two[measure], self.pairs, cells)
+        return cell_ratio(one["cost"], two["cost"], self.pairs, cells)
 
 
 def make_cells(judged: Sequence[JudgedFit], design: Mapping[str, Array]) -> tuple[StudyCell, ...]:
@@ -176,6 +178,7 @@ def _method(
         unidentified=", ".join(
             dict.fromkeys(as_answered(_class(run), run.config.unidentified, None)[0] for run in runs)
         ),
+        matrix=next((each.result.matrix for each in answered if each.result is not None), None),
     )
 
 

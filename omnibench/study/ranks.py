@@ -98,7 +98,7 @@ def profiles(cells: Sequence[StudyCell], methods: Sequence[str]) -> tuple[Profil
     for name in methods:
         if not all(name in cell.methods for cell in cells):
             continue
-        means = [cell.methods[name].mean("cost") if name in cell.methods else None for cell in cells]
+        means = [cell.methods[name].mean("cost") for cell in cells]
         ratios = [
             mean / lowest if lowest > 0 else 1.0 for mean, lowest in zip(means, best, strict=True) if mean is not None
         ]

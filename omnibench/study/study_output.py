@@ -19,7 +19,7 @@ from omnibench.study.study_result import StudyResult
 
 # First line of config.yaml in a folder of results. A folder whose config.yaml lacks it is not written to.
 _MARK = "# The effective config of a study; the results beside it were made with it."
-_COLUMNS = {
+_COLUMNS: dict[str, Any] = {
     "robot": pl.String, "training": pl.String, "regime": pl.String, "judged": pl.String, "fitted": pl.Boolean,
     "simulated": pl.Boolean, "method": pl.String, "family": pl.String, "status": pl.String, "reason": pl.String,
     "fits": pl.Int64, "answers": pl.Int64, "runs": pl.Int64, "sessions": pl.Int64, "cost": pl.Float64,
@@ -27,7 +27,7 @@ _COLUMNS = {
     "design_heading_deg": pl.Float64, "ratio": pl.Float64, "low": pl.Float64, "high": pl.Float64,
     "family_low": pl.Float64, "family_high": pl.Float64, "unit": pl.String, "units": pl.String, "seconds": pl.Float64,
     "numbers": pl.String,
-    "cost_name": pl.String, "unidentified": pl.String,
+    "cost_name": pl.String, "unidentified": pl.String, "matrix": pl.List(pl.Float64),
 }  # fmt: skip
 
 
@@ -109,6 +109,7 @@ def _row(result: StudyResult, cell: StudyCell, method: MethodInCell) -> dict[str
         "unit": ratio and ratio.unit, "units": ratio and ratio.units,
         "seconds": method.seconds if result.config.timing else None,
         "numbers": method.numbers, "cost_name": method.cost, "unidentified": method.unidentified,
+        "matrix": None if method.matrix is None else method.matrix.ravel().tolist(),
     }  # fmt: skip
 
 

@@ -88,18 +88,22 @@ def _of_robot(config: StudyConfig, robot: StudiedRobot, name: str, regime: Regim
 
 
 def _check_patterns(config: StudyConfig, robots: tuple[StudiedRobot, ...]) -> None:
-    """ConfigError: a method's or a regime's pattern is that of no training of any robot, or of no regime."""
+    """ConfigError: a method's or a regime's pattern is that of no training of any robot, or of no regime.
+
+    Where some robots could not be read their trainings are not known, and no pattern of trainings is refused.
+    """
     trainings = list(dict.fromkeys(training.name for robot in robots for training in robot.trainings))
     given = [(f"method {method.shown}: trainings", method.trainings, trainings) for method in config.methods]
     given += [(f"regime {name}: trainings", regime.trainings, trainings) for name, regime in config.regimes.items()]
+    given = given if len(robots) == len(config.robots) else []
     given += [(f"method {method.shown}: regimes", method.regimes, list(config.regimes)) for method in config.methods]
     for place, patterns, names in given:
-        if patterns and patterns != ("*",) and not any(_named(name, patterns) for name in names):
-            shown = ", ".join(patterns)
-            raise ConfigError(
-                f"config {config.name}: {place}: none is called {shown}; {nearest(shown, names)}known: "
-                f"{', '.join(names) or 'none'}"
-            )
+        for pattern in patterns:
+            if pattern != "*" and not any(_named(name, (pattern,)) for name in names):
+                raise ConfigError(
+                    f"config {config.name}: {place}: none is called {pattern}; {nearest(pattern, names)}known: "
+                    f"{', '.join(names) or 'none'}"
+                )
 
 
 def _named(name: str, patterns: tuple[str, ...]) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +10,13 @@ import pytest
 from commands import compared_here, small, write_plugin
 
 from omnibench.compare.config import CompareConfig
-from omnibench.compare.plan import load_datasets
-from omnibench.compare.scoring import SplitScorer
+from omnibench.compare.effective_config import effective_config
+from omnibench.compare.plan import load_datasets, make_plan
+from omnibench.compare.scoring import SplitScorer, score
+from omnibench.fit.calibrator import Outcome, run_calibrator
 from omnibench.fit.evaluate import evaluate
-from omnibench.registry import costs
-from omnibench.robot.calibration import read_calibration
+from omnibench.registry import calibrators, costs, effects
+from omnibench.robot.calibration import EffectTerm, ModelExtension, read_calibration
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.published_matrices import published_matrix
 
@@ -75,3 +78,18 @@ def test_row_and_file_are_of_the_model_with_its_effects(tmp_path: Path) -> None:
     assert rows["drifting"].train_cost != pytest.approx(rows["theoretical"].train_cost, rel=1e-3)
     assert rows["drifting"].gap is None
     assert rows["theoretical"].gap is not None
+
+
+def test_an_effect_that_does_not_act_on_a_run_is_a_failed_row() -> None:
+    config = effective_config(CompareConfig.model_validate(small(calibrators=["theoretical"])))
+    datasets = load_datasets(config)
+    (run,) = make_plan(config, datasets)
+    result = run_calibrator(calibrators.create("theoretical"), run.task.problem())
+    robot = run.dataset.robot
+    names = [parameter.name for parameter in effects.create("wheel_eccentricity").parameters(robot)]
+    term = EffectTerm(name="wheel_eccentricity", parameters=dict.fromkeys(names, 0.01))
+    bare = replace(run.dataset, trajectories=tuple(replace(each, angles=None) for each in run.training))
+    extended = replace(result, extension=ModelExtension(effects=(term,)))
+    (scored,) = score([replace(run, dataset=bare)], [extended], datasets | {run.dataset_name: bare})
+    assert scored.record.outcome == Outcome.FAILED
+    assert "effect 'wheel_eccentricity' needs" in scored.record.reason

@@ -17,7 +17,7 @@ from omnibench.data.dataset import Dataset, make_dataset
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrate import CalibrationRun, calibrate
 from omnibench.fit.calibrator import Outcome
-from omnibench.fit.evaluate import evaluate
+from omnibench.fit.evaluate import evaluate, final_errors
 from omnibench.fit.problem import Budget
 from omnibench.progress import Progress
 from omnibench.robot.calibration import read_calibration, write_calibration
@@ -62,17 +62,15 @@ def fitted(name: str = "learned") -> CalibrationRun:
     return learned(name)
 
 
-def final_errors(model: OdometryModel) -> tuple[float, float]:
+def mean_errors(model: OdometryModel) -> tuple[float, float]:
     """Mean error of the last poses of the validation runs, m and rad."""
-    runs = dataset().split("validation")
-    errors = np.array([poses[-1] for poses in model.poses([run.final_log for run in runs])])
-    errors -= [run.final_pose for run in runs]
+    errors = final_errors(model, dataset().split("validation"))
     return float(np.hypot(errors[:, 0], errors[:, 1]).mean()), float(np.abs(errors[:, 2]).mean())
 
 
 @pytest.mark.parametrize(("name", "share"), [("learned", 0.7), ("learned_alone", 0.8)])
 def test_it_predicts_a_slip_that_no_matrix_has(name: str, share: float) -> None:
-    plain, better = final_errors(calibrate(dataset()).calibration.model), final_errors(fitted(name).calibration.model)
+    plain, better = mean_errors(calibrate(dataset()).calibration.model), mean_errors(fitted(name).calibration.model)
     assert better[0] < share * plain[0]
     assert better[1] < share * plain[1]
 

@@ -119,6 +119,12 @@ def test_the_answer_is_in_the_summary_and_on_the_terminal(studied: Studied) -> N
     assert (studied.output / "report.html").stat().st_size > 100_000
 
 
+def test_a_row_holds_the_matrix_that_its_errors_come_of(studied: Studied) -> None:
+    same = studied.rows(method="design", robot="two")["matrix"].to_list()
+    assert all(matrix == same[0] for matrix in same)
+    assert studied.rows(method="default", robot="two", training="arc")["matrix"][0].to_list() != same[0]
+
+
 def test_run_again_nothing_is_fitted_twice_and_the_table_is_the_same(studied: Studied) -> None:
     config = studied.output.parent / "study.yaml"
     again = omnibench("compare", config, "-o", studied.output)
@@ -145,6 +151,10 @@ def test_run_again_nothing_is_fitted_twice_and_the_table_is_the_same(studied: St
             "'as recorded' is the name of the runs without any change",
         ),
         ({"methods": [{"name": "closed_form", "trainings": "lime"}], "reference": None}, "did you mean 'line'?"),
+        (
+            {"methods": [{"name": "closed_form", "trainings": ["arc", "lime"]}], "reference": None},
+            "none is called lime",
+        ),
         ({"methods": [{"name": "closed_form", "cost": "final_pos"}], "reference": None}, "did you mean 'final_pose'?"),
         ({"robots": {"one": {"format": "csv"}}}, "path is missing"),
     ],
@@ -157,6 +167,16 @@ def test_a_mistake_in_the_config_is_one_line_and_exit_code_2(
     assert words in run.stderr
     assert [line[:6] for line in run.stderr.splitlines() if "reading" not in line] == ["error:"]
     assert not (tmp_path / "out").exists()
+
+
+def test_a_pattern_of_a_robot_that_cannot_be_read_is_no_mistake(tmp_path: Path) -> None:
+    def change(config: dict[str, Any]) -> None:
+        config["robots"]["two"] |= {"path": "lost", "kinds": {"spiral": "spiral_*"}}
+        config["methods"][-1]["trainings"] = ["spiral"]
+
+    run = omnibench("compare", write_study(tmp_path, change), "-o", tmp_path / "out")
+    assert run.returncode == 1, run.stderr
+    assert "cannot be read: two" in run.stdout
 
 
 def test_data_says_where_the_recordings_are(tmp_path: Path) -> None:

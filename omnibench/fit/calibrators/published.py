@@ -36,6 +36,7 @@ class Published(Calibrator):
     Options = PublishedOptions
     options: PublishedOptions
     bounded = False
+    as_is = True
     fitted = False
     stochastic = False
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
 from omnibench.robot.kinematics import Array
+from omnibench.robot.planar import interpolated, relative
 
 _LONGEST = 1.5  # times the wanted length of a step: between poses that are farther apart, steps are no longer than this
 
@@ -49,11 +50,11 @@ class MotionWindows:
         for index, (run, (times, posed)) in enumerate(zip(runs, parts, strict=True)):
             steps = len(times) - 1
             drive[index, :steps], durations[index, :steps] = _means(run, times), np.diff(times)
-            poses = _at(times[posed], run.pose_times, run.poses)
+            poses = interpolated(times[posed], run.pose_times, run.poses)
             for number, length in enumerate(lengths):
                 for first, last in _pairs(times[posed], length):
                     windows.append((index, posed[first], posed[last]))
-                    motions.append(_seen_from(poses[first], poses[last]))
+                    motions.append(relative(poses[first], poses[last]))
                     numbers.append(number)
         return cls(drive, durations, np.array(windows), np.array(motions), np.array(numbers))
 
@@ -88,16 +89,11 @@ def _edges(stamps: Array, step: float) -> tuple[Array, NDArray[np.intp]]:
     return np.interp(np.arange(posed[-1] + 1), posed, kept), posed
 
 
-def _at(times: Array, known: Array, values: Array) -> Array:
-    """Values (n, c) at known times, interpolated at others."""
-    return np.column_stack([np.interp(times, known, column) for column in values.T])
-
-
 def _means(run: Trajectory, times: Array) -> Array:
     """Means (J, M) of a run's drive signals between edges (J + 1,), rad/s."""
     known = np.append(0.0, run.times)
     driven = np.cumsum(run.signals * np.diff(known)[:, None], axis=0)
-    of_edges = _at(times, known, np.vstack([np.zeros(driven.shape[1]), driven]))
+    of_edges = interpolated(times, known, np.vstack([np.zeros(driven.shape[1]), driven]))
     means: Array = np.diff(of_edges, axis=0) / np.diff(times)[:, None]
     return means
 
@@ -109,10 +105,3 @@ def _pairs(times: Array, length: float) -> list[tuple[int, int]]:
     firsts = np.searchsorted(times, np.arange(0.0, times[-1] - length + 1e-6, length / 2) - 1e-6)
     lasts = np.searchsorted(times, times[firsts] + length - 1e-6)
     return [pair for pair in zip(firsts.tolist(), lasts.tolist(), strict=True) if pair[1] < len(times)]
-
-
-def _seen_from(first: Array, last: Array) -> Array:
-    """Pose (3,) relative to another one (3,)."""
-    cosine, sine = np.cos(first[2]), np.sin(first[2])
-    x, y, turned = last - first
-    return np.array([cosine * x + sine * y, cosine * y - sine * x, turned])

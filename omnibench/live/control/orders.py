@@ -13,7 +13,7 @@ from omnibench.config import Model, parse_yaml, validate
 from omnibench.errors import ConfigError, DataError
 from omnibench.robot.calibration import Calibration, parse_calibration
 
-LONGEST: Final = 3 << 15  # bytes of a request: a calibration with 48 KiB of weights, which are 64 KiB in base64
+LONGEST: Final = 1 << 17  # bytes of a request: 48 KiB of weights, in base64, and 60 KB of driven motions beside them
 _NANOSECONDS: Final = 10**14  # values of ``at`` from this on are ns: as s they would be 3 million years from now
 _LAST: Final = 2**63 - 1  # ns, the last time in 64 bits
 _LONGEST_NUMBER: Final = 40  # characters of a time; chosen

@@ -21,6 +21,7 @@ from omnibench.report.blocks import (
 )
 from omnibench.report.numbers import NOTHING, fixed, seconds
 from omnibench.report.style import INK, plot, text, wrapped
+from omnibench.robot.kinematics import Robot
 from omnibench.study.cell_intervals import CellRatio
 from omnibench.study.cells import MethodInCell, StudyCell
 from omnibench.study.report.study_view import StudyView, cell_words
@@ -39,6 +40,8 @@ _COLUMNS = (
 # eighth and eight times (chosen).
 _SCALE = [[0.0, "#7fb2dc"], [0.5, "#ffffff"], [1.0, "#f0919d"]]
 _CUT = 3.0
+_LEAST_SHARE = 0.05  # %: smaller changes of an element are rounded away
+_LABELS, _COLUMN = 320, 62  # px that the names of cells and each method need
 
 
 def robot_cells(view: StudyView, robot: str) -> Section:
@@ -100,8 +103,8 @@ def heat_map(view: StudyView, robot: str) -> FigureGrid:
         "Rows: training → judged kind. Eq. (6); below 1 the design values' error falls. Training errors: the judged "
         f"runs trained. {NOTHING}: no answer, or not asked (see the tables).{without}"
     )
-    height = 110 + 26 * len(cells)
-    return FigureGrid((Figure(title, figure, described, height),), (), 1, caption, f"cells-{robot}")
+    height, width = 110 + 26 * len(cells), _LABELS + _COLUMN * len(methods)
+    return FigureGrid((Figure(title, figure, described, height, width),), (), 1, caption, f"cells-{robot}")
 
 
 def cell_table(cell: StudyCell, view: StudyView, judged: int) -> Table:
@@ -121,7 +124,8 @@ def cell_table(cell: StudyCell, view: StudyView, judged: int) -> Table:
         _COLUMNS,
         tuple(_row(each, cell, view, judged, each.method == best) for each in rows),
         f"Mean final errors; {size}{unit}. Small print under the ratio: 95 % interval of this cell; the verdict "
-        f"is that of each method in {plural(judged, 'cell')} together."
+        f"is that of each method in {plural(judged, 'cell')} together. Under what was found: "
+        "changes of the first answer's matrix, column by column, in % of each row's largest element."
         + (" Training errors, on which no verdict rests." if cell.key.fitted else ""),
     )
 
@@ -141,9 +145,22 @@ def _row(each: MethodInCell, cell: StudyCell, view: StudyView, judged: int, best
         Cell(fixed(ratio.value, 3), _interval(ratio)),
         Cell("" if cell.key.fitted or ratio.equal else ratio.verdict, partly),
         seconds(each.seconds if view.result.config.timing else None),
-        each.numbers,
+        Cell(each.numbers, _change(each, view.design(cell.key.robot))),
         role="best" if best else "plain",
     )
+
+
+def _change(each: MethodInCell, robot: Robot) -> str:
+    """Change of the elements of each row of the matrix, in % of the row's largest; empty for the design values."""
+    if each.matrix is None:
+        return ""
+    shares = 100 * (each.matrix - robot.inverse_kinematic_matrix) / robot.row_scales[:, None]
+    rows = [
+        f"{name} {', '.join(f'{share:+.1f}' for share in row)}"
+        for name, row in zip(("x", "y", "turn"), shares, strict=True)
+        if np.abs(row).max() >= _LEAST_SHARE
+    ]
+    return f"matrix: {'; '.join(rows)} % of the row" if rows else ""
 
 
 def _interval(ratio: CellRatio) -> str:
@@ -152,7 +169,7 @@ def _interval(ratio: CellRatio) -> str:
 
 
 def _is_for_none(cells: Sequence[StudyCell], method: str) -> bool:
-    """True if a method was asked in some cells and is not applicable in any."""
+    """True if a method was asked in some cells and applicable in none."""
     asked = [cell.methods[method] for cell in cells if method in cell.methods]
     return bool(asked) and all(each.status == "not applicable" for each in asked)
 

@@ -34,9 +34,10 @@ def study_answer(view: StudyView) -> Section:
         return answer_section(words, tiles, None)
     verdicts = [each.ratio.verdict for each in compared]
     counts = [sum(one == verdict for one in verdicts) for verdict in _VERDICTS]
+    worse = str(counts[-1] or "none")
     words = (
         f"The error of {reference} is {fixed(result.geometric_mean, 2)} times that of the best published method of "
-        f"each cell (geometric mean of {plural(len(compared), 'cell')}); it is worse beyond chance in {counts[-1]}."
+        f"each cell (geometric mean of {plural(len(compared), 'cell')}); it is worse beyond chance in {worse}."
     )
     tiles += [
         Fact("Ratio of errors, geometric mean", fixed(result.geometric_mean, 2), "below 1: less error"),
@@ -68,7 +69,7 @@ def _chart(compared: tuple[AgainstBest, ...], reference: str) -> FigureGrid:
         if mine:
             values, places = [each.ratio.value for _, each in mine], [float(row) for row, _ in mine]
             traces.append(marks(item, 9, values, places, hover="%{text}", words=words))
-    figure = plot(*traces, x_title=f"error of {reference} / error of the best published method [named]")
+    figure = plot(*traces, x_title="ratio of errors")
     ratios = [each.ratio.value for each in compared]
     logarithmic(figure, "x", max(min([*ratios, 0.5]) / 2, 0.05), min(max([*ratios, 2.0]) * 2, 20.0))
     figure.add_vline(x=1.0, line_color=INK, line_width=1, line_dash="dot")
@@ -76,9 +77,9 @@ def _chart(compared: tuple[AgainstBest, ...], reference: str) -> FigureGrid:
     figure.update_yaxes(**ends, ticks="", tickfont_color=INK, showgrid=False)
     items = tuple(_STYLES[verdict] for verdict in _VERDICTS if any(e.ratio.verdict == verdict for e in compared))
     caption = (
-        "Left of 1: less error. Lines: intervals of all cells together (95 %, Bonferroni), by sessions where three "
-        "or more judge, else by runs; a cell without a line has too few of either. A line that "
-        "ends at the frame goes on."
+        f"The error of {reference} over that of the best published method, which is named in brackets. Left of 1: less "
+        "error. Lines: intervals of all cells together (95 %, Bonferroni), by sessions where three or more judge, else "
+        "by runs; a cell without a line has too few of either. A line that ends at the frame goes on."
     )
     title = "Beside the best published method, cell by cell"
     picture = "; ".join(_hover(each, reference) for each in compared)

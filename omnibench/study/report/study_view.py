@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from omnibench.report.blocks import LegendItem
 from omnibench.report.style import THEORETICAL, colours
+from omnibench.robot.kinematics import Robot
 from omnibench.study.cells import StudyCell
 from omnibench.study.regimes import AS_RECORDED
 from omnibench.study.study_result import StudyResult
@@ -26,6 +27,10 @@ class StudyView:
     def robots(self) -> tuple[str, ...]:
         """Names of the robots that were read."""
         return tuple(robot.name for robot in self.result.robots)
+
+    def design(self, name: str) -> Robot:
+        """The robot called ``name`` as it was drawn."""
+        return next(robot.dataset.robot for robot in self.result.robots if robot.name == name)
 
     def judged(self, robot: str | None = None) -> tuple[StudyCell, ...]:
         """The cells that verdicts rest on, of one robot or of all."""

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from posterior_coverage import ratios_of
 from real_recordings import omni3
 from sample_robots import DIFFERENTIAL, WHEELED
 
@@ -18,20 +19,13 @@ from omnibench.fit.calibrator import Outcome, RunResult, model_of_answer, run_ca
 from omnibench.fit.evaluate import final_errors
 from omnibench.fit.shrinkage.physical_prior import physical_prior_root, physical_tolerance
 from omnibench.registry import calibrators
-from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.kinematics import Array, Mount, Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
-from omnibench.testing import CalibratorConformance, synthetic_problem
+from omnibench.testing import synthetic_problem
 
 PERIOD, SAMPLES = 0.1, 150
 TWISTS = [(0.3, 0.0), (-0.1, 0.0), (0.2, 0.5), (0.1, -0.2), (0.0, 0.6), (0.0, -0.2)]  # m/s, rad/s
-
-
-class TestPosterior(CalibratorConformance):
-    """The cases of every calibrator."""
-
-    name = "posterior"
-    solved = 0.2  # it draws to the design, and does not minimise the cost
 
 
 def two_wheels(shares: Sequence[float], lost: float = 0.0, noise: float = 0.0) -> tuple[Trajectory, ...]:
@@ -104,6 +98,24 @@ def test_the_prior_knows_every_class_of_robot(robot: Robot) -> None:
     shares = deviations[driven] / np.abs(robot.inverse_kinematic_matrix)[driven]
     assert shares.min() > 0.01
     assert np.isfinite(root).all()
+
+
+def test_the_prior_holds_a_tracked_point_that_stands_elsewhere() -> None:
+    tricycle = next(robot for robot in WHEELED if robot.name == "tricycle")
+    moved = tricycle.model_copy(update={"mount": Mount(x=0.03, y=-0.02, yaw=0.02)})
+    change = moved.inverse_kinematic_matrix - tricycle.inverse_kinematic_matrix
+    root = physical_prior_root(tricycle, physical_tolerance(tricycle))
+    of_motions = np.tile([False, True, False], (change.shape[1], 1)).T.ravel()  # row 2, which no wheel drives
+    numbers = np.linalg.pinv(root[of_motions]) @ change.ravel()[of_motions]
+    assert root[of_motions] @ numbers == pytest.approx(change.ravel()[of_motions], abs=1e-4)
+    assert np.linalg.norm(numbers) == pytest.approx(np.hypot(0.03 / 0.05, 0.02 / 0.035), rel=0.02)
+
+
+def test_the_stated_deviations_are_of_the_size_of_the_errors() -> None:
+    ratios = np.array([ratios_of(np.random.default_rng([12, seed]), 12) for seed in range(20)])
+    sizes = np.sqrt(np.square(ratios[:, [0, 4, 6]]).mean(axis=0))  # a row of speed, one of turning, the lost rate
+    assert sizes.max() < 1.8
+    assert sizes.min() > 0.6
 
 
 def test_runs_without_poses_are_not_for_it() -> None:

@@ -7,8 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 from fit_samples import box_between, make_problem, noisy_trajectories
+from sample_robots import DIFFERENTIAL
 
+from omnibench.data.dataset import make_dataset
 from omnibench.errors import ConfigError, UnknownNameError
+from omnibench.fit.calibrate import calibrate
 from omnibench.fit.calibrator import Outcome, RunResult, run_calibrator
 from omnibench.fit.geometry import GeometryLimits
 from omnibench.fit.problem import CalibrationProblem
@@ -236,3 +239,10 @@ class TestBaselines:
     def test_an_unknown_published_matrix_is_answered_with_the_known(self) -> None:
         with pytest.raises(ConfigError, match="'palacin2023_eq7' is not one of palacin2023_eq8, palacin2023_eq9"):
             calibrators.create("published", {"matrix": "palacin2023_eq7"})
+
+
+def test_a_published_matrix_is_not_kept_to_the_design_where_nothing_was_driven() -> None:
+    rows = DIFFERENTIAL.inverse_kinematic_matrix + np.array([[0, 0], [0.002, -0.002], [0, 0]])
+    data = make_dataset("two wheels", DIFFERENTIAL, 0.1, synthetic_trajectories(DIFFERENTIAL))
+    found = calibrate(data, calibrator="published", options={"matrix": rows.tolist()}, unidentified="keep")
+    np.testing.assert_allclose(found.calibration.matrix, rows)

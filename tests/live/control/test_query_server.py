@@ -87,9 +87,9 @@ def test_the_pose_at_a_time_is_interpolated(driven: Any, form: str) -> None:
         ("swap", "a: [" + "1, " * 20_000 + "1]", "more than 5000 values"),
         ("swap", "a: &a [1, 1]\nb: &b [*a, *a]\nc: [*b, *b]", "write out what *a stands for"),
         ("swap", as_text(calibration()).replace("session: null", r'session: "\ud800"'), "text that is not Unicode"),
-        ("swap", "#" * 100_000, "100000 bytes are more than a request may have, 98304"),
-        ("swap", "#" * 10_000_000, "10000000 bytes are more than a request may have, 98304"),
-        ("health?" + "x" * 100_000, None, "100000 bytes are more than a request may have"),
+        ("swap", "#" * 140_000, "140000 bytes are more than a request may have, 131072"),
+        ("swap", "#" * 10_000_000, "10000000 bytes are more than a request may have, 131072"),
+        ("health?" + "x" * 140_000, None, "140000 bytes are more than a request may have"),
     ],
 )
 def test_a_bad_order_is_refused_with_the_reason(driven: Any, selector: str, payload: Any, message: str) -> None:
@@ -240,7 +240,7 @@ def test_a_closed_queue_gives_out_what_waits_and_takes_no_more() -> None:
 def test_a_file_that_is_no_calibration_by_its_size_is_not_sent(loopback: Loopback, tmp_path: Path) -> None:
     file = tmp_path / "recording.yaml"
     file.write_bytes(b"- 1\n" * 2_500_000)
-    with pytest.raises(DataError, match="10000000 bytes are more than a node takes, 98304; is it a calibration file"):
+    with pytest.raises(DataError, match="10000000 bytes are more than a node takes, 131072; is it a calibration file"):
         swap_calibration(loopback.client(), "apr", file)
 
 
@@ -293,11 +293,11 @@ def test_a_flood_of_bad_calibrations_does_not_flood_the_log(tmp_path: Path, capl
 
 def test_a_calibration_too_long_to_be_put_is_refused_and_stands_in_health(tmp_path: Path) -> None:
     with running(config_of(tmp_path)) as (node, session):
-        session.put("omnibench/apr/calibration", "#" * 100_000)
+        session.put("omnibench/apr/calibration", "#" * 140_000)
         until(lambda: node.health("apr").counts["swaps_refused"] == 1, "the refusal")
         swap = node.health("apr").last_swap
     assert swap is not None
-    assert swap.reason == "omnibench/apr/calibration: 100000 bytes are more than a request may have, 98304"
+    assert swap.reason == "omnibench/apr/calibration: 140000 bytes are more than a request may have, 131072"
 
 
 def test_a_swap_is_kept_although_the_configs_file_went_elsewhere(tmp_path: Path) -> None:

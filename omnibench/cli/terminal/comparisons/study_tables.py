@@ -48,7 +48,7 @@ def print_study_ending(result: StudyResult) -> bool:
     worse = sum(each.ratio.verdict == "worse" for each in compared)
     print_ending(
         f"the error of {result.config.reference} is {result.geometric_mean:.2f} times that of the best published "
-        f"method of each cell ({plural(len(compared), 'cell')}, worse beyond chance in {worse})",
+        f"method of each cell ({plural(len(compared), 'cell')}, worse beyond chance in {worse or 'none'})",
         f"read {report}",
     )
     return True
