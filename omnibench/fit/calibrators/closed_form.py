@@ -29,6 +29,7 @@ from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import OdometryBatch
+from omnibench.words import plural
 
 if TYPE_CHECKING:
     from omnibench.fit.loss.sum_of_norms import SumOfNormsProgram
@@ -74,23 +75,29 @@ class ClosedForm(Calibrator):
         vector = self._better(problem, problem.start, linear_start(problem))
         cost = float(problem.cost(vector[None])[0])
         shares = problem.objective.shares(problem.odometry.trajectory)
-        for count in range(1, self.options.programs + 1):
+        newton_steps = cone_programs = 0
+        work = "the linear fit"
+        for _ in range(self.options.programs):
             if cost <= problem.objective.rounding:  # a program would find no direction
-                return Solution(vector, f"no error is left after {count - 1} cone programs")
+                return Solution(vector, f"no error is left after {work}")
+            program = cone_program(problem, problem.objective, vector)
             try:
-                step = cone_program(problem, problem.objective, vector).step(shares)
+                step = program.step(shares)
             except SolverError as error:
-                return Solution(vector, _stopped(problem, problem.objective, cost, error, count), converged=False)
+                return Solution(vector, _stopped(problem, problem.objective, cost, error), converged=False)
+            newton_steps, cone_programs = newton_steps + program.newton_steps, cone_programs + program.cone_programs
+            counts = ((newton_steps, "Newton step"), (cone_programs, "cone program"))
+            work = " and ".join(plural(count, name) for count, name in counts if count)
             before = problem.matrix(vector)
             vector, cost, descended = _descend(problem, vector, cost, step)
             if not descended:
                 wanted = float(np.abs(step).max())
-                reason = f"no part of the last step ({wanted:.1e}) lowers the cost after {count} cone programs"
+                reason = f"no part of the last step ({wanted:.1e}) lowers the cost after {work}"
                 return Solution(vector, reason, converged=wanted < _FLAT * float(np.ptp(problem.matrix(vector))))
             moved = float(np.abs(problem.matrix(vector) - before).max())
             if moved < self.options.tolerance:
-                return Solution(vector, f"step below {self.options.tolerance:g} after {count} cone programs")
-        reason = f"step still {moved:.1e} after {self.options.programs} cone programs"
+                return Solution(vector, f"step below {self.options.tolerance:g} after {work}")
+        reason = f"step still {moved:.1e} after {work}"
         return Solution(vector, reason, converged=False)
 
     def _robust(self, problem: CalibrationProblem, objective: RobustCost) -> Solution:
@@ -109,11 +116,11 @@ class ClosedForm(Calibrator):
         return vectors[int(np.nanargmin(np.where(np.isfinite(costs), costs, np.inf)))]
 
 
-def _stopped(problem: CalibrationProblem, objective: SumOfNorms, cost: float, error: Exception, count: int) -> str:
+def _stopped(problem: CalibrationProblem, objective: SumOfNorms, cost: float, error: Exception) -> str:
     """The reason of an answer for which the solver finds no better one: usually errors as few as the numbers fitted."""
     errors = len(problem.reference) * sum(map(bool, objective.weights))
     fitted = int(problem.free.sum())
-    reason = f"{error} at a cost of {cost:.1e} in cone program {count}"
+    reason = f"{error} at a cost of {cost:.1e} in a cone program"
     if errors < 2 * fitted:
         reason += f": {errors} errors for {fitted} numbers are met almost exactly, record more runs"
     return reason

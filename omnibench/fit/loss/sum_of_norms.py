@@ -46,13 +46,14 @@ class SolverError(OmnibenchError):
 class SumOfNormsProgram:
     """Minimises sum_s shares_s * norm(residuals_s + jacobian_s @ d) over steps d in a box, for any shares.
 
-    residuals (S, k), jacobian (S, k, n), lower and upper (n,).
+    residuals (S, k), jacobian (S, k, n), lower and upper (n,). newton_steps, cone_programs: how many were made so far.
     """
 
     def __init__(self, residuals: Array, jacobian: Array, lower: Array, upper: Array) -> None:
         count, components, size = jacobian.shape
         self._residuals, self._jacobian = residuals, jacobian
         self._lower, self._upper = lower, upper
+        self.newton_steps = self.cone_programs = 0
         # Steps in units of the box and residuals in units of their size keep the program well scaled.
         self._unit = np.where(upper > lower, (upper - lower) / 2, 1.0)
         reach = jacobian * self._unit
@@ -68,6 +69,7 @@ class SumOfNormsProgram:
         """The best step (n,) for shares (S,) >= 0. Raises SolverError."""
         if len(shares) >= _MANY and (step := self._by_newton(shares / shares.sum())) is not None:
             return step
+        self.cone_programs += 1
         self._shares.value = shares / shares.sum()
         # A program that cvxpy prepares for changing shares takes memory that grows with the square of their number.
         solve_program(self._program, ignore_dpp=len(shares) > _MOST_PREPARED)
@@ -80,6 +82,7 @@ class SumOfNormsProgram:
         columns, step = self._jacobian[..., free] * unit, np.zeros(len(unit))
         left = self._residuals
         for _ in range(_MOST_STEPS):
+            self.newton_steps += 1
             sizes = np.linalg.norm(left, axis=1)
             value, used = float(shares @ sizes), shares > 0
             if (sizes[used] <= _VANISHING * value).any():

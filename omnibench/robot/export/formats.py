@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 from omnibench.errors import UnknownNameError, require_type
@@ -53,7 +53,12 @@ def export_calibration(calibration: Calibration, format: str) -> Export:  # noqa
     require_type(calibration, Calibration, "read_calibration")
     if format not in EXPORT_FORMATS:
         raise UnknownNameError("export format", format, EXPORT_FORMATS)
-    return EXPORT_FORMATS[format](calibration)
+    export = EXPORT_FORMATS[format](calibration)
+    if calibration.provenance is None or not calibration.provenance.simulated:
+        return export
+    words = "simulated: no robot drove the runs that this was calibrated on"
+    comment = f"/* {words} */" if format == "c_header" else f"# {words}"
+    return replace(export, text=f"{comment}\n{export.text}", warnings=(words, *export.warnings))
 
 
 def _stem(name: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
@@ -201,11 +202,19 @@ def test_few_evaluations_are_enough() -> None:
     assert "cone programs" in result.reason
 
 
+def test_the_reason_says_newton_steps_where_no_cone_program_was_solved() -> None:
+    runs = noisy_trajectories()
+    stamps = sum(len(run.pose_times) - 1 for run in runs)
+    many = [replace(run, id=f"{run.id}-{copy}") for copy in range(-(-1000 // stamps)) for run in runs]
+    result = closed_form(make_problem(many, cost="trajectory"))
+    assert re.fullmatch(r"step below 1e-09 after \d+ Newton steps", result.reason)
+
+
 def test_too_few_programs_are_not_called_converged() -> None:
     result = closed_form(make_problem(), programs=1)
     assert result.outcome is Outcome.BUDGET
     assert result.reason.startswith("step still ")
-    assert result.reason.endswith(" after 1 cone programs")
+    assert result.reason.endswith(" after 1 cone program")
 
 
 def test_a_budget_of_one_evaluation_leaves_the_start() -> None:

@@ -33,7 +33,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from omnibench.errors import ConfigError
-from omnibench.robot.export.formats import Export, export_calibration
+from omnibench.robot.calibration import Provenance
+from omnibench.robot.export.formats import EXPORT_FORMATS, Export, export_calibration
 from omnibench.robot.export.remaining import RemainingError
 from omnibench.robot.kinematics import Array, Mount, Robot
 
@@ -346,3 +347,22 @@ def test_a_matrix_that_drives_the_wrong_way_is_refused(name: str) -> None:
     robot = ROBOTS[name][0]
     with pytest.raises(ConfigError, match=r"turn.* counter-clockwise; check .*sign"):
         export_calibration(calibration(robot, -robot.inverse_kinematic_matrix), "ros2_controllers")
+
+
+@pytest.mark.parametrize("form", EXPORT_FORMATS)
+def test_every_export_of_a_simulated_calibration_says_so(form: str) -> None:
+    origin = Provenance(
+        dataset="flower",
+        dataset_hash="0",
+        calibrator="genetic",
+        seed=1,
+        cost="final_pose",
+        box="row",
+        outcome="converged",
+    )
+    said = [
+        export_calibration(calibration(DIFF, provenance=origin.model_copy(update={"simulated": simulated})), form)
+        for simulated in (False, True)
+    ]
+    assert ["simulated" in export.text.splitlines()[0] for export in said] == [False, True]
+    assert ["simulated" in " ".join(export.warnings) for export in said] == [False, True]
