@@ -32,6 +32,7 @@ def _blocks(view: DatasetView) -> tuple[Block, ...]:
     blocks: list[Block] = [_element_table(view), _difference_table(view, None)]
     if view.reference_entry is not None and len(view.calibrated) > 1:
         blocks.append(_difference_table(view, view.reference_entry[0].label))
+    blocks += _published_differences(view)
     parameters = parameter_table(view)
     if parameters is not None:
         blocks.append(parameters)
@@ -110,14 +111,22 @@ def _element_table(view: DatasetView) -> Table:
     )
 
 
-def _difference_table(view: DatasetView, against: str | None) -> Table:
-    """Differences from the design values, or from the entry called ``against``."""
+def _published_differences(view: DatasetView) -> list[Table]:
+    """Eq. (11) of the paper with its methods here: the parametric matrix over the non-parametric one."""
+    labels = {entry.parameterisation: entry.label for _, entry, _ in view.published_entries}
+    if not {"geometry", "matrix"} <= labels.keys():
+        return []
+    return [_difference_table(view, labels["matrix"], labels["geometry"])]
+
+
+def _difference_table(view: DatasetView, against: str | None, only: str | None = None) -> Table:
+    """Differences from the design values or the entry called ``against``: of all entries, or of one ``only``."""
     matrices = {entry.label: run.matrix for entry, run in view.calibrated if run.matrix is not None}
     reference = view.design_matrix if against is None else matrices[against]
     project = _span_projector(view)
     rows = []
     for entry, run in view.calibrated:
-        if run.matrix is None or entry.label == against:
+        if run.matrix is None or entry.label == against or only not in (None, entry.label):
             continue
         matrix = run.matrix if project is None else reference + (run.matrix - reference) @ project
         share = differences(matrix, reference).ravel()
@@ -132,7 +141,7 @@ def _difference_table(view: DatasetView, against: str | None) -> Table:
         what = "wheel rates" if view.dataset.robot.drive.direct else "drive signals"
         note += f" Compared on the span of {what} that the data drive; across it the matrix is not determined."
     return Table(
-        f"Differences from {name}",
+        f"Differences from {name}" if only is None else f"{only} over {name}: Eq. (11) with the paper's methods here",
         (Column("Entry", numeric=False), *map(Column, _element_names(view))),
         tuple(rows),
         note,

@@ -63,7 +63,10 @@ def path_section(view: DatasetView) -> Section:
 
 
 def drawn_models(view: DatasetView, trajectories: Sequence[Trajectory]) -> list[DrawnModel]:
-    """The design values, then one model for each group of entries with the same ends as far as can be seen."""
+    """The design values, then one model for each group of entries with the same ends as far as can be seen.
+
+    Entries that are the methods of published results come last, on top, each by itself, as in Fig. 6 and 7.
+    """
     finals = [trajectory.final_log for trajectory in trajectories]
     last = np.array([trajectory.final_pose[:2] for trajectory in trajectories])
     calibrated = sorted(view.calibrated, key=lambda pair: not pair[0].is_best)  # the best one leads its group
@@ -71,15 +74,21 @@ def drawn_models(view: DatasetView, trajectories: Sequence[Trajectory]) -> list[
     ends = {label: np.array([poses[-1, :2] for poses in model.poses(finals)]) for label, model in models.items()}
     off = [1e3 * np.linalg.norm(end - last, axis=1) for end in ends.values()]
     seen = [2e-3 * _SEEN * _window(list(of_run)) for of_run in np.transpose(off)]  # m, of each run
+    of_paper = {entry.label: result.label for result, entry, _ in view.published_entries}
     groups: dict[str, list[str]] = {}
-    for label, end in ends.items():
-        near = (leader for leader in groups if (np.linalg.norm(end - ends[leader], axis=1) < seen).all())
+    for label in sorted(ends, key=lambda label: label in of_paper):
+        leaders = () if label in of_paper else groups
+        near = (leader for leader in leaders if (np.linalg.norm(ends[label] - ends[leader], axis=1) < seen).all())
         groups.setdefault(next(near, label), []).append(label)
-    drawn = [_group(view.styles[leader], models[leader], members) for leader, members in groups.items()]
-    return [DrawnModel(THEORETICAL_STYLE, view.model(view.design_matrix)), *reversed(drawn)]  # the best on top
+    others = [label for label in groups if label not in of_paper]
+    order = [*reversed(others), *of_paper]  # the best on top, but for the paper's methods
+    drawn = [_group(view.styles[leader], models[leader], groups[leader], of_paper.get(leader)) for leader in order]
+    return [DrawnModel(THEORETICAL_STYLE, view.model(view.design_matrix)), *drawn]
 
 
-def _group(style: LegendItem, model: OdometryModel, members: Sequence[str]) -> DrawnModel:
+def _group(style: LegendItem, model: OdometryModel, members: Sequence[str], published: str | None) -> DrawnModel:
+    if published is not None:
+        style = replace(style, label=f"{style.label}, as the paper's {published}")
     if len(members) > 1:
         style = replace(style, label=f"{style.label} and {plural(len(members) - 1, 'other')}")
     return DrawnModel(style, model, tuple(members))

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from omnibench.compare.config import PublishedResult
 from omnibench.compare.report.view import SPLIT_NAMES, DatasetView
 from omnibench.compare.report.wording import NO_INTERVAL, cost_decimals
-from omnibench.compare.result import THEORETICAL_NAME, EntryStatistics
+from omnibench.compare.result import THEORETICAL_NAME
 from omnibench.data.dataset import SPLITS, Split, Trajectory
 from omnibench.fit.uncertainty.ratio_intervals import Interval
+from omnibench.registry import calibrators
 from omnibench.report.blocks import Block, Callout, Cell, Column, Row, Table
 from omnibench.report.numbers import NOTHING, count, fixed, listing, percent, seconds, span
 from omnibench.robot.kinematics import Array
@@ -20,6 +22,7 @@ from omnibench.words import plural
 
 _PUBLISHED_COST = "final_pose"  # published costs are those of Eq. (6)
 _UNKNOWN = "not known"
+_MET = 1e-4  # share of the lowest cost: searches that end nearer to it are in one minimum (chosen)
 
 
 def published_blocks(view: DatasetView) -> tuple[Block, ...]:
@@ -31,14 +34,60 @@ def published_blocks(view: DatasetView) -> tuple[Block, ...]:
         return (Callout("The published costs cannot be set beside these", (remark,), "warning"),)
     remarks = tuple(dict.fromkeys(remark for result in view.config.published_results for remark in result.remarks))
     about = (Callout("About the published figures", remarks),) if remarks else ()
-    return (_figure_table(view), _circumstance_table(view), *_effort_tables(view), *about)
+    answers = tuple(filter(None, (_curves(view), _minima(view))))
+    claims = (Callout("What the paper claims, and what is seen here", answers),) if answers else ()
+    return (_figure_table(view), _circumstance_table(view), *_effort_tables(view), *claims, *about)
+
+
+def _curves(view: DatasetView) -> str:
+    """Section 4.1 of the paper: systematic errors show in curves rather than on straight runs. Empty without both."""
+    runs, split = view.dataset.split(view.scored), view.scored
+    if not view.runs or split not in view.runs[0].design or any(run.omega is None for run in runs):
+        return ""
+    turning = np.array([run.omega != 0 for run in runs])
+    if turning.all() or not turning.any():
+        return ""
+    costs = view.runs[0].design[split].costs
+    curved, straight = float(costs[turning].mean()), float(costs[~turning].mean())
+    return (
+        f"Curves show systematic errors best (section 4.1): {'so here' if curved > straight else 'not here'}, Eq. (6) "
+        f"of the design values is {fixed(curved, 3)} on the {SPLIT_NAMES[split]} runs in curves and "
+        f"{fixed(straight, 3)} on straight ones."
+    )
+
+
+def _minima(view: DatasetView) -> str:
+    """Section 5 of the paper: a genetic algorithm is less prone to local minima. Empty without other searches."""
+    genetic = next((run for _, entry, run in view.published_entries if entry.parameterisation == "matrix"), None)
+    if genetic is None:
+        return ""
+    space, label = genetic.search_space, genetic.record.label
+    reached: dict[str, list[float]] = {}
+    for run in view.runs:
+        record = run.record
+        searches = calibrators.entry(record.calibrator).cls.stochastic and record.label != label
+        if searches and run.search_space == space and record.train_cost is not None:
+            reached.setdefault(record.label, []).append(record.train_cost)
+    if not reached:
+        return ""
+    lowest = min(cost for costs in reached.values() for cost in costs)
+    met = [
+        f"{sum(cost <= (1 + _MET) * lowest for cost in costs)} of {plural(len(costs), 'run')} of {label}"
+        for label, costs in reached.items()
+    ]
+    proof = next((each for each in view.certificates if each.box == genetic.record.box), None)
+    proven = "" if proof is None else f"; by proof no matrix of the box is more than {percent(proof.gap, 2)} below it"
+    return (
+        f"Local minima (section 5): from random starts in the box {genetic.record.box}, {listing(met)} ended within "
+        f"{percent(_MET, 2)} of one cost, {fixed(lowest, cost_decimals(view))}{proven}."
+    )
 
 
 @dataclass(frozen=True)
 class ComparedFigure:
     """One of our figures with its 95 % interval, and the published ones: costs, or shares where ``is_share``.
 
-    decimals: of the published figures, as printed (shares in per cent).
+    decimals: of the published figures, as printed (shares in per cent). methods: labels of the published results.
     """
 
     name: str
@@ -46,6 +95,7 @@ class ComparedFigure:
     published: tuple[float, ...]
     is_share: bool
     decimals: int
+    methods: tuple[str, ...] = ()
 
     @property
     def alike(self) -> bool:
@@ -62,54 +112,53 @@ class ComparedFigure:
 
 
 def compared_figures(view: DatasetView) -> list[ComparedFigure]:
-    """Theoretical cost, calibrated cost and improvement on each split; then the change from training to validation."""
-    best = view.best
-    calibrated = None if best is None or best.calibrator == THEORETICAL_NAME else best
-    figures = [figure for split in view.splits for figure in _of_split(view, split, calibrated)]
-    return [*figures, *_over_time(view, calibrated)]
+    """The design values beside all published results, then each published method beside the entry that is the same.
+
+    Costs and improvements on each split, and the change of the cost from training to validation. A result that names no
+    entry with an answer stands beside the best one.
+    """
+    published, best = view.config.published_results, view.best
+    own = {result.label: entry for result, entry, _ in view.published_entries}
+    if best is not None and best.calibrator != THEORETICAL_NAME:
+        own = {result.label: best for result in published} | own
+    entries = {entry.label: entry for entry in own.values()}
+    figures = list(_compared(published, None, view.design_costs, {}))
+    for label, entry in entries.items():
+        same = [result for result in published if result.label in own and own[result.label].label == label]
+        costs = {split: cost for split in view.splits if (cost := entry.cost(split)) is not None}
+        fell = {split: share for split in view.splits if (share := entry.improvement(split)) is not None}
+        figures += _compared(same, label, costs, fell)
+    return figures
 
 
-def _of_split(view: DatasetView, split: Split, best: EntryStatistics | None) -> Iterator[ComparedFigure]:
-    published = [result for result in view.config.published_results if result.costs(split)]
-    if not published:
-        return
-    before, after = zip(*_published(view, split), strict=True)
-    name = SPLIT_NAMES[split]
-    if split in view.design_costs:
-        yield ComparedFigure(f"Theoretical cost, {name}", view.design_costs[split], before, False, 4)
-    if best is None:
-        return
-    if (reached := best.cost(split)) is not None:
-        yield ComparedFigure(f"Calibrated cost, {name} ({best.label})", reached, after, False, 4)
-    if (fell := best.improvement(split)) is not None:
+def _compared(
+    published: Sequence[PublishedResult],
+    label: str | None,
+    costs: Mapping[Split, Interval],
+    improvements: Mapping[Split, Interval],
+) -> Iterator[ComparedFigure]:
+    """Figures of the entry called ``label``, or of the design values, beside those of published results."""
+    name, kind, entry = ("theoretical", 0, "") if label is None else ("calibrated", 1, f" ({label})")
+    methods = tuple(dict.fromkeys(result.label for result in published)) if kind else ()
+    printed = {split: [pair for result in published if (pair := result.costs(split))] for split in SPLITS}
+    for split, pairs in printed.items():
+        if pairs and split in costs:
+            words = f"{name.capitalize()} cost, {SPLIT_NAMES[split]}{entry}"
+            yield ComparedFigure(words, costs[split], tuple(pair[kind] for pair in pairs), False, 4, methods)
         shares = tuple(share for result in published if (share := result.improvement(split)) is not None)
-        yield ComparedFigure(f"Improvement, {name} ({best.label})", fell, shares, True, 2)
-
-
-def _over_time(view: DatasetView, best: EntryStatistics | None) -> Iterator[ComparedFigure]:
-    """The change of the cost from training to validation, before and after calibration."""
-    pairs = [[result.costs(split) for split in SPLITS] for result in view.config.published_results]
-    published = [(train, validation) for train, validation in pairs if train is not None and validation is not None]
-    kinds = (
-        ("theoretical", [view.design_costs.get(split) for split in SPLITS], 0),
-        ("calibrated", [None if best is None else best.cost(split) for split in SPLITS], 1),
-    )
-    for name, (train, validation), kind in kinds:
-        if train is None or validation is None or not published or train.known is None or validation.known is None:
-            continue
-        change = validation.value / train.value - 1
-        known = ((train.known, train.value), (validation.known, validation.value))
-        # Both splits are samples, so that the interval of the change is about that of the two together.
-        spread = math.hypot(*((high - low) / 2 / each for (low, high), each in known))
-        changes = tuple(later[kind] / earlier[kind] - 1 for earlier, later in published)
-        ours = Interval(value=change, low=change - spread, high=change + spread)
-        yield ComparedFigure(f"Change of the {name} cost to validation", ours, changes, True, 1)
-
-
-def _published(view: DatasetView, split: Split) -> list[tuple[float, float]]:
-    """Published costs of a split before and after calibration, of the results that have both."""
-    costs = (result.costs(split) for result in view.config.published_results)
-    return [pair for pair in costs if pair is not None]
+        if shares and split in improvements:
+            words = f"Improvement, {SPLIT_NAMES[split]}{entry}"
+            yield ComparedFigure(words, improvements[split], shares, True, 2, methods)
+    known = [(costs[split].value, ends) for split in SPLITS if split in costs and (ends := costs[split].known)]
+    both = [pair for result in published if all(pair := [result.costs(split) for split in SPLITS])]
+    if len(known) < len(SPLITS) or not both:
+        return
+    change = known[1][0] / known[0][0] - 1
+    # Both splits are samples, so that the interval of the change is about that of the two together.
+    spread = math.hypot(*((high - low) / 2 / value for value, (low, high) in known))
+    ours = Interval(value=change, low=change - spread, high=change + spread)
+    changes = tuple(later[kind] / earlier[kind] - 1 for earlier, later in both)
+    yield ComparedFigure(f"Change of the {name} cost to validation{entry}", ours, changes, True, 1, methods)
 
 
 def _figure_table(view: DatasetView) -> Table:
@@ -138,7 +187,7 @@ def _figure_table(view: DatasetView) -> Table:
         cells = (
             Cell(figure.name),
             Cell(f"{fixed(factor * ours.value, decimals)}{unit}", interval),
-            Cell(listing(list(dict.fromkeys(theirs)))),
+            Cell(listing(list(dict.fromkeys(theirs))), listing(list(figure.methods))),
             Cell(figure.difference),
             Cell("as published" if figure.alike else "not as published"),
         )
@@ -154,11 +203,10 @@ def _figure_table(view: DatasetView) -> Table:
 
 def _effort_tables(view: DatasetView) -> tuple[Table, ...]:
     """Published computing times beside the evaluations and times of the entries that are the same methods."""
-    entries = {entry.label: entry for entry in view.statistics if entry.evaluations_median is not None}
     pairs = [
-        (result, entries[result.entry], result.seconds)
-        for result in view.config.published_results
-        if result.seconds is not None and result.entry in entries
+        (result, entry, result.seconds)
+        for result, entry, _ in view.published_entries
+        if result.seconds is not None and entry.evaluations_median is not None
     ]
     if not (pairs and view.times_compare):
         return ()
@@ -242,7 +290,8 @@ def _scatter_rows(view: DatasetView, runs: Sequence[Trajectory]) -> Iterator[Row
     here = Cell("no command was repeated")
     if scatter is not None:
         here = Cell(fixed(scatter, 4), f"{percent(scatter / reached.value, 0)} of the cost")
-    floor = min((after for _, after in _published(view, view.scored)), default=None)
+    floors = (costs[1] for result in view.config.published_results if (costs := result.costs(view.scored)))
+    floor = min(floors, default=None)
     yield Row.of("Scatter of a command's repetitions", here, Cell(_UNKNOWN, "" if floor is None else f"of {floor:.4f}"))
 
 

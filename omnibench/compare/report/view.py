@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from omnibench.compare.config import CompareConfig
+from omnibench.compare.config import CompareConfig, PublishedResult
 from omnibench.compare.result import (
     THEORETICAL_NAME,
     BoxCertificate,
@@ -142,6 +142,12 @@ class DatasetView:
         exact = [pair for pair in self.calibrated if calibrators.entry(pair[0].calibrator).cls.exact]
         best = [pair for pair in self.calibrated if pair[0].is_best]
         return next(iter(exact + best + self.calibrated), None)
+
+    @property
+    def published_entries(self) -> list[tuple[PublishedResult, EntryStatistics, ScoredRun]]:
+        """Published results whose method is an entry here that gave an answer, with that entry and its typical run."""
+        answers = {entry.label: (entry, run) for entry, run in self.calibrated if run.matrix is not None}
+        return [(result, *answers[result.entry]) for result in self.config.published_results if result.entry in answers]
 
     def theoretical_cost(self, split: Split) -> float | None:
         """The cost of the design values on a split; None where there is no run, or no such split."""

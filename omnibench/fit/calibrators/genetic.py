@@ -31,6 +31,10 @@ class GeneticOptions(Options):
     stall_generations: int = Field(50, gt=0, description="window of the stopping rule")
     tolerance: float = Field(1e-6, ge=0, description="average relative change of the best over the window")
 
+    def size(self, variables: int) -> int:
+        """Number of candidates in a generation."""
+        return self.population or (200 if variables > 5 else 50)
+
 
 @calibrators.register("genetic")
 class Genetic(Calibrator):
@@ -42,7 +46,7 @@ class Genetic(Calibrator):
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """Evolve a population around the start until the best stalls."""
         variables = int(problem.free.sum())
-        count = self.options.population or (200 if variables > 5 else 50)
+        count = self.options.size(variables)
         generations = self.options.generations or 100 * variables
         mutate = _AdaptiveFeasible() if self.options.mutation == "adaptive_feasible" else _Gaussian(generations)
         if np.ceil(self.options.elite * count) + 2 > count:

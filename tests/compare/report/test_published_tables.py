@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from report_samples import config, flower, run, statistics
+from report_samples import config, flower, run, statistics, usual
 
 from omnibench.compare.report.cost_tables import cost_table
 from omnibench.compare.report.published_tables import ComparedFigure, compared_figures, published_blocks
@@ -95,20 +95,33 @@ def test_improvements_are_shown_as_printed_and_not_from_rounded_costs(result: Co
     assert cost_table(with_published(result, printed), "train").rows[-1].cells[-1].text == "82.58 %"
 
 
-def test_published_times_stand_beside_evaluations_of_the_same_methods(result: ComparisonResult) -> None:
+def test_published_times_stand_beside_evaluations_of_the_same_methods() -> None:
+    result = usual()
     both = [
-        {**scaled(result, 1, 1), "label": "slow", "seconds": 903, "entry": "theoretical"},
+        {**scaled(result, 1, 1), "label": "slow", "seconds": 903, "entry": "random_search"},
         {**scaled(result, 1, 1), "label": "fast", "seconds": 637, "entry": "closed_form"},
     ]
     _, _, table = published_blocks(with_published(result, *both))
     assert isinstance(table, Table)
     slow, fast, change = ([cell.text for cell in row.cells] for row in table.rows)
     evaluations = statistics(result, "closed_form").evaluations_median
-    assert slow[:3] == ["slow", "903 s", "1"]
+    assert slow[:3] == ["slow", "903 s", "1,001"]
     assert fast[:3] == ["fast", "637 s", f"{evaluations:.0f}"]
     assert change[:2] == ["fast against slow", "−29 %"]
-    assert change[2] == f"+{100 * (evaluations - 1):,.1f} %"
+    assert change[2] == f"−{100 * (1 - evaluations / 1001):.1f} %"
     assert "Hardware and program differ" in table.note
+
+
+def test_each_published_method_stands_beside_the_entry_that_it_names() -> None:
+    result = usual()
+    both = [{**scaled(result, 1, 1), "label": label, "entry": label} for label in ("random_search", "closed_form")]
+    calibrated = [figure for figure in compared_figures(with_published(result, *both)) if figure.methods]
+    assert {figure.methods for figure in calibrated} == {("random_search",), ("closed_form",)}
+    for figure in calibrated:
+        (label,) = figure.methods
+        assert figure.name.endswith(f"({label})")
+        if figure.name.startswith("Calibrated cost, training"):
+            assert figure.ours == statistics(result, label).cost("train")
 
 
 def test_remarks_on_published_figures_are_shown_once(result: ComparisonResult) -> None:
@@ -142,7 +155,8 @@ def test_a_published_theoretical_cost_half_of_ours_is_not_as_ours(result: Compar
 def test_a_cost_that_rises_over_time_as_ours_does_not_is_told(result: ComparisonResult) -> None:
     published = scaled(result, 1.0, 1.0)
     published["validation_cost"] *= 3
-    assert "Change of the calibrated cost to validation" in figures(with_published(result, published), alike=False)
+    different = figures(with_published(result, published), alike=False)
+    assert "Change of the calibrated cost to validation (closed_form)" in different
 
 
 def test_the_nearest_of_several_published_figures_counts(result: ComparisonResult) -> None:
