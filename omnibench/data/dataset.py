@@ -38,7 +38,8 @@ WHEEL_DIGITS = 8
 # share of that has a dead encoder. Chosen: motion capture scatters by mm, and no wheel slips a hundredfold.
 _MOVED, _TURNED, _HARDLY = 0.05, 0.1, 0.01
 _EVERY = 1.0  # s between the moments at which wheel angles are compared where there are no poses; chosen
-_ARRAYS = ("times", "rates", "pose_times", "poses", "angles", "targets", "pose_covariances", "steering")
+_UNUSED = ("odometry", "sent")  # recorded, but no fit depends on them
+_ARRAYS = ("times", "rates", "pose_times", "poses", "angles", "targets", "pose_covariances", "steering", *_UNUSED)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -72,6 +73,8 @@ class Trajectory(Shown):
     steering: Array | None = None  # steering angles at ``times`` (F, S), rad
     drive: Drive | None = None  # the robot's drive signals where it steers; ``make_dataset`` sets it
     references: References | None = None  # distances, turns and the like that were measured in the place of poses
+    odometry: Array | None = None  # x, y (m), heading (rad) at ``times`` (F, 3) that the robot computed; not used
+    sent: Array | None = None  # motion commands (C, 5) sent in the run: t (s), v, alpha, omega, validity t_r (s)
 
     def with_arrays(self) -> Trajectory:
         """The run with its numbers as arrays, whatever sequences they were given as. DataError: they are no numbers."""
@@ -215,7 +218,7 @@ class Dataset(Shown):
         for trajectory in self.trajectories:
             for item in fields(trajectory):
                 value = getattr(trajectory, item.name)
-                if item.name == "drive" or (item.name in ("steering", "references") and value is None):
+                if item.name in ("drive", *_UNUSED) or (item.name in ("steering", "references") and value is None):
                     continue  # the robot has it; runs without steering or references keep the hash of earlier versions
                 if item.name in _ARRAYS and value is not None:
                     digest.update(np.ascontiguousarray(value, dtype=float).tobytes())
@@ -338,7 +341,8 @@ def _check_shapes(where: str, robot: Robot, trajectory: Trajectory) -> None:
     samples, poses = trajectory.times.shape, trajectory.pose_times.shape
     expected: dict[str, tuple[int, ...]] = {"rates": (*samples, len(robot.wheel_names)), "poses": (*poses, 3)}
     expected |= {"angles": expected["rates"], "targets": expected["rates"], "pose_covariances": (*poses, 3, 3)}
-    expected["steering"] = (*samples, len(robot.drive.steered))
+    expected |= {"steering": (*samples, len(robot.drive.steered)), "odometry": (*samples, 3)}
+    expected |= {} if trajectory.sent is None else {"sent": (len(trajectory.sent), 5)}
     if trajectory.steering is None and robot.drive.steered:
         raise DataError(f"{where}: it has no steering angles; wheels {', '.join(robot.drive.steered)} steer")
     for item, shape in expected.items():

@@ -20,7 +20,7 @@ from omnibench.data.splits import complete
 from omnibench.data.stored.dataset_folders import dataset_folders
 from omnibench.data.stored.stored_rows import MOST_IN_MEMORY, count_rows
 from omnibench.data.stored.stored_wheels import StoredWheels, WholeTableError
-from omnibench.data.tables.dataset_tables import POSE_COLUMNS, DatasetTables, tables_of
+from omnibench.data.tables.dataset_tables import COMMAND_COLUMNS, POSE_COLUMNS, DatasetTables, tables_of
 from omnibench.data.tables.table import Table, read_table, table_file
 from omnibench.data.tables.wheel_table import WheelTable
 from omnibench.errors import DataError, require_type
@@ -104,13 +104,16 @@ def read_recorded(folder: Path, *, left_in_files: bool = False) -> RecordedDatas
     runs = read_table(folder, "trajectories", ("trajectory", "split"))
     poses = _poses(folder)
     references = None if table_file(folder, TABLE) is None else read_table(folder, TABLE, REFERENCE_COLUMNS)
+    commands = None if table_file(folder, "commands") is None else read_table(folder, "commands", COMMAND_COLUMNS)
     whole = partial(read_table, folder, "wheels", ("trajectory", "t", *(f"omega_{wheel}" for wheel in header.wheels)))
     trajectories = None
     if left_in_files and (file := _parquet_of_wheels(folder)) is not None:
         with suppress(WholeTableError):
-            trajectories = DatasetTables(runs, StoredWheels(file), poses, references).trajectories(header.robot)
+            tables = DatasetTables(runs, StoredWheels(file), poses, references, commands)
+            trajectories = tables.trajectories(header.robot)
     if trajectories is None:
-        trajectories = DatasetTables(runs, WheelTable(whole()), poses, references).trajectories(header.robot)
+        tables = DatasetTables(runs, WheelTable(whole()), poses, references, commands)
+        trajectories = tables.trajectories(header.robot)
     return RecordedDataset(header, trajectories, _scans(folder, header, [trajectory.id for trajectory in trajectories]))
 
 
@@ -165,10 +168,11 @@ def save_dataset(
         ids = [trajectory.id for trajectory in dataset.trajectories]
         contents[folder / f"scans.{table_format}"] = partial(write_scans, scans, table_format, ids)
     write_files(contents)
-    for name in ("poses", TABLE, "scans"):  # that an earlier data set had
+    for name in ("poses", TABLE, "commands", "scans"):  # that an earlier data set had
         if folder / f"{name}.{table_format}" not in contents:
             remove(folder / f"{name}.{table_format}")
-    for name in ("trajectories", "wheels", "poses", TABLE, "scans"):  # in the other format, of an earlier data set
+    # In the other format, of an earlier data set.
+    for name in ("trajectories", "wheels", "poses", TABLE, "commands", "scans"):
         remove(folder / f"{name}.{'csv' if table_format == 'parquet' else 'parquet'}")
 
 

@@ -93,7 +93,7 @@ def test_only_trajectory_and_split_are_needed(good: dict[Format, Path], tmp_path
     unknown = {item.name for item in fields(run) if getattr(run, item.name) is None}
     assert unknown == {
         *("command", "repetition", "session", "started_at", "v", "alpha", "omega", "duration", "distance"),
-        *("angles", "targets", "pose_covariances", "steering", "drive", "references"),
+        *("angles", "targets", "pose_covariances", "steering", "drive", "references", "odometry", "sent"),
     }
 
 

@@ -28,6 +28,7 @@ RPM = 2 * math.pi / 60  # rad/s
 _METRES = {"m": 1.0, "mm": 1e-3}
 _COMMAND = ("v", "alpha", "omega", "d")
 _POSE = ("t", "x", "y", "theta")
+_SENT = ("t", "v", "alpha", "omega", "t_r")
 _WAY_OUT = "set scanner={rays: 1080, angle_min: -2.356, ..., mount: {x: 0.1, y: 0, yaw: 0}} (m, rad)"
 
 APR_02 = Robot(
@@ -54,7 +55,7 @@ UTM_30LX = Scanner(
 class Table1Options(RecordingOptions):
     """Unit of positions, the robot, and which trajectories train and validate."""
 
-    position_unit: Literal["m", "mm"] = Field("m", description="of x and y in slam.csv; Table 1 has m")
+    position_unit: Literal["m", "mm"] = Field("m", description="of x and y; Table 1 has m")
     robot: RobotOption = Field(APR_02, description="mapping as in dataset.yaml, or path of a YAML file; default APR-02")
     scanner: Scanner = Field(UTM_30LX, description="of lidar.csv: mapping as in dataset.yaml; default Hokuyo UTM-30LX")
     name: str = Field("table1", min_length=1, description="name of the data set")
@@ -69,11 +70,13 @@ class Table1(Importer):
         command.csv  one row: v (m/s), alpha (deg), omega (rad/s), d (m)[, omega_Ma, omega_Mb, omega_Mc (rpm)]
         wheels.csv   t (s), omega_a, omega_b, omega_c (rpm): a row holds the rates up to its t; rows start after 0
         slam.csv     t (s), x, y (m; ``position_unit: mm`` for mm), theta (deg): the ground truth, one row a scan
+        odometry.csv t, x, y, theta as in slam.csv: what the robot computed, a row for each of wheels.csv. Optional.
+        commands.csv t (s), v (m/s), alpha (deg), omega (rad/s), t_r (s): the commands that were sent. Optional.
         lidar.csv    t (s), d1, d2, ... d1080 (mm), counter-clockwise; 0: nothing was seen. It may be missing.
 
     Columns are separated by commas and named in a header; more columns do no harm. For another ``robot`` than the
     APR-02 the columns are omega_<wheel> and omega_M<wheel>; ``scanner`` describes another LIDAR, and where it is
-    mounted. The odometry that the robot computed is not read: omnibench computes its own. A first pose later than the
+    mounted. Odometry and sent commands are kept with the run, and no fit uses them. A first pose later than the
     first wheel sample becomes t = 0.
 
     A trajectory is called by its folder, seen from the source; its session is the folder above. Repetitions share
@@ -115,7 +118,8 @@ class Table1(Importer):
         command = _read_command(folder / "command.csv", wheels)
         times, pose_times = _times(samples), _times(slam)
         metres = _METRES[self.options.position_unit]
-        poses = slam.columns(_POSE[1:]) * (metres, metres, math.pi / 180)
+        units = (metres, metres, math.radians(1))
+        poses = slam.columns(_POSE[1:]) * units
         aligned = align(0.0, times, pose_times, poses)
         if aligned is None:
             raise DataError(
@@ -123,6 +127,16 @@ class Table1(Importer):
             )
         if (folder / "lidar.csv").exists():
             scans[name] = _read_scans(folder / "lidar.csv", self.options.scanner, aligned.zero, float(times[-1]))
+        odometry = sent = None
+        if (file := folder / "odometry.csv").exists():
+            computed = read_numbers(file, _POSE)
+            if not np.array_equal(computed.column("t"), times):
+                raise DataError(f"{file}: its times t are not those of {samples.file.name}; give a row for each")
+            odometry = (computed.columns(_POSE[1:]) * units)[aligned.kept]
+        if (file := folder / "commands.csv").exists():
+            commands = read_numbers(file, _SENT)
+            _times(commands)
+            sent = commands.columns(_SENT) * (1, 1, math.radians(1), 1, 1) - (aligned.zero, 0, 0, 0, 0)
         times = times[aligned.kept] - aligned.zero
         return Trajectory(
             id=name,
@@ -138,6 +152,8 @@ class Table1(Importer):
             omega=command.omega,
             distance=command.distance,
             duration=float(times[-1]),
+            odometry=odometry,
+            sent=sent,
             targets=None if command.targets is None else np.tile(command.targets, (len(times), 1)),
         )
 

@@ -13,6 +13,7 @@ import polars as pl
 
 from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory
 from omnibench.data.dataset import make_dataset as of_trajectories
+from omnibench.data.delimited import not_increasing
 from omnibench.data.references.reference_table import REFERENCE_COLUMNS, TABLE, read_references, reference_frame
 from omnibench.data.references.run_references import References
 from omnibench.data.run_checks import pose_times_flaw, stored_pose_times_flaw
@@ -26,6 +27,7 @@ from omnibench.errors import DataError, nearest, require_type
 from omnibench.robot.kinematics import Array, Robot
 
 POSE_COLUMNS = ("trajectory", "t", "x", "y", "theta")
+COMMAND_COLUMNS = ("trajectory", "t", "v", "alpha", "omega", "t_r")
 _RUN_NUMBERS = ("started_at", "v", "alpha", "omega", "duration", "distance")
 _COVARIANCE = ("xx", "xy", "xtheta", "yy", "ytheta", "thetatheta")
 _ONLY_RUN = "run"  # id of the run of tables without a column "trajectory"
@@ -156,12 +158,16 @@ def _frame(name: str, content: Any) -> pl.DataFrame:
 
 @dataclass(frozen=True, eq=False)
 class DatasetTables:
-    """The tables of a data set, whose required columns are there. poses: None where all runs have references."""
+    """The tables of a data set, whose required columns are there. poses: None where all runs have references.
+
+    commands: the motion commands that were sent in runs, if they were recorded.
+    """
 
     runs: Table
     wheels: WheelSource
     poses: Table | None
     references: Table | None
+    commands: Table | None = None
 
     def trajectories(self, robot: Robot) -> list[Trajectory]:
         """The runs of the tables. DataError names the table, the row and what is wrong."""
@@ -174,9 +180,10 @@ class DatasetTables:
         references = read_references(self.references, ends, started, runs.file.name)
         pose_rows = _pose_rows(runs, poses, references)
         reference = None if poses is None else _PoseColumns(poses)
+        sent = [None] * len(ids) if self.commands is None else _sent(runs, self.commands)
         return [
-            _trajectory(row, samples[index], reference, pose_rows[index], references.get(row["trajectory"]))
-            for index, row in enumerate(runs.frame.iter_rows(named=True))
+            _trajectory(row, samples[index], reference, pose_rows[index], references.get(row["trajectory"]), commands)
+            for index, (row, commands) in enumerate(zip(runs.frame.iter_rows(named=True), sent, strict=True))
         ]
 
 
@@ -190,7 +197,17 @@ def tables_of(dataset: Dataset) -> dict[str, pl.DataFrame]:
         tables["poses"] = pl.concat(placed)
     if measured := [(run.id, run.references) for run in dataset.trajectories if run.references is not None]:
         tables[TABLE] = reference_frame(measured)
+    if rows := [(run.id, *row) for run in dataset.trajectories if run.sent is not None for row in run.sent.tolist()]:
+        tables["commands"] = pl.DataFrame(rows, schema=list(COMMAND_COLUMNS), orient="row")
     return tables
+
+
+def _sent(runs: Table, commands: Table) -> list[Array | None]:
+    """The motion commands (C, 5) of each run; None for one without any."""
+    rows = rows_by_trajectory(runs, commands, runs.frame["trajectory"].to_list())
+    check_times(commands, [of_run for of_run in rows if len(of_run)], lambda times, _: not_increasing(times))
+    values = np.column_stack([commands.numbers(column) for column in COMMAND_COLUMNS[1:]])
+    return [values[of_run] if len(of_run) else None for of_run in rows]
 
 
 class _PoseColumns:
@@ -243,6 +260,7 @@ def _trajectory(
     reference: _PoseColumns | None,
     pose_rows: Rows,
     references: References | None,
+    sent: Array | None,
 ) -> Trajectory:
     pose_times: Array = np.zeros(1)
     poses: Array = np.zeros((1, 3))
@@ -263,6 +281,8 @@ def _trajectory(
         angles=wheels.angles,
         targets=wheels.targets,
         steering=wheels.steering,
+        odometry=wheels.odometry,
+        sent=sent,
         pose_covariances=covariances,
         references=references,
         **_run_numbers(run),
@@ -285,6 +305,7 @@ def _wheel_frame(trajectory: Trajectory, robot: Robot) -> pl.DataFrame:
         ("steer", robot.drive.steered, trajectory.steering),
         ("phi", robot.wheel_names, trajectory.angles),
         ("target", robot.wheel_names, trajectory.targets),
+        ("odom", ("x", "y", "theta"), trajectory.odometry),
     ):
         for index, wheel in enumerate(wheels):
             columns[f"{prefix}_{wheel}"] = [None] * len(trajectory.times) if values is None else values[:, index]

@@ -22,6 +22,7 @@ class WheelArrays(NamedTuple):
     steering: Array | None = None
     angles: Array | None = None
     targets: Array | None = None
+    odometry: Array | None = None
 
 
 class WheelSource(Protocol):
@@ -40,6 +41,7 @@ def wheel_columns(robot: Robot) -> dict[str, list[str]]:
         "steering": [f"steer_{wheel}" for wheel in steered],
         "angles": [f"phi_{wheel}" for wheel in wheels],
         "targets": [f"target_{wheel}" for wheel in wheels],
+        "odometry": ["odom_x", "odom_y", "odom_theta"],
     }
     return {name: names for name, names in columns.items() if names}
 

@@ -44,7 +44,7 @@ def _windows(run: Trajectory, count: int) -> Iterator[Trajectory]:
 def _part(run: Trajectory, driven: slice, seen: slice, begin: float, end: float) -> Trajectory:
     fields = {
         name: value[driven]
-        for name in ("rates", "angles", "targets", "steering")
+        for name in ("rates", "angles", "targets", "steering", "odometry")
         if (value := getattr(run, name)) is not None
     }
     return replace(

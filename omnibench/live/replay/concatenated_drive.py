@@ -207,7 +207,8 @@ def _trimmed(run: Trajectory) -> Trajectory:
         angles = run.angles[kept].copy()
         angles[last] -= run.rates[last] * (run.times[last] - times[last])
     targets, steering = (None if array is None else array[kept] for array in (run.targets, run.steering))
-    return replace(run, times=times, rates=run.rates[kept], angles=angles, targets=targets, steering=steering)
+    cut = replace(run, times=times, rates=run.rates[kept], angles=angles, targets=targets, steering=steering)
+    return replace(cut, odometry=None)
 
 
 def _rest_samples(run: Trajectory, pause: float, period: float) -> int:

@@ -21,11 +21,12 @@ def contents_table(dataset: Dataset) -> Table:
     number = sum(map(len, samples))
     rows = [
         _commands(runs),
+        _sent(runs),
         _wheels("Target wheel rates", _rates("ωM", dataset), runs, "targets", "what the motor controllers were told"),
         _row("Measured wheel rates", _rates("ω", dataset), number, "samples", _every(samples, first=0.0), _steps(runs)),
         _wheels("Wheel angles", "φ", runs, "angles", "absolute, continuous within a session"),
         *_steering(runs),
-        _row("Odometry", "(x, y, θ)", number, "poses", _every(samples, first=0.0), "computed from the wheel rates"),
+        _wheels("Odometry of the robot", "(x, y, θ)", runs, "odometry", "as it computed it"),
         _scans(dataset),
         _reference(dataset),
     ]
@@ -59,6 +60,15 @@ def _commands(runs: Sequence[Trajectory]) -> Row:
     limit = "length d" if any(run.distance is not None for run in commanded) else "no length"
     remark = f"{count(different)} different, {limit}" + (", duration" if commanded[0].duration is not None else "")
     return _row("Motion command", "(v, α, ω, d)", len(commanded), "runs", "", remark)
+
+
+def _sent(runs: Sequence[Trajectory]) -> Row:
+    sent = [run.sent for run in runs if run.sent is not None]
+    if not sent:
+        return _missing("Sent commands", "(v, α, ω, t_r)")
+    number, longest = sum(map(len, sent)), max(float(commands[:, 4].max()) for commands in sent)
+    every = _every([commands[:, 0] for commands in sent])
+    return _row("Sent commands", "(v, α, ω, t_r)", number, "commands", every, f"valid for up to {longest:g} s")
 
 
 def _wheels(name: str, symbol: str, runs: Sequence[Trajectory], field: str, remark: str) -> Row:

@@ -225,6 +225,10 @@ class _RobotSimulator:
         every = round(min(config.sample_period, _DENSE) / TRUE_STEP)
         design = OdometryModel.of_design(config.robot, "arc")
         (odometry,) = design.poses([replace(run.log(stamps), start=np.zeros(3))])
+        by_robot = OdometryModel.of_design(config.robot, "euler")  # Eq. (1), from (0, 0, 0) on
+        (computed,) = by_robot.poses([replace(run.log(run.times), start=np.zeros(3))])
+        sent = [(command.time, run.v, run.alpha, run.omega, command.duration) for command in motion.commands]
+        run = replace(run, odometry=computed, sent=np.reshape(np.array(sent, dtype=float), (-1, 5)))
         true = TruePath(log.stamps[::every], path[::every])
         return _Recorded(
             replace(run, pose_times=stamps, poses=odometry), scans, true, start, motion.stopped_by_watchdog

@@ -69,6 +69,47 @@ def test_rpm_and_degrees_become_si_so_that_the_design_drives_the_reference(tmp_p
     assert data.sample_period == PERIOD
 
 
+def write_recorded(folder: Path, times: list[float]) -> None:
+    """What the robot computed, at these times, and two commands that were sent to it."""
+    rows = [f"{t:.2f},{0.2 * t:.6f},0,{90 * t:.6f}" for t in times]
+    (folder / "odometry.csv").write_text("t,x,y,theta\n" + "\n".join(rows) + "\n")
+    (folder / "commands.csv").write_text("t,v,alpha,omega,t_r\n0,0.2,30,0.35,0.5\n0.3,0.2,30,0.35,0.2\n")
+
+
+def test_the_robots_odometry_and_the_commands_sent_to_it_are_kept_in_si_units(tmp_path: Path) -> None:
+    write_recorded(write_trajectory(tmp_path / "t01"), [PERIOD * k for k in range(1, SAMPLES + 1)])
+    save_dataset(import_dataset("table1", tmp_path), tmp_path / "saved")
+    (run,) = load_dataset(tmp_path / "saved").trajectories
+    expected = np.outer(run.times, [0.2, 0, math.pi / 2])
+    np.testing.assert_allclose(run.odometry, expected, atol=1e-6)
+    alpha = math.radians(30)
+    np.testing.assert_allclose(run.sent, [[0, 0.2, alpha, 0.35, 0.5], [0.3, 0.2, alpha, 0.35, 0.2]], atol=1e-12)
+
+
+def test_a_data_set_without_odometry_and_commands_has_none(tmp_path: Path) -> None:
+    write_trajectory(tmp_path / "t01")
+    run = only(tmp_path)
+    assert run.odometry is None
+    assert run.sent is None
+
+
+def test_odometry_and_commands_are_cut_with_the_run(tmp_path: Path) -> None:
+    folder = write_trajectory(tmp_path / "t01", first_scan=0.25)
+    write_recorded(folder, [PERIOD * k for k in range(1, SAMPLES + 1)])
+    run = only(tmp_path)
+    assert run.odometry is not None
+    assert run.sent is not None
+    assert len(run.odometry) == len(run.times) == SAMPLES - 25
+    np.testing.assert_allclose(run.odometry[:, 0], 0.2 * (run.times + 0.25), atol=1e-6)
+    np.testing.assert_allclose(run.sent[:, 0], [-0.25, 0.05])
+
+
+def test_odometry_at_other_times_than_the_wheels_is_refused(tmp_path: Path) -> None:
+    write_recorded(write_trajectory(tmp_path / "t01"), [0.1, 0.2])
+    with pytest.raises(DataError, match=r"odometry.csv: its times t are not those of wheels.csv; give a row for each"):
+        import_dataset("table1", tmp_path)
+
+
 def test_millimetres_are_an_option(tmp_path: Path) -> None:
     write_trajectory(tmp_path / "mm", metre=1000)
     write_trajectory(tmp_path / "m")

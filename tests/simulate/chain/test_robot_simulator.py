@@ -108,12 +108,37 @@ class TestWhatIsRecorded:
             cruising = run.targets[len(run.targets) // 3]
             np.testing.assert_allclose(cruising, wheel_equations(simulation.dataset.robot.wheels) @ twist, atol=1e-9)
 
+    def test_the_robots_odometry_is_eq_1_by_the_design_at_every_sample(self, simulation: Simulation) -> None:
+        design = simulation.dataset.robot.inverse_kinematic_matrix
+        for run in simulation.dataset.trajectories:
+            pose = np.zeros(3)
+            for number, rates in enumerate(run.rates):
+                c, s = np.cos(pose[2]), np.sin(pose[2])
+                pose = pose + 0.01 * np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ design @ rates
+                assert run.odometry is not None
+                np.testing.assert_allclose(run.odometry[number], pose, atol=1e-9)
+
+    def test_commands_are_sent_every_300_ms_and_the_last_is_valid_until_the_way_is_driven(
+        self, simulation: Simulation
+    ) -> None:
+        for run in simulation.dataset.trajectories:
+            assert run.sent is not None
+            times, *command, validity = run.sent.T
+            np.testing.assert_allclose(times, 0.3 * np.arange(len(times)), atol=1e-12)
+            np.testing.assert_array_equal(np.unique(np.transpose(command), axis=0), [[run.v, run.alpha, run.omega]])
+            np.testing.assert_array_equal(validity[:-1], 0.5)
+            # At 0.2 m/s, reached and left at 0.5 m/s2: the set point covers v times the time of validity.
+            assert 0.2 * (times[-1] + validity[-1]) == pytest.approx(0.4, abs=0.01)
+
     def test_it_survives_the_disk_in_both_formats(self, simulation: Simulation, tmp_path: Path) -> None:
         assert simulation.dataset.scans is not None
         for table_format in ("parquet", "csv"):
             save_dataset(simulation.dataset, tmp_path / table_format, table_format)
             read = load_dataset(tmp_path / table_format)
             assert read.hash == simulation.dataset.hash
+            for run, recorded in zip(read.trajectories, simulation.dataset.trajectories, strict=True):
+                np.testing.assert_array_equal(run.odometry, recorded.odometry)
+                np.testing.assert_array_equal(run.sent, recorded.sent)
             assert read.scans is not None
             assert read.scans.scanner == simulation.dataset.scans.scanner
             for name, scans in simulation.dataset.scans:

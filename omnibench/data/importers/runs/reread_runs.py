@@ -65,7 +65,9 @@ def in_seconds(run: Trajectory, wheels: float, poses: float) -> Trajectory:
     if references is not None:
         given = references.open_ended(float(run.times[-1]))
         references = replace(given, t0=given.t0 * poses, t1=given.t1 * poses).of_run(0.0, float(times[-1]))
-    return replace(run, times=times, pose_times=run.pose_times * poses, duration=duration, references=references)
+    sent = None if run.sent is None else run.sent * [wheels, 1, 1, 1, wheels]
+    recorded = replace(run, times=times, pose_times=run.pose_times * poses, sent=sent)
+    return replace(recorded, duration=duration, references=references)
 
 
 def _indices(names: Sequence[str], known: Sequence[str], prefix: str, option: str) -> tuple[int, ...]:
@@ -139,9 +141,12 @@ def _parts(run: Trajectory, streams: RecordedStreams, options: ReferenceOptions,
     parts = []
     recorded = _recorded(run, streams.samples)
     for cut in recording_runs(run, streams.samples, reference, options, notes, streams.place):
-        targets = None if run.targets is None else run.targets[recorded[cut.kept]]
+        rows = recorded[cut.kept]
+        targets, odometry = (None if array is None else array[rows] for array in (run.targets, run.odometry))
+        sent = None if run.sent is None else run.sent - np.array([cut.zero, 0, 0, 0, 0])
         whole = cut.zero == 0 and len(cut.kept) == len(run.times)
-        made = replace(cut.trajectory, targets=targets, distance=run.distance if whole else None)
+        distance = run.distance if whole else None
+        made = replace(cut.trajectory, targets=targets, odometry=odometry, sent=sent, distance=distance)
         parts.append(Part(replace(made, duration=run.duration) if whole else made, run.id, cut.zero, whole))
     return parts
 
