@@ -150,7 +150,8 @@ def _compared(
             words = f"Improvement, {SPLIT_NAMES[split]}{entry}"
             yield ComparedFigure(words, improvements[split], shares, True, 2, methods)
     known = [(costs[split].value, ends) for split in SPLITS if split in costs and (ends := costs[split].known)]
-    both = [pair for result in published if all(pair := [result.costs(split) for split in SPLITS])]
+    splits = [(result.costs("train"), result.costs("validation")) for result in published]
+    both = [(before, after) for before, after in splits if before and after]
     if len(known) < len(SPLITS) or not both:
         return
     change = known[1][0] / known[0][0] - 1
