@@ -8,8 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import ROOT, rows, summary
+from commands import rows, summary
 from newcomer import ELSEWHERE, PAGES, lines_of, ten_minutes, typed
+from page_figures import EVALUATIONS, PASSAGES, assert_printed, omni3_figures, paper_figures
+
+from omnibench.data.dataset import Dataset
 
 ELSEWHERE_TYPED = ("simulate", "slam")  # in test_simulation_pages_run.py
 
@@ -64,13 +67,34 @@ def test_the_exact_optimum_takes_a_handful_of_evaluations(paper: dict[str, dict[
     assert paper["closed_form"]["outcome"] == "converged"
 
 
+def test_the_page_on_the_paper_prints_what_the_comparison_says() -> None:
+    figures = paper_figures(ten_minutes() / "results" / "apr02" / "latest")
+    assert_printed("paper", figures, EVALUATIONS)  # whose numbers differ between processors
+
+
+@pytest.mark.parametrize(("search", "label"), [("matrix", "genetic"), ("geometry", "parametric (GA)"), ("crs", "crs")])
+def test_the_evaluations_that_the_page_prints_are_those_of_this_processor_too(
+    search: str, label: str, paper: dict[str, dict[str, Any]]
+) -> None:
+    printed = {name: text for passage in PASSAGES["paper"] for name, text in passage.printed().items()}
+    least, most = (int(printed[f"{search}_{end}"].replace(",", "")) for end in ("least", "most"))
+    assert 0.8 * least <= paper[label]["evaluations"] <= 1.2 * most
+
+
+def test_the_readme_prints_the_real_robots_improvement_with_both_intervals(
+    ended: dict[str, Path], omni3: Dataset
+) -> None:
+    if "compare" not in ended:
+        pytest.skip("the page on comparisons ended before the real robot's")
+    assert_printed("omni3", omni3_figures(ended["compare"] / "results" / "omni3" / "latest", omni3))
+
+
 def test_a_real_robot_is_calibrated_as_well_as_was_measured(ended: dict[str, Path]) -> None:
     if "compare" not in ended:
         pytest.skip("the page on comparisons ended before the real robot's")
     results = ended["compare"] / "results" / "omni3" / "latest"
     assert summary(results)["simulated"] == {"omni3": False}
     found = rows(results)
-    assert f"{100 * found['closed_form']['validation_improvement']:.1f} %" in (ROOT / "README.md").read_text("utf-8")
     assert found["closed_form"]["train_position_m"] <= 0.045
     assert np.degrees(found["closed_form"]["train_heading_rad"]) <= 3.8
     assert found["closed_form"]["validation_position_m"] <= 0.11

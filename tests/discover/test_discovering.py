@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from discovery_samples import COUPLING, lagging, nameless, nothing, repeated, simulated
+from page_figures import assert_printed, discovery_figures, plan_lines, printed_plan
 
 from omnibench.data.dataset import Dataset
 from omnibench.data.joining import joined
@@ -115,6 +116,11 @@ def test_what_a_real_robot_lacks_is_found_on_circles_and_holds_on_squares(record
     square = recorded.held_out[-1]
     assert square.position_m[1] <= 0.045
     assert np.degrees(square.heading_rad[1]) <= 1.8
+
+
+def test_the_readme_and_the_page_on_discover_print_its_figures_and_its_driving_plan(recorded: Discovery) -> None:
+    assert_printed("discovery", discovery_figures(recorded))
+    assert printed_plan().group() == plan_lines(recorded)
 
 
 def test_squares_are_told_to_hold_motions_that_circles_had_not(recorded: Discovery) -> None:
