@@ -13,6 +13,7 @@ from omnibench.compare.report.view import SPLIT_NAMES, DatasetView
 from omnibench.compare.report.wording import NO_INTERVAL, cost_decimals
 from omnibench.compare.result import THEORETICAL_NAME
 from omnibench.data.dataset import SPLITS, Split, Trajectory
+from omnibench.fit.least_squares.repetitions import grouped
 from omnibench.fit.uncertainty.ratio_intervals import Interval
 from omnibench.registry import calibrators
 from omnibench.report.blocks import Block, Callout, Cell, Column, Row, Table
@@ -34,53 +35,48 @@ def published_blocks(view: DatasetView) -> tuple[Block, ...]:
         return (Callout("The published costs cannot be set beside these", (remark,), "warning"),)
     remarks = tuple(dict.fromkeys(remark for result in view.config.published_results for remark in result.remarks))
     about = (Callout("About the published figures", remarks),) if remarks else ()
-    answers = tuple(filter(None, (_curves(view), _minima(view))))
-    claims = (Callout("What the paper claims, and what is seen here", answers),) if answers else ()
+    lines = _claims(view)
+    claims = (Callout("What the paper claims, and what is seen here", lines),) if lines else ()
     return (_figure_table(view), _circumstance_table(view), *_effort_tables(view), *claims, *about)
 
 
-def _curves(view: DatasetView) -> str:
-    """Section 4.1 of the paper: systematic errors show in curves rather than on straight runs. Empty without both."""
-    runs, split = view.dataset.split(view.scored), view.scored
-    if not view.runs or split not in view.runs[0].design or any(run.omega is None for run in runs):
-        return ""
-    turning = np.array([run.omega != 0 for run in runs])
-    if turning.all() or not turning.any():
-        return ""
-    costs = view.runs[0].design[split].costs
-    curved, straight = float(costs[turning].mean()), float(costs[~turning].mean())
-    return (
-        f"Curves show systematic errors best (section 4.1): {'so here' if curved > straight else 'not here'}, Eq. (6) "
-        f"of the design values is {fixed(curved, 3)} on the {SPLIT_NAMES[split]} runs in curves and "
-        f"{fixed(straight, 3)} on straight ones."
-    )
-
-
-def _minima(view: DatasetView) -> str:
-    """Section 5 of the paper: a genetic algorithm is less prone to local minima. Empty without other searches."""
+def _claims(view: DatasetView) -> tuple[str, ...]:
+    """Two claims of the paper: curves show systematic errors best, and a genetic algorithm avoids local minima."""
+    lines, split, turns = [], view.scored, [run.omega for run in view.dataset.split(view.scored)]
+    turning = np.array([bool(turn) for turn in turns])
+    if view.runs and None not in turns and 0 < turning.sum() < len(turning):
+        costs = view.runs[0].design[split].costs
+        curved, straight = float(costs[turning].mean()), float(costs[~turning].mean())
+        seen = "so here" if curved > straight else "not here"
+        lines.append(
+            f"Curves show systematic errors best (section 4.1): {seen}, Eq. (6) of the design values is "
+            f"{fixed(curved, 3)} on the {SPLIT_NAMES[split]} runs in curves and {fixed(straight, 3)} on straight ones."
+        )
     genetic = next((run for _, entry, run in view.published_entries if entry.parameterisation == "matrix"), None)
-    if genetic is None:
-        return ""
-    space, label = genetic.search_space, genetic.record.label
-    reached: dict[str, list[float]] = {}
+    costs_of: dict[str, list[float]] = {}
     for run in view.runs:
         record = run.record
-        searches = calibrators.entry(record.calibrator).cls.stochastic and record.label != label
-        if searches and run.search_space == space and record.train_cost is not None:
-            reached.setdefault(record.label, []).append(record.train_cost)
-    if not reached:
-        return ""
-    lowest = min(cost for costs in reached.values() for cost in costs)
-    met = [
-        f"{sum(cost <= (1 + _MET) * lowest for cost in costs)} of {plural(len(costs), 'run')} of {label}"
-        for label, costs in reached.items()
-    ]
-    proof = next((each for each in view.certificates if each.box == genetic.record.box), None)
-    proven = "" if proof is None else f"; by proof no matrix of the box is more than {percent(proof.gap, 2)} below it"
-    return (
-        f"Local minima (section 5): from random starts in the box {genetic.record.box}, {listing(met)} ended within "
-        f"{percent(_MET, 2)} of one cost, {fixed(lowest, cost_decimals(view))}{proven}."
-    )
+        rival = (
+            genetic is not None and record.label != genetic.record.label and run.search_space == genetic.search_space
+        )
+        if rival and calibrators.entry(record.calibrator).cls.stochastic and record.train_cost is not None:
+            costs_of.setdefault(record.label, []).append(record.train_cost)
+    if genetic is not None and costs_of:
+        box, lowest = genetic.record.box, min(min(costs) for costs in costs_of.values())
+        met = [
+            f"{sum(cost <= (1 + _MET) * lowest for cost in costs)} of {plural(len(costs), 'run')} of {label}"
+            for label, costs in costs_of.items()
+        ]
+        proven = [
+            f"; by proof no matrix of the box is more than {percent(certificate.gap, 2)} below it"
+            for certificate in view.certificates
+            if certificate.box == box
+        ]
+        lines.append(
+            f"Local minima (section 5): from random starts in the box {box}, {listing(met)} ended within "
+            f"{percent(_MET, 2)} of one cost, {fixed(lowest, cost_decimals(view))}{''.join(proven)}."
+        )
+    return tuple(lines)
 
 
 @dataclass(frozen=True)
@@ -302,11 +298,8 @@ def _parts(errors: Array, runs: Sequence[Trajectory]) -> tuple[float | None, flo
     The systematic part is the norm of a command's mean error, the scatter the norm of a run's deviation from it,
     each on average. sqrt(n / (n - 1)) corrects for a mean that is itself estimated from the n runs.
     """
-    rows: dict[str, list[int]] = {}
-    for index, run in enumerate(runs):
-        if run.command is not None:
-            rows.setdefault(run.command, []).append(index)
-    groups = [errors[chosen] for chosen in rows.values() if len(chosen) > 1]
+    repeated = [rows for rows in grouped([run.command for run in runs]) if len(rows) > 1]
+    groups = [errors[list(rows)] for rows in repeated if runs[rows[0]].command is not None]
     if not groups:
         return None, None
     means = [float(np.linalg.norm(group.mean(axis=0))) for group in groups]

@@ -18,8 +18,8 @@ from omnibench.words import plural
 # Middles of the boxes in units of the picture: two columns, which a phone and half a sheet of paper can hold.
 _START, _CANDIDATES, _ODOMETRY, _COST = (1.0, 3.0), (1.0, 2.0), (1.0, 1.0), (1.0, 0.0)
 _STOP, _SELECTION, _NEXT = (0.0, 0.0), (0.0, 1.0), (0.0, 2.0)
-_WIDTH = 168  # px of a box
-_TO_SIDE, _TO_TOP = 83, 32  # px from a box's middle to its edges
+_WIDTH = 156  # px of a box
+_TO_SIDE, _TO_TOP = 87, 38  # px from a box's middle to its edges
 
 
 def search_diagram(view: DatasetView) -> FigureGrid:
@@ -27,13 +27,13 @@ def search_diagram(view: DatasetView) -> FigureGrid:
     config, runs = view.config, len(view.dataset.split("train"))
     euler = "Euler steps, Eq. (1)" if config.integration == "euler" else "exact arcs"
     is_paper = config.cost.name == "final_pose"
-    stop = f"or after {count(config.budget.evaluations)} evaluations"
+    stop = f"{count(config.budget.evaluations)} evaluations"
     genetic = next((run.record for _, entry, run in view.published_entries if entry.calibrator == "genetic"), None)
     if genetic is None:
         own = {
             _START: "<b>Start</b><br>the design values",
             _CANDIDATES: "<b>Candidates</b><br>elements or geometry,<br>within their bounds",
-            _STOP: f"<b>Stop?</b><br>by its own rule,<br>{stop}",
+            _STOP: f"<b>Stop?</b><br>by its own rule, or<br>after {stop}",
             _NEXT: "<b>Next candidates</b><br>by the search's own rule",
         }
     else:
@@ -41,10 +41,10 @@ def search_diagram(view: DatasetView) -> FigureGrid:
         population = options.size(3 * len(view.dataset.robot.drive.names) - len(genetic.held))
         bounds = "±10 % of V" if genetic.box == "paper" else f"box {genetic.box}"
         own = {
-            _START: f"<b>Initial population</b><br>V, the design values,<br>and {population - 1} drawn in the box",
-            _CANDIDATES: f"<b>Population of {population}</b><br>within V<sub>LB</sub>, V<sub>UB</sub>: {bounds}",
-            _STOP: f"<b>Stop?</b> best changes<br>≤ {options.tolerance:g} on average over<br>"
-            f"{options.stall_generations} generations, {stop}",
+            _START: f"<b>Initial population</b><br>V, the design values,<br>and {population - 1} random ones",
+            _CANDIDATES: f"<b>Population of {population}</b><br>V<sub>LB</sub>, V<sub>UB</sub>: {bounds}",
+            _STOP: f"<b>Stop?</b> best changes<br>≤ {options.tolerance:g} on average of<br>"
+            f"{options.stall_generations} generations, or<br>{stop}",
             _SELECTION: f"<b>Selection</b><br>elite {percent(options.elite, 0)} unchanged,<br>parents by rank",
             _NEXT: f"<b>Crossover</b> of {percent(options.crossover, 0)}<br><b>Mutation</b> of the others<br>"
             f"({options.mutation.replace('_', ' ')})",
@@ -63,7 +63,7 @@ def search_diagram(view: DatasetView) -> FigureGrid:
     title, paper = "How a search runs", ""
     if genetic is not None:
         title, paper = "How the genetic search runs", f"Fig. 4 of the paper, with the settings of {genetic.label}. "
-    return FigureGrid((Figure(title, figure, words, 460),), (), 1, f"{paper}The cost is {cost_in_words(view)}")
+    return FigureGrid((Figure(title, figure, words, 500),), (), 1, f"{paper}The cost is {cost_in_words(view)}")
 
 
 def _box(middle: tuple[float, float], words: str) -> dict[str, Any]:
