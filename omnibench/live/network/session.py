@@ -46,9 +46,11 @@ _SOURCE = re.compile(r"\s+at /\S+\.rs:\d+\.?")  # the place in Zenoh's source at
 def open_session(config: SessionConfig, purpose: str, stop: Stop | None = None) -> zenoh.Session:
     """Open a session. purpose: who opens it or what for; an error's message begins with it. stop: ends the waiting.
 
-    A client reconnects by itself after its router was away. ConfigError in one line: a file is missing or wrong, the
-    address is in use, nothing listens at the endpoint to connect to, or it refuses us.
+    A client reconnects by itself after its router was away. Zenoh logs to standard output what RUST_LOG says.
+    ConfigError in one line: a file is missing or wrong, the address is in use, nothing listens at the endpoint to
+    connect to, or it refuses us.
     """
+    zenoh.try_init_log_from_env()
     try:
         settings = zenoh_config(config)
         try:
