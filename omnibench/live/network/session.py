@@ -36,6 +36,8 @@ _SETTINGS: Final[dict[str, Any]] = {
     # subscriber that does not read is dropped soon, so that it delays no other.
     "transport/link/tx/queue/size": dict.fromkeys(_PRIORITIES, 16),
     "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 200,  # us
+    # 100 connections that say nothing keep others from logging in until they are given up, with Zenoh's default 10 s.
+    "transport/unicast/accept_timeout": 3000,  # ms
 }
 _SCOUTING_DELAY: Final = 500  # ms; Zenoh's default
 _CONNECT_TIMEOUT: Final = 3.0  # s for a router or peer to reach an endpoint it connects to; chosen
@@ -69,6 +71,12 @@ def open_session(config: SessionConfig, purpose: str, stop: Stop | None = None) 
             "%s listens at %s, where anybody on the network may connect; give users_file, or tls and access",
             purpose,
             ", ".join(config.unprotected),
+        )
+    elif config.listening and config.access is None and (config.tls or config.users_file):
+        LOG.warning(
+            "%s has no access rules, so that everybody with %s may do everything, as swap calibrations; give access",
+            purpose,
+            f"a certificate of {config.tls.ca}" if config.tls else f"a password of {config.users_file}",
         )
     return session
 
@@ -114,6 +122,7 @@ def zenoh_config(config: SessionConfig) -> zenoh.Config:
 def _settings(config: SessionConfig) -> Iterator[tuple[str, Any]]:
     yield from _SETTINGS.items()
     yield "mode", config.mode
+    yield "transport/link/rx/max_message_size", config.largest_message
     yield "listen/endpoints", list(config.listening)
     yield "connect/endpoints", list(config.connecting)
     yield "scouting/multicast/enabled", config.scouting
