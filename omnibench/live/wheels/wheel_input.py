@@ -34,6 +34,7 @@ _SLOWER = 50  # samples in a row each after a missing one, as of a robot that se
 _SMOOTHING = 0.02  # share of a new period in the mean
 _IRREGULAR = 0.25  # share of the mean period by which a regular one may be off
 _MEMORY = 0.995  # share of the past in the pace of the stamps, which is 1 of a robot and more of a fast replay
+_FOLLOWING = 1e-3  # share of a sample's delay that counts as the drift of the two clocks
 
 
 class WheelSettings(Model):
@@ -132,6 +133,7 @@ class WheelInput:
         self._learnt: list[float] = []
         self._after_missing = 0  # samples in a row, each after a missing one
         self._stamped, self._waited = 1.0, 1.0  # s by stamps and by this machine's clock, recent ones weighing most
+        self._on_time = 0.0  # s, when the last sample would have come without the delays that others did not have
         self.period = period
         self.last_refusal = ""
 
@@ -151,6 +153,7 @@ class WheelInput:
         if self._steering is not None:
             self._steering.resume(stamp, steering)
         self._last = _Sample(stamp, arrival, positions, None, steering=steering)
+        self._on_time = arrival
         self._counting = positions is not None and self._settings.use != "velocities"
         self._angles.begin(positions if self._counting else None)
 
@@ -242,7 +245,7 @@ class WheelInput:
         self._counting = sample.positions is not None
         self._angles.begin(sample.positions)
         self._counts.samples += 1
-        self._last = sample
+        self._last, self._on_time = sample, sample.arrival
         if sample.velocities is not None:
             self._rates = sample.velocities
         still = np.zeros(len(self._joints))
@@ -256,21 +259,26 @@ class WheelInput:
         set_ahead = elapsed > max(waited + _SLACK, (3 + sample.skipped) * self.period)
         if set_back or set_ahead:  # the clock jumped within the limits of a next sample: this machine's clock counts
             self._counts.clock_jumps += 1
+            unseen = max(elapsed, waited)
             elapsed = min(max(waited, self.period), self._settings.max_gap)
+            self._on_time = sample.arrival
         else:
+            due = self._on_time + elapsed / self._pace
+            self._on_time = min(sample.arrival, due + _FOLLOWING * (sample.arrival - due))
             self._learn(elapsed, sample.arrival - self._last.arrival, sample.skipped)
+            unseen = elapsed - self.period if elapsed > 1.7 * self.period else 0.0
         self._late_in_a_row = 0
         if self._counting and sample.positions is not None and self._angles.known is not None:
             rates = self._rates if sample.velocities is None else sample.velocities
             angles, counted = self._angles.turned(sample.positions, rates, elapsed)
             return self._taken(sample, elapsed, angles, angles / elapsed, 0.0 if counted else elapsed, counted)
-        return self._by_rates(sample, elapsed, elapsed, blind=0.0)
+        return self._by_rates(sample, elapsed, elapsed, blind=unseen)
 
     def _after_silence(self, sample: _Sample, elapsed: float, *, restarted: bool = False) -> WheelStep:
         """The step over a silence of ``elapsed`` s, of which only the two ends are known."""
         if not restarted:
             self._counts.gaps += 1
-        self._late_in_a_row = 0
+        self._late_in_a_row, self._on_time = 0, sample.arrival
         if self._counting and sample.positions is not None and self._angles.known is not None:
             angles, counted = self._angles.turned_unseen(sample.positions, elapsed)
             rates = angles / elapsed if sample.velocities is None else sample.velocities
@@ -331,11 +339,17 @@ class WheelInput:
             self._learnt.clear()
             self._after_missing = 0
 
+    @property
+    def _pace(self) -> float:
+        """Time by the stamps per time by this machine's clock."""
+        return self._stamped / self._waited if self._waited > 1e-6 else 1e6
+
     def _waited_for(self, sample: _Sample) -> float:
-        """Time since the last sample by this machine's clock, s, at the pace of the stamps."""
+        """Time since the last sample should have come, by this machine's clock at the pace of the stamps, s."""
         assert self._last is not None
-        pace = self._stamped / self._waited if self._waited > 1e-6 else 1e6
-        return (sample.arrival - self._last.arrival) * (pace if not 0.5 < pace < 2 else 1.0)
+        if 0.5 < self._pace < 2:  # a robot; a replay may come as it likes
+            return sample.arrival - self._on_time
+        return (sample.arrival - self._last.arrival) * self._pace
 
     def _confirmed(self, sample: _Sample) -> list[WheelStep]:
         """The steps of samples at a new time of the clock, once enough follow each other; till then none."""
