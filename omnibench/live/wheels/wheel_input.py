@@ -23,6 +23,7 @@ from omnibench.live.wheels.wheel_angles import WheelAngles
 from omnibench.live.wire.messages import JointState, MessageError
 from omnibench.robot.kinematics import Array
 from omnibench.robot.wheels.fastest import FASTEST, FASTEST_RIM, fastest_rates
+from omnibench.robot.wheels.joint_choice import JointChoice
 
 _SECOND = 1e9  # ns
 # All of these are chosen.
@@ -51,6 +52,9 @@ class WheelSettings(Model):
     )
     max_rate: Positive | None = Field(
         None, description=f"no wheel turns faster, rad/s; default: {FASTEST:g}, or {FASTEST_RIM:g} m/s at its rim"
+    )
+    stamps: Literal["header", "arrival"] = Field(
+        "header", description="arrival: where headers' stamps are 0 or by another clock, the times of arrival count"
     )
     max_gap: Positive = Field(1.0, description="a longer silence makes the path unknown, s")
     max_steering_age: Positive = Field(0.2, description="older steering angles make the path unknown, s")
@@ -119,6 +123,7 @@ class WheelInput:
         steering: SteeringInput | None = None,
     ) -> None:
         self._joints = settings.joints or tuple(wheels)
+        self._choice = JointChoice(tuple(wheels), settings.joints or ())
         self._settings = settings
         self._counts = counts
         self._steering = steering
@@ -130,6 +135,7 @@ class WheelInput:
         self._rates: Array = np.zeros(len(self._joints))
         self._unconfirmed: list[_Sample] = []  # samples of a new time of the clock, until enough of them came
         self._late_in_a_row = 0
+        self.repeats, self.repeated_at = 0, 0.0  # samples in a row with the last stamp, and when the last of them came
         self._learnt: list[float] = []
         self._after_missing = 0  # samples in a row, each after a missing one
         self._stamped, self._waited = 1.0, 1.0  # s by stamps and by this machine's clock, recent ones weighing most
@@ -175,6 +181,7 @@ class WheelInput:
         elapsed = (sample.stamp - self._last.stamp) / _SECOND
         if elapsed == 0 or (self._unconfirmed and sample.stamp == self._unconfirmed[-1].stamp):
             self._counts.duplicates += 1
+            self.repeats, self.repeated_at = self.repeats + 1, arrival
             return []
         if 0 < elapsed <= self._settings.max_gap:
             if self._unconfirmed:
@@ -227,18 +234,23 @@ class WheelInput:
 
         MessageError: a wheel is not there.
         """
-        missing = [joint for joint in self._joints if joint not in names]
+        chosen = self._choice.places(names)
+        missing = [] if chosen else [joint for joint in self._joints if not self._has(joint, names)]
         alone = len(missing) == len(self._joints) and self._steering is not None and self._steering.tells(names)
-        if missing and not alone:
+        if chosen is None and not alone:
             self._counts.wrong_joints += 1
+            where = f"among {', '.join(names[:12]) or 'no names'}; set wheels.joints"
             raise MessageError(
-                f"no joint {missing[0]!r} among {', '.join(names[:12]) or 'no names'}; set wheels.joints"
+                f"no joint {missing[0]!r} {where}" if missing else f"more than one joint a wheel {where}"
             )
         if len(self._places) > 16:  # so that a sender of ever new names cannot fill the memory
             self._places.clear()
-        places = None if alone else np.array([names.index(joint) for joint in self._joints])
+        places = None if chosen is None else np.array(chosen)
         self._places[names] = places
         return places
+
+    def _has(self, joint: str, names: tuple[str, ...]) -> bool:
+        return joint in names or (not self._choice.asked and bool(self._choice.matching(joint, names)))
 
     def _first(self, sample: _Sample) -> WheelStep:
         """The first step, which has no duration; from here on angles are counted if there are any, else rates."""
@@ -310,6 +322,7 @@ class WheelInput:
     ) -> WheelStep:
         """The step of a sample that is taken, which becomes the last one."""
         self._counts.samples += 1
+        self.repeats = 0
         self._last, self._rates = sample, rates
         known, steering, held = self._angles.known, sample.steering, self.old_steering > 0
         if held:
