@@ -230,14 +230,12 @@ def keys(
 
 def _run(config: "LiveConfig", file: Path, seconds: float | None) -> None:
     from omnibench.cli.terminal.live_tables import node_log
-    from omnibench.live.network.access_log import log_refused_access
     from omnibench.live.node import LiveNode
     from omnibench.live.stopping import stop_on_signals, ticks
 
     with (
         node_log(make_console(error=True)) as log,
         stop_on_signals() as stop,
-        log_refused_access(config.zenoh),
         LiveNode(config, stop=stop) as node,
     ):
         for robot in config.robots:
@@ -259,7 +257,6 @@ def _replay_to_node(
     from omnibench.cli.terminal.live_tables import node_log, print_demonstration
     from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.config import validate
-    from omnibench.live.network.access_log import log_refused_access
     from omnibench.live.replay.arrivals import ReplayConfig
     from omnibench.live.replay.demonstration import demonstrate
     from omnibench.live.replay.played_recording import load_recording
@@ -274,12 +271,7 @@ def _replay_to_node(
         config = config.model_copy(update={"replay": changed})
     with ProgressDisplay() as watch:
         recording = load_recording(source, watch=watch)
-    with (
-        ProgressDisplay() as watch,
-        node_log(watch.console, warnings_only=True),
-        stop_on_signals() as stop,
-        log_refused_access(config.zenoh),
-    ):
+    with ProgressDisplay() as watch, node_log(watch.console, warnings_only=True), stop_on_signals() as stop:
         shown = demonstrate(config, recording, stop, watch, math.inf if seconds is None else seconds)
     print_demonstration(make_console(), shown)
     if shown.report.interrupted:

@@ -148,7 +148,7 @@ class RobotService:
                     continue
                 self._receive_poses()
                 if self._flows.accepts(flow):
-                    self._take(message, late=False, published=self._flows.inherited(flow))
+                    self._take(message, late=False, published=self._flows.inherited(flow), replayed=True)
             self._late.end_turn()
             if self._flows.heard:  # the sender forgets what is acknowledged: the state has to hold it before
                 self.tracker.save()
@@ -158,16 +158,18 @@ class RobotService:
                 self._scheduled = True
                 self._intake.ready(self._take_turn)
 
-    def _take(self, message: _Message, *, late: bool, published: bool = False, skipped: int = 0) -> None:
+    def _take(
+        self, message: _Message, *, late: bool, published: bool = False, skipped: int = 0, replayed: bool = False
+    ) -> None:
         """Take a message, and publish its updates unless it is late, or they may be published already.
 
-        skipped: messages before it that never came, by the sender's numbers.
+        skipped: messages before it that never came, by the sender's numbers. replayed: it comes in a flow.
         """
         try:
             if message.is_pose:
-                self.tracker.take_pose(message.payload, message.arrival)
+                self.tracker.take_pose(message.payload, message.arrival, replayed=replayed)
                 return
-            updates = self.tracker.take_wheels(message.payload, message.arrival, skipped)
+            updates = self.tracker.take_wheels(message.payload, message.arrival, skipped, replayed=replayed)
             if published:
                 self._late.unpublished += len(updates)
             elif late:

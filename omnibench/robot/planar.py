@@ -8,8 +8,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from omnibench.robot.kinematics import Array
+
+# Standard deviations of measured poses, m and rad, beyond which a covariance means that it is unknown (chosen).
+_LEAST_SIGMA, _LARGEST_SIGMA = 1e-7, 1e7
 
 
 def rotation(angle: float) -> Array:
@@ -78,3 +82,17 @@ def correction(in_map: Array, in_odom: Array) -> Array:
     turned = heading - odom_heading
     cosine, sine = math.cos(turned), math.sin(turned)
     return np.array([x - cosine * odom_x + sine * odom_y, y - sine * odom_x - cosine * odom_y, turned])
+
+
+def pose_covariance(position_sigma: float, heading_sigma_deg: float) -> Array:
+    """Covariance (3, 3) of a pose by its standard deviations, m and deg."""
+    return np.diag([position_sigma, position_sigma, math.radians(heading_sigma_deg)]) ** 2
+
+
+def usable_covariances(covariances: Array) -> NDArray[np.bool_]:
+    """True for poses' covariances (..., 3, 3), m and rad; False for what senders write where they do not know them."""
+    possible = np.asarray((np.abs(covariances) <= _LARGEST_SIGMA**2).all(axis=(-2, -1)))
+    filled = np.where(possible[..., None, None], covariances, np.eye(3))
+    symmetric = np.isclose(filled, np.swapaxes(filled, -2, -1)).all(axis=(-2, -1))
+    usable: NDArray[np.bool_] = possible & symmetric & (np.linalg.eigvalsh(filled)[..., 0] >= _LEAST_SIGMA**2)
+    return usable

@@ -243,7 +243,7 @@ def nonsense() -> list[tuple[str, str, bytes, str]]:
         ("truncated", slam(last, [0, 0, 0])[:100], "pose_undecodable"),
         ("a wheel message", whole, "pose_undecodable"),
         ("nan", slam(last, [np.nan, 0, 0]), "pose_invalid"),
-        ("no covariance", slam(last, [0, 0, 0], np.full((3, 3), np.nan)), "pose_invalid"),
+        ("no covariance", slam(last, [0, 0, 0], np.full((3, 3), np.nan)), "pose_default_covariance"),
         ("a kilometre away", slam(last - 20_000_000, [1000, 0, 0]), "pose_rejected"),
         ("of an hour ago", slam(last - 3600 * SECOND, [0, 0, 0]), "pose_too_late"),
         ("of tomorrow", slam(last + 86400 * SECOND, [0, 0, 0]), "pose_ahead"),

@@ -40,7 +40,8 @@ class Counts:
     pose_too_late: int = _anomaly("pose", "older than the history")
     pose_ahead: int = _anomaly("pose", "ahead of the wheel samples")  # or more than can wait for them
     pose_duplicates: int = _anomaly("pose", "twice")
-    pose_invalid: int = _anomaly("pose", "invalid")  # not finite, no covariance, wrong frame
+    pose_invalid: int = _anomaly("pose", "invalid")  # not finite, too far away, wrong frame
+    pose_default_covariance: int = 0  # fused with pose_sigma or the calibration's, as the message's is unknown
     pose_undecodable: int = _anomaly("pose message", "undecodable")  # no geometry_msgs/PoseWithCovarianceStamped
     reacquired: int = _anomaly("restart", "of the filter at SLAM's pose")  # it gave up its own
     swaps: int = 0  # calibrations taken

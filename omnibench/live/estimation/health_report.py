@@ -69,6 +69,10 @@ class HealthReporter:
             return "waiting", f"no wheel sample yet{f': {state.last_refusal}' if state.last_refusal else ''}"
         behind = self._longest_wait(state)
         if age > self._stale_after + behind:
+            wheels = state.wheel_input
+            if wheels.repeats and now - wheels.repeated_at <= self._stale_after + behind:
+                repeated = f"{wheels.repeats} wheel samples have the stamp {state.timeline.newest / _SECOND:.3f} s"
+                return "stale", f"stamps stand still: {repeated}; `wheels: {{stamps: arrival}}` takes times of arrival"
             return "stale", f"no wheel sample for {age:.1f} s"
         if behind > _BEHIND:
             return "degraded", f"behind by {behind:.1f} s: samples come faster than they can be taken"

@@ -18,6 +18,7 @@ from omnibench.live.wheels.steering_input import SteeringInput
 from omnibench.live.wheels.wheel_input import WheelInput, WheelSettings
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.wheels.drive import CarDrive
+from omnibench.robot.wheels.joint_choice import JointChoice
 
 _HISTORY = 5.0  # s of odometry that are remembered without fusion; chosen, as FusionSettings.history
 # Largest steering angles, rad, of a car, which drives by their tangents, and of others, 1600 turns one way; chosen.
@@ -67,14 +68,15 @@ def new_state(name: str, calibration: Calibration, wheels: WheelSettings, fusion
     counts, drive = Counts(), calibration.robot.drive
     joints = joints_of(calibration.robot, wheels, f"robot {name!r}: wheels")
     limit = _FARTHEST_OF_CAR if isinstance(drive, CarDrive) else _FARTHEST
-    steering = SteeringInput(joints.steering, limit, counts) if drive.steered else None
+    choice = JointChoice(drive.steered, wheels.steering_joints or (), steering=True)
+    steering = SteeringInput(joints.steering, choice, limit, counts) if drive.steered else None
     timeline = Timeline(fusion.history if fusion else _HISTORY)
     taken = wheels.for_wheels(calibration.robot.radii)
     return RobotState(
         name=name,
         calibration=calibration,
         counts=counts,
-        wheel_input=WheelInput(joints.wheels, taken, calibration.sample_period, counts, steering),
+        wheel_input=WheelInput(calibration.robot.wheel_names, taken, calibration.sample_period, counts, steering),
         odometry=LiveOdometry(calibration, (fusion or FusionSettings()).standstill),
         timeline=timeline,
         fusion=Fusion(fusion, timeline, counts) if fusion else None,

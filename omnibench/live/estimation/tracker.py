@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -30,7 +31,7 @@ from omnibench.live.fusion.pose_fusion import Fusion, FusionSettings, Outcome
 from omnibench.live.fusion.pose_input import PoseInput
 from omnibench.live.fusion.timeline import Entry
 from omnibench.live.wheels.wheel_input import WheelSettings, WheelStep
-from omnibench.live.wire.messages import JointState, MessageError
+from omnibench.live.wire.messages import JointState, MessageError, arrival_stamp
 from omnibench.live.wire.robot_messages import JointStateDecoder
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
@@ -61,7 +62,8 @@ class RobotTracker:
         self.frames = frames or Frames()
         self._state = new_state(name, calibration, wheels or WheelSettings(), fusion)
         self._decoder = JointStateDecoder()
-        self._pose_input = PoseInput(self.frames.map, self.counts)
+        self._by_arrival = wheels is not None and wheels.stamps == "arrival"
+        self._pose_input = PoseInput(self.frames.map, fusion or FusionSettings(), self.counts)
         self._state_writer = StateWriter(memory)
         self._health = HealthReporter(stale_after)
         self._state_lock = threading.Lock()  # held while the state is read or changed
@@ -73,14 +75,16 @@ class RobotTracker:
         """Number of messages that were refused for a reason."""
         return self._state.refusals
 
-    def take_wheels(self, payload: bytes, arrival: float, skipped: int = 0) -> list[Update]:
+    def take_wheels(self, payload: bytes, arrival: float, skipped: int = 0, *, replayed: bool = False) -> list[Update]:
         """Take a sensor_msgs/JointState in CDR; its updates, in order.
 
         Mostly there is one; none while a sample is refused or has to be confirmed. arrival: s, monotonic. skipped:
-        messages before it that never came, by the sender's numbers.
+        messages before it that never came, by the sender's numbers. replayed: its stamp counts in any case.
         """
         with self._state_lock:
             message = self._decode(payload)
+            if message is not None and self._by_arrival and not replayed:
+                message = replace(message, stamp=arrival_stamp(arrival))
             updates = []
             for step in self._order_and_repair(message, arrival, skipped):
                 motion = self._integrate(step)
@@ -89,14 +93,14 @@ class RobotTracker:
             self._state_writer.save_if_due(self._state)
             return updates
 
-    def take_pose(self, payload: bytes, arrival: float) -> Outcome | None:
+    def take_pose(self, payload: bytes, arrival: float, *, replayed: bool = False) -> Outcome | None:
         """Take a geometry_msgs/PoseWithCovarianceStamped in CDR; None: it is invalid, or there is no fusion."""
         with self._state_lock:
             fusion = self._state.fusion
             if fusion is None:
                 return None
             try:
-                measurement = self._pose_input.read(payload, arrival, self.calibration)
+                measurement = self._pose_input.read(payload, arrival, self.calibration, replayed=replayed)
             except MessageError as error:
                 self._state.refused(str(error))
                 return None

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field
 from scipy.special import gammaincinv
 
-from omnibench.config import Model
+from omnibench.config import Model, Positive
 from omnibench.live.estimation.counts import Counts
 from omnibench.live.estimation.live_odometry import Motion
 from omnibench.live.fusion.pose_filter import PoseFilter
@@ -42,6 +42,12 @@ class FusionSettings(Model):
         10, ge=1, description="rejected poses that agree with each other: then SLAM is believed"
     )
     standstill: float = Field(0.01, gt=0.0, le=1.0, description="share of the wheels' noise while none turns")
+    pose_sigma: tuple[Positive, Positive] | None = Field(
+        None,
+        description="m and deg, standard deviations of poses whose covariance is unknown (0, negative, NaN, huge); "
+        "default: the calibration's",
+    )
+    stamps: Literal["header", "arrival"] = Field("header", description="arrival: as wheels.stamps, for SLAM's poses")
     stale_after: float = Field(2.0, gt=0.0, description="no pose for so long makes the health degraded, s")
 
 

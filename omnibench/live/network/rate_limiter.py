@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 import time
 from typing import Final
@@ -11,13 +10,10 @@ PERIOD: Final = 10.0  # s between two lines of the same kind; chosen
 
 
 class RateLimiter:
-    """Allows one line of each kind in ``period`` s (infinity: one in all), and ``most`` lines of all kinds together.
+    """Allows one line of each kind in ``period`` s (infinity: one in all). Safe to call from any thread."""
 
-    Safe to call from any thread.
-    """
-
-    def __init__(self, period: float = PERIOD, most: float = math.inf) -> None:
-        self._period, self._most = period, most
+    def __init__(self, period: float = PERIOD) -> None:
+        self._period = period
         self._last: dict[str, float] = {}  # kind -> when a line was allowed, within the period
         self._lock = threading.Lock()
 
@@ -26,7 +22,7 @@ class RateLimiter:
         now = time.monotonic()
         with self._lock:
             self._last = {other: at for other, at in self._last.items() if now - at < self._period}
-            if kind in self._last or len(self._last) >= self._most:
+            if kind in self._last:
                 return False
             self._last[kind] = now
             return True

@@ -36,6 +36,8 @@ _SETTINGS: Final[dict[str, Any]] = {
     # subscriber that does not read is dropped soon, so that it delays no other.
     "transport/link/tx/queue/size": dict.fromkeys(_PRIORITIES, 16),
     "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 200,  # us
+    # 100 connections that say nothing keep others from logging in until they are given up, with Zenoh's default 10 s.
+    "transport/unicast/accept_timeout": 3000,  # ms
 }
 _SCOUTING_DELAY: Final = 500  # ms; Zenoh's default
 _CONNECT_TIMEOUT: Final = 3.0  # s for a router or peer to reach an endpoint it connects to; chosen
@@ -46,9 +48,11 @@ _SOURCE = re.compile(r"\s+at /\S+\.rs:\d+\.?")  # the place in Zenoh's source at
 def open_session(config: SessionConfig, purpose: str, stop: Stop | None = None) -> zenoh.Session:
     """Open a session. purpose: who opens it or what for; an error's message begins with it. stop: ends the waiting.
 
-    A client reconnects by itself after its router was away. ConfigError in one line: a file is missing or wrong, the
-    address is in use, nothing listens at the endpoint to connect to, or it refuses us.
+    A client reconnects by itself after its router was away. Zenoh logs to standard output what RUST_LOG says.
+    ConfigError in one line: a file is missing or wrong, the address is in use, nothing listens at the endpoint to
+    connect to, or it refuses us.
     """
+    zenoh.try_init_log_from_env()
     try:
         settings = zenoh_config(config)
         try:
@@ -67,6 +71,12 @@ def open_session(config: SessionConfig, purpose: str, stop: Stop | None = None) 
             "%s listens at %s, where anybody on the network may connect; give users_file, or tls and access",
             purpose,
             ", ".join(config.unprotected),
+        )
+    elif config.listening and config.access is None and (config.tls or config.users_file):
+        LOG.warning(
+            "%s has no access rules, so that everybody with %s may do everything, as swap calibrations; give access",
+            purpose,
+            f"a certificate of {config.tls.ca}" if config.tls else f"a password of {config.users_file}",
         )
     return session
 
@@ -112,6 +122,7 @@ def zenoh_config(config: SessionConfig) -> zenoh.Config:
 def _settings(config: SessionConfig) -> Iterator[tuple[str, Any]]:
     yield from _SETTINGS.items()
     yield "mode", config.mode
+    yield "transport/link/rx/max_message_size", config.largest_message
     yield "listen/endpoints", list(config.listening)
     yield "connect/endpoints", list(config.connecting)
     yield "scouting/multicast/enabled", config.scouting

@@ -160,6 +160,9 @@ class SessionConfig(Model):
     users_file: RelativePath | None = Field(None, description="users that may connect to us: lines of user:password")
     tls: Tls | None = None
     access: Access | None = Field(None, description="access rights at this router; default: all may do everything")
+    largest_message: int = Field(
+        1_000_000, ge=1000, description="bytes; larger messages are dropped before anybody's rights are looked at"
+    )
     extra: dict[str, Any] = Field({}, description="settings of Zenoh itself, as transport/link/tx/lease: 3000")
 
     @field_validator("listen", "connect", mode="before", json_schema_input_type=str | tuple[str, ...])

@@ -11,6 +11,7 @@ import numpy as np
 from omnibench.live.estimation.counts import Counts
 from omnibench.live.wire.messages import JointState, MessageError
 from omnibench.robot.kinematics import Array
+from omnibench.robot.wheels.joint_choice import JointChoice
 
 REORDERED: Final = 0.2  # s; a message that is late by less is out of order, or the clock was set back a little; chosen
 _SECOND = 1e9  # ns
@@ -21,12 +22,14 @@ _MOST_SENDERS = 16  # lists of names that are remembered, so that a sender of ev
 class SteeringInput:
     """Takes the positions of a robot's steering joints, in messages of their own or beside those of the wheels.
 
-    joints (S,): their names. limit: beyond it, rad, no angle is believed. An angle that a message does not tell, or
-    tells as NaN, as ros2_control does of joints without a position, is held.
+    joints (S,): their names. choice: finds them where a message calls them otherwise. limit: beyond it, rad, no angle
+    is believed. An angle that a message does not tell, or tells as NaN, as ros2_control does of joints without a
+    position, is held.
     """
 
-    def __init__(self, joints: Sequence[str], limit: float, counts: Counts) -> None:
+    def __init__(self, joints: Sequence[str], choice: JointChoice, limit: float, counts: Counts) -> None:
         self._joints = tuple(joints)
+        self._choice = choice
         self._limit = limit
         self._counts = counts
         self._angles = [math.nan] * len(self._joints)
@@ -77,9 +80,10 @@ class SteeringInput:
             self._angles, self._stamps = angles.tolist(), [stamp] * len(self._joints)
 
     def _why_missing(self, joint: str, message: JointState) -> str:
-        if joint not in message.names:
+        place = dict(self._found(message.names)).get(self._joints.index(joint))
+        if place is None:
             return f"no joint {joint!r} among {', '.join(message.names[:12])}; set wheels.steering_joints"
-        if message.positions is None or math.isnan(angle := message.positions[message.names.index(joint)]):
+        if message.positions is None or math.isnan(angle := message.positions[place]):
             return f"joint {joint!r} tells no position"
         return _too_far(joint, angle)
 
@@ -88,7 +92,11 @@ class SteeringInput:
         if found is None:
             if len(self._places) >= _MOST_SENDERS:
                 self._places.clear()
-            found = [(index, names.index(joint)) for index, joint in enumerate(self._joints) if joint in names]
+            found = []
+            for index, (joint, wheel) in enumerate(zip(self._joints, self._choice.wheels, strict=True)):
+                matching = [] if self._choice.asked else self._choice.matching(wheel, names)
+                if joint in names or len(matching) == 1:
+                    found.append((index, names.index(joint) if joint in names else matching[0]))
             self._places[names] = found
         return found
 

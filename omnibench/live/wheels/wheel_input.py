@@ -23,6 +23,7 @@ from omnibench.live.wheels.wheel_angles import WheelAngles
 from omnibench.live.wire.messages import JointState, MessageError
 from omnibench.robot.kinematics import Array
 from omnibench.robot.wheels.fastest import FASTEST, FASTEST_RIM, fastest_rates
+from omnibench.robot.wheels.joint_choice import JointChoice
 
 _SECOND = 1e9  # ns
 # All of these are chosen.
@@ -34,6 +35,7 @@ _SLOWER = 50  # samples in a row each after a missing one, as of a robot that se
 _SMOOTHING = 0.02  # share of a new period in the mean
 _IRREGULAR = 0.25  # share of the mean period by which a regular one may be off
 _MEMORY = 0.995  # share of the past in the pace of the stamps, which is 1 of a robot and more of a fast replay
+_FOLLOWING = 1e-3  # share of a sample's delay that counts as the drift of the two clocks
 
 
 class WheelSettings(Model):
@@ -50,6 +52,9 @@ class WheelSettings(Model):
     )
     max_rate: Positive | None = Field(
         None, description=f"no wheel turns faster, rad/s; default: {FASTEST:g}, or {FASTEST_RIM:g} m/s at its rim"
+    )
+    stamps: Literal["header", "arrival"] = Field(
+        "header", description="arrival: where headers' stamps are 0 or by another clock, the times of arrival count"
     )
     max_gap: Positive = Field(1.0, description="a longer silence makes the path unknown, s")
     max_steering_age: Positive = Field(0.2, description="older steering angles make the path unknown, s")
@@ -118,6 +123,7 @@ class WheelInput:
         steering: SteeringInput | None = None,
     ) -> None:
         self._joints = settings.joints or tuple(wheels)
+        self._choice = JointChoice(tuple(wheels), settings.joints or ())
         self._settings = settings
         self._counts = counts
         self._steering = steering
@@ -129,9 +135,11 @@ class WheelInput:
         self._rates: Array = np.zeros(len(self._joints))
         self._unconfirmed: list[_Sample] = []  # samples of a new time of the clock, until enough of them came
         self._late_in_a_row = 0
+        self.repeats, self.repeated_at = 0, 0.0  # samples in a row with the last stamp, and when the last of them came
         self._learnt: list[float] = []
         self._after_missing = 0  # samples in a row, each after a missing one
         self._stamped, self._waited = 1.0, 1.0  # s by stamps and by this machine's clock, recent ones weighing most
+        self._on_time = 0.0  # s, when the last sample would have come without the delays that others did not have
         self.period = period
         self.last_refusal = ""
 
@@ -151,6 +159,7 @@ class WheelInput:
         if self._steering is not None:
             self._steering.resume(stamp, steering)
         self._last = _Sample(stamp, arrival, positions, None, steering=steering)
+        self._on_time = arrival
         self._counting = positions is not None and self._settings.use != "velocities"
         self._angles.begin(positions if self._counting else None)
 
@@ -172,6 +181,7 @@ class WheelInput:
         elapsed = (sample.stamp - self._last.stamp) / _SECOND
         if elapsed == 0 or (self._unconfirmed and sample.stamp == self._unconfirmed[-1].stamp):
             self._counts.duplicates += 1
+            self.repeats, self.repeated_at = self.repeats + 1, arrival
             return []
         if 0 < elapsed <= self._settings.max_gap:
             if self._unconfirmed:
@@ -224,25 +234,30 @@ class WheelInput:
 
         MessageError: a wheel is not there.
         """
-        missing = [joint for joint in self._joints if joint not in names]
+        chosen = self._choice.places(names)
+        missing = [] if chosen else [joint for joint in self._joints if not self._has(joint, names)]
         alone = len(missing) == len(self._joints) and self._steering is not None and self._steering.tells(names)
-        if missing and not alone:
+        if chosen is None and not alone:
             self._counts.wrong_joints += 1
+            where = f"among {', '.join(names[:12]) or 'no names'}; set wheels.joints"
             raise MessageError(
-                f"no joint {missing[0]!r} among {', '.join(names[:12]) or 'no names'}; set wheels.joints"
+                f"no joint {missing[0]!r} {where}" if missing else f"more than one joint a wheel {where}"
             )
         if len(self._places) > 16:  # so that a sender of ever new names cannot fill the memory
             self._places.clear()
-        places = None if alone else np.array([names.index(joint) for joint in self._joints])
+        places = None if chosen is None else np.array(chosen)
         self._places[names] = places
         return places
+
+    def _has(self, joint: str, names: tuple[str, ...]) -> bool:
+        return joint in names or (not self._choice.asked and bool(self._choice.matching(joint, names)))
 
     def _first(self, sample: _Sample) -> WheelStep:
         """The first step, which has no duration; from here on angles are counted if there are any, else rates."""
         self._counting = sample.positions is not None
         self._angles.begin(sample.positions)
         self._counts.samples += 1
-        self._last = sample
+        self._last, self._on_time = sample, sample.arrival
         if sample.velocities is not None:
             self._rates = sample.velocities
         still = np.zeros(len(self._joints))
@@ -256,21 +271,26 @@ class WheelInput:
         set_ahead = elapsed > max(waited + _SLACK, (3 + sample.skipped) * self.period)
         if set_back or set_ahead:  # the clock jumped within the limits of a next sample: this machine's clock counts
             self._counts.clock_jumps += 1
+            unseen = max(elapsed, waited)
             elapsed = min(max(waited, self.period), self._settings.max_gap)
+            self._on_time = sample.arrival
         else:
+            due = self._on_time + elapsed / self._pace
+            self._on_time = min(sample.arrival, due + _FOLLOWING * (sample.arrival - due))
             self._learn(elapsed, sample.arrival - self._last.arrival, sample.skipped)
+            unseen = elapsed - self.period if elapsed > 1.7 * self.period else 0.0
         self._late_in_a_row = 0
         if self._counting and sample.positions is not None and self._angles.known is not None:
             rates = self._rates if sample.velocities is None else sample.velocities
             angles, counted = self._angles.turned(sample.positions, rates, elapsed)
             return self._taken(sample, elapsed, angles, angles / elapsed, 0.0 if counted else elapsed, counted)
-        return self._by_rates(sample, elapsed, elapsed, blind=0.0)
+        return self._by_rates(sample, elapsed, elapsed, blind=unseen)
 
     def _after_silence(self, sample: _Sample, elapsed: float, *, restarted: bool = False) -> WheelStep:
         """The step over a silence of ``elapsed`` s, of which only the two ends are known."""
         if not restarted:
             self._counts.gaps += 1
-        self._late_in_a_row = 0
+        self._late_in_a_row, self._on_time = 0, sample.arrival
         if self._counting and sample.positions is not None and self._angles.known is not None:
             angles, counted = self._angles.turned_unseen(sample.positions, elapsed)
             rates = angles / elapsed if sample.velocities is None else sample.velocities
@@ -302,6 +322,7 @@ class WheelInput:
     ) -> WheelStep:
         """The step of a sample that is taken, which becomes the last one."""
         self._counts.samples += 1
+        self.repeats = 0
         self._last, self._rates = sample, rates
         known, steering, held = self._angles.known, sample.steering, self.old_steering > 0
         if held:
@@ -331,11 +352,17 @@ class WheelInput:
             self._learnt.clear()
             self._after_missing = 0
 
+    @property
+    def _pace(self) -> float:
+        """Time by the stamps per time by this machine's clock."""
+        return self._stamped / self._waited if self._waited > 1e-6 else 1e6
+
     def _waited_for(self, sample: _Sample) -> float:
-        """Time since the last sample by this machine's clock, s, at the pace of the stamps."""
+        """Time since the last sample should have come, by this machine's clock at the pace of the stamps, s."""
         assert self._last is not None
-        pace = self._stamped / self._waited if self._waited > 1e-6 else 1e6
-        return (sample.arrival - self._last.arrival) * (pace if not 0.5 < pace < 2 else 1.0)
+        if 0.5 < self._pace < 2:  # a robot; a replay may come as it likes
+            return sample.arrival - self._on_time
+        return (sample.arrival - self._last.arrival) * self._pace
 
     def _confirmed(self, sample: _Sample) -> list[WheelStep]:
         """The steps of samples at a new time of the clock, once enough follow each other; till then none."""

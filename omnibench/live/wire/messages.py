@@ -8,6 +8,7 @@ are 1e-9 there, so that the matrix can be inverted.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Generic, TypeVar
@@ -98,6 +99,14 @@ class Diagnostics:
 
     stamp: int
     statuses: tuple[Diagnostic, ...]
+
+
+_CLOCKS_APART: Final = time.time_ns() - time.monotonic_ns()  # ns, once: stamps by arrival never jump
+
+
+def arrival_stamp(arrival: float) -> int:
+    """The stamp (ns, unix time) of a message that came at a time of the monotonic clock, s."""
+    return _CLOCKS_APART + round(arrival * _SECOND)
 
 
 M = TypeVar("M")

@@ -136,6 +136,21 @@ def test_covariances_of_zeros_mean_that_they_are_not_known(tmp_path: Path) -> No
     assert read(write_mcap(tmp_path / "drive", [*wheels, *poses])).trajectories[0].pose_covariances is None
 
 
+@pytest.mark.parametrize("variance", [1.797e308, 0.0, -1.0, np.nan, np.inf])
+def test_poses_of_unknown_covariance_are_read_and_pose_sigma_counts_for_them(tmp_path: Path, variance: float) -> None:
+    wheels = [each for each in messages(DRIVE) if each.topic == WHEELS]
+    poses = [slam_pose(*each) for each in zip(DRIVE.pose_stamps, DRIVE.poses, strict=True)]
+    poses[3:] = [changed(each, pose=each.content["pose"] | {"covariance": [variance] * 36}) for each in poses[3:]]
+    bag, unusable = write_mcap(tmp_path / "drive", [*wheels, *poses]), f"{len(poses) - 3} of {len(poses)} poses"
+    without = read(bag)
+    assert all(run.pose_covariances is None for run in without.trajectories)
+    assert any(f"{unusable} have no usable covariance, so that" in warning for warning in without.warnings)
+    data = read(bag, pose_sigma=[0.2, 3.0])
+    covariances = np.concatenate([run.pose_covariances for run in data.trajectories])
+    np.testing.assert_allclose(covariances[-1], np.diag([0.04, 0.04, np.radians(3.0) ** 2]))
+    assert any(f"{unusable} have no usable covariance: 0.2 m and 3 deg count" in warning for warning in data.warnings)
+
+
 @pytest.mark.parametrize("kind", ["PoseStamped", "TransformStamped"])
 def test_other_types_of_poses_are_read(tmp_path: Path, kind: str) -> None:
     poses = []

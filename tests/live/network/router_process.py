@@ -14,7 +14,6 @@ from pathlib import Path
 import zenoh
 
 from omnibench.config import read_model
-from omnibench.live.network.access_log import log_refused_access
 from omnibench.live.network.session import open_session
 from omnibench.live.network.session_config import SessionConfig
 
@@ -33,7 +32,7 @@ def main(path: Path) -> None:
     def got(sample: zenoh.Sample) -> None:
         say(f"got {sample.key_expr}")
 
-    with log_refused_access(config), open_session(config, "router") as session:
+    with open_session(config, "router") as session:
         subscribers = [session.declare_subscriber(key, got) for key in ("*/joint_states", "*/slam_pose")]
         publishers = [session.declare_publisher(key) for key in ("apr02/odom", "apr03/odom")]
         say("ready")

@@ -41,12 +41,6 @@ class RouterProcess:
     def got(self, key: str) -> int:
         return self.output.read_text().split("\n").count(f"got {key}")
 
-    def has_logged(self, text: str) -> bool:
-        return text in self.errors.read_text()
-
-    def until_logged(self, text: str) -> None:
-        until(lambda: self.has_logged(text), f"{text!r} in {self.errors.read_text()!r}")
-
 
 @contextmanager
 def running(folder: Path, config: dict[str, Any]) -> Iterator[RouterProcess]:

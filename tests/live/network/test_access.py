@@ -18,9 +18,7 @@ from omnibench.live.network.session_config import Access
 
 class TestAccess:
     @pytest.mark.parametrize("declared", [False, True])
-    def test_a_robot_writing_anothers_keys_is_refused_and_logged(
-        self, fleet: RouterProcess, keys: Path, declared: bool
-    ) -> None:
+    def test_a_robot_writing_anothers_keys_is_refused(self, fleet: RouterProcess, keys: Path, declared: bool) -> None:
         with open_session(member(fleet, keys, "apr02"), "apr02") as session:
             works(session, fleet)
             for key in ("apr03/joint_states", "apr03/slam_pose"):
@@ -28,37 +26,34 @@ class TestAccess:
                 put = publisher.put if declared else (lambda value, key=key: session.put(key, value))
                 for _ in range(100):
                     put(b"forged")
-                fleet.until_logged(f"may not write {key}\n")
                 publisher.undeclare()
             works(session, fleet)
         assert fleet.got("apr03/joint_states") == fleet.got("apr03/slam_pose") == 0
-        lines = fleet.errors.read_text().splitlines()
-        assert [line for line in lines if "may not write apr03/joint_states" in line] == lines[:1]  # logged once
-        assert lines[0].startswith("refused: certificate 'apr02' at tls/127.0.0.1:")
 
     def test_a_robot_reads_what_is_its_own_only(self, fleet: RouterProcess, keys: Path) -> None:
         with open_session(member(fleet, keys, "apr02"), "apr02") as session:
             received: list[zenoh.Sample] = []
             subscribers = [session.declare_subscriber(key, received.append) for key in ("apr03/odom", "*/odom", "**")]
             works(session, fleet)
-            for key in ("apr03/odom", "*/odom", "**"):
-                fleet.until_logged(f"may not declare subscriber {key}\n")
+            works(session, fleet)  # by then the router has published apr03/odom, too
             assert {str(sample.key_expr).split("/")[0] for sample in received} == {"apr02"}
             for subscriber in subscribers:
                 subscriber.undeclare()
 
     def test_a_certificate_without_rights_can_do_nothing(self, fleet: RouterProcess, keys: Path) -> None:
-        with open_session(member(fleet, keys, "stranger"), "stranger") as session:
+        with (
+            open_session(member(fleet, keys, "stranger"), "stranger") as stranger,
+            open_session(member(fleet, keys, "apr02"), "apr02") as session,
+        ):
             received: list[zenoh.Sample] = []
-            subscriber = session.declare_subscriber("apr02/odom", received.append)
+            subscriber = stranger.declare_subscriber("*/odom", received.append)
             for _ in range(20):
-                session.put("apr02/joint_states", b"forged")
+                stranger.put("apr03/joint_states", b"forged")
                 time.sleep(0.005)
-            fleet.until_logged("may not declare subscriber apr02/odom")
-            fleet.until_logged("may not write apr02/joint_states")
+            works(session, fleet)
             assert not received
             subscriber.undeclare()
-        assert fleet.got("apr02/joint_states") == 0
+        assert fleet.got("apr03/joint_states") == 0
 
     def test_nodes_serve_operators_through_the_router(self, fleet: RouterProcess, keys: Path) -> None:
         with (
@@ -80,8 +75,6 @@ class TestAccess:
             until(lambda: alive(viewer, "omnibench/*/alive") == ["omnibench/apr07/alive"], "the token")
             assert fleet.errors.read_text() == ""
             assert answers(viewer, "omnibench/apr07/set_pose") == []
-            fleet.until_logged("certificate 'viewer' at")
-            assert fleet.has_logged("may not ask omnibench/apr07/set_pose")
             for each in (*served, token):
                 each.undeclare()
 
@@ -103,16 +96,16 @@ class TestAccess:
                 "omnibench/apr07/calibration", lambda each: received.append(bytes(each.payload))
             )
 
-            def again() -> bool:
-                operator.put("omnibench/apr07/calibration", b"operator")
-                return b"operator" in received
+            def passed(payload: bytes) -> bool:
+                operator.put("omnibench/apr07/calibration", payload)
+                return payload in received
 
-            until(again, "the operator's calibration")
+            until(lambda: passed(b"before"), "the operator's calibration")
             for session in (viewer, robot):
                 session.put("omnibench/apr07/calibration", b"forged")
-            fleet.until_logged("certificate 'viewer' at")
-            fleet.until_logged("certificate 'apr02' at")
-            assert set(received) == {b"operator"}
+                answers(session, "omnibench/apr07/health")  # the router has had the forgery when this ends
+            until(lambda: passed(b"after"), "the operator's calibration")
+            assert set(received) == {b"before", b"after"}
             subscriber.undeclare()
 
     def test_tokens_of_ros_nodes_pass(self, fleet: RouterProcess, keys: Path) -> None:
@@ -147,13 +140,6 @@ class TestAccess:
             assert received == [b"before"]
             subscriber.undeclare()
             publisher.undeclare()
-
-    def test_a_flood_of_forgeries_is_logged_in_a_few_lines(self, fleet: RouterProcess, keys: Path) -> None:
-        with open_session(member(fleet, keys, "apr02"), "apr02") as session:
-            for number in range(2000):
-                session.put(f"apr03/forged_{number}", b"x", congestion_control=zenoh.CongestionControl.BLOCK)
-            works(session, fleet)
-        assert 0 < len(fleet.errors.read_text().splitlines()) <= 25
 
     def test_rights_in_every_profile(self) -> None:
         rights = rights_of(Access.model_validate({"robots": {"apr02": "robot 2"}}))

@@ -1,10 +1,9 @@
-"""Intruders against a router in its own process: they are refused and logged, and peers get in."""
+"""Intruders against a router in its own process: they are refused, and peers get in."""
 
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
+import re
 import time
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import zenoh
 from routers import RouterProcess, member, mutual, refusal, running, user, works
 from sessions import free_port, until
 
-from omnibench.live.network.access_log import AccessLog
+from omnibench.cli.handbook_topics import find_topic
 from omnibench.live.network.session import open_session, zenoh_config
 from omnibench.live.network.session_config import SessionConfig, Tls, User
 
@@ -28,20 +27,17 @@ class TestMutualTls:
             *("ready", "got apr02/joint_states", "got apr03/joint_states", "")
         }
 
-    def test_another_authority_is_refused_and_logged(self, fleet: RouterProcess, keys: Path) -> None:
+    def test_another_authority_is_refused(self, fleet: RouterProcess, keys: Path) -> None:
         text = refusal(member(fleet, keys / "other", "apr02", ca=keys / "ca.pem"))
         assert "our certificate is not from its authority" in text
-        fleet.until_logged("refused: a connection: invalid peer certificate: UnknownIssuer")
 
-    def test_no_certificate_is_refused_and_logged(self, fleet: RouterProcess, keys: Path) -> None:
+    def test_no_certificate_is_refused(self, fleet: RouterProcess, keys: Path) -> None:
         tls = Tls(ca=keys / "ca.pem", mutual=False)
         assert "it asks for a certificate" in refusal(SessionConfig(mode="client", connect=(fleet.address,), tls=tls))
-        fleet.until_logged("refused: a connection: peer sent no certificates")
 
-    def test_no_encryption_is_refused_and_logged(self, fleet: RouterProcess) -> None:
+    def test_no_encryption_is_refused(self, fleet: RouterProcess) -> None:
         plain = fleet.address.replace("tls", "tcp")
         assert "asks for TLS" in refusal(SessionConfig(mode="client", connect=(plain,)))
-        fleet.until_logged("refused: a connection: received corrupt message")
 
     def test_a_router_of_another_authority_is_refused_by_its_client(self, fleet: RouterProcess, keys: Path) -> None:
         text = refusal(member(fleet, keys, "apr02", ca=keys / "other" / "ca.pem"))
@@ -76,8 +72,7 @@ class TestMutualTls:
             for _ in range(20):
                 publisher.put(b"forged")
                 time.sleep(0.005)
-            fleet.until_logged("refused: a connection: invalid peer certificate: UnknownIssuer")
-            assert not session.info.routers_zid()
+                assert not session.info.routers_zid()
         assert fleet.got("apr02/joint_states") == 0
 
     def test_a_router_that_is_refused_elsewhere_does_not_open(
@@ -93,9 +88,9 @@ class TestMutualTls:
             works(session, fleet)
             refusal(member(fleet, keys / "other", "apr02", ca=keys / "ca.pem"))
             with open_session(member(fleet, keys, "stranger"), "stranger") as stranger:
-                stranger.put("apr02/joint_states", b"forged")
-                fleet.until_logged("certificate 'stranger'")
+                stranger.put("apr03/joint_states", b"forged")
                 works(session, fleet)
+        assert fleet.got("apr03/joint_states") == 0
 
 
 class TestUsers:
@@ -105,78 +100,35 @@ class TestUsers:
         assert users.errors.read_text() == ""
 
     @pytest.mark.parametrize(
-        ("who", "reason"),
-        [("apr02", "wrong password"), ("nobody", "unknown user"), (None, "no user and password given")],
+        "who",
+        ["apr02", "nobody", None],
     )
-    def test_wrong_ones_are_refused_and_logged(self, users: RouterProcess, who: str | None, reason: str) -> None:
+    def test_wrong_ones_are_refused(self, users: RouterProcess, who: str | None) -> None:
         shown = None if who is None else User.model_validate({"name": who, "password": "guessed"})
         text = refusal(SessionConfig(mode="client", connect=(users.address,), user=shown))
         assert "may ask for a user and password" in text if who is None else f"refuses user '{who}'" in text
-        users.until_logged(f": {reason}\n")
-        assert users.has_logged("refused: tcp/127.0.0.1:")
 
     def test_a_users_rights_are_its_own(self, users: RouterProcess, keys: Path) -> None:
         with open_session(user(users, keys, "apr02"), "apr02") as session:
-
-            def refused() -> bool:
-                session.put("apr03/joint_states", b"forged")
-                return users.has_logged("user 'apr02' at tcp/127.0.0.1:")
-
-            until(refused, "the refusal in the log")
-            assert users.has_logged("may not write apr03/joint_states")
+            session.put("apr03/joint_states", b"forged")
             works(session, users)
         assert users.got("apr03/joint_states") == 0
 
 
-class TestLog:
-    def test_lines_that_are_not_zenohs_are_left_alone(self) -> None:
-        warnings: list[str] = []
-        access_log = AccessLog(warnings.append)
-        assert not access_log.read("a table of the program, with words as unauthorized to Put in it")
-        assert not warnings
-
-    def test_what_is_only_looked_up_is_not_logged(self) -> None:
-        warnings: list[str] = []
-        access_log = AccessLog(warnings.append)
-        head = "2026-11-21T08:51:04.100951Z TRACE  rx-1 ThreadId(10) zenoh::net::routing::interceptor"
-        subject = "Interface(lo)+CertCommonName(apr02)+Transport(Tls)+3f"
-        assert access_log.read(
-            f"{head}::access_control: 3f on {subject} is unauthorized to Put (ingress) on apr03/odom"
-        )
-        assert not warnings
-        assert access_log.read(f"{head}: Msg intercepted!")
-        assert warnings == ["refused: certificate 'apr02' at an unknown address: may not write apr03/odom"]
-        assert access_log.count == 1
-
-    def test_the_programs_own_output_comes_out_as_it_was_written(self, keys: Path, tmp_path: Path) -> None:
-        config = tmp_path / "router.yaml"
-        config.write_text(json.dumps(mutual(keys)))
-        process = subprocess.run([sys.executable, "-c", _PROGRAM, str(config)], capture_output=True, check=False)
-        assert (process.returncode, process.stderr) == (0, b"")
-        assert sorted(process.stdout.split(b"\n")) == [b"before", b"of a child", b"printed", b"unended"]
-
-    @pytest.mark.parametrize(("variable", "logged"), [("off", False), ("zenoh_link_tls=warn", True)])
-    def test_rust_log_asks_for_zenohs_own_log(
-        self, keys: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, variable: str, logged: bool
+class TestZenohsOwnLog:
+    @pytest.mark.parametrize("asked", [True, False])
+    def test_it_names_who_was_refused_what_if_the_guides_line_asks_for_it(
+        self, keys: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, asked: bool
     ) -> None:
-        monkeypatch.setenv("RUST_LOG", variable)
+        line = re.search(r"RUST_LOG=(\S+)", find_topic("live").text)
+        assert line is not None
+        monkeypatch.setenv("RUST_LOG", line[1] if asked else "off")
         with running(tmp_path / "router", mutual(keys)) as router:
             refusal(member(router, keys / "other", "apr02", ca=keys / "ca.pem"))
-            until(lambda: not logged or "UnknownIssuer" in router.output.read_text(), "Zenoh's own log")
-            assert not router.has_logged("UnknownIssuer")
-
-
-_PROGRAM = """
-import os, subprocess, sys
-from pathlib import Path
-from omnibench.config import read_model
-from omnibench.live.network.access_log import log_refused_access
-from omnibench.live.network.session import open_session
-from omnibench.live.network.session_config import SessionConfig
-config = read_model(SessionConfig, Path(sys.argv[1]))
-print("before")
-with log_refused_access(config), open_session(config, "router"):
-    print("printed")
-    subprocess.run(["echo", "of a child"], check=True)
-print("unended", end="")
-"""
+            with open_session(member(router, keys, "apr02"), "apr02") as session:
+                session.put("apr03/joint_states", b"forged")
+                works(session, router)
+            refused = ("UnknownIssuer", r"CertCommonName\(apr02\).* is unauthorized to Put .* on apr03/joint_states")
+            for pattern in refused:
+                until(lambda wanted=pattern: bool(re.search(wanted, router.output.read_text())) or not asked, pattern)
+                assert bool(re.search(pattern, router.output.read_text())) == asked

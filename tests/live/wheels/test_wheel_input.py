@@ -253,6 +253,22 @@ def test_a_clock_that_is_set_by_less_than_a_second_neither_adds_nor_loses_motion
     )
     np.testing.assert_allclose(receiver.driven, [3.98, 1.99, 0], atol=0.25 if rates else 1e-9)
     assert receiver.counts.clock_jumps == 1
+    unsure = rates and jump > -0.2  # a clock that goes back by more is no other explanation's
+    assert (max(step.blind for step in receiver.steps) > 0.1) == unsure
+
+
+@pytest.mark.parametrize("begin", [1, 100])
+def test_samples_lost_after_a_late_one_are_missing_and_no_way_is_lost_with_them(begin: int) -> None:
+    lost = range(begin + 1, begin + 20)
+    times = [PERIOD * k for k in range(200) if k not in lost]
+    arrivals = [time + 0.15 * (time == PERIOD * begin) for time in times]
+    receiver = Receiver()
+    receiver.take(*[at(time, 2.0, 1.0, 0.0, rates=True) for time in times], arrivals=arrivals)
+    np.testing.assert_allclose(receiver.driven, [3.98, 1.99, 0], atol=1e-9)
+    assert receiver.counts.clock_jumps == 0
+    assert receiver.counts.missing == (19 if begin == 100 else 0)  # the period is not known before
+    blind = [step.blind for step in receiver.steps if step.blind]
+    assert blind == pytest.approx([0.19])
 
 
 def test_samples_farther_apart_than_a_gap_are_taken_one_by_one() -> None:

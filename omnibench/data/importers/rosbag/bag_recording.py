@@ -84,7 +84,7 @@ def read_recording(path: Path, name: str, options: RosbagOptions, warnings: list
         if reference is not None and reference.type == TRANSFORMS:
             poses = read_transforms(bag, reference, options.pose_frames, warnings)
         elif reference is not None:
-            poses = read_poses(bag, reference, warnings)
+            poses = read_poses(bag, reference, warnings, sigma=options.pose_sigma)
         cuts = _read_cuts(bag, commands, wheels) if commands else []
         scans = read_scans(bag, scan, options.scanner_mount, warnings) if scan else None
         sensors = read_sensors(bag, sensed, int(wheels.stamps[0]), options, warnings)

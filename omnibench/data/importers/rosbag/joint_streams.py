@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from omnibench.data.importers.encoder_options import Quantity
 from omnibench.data.importers.rosbag.bag import Bag, Topic
-from omnibench.data.importers.rosbag.joint_choice import JointChoice
 from omnibench.data.importers.rosbag.message_streams import MessageFilter, Stamps, possible
 from omnibench.data.importers.rosbag.rosbag_options import RosbagOptions, Use
 from omnibench.data.importers.rosbag.topic_choice import JointTopics
@@ -21,6 +20,7 @@ from omnibench.data.importers.wheel_samples import WheelReadings
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
 from omnibench.robot.planar import interpolated
+from omnibench.robot.wheels.joint_choice import JointChoice
 
 # A longer gap while the robot drives ends a stretch, since a constant twist does not describe it (chosen):
 _LONGEST_GAP = 0.5  # s, and

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -13,6 +13,7 @@ from omnibench.data.importers.orientation import planar_headings
 from omnibench.data.importers.rosbag.bag import Bag, Record, Topic
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
+from omnibench.robot.planar import pose_covariance, usable_covariances
 from omnibench.words import plural
 
 T = TypeVar("T")
@@ -22,6 +23,7 @@ _SECOND = 1_000_000_000  # ns
 _NO_STAMP = "without a header stamp (it is 0)"
 _MOST_SET_BACK = 20  # messages that may come over a second late; more mean a clock that was set back (chosen)
 _LARGEST = 1e9  # m; a larger value is garbage
+_UNKNOWN = np.zeros((3, 3))  # covariance of a pose that comes without one
 _PLANAR = np.ix_((0, 1, 5), (0, 1, 5))  # x, y and yaw of a covariance of x, y, z, roll, pitch, yaw
 
 
@@ -35,11 +37,15 @@ class PoseStream:
 
 
 def read_poses(
-    bag: Bag, topic: Topic, warnings: list[str], part: Callable[[Any], Any] = lambda message: message
+    bag: Bag,
+    topic: Topic,
+    warnings: list[str],
+    part: Callable[[Any], Any] = lambda message: message,
+    sigma: tuple[float, float] | None = None,
 ) -> PoseStream:
     """Planar poses of messages, or of the ``part`` of each that has one; what is left out is added to ``warnings``.
 
-    DataError.
+    sigma: standard deviations (m, deg) of poses whose covariance is unknown. DataError.
     """
     messages = MessageFilter(bag, topic, part)
     rows, covariances, numbers, stamps = [], [], [], []
@@ -60,7 +66,19 @@ def read_poses(
     messages.require(len(order))
     warnings.extend(messages.warnings())
     poses = np.column_stack([table[:, :2], headings.headings])[order]
-    return PoseStream(stamp_array[order], poses, _known([covariances[index] for index in order]))
+    table = np.array([_UNKNOWN if covariances[index] is None else covariances[index] for index in order])
+    usable = usable_covariances(table)
+    unknown = (
+        f"{bag.path}: topic {topic.name}: {np.sum(~usable)} of {plural(len(order), 'pose')} have no usable covariance"
+    )
+    if sigma is not None:
+        table[~usable] = pose_covariance(*sigma)
+        if not usable.all():
+            warnings.append(f"{unknown}: {sigma[0]:g} m and {sigma[1]:g} deg count for them (pose_sigma)")
+        return PoseStream(stamp_array[order], poses, table)
+    if usable.any() and not usable.all():
+        warnings.append(f"{unknown}, so that those of the others are left out; set pose_sigma=[m,deg] to use them")
+    return PoseStream(stamp_array[order], poses, table if usable.all() else None)
 
 
 def header_stamp(message: Any) -> int:
@@ -185,13 +203,3 @@ def _pose(message: Any) -> tuple[tuple[float, ...], Array | None]:
             pose, covariance = pose.pose, np.reshape(pose.covariance, (6, 6))[_PLANAR]
         place, turn = pose.position, pose.orientation
     return (place.x, place.y, turn.x, turn.y, turn.z, turn.w), covariance
-
-
-def _known(covariances: Sequence[Array | None]) -> Array | None:
-    """Covariances (K, 3, 3), or None unless every pose has one; in ROS zeros and -1 mean that it is not known."""
-    known = [each for each in covariances if each is not None]
-    if len(known) < len(covariances):
-        return None
-    table = np.array(known, dtype=float)
-    usable = np.isfinite(table).all() and (np.diagonal(table, axis1=1, axis2=2) > 0).all()
-    return table if usable else None

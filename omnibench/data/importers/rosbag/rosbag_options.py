@@ -38,6 +38,11 @@ class RosbagOptions(EncoderOptions):
         "ending in slam_pose; or, if independent of the wheels, Odometry or tf",
     )
     pose_frames: Names = Field((), description="with a tf pose_topic: frame of the reference, and the tracked one")
+    pose_sigma: tuple[Positive, Positive] | None = Field(
+        None,
+        description="m and deg, standard deviations of poses whose covariance is unknown (0, negative, NaN, huge); "
+        "default: if one is, no pose's counts",
+    )
     references: Names = Field(
         (),
         description="sensor_msgs/NavSatFix and Imu that are references, as [/fix,/imu]; default: those that there are, "

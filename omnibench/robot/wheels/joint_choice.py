@@ -1,4 +1,4 @@
-"""Choice of the joints in a topic's messages that are the robot's wheels, or the axles that steer them."""
+"""Choice of the joints in messages that are the robot's wheels, or the axles that steer them: of bags and live."""
 
 from __future__ import annotations
 
@@ -41,13 +41,18 @@ class JointChoice:
             return tuple(found.index(name) for name in wanted)
         if self.asked:
             return None
-        cores = [_core(name, self.steering) for name in found]
-        places = [[place for place, core in enumerate(cores) if core == _core(wheel)] for wheel in self.wheels]
-        if self.steering and len(self.wheels) == 1 and not places[0]:
-            places = [[place for place, core in enumerate(cores) if core is not None]]  # steering_joint
+        places = [self.matching(wheel, found) for wheel in self.wheels]
         if not all(len(each) == 1 for each in places) or len({each[0] for each in places}) < len(places):
             return None
         return tuple(each[0] for each in places)
+
+    def matching(self, wheel: str, found: Sequence[str]) -> list[int]:
+        """Indices of the joints that are called like a wheel, but for words such as ``wheel``, ``joint`` and case."""
+        cores = [_core(name, self.steering) for name in found]
+        places = [place for place, core in enumerate(cores) if core == _core(wheel)]
+        if self.steering and len(self.wheels) == 1 and not places:
+            places = [place for place, core in enumerate(cores) if core is not None]  # steering_joint
+        return places
 
     def not_found(self, place: str, found: Sequence[str]) -> ConfigError:
         """The error of a topic whose messages never hold all that is wanted; it lists the joints found."""
