@@ -1,6 +1,7 @@
 """Coverage of the printed 95 % intervals of shrunk and of kept calibrations, for seven classes of robots.
 
     python tests/benchmarks/shrink_coverage.py --out coverage.jsonl --sets 1000 [--robots skid] [--table]
+    python tests/benchmarks/shrink_coverage.py --out slip.jsonl --slip 5
 
 One line of JSON a set, added as it comes: run again with the same file, and it goes on where it was.
 
@@ -17,8 +18,9 @@ the prior that shrinkage assumes (fit/shrinkage/prior.py). Standard deviations, 
 - tricycle, car, swerve: the place of a wheel 3 mm, the zero of a driven wheel's steering angle 0.5 degrees; of tricycle
   and car the tracked point 3 cm along x and y, and 1 degree of its heading.
 
-Eight commands are driven, three times each, for 4 s. Every run slips by 0.5 % ahead and aside and by 1 % in turns; its
-reference poses, the start too, are off by 2 mm and 3 mrad each, and all together by 2 mm and 2 mrad.
+Eight commands are driven, three times each, for 4 s. The reference poses of a run, the start too, are off by 2 mm and
+3 mrad each, and all together by 2 mm and 2 mrad. Every run slips by 0.1 % ahead and aside and by 0.2 % in turns, which
+--slip multiplies.
 
 What is counted: elements of a row that have an interval, and the row along its own motion (x ahead, y aside, the turn
 on the spot), with the elements' mean quantile of Student's t. Intervals are said to hold if the design is right along
@@ -53,7 +55,7 @@ ANSWERS: tuple[Unidentified, ...] = ("shrink", "keep")
 ROWS = ("x", "y", "turn")
 PERIOD, SAMPLES, EVERY = 0.2, 20, 4  # s, samples of a run, samples between reference poses
 REPETITIONS = 3
-SLIP = np.array([0.005, 0.005, 0.01])  # of the motions ahead, aside and in turns, each run
+SLIP = np.array([0.001, 0.001, 0.002])  # of the motions ahead, aside and in turns, each run
 WHITE, OF_RUN = np.array([0.002, 0.002, 0.003]), np.array([0.002, 0.002, 0.002])  # m, m, rad
 DRIVEN = 0.1  # share of the strongest direction of drive signals: what is driven less keeps the design
 WANTED = (0.93, 0.97)
@@ -231,7 +233,7 @@ def signals(name: str, rates: Sequence[float], angles: Sequence[float]) -> list[
     return [part for rate, a in zip(rates, angles, strict=True) for part in (rate * math.cos(a), rate * math.sin(a))]
 
 
-def simulated(name: str, seed: int, repetitions: int = REPETITIONS) -> tuple[Dataset, Array, Array]:
+def simulated(name: str, seed: int, repetitions: int = REPETITIONS, slip: float = 1.0) -> tuple[Dataset, Array, Array]:
     """Recordings of a robot; its true matrix (3, M), as drawn along what they do not drive; its motions (3, M).
 
     Motions are directions of drive signals, of length one; zero for a motion that the robot cannot make.
@@ -247,7 +249,7 @@ def simulated(name: str, seed: int, repetitions: int = REPETITIONS) -> tuple[Dat
         moved.append(truth.tracked @ command)
         for repetition in range(repetitions):
             stamps = PERIOD * np.arange(0, SAMPLES + 1, EVERY)
-            poses = arc(truth.tracked @ (command * (1 + SLIP * rng.standard_normal(3))), stamps)
+            poses = arc(truth.tracked @ (command * (1 + slip * SLIP * rng.standard_normal(3))), stamps)
             poses += OF_RUN * rng.standard_normal(3) + WHITE * rng.standard_normal(poses.shape)
             runs.append(
                 Trajectory(
@@ -298,9 +300,9 @@ class Row:
         return float(np.mean(np.array(self.elements[row]) <= 1)) if self.elements[row] else None
 
 
-def covered(name: str, answer: Unidentified, seed: int, repetitions: int = REPETITIONS) -> Row:
+def covered(name: str, answer: Unidentified, seed: int, repetitions: int = REPETITIONS, slip: float = 1.0) -> Row:
     """Calibrate one set and compare its intervals with the truth."""
-    dataset, truth, motions = simulated(name, seed, repetitions)
+    dataset, truth, motions = simulated(name, seed, repetitions, slip)
     run = calibrate(dataset, unidentified=answer, seed=seed)
     off = run.calibration.matrix_array - truth
     errors = (np.sum(off * motions, axis=1) / dataset.robot.row_scales).round(6).tolist()
@@ -323,9 +325,9 @@ def covered(name: str, answer: Unidentified, seed: int, repetitions: int = REPET
     return Row(name, answer, seed, elements, along, errors, known.source)
 
 
-def both_answers(name: str, seed: int, repetitions: int) -> list[Row]:
+def both_answers(name: str, seed: int, repetitions: int, slip: float) -> list[Row]:
     """Both answers to one set."""
-    return [covered(name, answer, seed, repetitions) for answer in ANSWERS]
+    return [covered(name, answer, seed, repetitions, slip) for answer in ANSWERS]
 
 
 def read_rows(path: Path) -> list[Row]:
@@ -334,12 +336,14 @@ def read_rows(path: Path) -> list[Row]:
     return [Row(**json.loads(line)) for line in lines]
 
 
-def carry_out(missing: Sequence[tuple[str, int]], path: Path, repetitions: int, workers: int) -> Iterator[Row]:
+def carry_out(
+    missing: Sequence[tuple[str, int]], path: Path, repetitions: int, slip: float, workers: int
+) -> Iterator[Row]:
     """Calibrate sets and add their rows to the file at once."""
     written = path.read_bytes() if path.exists() else b""
     path.write_bytes(written[: written.rfind(b"\n") + 1])
     with one_thread(), ProcessPoolExecutor(workers) as pool, path.open("a") as file:
-        for done in as_completed([pool.submit(both_answers, name, seed, repetitions) for name, seed in missing]):
+        for done in as_completed([pool.submit(both_answers, *one, repetitions, slip) for one in missing]):
             rows = done.result()
             file.write("".join(json.dumps(asdict(row)) + "\n" for row in rows))
             file.flush()
@@ -396,6 +400,7 @@ def main() -> None:
     parser.add_argument("--sets", type=int, default=1000)
     parser.add_argument("--robots", nargs="*", default=list(CLASSES))
     parser.add_argument("--repetitions", type=int, default=REPETITIONS, help="of every command")
+    parser.add_argument("--slip", type=float, default=1.0, help="of every run, as a multiple of the above")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--table", action="store_true", help="only print the table")
     arguments = parser.parse_args()
@@ -405,7 +410,7 @@ def main() -> None:
         missing = [
             (name, seed) for seed in range(arguments.sets) for name in arguments.robots if (name, seed) not in done
         ]
-        rows += carry_out(missing, arguments.out, arguments.repetitions, arguments.workers)
+        rows += carry_out(missing, arguments.out, arguments.repetitions, arguments.slip, arguments.workers)
     print("\n".join(table(rows)))
 
 

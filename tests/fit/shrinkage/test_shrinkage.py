@@ -153,14 +153,14 @@ def test_correlations_that_few_runs_show_by_chance_do_not_bend_the_turn_of_a_dif
 
 def test_intervals_of_shrunk_answers_hold_the_truth_of_skid_bases() -> None:
     """Rows y and turn of five bases; 30 % held it when the centre of turning counted as known."""
-    rows = [covered("skid", "shrink", seed, repetitions=1) for seed in range(5)]
+    rows = [covered("skid", "shrink", seed, repetitions=1, slip=5.0) for seed in range(5)]
     ratios = np.array([row.elements[1:] for row in rows])
     assert np.mean(ratios <= 1) > 0.8
 
 
 def moved_by_shrinking(name: str, seeds: range) -> Array:
     """Difference of the turn on the spot between shrunk and kept answers, share of row 3's largest element."""
-    answers = [[covered(name, answer, seed, repetitions=1).errors[2] for answer in ANSWERS] for seed in seeds]
+    answers = [[covered(name, answer, seed, repetitions=1, slip=5.0).errors[2] for answer in ANSWERS] for seed in seeds]
     return np.diff(np.array(answers), axis=1)
 
 
