@@ -47,6 +47,13 @@ def test_a_design_that_may_be_anything_leaves_the_answer_as_it_is() -> None:
     np.testing.assert_allclose(shrunk(1e3).calibration.matrix_array, kept, rtol=0, atol=1e-9)
 
 
+def test_a_design_that_may_be_anything_leaves_the_scatter_of_the_runs_as_the_uncertainty() -> None:
+    free, wide = calibrate(RECORDING, unidentified="keep").uncertainty, shrunk(1e3).uncertainty
+    assert free is not None
+    assert wide is not None
+    np.testing.assert_allclose(wide.covariance, free.covariance, rtol=1e-4, atol=1e-14)
+
+
 def test_a_design_that_is_exact_is_the_answer() -> None:
     np.testing.assert_allclose(shrunk(1e-9).calibration.matrix_array, DESIGN, rtol=0, atol=1e-9)
 
