@@ -17,6 +17,7 @@ from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrate import CalibrationRun, calibrate
 from omnibench.fit.certify import certify_optimum
+from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.shrinkage.prior import TOLERANCES, default_mount, default_unidentified, prior_root, tolerance_of
 from omnibench.robot.kinematics import Array
 from omnibench.testing.synthetic import synthetic_robot
@@ -147,6 +148,13 @@ def test_the_prior_has_the_stated_widths() -> None:
     np.testing.assert_allclose(deviations[0], np.sqrt(elements**2 + rows[0] ** 2 + along**2), rtol=1e-9)
     np.testing.assert_allclose(deviations[1], np.sqrt(elements**2 + along**2 + across**2), rtol=1e-9)
     np.testing.assert_allclose(deviations[2], np.hypot(elements, rows[2]), rtol=1e-9)
+
+
+def test_a_tracked_point_that_is_fitted_may_stand_centimetres_off() -> None:
+    root = MatrixElements(TRICYCLE, "row", np.zeros((0, 2)), known_mount=False).prior_root
+    deviations = np.sqrt(np.diag(root @ root.T)).reshape(3, -1)
+    turning = 0.05 * np.abs(TRICYCLE.inverse_kinematic_matrix[2])  # m per rad of wheel
+    assert (deviations[:2] >= turning).all()
 
 
 def test_a_centre_of_turning_that_is_not_in_the_middle_leaves_a_skid_base_its_turn() -> None:
