@@ -248,7 +248,7 @@ def simulated(name: str, seed: int, repetitions: int = REPETITIONS, slip: float 
         driven.append(signals(name, rates, angles))
         moved.append(truth.tracked @ command)
         for repetition in range(repetitions):
-            stamps = PERIOD * np.arange(0, SAMPLES + 1, EVERY)
+            stamps = np.linspace(0.0, PERIOD * SAMPLES, SAMPLES // EVERY + 1)
             poses = arc(truth.tracked @ (command * (1 + slip * SLIP * rng.standard_normal(3))), stamps)
             poses += OF_RUN * rng.standard_normal(3) + WHITE * rng.standard_normal(poses.shape)
             runs.append(
@@ -362,7 +362,7 @@ def holm(chances: Sequence[float]) -> list[float]:
     scaled = np.array(chances)[order] * np.arange(len(chances), 0, -1)
     adjusted = np.empty(len(chances))
     adjusted[order] = np.minimum(np.maximum.accumulate(scaled), 1.0)
-    return adjusted.tolist()  # type: ignore[no-any-return]
+    return adjusted.tolist()
 
 
 def table(rows: Iterable[Row]) -> Iterator[str]:
