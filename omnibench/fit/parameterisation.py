@@ -137,7 +137,8 @@ class MatrixElements:
 
     @property
     def prior_root(self) -> Array:
-        return self.projection @ prior_root(self.robot, tolerance_of(self.robot, self.tolerance))
+        tolerance = tolerance_of(self.robot, self.tolerance)
+        return self.projection @ prior_root(self.robot, tolerance, fitted_mount=not self.known_mount)
 
     @cached_property
     def rows(self) -> Array:
