@@ -1,9 +1,10 @@
-"""Writing results: files that are complete or not there, and folders that hold nothing else."""
+"""Files: checked before they are read, written whole or not at all; folders that hold nothing else."""
 
 from __future__ import annotations
 
 import os
 import shutil
+import stat
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
@@ -11,11 +12,12 @@ from datetime import datetime
 from errno import EACCES, EDQUOT, EFBIG, EIO, EISDIR, ENOSPC, EPERM, EROFS
 from io import BytesIO
 from pathlib import Path
-from typing import Literal
-
-import polars as pl
+from typing import TYPE_CHECKING, Literal
 
 from omnibench.errors import ConfigError, DataError
+
+if TYPE_CHECKING:
+    import polars as pl
 
 RESULTS = Path("results")  # the folder of results, where the user names none
 TableFormat = Literal["parquet", "csv"]
@@ -25,6 +27,7 @@ FileContent = bytes | Callable[[Path], None]
 _IS_A_FOLDER = "is a folder; name a file"
 _MORE_SPACE = "free space or choose another place"
 _MORE_RIGHTS = "get permission to write there or choose another place"
+_NO_TEXT = "cannot be read: it is not a text file in UTF-8; save it so (CSV UTF-8), or leave it out"
 _LEAST_SPACE = 1 << 16  # bytes: a calibration or the tables of a small comparison
 _WAYS_OUT = {
     ENOSPC: _MORE_SPACE,
@@ -34,6 +37,46 @@ _WAYS_OUT = {
     EACCES: _MORE_RIGHTS,
     EPERM: _MORE_RIGHTS,
 }
+
+MOST_TEXT = 1 << 30  # bytes of a text that is read whole, as tables are; chosen
+_SPECIAL = {stat.S_IFIFO: "pipe", stat.S_IFCHR: "device", stat.S_IFBLK: "device", stat.S_IFSOCK: "socket"}
+
+
+def check_file(path: Path, most: int | None = None, *, text: bool = False) -> None:
+    """DataError in one line unless a path is a file that may be read, of at most ``most`` bytes; links are followed.
+
+    Pipes and devices may have no end, and nobody may write to them. text: refuse one with holes, which are zero bytes.
+    """
+    try:
+        status = path.stat()
+        if stat.S_ISDIR(status.st_mode):
+            raise DataError(f"{path}: is a folder; name the file in it")
+        if not stat.S_ISREG(status.st_mode):
+            kind = _SPECIAL.get(stat.S_IFMT(status.st_mode), "special file")
+            raise DataError(f"{path}: is a {kind}; write its content to a file, and name that")
+        if most is not None and status.st_size > most:
+            raise DataError(f"{path}: has {status.st_size:,} bytes, more than the {most:,} that such a file may have")
+        with path.open("rb") as file:
+            looked_for = text and status.st_size > 0 and hasattr(os, "SEEK_HOLE")
+            if looked_for and os.lseek(file.fileno(), 0, os.SEEK_HOLE) < status.st_size:
+                raise DataError(f"{path}: {_NO_TEXT}")
+    except FileNotFoundError:
+        raise DataError(f"{path}: no such file") from None
+    except (OSError, ValueError) as error:  # ValueError: a zero byte in the path
+        raise DataError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+
+
+def read_text(path: Path, most: int = MOST_TEXT) -> str:
+    """The text of a file of at most ``most`` bytes, in UTF-8. DataError as for ``check_file``; it is no such text."""
+    check_file(path, most, text=True)
+    try:
+        with path.open("rb") as file:  # files of /proc tell no size
+            content = file.read(most)
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise DataError(f"{path}: {_NO_TEXT}") from None
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read: {error.strerror or error}") from None
 
 
 @contextmanager

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.errors import DataError, nearest
+from omnibench.files import read_text
 from omnibench.robot.kinematics import Array
 
 if TYPE_CHECKING:
@@ -243,18 +244,6 @@ def row_error(file: Path, row: int, line: int, what: str) -> DataError:
     """The error of one row (0 is the first) of a text file, with its line where that is another number."""
     place = f"row {row + 1}" if line == row + 1 else f"row {row + 1} (line {line})"
     return DataError(f"{file}, {place}: {what}")
-
-
-def read_text(file: Path) -> str:
-    """The text of a file; DataError when it cannot be read."""
-    try:
-        return file.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise DataError(f"{file}: no such file") from None
-    except UnicodeDecodeError:
-        raise DataError(f"{file}: is not a text file in UTF-8; save it so (CSV UTF-8), or leave it out") from None
-    except OSError as error:
-        raise DataError(f"{file}: cannot be read: {error.strerror or error}") from None
 
 
 def _read_parquet(file: Path) -> CellTable:
