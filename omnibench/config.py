@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
 
@@ -99,8 +99,8 @@ class _Scalars(yaml.SafeLoader):
         text: str = event.value
         text.encode()
         plain = event.implicit[0] and len(text) <= _LONGEST_NUMBER
-        tag = self.resolve(yaml.ScalarNode, text, (True, False)) if plain else None  # type: ignore[no-untyped-call]
-        construct = self.yaml_constructors.get(tag) if tag else None
+        tag: str = self.resolve(yaml.ScalarNode, text, (True, False)) if plain else ""  # type: ignore[no-untyped-call]
+        construct = self.yaml_constructors.get(tag)
         return text if construct is None else construct(self, yaml.ScalarNode(tag, text))
 
 
@@ -125,14 +125,14 @@ class _Document:
     """
 
     def __init__(self, text: str, most: int) -> None:
-        self._events = yaml.parse(text, Loader=_PARSER)
+        self._events: Iterator[Any] = yaml.parse(text, Loader=_PARSER)
         self._most = self._left = most
         self._scalars = _Scalars("")
 
     def content(self) -> Any:
         """The values of the text's only document; None if it is empty."""
         next(self._events)  # the stream's start
-        start = next(self._events)
+        start: Any = next(self._events)
         if isinstance(start, yaml.StreamEndEvent):
             return None
         if start.version or start.tags:
@@ -175,8 +175,9 @@ class _Document:
         return mapping
 
 
-def _line(event: yaml.Event) -> int:
-    return event.start_mark.line + 1
+def _line(event: Any) -> int:
+    line: int = event.start_mark.line
+    return line + 1
 
 
 class _Dumper(yaml.SafeDumper):
@@ -205,8 +206,8 @@ def parse_yaml(text: str, where: str, most: int = MOST_VALUES) -> Any:
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from None
     except (yaml.YAMLError, ValueError) as error:  # ValueError: an impossible date or number such as 2023-99-99
-        marked = isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None
-        problem = f"line {error.problem_mark.line + 1}: {error.problem}" if marked else error
+        mark = getattr(error, "problem_mark", None)
+        problem = error if mark is None else f"line {mark.line + 1}: {getattr(error, 'problem', error)}"
         raise ConfigError(f"{where}: not valid YAML: {problem}") from None
 
 

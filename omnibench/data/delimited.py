@@ -250,10 +250,9 @@ def _read_parquet(file: Path) -> CellTable:
     """The columns of a Parquet file; dates become seconds since 1970, durations seconds."""
     import polars as pl
 
-    try:
-        frame = pl.read_parquet(file)
-    except (pl.exceptions.PolarsError, OSError) as error:
-        raise DataError(f"{file}: cannot be read: {error}") from None
+    from omnibench.data.stored.stored_rows import read_parquet
+
+    frame = read_parquet(file)
     if frame.is_empty():
         raise NoRowsError(f"{file}: it has no rows")
     columns = [

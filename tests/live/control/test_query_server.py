@@ -240,7 +240,7 @@ def test_a_closed_queue_gives_out_what_waits_and_takes_no_more() -> None:
 def test_a_file_that_is_no_calibration_by_its_size_is_not_sent(loopback: Loopback, tmp_path: Path) -> None:
     file = tmp_path / "recording.yaml"
     file.write_bytes(b"- 1\n" * 2_500_000)
-    with pytest.raises(DataError, match="10000000 bytes are more than a node takes, 131072; is it a calibration file"):
+    with pytest.raises(DataError, match="has 10,000,000 bytes, more than the 131,072 that"):
         swap_calibration(loopback.client(), "apr", file)
 
 
