@@ -1,7 +1,8 @@
 """Calibrate the odometry of wheeled robots, compare calibrators, find missing physics, run the result live."""
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from __future__ import annotations
+
+TYPE_CHECKING = False  # that of ``typing`` would take its import, during which Ctrl-C prints a traceback
 
 # The public names and their modules. A name is imported when it is first asked for, so that the command line starts at
 # once.
@@ -46,6 +47,8 @@ __all__ = list(_PUBLIC)
 __version__: str  # of the installed package, "unknown" in a folder of source files that is not installed
 
 if TYPE_CHECKING:  # imports for type checkers; tests/ground/test_package.py holds them equal to the list
+    from typing import Any
+
     from omnibench.compare.read_config import read_compare_config as read_compare_config
     from omnibench.compare.run import run_comparison as run_comparison
     from omnibench.data.dataset import Dataset as Dataset
@@ -92,6 +95,8 @@ def __getattr__(name: str) -> Any:
             return "unknown"
     if name not in _PUBLIC:
         raise AttributeError(f"module 'omnibench' has no attribute {name!r}")
+    from importlib import import_module
+
     return getattr(import_module(f"omnibench.{_PUBLIC[name]}"), name)
 
 

@@ -1,33 +1,50 @@
 """``omnibench`` and ``python -m omnibench``: every mistake is one line on standard error and an exit code.
 
-Ctrl-C and SIGTERM are handled from the first import on; therefore nothing of omnibench is imported before ``main``
+Ctrl-C and SIGTERM are handled from the first line on; therefore nothing that takes time is imported before ``main``
 runs. The exit code is 128 and the signal's number.
 """
 
+from __future__ import annotations
+
+import _signal  # type: ignore[import-not-found]  # the core of ``signal``, which takes 10 ms to import
 import gc
 import os
-import signal
 import sys
-from contextlib import suppress
-from types import FrameType
-from typing import Any, NoReturn
+
+TYPE_CHECKING = False  # that of ``typing`` would take its import
+if TYPE_CHECKING:
+    from types import FrameType
+    from typing import Any, NoReturn
 
 _PACKAGE = os.path.dirname(__file__)
 _INTERRUPTED = 130  # exit code after Ctrl-C; of another signal once it has come
+_PROGRAM = __name__ == "__main__" or os.path.basename(sys.argv[0]) == "omnibench"  # not imported by another
+_at_work = False  # True while ``main`` runs
 _BEGINS_ANEW = "interrupted; the same command begins anew"  # where a command keeps nothing on the way
 _COMMANDS = os.path.join(_PACKAGE, "cli")
 
 
 def main() -> None:
     """Run the command line."""
-    for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, signal.SIG_DFL)):
-        if signal.getsignal(number) == usual:
-            with suppress(ValueError):  # not in the main thread
-                signal.signal(number, _interrupted)
+    global _at_work
+    _handle_signals()
+    _at_work = True
     try:
         _run(_command_line())
     except KeyboardInterrupt:
         _fail("interrupted", _INTERRUPTED)
+    finally:
+        _at_work = False
+
+
+def _handle_signals() -> None:
+    """Take Ctrl-C and SIGTERM over, unless somebody else has."""
+    for number, usual in ((_signal.SIGINT, _signal.default_int_handler), (_signal.SIGTERM, _signal.SIG_DFL)):
+        if _signal.getsignal(number) == usual:
+            try:
+                _signal.signal(number, _interrupted)
+            except ValueError:  # not in the main thread
+                return
 
 
 def _command_line() -> Any:
@@ -46,13 +63,16 @@ def _command_line() -> Any:
 
 
 def _interrupted(number: int, frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt; end at once during a command's imports, where libraries make it errors of their own."""
+    """Raise KeyboardInterrupt; end at once before and after the work, and during a command's imports.
+
+    Libraries that are being imported make it errors of their own.
+    """
     global _INTERRUPTED
     _INTERRUPTED = 128 + number
-    if _imports_of_a_command(frame):
+    if (_PROGRAM and not _at_work) or _imports_of_a_command(frame):
         os.write(2, b"interrupted\n")
         os._exit(_INTERRUPTED)
-    signal.default_int_handler(number, frame)
+    _signal.default_int_handler(number, frame)
 
 
 def _imports_of_a_command(frame: FrameType | None) -> bool:
@@ -78,6 +98,9 @@ def _run(command: Any) -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="replace")  # a letter that the terminal lacks becomes a ?
+    for argument in sys.argv:
+        if not argument.isprintable() and any("\udc80" <= letter <= "\udcff" for letter in argument):
+            _fail(f"error: {argument}: this name is not in UTF-8; rename the file or folder")
     usage_error: Any = typer.BadParameter.__mro__[1]  # click's UsageError, wherever this Typer keeps it
     try:
         code = command.main(prog_name="omnibench", standalone_mode=False)
@@ -94,6 +117,8 @@ def _run(command: Any) -> None:
     except BrokenPipeError:
         sys.stderr.close()  # the program that read our output has ended
         sys.exit(1)
+    except UnicodeEncodeError as error:  # of a file's name that was found in a folder
+        _fail(f"error: {error.object[:200]}: there is a name in it that is not in UTF-8; rename that file or folder")
     except MemoryError as error:
         _fail(_with_notes("error: out of memory; make the data or the budget smaller", error))
     except OSError as error:  # a disk or a terminal that failed unexpectedly
@@ -129,5 +154,7 @@ def _fail(message: str, code: int = 2) -> NoReturn:
     sys.exit(code)
 
 
+if _PROGRAM:
+    _handle_signals()
 if __name__ == "__main__":
     main()

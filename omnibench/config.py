@@ -5,15 +5,16 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
 
 import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo
 from pydantic_core import ErrorDetails, to_jsonable_python
 
-from omnibench.errors import ConfigError, nearest
+from omnibench.errors import ConfigError, DataError, nearest, shown
+from omnibench.files import read_text
 from omnibench.views import brief
 
 M = TypeVar("M", bound=BaseModel)
@@ -82,29 +83,32 @@ RelativePath = Annotated[Path, AfterValidator(_from_folder)]
 _PATTERN = re.compile(r"\s*([*!&@%`]|\[[^\]]*\].)")
 
 
-class _Loader(yaml.SafeLoader):
-    """YAML 1.1 without its traps: a key given twice is refused, ``1e-6`` is a number."""
+_PARSER: Final = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the fast one in C if PyYAML has it
+# Limits of a YAML document, far above what configs and calibrations need; chosen.
+_MOST_BYTES: Final = 1 << 22  # of a file
+MOST_VALUES: Final = 200_000
+_DEEPEST: Final = 32  # levels of nesting
+_LONGEST_NUMBER: Final = 400  # characters: what is longer is text, since long numbers take quadratic time
 
 
-_MERGE = "tag:yaml.org,2002:merge"  # of the key <<, https://yaml.org/type/merge.html
+class _Scalars(yaml.SafeLoader):
+    """YAML 1.1's values of plain scalars, of which ``1e-6`` is a number, too."""
+
+    def value(self, event: yaml.ScalarEvent) -> Any:
+        """The value of a scalar. ValueError: an impossible date, or text that is not Unicode (lone surrogates)."""
+        text: str = event.value
+        text.encode()
+        plain = event.implicit[0] and len(text) <= _LONGEST_NUMBER
+        tag: str = self.resolve(yaml.ScalarNode, text, (True, False)) if plain else ""  # type: ignore[no-untyped-call]
+        construct = self.yaml_constructors.get(tag)
+        return text if construct is None else construct(self, yaml.ScalarNode(tag, text))
 
 
-def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict[Any, Any]:
-    nodes = [key for key, _ in node.value if key.tag != _MERGE]  # a key beside << takes the place of a merged one
-    keys = [loader.construct_object(key, deep=True) for key in nodes]
-    for index, key in enumerate(keys):
-        if key in keys[:index]:
-            line = nodes[index].start_mark.line + 1
-            raise ConfigError(f"line {line}: key {key!r} is given twice")
-    return loader.construct_mapping(node, deep=True)
-
-
-_Loader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _mapping)
-_Loader.yaml_implicit_resolvers = {
+_Scalars.yaml_implicit_resolvers = {
     first: [(tag, pattern) for tag, pattern in resolvers if tag != "tag:yaml.org,2002:float"]
     for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
 }
-_Loader.add_implicit_resolver(
+_Scalars.add_implicit_resolver(
     "tag:yaml.org,2002:float",
     re.compile(
         r"^[-+]?(?:[0-9][0-9_]*\.[0-9_]*(?:[eE][-+]?[0-9]+)?|\.[0-9]+(?:[eE][-+]?[0-9]+)?|[0-9]+[eE][-+]?[0-9]+"
@@ -114,36 +118,97 @@ _Loader.add_implicit_resolver(
 )
 
 
+class _Document:
+    """Reader of a YAML text that makes values of the parser's events, without aliases, tags and directives.
+
+    most: values that it may have. YAMLError names the line of what is not read; ConfigError: a key is there twice.
+    """
+
+    def __init__(self, text: str, most: int) -> None:
+        self._events: Iterator[Any] = yaml.parse(text, Loader=_PARSER)
+        self._most = self._left = most
+        self._scalars = _Scalars("")
+
+    def content(self) -> Any:
+        """The values of the text's only document; None if it is empty."""
+        next(self._events)  # the stream's start
+        start: Any = next(self._events)
+        if isinstance(start, yaml.StreamEndEvent):
+            return None
+        if start.version or start.tags:
+            raise yaml.YAMLError("directives such as %YAML are not read; leave these lines out")
+        content = self._node(next(self._events), 1)
+        next(self._events)  # the document's end
+        if not isinstance(rest := next(self._events), yaml.StreamEndEvent):
+            raise yaml.YAMLError(f"line {_line(rest)}: a second document begins; keep one")
+        return content
+
+    def _node(self, event: Any, depth: int) -> Any:
+        self._left -= 1
+        if self._left < 0:
+            raise yaml.YAMLError(f"more than {self._most} values")
+        if depth > _DEEPEST:
+            raise yaml.YAMLError(f"line {_line(event)}: nested too deeply")
+        if isinstance(event, yaml.AliasEvent):
+            raise yaml.YAMLError(
+                f"line {_line(event)}: aliases are not read; write out what *{event.anchor} stands for"
+            )
+        if event.tag is not None:
+            raise yaml.YAMLError(f"line {_line(event)}: tags such as !!str are not read; leave it out")
+        if isinstance(event, yaml.ScalarEvent):
+            return self._scalars.value(event)
+        if isinstance(event, yaml.SequenceStartEvent):
+            items = []
+            while not isinstance(event := next(self._events), yaml.SequenceEndEvent):
+                items.append(self._node(event, depth + 1))
+            return items
+        mapping: dict[Any, Any] = {}
+        while not isinstance(event := next(self._events), yaml.MappingEndEvent):
+            key = self._node(event, depth + 1)
+            if isinstance(key, list | dict):
+                raise yaml.YAMLError(f"line {_line(event)}: a key is a {type(key).__name__}, expected a word")
+            if key == "<<" and event.implicit[0]:
+                raise yaml.YAMLError(f"line {_line(event)}: merge keys (<<) are not read; write the keys out")
+            if key in mapping:
+                raise ConfigError(f"line {_line(event)}: key {shown(key)} is given twice")
+            mapping[key] = self._node(next(self._events), depth + 1)
+        return mapping
+
+
+def _line(event: Any) -> int:
+    line: int = event.start_mark.line
+    return line + 1
+
+
 class _Dumper(yaml.SafeDumper):
     """Quotes what the loader would otherwise take for a number."""
 
 
-_Dumper.yaml_implicit_resolvers = _Loader.yaml_implicit_resolvers
+_Dumper.yaml_implicit_resolvers = _Scalars.yaml_implicit_resolvers
 
 
 def read_yaml(path: Path) -> Any:
     """The content of a YAML file; ConfigError in one line when it cannot be read."""
     try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file") from None
-    except IsADirectoryError:
-        raise ConfigError(f"{path}: is a folder; name the file in it") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read: {error}") from None
-    return parse_yaml(text, str(path))
+        return parse_yaml(read_text(path, _MOST_BYTES), str(path))
+    except DataError as error:
+        raise ConfigError(str(error)) from None
 
 
-def parse_yaml(text: str, where: str) -> Any:
-    """The content of YAML text; ConfigError in one line, with ``where`` in front, when it is not valid."""
+def parse_yaml(text: str, where: str, most: int = MOST_VALUES) -> Any:
+    """The content of YAML text; ConfigError in one line, with ``where`` in front, when it is not valid.
+
+    most: values that it may have. Aliases, merge keys, tags and directives are refused: they make a text mean more than
+    it shows.
+    """
     try:
-        return yaml.load(text, Loader=_Loader)
+        return _Document(text, most).content()
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from None
     except (yaml.YAMLError, ValueError) as error:  # ValueError: an impossible date or number such as 2023-99-99
-        raise ConfigError(f"{where}: not valid YAML: {error}") from None
-    except RecursionError:
-        raise ConfigError(f"{where}: not valid YAML: nested too deeply") from None
+        mark = getattr(error, "problem_mark", None)
+        problem = error if mark is None else f"line {mark.line + 1}: {getattr(error, 'problem', error)}"
+        raise ConfigError(f"{where}: not valid YAML: {problem}") from None
 
 
 def parse_settings(settings: Iterable[str] | None) -> dict[str, Any]:
@@ -224,12 +289,11 @@ def _describe_one(model: type[BaseModel], detail: ErrorDetails) -> str:
         meaning = f" ({field.description})" if field is not None and field.description else ""
         return f"key {place!r} is missing{meaning}"
     message = detail["msg"].removeprefix("Value error, ")
-    given = repr(detail["input"])
-    shown = "" if detail["type"] == "value_error" or len(given) > 60 else f" (given: {given})"
+    given = "" if detail["type"] == "value_error" else f" (given: {shown(detail['input'])})"
     if detail["type"] == "literal_error" and isinstance(detail["input"], str):
         hint = nearest(detail["input"], re.findall(r"'([^']*)'", detail["ctx"]["expected"]))
-        shown += f"; {hint.strip()}" if hint else ""
-    return f"{place}: {message}{shown}" if place else f"{message}{shown}"
+        given += f"; {hint.strip()}" if hint else ""
+    return f"{place}: {message}{given}" if place else f"{message}{given}"
 
 
 def _keys_at(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+import reprlib
+from collections.abc import Iterable, Sized
 from difflib import get_close_matches
 from numbers import Integral, Real
 from typing import Any
@@ -18,6 +19,20 @@ def one_line(text: str) -> str:
     if len(line) > _LONGEST:
         line = f"{line[:_LONGEST]} ... ({len(line) - _LONGEST:,} more characters)"
     return line if line.isprintable() else "".join(letter if letter.isprintable() else "?" for letter in line)
+
+
+_SHORT = reprlib.Repr()
+_SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother = 2, 60, 60
+
+
+def shown(value: object) -> str:
+    """A refused value in a message, in bounded time and length; of a long list or mapping its type and size."""
+    if isinstance(value, int) and value.bit_length() > 200:
+        return "a whole number of more than 60 digits"
+    words = _SHORT.repr(value)
+    if len(words) <= 60:
+        return words
+    return f"{type(value).__name__} of {len(value):,}" if isinstance(value, Sized) else type(value).__name__
 
 
 class OmnibenchError(Exception):
@@ -56,10 +71,9 @@ def require_type(value: object, kind: type, maker: str) -> None:
     """ConfigError: an argument is not of its type, as a path is not what ``maker`` makes of it."""
     if isinstance(value, kind):
         return
-    shown = repr(value) if len(repr(value)) <= 60 else type(value).__name__
     held = [name for name in _HOLDERS if isinstance(getattr(value, name, None), kind)]
     way = f"take its .{held[0]}" if held else f"make one with omnibench.{maker}"
-    raise ConfigError(f"expected a {kind.__name__}, found {shown}; {way}")
+    raise ConfigError(f"expected a {kind.__name__}, found {shown(value)}; {way}")
 
 
 def require_choice(what: str, value: object, words: Iterable[str]) -> None:
@@ -75,7 +89,7 @@ def require_range(what: str, value: Any, least: float, most: float = math.inf, *
     if not right_kind or not least <= value <= most:
         number = "a whole number, " if whole else ""
         bounds = f"at least {least:g}" if math.isinf(most) else f"from {least:g} to {most:g}"
-        raise ConfigError(f"{what}: must be {number}{bounds} (given: {value!r})")
+        raise ConfigError(f"{what}: must be {number}{bounds} (given: {shown(value)})")
 
 
 class UnknownNameError(ConfigError):

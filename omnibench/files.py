@@ -1,9 +1,10 @@
-"""Writing results: files that are complete or not there, and folders that hold nothing else."""
+"""Files: checked before they are read, written whole or not at all; folders that hold nothing else."""
 
 from __future__ import annotations
 
 import os
 import shutil
+import stat
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
@@ -11,11 +12,12 @@ from datetime import datetime
 from errno import EACCES, EDQUOT, EFBIG, EIO, EISDIR, ENOSPC, EPERM, EROFS
 from io import BytesIO
 from pathlib import Path
-from typing import Literal
-
-import polars as pl
+from typing import TYPE_CHECKING, Literal
 
 from omnibench.errors import ConfigError, DataError
+
+if TYPE_CHECKING:
+    import polars as pl
 
 RESULTS = Path("results")  # the folder of results, where the user names none
 TableFormat = Literal["parquet", "csv"]
@@ -25,6 +27,8 @@ FileContent = bytes | Callable[[Path], None]
 _IS_A_FOLDER = "is a folder; name a file"
 _MORE_SPACE = "free space or choose another place"
 _MORE_RIGHTS = "get permission to write there or choose another place"
+_FORMULA = r"^'*[=+\-@\t\r]"
+_NO_TEXT = "cannot be read: it is not a text file in UTF-8; save it so (CSV UTF-8), or leave it out"
 _LEAST_SPACE = 1 << 16  # bytes: a calibration or the tables of a small comparison
 _WAYS_OUT = {
     ENOSPC: _MORE_SPACE,
@@ -34,6 +38,59 @@ _WAYS_OUT = {
     EACCES: _MORE_RIGHTS,
     EPERM: _MORE_RIGHTS,
 }
+
+MOST_TEXT = 1 << 30  # bytes of a text that is read whole, as tables are; chosen
+_SPECIAL = {stat.S_IFIFO: "pipe", stat.S_IFCHR: "device", stat.S_IFBLK: "device", stat.S_IFSOCK: "socket"}
+
+
+def check_file(path: Path, most: int | None = None, *, text: bool = False) -> None:
+    """DataError in one line unless a path is a file that may be read, of at most ``most`` bytes; links are followed.
+
+    Pipes and devices may have no end, and nobody may write to them. text: refuse one with holes, which are zero bytes.
+    """
+    try:
+        status = path.stat()
+        if stat.S_ISDIR(status.st_mode):
+            raise DataError(f"{path}: is a folder; name the file in it")
+        if not stat.S_ISREG(status.st_mode):
+            kind = _SPECIAL.get(stat.S_IFMT(status.st_mode), "special file")
+            raise DataError(f"{path}: is a {kind}; write its content to a file, and name that")
+        if most is not None and status.st_size > most:
+            raise DataError(f"{path}: has {status.st_size:,} bytes, more than the {most:,} that such a file may have")
+        with path.open("rb") as file:
+            looked_for = text and status.st_size > 0 and hasattr(os, "SEEK_HOLE")
+            if looked_for and os.lseek(file.fileno(), 0, os.SEEK_HOLE) < status.st_size:
+                raise DataError(f"{path}: {_NO_TEXT}")
+    except FileNotFoundError:
+        raise DataError(f"{path}: no such file") from None
+    except (OSError, ValueError) as error:  # ValueError: a zero byte in the path
+        raise DataError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+
+
+def check_source(path: Path) -> None:
+    """DataError in one line unless a path is a folder, or a file that may be read."""
+    if not path.exists():
+        raise DataError(f"{path}: no such file or folder")
+    if not path.is_dir():
+        check_file(path)
+
+
+def read_bytes(path: Path, most: int = MOST_TEXT, *, text: bool = False) -> bytes:
+    """The content of a file of at most ``most`` bytes. DataError as for ``check_file``."""
+    check_file(path, most, text=text)
+    try:
+        with path.open("rb") as file:
+            return file.read(most)  # of /proc no sizes are known
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read: {error.strerror or error}") from None
+
+
+def read_text(path: Path, most: int = MOST_TEXT) -> str:
+    """The text of a file of at most ``most`` bytes, in UTF-8. DataError as for ``check_file``; it is no such text."""
+    try:
+        return read_bytes(path, most, text=True).decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise DataError(f"{path}: {_NO_TEXT}") from None
 
 
 @contextmanager
@@ -167,8 +224,27 @@ def encode_table(table: pl.DataFrame, table_format: TableFormat) -> bytes:
     if table_format == "parquet":
         table.write_parquet(content)
     else:
-        table.write_csv(content)
+        quoted_formulas(table).write_csv(content)
     return content.getvalue()
+
+
+def quoted_formulas(table: pl.DataFrame) -> pl.DataFrame:
+    """A table for CSV with ' before the texts that spreadsheets run as formulas (OWASP, CSV injection)."""
+    import polars as pl
+
+    def quoted(text: pl.Expr) -> pl.Expr:
+        formula = text.str.contains(_FORMULA) & text.cast(pl.Float64, strict=False).is_null()  # -1.5 stays a number
+        return pl.when(formula).then("'" + text).otherwise(text)
+
+    texts = [name for name, kind in table.schema.items() if kind == pl.String]
+    return table.with_columns(quoted(pl.col(name)).alias(name) for name in texts)
+
+
+def unquoted_formulas(table: pl.DataFrame) -> pl.DataFrame:
+    """A table as it was before ``quoted_formulas``."""
+    import polars as pl
+
+    return table.with_columns(pl.col(pl.String).str.replace(f"^'({_FORMULA[1:]})", "${1}"))
 
 
 def write_files(contents: Mapping[Path, FileContent]) -> None:
@@ -201,8 +277,8 @@ def check_results_folder(folder: Path, mark: str, kind: str, *, force: bool = Fa
     if force or not _holds_something(folder):
         return
     try:
-        ours = (folder / "config.yaml").read_text(encoding="utf-8").startswith(mark)
-    except (OSError, UnicodeDecodeError):
+        ours = read_text(folder / "config.yaml").startswith(mark)
+    except DataError:
         ours = False
     if not ours:
         raise DataError(

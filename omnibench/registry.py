@@ -11,8 +11,11 @@ import importlib
 import importlib.util
 import inspect
 import pkgutil
+import signal
 import sys
-from collections.abc import Callable, Iterable, Mapping
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -22,6 +25,10 @@ from pydantic import BaseModel, ConfigDict
 
 from omnibench.config import Model, validate
 from omnibench.errors import OmnibenchError, PluginError, UnknownNameError
+from omnibench.files import check_file
+
+_MOST_BYTES = 1 << 24  # of a plug-in file; chosen
+_IMPORT_SECONDS = 60.0  # in which a plug-in file must be imported, whatever command loads it; chosen: JAX takes 10 s
 
 T = TypeVar("T")
 C = TypeVar("C", bound=type[Any])
@@ -220,6 +227,7 @@ def _attempt(origin: str, load: Callable[[], object]) -> PluginFailure | None:
 
 
 def _import_file(path: Path) -> None:
+    check_file(_copies.get(path, path), _MOST_BYTES, text=True)
     digest = hashlib.sha256(str(path).encode()).hexdigest()[:8]
     name = f"omnibench_plugin_{path.stem}_{digest}"
     spec = importlib.util.spec_from_file_location(name, _copies.get(path, path))
@@ -227,7 +235,29 @@ def _import_file(path: Path) -> None:
         raise PluginError(f"{path} is not a Python file")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
-    spec.loader.exec_module(module)
+    with _limited_time(path):
+        spec.loader.exec_module(module)
+
+
+@contextmanager
+def _limited_time(path: Path) -> Iterator[None]:
+    """PluginError: the block takes longer than an import may. Without a limit in other threads than the main one."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def over(number: int, frame: object) -> None:  # noqa: ARG001 (a handler of signals)
+        raise PluginError(
+            f"{path}: it is not imported within {_IMPORT_SECONDS:g} s; what takes long belongs in a method"
+        )
+
+    before = signal.signal(signal.SIGALRM, over)
+    signal.setitimer(signal.ITIMER_REAL, _IMPORT_SECONDS, 1.0)  # again if the file catches it
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
 
 
 def _origin(cls: type) -> str:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.errors import DataError, nearest
+from omnibench.files import read_text
 from omnibench.robot.kinematics import Array
 
 if TYPE_CHECKING:
@@ -245,26 +246,13 @@ def row_error(file: Path, row: int, line: int, what: str) -> DataError:
     return DataError(f"{file}, {place}: {what}")
 
 
-def read_text(file: Path) -> str:
-    """The text of a file; DataError when it cannot be read."""
-    try:
-        return file.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise DataError(f"{file}: no such file") from None
-    except UnicodeDecodeError:
-        raise DataError(f"{file}: is not a text file in UTF-8; save it so (CSV UTF-8), or leave it out") from None
-    except OSError as error:
-        raise DataError(f"{file}: cannot be read: {error.strerror or error}") from None
-
-
 def _read_parquet(file: Path) -> CellTable:
     """The columns of a Parquet file; dates become seconds since 1970, durations seconds."""
     import polars as pl
 
-    try:
-        frame = pl.read_parquet(file)
-    except (pl.exceptions.PolarsError, OSError) as error:
-        raise DataError(f"{file}: cannot be read: {error}") from None
+    from omnibench.data.stored.stored_rows import read_parquet
+
+    frame = read_parquet(file)
     if frame.is_empty():
         raise NoRowsError(f"{file}: it has no rows")
     columns = [

@@ -11,7 +11,7 @@ from pydantic_core import to_jsonable_python
 
 from omnibench.config import Model, Positive, read_yaml, to_yaml, validate
 from omnibench.data.scans import Scanner
-from omnibench.errors import ConfigError, DataError
+from omnibench.errors import ConfigError, DataError, shown
 from omnibench.robot.kinematics import Robot
 
 FORMAT: Final = "omnibench-dataset/1"
@@ -74,7 +74,7 @@ def read_header(folder: Path) -> Header:
         content = read_yaml(file)
         given = content.get("format") if isinstance(content, dict) else None
         if given != FORMAT:
-            raise DataError(f"{file}: format is {given!r}, expected {FORMAT!r}")
+            raise DataError(f"{file}: format is {shown(given)}, expected {FORMAT!r}")
         return validate(Header, content, str(file))
     except ConfigError as error:
         raise DataError(str(error)) from None

@@ -14,9 +14,10 @@ from polars.io.plugins import register_io_source
 
 from omnibench.data.delimited import missing_column, not_increasing
 from omnibench.data.scans import Ranges, Scanner, Scans, TrajectoryScans
+from omnibench.data.stored.stored_rows import count_rows, file_state, readable
 from omnibench.data.tables.table import Table
 from omnibench.errors import DataError, nearest
-from omnibench.files import TableFormat
+from omnibench.files import TableFormat, check_file, quoted_formulas, unquoted_formulas
 from omnibench.robot.kinematics import Array
 
 _COLUMNS = ("trajectory", "t", "ranges")
@@ -36,7 +37,7 @@ class ScansOnDisk(Scans):
 
     def __init__(self, file: Path, scanner: Scanner, trajectories: Iterable[str]) -> None:
         self.file, self.scanner = file, scanner
-        self._state = self._file_state()
+        self._state = file_state(self.file)
         self._index = self._read_index(set(trajectories))
 
     @property
@@ -48,7 +49,7 @@ class ScansOnDisk(Scans):
 
     def of(self, trajectory: str) -> TrajectoryScans:
         rows, times = self._indexed(trajectory)
-        if self._file_state() != self._state:
+        if file_state(self.file) != self._state:
             raise DataError(
                 f"{self.file}: the file has changed since it was opened; load it, or run the command, again"
             )
@@ -62,24 +63,15 @@ class ScansOnDisk(Scans):
             raise DataError(f"{self.file}: trajectory {trajectory} has no scans")
         return self._index[trajectory]
 
-    def _file_state(self) -> tuple[int, int]:
-        try:
-            status = self.file.stat()
-        except OSError as error:
-            raise DataError(f"{self.file}: cannot be read: {error.strerror}") from None
-        return status.st_mtime_ns, status.st_size
-
     def _collect(self, table: pl.LazyFrame) -> pl.DataFrame:
-        try:
+        with readable(self.file):
             return table.collect()
-        except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as error:
-            raise DataError(f"{self.file}: cannot be read: {error}") from None
 
     def _lazy(self) -> pl.LazyFrame:
         if self.file.suffix == ".parquet":
-            return pl.scan_parquet(self.file)
+            return pl.scan_parquet(self.file, glob=False)
         # Cells are read as text, so that one that is no number is reported with its row.
-        return pl.scan_csv(self.file, infer_schema=False)
+        return pl.scan_csv(self.file, infer_schema=False, glob=False)
 
     def _read(self, rows: Rows, whose: str, times: Array) -> Ranges:
         """The checked ranges (n, R) of some rows."""
@@ -140,17 +132,19 @@ class ScansOnDisk(Scans):
 
     def _names_and_stamps(self) -> Table:
         """The checked columns of trajectories and stamps."""
-        try:
+        if self.file.suffix == ".parquet":
+            count_rows(self.file)
+        else:
+            check_file(self.file, text=True)
+        with readable(self.file):
             schema = self._lazy().collect_schema()
-        except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as error:
-            raise DataError(f"{self.file}: cannot be read: {error}") from None
         for column in _COLUMNS:
             if column not in schema:
                 raise missing_column(self.file, column, schema)
         frame = self._collect(self._lazy().select("trajectory", "t"))
         if frame.is_empty():
             raise DataError(f"{self.file}: it has no rows; remove it, or record scans")
-        table = Table(self.file, frame)
+        table = Table(self.file, frame if self.file.suffix == ".parquet" else unquoted_formulas(frame))
         table.name_trajectories()
         return table
 
@@ -190,7 +184,10 @@ def _frames(trajectory: str, scans: TrajectoryScans, as_text: bool) -> Iterator[
             {"trajectory": [trajectory] * len(times), "t": times, "ranges": ranges},
             schema={"trajectory": pl.String, "t": pl.Float64, "ranges": pl.Array(pl.Float32, rays)},
         ).with_columns(pl.col("ranges").arr.to_list())
-        yield frame.with_columns(pl.col("ranges").cast(pl.List(pl.String)).list.join(" ")) if as_text else frame
+        if as_text:
+            joined = pl.col("ranges").cast(pl.List(pl.String)).list.join(" ")
+            frame = quoted_formulas(frame.with_columns(joined))
+        yield frame
 
 
 def _parts(rows: Rows, most: int) -> Iterator[slice]:

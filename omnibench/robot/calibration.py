@@ -18,8 +18,8 @@ from pydantic import (
     model_validator,
 )
 
-from omnibench.config import Model, NonNegative, parse_yaml, printable, read_yaml, to_yaml, validate
-from omnibench.errors import ConfigError, DataError, require_type
+from omnibench.config import MOST_VALUES, Model, NonNegative, parse_yaml, printable, read_yaml, to_yaml, validate
+from omnibench.errors import ConfigError, DataError, require_type, shown
 from omnibench.files import write_text
 from omnibench.robot.domain.fade import Fade
 from omnibench.robot.effects.term import Term, make_term
@@ -322,10 +322,13 @@ def read_calibration(path: Path | str) -> Calibration:
         raise DataError(str(error)) from None
 
 
-def parse_calibration(text: str, where: str) -> Calibration:
-    """Parse and check the text of a calibration file. DataError begins with ``where`` and says what is wrong."""
+def parse_calibration(text: str, where: str, most: int = MOST_VALUES) -> Calibration:
+    """Parse and check the text of a calibration file. DataError begins with ``where`` and says what is wrong.
+
+    most: values that the text may have.
+    """
     try:
-        return _checked(parse_yaml(text, where), where)
+        return _checked(parse_yaml(text, where, most), where)
     except ConfigError as error:
         raise DataError(str(error)) from None
 
@@ -333,7 +336,7 @@ def parse_calibration(text: str, where: str) -> Calibration:
 def _checked(content: Any, where: str) -> Calibration:
     version = content.get("format") if isinstance(content, dict) else None
     if version != FORMAT:
-        raise DataError(f"{where}: format is {version!r}, expected {FORMAT!r}; is this a calibration file?")
+        raise DataError(f"{where}: format is {shown(version)}, expected {FORMAT!r}; is this a calibration file?")
     calibration = validate(Calibration, content, where)
     for term in calibration.effects:
         term.term(calibration.robot, where)

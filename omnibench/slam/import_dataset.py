@@ -11,7 +11,7 @@ from omnibench.config import validate
 from omnibench.data.dataset import Dataset
 from omnibench.data.header import Imported
 from omnibench.data.importer import Importer
-from omnibench.errors import DataError
+from omnibench.files import check_source
 from omnibench.registry import importers
 from omnibench.slam.slam_options import SlamOptions
 
@@ -24,8 +24,7 @@ def import_dataset(name: str, source: Path | str, options: Mapping[str, Any] | N
     """
     given, source = dict(options or {}), Path(source)
     entry = importers.entry(name)
-    if not source.exists():
-        raise DataError(f"{source}: no such file or folder")
+    check_source(source)
     given = entry.cls.completed(given, source)
     importer: Importer = importers.create(name, given)
     slam = validate(SlamOptions, getattr(importer.options, "slam", {}), f"importer {name!r}: slam")

@@ -54,6 +54,31 @@ main()
 """
 
 
+PROGRAM = """
+import signal, sys
+sys.argv = [{name!r}, "--version"]
+from omnibench.__main__ import main
+{before}
+try:
+    main()
+finally:
+    signal.raise_signal(signal.SIGINT)
+"""
+
+
+@pytest.mark.parametrize("before", ["signal.raise_signal(signal.SIGINT)", ""], ids=["before", "after"])
+def test_ctrl_c_before_and_after_the_work_of_the_program_is_one_line(before: str) -> None:
+    program = PROGRAM.format(name="/usr/bin/omnibench", before=before)
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=PATIENCE, check=False)
+    assert (run.returncode, run.stderr) == (130, "interrupted\n")
+
+
+def test_the_program_takes_ctrl_c_over_before_it_imports_anything_that_takes_time() -> None:
+    listed = "import sys; before = {*sys.modules}; from omnibench.__main__ import main; print(*{*sys.modules} - before)"
+    run = subprocess.run([sys.executable, "-c", listed], capture_output=True, text=True, timeout=PATIENCE, check=True)
+    assert set(run.stdout.split()) == {"__future__", "gc", "omnibench", "omnibench.__main__"}
+
+
 @pytest.mark.parametrize(
     ("module", "arguments"),
     [

@@ -7,10 +7,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fit_samples import noisy_trajectories
+from sample_robots import WHEELED
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
+from omnibench.data.tables.dataset_tables import make_dataset as dataset_of_tables
 from omnibench.fit.inspect import Inspection, inspect_dataset
+from omnibench.robot.kinematics import Robot
 from omnibench.testing.synthetic import synthetic_robot
+
+
+@pytest.mark.parametrize("robot", WHEELED, ids=lambda robot: robot.name)
+def test_wheels_that_never_turn_tell_nothing_of_any_robot(robot: Robot) -> None:
+    t, poses = np.arange(1, 21) * 0.1, {"t": [0.0, 1.0, 2.0]} | dict.fromkeys(("x", "y", "theta"), np.zeros(3))
+    names = [f"omega_{wheel}" for wheel in robot.wheel_names] + [f"steer_{wheel}" for wheel in robot.drive.steered]
+    still = dataset_of_tables("still", robot, wheels={"t": t} | dict.fromkeys(names, np.zeros(20)), poses=poses)
+    inspection = inspect_dataset(still)
+    assert inspection.driven_directions == 0
+    assert not any(parameter.told for parameter in inspection.identifiability.parameters)
+    assert {direction.state for direction in inspection.identifiability.directions} == {"undriven"}
 
 
 def dataset(runs: list[Trajectory], wheels: int = 3) -> Dataset:

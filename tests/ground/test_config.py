@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tempfile
 from pathlib import Path
 from typing import Any, Literal
@@ -241,19 +242,46 @@ def validated(model: type[Model], document: Model) -> Model:
 
 
 @pytest.mark.parametrize(
-    ("text", "expected"),
+    ("text", "words"),
     [
-        ("a: &a {x: 1, y: 2}\nb: {<<: *a, x: 3}", {"x": 3, "y": 2}),
-        ("a: &a {x: 1}\nc: &c {z: 1}\nb:\n  <<: [*a, *c]\n  y: 5", {"x": 1, "z": 1, "y": 5}),
+        ("a: &a [1]\nb: *a", "line 2: aliases are not read; write out what *a stands for"),
+        ("a: {<<: {x: 1}}", "line 1: merge keys (<<) are not read; write the keys out"),
+        ("a: !!str 5", "line 1: tags such as !!str are not read; leave it out"),
+        ("%YAML 1.1\n---\na: 1", "directives such as %YAML are not read; leave these lines out"),
+        ("%YAML 1.3\n---\na: 1", "line 1: found incompatible YAML document"),
+        ("a: 1\n---\nb: 2", "line 2: a second document begins; keep one"),
+        ("? [1]\n: 2", "line 1: a key is a list, expected a word"),
+        (r'a: "\ud800"', "line 1: found invalid Unicode character escape code"),
+        ("- " * 40 + "x", "line 1: nested too deeply"),
+        ("[" + "1, " * 100 + "]", "more than 90 values"),
     ],
 )
-def test_merge_keys_take_over_what_is_not_given(text: str, expected: dict[str, int]) -> None:
-    assert parse_yaml(text, "config")["b"] == expected
+def test_yaml_that_means_more_than_it_shows_is_refused(text: str, words: str) -> None:
+    with pytest.raises(ConfigError, match=rf"^file: not valid YAML: {re.escape(words)}$"):
+        parse_yaml(text, "file", 90)
 
 
-def test_a_key_that_is_given_twice_beside_a_merge_key_is_refused() -> None:
-    with pytest.raises(ConfigError, match="line 2: key 'x' is given twice"):
-        parse_yaml("a: &a {x: 1}\nb: {<<: *a, x: 1, x: 2}", "config")
+@pytest.mark.parametrize(
+    "digits", ["9" * 5000, "0x" + "f" * 5000, ":".join(["1"] * 40_000)], ids=["decimal", "hexadecimal", "of base 60"]
+)
+def test_a_number_too_long_to_be_converted_quickly_is_text(digits: str) -> None:
+    assert parse_yaml(f"a: {digits}", "file") == {"a": digits}
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        ([1] * 100_000, "[1, 1, 1, 1, 1, 1, ...]"),
+        ([["x" * 99] * 9] * 9, "list of 9"),
+        (2**50_000, "a whole number of more than 60 digits"),
+        ("x" * 100_000, "'" + "x" * 27 + "..." + "x" * 28 + "'"),
+    ],
+    ids=["a list", "lists of texts", "a number", "a text"],
+)
+def test_a_refused_value_is_never_shown_whole(value: Any, words: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        validate(Circle, {"diameter": value}, "file")
+    assert str(refused.value).endswith(f"(given: {words})")
 
 
 @pytest.mark.parametrize("pattern", ["*_1", "[0-4]*", "!x*", "@x*", " *_1", "&x"])

@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sample_robots import APR_02
 
-from omnibench.config import validate
+from omnibench.config import to_yaml, validate
 from omnibench.errors import ConfigError, DataError, OmnibenchError
 from omnibench.registry import effects
 from omnibench.robot.calibration import (
@@ -70,7 +70,7 @@ def broken(folder: Path, change: Callable[[dict[str, Any]], object]) -> Path:
     write_calibration(a_calibration(), file)
     content = yaml.safe_load(file.read_text())
     change(content)
-    file.write_text(yaml.safe_dump(content))
+    file.write_text(to_yaml(content))
     return file
 
 

@@ -20,11 +20,14 @@ import numpy as np
 import polars as pl
 
 from omnibench.errors import DataError
+from omnibench.files import check_file
 from omnibench.progress import tell_reading
 from omnibench.robot.kinematics import Array
 
 MOST_IN_MEMORY = 5_000_000  # wheel samples that are kept: 200 MB of three wheels' (chosen)
 BLOCK_ROWS = 500_000  # rows of a block, of whole runs: 16 MB of four columns (chosen)
+_LARGE = 1 << 29  # bytes in memory up to which a file may be packed as tightly as it likes; chosen
+_PACKED = 1000  # times smaller than in memory: stamps, which increase, do not pack so tightly; chosen
 _BLOCKS_KEPT = 4  # blocks in memory, those of all files together (chosen)
 
 Value = TypeVar("Value")
@@ -75,24 +78,45 @@ def file_state(file: Path) -> tuple[int, int]:
 
 def read_rows(file: Path, columns: Sequence[str], first: int, count: int) -> pl.DataFrame:
     """Some rows of a Parquet file. DataError: it cannot be read."""
-    with _readable(file):
+    with readable(file):
         return pl.scan_parquet(file, glob=False).select(columns).slice(first, count).collect()
 
 
 def count_rows(file: Path) -> int:
-    """The number of rows of a Parquet file. DataError: it cannot be read."""
-    with _readable(file):
-        return int(pl.scan_parquet(file, glob=False).select(pl.len()).collect().item())
+    """The number of rows of a Parquet file. DataError: it cannot be read, or is packed as no recording can be."""
+    check_file(file)
+    with readable(file):
+        scanned = pl.scan_parquet(file, glob=False)
+        rows = int(scanned.select(pl.len()).collect().item())
+        size = rows * len(scanned.collect_schema()) * 8
+        packed = file.stat().st_size
+    if size > _LARGE and size > _PACKED * packed:
+        raise DataError(
+            f"{file}: its {packed / 1e6:.3g} MB would unpack to {size / 1e9:.3g} GB ({rows:,} rows), as no recording "
+            "does; write it anew, or leave it out"
+        )
+    return rows
+
+
+def read_parquet(file: Path) -> pl.DataFrame:
+    """A whole Parquet file. DataError as for count_rows; a column holds lists."""
+    count_rows(file)
+    for column, kind in types_of(file).items():
+        if kind.is_nested():
+            raise DataError(f"{file}: column {column!r} holds {kind}, expected names or numbers")
+    with readable(file):
+        return pl.read_parquet(file, glob=False)
 
 
 def types_of(file: Path) -> pl.Schema:
     """The types of the columns of a Parquet file, by their names. DataError: it cannot be read."""
-    with _readable(file):
+    with readable(file):
         return pl.scan_parquet(file, glob=False).collect_schema()
 
 
 @contextmanager
-def _readable(file: Path) -> Iterator[None]:
+def readable(file: Path) -> Iterator[None]:
+    """Turn what Polars raises while it reads a file into a DataError."""
     try:
         yield
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as error:

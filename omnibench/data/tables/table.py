@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from omnibench.data.delimited import missing_column
 from omnibench.data.run_checks import LARGEST
+from omnibench.data.stored.stored_rows import read_parquet, readable
 from omnibench.errors import DataError
+from omnibench.files import MOST_TEXT, check_file, unquoted_formulas
 from omnibench.robot.kinematics import Array
 
 # Names may consist of digits: 007 is not 7.
@@ -86,17 +88,15 @@ def read_table(folder: Path, name: str, required: Sequence[str]) -> Table:
     file = table_file(folder, name)
     if file is None:
         raise DataError(f"{folder}: {name}.parquet (or {name}.csv) is missing")
-    try:
-        if file.suffix == ".parquet":
-            frame = pl.read_parquet(file, glob=False)
-        else:
-            frame = pl.read_csv(file, infer_schema_length=None, schema_overrides=_TEXTS)
-    except (pl.exceptions.PolarsError, OSError) as error:
-        raise DataError(f"{file}: cannot be read: {error}") from None
-    twice = [column for column in frame.columns if "_duplicated_" in column and file.suffix == ".csv"]
+    if file.suffix == ".parquet":
+        return checked_table(file, read_parquet(file), required)
+    check_file(file, MOST_TEXT, text=True)
+    with readable(file):
+        frame = pl.read_csv(file, infer_schema_length=None, schema_overrides=_TEXTS, glob=False)
+    twice = [column for column in frame.columns if "_duplicated_" in column]
     if twice:  # polars' name for the second of two
         raise DataError(f"{file}: column {twice[0].partition('_duplicated_')[0]!r} is there twice; remove one")
-    return checked_table(file, frame, required)
+    return checked_table(file, unquoted_formulas(frame), required)
 
 
 def checked_table(file: Path, frame: pl.DataFrame, required: Sequence[str], rows_before: int = 0) -> Table:
@@ -120,7 +120,7 @@ def check_columns(file: Path, columns: Sequence[str], required: Sequence[str]) -
 
 def table_file(folder: Path, name: str) -> Path | None:
     """The file of the table called ``name`` in a data set's folder, if there is one. DataError when there are two."""
-    files = [file for file in (folder / f"{name}.parquet", folder / f"{name}.csv") if file.is_file()]
+    files = [file for file in (folder / f"{name}.parquet", folder / f"{name}.csv") if file.exists()]
     if len(files) > 1:
         raise DataError(f"{folder}: both {name}.parquet and {name}.csv are there; remove the one that is not meant")
     return files[0] if files else None

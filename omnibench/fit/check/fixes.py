@@ -17,6 +17,7 @@ from omnibench.registry import importers
 _POSE = ("x", "y", "theta")
 _RATES = {"rpm": 2 * 3.141592653589793 / 60, "deg/s": 3.141592653589793 / 180, "rev/s": 2 * 3.141592653589793}
 _POSITIONS = {"deg/s": "deg", "rev/s": "rev"}
+_HEADER = 10_000  # characters of a header that are looked at
 _TABLES = 8  # whose headers are looked at
 _IDENTITY = {"position_unit": "m", "heading_unit": "rad", "wheel_time_unit": "s", "pose_time_unit": "s"}
 
@@ -193,7 +194,7 @@ def _header_words(source: Path) -> set[str]:
     words: set[str] = set()
     for file in files[:_TABLES]:
         with file.open(errors="replace") as lines:
-            words |= set(re.split(r"[\s,;]+", lines.readline().strip()))
+            words |= set(re.split(r"[\s,;]+", lines.readline(_HEADER).strip()))
     return words
 
 

@@ -17,6 +17,7 @@ from omnibench.data.storage import load_dataset
 from omnibench.data.stored.dataset_folders import dataset_folders
 from omnibench.data.stored.periods import median_period
 from omnibench.errors import ConfigError, DataError
+from omnibench.files import check_source
 from omnibench.registry import importers
 
 _BAGS = (".mcap", ".bag", ".db3")
@@ -70,8 +71,7 @@ def read_source(
             )
         return replace(of_dataset(load_dataset(places)), places=tuple(places))
     (source,) = places
-    if not source.exists():
-        raise DataError(f"{source}: no such file or folder")
+    check_source(source)
     name = form or recognised(source)
     if name == "dataset" and not given:
         return _of_folder(source)

@@ -94,7 +94,7 @@ def identifiability(
         information = information + information_of_references(robot, measured, integration, poses=False)
     rows = robot.row_scales
     every = wheel_directions(robot, span)
-    driven = np.array([each.rates for each in every if each.state != "undriven"])
+    driven = np.array([each.rates for each in every if each.state != "undriven"]).reshape(-1, matrix.shape[1])
     deviations = iter((deviations_along(information, driven) / rows).tolist())
     directions = tuple(
         DirectionIdentifiability(

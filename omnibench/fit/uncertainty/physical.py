@@ -15,6 +15,7 @@ from omnibench.robot.kinematics import Array, Robot
 # half of each and twice name the same parameters (tests/benchmarks/constants_fit.py).
 _UNIDENTIFIED = 1e-3  # share of a parameter's axis in the unidentified space from which on it is not identified
 _NO_CHANGE = 1e-6  # share of the largest singular value below which a change of the geometry leaves the matrix as it is
+_ROUNDING = 1e-12  # strength of a change, in units of its scale, that is none: nothing of the matrix may be known
 
 
 @dataclass(frozen=True)
@@ -126,6 +127,6 @@ def _unseen_changes(geometry: WheelGeometry, kept: Array, left_open: Array | Non
     rows = np.repeat(geometry.robot.row_scales, len(geometry.robot.drive.names))
     slopes = known_slopes(geometry, kept, left_open) / rows[:, None]
     _, strengths, directions = np.linalg.svd(np.vstack([slopes, np.zeros((slopes.shape[1], slopes.shape[1]))]))
-    unidentified = directions[strengths <= _NO_CHANGE * strengths[0]]
+    unidentified = directions[strengths <= max(_NO_CHANGE * strengths[0], _ROUNDING)]
     projection: Array = unidentified.T @ unidentified
     return projection

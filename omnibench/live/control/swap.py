@@ -8,10 +8,10 @@ import zenoh
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from omnibench.errors import DataError
-from omnibench.live.control.orders import LONGEST
+from omnibench.files import read_bytes
+from omnibench.live.control.orders import LONGEST, read_sent_calibration
 from omnibench.live.control.request_queue import source_of
 from omnibench.live.network.presence import alive_robots, checked_robot, nothing_received
-from omnibench.robot.calibration import read_calibration
 
 
 class SwapReply(BaseModel):
@@ -36,9 +36,8 @@ def swap_calibration(session: zenoh.Session, robot: str, file: Path, timeout: fl
 
     DataError: the file is no calibration, no node answers (the message names the robots alive), or the node refuses.
     """
-    _check_size(file)
-    read_calibration(file)
-    payload, key = file.read_bytes(), f"omnibench/{checked_robot(robot)}/swap"
+    payload, key = read_bytes(file, LONGEST), f"omnibench/{checked_robot(robot)}/swap"
+    read_sent_calibration(payload, str(file))
     for reply in session.get(key, payload=payload, timeout=timeout, source_info=source_of(session)):
         try:
             if reply.ok is not None:
@@ -54,13 +53,3 @@ def swap_calibration(session: zenoh.Session, robot: str, file: Path, timeout: fl
             "not let us swap, which only operators may, or the node is too busy"
         )
     raise DataError(nothing_received(robot, timeout, alive))
-
-
-def _check_size(file: Path) -> None:
-    """DataError at once for a file that every node would refuse; to parse it could take minutes."""
-    try:
-        size = file.stat().st_size
-    except OSError:
-        return  # whoever reads it says what is wrong
-    if size > LONGEST:
-        raise DataError(f"{file}: {size} bytes are more than a node takes, {LONGEST}; is it a calibration file?")

@@ -20,7 +20,7 @@ from pydantic import Field, FiniteFloat, ValidationError, model_validator
 
 from omnibench.config import Model, NonNegative, read_model, to_yaml
 from omnibench.errors import ConfigError, DataError
-from omnibench.files import remove, write_text
+from omnibench.files import read_bytes, remove, write_text
 from omnibench.robot.calibration import Calibration, read_calibration
 
 LOG = logging.getLogger("omnibench.live")
@@ -145,7 +145,4 @@ class RobotMemory:
 
 
 def _digest(path: Path) -> str:
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read: {error.strerror}") from None
+    return hashlib.sha256(read_bytes(path)).hexdigest()

@@ -15,7 +15,8 @@ from typing import Any, Final
 
 import zenoh
 
-from omnibench.errors import ConfigError, nearest
+from omnibench.errors import ConfigError, DataError, nearest
+from omnibench.files import read_text
 from omnibench.live.network.access import access_control
 from omnibench.live.network.diagnosis import why_not_connected, why_not_listening
 from omnibench.live.network.session_config import Access, SessionConfig, Tls, User
@@ -24,6 +25,7 @@ from omnibench.live.stopping import Stop, wait_until
 
 LOG = logging.getLogger("omnibench.live")
 
+_MOST_BYTES: Final = 1 << 20  # of files of users and passwords; chosen
 _PRIORITIES: Final = (
     *("control", "real_time", "interactive_high", "interactive_low"),
     *("data_high", "data", "data_low", "background"),
@@ -190,11 +192,9 @@ def _check_users(path: Path) -> None:
 
 def _lines(path: Path, what: str) -> list[str]:
     try:
-        return path.read_text(encoding="utf-8").splitlines()
-    except FileNotFoundError:
-        raise ConfigError(f"{what}: {path}: no such file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{what}: {path}: cannot be read: {error}") from None
+        return read_text(path, _MOST_BYTES).splitlines()
+    except DataError as error:
+        raise ConfigError(f"{what}: {error}") from None
 
 
 def _check_connected(session: zenoh.Session, config: SessionConfig) -> None:

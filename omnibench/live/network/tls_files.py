@@ -13,10 +13,12 @@ from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat, load_pem_private_key
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from omnibench.errors import ConfigError
+from omnibench.errors import ConfigError, DataError
+from omnibench.files import read_bytes
 from omnibench.live.network.session_config import Tls
 
 LOG = logging.getLogger("omnibench.live")
+_MOST_BYTES: Final = 1 << 20  # of certificates and keys; chosen
 _SOON: Final = timedelta(days=14)  # before a certificate expires, from when on a warning is logged; chosen
 
 
@@ -101,9 +103,9 @@ def read_key(path: Path) -> PrivateKeyTypes:
 
 
 def _content(path: Path) -> bytes:
+    if not path.exists():
+        raise ConfigError(f"tls: {path}: no such file; omnibench keys DIR makes certificates and keys")
     try:
-        return path.read_bytes()
-    except FileNotFoundError:
-        raise ConfigError(f"tls: {path}: no such file; omnibench keys DIR makes certificates and keys") from None
-    except OSError as error:
-        raise ConfigError(f"tls: {path}: cannot be read: {error.strerror or error}") from None
+        return read_bytes(path, _MOST_BYTES)
+    except DataError as error:
+        raise ConfigError(f"tls: {error}") from None

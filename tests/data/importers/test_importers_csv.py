@@ -322,7 +322,7 @@ def test_an_empty_file_is_named(tmp_path: Path, recording: Recording) -> None:
 def test_a_binary_file_is_named(tmp_path: Path, recording: Recording) -> None:
     write_run(tmp_path, recording)
     (tmp_path / "run1_poses.csv").write_bytes(b"\xff\xfe\x00\x81")
-    with pytest.raises(DataError, match=r"run1_poses\.csv: is not a text file"):
+    with pytest.raises(DataError, match=r"run1_poses\.csv: cannot be read: it is not a text file"):
         read(tmp_path)
 
 

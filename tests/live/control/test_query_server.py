@@ -82,11 +82,11 @@ def test_the_pose_at_a_time_is_interpolated(driven: Any, form: str) -> None:
         ("swap", "format: something", "format is 'something', expected 'omnibench-calibration/1'"),
         ("swap", "{", "not valid YAML"),
         ("swap", b"\xff\xfe", "not a text in UTF-8"),
-        ("swap", "[" * 50_000, "nested too deeply"),
+        ("swap", "[" * 50_000, "exceeded maximum nesting depth"),
         ("swap", "- " * 30_000, "nested too deeply"),
         ("swap", "a: [" + "1, " * 20_000 + "1]", "more than 5000 values"),
         ("swap", "a: &a [1, 1]\nb: &b [*a, *a]\nc: [*b, *b]", "write out what *a stands for"),
-        ("swap", as_text(calibration()).replace("session: null", r'session: "\ud800"'), "text that is not Unicode"),
+        ("swap", as_text(calibration()).replace("session: null", r'session: "\ud800"'), "invalid Unicode character"),
         ("swap", "#" * 140_000, "140000 bytes are more than a request may have, 131072"),
         ("swap", "#" * 10_000_000, "10000000 bytes are more than a request may have, 131072"),
         ("health?" + "x" * 140_000, None, "140000 bytes are more than a request may have"),
@@ -240,7 +240,7 @@ def test_a_closed_queue_gives_out_what_waits_and_takes_no_more() -> None:
 def test_a_file_that_is_no_calibration_by_its_size_is_not_sent(loopback: Loopback, tmp_path: Path) -> None:
     file = tmp_path / "recording.yaml"
     file.write_bytes(b"- 1\n" * 2_500_000)
-    with pytest.raises(DataError, match="10000000 bytes are more than a node takes, 131072; is it a calibration file"):
+    with pytest.raises(DataError, match="has 10,000,000 bytes, more than the 131,072 that"):
         swap_calibration(loopback.client(), "apr", file)
 
 

@@ -163,7 +163,7 @@ class TestCheckedFiles:
 
     def test_folder_in_place_of_a_file(self, folder: Path) -> None:
         files = Tls(ca=folder, certificate=folder / "node.pem", key=folder / "node.key")
-        assert f"{folder}: cannot be read" in self.refusal(files)
+        assert f"{folder}: is a folder" in self.refusal(files)
 
     def test_no_certificate_in_the_file(self, folder: Path) -> None:
         (folder / "node.pem").write_text("garbage")

@@ -8,9 +8,9 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from omnibench.data.delimited import read_text
 from omnibench.data.importers.optiodom.robots import KINDS, Geometry, Kind
 from omnibench.errors import DataError, nearest
+from omnibench.files import read_text
 
 _RUN = re.compile(r"_run-(\d+)\.csv$")
 

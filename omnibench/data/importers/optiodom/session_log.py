@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from omnibench.data.delimited import read_text
 from omnibench.data.importers.optiodom.session_files import SessionMetadata
 from omnibench.errors import DataError
+from omnibench.files import read_text
 from omnibench.robot.kinematics import Array
 
 

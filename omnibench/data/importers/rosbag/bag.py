@@ -9,7 +9,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from omnibench.config import read_yaml
 from omnibench.errors import DataError, UnknownNameError
+from omnibench.files import check_file
 from omnibench.words import plural
 
 if TYPE_CHECKING:
@@ -111,6 +113,11 @@ def open_bag(path: Path, recorded: Sequence[str] = ()) -> Iterator[Bag]:
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
+    if path.is_dir() and (path / _METADATA).exists():
+        read_yaml(path / _METADATA)  # within limits, which rosbags has not
+    for file in sorted(path.iterdir()) if path.is_dir() else [path]:
+        if file.suffix in _SUFFIXES:
+            check_file(file)
     with _damage_as_error(path):
         # Bags before ROS 2 Iron do not hold the definitions of their types; those used here never changed.
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
