@@ -78,18 +78,23 @@ def count_slots(client: Any) -> int:
     return sum(threads.values())
 
 
-class _Client(distributed.Client):
+class _PackedClient(distributed.Client):
     """Client that leaves packed what others publish at the scheduler: distributed's own unpickles it, thus runs it."""
 
     async def _ensure_connected(self, timeout: Any = None) -> None:
-        await super()._ensure_connected(timeout)
+        parent: Any = super()  # without types
+        await parent._ensure_connected(timeout)
         if self.scheduler_comm is not None:
             self.scheduler_comm.comm.deserialize = False
 
     def _handle_task_erred(self, key: Any = None, exception: Any = None, traceback: Any = None) -> None:
         if key in self.futures:  # a task of this client
-            exception, traceback = distributed.protocol.loads(distributed.protocol.dumps([exception, traceback]))
-            super()._handle_task_erred(key, exception, traceback)
+            parent: Any = super()
+            parent._handle_task_erred(key, *_protocol.loads(_protocol.dumps([exception, traceback])))
+
+
+_Client: Any = _PackedClient
+_protocol: Any = distributed.protocol
 
 
 @contextmanager
