@@ -213,13 +213,16 @@ def test_events_that_another_client_sends_run_nothing(dask: DaskBackend, tmp_pat
 
 
 SECOND_USER = """
-import asyncio, sys
+import asyncio, ssl, sys
 from distributed.comm.core import connect
 from distributed.core import send_recv
 
+trusting = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+trusting.check_hostname, trusting.verify_mode = False, ssl.CERT_NONE
+
 async def ask(address):
     try:
-        comm = await connect(address, timeout=3)
+        comm = await connect(address, timeout=3, ssl_context=trusting, require_encryption=False)
         return await asyncio.wait_for(send_recv(comm, op="identity", reply=True), 3)
     except Exception as error:
         return type(error).__name__
@@ -237,7 +240,7 @@ def test_a_process_without_the_certificate_reaches_no_part_of_a_cluster_of_this_
     second = subprocess.run([sys.executable, "-c", SECOND_USER, *places], capture_output=True, text=True, check=True)
     answers = second.stdout.splitlines()
     assert len(answers) == 2 * len(places) == 10
-    assert set(answers) <= {"OSError", "CommClosedError", "TimeoutError", "TypeError", "RuntimeError"}
+    assert set(answers) <= {"OSError", "CommClosedError", "TimeoutError"}
 
 
 def noting(folder: Path, _: Reporter) -> Answer:
