@@ -224,7 +224,8 @@ def test_a_comparison_in_a_folder_in_which_another_writes_is_refused(tmp_path: P
     process.communicate(timeout=PATIENCE)
     assert process.returncode == 0
     assert_refused(second, f"{tmp_path / 'out'}: another omnibench is writing results there", "--output")
-    labels = [entry["label"] for entry in yaml.safe_load((tmp_path / "out" / "config.yaml").read_text())["calibrators"]]
+    entries = yaml.safe_load((tmp_path / "out" / "config.yaml").read_text())["calibrators"]
+    labels = [entry["label"] or entry["name"] for entry in entries]
     assert labels == [run["label"] for run in summary(tmp_path / "out")["runs"]]
 
 
