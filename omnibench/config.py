@@ -22,6 +22,8 @@ M = TypeVar("M", bound=BaseModel)
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+LONGEST_NAME = 200  # characters of a name in a file, of which tables and messages show the whole; chosen
+Name = Annotated[str, Field(max_length=LONGEST_NAME)]
 
 
 def printable(text: str) -> str:

@@ -18,7 +18,14 @@ def one_line(text: str) -> str:
     line = " ".join(text.split())
     if len(line) > _LONGEST:
         line = f"{line[:_LONGEST]} ... ({len(line) - _LONGEST:,} more characters)"
-    return line if line.isprintable() else "".join(letter if letter.isprintable() else "?" for letter in line)
+    return visible(line)
+
+
+def visible(text: str) -> str:
+    """A text with ? for each control character that is no line break: those of terminals, and of writing directions."""
+    if text.isprintable():
+        return text
+    return "".join(letter if letter.isprintable() or letter == "\n" else "?" for letter in text)
 
 
 _SHORT = reprlib.Repr()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import stat
-import tempfile
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import datetime
@@ -97,6 +97,7 @@ def read_text(path: Path, most: int = MOST_TEXT) -> str:
 def replacing(path: Path) -> Iterator[Path]:
     """A temporary path beside ``path`` that takes its place when the block ends well.
 
+    Where it replaces a file, it is on the disk before, so that a machine that loses its power has the one or the other.
     DataError names the path when its folder cannot be made or the disk refuses (full, read-only, no permission).
     """
     path = resolved(path)  # a link goes on pointing to the file
@@ -116,7 +117,13 @@ def replacing(path: Path) -> Iterator[Path]:
         raise _refused(path, error) from None
     try:
         yield partial
+        replaced = path.exists()
+        if replaced:
+            _to_disk(partial)
         partial.replace(path)
+        if replaced:
+            with suppress(OSError):  # a file system that cannot, or a folder that cannot be read
+                _to_disk(path.parent)
     except OSError as error:
         raise _refused(path, error) from None
     finally:
@@ -124,6 +131,51 @@ def replacing(path: Path) -> Iterator[Path]:
             partial.unlink(missing_ok=True)
             for folder in made:  # they stay unless empty
                 folder.rmdir()
+
+
+def _to_disk(path: Path) -> None:
+    """Wait until a file's content, or the names in a folder, are on the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def results_locked(folder: Path) -> Iterator[None]:
+    """Make a folder, if it is missing, and keep other processes from writing results there.
+
+    The lock is the system's, and gone with this process, however it dies. DataError: another process has it.
+    """
+    if sys.platform == "win32":  # which has no locks of folders
+        yield
+        return
+    import fcntl
+
+    made = [parent for parent in (folder, *folder.parents) if not parent.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(folder, os.O_RDONLY)
+    except OSError as error:
+        raise _refused(folder, error) from None
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise DataError(
+                f"{folder}: another omnibench is writing results there; name another folder (--output), or wait for it"
+            ) from None
+        except OSError:
+            pass  # a file system without locks
+        try:
+            yield
+        finally:
+            with suppress(OSError):  # folders stay unless they are empty
+                for parent in made:
+                    parent.rmdir()
+    finally:
+        os.close(descriptor)
 
 
 def refuse_existing(*paths: Path | None, force: bool, folders: bool = False) -> None:
@@ -186,31 +238,6 @@ def write_text(path: Path, text: str) -> None:
     """Write a text file, whole or not at all. DataError when the disk refuses."""
     with replacing(path) as partial:
         partial.write_text(text, encoding="utf-8")
-
-
-def write_result(path: Path, text: str) -> None:
-    """Write what took long to find. What the disk refuses goes to the folder of temporary files, as DataError says."""
-    try:
-        write_text(path, text)
-    except DataError as refused:
-        kept = _kept_meanwhile(text, path.suffix)
-        raise (DataError(f"{refused}; meanwhile the result is in {kept}") if kept else refused) from None
-
-
-def _kept_meanwhile(text: str, suffix: str) -> Path | None:
-    """A new file in the folder of temporary files; None where that takes it neither."""
-    try:
-        descriptor, name = tempfile.mkstemp(prefix="omnibench-", suffix=suffix)
-    except OSError:
-        return None
-    try:
-        with os.fdopen(descriptor, "w", encoding="utf-8") as kept:
-            kept.write(text)
-    except OSError:
-        with suppress(OSError):
-            Path(name).unlink()
-        return None
-    return Path(name)
 
 
 def write_table(path: Path, table: pl.DataFrame) -> None:

@@ -106,7 +106,7 @@ def calibrate(
     from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.config import parse_settings, to_yaml
     from omnibench.data.storage import load_dataset
-    from omnibench.files import refuse_existing, write_result
+    from omnibench.files import refuse_existing, write_text
     from omnibench.fit.calibrate import calibrate as fit
     from omnibench.fit.problem import Budget
     from omnibench.registry import calibrators, costs
@@ -145,7 +145,7 @@ def calibrate(
         )
     calibration, result = run.calibration, run.result
     if output is not None:
-        write_result(output, to_yaml(calibration))
+        write_text(output, to_yaml(calibration))
     warn([*recordings.warnings, *run.warnings])
     if result.at_bounds:
         when = "" if result.shrinkage is None else " before the answer was shrunk to the design"

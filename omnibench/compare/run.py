@@ -27,6 +27,7 @@ from omnibench.compare.uncertainties import typical_uncertainties
 from omnibench.data.dataset import Dataset
 from omnibench.environment import environment
 from omnibench.errors import ConfigError, UnknownNameError, require_type
+from omnibench.files import results_locked
 from omnibench.fit.calibrator import RunResult
 from omnibench.fit.uncertainty.unidentified import warnings_of_calibration
 from omnibench.jobs.backend_choice import BackendChoice, open_backend
@@ -53,40 +54,45 @@ def run_comparison(
     require_type(config, CompareConfig, "read_compare_config")
     check_output(output, config, force=force)
     failures = load_calibrators(config.plugins, [entry.name for entry in config.calibrators])
-    with _naming_failed_plugins(failures):
-        config = effective_config(config)
-        with ExitStack() as opened:
-            backend = opened.enter_context(open_backend(_backend(config), PRELOAD, progress))
-            # Processes that are started for simulation serve the calibrators, too.
-            opened.enter_context(one_thread_processes(_preload(config)))
-            datasets = load_datasets(config, progress)
-            plan = make_plan(config, datasets)
-            folder = prepare_output(config, output, force=force)
-            store = ResultStore(folder / "runs", RunResult)
-            with resumable(plan, store, folder), opened.pop_all():  # Ctrl-C while they close is resumable, too
-                results = execute(plan, store, progress, backend)
-    with resumable(plan, store, folder):
-        scored = score(plan, results, datasets)
-        runs, certificates = certify(plan, scored)
-        statistics = entry_statistics(runs, config.bootstrap)
-        uncertainties = typical_uncertainties(plan, results, runs, statistics)
-        result = ComparisonResult(
-            config=config,
-            output=folder,
-            datasets=datasets,
-            runs=runs,
-            statistics=statistics,
-            design_costs=design_costs(runs, config.bootstrap),
-            certificates=certificates,
-            uncertainties=uncertainties,
-            held_out=held_out_verdicts(statistics, datasets, config.bootstrap),
-            sessions=sessions_that_differ(datasets, config.integration),
-            environment=environment(),
-            warnings=tuple(_warnings(config, failures, datasets, plan, runs)),
-        )
-        write_results(result)
-        write_document(comparison_document(result), folder / "report.html")
-    return result
+    with ExitStack() as lock:
+        if output is not None:
+            lock.enter_context(results_locked(output))
+        with _naming_failed_plugins(failures):
+            config = effective_config(config)
+            with ExitStack() as opened:
+                backend = opened.enter_context(open_backend(_backend(config), PRELOAD, progress))
+                # Processes that are started for simulation serve the calibrators, too.
+                opened.enter_context(one_thread_processes(_preload(config)))
+                datasets = load_datasets(config, progress)
+                plan = make_plan(config, datasets)
+                folder = prepare_output(config, output, force=force)
+                if output is None:
+                    lock.enter_context(results_locked(folder))
+                store = ResultStore(folder / "runs", RunResult)
+                with resumable(plan, store, folder), opened.pop_all():  # Ctrl-C while they close is resumable, too
+                    results = execute(plan, store, progress, backend)
+        with resumable(plan, store, folder):
+            scored = score(plan, results, datasets)
+            runs, certificates = certify(plan, scored)
+            statistics = entry_statistics(runs, config.bootstrap)
+            uncertainties = typical_uncertainties(plan, results, runs, statistics)
+            result = ComparisonResult(
+                config=config,
+                output=folder,
+                datasets=datasets,
+                runs=runs,
+                statistics=statistics,
+                design_costs=design_costs(runs, config.bootstrap),
+                certificates=certificates,
+                uncertainties=uncertainties,
+                held_out=held_out_verdicts(statistics, datasets, config.bootstrap),
+                sessions=sessions_that_differ(datasets, config.integration),
+                environment=environment(),
+                warnings=tuple(_warnings(config, failures, datasets, plan, runs)),
+            )
+            write_results(result)
+            write_document(comparison_document(result), folder / "report.html")
+        return result
 
 
 def _backend(config: CompareConfig) -> BackendChoice:

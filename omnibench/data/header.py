@@ -9,7 +9,7 @@ from typing import Any, Final, Literal
 from pydantic import Field, model_validator
 from pydantic_core import to_jsonable_python
 
-from omnibench.config import Model, Positive, read_yaml, to_yaml, validate
+from omnibench.config import Model, Name, Positive, read_yaml, to_yaml, validate
 from omnibench.data.scans import Scanner
 from omnibench.errors import ConfigError, DataError, shown
 from omnibench.robot.kinematics import Robot
@@ -34,7 +34,7 @@ class Header(Model):
     """The content of dataset.yaml."""
 
     format: Literal["omnibench-dataset/1"] = FORMAT
-    name: str = Field(min_length=1)
+    name: Name = Field(min_length=1)
     description: str = ""
     source: str = ""
     licence: str = ""

@@ -24,7 +24,16 @@ from omnibench.data.tables.dataset_tables import COMMAND_COLUMNS, POSE_COLUMNS, 
 from omnibench.data.tables.table import Table, read_table, table_file
 from omnibench.data.tables.wheel_table import WheelTable
 from omnibench.errors import DataError, require_type
-from omnibench.files import FileContent, TableFormat, check_place, encode_table, remove, resolved, write_files
+from omnibench.files import (
+    FileContent,
+    TableFormat,
+    check_place,
+    encode_table,
+    remove,
+    resolved,
+    results_locked,
+    write_files,
+)
 from omnibench.progress import expect_reading
 from omnibench.words import plural, some
 
@@ -167,13 +176,14 @@ def save_dataset(
     if scans is not None:
         ids = [trajectory.id for trajectory in dataset.trajectories]
         contents[folder / f"scans.{table_format}"] = partial(write_scans, scans, table_format, ids)
-    write_files(contents)
-    for name in ("poses", TABLE, "commands", "scans"):  # that an earlier data set had
-        if folder / f"{name}.{table_format}" not in contents:
-            remove(folder / f"{name}.{table_format}")
-    # In the other format, of an earlier data set.
-    for name in ("trajectories", "wheels", "poses", TABLE, "commands", "scans"):
-        remove(folder / f"{name}.{'csv' if table_format == 'parquet' else 'parquet'}")
+    with results_locked(folder):
+        write_files(contents)
+        for name in ("poses", TABLE, "commands", "scans"):  # that an earlier data set had
+            if folder / f"{name}.{table_format}" not in contents:
+                remove(folder / f"{name}.{table_format}")
+        # In the other format, of an earlier data set.
+        for name in ("trajectories", "wheels", "poses", TABLE, "commands", "scans"):
+            remove(folder / f"{name}.{'csv' if table_format == 'parquet' else 'parquet'}")
 
 
 def check_dataset_folder(folder: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +18,7 @@ from omnibench.files import (
     link_latest,
     new_results_folder,
     remove,
+    results_locked,
     write_files,
 )
 from omnibench.report.render import render
@@ -56,19 +56,15 @@ def write_discovery(
     Default: ``results/<data set name>/<time>``, with a link ``latest``. Raises DataError as ``check_output`` does, or
     if the folder cannot be written to; it is then left as it was.
     """
-    check_output(folder, options, force=force)
     chosen = folder or new_results_folder(RESULTS / _folder_name(discovery.dataset.name))
-    try:
+    with results_locked(chosen):
+        check_output(folder, options, force=force)
         write_files(_contents(discovery, options, chosen))
-    except BaseException:
-        with suppress(OSError):
-            chosen.rmdir()  # only if it is empty
-        raise
-    for stale in chosen.glob("experiment-*.yaml"):  # files of an earlier discovery
-        if stale.name not in _experiments(discovery):
-            remove(stale)
-    if not discovery.extends:
-        remove(chosen / CALIBRATION_FILES["extended"])
+        for stale in chosen.glob("experiment-*.yaml"):  # files of an earlier discovery
+            if stale.name not in _experiments(discovery):
+                remove(stale)
+        if not discovery.extends:
+            remove(chosen / CALIBRATION_FILES["extended"])
     if folder is None:
         link_latest(chosen)
     return chosen

@@ -13,7 +13,7 @@ from omnibench.errors import ConfigError, nearest
 from omnibench.jobs.job import Backend
 from omnibench.jobs.local_backends import Processes
 from omnibench.jobs.scheduler_tls import TlsFiles
-from omnibench.progress import Reporter, no_progress
+from omnibench.progress import Progress, Reporter, no_progress
 
 _NAMES = ("processes", "dask")
 _SCHEMES = ("tcp", "tls")
@@ -75,6 +75,11 @@ def open_backend(
     from omnibench.jobs.dask_cluster import checked_requirements, dask_client, say_cluster
 
     address = None if choice.name == "dask" else choice.name
+    if choice.name.startswith("tcp:"):
+        way = "with tls://HOST:PORT it asks for certificates (omnibench guide scale)"
+        report(
+            Progress("tcp", result=f"warning: whoever reaches {choice.name} runs code on its workers and here; {way}")
+        )
     with dask_client(address, choice.workers, choice.tls, report) as client:
         backend = DaskBackend(client, checked_requirements(client, preload), report)
         say_cluster(client, report)

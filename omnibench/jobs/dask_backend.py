@@ -1,15 +1,14 @@
 """Backend of a Dask cluster. Results come back to the client, which alone writes the store.
 
-A job's begin, its reports and its end are events from its worker; the future tells that it is lost, and holds ends that
-are too large for an event. A worker that is killed takes its jobs with it, and they are given to another. Their begins
-are counted here, since the scheduler also counts jobs that only waited there. (A scheduler that was not started here
-tries again by itself, by its own setting ``allowed-failures``: it may begin a job a fourth time before this hears of
-it.)
+A job's begin, its reports and its end are events from its worker, in JSON; the future tells that it is lost, and holds
+what is pickled, errors and results that are no text, or too large for an event. A worker that is killed takes its jobs
+with it, and they are given to another. Their begins are counted here, since the scheduler also counts jobs that only
+waited there. (A scheduler that was not started here tries again by itself, by its own setting ``allowed-failures``: it
+may begin a job a fourth time before this hears of it.)
 """
 
 from __future__ import annotations
 
-import pickle
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
@@ -25,7 +24,7 @@ from distributed.client import FutureCancelledError
 
 from omnibench.errors import DataError, OmnibenchError, one_line
 from omnibench.jobs.dask_cluster import WAIT, ClusterLostError, count_slots, lost, lost_if_closed
-from omnibench.jobs.dask_worker import Order, Parcel, Told, carry_out, content
+from omnibench.jobs.dask_worker import JobEvent, JobOutcome, Order, Parcel, carry_out, content, read_events
 from omnibench.jobs.job import TRIES, BackendError, Ended, Failure, Job, JobWatch
 from omnibench.jobs.job_process import JobEnd
 from omnibench.jobs.packing import Packer, run_packed
@@ -66,7 +65,7 @@ class DaskBackend:
     _packer: Packer = field(default_factory=Packer)
     _data: dict[str, Any] = field(default_factory=dict)
     topic: str = field(default_factory=lambda: f"omnibench-{uuid4().hex[:12]}")
-    events: SimpleQueue[bytes] = field(default_factory=SimpleQueue)
+    events: SimpleQueue[object] = field(default_factory=SimpleQueue)
     _runs: Iterator[int] = field(default_factory=count)
 
     def __post_init__(self) -> None:
@@ -150,15 +149,15 @@ class _Run:
 
     def ends(self) -> Iterator[Ended]:
         """Wait a moment for events, which are passed on; the jobs that have ended."""
-        events: list[bytes] = []
+        texts: list[object] = []
         with suppress(Empty):
-            events.append(self._backend.events.get(timeout=_LOOK))
+            texts.append(self._backend.events.get(timeout=_LOOK))
             while True:
-                events.append(self._backend.events.get_nowait())
-        for event in events:
-            number, all_told = pickle.loads(event)
-            for told in all_told if number == self._number else ():  # others are of a call that was interrupted
-                yield from self._told(told)
+                texts.append(self._backend.events.get_nowait())
+        for text in texts:
+            number, events = read_events(text)
+            for event in events if number == self._number else ():  # others are of a call that was interrupted
+                yield from self._heard(event)
         if time.monotonic() - self._looked >= _LOOK:
             self._look()
             for key in [*self._futures]:
@@ -170,41 +169,41 @@ class _Run:
             with suppress(OSError):  # a scheduler that does not answer in time
                 self._client.cancel([*self._futures.values()], force=True)
 
-    def _told(self, told: Told) -> Iterator[Ended]:
-        item = self.pending.get(told.number)
+    def _heard(self, event: JobEvent) -> Iterator[Ended]:
+        item = self.pending.get(event.number)
         if item is None:
             return
-        if told.fetch:
+        if event.progress is not None:
+            self._watch.moved(item.number, event.progress)
+        if event.fetch:
             with suppress(KilledWorker):  # ``_lost`` tells of such jobs
                 try:
-                    ends = self._futures[item.parcel].result()
+                    outcomes = self._futures[item.parcel].result()
                 except FutureCancelledError:
                     raise lost(self._client) from None
-                for each in ends:
-                    yield from self._told(each)
-            return
-        if told.progress is not None:
-            self._watch.moved(item.number, told.progress)
-        if told.end is not None:
-            yield self._ended(item, told, told.end)
-        elif told.progress is None:
+                for outcome in outcomes:
+                    if (item := self.pending.get(outcome.number)) is not None:
+                        yield self._ended(item, outcome)
+        elif event.answer is not None:
+            yield self._ended(item, JobOutcome(item.number, JobEnd(event.answer), event.seconds))
+        elif event.progress is None:
             item.begins += 1
             if item.begins > TRIES:
                 yield self._given_up(item)
             else:
-                item.worker = told.worker
+                item.worker = event.worker
                 self._watch.began(item.number)
 
-    def _ended(self, item: _Pending, told: Told, end: JobEnd) -> Ended:
+    def _ended(self, item: _Pending, outcome: JobOutcome) -> Ended:
         self._forget(item)
-        self._seconds += _WEIGHT * (told.seconds - self._seconds)
-        failure = end.failure(item.job)
+        self._seconds += _WEIGHT * (outcome.seconds - self._seconds)
+        failure = outcome.end.failure(item.job)
         if failure is None:
-            self._store.put_content(item.job.key, end.answer)
+            self._store.put_content(item.job.key, outcome.end.answer)
         elif isinstance(failure.error, OSError) and failure.error.errno in _FULL:
-            raise DataError(f"worker {told.worker}: {failure.error}; free space there")
+            raise DataError(f"worker {item.worker}: {failure.error}; free space there")
         elif item.job.own and isinstance(failure.error, DataError):
-            raise DataError(f"worker {told.worker}: {failure.error} (workers must see the files of a large data set)")
+            raise DataError(f"worker {item.worker}: {failure.error} (workers must see the files of a large data set)")
         return Ended(item.number, item.job, failure)
 
     def _given_up(self, item: _Pending) -> Ended:

@@ -20,7 +20,7 @@ from distributed.comm.core import CommClosedError, connect
 from distributed.core import send_recv
 
 from omnibench.errors import ConfigError, one_line
-from omnibench.jobs.dask_worker import Requirements, UnfitWorkerError, check
+from omnibench.jobs.dask_worker import Requirements, UnfitWorkerError, prepare
 from omnibench.jobs.job import BackendError
 from omnibench.jobs.scheduler_tls import TlsFiles
 from omnibench.jobs.software import software
@@ -78,6 +78,25 @@ def count_slots(client: Any) -> int:
     return sum(threads.values())
 
 
+class _PackedClient(distributed.Client):
+    """Client that leaves packed what others publish at the scheduler: distributed's own unpickles it, thus runs it."""
+
+    async def _ensure_connected(self, timeout: Any = None) -> None:
+        parent: Any = super()  # without types
+        await parent._ensure_connected(timeout)
+        if self.scheduler_comm is not None:
+            self.scheduler_comm.comm.deserialize = False
+
+    def _handle_task_erred(self, key: Any = None, exception: Any = None, traceback: Any = None) -> None:
+        if key in self.futures:  # a task of this client
+            parent: Any = super()
+            parent._handle_task_erred(key, *_protocol.loads(_protocol.dumps([exception, traceback])))
+
+
+_Client: Any = _PackedClient
+_protocol: Any = distributed.protocol
+
+
 @contextmanager
 def dask_client(address: str | None, workers: int, tls: TlsFiles | None, report: Reporter) -> Iterator[Any]:
     """A client of the scheduler at ``address``, or of a cluster of so many processes that is started here.
@@ -92,7 +111,7 @@ def dask_client(address: str | None, workers: int, tls: TlsFiles | None, report:
         if address is None:
             with (
                 _local_cluster(workers) as cluster,
-                _closing(distributed.Client(cluster, set_as_default=False), _CLIENT_CLOSED) as client,
+                _closing(_Client(cluster, set_as_default=False), _CLIENT_CLOSED) as client,
             ):
                 yield client
         else:
@@ -121,6 +140,7 @@ def _local_cluster(workers: int) -> Iterator[Any]:
             cluster = distributed.LocalCluster(
                 n_workers=workers,
                 threads_per_worker=1,
+                security=True,  # certificates of its own: other users of this machine cannot join
                 memory_limit=None,
                 dashboard_address="127.0.0.1:8787",
                 silence_logs=logging.CRITICAL,
@@ -138,7 +158,7 @@ def _joined(address: str, tls: TlsFiles | None) -> Any:
     try:
         with ThreadPoolExecutor(1) as thread:  # a notebook has a loop of its own in this one
             thread.submit(asyncio.run, _ask(address, security)).result()
-        return distributed.Client(address, timeout=_ANSWER, set_as_default=False, security=security)
+        return _Client(address, timeout=_ANSWER, set_as_default=False, security=security)
     except ConfigError:
         raise
     except Exception as error:  # sockets, TLS and the protocol of another version raise what they like
@@ -209,11 +229,11 @@ def checked_requirements(client: Any, preload: Sequence[str]) -> bytes:
             preload=tuple(preload),
         )
     )
-    answers = client.run(check, requirements, on_error="return")
+    answers = client.run(prepare, requirements, on_error="return")
     for worker, answer in answers.items():
+        if isinstance(answer, UnfitWorkerError):
+            raise answer
         if isinstance(answer, BaseException):  # another Python, or no omnibench
             reason = one_line(f"{type(answer).__name__}: {answer}")
             raise UnfitWorkerError(f"worker {worker} cannot run omnibench's jobs ({reason}); install the same there")
-        if answer is not None:
-            raise UnfitWorkerError(answer)
     return requirements

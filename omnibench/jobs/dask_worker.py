@@ -6,21 +6,24 @@ So limits, isolation and threads are those of the processes of one machine, and 
 from __future__ import annotations
 
 import hashlib
+import json
 import multiprocessing
 import os
 import pickle
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
 import distributed
+from pydantic import TypeAdapter
 
+from omnibench.config import NonNegative
 from omnibench.errors import DataError
 from omnibench.files import write_text
 from omnibench.jobs.job import BackendError, Job
@@ -64,10 +67,7 @@ class Order:
 
 @dataclass(frozen=True)
 class Parcel:
-    """Jobs that travel together, quick ones. names: of what they share.
-
-    topic: of the events that tell of them; an event is the pickled ``run`` and a tuple of Told.
-    """
+    """Jobs that travel together, quick ones. names: of what they share. topic: of events, texts of ``events_text``."""
 
     topic: str
     run: int
@@ -77,18 +77,43 @@ class Parcel:
 
 
 @dataclass(frozen=True)
-class Told:
-    """Event of a job: it begins (neither progress nor end), reports, or ends, perhaps with a last report.
+class JobEvent:
+    """Event of a job: it begins at a worker, reports, or ends.
 
-    seconds: that it took. fetch: ends that are too large for an event are the result of the parcel's task.
+    answer: content of its result. seconds: that it took. fetch: how it ended is in the result of the parcel's task.
     """
 
     number: int
-    worker: str
+    worker: str = ""
     progress: Progress | None = None
-    end: JobEnd | None = None
-    seconds: float = 0.0
+    answer: str | None = None
+    seconds: NonNegative = 0.0
     fetch: bool = False
+
+
+@dataclass(frozen=True)
+class JobOutcome:
+    """End of a job. seconds: that it took."""
+
+    number: int
+    end: JobEnd
+    seconds: float
+
+
+def events_text(run: int, events: Iterable[JobEvent]) -> str:
+    """Events as JSON. Nobody unpickles events: whoever reaches the scheduler can send some."""
+    return json.dumps([run, [asdict(event) for event in events]], default=str)  # a plug-in may report numpy's integers
+
+
+def read_events(text: object) -> tuple[int, list[JobEvent]]:
+    """The run and the events of a text; none of a text that ``events_text`` does not write."""
+    try:
+        return _EVENTS.validate_python(json.loads(text) if isinstance(text, str) else None)
+    except (ValueError, RecursionError):  # ValueError: pydantic's errors, too
+        return -1, []
+
+
+_EVENTS = TypeAdapter(tuple[int, list[JobEvent]])
 
 
 def content(data: bytes) -> bytes:
@@ -96,8 +121,8 @@ def content(data: bytes) -> bytes:
     return data
 
 
-def carry_out(parcel: Parcel, requirements: bytes, *shared: bytes) -> list[Told]:
-    """Task of a parcel's jobs, one after the other. Their ends are told together, those of quick ones; large ones stay.
+def carry_out(parcel: Parcel, requirements: bytes, *shared: bytes) -> list[JobOutcome]:
+    """Task of a parcel's jobs, one after the other; returns the ends that no event tells.
 
     UnfitWorkerError: this worker joined after the first job, and is not as it must be.
     """
@@ -108,7 +133,7 @@ def carry_out(parcel: Parcel, requirements: bytes, *shared: bytes) -> list[Told]
     data = dict(zip(parcel.names, shared, strict=True))
     timed = any(order.job.timed for order in parcel.orders)
     with _slots(worker.state.nthreads if timed else 1, worker.state.nthreads):
-        teller.begins(*(Told(order.number, worker.address) for order in parcel.orders))
+        teller.begins([JobEvent(order.number, worker.address) for order in parcel.orders])
         for order in parcel.orders:
             held = {name: data[name] for name in order.names}
             packed = PackedJob(order.content, held, plugins, kept=order.job.own)
@@ -116,7 +141,7 @@ def carry_out(parcel: Parcel, requirements: bytes, *shared: bytes) -> list[Told]
             process = process_for(job, idle, _context(preload))
             try:
                 process.give(job, parcel.store.content)
-                progress, end = _follow(process, teller, order.number)
+                end = _follow(process, teller, order.number)
             except BaseException:
                 process.end()
                 raise
@@ -127,23 +152,14 @@ def carry_out(parcel: Parcel, requirements: bytes, *shared: bytes) -> list[Told]
                 idle.append(process)
             else:
                 process.end()
-            teller.ended(Told(order.number, worker.address, progress, end, time.monotonic() - began))
+            teller.ended(JobOutcome(order.number, end, time.monotonic() - began))
     return teller.close()
 
 
-def prepare(requirements: bytes, worker: Any) -> dict[Path, Path]:
+def prepare(requirements: bytes, dask_worker: Any) -> dict[Path, Path]:
     """Check a worker, once for the same requirements: copies of plug-in files there. UnfitWorkerError in one line."""
     with _preparing:
-        return _prepared(requirements, worker.address, Path(worker.local_directory))
-
-
-def check(requirements: bytes, dask_worker: Any) -> str | None:
-    """Why a worker is unfit; None if it is fit."""
-    try:
-        prepare(requirements, dask_worker)
-    except UnfitWorkerError as error:
-        return str(error)
-    return None
+        return _prepared(requirements, dask_worker.address, Path(dask_worker.local_directory))
 
 
 _preparing = threading.Lock()
@@ -203,22 +219,22 @@ def _as_it_is(_: str, result: Any) -> Any:
     return result
 
 
-def _follow(process: JobProcess, teller: _Teller, number: int) -> tuple[Progress | None, JobEnd | None]:
-    """Wait for a job's end, and report: the last report not yet told, and the end; None if it is wanted no more."""
+def _follow(process: JobProcess, teller: _Teller, number: int) -> JobEnd | None:
+    """Wait for a job's end, and report; None if it is wanted no more."""
     told, last = time.monotonic(), None
     while True:
         wait(process.signs, timeout=_PERIOD)
+        end = None
         for event in process.events():
             if isinstance(event, JobEnd):
-                return last, event
-            last = event
-        if time.monotonic() - told >= _PERIOD:
-            told = time.monotonic()
-            if last is not None:
-                teller.tell(Told(number, teller.worker.address, last))
-                last = None
-            if not teller.wanted:
-                return None, None
+                end = event
+                break
+            last = JobEvent(number, progress=event)
+        if last is not None and (end or time.monotonic() - told >= _PERIOD):
+            teller.tell(last, at_once=end is None)
+            told, last = time.monotonic(), None
+        if end or not teller.wanted:
+            return end
 
 
 class _Teller:
@@ -228,9 +244,9 @@ class _Teller:
         self.worker = worker
         self._topic, self._run = parcel.topic, parcel.run
         self._key = worker.get_current_task()
-        self._waiting: list[Told] = []
+        self._waiting: list[JobEvent] = []
         self._size = 0  # bytes of those that wait
-        self._large: list[Told] = []
+        self._fetched: list[JobOutcome] = []
         self._told = time.monotonic()
 
     @property
@@ -239,38 +255,39 @@ class _Teller:
         task = self.worker.state.tasks.get(self._key)
         return task is not None and task.state != "cancelled"
 
-    def begins(self, *events: Told) -> None:
+    def begins(self, events: Iterable[JobEvent]) -> None:
         """Send begins, and wait until the scheduler has them: one that died with its worker would not be counted."""
         log_event = self.worker.scheduler.log_event
-        distributed.utils.sync(self.worker.loop, log_event, topic=self._topic, msg=pickle.dumps((self._run, events)))
+        distributed.utils.sync(self.worker.loop, log_event, topic=self._topic, msg=events_text(self._run, events))
 
-    def tell(self, *events: Told) -> None:
-        """Send events."""
-        self.worker.log_event(self._topic, pickle.dumps((self._run, events)))
-
-    def ended(self, end: Told) -> None:
-        """Send an end, soon."""
-        size = len(pickle.dumps(end))
-        if size > _LARGEST:
-            self._large.append(end)
-        else:
-            if self._size + size > _LARGEST:
-                self._send()
-            self._waiting.append(end)
-            self._size += size
-        if time.monotonic() - self._told > _TOGETHER or len(self._waiting) >= _MOST_TOGETHER:
+    def tell(self, event: JobEvent, *, at_once: bool = False) -> None:
+        """Send an event, with others that wait unless ``at_once``."""
+        size = len(event.answer or "")
+        if self._size + size > _LARGEST:
+            self._send()
+        self._waiting.append(event)
+        self._size += size
+        if at_once or time.monotonic() - self._told > _TOGETHER or len(self._waiting) >= _MOST_TOGETHER:
             self._send()
 
-    def close(self) -> list[Told]:
-        """Send what is left; the ends that are too large for that."""
+    def ended(self, outcome: JobOutcome) -> None:
+        """Send an end soon, if it is a result in text that is not too large for an event."""
+        answer = outcome.end.answer
+        if isinstance(answer, str) and len(answer) <= _LARGEST:
+            self.tell(JobEvent(outcome.number, answer=answer, seconds=outcome.seconds))
+        else:
+            self._fetched.append(outcome)
+
+    def close(self) -> list[JobOutcome]:
+        """Send what is left; the ends that are no events."""
+        for outcome in self._fetched:
+            self.tell(JobEvent(outcome.number, fetch=True))
         self._send()
-        if self._large:
-            self.tell(*(Told(end.number, self.worker.address, fetch=True) for end in self._large))
-        return self._large
+        return self._fetched
 
     def _send(self) -> None:
         if self._waiting:
-            self.tell(*self._waiting)
+            self.worker.log_event(self._topic, events_text(self._run, self._waiting))
         self._waiting, self._size, self._told = [], 0, time.monotonic()
 
 

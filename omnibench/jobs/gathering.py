@@ -47,7 +47,7 @@ class _InMemory(Generic[T]):
 
     def get(self, key: str) -> T | None:
         content = self._contents.pop(key, None)
-        return None if content is None else pickle.loads(content)
+        return pickle.loads(content) if isinstance(content, bytes) else None  # no text, which events may bring
 
     def keep(self, key: str, result: T) -> bytes:
         return self.content(key, result)

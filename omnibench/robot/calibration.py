@@ -18,7 +18,18 @@ from pydantic import (
     model_validator,
 )
 
-from omnibench.config import MOST_VALUES, Model, NonNegative, parse_yaml, printable, read_yaml, to_yaml, validate
+from omnibench.config import (
+    LONGEST_NAME,
+    MOST_VALUES,
+    Model,
+    Name,
+    NonNegative,
+    parse_yaml,
+    printable,
+    read_yaml,
+    to_yaml,
+    validate,
+)
 from omnibench.errors import ConfigError, DataError, require_type, shown
 from omnibench.files import write_text
 from omnibench.robot.domain.fade import Fade
@@ -44,7 +55,7 @@ def _is_none(value: object) -> bool:
 class EffectTerm(Model):
     """An effect by its name, with the values of its parameters."""
 
-    name: str
+    name: Name
     parameters: dict[str, FiniteFloat] = {}
     weights: str | None = Field(
         None, description="of a learned effect: base64 of float32, at most 48 KiB", exclude_if=_is_none
@@ -110,11 +121,11 @@ class Provenance(Model):
     fitted: None in files of versions that did not write it. on_bounds: no interval is stated of what depends on these.
     """
 
-    dataset: str
+    dataset: Name
     dataset_hash: str
     fitted: tuple[Fingerprint, ...] | None = Field(None, description="fingerprints of the runs that it was fitted to")
     simulated: bool = False
-    calibrator: str
+    calibrator: Name
     options: dict[str, Any] = {}
     seed: int
     cost: str
@@ -179,7 +190,7 @@ class Calibration(Shown, Model):
     """The content of a calibration file."""
 
     format: Literal["omnibench-calibration/1"] = FORMAT
-    name: Annotated[str, AfterValidator(printable)]
+    name: Annotated[str, Field(max_length=2 * LONGEST_NAME + 1), AfterValidator(printable)]  # data set and calibrator
     created: datetime = Field(default_factory=lambda: datetime.now(UTC).replace(microsecond=0))
     robot: Robot
     sample_period: float = Field(ge=SAMPLE_PERIODS[0], le=SAMPLE_PERIODS[1], description="s")
@@ -191,7 +202,7 @@ class Calibration(Shown, Model):
     effects: tuple[EffectTerm, ...] = ()
     noise: Noise | None = None
     covariance: tuple[Row, ...] | None = Field(None, description="of the matrix, row by row, then of the effects")
-    session: str | None = Field(None, description="what drift terms are measured from")
+    session: Name | None = Field(None, description="what drift terms are measured from")
     driven: tuple[tuple[FiniteFloat, FiniteFloat, FiniteFloat], ...] | None = Field(
         None, description="motions that it was fitted to, m/s, m/s, rad/s; its effects are not known to hold beyond"
     )

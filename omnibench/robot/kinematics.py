@@ -34,7 +34,7 @@ from pydantic import (
     model_validator,
 )
 
-from omnibench.config import Model
+from omnibench.config import Model, Name
 from omnibench.robot.arrays import Array as Array
 from omnibench.robot.arrays import JsonArray as JsonArray
 from omnibench.robot.wheels.drive import CarDrive, Drive, drive_of
@@ -81,7 +81,7 @@ class Robot(Shown, Model):
     mount: the tracked point, where it is not the robot's centre. skid: True where fixed wheels have to slide in turns.
     """
 
-    name: str
+    name: Name
     wheels: tuple[Wheel, ...] = Field(min_length=1)
     mount: Mount | None = Field(None, description="the tracked point in the robot's frame; default: its centre")
     skid: bool = Field(False, description="true for skid steering: fixed wheels slide when the robot turns")

@@ -11,6 +11,7 @@ from omnibench.compare.effective_config import effective_cost, effective_options
 from omnibench.compare.execute import PRELOAD, execute, resumable
 from omnibench.environment import environment
 from omnibench.errors import DataError, require_type
+from omnibench.files import results_locked
 from omnibench.fit.calibrator import RunResult
 from omnibench.jobs.backend_choice import BackendChoice, open_backend
 from omnibench.jobs.result_store import ResultStore
@@ -40,38 +41,43 @@ def run_study(
     """
     require_type(config, StudyConfig, "study.read_study_config")
     check_output(output, config, force=force)
-    failures, config = _with_methods(config)
-    robots, broken = load_robots(config, progress)
-    if not robots:
-        name, reason = next(iter(broken.items()))
-        raise DataError(f"no robot's recordings can be read, the first: {name}: {reason}")
-    fits = plan_fits(config, robots)
-    folder = prepare_output(config, output, force=force)
-    store = ResultStore(folder / "runs", RunResult)
-    asked = {index: fit.run for index, fit in enumerate(fits) if fit.run is not None}
-    plan = list(asked.values())
-    with resumable(plan, store, folder, "fits"):
-        with ExitStack() as opened:
-            backend = opened.enter_context(open_backend(_backend(config), PRELOAD, progress))
-            opened.enter_context(one_thread_processes(PRELOAD))
-            results = dict(zip(asked, execute(plan, store, progress, backend), strict=True))
-        judged, design = judge_fits(fits, results, config.integration, progress)
-        result = StudyResult(
-            config=config,
-            output=folder,
-            robots=robots,
-            broken=broken,
-            fits=judged,
-            cells=make_cells(judged, design),
-            environment=environment(),
-            warnings=(
-                *(f"plug-in {each.origin} cannot be imported: {each.error}" for each in failures),
-                *(f"{robot.name}: {warning}" for robot in robots for warning in robot.dataset.warnings),
-            ),
-        )
-        write_results(result)
-        write_document(study_document(result), folder / "report.html")
-    return result
+    with ExitStack() as lock:
+        if output is not None:
+            lock.enter_context(results_locked(output))
+        failures, config = _with_methods(config)
+        robots, broken = load_robots(config, progress)
+        if not robots:
+            name, reason = next(iter(broken.items()))
+            raise DataError(f"no robot's recordings can be read, the first: {name}: {reason}")
+        fits = plan_fits(config, robots)
+        folder = prepare_output(config, output, force=force)
+        if output is None:
+            lock.enter_context(results_locked(folder))
+        store = ResultStore(folder / "runs", RunResult)
+        asked = {index: fit.run for index, fit in enumerate(fits) if fit.run is not None}
+        plan = list(asked.values())
+        with resumable(plan, store, folder, "fits"):
+            with ExitStack() as opened:
+                backend = opened.enter_context(open_backend(_backend(config), PRELOAD, progress))
+                opened.enter_context(one_thread_processes(PRELOAD))
+                results = dict(zip(asked, execute(plan, store, progress, backend), strict=True))
+            judged, design = judge_fits(fits, results, config.integration, progress)
+            result = StudyResult(
+                config=config,
+                output=folder,
+                robots=robots,
+                broken=broken,
+                fits=judged,
+                cells=make_cells(judged, design),
+                environment=environment(),
+                warnings=(
+                    *(f"plug-in {each.origin} cannot be imported: {each.error}" for each in failures),
+                    *(f"{robot.name}: {warning}" for robot in robots for warning in robot.dataset.warnings),
+                ),
+            )
+            write_results(result)
+            write_document(study_document(result), folder / "report.html")
+        return result
 
 
 def _with_methods(config: StudyConfig) -> tuple[list[PluginFailure], StudyConfig]:

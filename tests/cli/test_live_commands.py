@@ -16,7 +16,7 @@ from commands import CONFIGS, assert_refused, flower, omnibench, prepare, write_
 from commands import Command as InProcess
 from drives import calibration
 from nodes import Command, write_node
-from sessions import free_port, raw_session, until
+from sessions import Loopback, free_port, raw_session, until
 from timing import PATIENCE, load
 
 import omnibench as package
@@ -108,6 +108,24 @@ def test_ctrl_c_ends_a_replay_with_what_it_has_shown(workplace: Path) -> None:
     assert demonstration.process.returncode == 130
     assert "stopped after" in out
     assert "Traceback" not in said
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("\x1b[2Jmine", "apr runs ?[2Jmine now; next, "),
+        ("x" * 100_000, "apr': cannot read its node's answer; is it an"),
+    ],
+)
+def test_what_a_node_answers_to_a_swap_is_printed_without_its_control_characters_and_not_without_end(
+    loopback: Loopback, name: str, words: str
+) -> None:
+    key, answer = "omnibench/apr/swap", json.dumps({"accepted": True, "calibration": name})
+    _node = loopback.router.declare_queryable(key, lambda query: query.reply(key, answer))
+    run = omnibench("swap", "apr", prepare().calibration, "--connect", loopback.address)
+    assert words in run.stderr
+    assert len(run.stderr) < 500
+    assert run.stderr.replace("\n", "").isprintable()
 
 
 def test_a_recording_goes_out_and_comes_back_as_a_calibration_that_is_swapped_in(

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from announced_robot import AnnouncedRobot
+from commands import omnibench
 from rich.console import Console
 from samples import odometry
 from sessions import Loopback
@@ -49,6 +50,13 @@ def test_a_robot_that_is_not_there_is_one_line_with_the_nearest_that_is(
         DataError, match=r"'apr2': nothing was received from it in 0\.5 s; did you mean 'apr02'\? alive: apr02"
     ):
         listened(loopback, "apr2", patience=0.5)
+
+
+def test_control_characters_of_a_robot_do_not_reach_the_terminal(loopback: Loopback, apr02: AnnouncedRobot) -> None:
+    apr02.answer_health("stale", "\x1b[2Jgone \u202eback\x07")
+    run = omnibench("listen", "apr02", "--connect", loopback.address, "--seconds", "1")
+    assert "apr02: no odometry yet, stale: ?[2Jgone ?back?" in run.stdout
+    assert (run.stdout + run.stderr).replace("\n", "").isprintable()
 
 
 def test_when_nobody_is_there_the_line_says_so(loopback: Loopback) -> None:

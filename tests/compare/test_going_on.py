@@ -16,6 +16,7 @@ from commands import (
     COMMAND,
     ENVIRONMENT,
     Command,
+    assert_refused,
     compared,
     compared_here,
     files_of,
@@ -214,6 +215,18 @@ def test_the_runs_end_with_a_comparison_that_is_killed_which_then_goes_on(name: 
     assert before.items() <= files_of(tmp_path / "out" / "runs").items()
     outcomes = {run["label"]: run["outcome"] for run in summary(tmp_path / "out")["runs"]}
     assert outcomes == {"theoretical": "converged", "waiting": "budget", "second": "budget", "third": "budget"}
+
+
+def test_a_comparison_in_a_folder_in_which_another_writes_is_refused(tmp_path: Path) -> None:
+    process = started(write_config(tmp_path, **waiting(tmp_path)), tmp_path / "out")
+    second = omnibench("compare", write_config(tmp_path / "second"), "--output", tmp_path / "out")
+    (tmp_path / "go").touch()
+    process.communicate(timeout=PATIENCE)
+    assert process.returncode == 0
+    assert_refused(second, f"{tmp_path / 'out'}: another omnibench is writing results there", "--output")
+    entries = yaml.safe_load((tmp_path / "out" / "config.yaml").read_text())["calibrators"]
+    labels = [entry["label"] or entry["name"] for entry in entries]
+    assert labels == [run["label"] for run in summary(tmp_path / "out")["runs"]]
 
 
 MISBEHAVING = """

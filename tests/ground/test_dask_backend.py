@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import gc
 import os
+import pickle
 import signal
+import subprocess
+import sys
 import threading
 import time
 import weakref
@@ -13,9 +16,11 @@ from multiprocessing import parent_process
 from pathlib import Path
 from typing import Any
 
+import distributed
 import numpy as np
 import pytest
-from job_samples import Answer, Notes, jobs_of, squared, tried
+from distributed.protocol import Serialize
+from job_samples import Answer, Notes, jobs_of, squared, tried, wait_for
 from test_jobs import (
     asleep,
     killed,
@@ -168,7 +173,7 @@ class TestWorkersThatDie:
         jobs = [Job("always", kills_its_worker, (tmp_path, 9)), Job("once", kills_its_worker, (tmp_path / "once", 1))]
         (tmp_path / "once").mkdir()
         notes = run(tmp_path / "results", [*jobs, *jobs_of(squared, range(20))], dask)
-        assert notes.reason(0).startswith("its worker was killed in each of 3 tries (the last: tcp://127.0.0.1:")
+        assert notes.reason(0).startswith("its worker was killed in each of 3 tries (the last: tls://127.0.0.1:")
         assert (tmp_path / "kills").stat().st_size == 3
         assert [notes.answers()[number] for number in range(1, 22)] == [2, *(number**2 for number in range(20))]
 
@@ -183,6 +188,59 @@ def kills_its_worker(order: tuple[Path, int], _: Reporter) -> Answer:
         os.kill(parent.pid, signal.SIGKILL)
         time.sleep(60)
     return Answer(count)
+
+
+class Crafted:
+    """An object that makes a file where it is unpickled."""
+
+    def __init__(self, file: Path) -> None:
+        self._file = file
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.touch, (self._file,)
+
+
+def test_events_that_another_client_sends_run_nothing(dask: DaskBackend, tmp_path: Path) -> None:
+    crafted = Crafted(tmp_path / "ran")
+    events = [pickle.dumps(crafted), pickle.dumps((0, [crafted])), Serialize(crafted), "no JSON", "[" * 100_000]
+    ours = dask.client
+    with distributed.Client(ours.scheduler.address, security=ours.security, set_as_default=False) as another:
+        for event in events:
+            another.log_event(dask.topic, event)
+    wait_for(lambda: dask.events.qsize() >= len(events))
+    assert run(tmp_path / "results", jobs_of(squared, range(3)), dask).answers() == {0: 0, 1: 1, 2: 4}
+    assert not (tmp_path / "ran").exists()
+
+
+SECOND_USER = """
+import asyncio, ssl, sys
+from distributed.comm.core import connect
+from distributed.core import send_recv
+
+trusting = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+trusting.check_hostname, trusting.verify_mode = False, ssl.CERT_NONE
+
+async def ask(address):
+    try:
+        comm = await connect(address, timeout=3, ssl_context=trusting, require_encryption=False)
+        return await asyncio.wait_for(send_recv(comm, op="identity", reply=True), 3)
+    except Exception as error:
+        return type(error).__name__
+
+for place in sys.argv[1:]:
+    for scheme in ("tcp", "tls"):
+        print(asyncio.run(ask(f"{scheme}://{place}")))
+"""
+
+
+def test_a_process_without_the_certificate_reaches_no_part_of_a_cluster_of_this_machine(dask: DaskBackend) -> None:
+    workers = dask.client.scheduler_info(n_workers=-1)["workers"]
+    addresses = [dask.client.scheduler.address, *workers, *(worker["nanny"] for worker in workers.values())]
+    places = [address.partition("://")[2] for address in addresses]
+    second = subprocess.run([sys.executable, "-c", SECOND_USER, *places], capture_output=True, text=True, check=True)
+    answers = second.stdout.splitlines()
+    assert len(answers) == 2 * len(places) == 10
+    assert set(answers) <= {"OSError", "CommClosedError", "TimeoutError"}
 
 
 def noting(folder: Path, _: Reporter) -> Answer:

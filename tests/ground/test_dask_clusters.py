@@ -74,6 +74,18 @@ def test_a_scheduler_that_nobody_started_is_one_line_soon(tmp_path: Path) -> Non
     assert time.monotonic() - began < 60
 
 
+def test_a_scheduler_without_tls_is_joined_with_a_line_that_says_who_runs_code_there() -> None:
+    said: list[Progress] = []
+    choice = BackendChoice(name="tcp://127.0.0.1:9")
+    with pytest.raises(ConfigError, match="no Dask scheduler answers"), open_backend(choice, report=said.append):
+        pass
+    (line,) = [event.result for event in said]
+    assert line == (
+        "warning: whoever reaches tcp://127.0.0.1:9 runs code on its workers and here; with tls://HOST:PORT it asks "
+        "for certificates (omnibench guide scale)"
+    )
+
+
 def test_without_dask_one_line_names_the_extra(tmp_path: Path) -> None:
     without = "import sys; sys.modules['distributed'] = None; from omnibench.__main__ import main; main()"
     command = [sys.executable, "-c", without, "compare", str(write_config(tmp_path)), "--backend", "dask"]

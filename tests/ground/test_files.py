@@ -5,12 +5,21 @@ from __future__ import annotations
 import errno
 import os
 import stat
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from omnibench.errors import DataError, one_line
-from omnibench.files import check_results_folder, link_latest, new_results_folder, replacing, write_text
+from omnibench.files import (
+    check_results_folder,
+    link_latest,
+    new_results_folder,
+    replacing,
+    results_locked,
+    write_text,
+)
 
 
 def test_a_link_goes_on_pointing_to_the_file_that_is_written(tmp_path: Path) -> None:
@@ -100,3 +109,36 @@ def test_a_folder_with_other_files_is_refused(tmp_path: Path, content: bytes) ->
     (tmp_path / "config.yaml").write_bytes(content)
     with pytest.raises(DataError, match=r"holds other files; name a new folder, or one of an earlier trial"):
         check_results_folder(tmp_path, "# ours", "trial")
+
+
+def test_a_folder_of_results_is_free_again_when_the_process_that_wrote_there_is_killed(tmp_path: Path) -> None:
+    folder = tmp_path / "results"
+    writes = (
+        "import sys, time\nfrom pathlib import Path\nfrom omnibench.files import results_locked\n"
+        "with results_locked(Path(sys.argv[1])):\n    print(flush=True)\n    time.sleep(600)"
+    )
+    with subprocess.Popen([sys.executable, "-c", writes, str(folder)], stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        refusal = f"^{folder}: another omnibench is writing results there; name another folder"
+        with pytest.raises(DataError, match=refusal), results_locked(folder):
+            pass
+        process.kill()
+    with results_locked(folder):
+        assert list(folder.iterdir()) == []
+
+
+def test_a_file_that_replaces_another_is_on_the_disk_before_it_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[tuple[str, str]] = []
+
+    def sync(descriptor: int) -> None:
+        path = Path(os.readlink(f"/proc/self/fd/{descriptor}"))
+        calls.append((path.name.partition(".")[2].partition(".")[0], (tmp_path / "state.yaml").read_text()))
+
+    monkeypatch.setattr(os, "fsync", sync)
+    write_text(tmp_path / "state.yaml", "old")
+    assert calls == []
+    write_text(tmp_path / "state.yaml", "new")
+    assert calls == [("state", "old"), ("", "new")]

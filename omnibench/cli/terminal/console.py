@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import typer
 
+from omnibench.errors import visible
+
 if TYPE_CHECKING:
     from pydantic import BaseModel
     from rich.console import Console
+    from rich.segment import Segment
 
     from omnibench.robot.calibration import HeldOutVerdict
 
@@ -21,12 +24,17 @@ _PIPED_WIDTH = 160  # columns of a table in a pipe or a file, where nobody's win
 def make_console(error: bool = False) -> Console:
     """A console that shows texts as they are, and does not squeeze tables into 80 columns when it is piped.
 
+    Texts may come from files and the network: their control characters, which could command the terminal, become ?.
     On a terminal text wraps between words; in a pipe a text with ``soft_wrap`` stays one line.
     error: on standard error, where progress goes; work goes on in silence when nobody reads it any more.
     """
     from rich.console import Console as RichConsole
 
     class Console(RichConsole):
+        def render(self, *arguments: Any, **settings: Any) -> Iterator[Segment]:
+            for segment in super().render(*arguments, **settings):
+                yield segment if segment.control else segment._replace(text=visible(segment.text))
+
         def print(self, *objects: Any, soft_wrap: bool | None = None, **settings: Any) -> None:
             super().print(*objects, soft_wrap=bool(soft_wrap) and not self.is_terminal, **settings)
 
@@ -83,4 +91,4 @@ def print_ending(outcome: str, then: str = "", *command: object) -> None:
         return
     console.print(f"{outcome}; next, {then}{':' if command else '.'}", soft_wrap=True)
     if command:
-        typer.echo(f"  {shlex.join(map(str, command))}", err=True)
+        typer.echo(f"  {visible(shlex.join(map(str, command)))}", err=True)

@@ -15,6 +15,7 @@ from rich.live import Live
 from rich.text import Text
 
 from omnibench.cli.terminal.tables import render_table
+from omnibench.errors import one_line
 from omnibench.live.robot_monitor import RobotMonitor
 from omnibench.live.robot_status import OdometryStatus, RobotStatus, json_document
 from omnibench.live.stopping import ticks
@@ -106,7 +107,7 @@ def describe(status: RobotStatus) -> str:
     missed = sum(stream.missed for stream in streams)
     if missed:
         parts.append(f"{plural(missed, 'message')} missed on the way")
-    return ", ".join(parts)
+    return one_line(", ".join(parts))
 
 
 def plain_line(status: RobotStatus) -> str:

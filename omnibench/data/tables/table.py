@@ -9,6 +9,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from omnibench.config import LONGEST_NAME
 from omnibench.data.delimited import missing_column
 from omnibench.data.run_checks import LARGEST
 from omnibench.data.stored.stored_rows import read_parquet, readable
@@ -66,12 +67,16 @@ class Table:
         return values
 
     def name_trajectories(self) -> None:
-        """Make the trajectories' ids texts. DataError when they are neither names nor numbers, or one is missing."""
+        """Make the trajectories' ids texts. DataError: one is missing, or no name or number, or a name is too long."""
         ids = self.frame["trajectory"]
         if ids.dtype.is_nested():
             raise DataError(f"{self.file}: column 'trajectory' holds {ids.dtype}, expected names or numbers")
         self.refuse(ids.is_null(), lambda _: "trajectory is missing")
         self.frame = self.frame.with_columns(ids.cast(pl.String))
+        for column in _TEXTS:
+            if column in self.frame.columns and (names := self.frame[column]).dtype == pl.String:
+                for row in (names.str.len_chars() > LONGEST_NAME).fill_null(value=False).arg_true()[:1]:
+                    raise self.fail(row, f"{column} has more than {LONGEST_NAME} characters; shorten it")
 
     def stack(self, columns: Sequence[str]) -> Array | None:
         """Optional columns as (rows, n), or None when none is there. DataError when only some are."""

@@ -5,13 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import zenoh
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from omnibench.errors import DataError
 from omnibench.files import read_bytes
 from omnibench.live.control.orders import LONGEST, read_sent_calibration
 from omnibench.live.control.request_queue import source_of
 from omnibench.live.network.presence import alive_robots, checked_robot, nothing_received
+
+_LONGEST_TEXT = 2000  # characters; names have some 400, reasons are one line
 
 
 class SwapReply(BaseModel):
@@ -20,9 +22,9 @@ class SwapReply(BaseModel):
     model_config = ConfigDict(extra="ignore", frozen=True)
 
     accepted: bool
-    calibration: str
+    calibration: str = Field(max_length=_LONGEST_TEXT)
     kept: bool = True
-    reason: str = ""
+    reason: str = Field("", max_length=_LONGEST_TEXT)
 
 
 class _Refusal(BaseModel):

@@ -1,7 +1,8 @@
 """Saved state of a robot, which outlives the node: pose, wheel angles, and a calibration that was swapped in.
 
 The pose goes to the two slots of one file in turn, so that a node that is killed while it writes leaves the other slot.
-A state is one line of JSON that fills a block, or of many wheels some.
+A state is one line that fills a block, or of many wheels some: its CRC-32, by which a slot that was written in part is
+known, and JSON.
 """
 
 from __future__ import annotations
@@ -12,13 +13,14 @@ import hashlib
 import json
 import logging
 import os
+import zlib
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
 from pydantic import Field, FiniteFloat, ValidationError, model_validator
 
-from omnibench.config import Model, NonNegative, read_model, to_yaml
+from omnibench.config import Model, read_model, to_yaml
 from omnibench.errors import ConfigError, DataError
 from omnibench.files import read_bytes, remove, write_text
 from omnibench.robot.calibration import Calibration, read_calibration
@@ -27,8 +29,14 @@ LOG = logging.getLogger("omnibench.live")
 _BLOCK = 4096  # bytes, a block of most disks; a state takes some 1000, and 20 more for each wheel
 _LONG = 16 * _BLOCK  # bytes; room for some 3000 wheels
 
-SavedPose = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
-SavedCovariance = Annotated[tuple[FiniteFloat, ...], Field(min_length=9, max_length=9)]
+# Bounds that no robot reaches; chosen.
+Coordinate = Annotated[FiniteFloat, Field(ge=-1e9, le=1e9)]  # m, rad: 25 times round the Earth
+SavedPose = tuple[Coordinate, Coordinate, Coordinate]
+Moment = Annotated[FiniteFloat, Field(ge=-1e18, le=1e18)]  # m2, m rad, rad2
+SavedCovariance = Annotated[tuple[Moment, ...], Field(min_length=9, max_length=9)]
+Angle = Annotated[FiniteFloat, Field(ge=-1e12, le=1e12)]  # rad
+Time = Annotated[FiniteFloat, Field(ge=0, le=1e11)]  # s, 3000 years
+Count = Annotated[int, Field(ge=0, lt=2**64)]
 
 
 class SavedState(Model):
@@ -39,17 +47,17 @@ class SavedState(Model):
     the session began. flows: as RobotState's.
     """
 
-    sequence: int = Field(0, ge=0)
+    sequence: Count = 0
     stamp: int = Field(ge=-(2**63), lt=2**63)
-    wall: FiniteFloat
-    positions: tuple[FiniteFloat, ...] | None
-    steering: tuple[FiniteFloat, ...] | None = None
+    wall: Time
+    positions: tuple[Angle, ...] | None
+    steering: tuple[Angle, ...] | None = None
     pose: SavedPose
     covariance: SavedCovariance
     map_pose: SavedPose | None = None
     map_covariance: SavedCovariance | None = None
-    session_time: NonNegative = 0.0
-    flows: dict[int, int] = {}
+    session_time: Time = 0.0
+    flows: dict[Count, Count] = {}
 
     @model_validator(mode="after")
     def _variances_are_not_negative(self) -> SavedState:
@@ -95,10 +103,13 @@ class RobotMemory:
         states: list[SavedState] = []
         slots = [os.pread(self._file, _LONG, place).partition(b"\n")[0] for place in (0, _BLOCK, _LONG)]
         for content in slots:
-            with suppress(ValueError, ValidationError, RecursionError):  # torn, or never written
-                states.append(SavedState.model_validate(json.loads(content)))
+            checksum, _, text = content.rstrip().partition(b" ")
+            if checksum == _checksum(text):  # else torn, or never written
+                with suppress(ValueError, ValidationError, RecursionError):
+                    states.append(SavedState.model_validate(json.loads(text)))
         if not states and any(slots):
-            LOG.warning("%s: damaged; odom starts at its origin", self._path)
+            fault = "of an earlier version, without checksums" if slots[0].startswith(b"{") else "damaged"
+            LOG.warning("%s: %s; odom starts at its origin", self._path, fault)
         newest = max(states, key=lambda state: state.sequence, default=None)
         self._sequence = 0 if newest is None else newest.sequence
         return newest
@@ -108,9 +119,8 @@ class RobotMemory:
         if self._file is None:
             return
         self._sequence += 1
-        numbered = state.model_copy(update={"sequence": self._sequence})
-        # a robot that does not steer has the states of earlier versions
-        text = numbered.model_dump_json(exclude={"steering"} if state.steering is None else None).encode()
+        text = state.model_copy(update={"sequence": self._sequence}).model_dump_json().encode()
+        text = _checksum(text) + b" " + text
         slot = _BLOCK if len(text) < _BLOCK else _LONG
         if len(text) >= slot:
             raise OSError(errno.EFBIG, f"it takes {len(text)} bytes")
@@ -142,6 +152,10 @@ class RobotMemory:
         if self._file is not None:
             os.close(self._file)
             self._file = None
+
+
+def _checksum(text: bytes) -> bytes:
+    return b"%08x" % zlib.crc32(text)
 
 
 def _digest(path: Path) -> str:

@@ -41,7 +41,7 @@ class StateWriter:
         stamp, positions, steering = last
         fusion = state.fusion
         fused = (fusion.pose, fusion.covariance) if fusion is not None and fusion.located else (None, None)
-        saved = SavedState.model_construct(  # not validated: reading refuses numbers that are not finite
+        saved = SavedState.model_construct(  # not validated: reading refuses numbers that cannot be
             stamp=stamp,
             wall=time.time() - (time.monotonic() - state.arrival),
             positions=_row(positions),

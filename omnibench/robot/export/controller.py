@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from omnibench.errors import one_line
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.export.odometry_noise import interval_in_words, pose_variances, twist_variances
 from omnibench.robot.export.remaining import of_centre, remaining_error, remaining_errors
@@ -60,11 +61,6 @@ def joint_name(wheel: str) -> str:
 def reversed_joints(wheels: list[str], what: str = "") -> tuple[str, ...]:
     """The note on wheels whose joints turn the other way; none for none."""
     return (f"reverse the axes of the {what}joints of {', '.join(wheels)}",) if wheels else ()
-
-
-def one_line(text: str) -> str:
-    """Text for a comment."""
-    return " ".join(text.split())
 
 
 def document(calibration: Calibration, fitted: Controller, design: Controller) -> tuple[str, tuple[str, ...]]:

@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from omnibench.errors import ConfigError
+from omnibench.errors import ConfigError, one_line
 from omnibench.robot.calibration import Calibration
-from omnibench.robot.export.controller import Parameter, covariance_parameters, one_line, to_node
+from omnibench.robot.export.controller import Parameter, covariance_parameters, to_node
 from omnibench.robot.export.odometry_noise import (
     interval_in_words,
     matrix_deviations,

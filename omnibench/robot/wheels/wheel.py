@@ -16,7 +16,7 @@ from pydantic import (
     model_validator,
 )
 
-from omnibench.config import Model
+from omnibench.config import Model, Name
 
 WheelType = Literal["omni", "mecanum", "fixed", "steered"]
 
@@ -90,7 +90,7 @@ class Wheel(Model):
 
     model_config = ConfigDict(json_schema_extra=in_degrees_too("angle", "roller_angle"))
 
-    name: str = Field(min_length=1, pattern=r"^[A-Za-z0-9_]+$", description="ends the column names: omega_<name>")
+    name: Name = Field(min_length=1, pattern=r"^[A-Za-z0-9_]+$", description="ends the column names: omega_<name>")
     radius: FiniteFloat = Field(ge=1e-6, le=1e3, description="m")
     type: WheelType | None = Field(None, description="default: omni or mecanum, by the roller angle")
     distance: FiniteFloat | None = Field(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -33,14 +34,20 @@ def memory(tmp_path: Path) -> Iterator[RobotMemory]:
     opened.close()
 
 
-def loaded(folder: Path, content: str) -> SavedState | None:
+def loaded(folder: Path, content: bytes) -> SavedState | None:
     """What a node makes of such a file."""
-    (folder / "apr.state.json").write_text(content)
+    (folder / "apr.state.json").write_bytes(content)
     memory = RobotMemory(folder, "apr")
     try:
         return memory.load()
     finally:
         memory.close()
+
+
+def with_checksum(document: dict[str, Any]) -> bytes:
+    """The line of a state."""
+    text = json.dumps(document).encode()
+    return b"%08x %s\n" % (zlib.crc32(text), text)
 
 
 def test_a_state_comes_back_as_it_was(memory: RobotMemory) -> None:
@@ -62,7 +69,7 @@ def test_the_newest_state_of_any_number_of_wheels_comes_back(memory: RobotMemory
 
 
 def test_the_state_of_the_examples_below_is_taken(tmp_path: Path) -> None:
-    found = loaded(tmp_path, json.dumps(STATE))
+    found = loaded(tmp_path, with_checksum(STATE))
     assert found is not None
     assert found.positions == (1.0, 2.0, 3.0)
 
@@ -81,18 +88,62 @@ def test_the_state_of_the_examples_below_is_taken(tmp_path: Path) -> None:
         {"stamp": 10**30},
         {"wall": float("nan")},
         {"more": 1},
+        {"pose": [1e300, 2.0, 0.3]},
+        {"pose": [1.0, 2.0, 1e10]},
+        {"map_pose": [0.0, -1e10, 0.0]},
+        {"covariance": [1e300, 0, 0, 0, 1e-4, 0, 0, 0, 1e-5]},
+        {"positions": [1.0, 1e300, 3.0]},
+        {"steering": [1e300]},
+        {"wall": 1e300},
+        {"session_time": 1e300},
+        {"sequence": 2**64},
+        {"flows": {"1": 2**64}},
     ],
 )
 def test_a_damaged_state_is_left_aside_and_told(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, change: dict[str, Any]
 ) -> None:
-    assert loaded(tmp_path, json.dumps(STATE | change)) is None
+    assert loaded(tmp_path, with_checksum(STATE | change)) is None
     assert "apr.state.json: damaged; odom starts at its origin" in caplog.text
 
 
-@pytest.mark.parametrize("content", ["\x00" * 8192, "[" * 4096, '{"sequence": 1'])
-def test_what_is_no_state_at_all_is_left_aside(tmp_path: Path, content: str) -> None:
+@pytest.mark.parametrize("wheels", [3, 12, 200])
+def test_of_a_write_that_is_torn_at_any_sector_no_part_is_taken(
+    tmp_path: Path, memory: RobotMemory, wheels: int
+) -> None:
+    def save(step: int) -> bytes:
+        place, angles = [np.pi * step] * 3, (np.pi * (np.arange(wheels) + step)).tolist()
+        covariance = (1e-4 * np.pi * step * (np.eye(3) + 0.1)).ravel().tolist()
+        poses = {"pose": place, "covariance": covariance, "map_pose": place, "map_covariance": covariance}
+        memory.save(SavedState(**STATE | poses | {"stamp": step, "positions": angles}))
+        return (tmp_path / "apr.state.json").read_bytes()
+
+    for step in range(1, 9):
+        before = save(step)
+    after = save(9)
+    memory.close()
+    taken = []
+    for sector in range(0, len(after) + 512, 512):
+        for torn in (after[:sector] + before[sector:], before[:sector] + after[sector:]):
+            state = loaded(tmp_path, torn)
+            assert state is not None
+            taken.append((torn == after, torn == before, state.stamp))
+            assert state.pose == state.map_pose == (np.pi * state.stamp,) * 3
+    assert {stamp for whole, _, stamp in taken if whole} == {9}
+    assert {stamp for whole, _, stamp in taken if not whole} == {8}
+    assert sum(not whole and not untouched for whole, untouched, _ in taken) >= 2
+
+
+@pytest.mark.parametrize("content", [b"\x00" * 8192, b"[" * 4096, b"00000000 {", with_checksum({}) * 2])
+def test_what_is_no_state_at_all_is_left_aside(tmp_path: Path, content: bytes) -> None:
     assert loaded(tmp_path, content) is None
+
+
+def test_the_state_of_an_earlier_version_is_refused_in_a_line(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    assert loaded(tmp_path, json.dumps(STATE).encode().ljust(4095) + b"\n") is None
+    assert [record.getMessage() for record in caplog.records] == [
+        f"{tmp_path}/apr.state.json: of an earlier version, without checksums; odom starts at its origin"
+    ]
 
 
 def test_a_robot_without_a_state_begins_without_a_word(memory: RobotMemory, caplog: pytest.LogCaptureFixture) -> None:
