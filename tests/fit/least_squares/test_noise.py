@@ -135,7 +135,7 @@ def test_no_trajectories_have_no_noise() -> None:
 
 
 def test_a_component_that_differences_hardly_show_is_the_likeliest_one_and_not_zero() -> None:
-    """Twice the log-likelihood of a bias beside none is near 1 here: no test would prove it, and zero is less likely."""
+    """Twice the log-likelihood of a bias beside none is near 1 here: no proof of it, and yet zero is less likely."""
     stamps, rng = np.array([1.0, 2.0, 3.0, 4.0]), np.random.default_rng(6)
     values = rng.standard_normal((20, 4, 3)) + 0.3 * rng.standard_normal((20, 1, 3))
     differences = tuple(Difference(stamps, of_run, np.zeros((4, 3, 0))) for of_run in values)
@@ -147,8 +147,6 @@ def test_a_component_that_differences_hardly_show_is_the_likeliest_one_and_not_z
         return 20 * float(np.linalg.slogdet(covariance)[1]) + squares
 
     grid = np.linspace(0.0, 0.6, 13)
-    losses = np.array(
-        [[loss(w, k, b) for w in np.linspace(0.8, 1.2, 21) for k in grid] for b in grid]
-    )
+    losses = np.array([[loss(w, k, b) for w in np.linspace(0.8, 1.2, 21) for k in grid] for b in grid])
     assert 0.3 < losses[0].min() - losses.min() < 2.0
     assert loss(noise.pose_heading, noise.walk_heading, noise.bias_heading) <= losses.min() + 0.01
