@@ -56,7 +56,7 @@ def test_the_bound_is_just_below_the_least_cost_of_a_grid_over_three_elements(co
 def test_a_box_that_holds_the_true_matrix_in_any_corner_is_bounded_by_no_cost_above_zero(
     corner: tuple[int, int, int], integration: Integration
 ) -> None:
-    """Poses without noise: positions bend with row 3, and a bound by their slopes in the middle alone would exceed 0."""
+    """Poses without noise: positions bend with row 3, and a bound by slopes in the middle alone exceeds 0."""
     robot, width = synthetic_robot(), 0.06
     truth = robot.inverse_kinematic_matrix + width * np.outer([0.0, 0.0, 1.0], corner)
     runs = []
