@@ -136,7 +136,7 @@ def test_no_trajectories_have_no_noise() -> None:
 
 def test_a_component_that_differences_hardly_show_is_the_likeliest_one_and_not_zero() -> None:
     """Twice the log-likelihood of a bias beside none is near 1 here: no proof of it, and yet zero is less likely."""
-    stamps, rng = np.array([1.0, 2.0, 3.0, 4.0]), np.random.default_rng(6)
+    stamps, rng = np.array([1.0, 2.0, 3.0, 4.0]), np.random.default_rng(5)
     values = rng.standard_normal((20, 4, 3)) + 0.3 * rng.standard_normal((20, 1, 3))
     differences = tuple(Difference(stamps, of_run, np.zeros((4, 3, 0))) for of_run in values)
     noise = estimate_noise(Differences(differences, "repetitions", "")).noise
