@@ -72,6 +72,7 @@ class Mount(Model):
         """The matrix (3, 3) that makes the tracked point's twist, in its own axes, of the robot's."""
         cosine, sine = math.cos(self.yaw), math.sin(self.yaw)
         axes = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+        axes[np.abs(axes) < _ROUNDING] = 0.0  # of a quarter turn: a row of the design would be rounding alone
         return axes @ np.array([[1.0, 0.0, -self.y], [0.0, 1.0, self.x], [0.0, 0.0, 1.0]])
 
 
@@ -98,9 +99,8 @@ class Robot(Shown, Model):
     @model_serializer(mode="wrap")
     def _without_defaults(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Only what is said, so that files, hashes and documents of earlier versions stay as they were."""
-        written: dict[str, Any] = write(self)
-        unsaid = [key for key, default in (("mount", None), ("skid", False)) if written.get(key) == default]
-        return {key: value for key, value in written.items() if key not in unsaid}
+        plain: dict[str, Any] = {"mount": None, "skid": False}
+        return {key: value for key, value in write(self).items() if key not in plain or value != plain[key]}
 
     @property
     def drive(self) -> Drive:

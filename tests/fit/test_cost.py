@@ -134,3 +134,12 @@ def test_an_unknown_cost_is_answered_with_the_nearest_and_all() -> None:
     known = "did you mean 'final_pose'\\? known: final_heading, final_pose, final_position, trajectory"
     with pytest.raises(UnknownNameError, match=known):
         costs.create("final_poses")
+
+
+def test_weights_multiply_the_errors_before_the_norm_is_taken() -> None:
+    class Weighted(SumOfNorms):
+        weights = (3.0, 0.0, 0.5)
+
+    cost = Weighted(costs.entry("final_pose").cls.Options())
+    errors = np.array([[[2.0, 7.0, 16.0], [-1.0, 9.0, 0.0]]])  # norms (6, 8) -> 10 and (3, 0) -> 3
+    assert cost.combine(errors, np.array([0, 1])) == pytest.approx([6.5])

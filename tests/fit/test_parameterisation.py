@@ -10,7 +10,7 @@ import pytest
 from fit_samples import box_between, make_problem
 from hypothesis import given
 from hypothesis import strategies as st
-from sample_robots import APR_02
+from sample_robots import APR_02, DIFFERENTIAL, SKID
 
 from omnibench.config import validate
 from omnibench.errors import ConfigError
@@ -217,3 +217,10 @@ def test_the_derivatives_of_matrix_elements_are_zero_along_directions_that_are_k
     slopes = MatrixElements(APR_02, "row", np.array([[0.6, 0.8, 0.0]])).slopes(DESIGN.ravel())
     kept = np.array([[0.64, -0.48, 0.0], [-0.48, 0.36, 0.0], [0.0, 0.0, 1.0]])  # 1 - n n'
     np.testing.assert_allclose(slopes, np.kron(np.eye(3), kept), rtol=0, atol=1e-15)
+
+
+def test_a_robot_that_turns_by_half_of_its_track_is_in_the_box_where_it_skids_and_not_where_it_cannot() -> None:
+    for robot, turns_by_half in ((SKID, True), (DIFFERENTIAL, False)):
+        matrix = robot.inverse_kinematic_matrix * [[1.0], [1.0], [0.5]]
+        box = make_bounds(robot, "row")
+        assert bool(((matrix.ravel() >= box.lower) & (matrix.ravel() <= box.upper)).all()) is turns_by_half

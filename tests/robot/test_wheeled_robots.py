@@ -251,3 +251,10 @@ def test_a_stream_drives_as_a_batch(robot: Robot, seed: int, integration: Integr
     for sample, duration in enumerate(np.diff(times, prepend=0.0)):
         stream.drive(rates[sample] * duration, steering=None if steering is None else steering[sample])
     np.testing.assert_allclose(stream.pose, model.poses([log])[0][-1], rtol=0, atol=1e-12)
+
+
+def test_a_row_of_zeros_has_the_scale_of_the_other_direction_of_driving() -> None:
+    """Of a differential drive, radius r and track 2 b: r / 2 ahead and aside, r / 2b for turning."""
+    sideways = DIFFERENTIAL.model_copy(update={"mount": Mount(yaw=math.pi / 2)})  # zeros to rounding in row 1 then
+    for robot in (DIFFERENTIAL, sideways):
+        np.testing.assert_allclose(robot.row_scales, [0.05 / 2, 0.05 / 2, 0.05 / 0.3], rtol=1e-12)

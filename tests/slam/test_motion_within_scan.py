@@ -52,6 +52,18 @@ def test_a_robot_that_speeds_up_is_followed_through_the_scan() -> None:
     np.testing.assert_allclose(within.at(delays), expected, atol=1e-9)
 
 
+def test_a_scan_without_ticks_is_as_uncertain_as_scans_are_in_the_mean() -> None:
+    """A robot that stands at first shows no ticks then, and has them all the same."""
+
+    def ticking_later(times: Array) -> Array:
+        return np.column_stack([0.002 * np.floor(0.137 * np.maximum(times - 2.0, 0.0) / 0.002), 0 * times, 0 * times])
+
+    motions, _ = smoothed(ticking_later, np.array([1.0, 3.0, 3.5]), 0.2)
+    still, *moving = (motion.deviations[0] ** 2 for motion in motions)
+    assert still > 0
+    assert sum(moving) / 3 <= still <= min(moving) * (1 + 1e-9)
+
+
 def test_ticks_are_smoothed_out_and_what_they_hide_is_said() -> None:
     tick = 0.002
 

@@ -52,6 +52,12 @@ def test_two_effects_with_one_signature_share_the_probability_and_stand_in_for_e
     assert {*names(found), *found.confusable[0]} == {DRIFT, BIAS}
 
 
+def test_of_two_effects_with_one_signature_one_is_twice_as_likely_right_as_a_single_effect() -> None:
+    effects = ({DRIFT: FIRST, BIAS: other} for other in (SECOND, FIRST))
+    single, alike = (selected(screening(columns, BASES, [0, 20, 0, 0, 0])).known for columns in effects)
+    assert alike / (1 - alike) == pytest.approx(2 * single / (1 - single), rel=0.02)
+
+
 def test_an_effect_of_many_shapes_is_as_much_less_likely_as_it_has_shapes() -> None:
     alike = {DRIFT: FIRST, BIAS: FIRST}
     found = selected(screening(alike, BASES, [0, 20, 0, 0, 0], tries={BIAS: 4}))

@@ -12,6 +12,7 @@ from fit_samples import box_between, make_problem, noisy_trajectories
 
 from omnibench.data.dataset import Trajectory
 from omnibench.fit.bounds.dual_directions import into_unit_ball, least_sum_of_norms
+from omnibench.fit.bounds.lower_bound import LowerBounds
 from omnibench.fit.bounds.stamp_sums import StampSums
 from omnibench.fit.certify import prove
 from omnibench.fit.cost import SumOfNorms
@@ -20,6 +21,8 @@ from omnibench.fit.parameterisation import Box
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options
 from omnibench.robot.kinematics import Array
+from omnibench.robot.model import OdometryModel
+from omnibench.robot.odometry import Integration
 from omnibench.testing.synthetic import synthetic_robot
 
 
@@ -46,6 +49,42 @@ def test_the_bound_is_just_below_the_least_cost_of_a_grid_over_three_elements(co
     least = best_of_a_grid(problem, 17)
     assert proof.finished
     assert 0.97 * least <= proof.lower_bound <= least
+
+
+@pytest.mark.parametrize("corner", list(product((-1, 1), repeat=3)))
+@pytest.mark.parametrize("integration", ["euler", "arc"])
+def test_a_box_that_holds_the_true_matrix_in_any_corner_is_bounded_by_no_cost_above_zero(
+    corner: tuple[int, int, int], integration: Integration
+) -> None:
+    """Poses without noise: positions bend with row 3, and a bound by slopes in the middle alone exceeds 0."""
+    robot, width = synthetic_robot(), 0.06
+    truth = robot.inverse_kinematic_matrix + width * np.outer([0.0, 0.0, 1.0], corner)
+    runs = []
+    for run in noisy_trajectories(noise=0.0)[1:7]:
+        (poses,) = OdometryModel(robot, truth, integration).poses([run.reference_log])
+        runs.append(replace(run, poses=np.vstack([run.start, poses])))
+    box = box_about_the_design(*((2, column, width) for column in range(3)))
+    problem = make_problem(runs, cost="final_position", box=box, integration=integration)
+    assert float(problem.values(truth.ravel()[None])[0]) < 1e-12
+    assert LowerBounds(problem).root(problem.start).bound < 1e-12
+
+
+@pytest.mark.parametrize("integration", ["euler", "arc"])
+def test_for_any_directions_the_bound_is_just_below_their_least_sum_at_the_corners(integration: Integration) -> None:
+    """Eq. (B2) and (B7): phi is linear in each row nearly, and the bound lies below its least value for any u_s."""
+    design = synthetic_robot().inverse_kinematic_matrix
+    box = box_between(design - 0.001, design + 0.003)
+    problem = make_problem(noisy_trajectories(noise=0.03), box=box, integration=integration)
+    bounds = LowerBounds(problem)
+    part = bounds.root(problem.start)
+    corners = problem.from_unit(np.array(list(product((0.0, 1.0), repeat=9)))).reshape(-1, 3, 3)
+    errors = problem.odometry.poses(corners) - problem.reference
+    for seed in range(5):
+        directions = np.random.default_rng(seed).standard_normal((len(problem.reference), 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        phi = (errors * directions).sum(axis=2).mean(axis=1)
+        bound, _ = bounds._dual_bound(part, *bounds._stamps.at(part.centre[2]), directions)
+        assert phi.min() - 0.02 * np.ptp(phi) <= bound <= phi.min() + 1e-12
 
 
 def test_a_box_too_wide_for_positions_is_bounded_by_headings_from_its_first_part_on() -> None:

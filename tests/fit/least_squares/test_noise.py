@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
 from omnibench.fit.least_squares.noise import Whitener, covariance_of_sums, estimate_noise
-from omnibench.fit.least_squares.repetitions import differences_between_repetitions
+from omnibench.fit.least_squares.repetitions import Difference, Differences, differences_between_repetitions
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 from omnibench.simulate.config import FlowerConfig
@@ -132,3 +132,21 @@ def test_without_repetitions_the_residuals_are_taken_and_that_is_said() -> None:
 def test_no_trajectories_have_no_noise() -> None:
     with pytest.raises(DataError, match="no trajectory has a reference pose"):
         estimate_noise(differences_between_repetitions([], []))
+
+
+def test_a_component_that_differences_hardly_show_is_the_likeliest_one_and_not_zero() -> None:
+    """Twice the log-likelihood of a bias beside none is near 1 here: no proof of it, and yet zero is less likely."""
+    stamps, rng = np.array([1.0, 2.0, 3.0, 4.0]), np.random.default_rng(5)
+    values = rng.standard_normal((20, 4, 3)) + 0.3 * rng.standard_normal((20, 1, 3))
+    differences = tuple(Difference(stamps, of_run, np.zeros((4, 3, 0))) for of_run in values)
+    noise = estimate_noise(Differences(differences, "repetitions", "")).noise
+
+    def loss(white: float, walk: float, bias: float) -> float:
+        covariance, headings = dense(white, walk, bias, stamps), values[:, :, 2].T
+        squares = float((headings * np.linalg.solve(covariance, headings)).sum())
+        return 20 * float(np.linalg.slogdet(covariance)[1]) + squares
+
+    grid = np.linspace(0.0, 0.6, 13)
+    losses = np.array([[loss(w, k, b) for w in np.linspace(0.8, 1.2, 21) for k in grid] for b in grid])
+    assert 0.3 < losses[0].min() - losses.min() < 2.0
+    assert loss(noise.pose_heading, noise.walk_heading, noise.bias_heading) <= losses.min() + 0.01

@@ -33,6 +33,17 @@ def test_an_end_that_has_jumped_comes_back_and_all_other_runs_stay(end: int) -> 
     assert [one is other for one, other in zip(found, moved, strict=True)] == [run is not runs[3] for run in runs]
 
 
+def test_a_pose_beside_an_end_that_has_jumped_too_moves_it_no_farther_the_farther_it_jumped() -> None:
+    _, moved = jumped(0)
+    ends = []
+    for size in (5.0, 500.0):
+        poses = moved[3].poses.copy()
+        poses[2, :2] += [size, -size]
+        runs = [*moved[:3], replace(moved[3], poses=poses), *moved[4:]]
+        ends.append(with_ends_from_others(runs, ROBOT, "arc", Huber(3), last=True)[0][3].poses[0])
+    np.testing.assert_allclose(ends[0], ends[1], rtol=0, atol=1e-12)
+
+
 def test_ends_stay_where_the_cost_uses_other_poses_too() -> None:
     _, moved = jumped(-1)
     found, names = with_ends_from_others(moved, ROBOT, "arc", Huber(3), last=False)

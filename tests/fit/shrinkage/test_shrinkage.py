@@ -78,6 +78,19 @@ def test_the_posterior_weighs_design_and_data_by_their_variances() -> None:
     np.testing.assert_allclose(run.uncertainty.covariance, prior - gain @ prior, rtol=1e-5, atol=1e-12)
 
 
+def test_a_posterior_variance_has_the_degrees_of_freedom_of_the_part_that_the_data_estimate() -> None:
+    """Satterthwaite: 2 E^2 / Var of a sum of an exact part and one, w, whose variance is 2 w^2 / f."""
+    free, shrunk_little, run = calibrate(RECORDING, unidentified="keep"), shrunk(1e3), shrunk(0.01)
+    assert free.uncertainty is not None
+    assert run.uncertainty is not None
+    posterior = run.uncertainty.covariance
+    of_data = np.diag(posterior @ np.linalg.solve(free.uncertainty.covariance, posterior))
+    variance_of_estimate = 2 * of_data**2 / shrunk_little.result.degrees_of_freedom
+    expected = 2 * np.diag(posterior) ** 2 / variance_of_estimate
+    assert (of_data < 0.9 * np.diag(posterior)).any()
+    np.testing.assert_allclose(run.result.degrees_of_freedom, expected, rtol=1e-3)
+
+
 def test_an_answer_that_was_not_fitted_is_not_shrunk() -> None:
     run = shrunk(0.001, calibrator="theoretical")
     assert run.result.shrinkage is None

@@ -127,6 +127,19 @@ def test_an_improvement_is_below_one_and_a_mean_cost_above_zero_over_few_units()
     assert mean.known[0] > 0
 
 
+def test_the_ends_are_where_the_paired_t_statistic_reaches_its_bootstrapped_quantiles() -> None:
+    """Resampled here anew, by another generator: 2 % of noise in each quantile."""
+    rng = np.random.default_rng(8)
+    before = rng.uniform(1, 2, 14)
+    after = before * rng.gamma(4.0, 0.2, 14)  # skewed, so that the two quantiles differ
+    found = RatioIntervals(Bootstrap(resamples=20_000)).ratio(after, before, units(14))
+    left = after - after.sum() / before.sum() * before
+    low, high = np.percentile(stats.ttest_1samp(rng.choice(left, (20_000, 14)), 0.0, axis=1).statistic, [2.5, 97.5])
+    assert found.known is not None
+    reached = [stats.ttest_1samp(after - end * before, 0.0).statistic for end in found.known]
+    assert reached == pytest.approx([high, low], rel=0.06)
+
+
 def test_one_command_that_outweighs_all_others_has_no_interval() -> None:
     before = np.append(np.full(11, 1e-3), 100.0)
     gain = RatioIntervals(BOOTSTRAP).improvement(np.append(np.full(11, 2e-3), 90.0), before, units(12))

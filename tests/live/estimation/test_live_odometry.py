@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from drives import NOISE, calibration, drive
@@ -12,6 +14,7 @@ from omnibench.live.estimation.live_odometry import LiveOdometry
 from omnibench.live.wheels.wheel_input import WheelStep
 from omnibench.robot.calibration import Calibration, Noise, Provenance
 from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog
+from omnibench.robot.planar import rotation
 
 
 def driven(odometry: LiveOdometry, angles: np.ndarray, durations: np.ndarray) -> LiveOdometry:
@@ -128,3 +131,33 @@ def test_a_calibration_with_numbers_on_a_bound_is_warned_of(caplog: pytest.LogCa
     assert not caplog.messages
     LiveOdometry(calibration().model_copy(update={"provenance": origin.model_copy(update={"on_bounds": ("m23",)})}))
     assert "m23 on a bound of the box, of which no variance is known: covariances are too small" in caplog.text
+
+
+@pytest.mark.parametrize("heading", [0.7, -2.0])
+def test_the_covariance_of_a_path_that_begins_turned_is_turned_with_it(heading: float) -> None:
+    path, turn = drive(4.0), rotation(heading)
+    straight, turned = LiveOdometry(path.calibration), LiveOdometry(path.calibration)
+    turned.resume(np.array([0.0, 0.0, heading]), np.zeros((3, 3)))
+    for live in (straight, turned):
+        driven(live, path.angles, np.full(400, 0.01))
+    expected = turn @ straight.covariance @ turn.T
+    np.testing.assert_allclose(turned.covariance, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
+
+
+def test_a_filter_takes_the_error_of_the_matrix_as_noise_that_lasts_a_second() -> None:
+    """What the matrix adds to the twist's variances, v2 for a velocity, adds v2 x 1 s x dt to the motion's."""
+    exact, doubtful = LiveOdometry(calibration(deviation=None)), LiveOdometry(calibration(deviation=2e-3))
+    quiet, noisy = (live.step(step(0.02, [0.01, -0.02, 0.005])) for live in (exact, doubtful))
+    along_x, along_y, turning = np.diag(doubtful.twist_covariance - exact.twist_covariance)
+    assert min(along_x, along_y, turning) > 0
+    added = noisy.position_variance - quiet.position_variance, noisy.heading_variance - quiet.heading_variance
+    assert added == pytest.approx((0.02 * (along_x + along_y) / 2, 0.02 * turning))
+
+
+def test_held_steering_angles_make_a_way_as_doubtful_in_many_steps_as_in_one() -> None:
+    """The angle is wrong in the same way all along, so that deviations add up, and not variances."""
+    once, often = (LiveOdometry(calibration(deviation=None)) for _ in range(2))
+    whole = [once.step(replace(step(1.0, [1.0, 1.0, 1.0], blind=1.0), held=True))]
+    parts = [often.step(replace(step(0.1, [0.1, 0.1, 0.1], blind=0.1), held=True)) for _ in range(10)]
+    for name in ("position_variance", "heading_variance"):
+        assert sum(getattr(part, name) for part in parts) == pytest.approx(getattr(whole[0], name))

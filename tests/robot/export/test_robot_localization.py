@@ -12,7 +12,8 @@ from sample_robots import APR_02
 from omnibench.errors import ConfigError
 from omnibench.robot.calibration import covariance_rows
 from omnibench.robot.export.formats import export_calibration
-from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.export.odometry_noise import matrix_deviations
+from omnibench.robot.kinematics import Array, Mount, Robot
 
 _PLANAR = [0, 1, 5, 6, 7, 11]  # x, y, yaw, vx, vy, vyaw of the filter's 15 states
 
@@ -99,3 +100,16 @@ def test_a_walk_that_was_not_seen_is_named() -> None:
 def test_a_calibration_without_noise_is_refused() -> None:
     with pytest.raises(ConfigError, match="robot_localization: calibration 'diff' has no noise model"):
         export_calibration(calibration(DIFF, noise=None), "robot_localization")
+
+
+def test_an_error_of_the_tracked_points_matrix_moves_the_centre_as_a_rigid_body() -> None:
+    """With the covariance e e' the matrix errs by e times one number: the deviations are those of that one error."""
+    error = 1e-3 * np.random.default_rng(3).standard_normal((3, 2))
+    known = calibration(mounted(DIFF), covariance=covariance_rows(np.outer(error, error)))
+    deviations = matrix_deviations(known, Mount())
+    assert deviations is not None
+    for stated, rates in zip(deviations, ([1 / 0.08, 1 / 0.08], [0.2 / 0.08, -0.2 / 0.08]), strict=True):  # 1 m, 1 rad
+        along, aside, turned = error @ rates  # of the tracked point, along its own axes
+        ahead = along * math.cos(MOUNT.yaw) - aside * math.sin(MOUNT.yaw) + turned * MOUNT.y
+        left = along * math.sin(MOUNT.yaw) + aside * math.cos(MOUNT.yaw) - turned * MOUNT.x
+        np.testing.assert_allclose(stated, np.abs([ahead, left, turned]), rtol=1e-9)

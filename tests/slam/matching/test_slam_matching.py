@@ -58,6 +58,12 @@ def room_map() -> ScanMap:
     return surroundings
 
 
+def test_the_noise_of_a_map_of_one_scan_counts_as_much_as_that_of_the_scan_that_is_matched() -> None:
+    """Both see every wall with as many rays; the gradient's covariance is the information for one of them alone."""
+    pairs = Correspondences(room_map(), points_of(ranges_at(np.zeros(3))), np.zeros(3))
+    np.testing.assert_allclose(np.diag(pairs.scatter()), 2 * np.diag(pairs.information()), rtol=0.1)
+
+
 class TestSmallGicp:
     def test_a_planar_cloud_alone_would_keep_it_where_it_began(self) -> None:
         """Why the map is made of crosses; when this fails, small_gicp has learnt to do without."""
