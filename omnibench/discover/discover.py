@@ -126,19 +126,19 @@ def discover_effects(
         )
         if smooth.models is not models:
             dependences = without_smooth_term(dependences, smooth.left, screening, selection)
-            baseline = without_effects(plain, smooth.models.used)
         models, term_notes = smooth.models, smooth.notes
         effects = named_effects(models, motors)
 
     progress.begin("comparing on runs that were held out")
     average = averaged(models.weighted)
+    baseline = without_effects(plain, average.extended)
     extended = faded(average.extended, baseline)
     validation = validation_runs(dataset, extended.fit)
     held_out = compare_held_out(baseline, extended, validation, folds)
     steps = waterfall_steps(plain, baseline, models.used, extended, validation)
     sessions = compare_with_validation(extended, validation)
     eq6_of_sessions = eq6_with_changes(extended, validation.runs, sessions)
-    extrapolations = extrapolations_of(validation.kept, baseline, extended, average.members)
+    extrapolations = extrapolations_of(validation.runs, baseline, extended, average.members)
     detectability = detectability_of(screening, models.selection)
 
     if any(effect.confusable_with for effect in effects):
