@@ -2,10 +2,10 @@
 
     python tests/benchmarks/outlier_study.py --out sets.jsonl --sets 350 [--whole 25] [--jobs 1] [--table]
 
-A robot with three omni wheels drives 48 commands four times each; a camera sees it with plain Gaussian noise. Each wheel
-drives farther one way than the other, by +0.6, -0.4 and +0.8 %. Every set is fitted as discover fits it once the effect
-is named: the plain matrix, then matrix and effect. The first --whole sets are discovered as a whole, too, from the
-recording to the named effect, and the table says whether both agree.
+A robot with three omni wheels drives 48 commands four times each; a camera sees it with plain Gaussian noise. Each
+wheel drives farther one way than the other, by +0.6, -0.4 and +0.8 %. Every set is fitted as discover fits it once the
+effect is named: the plain matrix, then matrix and effect. The first --whole sets are discovered as a whole, too, from
+the recording to the named effect, and the table says whether both agree.
 
 The truth shares nothing with what fits: runs are arcs in closed form, and the wheel equations stand here. One line of
 JSON a set, added as it comes: run again with the same file, and it goes on where it was.

@@ -34,8 +34,8 @@ _OFTEN, _OFTEN_BY_CHANCE = 0.8, 1.80  # likewise, of the scores at one stamp in 
 def inliers_of(runs: Sequence[Trajectory], residuals: Sequence[Array], noise: Noise) -> tuple[NDArray[np.bool_], ...]:
     """True (K,) for the poses of each run that are no outliers. residuals (K, 3): in the frame of the run's start.
 
-    A score of 4.5 makes an outlier, or of 4.5 times as much as is usual for the scores at its stamp in other runs. Where
-    more than 8 % of the poses seem to be outliers they are not, and the limit rises in proportion to the usual score.
+    A score of 4.5 makes an outlier, or 4.5 times what is usual for the scores at its stamp in other runs. Where more
+    than 8 % of the poses seem to be outliers they are not, and the limit rises in proportion to the usual score.
     """
     scores = [_scores(noise, run.pose_times[1:], of_run) for run, of_run in zip(runs, residuals, strict=True)]
     every = np.concatenate(scores)
@@ -52,7 +52,7 @@ def inliers_of(runs: Sequence[Trajectory], residuals: Sequence[Array], noise: No
 def _below(
     runs: Sequence[Trajectory], residuals: Sequence[Array], noise: Noise, limits: Array
 ) -> tuple[NDArray[np.bool_], ...]:
-    """True (K,) for the poses of each run with scores below their limits; the worst goes first. limits: of all poses."""
+    """True (K,) for the poses of each run below their limits; the worst goes first. limits (S,): of all poses."""
     of_runs = []
     ends = np.cumsum([len(of_run) for of_run in residuals])[:-1]
     for run, of_run, limit in zip(runs, residuals, np.split(limits, ends), strict=True):

@@ -67,14 +67,12 @@ def screen_extended(extended: Extended, without: Sequence[str]) -> Screening:
     return _screened(extended.fit, extended.residuals_without_effects, _groups_at(extended.fit, without))
 
 
-def screen_again(extended: Extended, earlier: Screening, without: Sequence[str]) -> Screening:
+def screen_again(extended: Extended, earlier: Screening) -> Screening:
     """Screen as ``screen_extended``, with the columns of an earlier screening."""
     return _screened(extended.fit, extended.residuals_without_effects, earlier.groups)
 
 
-def significance_left(
-    extended: Extended, screening: Screening, without: Sequence[str], rng: np.random.Generator
-) -> Significance:
+def significance_left(extended: Extended, screening: Screening, rng: np.random.Generator) -> Significance:
     """Significance of the generic bases beyond all that an extended model holds, smooth terms among it."""
     fit, groups = extended.fit, screening.groups
     data = _whitened(fit, groups, fit.nuisance_free_residuals, extended.columns)
