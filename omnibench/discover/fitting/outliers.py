@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
-from omnibench.fit.least_squares.noise import Whitener
+from omnibench.fit.least_squares.noise import Whitener, whiteners
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 
@@ -37,38 +37,38 @@ def inliers_of(runs: Sequence[Trajectory], residuals: Sequence[Array], noise: No
     A score of 4.5 makes an outlier, or 4.5 times what is usual for the scores at its stamp in other runs. Where more
     than 8 % of the poses seem to be outliers they are not, and the limit rises in proportion to the usual score.
     """
-    scores = [_scores(noise, run.pose_times[1:], of_run) for run, of_run in zip(runs, residuals, strict=True)]
+    whitening = whiteners(noise, [run.pose_times[1:] for run in runs])
+    scores = [_scores(*each) for each in zip(whitening, residuals, strict=True)]
     every = np.concatenate(scores)
     if every.max() < _JUMP:
         return tuple(np.ones(len(of_run), dtype=bool) for of_run in scores)
     limits = _JUMP * np.maximum(_usual_at_stamps(runs, scores), 1.0)
-    inliers = _below(runs, residuals, noise, limits)
+
+    def below(limits: Array) -> tuple[NDArray[np.bool_], ...]:
+        of_runs = np.split(limits, np.cumsum([len(of_run) for of_run in scores])[:-1])
+        return tuple(_below(noise, *each) for each in zip(runs, residuals, scores, of_runs, strict=True))
+
+    inliers = below(limits)
     if sum(int((~of_run).sum()) for of_run in inliers) <= _RARE * len(every):
         return inliers
-    usual = float(np.quantile(every, _MANY)) / _MANY_BY_CHANCE
-    return _below(runs, residuals, noise, np.maximum(limits, _JUMP * usual))
+    return below(np.maximum(limits, _JUMP * float(np.quantile(every, _MANY)) / _MANY_BY_CHANCE))
 
 
-def _below(
-    runs: Sequence[Trajectory], residuals: Sequence[Array], noise: Noise, limits: Array
-) -> tuple[NDArray[np.bool_], ...]:
-    """True (K,) for the poses of each run below their limits; the worst goes first. limits (S,): of all poses."""
-    of_runs = []
-    ends = np.cumsum([len(of_run) for of_run in residuals])[:-1]
-    for run, of_run, limit in zip(runs, residuals, np.split(limits, ends), strict=True):
-        inliers = np.ones(len(limit), dtype=bool)
-        for _ in range(int(np.ceil(_MOST_JUMPS * len(limit)))):
-            excess = _scores(noise, run.pose_times[1:][inliers], of_run[inliers]) / limit[inliers]
-            if len(excess) < 3 or excess.max() < 1:
-                break
-            inliers[np.flatnonzero(inliers)[excess.argmax()]] = False
-        of_runs.append(inliers)
-    return tuple(of_runs)
+def _below(noise: Noise, run: Trajectory, residuals: Array, scores: Array, limits: Array) -> NDArray[np.bool_]:
+    """True (K,) for the poses of a run whose scores are below their limits; the worst goes first."""
+    inliers, stamps = np.ones(len(limits), dtype=bool), run.pose_times[1:]
+    for _ in range(int(np.ceil(_MOST_JUMPS * len(limits)))):
+        excess = scores / limits[inliers]
+        if len(excess) < 3 or excess.max() < 1:
+            break
+        inliers[np.flatnonzero(inliers)[excess.argmax()]] = False
+        scores = _scores(Whitener(noise, stamps[inliers]), residuals[inliers])
+    return inliers
 
 
-def _scores(noise: Noise, stamps: Array, residuals: Array) -> Array:
+def _scores(whitener: Whitener, residuals: Array) -> Array:
     """Distances (K,) of poses from what the others of their run predict, in standard deviations, Eq. (1)."""
-    errors, variances = Whitener(noise, stamps).left_out(residuals)
+    errors, variances = whitener.left_out(residuals)
     scores: Array = np.abs(errors / np.sqrt(variances)).max(axis=1)
     return scores
 
