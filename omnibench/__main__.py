@@ -21,6 +21,8 @@ _INTERRUPTED = 130  # exit code after Ctrl-C; of another signal once it has come
 _PROGRAM = __name__ == "__main__" or os.path.basename(sys.argv[0]) == "omnibench"  # not imported by another
 _at_work = False  # True while ``main`` runs
 _BEGINS_ANEW = "interrupted; the same command begins anew"  # where a command keeps nothing on the way
+_LINEAR_ALGEBRA = ("numpy.linalg", "numpy.linalg.linalg", "_flapack")  # modules of the errors of numpy and LAPACK
+_NOT_COMPUTABLE = "the equations have no finite solution; omnibench check DATASET says what may be wrong with it"
 _COMMANDS = os.path.join(_PACKAGE, "cli")
 
 
@@ -123,6 +125,10 @@ def _run(command: Any) -> None:
         _fail(_with_notes("error: out of memory; make the data or the budget smaller", error))
     except OSError as error:  # a disk or a terminal that failed unexpectedly
         _fail(_with_notes(f"error: {error.filename or 'output'}: {error.strerror or error}", error))
+    except Exception as error:
+        if type(error).__module__ not in _LINEAR_ALGEBRA and "infs or NaNs" not in str(error):
+            raise
+        _fail(_with_notes(f"error: {_NOT_COMPUTABLE} ({error})", error))
     else:
         if code == 130:  # newer versions of Typer return this after Ctrl-C
             _fail(_BEGINS_ANEW, _INTERRUPTED)

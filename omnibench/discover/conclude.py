@@ -68,6 +68,7 @@ def conclude(dataset: Dataset, request: Request, findings: Findings, seconds: fl
     """The result of a discovery that took so many seconds."""
     baseline, extended, held_out = findings.baseline, findings.extended, findings.held_out
     fit, effects, limits = extended.fit, findings.effects, findings.detectability
+    inliers = fit.at_inliers.runs
     where, left = findings.dependences.where, findings.dependences.left
     trained = {run.session for run in fit.runs}
     of_sessions = sessions_in_words(findings.verdict, findings.sessions, held_out, findings.eq6_of_sessions, trained)
@@ -78,7 +79,7 @@ def conclude(dataset: Dataset, request: Request, findings: Findings, seconds: fl
     headline = " ".join([*of_sessions, of_model, *(doubts if findings.verdict == "none" else ()), *_warnings(findings)])
     needs_session = any("session" in term.effect.needs for term in fit.model.terms)
     return Discovery(
-        dataset=replace(dataset, trajectories=(*fit.runs, *findings.validation.runs)),
+        dataset=replace(dataset, trajectories=(*inliers, *findings.validation.runs)),
         dataset_hash=dataset.hash,
         simulated=dataset.simulated,
         verdict=findings.verdict,
@@ -100,12 +101,12 @@ def conclude(dataset: Dataset, request: Request, findings: Findings, seconds: fl
         notes=(*_notes(findings), *findings.term_notes, *findings.validation.warnings),
         noise=fit.noise,
         outliers=fit.jumps,
-        poses=sum(len(residuals) for residuals in fit.residuals),
+        poses=sum(len(run.pose_times) - 1 for run in inliers),
         plain=calibration_of(dataset, baseline, "plain", request, headline),
         extended=calibration_of(dataset, extended, "extended", request, headline, baseline),
         trajectories=tuple(run.id for run in fit.runs),
-        before=tuple(baseline.fit.residuals),
-        after=tuple(fit.residuals),
+        before=_of_inliers(fit, baseline.fit.residuals),
+        after=_of_inliers(fit, fit.residuals),
         whitened_before=_whitened(fit, baseline.fit.residuals),
         whitened_after=_whitened(fit, fit.residuals),
         sessions=findings.sessions,
@@ -114,14 +115,19 @@ def conclude(dataset: Dataset, request: Request, findings: Findings, seconds: fl
     )
 
 
+def _of_inliers(fit: Fit, residuals: Sequence[Array]) -> tuple[Array, ...]:
+    """Residuals (k, 3) of the fit's inliers, of those (K, 3) of all poses."""
+    return tuple(of_run[inliers] for of_run, inliers in zip(residuals, fit.masks, strict=True))
+
+
 def _whitened(fit: Fit, residuals: Sequence[Array]) -> tuple[Array, ...]:
-    """Residuals (K, 3) of the fit's runs, independent and of unit variance under its noise."""
+    """Residuals (k, 3) of the fit's inliers, independent and of unit variance under its noise."""
     return tuple(whiten(of_run) for whiten, of_run in zip(fit.weightings, residuals, strict=True))
 
 
 def _warnings(findings: Findings) -> Iterator[str]:
     """A warning for each kind of held-out runs that the extended model predicts worse than the plain matrix."""
-    session = is_other_session(findings.extended.fit.runs, findings.validation.kept)
+    session = is_other_session(findings.extended.fit.runs, findings.validation.runs)
     for held in findings.held_out:
         where = "repetitions that were held out"
         if held.data == "session":

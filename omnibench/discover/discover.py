@@ -99,12 +99,12 @@ def discover_effects(
         model = _extend_by_tentative(plain, model, without, rng)
     if model.selection.chosen:
         progress.begin("looking again, now that the noise is known better")
-        model = _confirm(plain, model, without, rng)
+        model = _confirm(plain, model, rng)
     screening = model.screening
     models = competing_models(plain, model.selection, model.extended)
     models = with_fitted_forms(plain, screening, models)
     baseline = without_effects(plain, models.used)
-    selection = located(models.selection, screening, baseline, models.used, without, rng)
+    selection = located(models.selection, screening, baseline, models.used, rng)
 
     progress.begin("looking at the motors")
     motors = select_motor_effects(runs, dataset.robot, without, rng)
@@ -121,24 +121,24 @@ def discover_effects(
             screening,
             models,
             selection.left,
-            lambda model: all_left(model, screening, without, rng),
+            lambda model: all_left(model, screening, rng),
             folds,
         )
         if smooth.models is not models:
             dependences = without_smooth_term(dependences, smooth.left, screening, selection)
-            baseline = without_effects(plain, smooth.models.used)
         models, term_notes = smooth.models, smooth.notes
         effects = named_effects(models, motors)
 
     progress.begin("comparing on runs that were held out")
     average = averaged(models.weighted)
+    baseline = without_effects(plain, average.extended)
     extended = faded(average.extended, baseline)
     validation = validation_runs(dataset, extended.fit)
     held_out = compare_held_out(baseline, extended, validation, folds)
     steps = waterfall_steps(plain, baseline, models.used, extended, validation)
     sessions = compare_with_validation(extended, validation)
     eq6_of_sessions = eq6_with_changes(extended, validation.runs, sessions)
-    extrapolations = extrapolations_of(validation.kept, baseline, extended, average.members)
+    extrapolations = extrapolations_of(validation.runs, baseline, extended, average.members)
     detectability = detectability_of(screening, models.selection)
 
     if any(effect.confusable_with for effect in effects):
@@ -192,9 +192,9 @@ def _extend_by_tentative(
     return model
 
 
-def _confirm(plain: Fit, model: _ExtendedModel, without: Sequence[str], rng: np.random.Generator) -> _ExtendedModel:
+def _confirm(plain: Fit, model: _ExtendedModel, rng: np.random.Generator) -> _ExtendedModel:
     """Screen and select once more with the noise of the extended model; extend anew if other effects are selected."""
-    screening = screen_again(model.extended, model.screening, without)
+    screening = screen_again(model.extended, model.screening)
     selection = select_effects(screening, rng)
     same = selection.is_same_as(model.selection)
     return _ExtendedModel(screening, selection, model.extended if same else extend(plain, selection.chosen))

@@ -92,7 +92,7 @@ def measured(kind: Hidden, effects: tuple[str, ...], seed: int) -> Result:
     right = _best_shapes(screening, effects) if kind != "outside" else []
     explained, discrepancy = [], ()
     if right:
-        screening = screen_again(extend(plain, right), screening, ())
+        screening = screen_again(extend(plain, right), screening)
         right = _best_shapes(screening, effects)
         explained.append(_names(screening, right, rng, right=True))
         discrepancy = _discrepancy(screening.beyond_matrix(), right, _others(screening, effects))

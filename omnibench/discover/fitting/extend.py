@@ -35,7 +35,7 @@ from omnibench.robot.odometry import split_by
 
 # tests/benchmarks/constants.py varies each number by 0.5 and 2: on a small set with heading drift no verdict and no
 # name changes.
-_ROUNDS = 4  # rounds that fit noise and plain matrix by turns, at most; fewer where the noise stays within 2 %
+_ROUNDS = 4  # rounds that fit model, noise and outliers by turns, at most; fewer where these stay
 _NEAR = 0.02  # share of the largest component of the noise by which two noises may differ, see is_near
 _STEPS = 4  # Gauss-Newton steps, at most
 _HALVINGS = 10  # tries of a step that leads too far, each half of the one before: at last 1 / 512 of it
@@ -98,33 +98,39 @@ def fit_matrix(
     start: Array,
     noise_runs: Sequence[Trajectory] = (),
 ) -> Fit:
-    """Fit the plain matrix from a start (3, N), and with it noise, nuisances and the poses that jump.
+    """Fit the plain matrix from a start (3, N), and with it noise, nuisances and outliers.
 
     noise_runs: repetitions of the runs that the noise alone sees.
     """
     first = replace(first_fit(runs, robot, sample_period, start), noise_runs=tuple(noise_runs))
-    return _in_turn(first, (), _ROUNDS)[0]
+    return _in_turn(first, ())[0]
 
 
 def extend(plain: Fit, groups: Sequence[Group]) -> Extended:
-    """Fit matrix and effects together, from the plain matrix and effects of 0."""
-    fit, values, data, columns = _in_turn(plain, groups, 1 if groups else 0)
+    """Fit matrix and effects together, from the plain matrix and effects of 0; noise stays where there are none."""
+    fit, values, data, columns = _in_turn(plain, groups) if groups else _descend(plain, (), np.zeros(0))
     return Extended(fit, tuple(groups), data, columns, values, _covariance(fit, data))
 
 
-def _in_turn(fit: Fit, groups: Sequence[Group], rounds: int) -> tuple[Fit, Array, Whitened, tuple[Array, ...]]:
-    """Matrix and effects fitted, then noise and these by turns until the noise stays, so many rounds at most."""
+def _in_turn(fit: Fit, groups: Sequence[Group]) -> tuple[Fit, Array, Whitened, tuple[Array, ...]]:
+    """Matrix and effects fitted, then noise, outliers and these by turns until the outliers and the noise stay.
+
+    Outliers that come back in a circle end it, too.
+    """
     fit, values, data, columns = _descend(fit, groups, np.zeros(sum(len(group.parameters) for group in groups)))
-    for _ in range(rounds):
+    seen: set[bytes] = set()
+    for _ in range(_ROUNDS):
         before = fit.noise.noise
+        seen.add(np.concatenate(fit.masks).tobytes())
         fit, values, data, columns = _descend(with_noise(fit), groups, values)
-        if is_near(before.model_dump(), fit.noise.noise.model_dump(), _NEAR):
+        same_noise = is_near(before.model_dump(), fit.noise.noise.model_dump(), _NEAR)
+        if same_noise and np.concatenate(fit.masks).tobytes() in seen:
             break
     return fit, values, data, columns
 
 
 def without_effects(plain: Fit, extended: Extended) -> Extended:
-    """The plain matrix fitted to the runs, noise and nuisances of an extended model, to be compared with it."""
+    """The plain matrix fitted to the inliers, noise and nuisances of an extended model, to be compared with it."""
     return extend(at_model(extended.fit, plain.model), ()) if extended.groups else extended
 
 

@@ -7,16 +7,18 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
-from omnibench.discover.fitting.outliers import without_jumps
+from omnibench.discover.fitting.outliers import InlierWhitener, inliers_of
 from omnibench.discover.regressors.paths import Paths, blocks_of, make_paths
-from omnibench.fit.least_squares.noise import FIRST_NOISE, NoiseEstimate, Whitener, estimate_noise, whiteners
+from omnibench.fit.least_squares.noise import FIRST_NOISE, NoiseEstimate, estimate_noise
 from omnibench.fit.least_squares.nuisance_noise import noise_of_fit
 from omnibench.fit.least_squares.nuisances import Nuisances
 from omnibench.fit.least_squares.repetitions import differences_between_repetitions
 from omnibench.fit.least_squares.start_frames import in_start_frames
 from omnibench.fit.least_squares.trajectory_fit import TrajectoryFit
+from omnibench.fit.least_squares.usable_runs import with_poses
 from omnibench.fit.least_squares.whitened import Whitened, whitened, without
 from omnibench.robot.effects.term import Term
 from omnibench.robot.kinematics import Array, Robot
@@ -35,14 +37,26 @@ _CHANCE = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Fit(TrajectoryFit):
-    """A fitted model at runs without poses that jump, and its noise.
+    """A fitted model at whole runs, its noise, and which of their poses are outliers, that no weighting counts.
 
-    jumps: the number of poses that were left out. noise_runs: runs that the noise alone sees, as repetitions of these.
+    noise_runs: runs that the noise alone sees, as repetitions of these. inliers: True (K,) for the poses of the runs,
+    then of these, that are no outliers; empty if there are none.
     """
 
     noise: NoiseEstimate
-    jumps: int = 0
+    inliers: tuple[NDArray[np.bool_], ...] = ()
     noise_runs: tuple[Trajectory, ...] = ()
+
+    @property
+    def masks(self) -> list[NDArray[np.bool_]]:
+        """True (K,) for the inliers of each run."""
+        masks = self.inliers or [np.ones(len(run.pose_times) - 1, dtype=bool) for run in self.runs]
+        return list(masks[: len(self.runs)])
+
+    @property
+    def jumps(self) -> int:
+        """The number of the runs' poses that are outliers."""
+        return sum(int((~mask).sum()) for mask in self.masks)
 
     @cached_property
     def with_noise_runs(self) -> Fit:
@@ -52,6 +66,15 @@ class Fit(TrajectoryFit):
         values = np.vstack([self.nuisances.values, np.zeros((len(self.noise_runs), 3))])
         runs, nuisances = (*self.runs, *self.noise_runs), replace(self.nuisances, values=values)
         return self.changed(runs=runs, noise_runs=(), nuisances=nuisances).with_likeliest_nuisances()
+
+    @cached_property
+    def at_inliers(self) -> Fit:
+        """The fit's model at its runs without their outliers."""
+        if not self.jumps:
+            return self
+        pairs = zip(self.runs, self.masks, strict=True)
+        runs = [run if mask.all() else with_poses(run, np.append(True, mask)) for run, mask in pairs]
+        return self.changed(runs=tuple(runs), inliers=(), noise_runs=())
 
     @property
     def velocities(self) -> list[Array]:
@@ -63,9 +86,14 @@ class Fit(TrajectoryFit):
         return [_velocities(log, poses) for log, poses in zip(self.logs, self.poses, strict=True)]
 
     @cached_property
-    def weightings(self) -> list[Whitener]:
-        """The whitening of each run under the noise."""
-        return whiteners(self.noise.noise, self.stamps)
+    def weightings(self) -> list[InlierWhitener]:
+        """The whitening of each run's inliers under the noise; runs with the same stamps share theirs."""
+        made: dict[tuple[bytes, bytes], InlierWhitener] = {}
+        keys = [(stamps.tobytes(), mask.tobytes()) for stamps, mask in zip(self.stamps, self.masks, strict=True)]
+        for key, stamps, mask in zip(keys, self.stamps, self.masks, strict=True):
+            if key not in made:
+                made[key] = InlierWhitener(self.noise.noise, stamps, mask)
+        return [made[key] for key in keys]
 
     def whitened(self, columns: Sequence[Array], residuals: Sequence[Array] | None = None) -> Whitened:
         """Columns (K, 3, p) and residuals (K, 3) of every run, whitened under the noise, nuisances eliminated.
@@ -92,7 +120,7 @@ class Fit(TrajectoryFit):
 
     @property
     def weighted_residuals(self) -> list[Array]:
-        """The inverse covariance of noise and nuisances times the nuisance-free residuals (K, 3), of each run."""
+        """Inverse covariance of noise and nuisances times the nuisance-free residuals (K, 3); 0 for outliers."""
         deviations, weighted = self.nuisances.deviations[self.nuisances.estimated], []
         runs = zip(self.nuisance_free_residuals, self.estimated_slopes, self.weightings, strict=True)
         for residuals, slopes, weigh in runs:
@@ -100,8 +128,7 @@ class Fit(TrajectoryFit):
             if len(deviations):
                 nuisances = (weigh(slopes) * deviations).reshape(white.size, -1)
                 white = without(without(white.reshape(-1, 1), nuisances), nuisances).reshape(white.shape)
-            of_differences = weigh.transposed(white)
-            weighted.append(-np.diff(of_differences, axis=0, append=0.0))
+            weighted.append(weigh.weighted(white))
         return weighted
 
     def with_likeliest_nuisances(self) -> Fit:
@@ -127,15 +154,15 @@ def first_fit(runs: Sequence[Trajectory], robot: Robot, sample_period: float, st
 
 
 def with_noise(fit: Fit) -> Fit:
-    """The fit with noise, nuisances and jumping poses estimated anew from its residuals."""
+    """The fit with noise, nuisances and outliers estimated anew from its residuals; outliers may come back."""
     near = fit.noise.noise if fit.noise is not _UNKNOWN_NOISE else None
-    seen, count = fit.with_noise_runs, len(fit.runs)
-    turned = in_start_frames(seen.runs, seen.residuals)
-    noise = estimate_noise(differences_between_repetitions(seen.runs, turned), near)
-    runs, jumps = without_jumps(fit.runs, turned[:count], noise.noise)
-    noise_runs, _ = without_jumps(fit.noise_runs, turned[count:], noise.noise)
-    fit = fit.changed(runs=runs, jumps=fit.jumps + jumps, noise_runs=noise_runs)
-    found = noise_of_fit(fit.with_noise_runs, range(3), noise.noise, _CHANCE)
+    seen = fit.with_noise_runs
+    usual = seen.at_inliers
+    noise = estimate_noise(
+        differences_between_repetitions(usual.runs, in_start_frames(usual.runs, usual.residuals)), near
+    )
+    fit = fit.changed(inliers=inliers_of(seen.runs, in_start_frames(seen.runs, seen.residuals), noise.noise))
+    found = noise_of_fit(fit.with_noise_runs.at_inliers, range(3), noise.noise, _CHANCE)
     values = np.where(found.deviations > 0, fit.nuisances.values, 0.0)
     fit = fit.changed(nuisances=Nuisances(values, found.deviations), noise=found.estimate)
     return fit.with_likeliest_nuisances()
@@ -178,7 +205,7 @@ def at_model(fit: Fit, model: OdometryModel) -> Fit:
 def at_runs(fit: Fit, runs: Sequence[Trajectory]) -> Fit:
     """The fit's model at other runs, their nuisances 0: only the sizes of these are known."""
     nothing_known = Nuisances(np.zeros((len(runs), 3)), fit.nuisances.deviations)
-    return replace(fit, runs=tuple(runs), nuisances=nothing_known, jumps=0, noise_runs=())
+    return replace(fit, runs=tuple(runs), nuisances=nothing_known, inliers=(), noise_runs=())
 
 
 def model_with(model: OdometryModel, matrix: Array, terms: Sequence[Term]) -> OdometryModel:

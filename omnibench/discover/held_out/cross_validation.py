@@ -106,11 +106,12 @@ def values_of_other_folds(data: Whitened, index: Sequence[int], folds: NDArray[n
 
 
 def held_out_residuals(extended: Extended, folds: NDArray[np.intp]) -> list[Array]:
-    """Residuals (K, 3) of each run, to first order, by the model fitted to all folds but the run's own.
+    """Residuals (k, 3) of each run's inliers, to first order, by the model fitted to all folds but the run's own.
 
     Nothing is fitted to the run itself, nor are its nuisances.
     """
-    return left_by(extended, values_of_other_folds(extended.data, range(len(extended.data.information)), folds))
+    left = left_by(extended, values_of_other_folds(extended.data, range(len(extended.data.information)), folds))
+    return [residuals[inliers] for residuals, inliers in zip(left, extended.fit.masks, strict=True)]
 
 
 def left_by(extended: Extended, values: Array) -> list[Array]:

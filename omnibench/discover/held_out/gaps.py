@@ -45,9 +45,9 @@ def compare_held_out(
     if len(np.unique(folds)) > 1:
         before, after = (errors_of_repetitions(model, folds) for model in (plain, extended))
         held_out.append(_compared("repetitions", before, after, floor))
-    if validation.kept:
+    if validation.runs:
         before, after = (errors_on(model.fit, validation) for model in (plain, extended))
-        of_session = floor_of(validation.kept_under(extended.fit))
+        of_session = floor_of(validation.under(extended.fit))
         held_out.append(_compared("session", before, after, of_session or floor))
     return tuple(held_out)
 
@@ -89,10 +89,10 @@ def errors_of_repetitions(extended: Extended, folds: NDArray[np.intp]) -> Errors
 
 
 def errors_on(fit: Fit, validation: ValidationRuns) -> Errors:
-    """Errors on the validation split: of all final poses, and the chi-square of the poses that do not jump."""
-    finals = np.array([residuals[-1] for residuals in validation.all_under(fit).residuals])
-    kept = validation.kept_under(fit)
-    white = kept.whitened([np.zeros((*residuals.shape, 0)) for residuals in kept.residuals]).residuals
+    """Errors on the validation split: of all final poses, and the chi-square of the poses that are no outliers."""
+    there = validation.under(fit)
+    white = there.whitened([np.zeros((*residuals.shape, 0)) for residuals in there.residuals]).residuals
+    finals = np.array([residuals[-1] for residuals in there.residuals])
     return Errors(finals, np.array([float(np.square(residuals).mean()) for residuals in white]))
 
 
@@ -110,7 +110,7 @@ class Floor:
 def floor_of(fit: Fit) -> Floor | None:
     """The floor of a fit's runs; None where no command is repeated."""
     known = np.flatnonzero(fit.nuisances.estimated)
-    differences = differences_without_nuisances(fit.with_noise_runs, list(known))
+    differences = differences_without_nuisances(fit.with_noise_runs.at_inliers, list(known))
     if differences.source != "repetitions":
         return None
     each = differences.each

@@ -20,7 +20,9 @@ from omnibench.fit.sessions.session_differences import SessionComparison, compar
 
 def compare_with_validation(extended: Extended, validation: ValidationRuns) -> SessionComparison:
     """Comparison of all sessions by the extended model, as ``evaluate`` compares them."""
-    return compare_sessions(extended.fit.model, [*extended.fit.runs, *validation.kept])
+    fit = extended.fit
+    held_out = validation.under(fit).at_inliers.runs if validation.runs else ()
+    return compare_sessions(fit.model, [*fit.at_inliers.runs, *held_out])
 
 
 def eq6_with_changes(extended: Extended, runs: Sequence[Trajectory], comparison: SessionComparison) -> float | None:

@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.discover.fitting.model_fit import Fit, at_runs
-from omnibench.discover.fitting.outliers import without_jumps
+from omnibench.discover.fitting.outliers import inliers_of
 from omnibench.errors import DataError
 from omnibench.fit.least_squares.repetitions import repeating_runs
 from omnibench.fit.least_squares.start_frames import in_start_frames
@@ -21,25 +24,24 @@ _LATER, _LATER_S = 1.1, 60
 
 @dataclass(frozen=True, eq=False)
 class ValidationRuns:
-    """Runs of the validation split: all that the model can predict, these without poses that jump, and warnings."""
+    """Runs of the validation split that the model can predict, which of their poses are outliers, and warnings.
+
+    inliers: True (K,) for the poses of each run that are none; empty if none is an outlier.
+    """
 
     runs: tuple[Trajectory, ...]
-    kept: tuple[Trajectory, ...]
+    inliers: tuple[NDArray[np.bool_], ...]
     warnings: tuple[str, ...]
     _fits: dict[OdometryModel, Fit] = field(default_factory=dict)
 
-    def all_under(self, fit: Fit) -> Fit:
-        """The model of a fit at all runs; each model is evaluated once."""
+    def under(self, fit: Fit) -> Fit:
+        """The model of a fit at the runs; each model is evaluated once."""
         there = self._fits.setdefault(fit.model, at_runs(fit, self.runs))
         nuisances = replace(there.nuisances, deviations=fit.nuisances.deviations)
-        again = there.changed(noise=fit.noise, nuisances=nuisances)
+        again = there.changed(noise=fit.noise, nuisances=nuisances, inliers=self.inliers)
         _ = again.residuals
         self._fits[fit.model] = again
         return again
-
-    def kept_under(self, fit: Fit) -> Fit:
-        """The model of a fit at the runs without poses that jump."""
-        return self.all_under(fit).changed(runs=self.kept)
 
 
 def validation_runs(dataset: Dataset, fit: Fit) -> ValidationRuns:
@@ -57,10 +59,10 @@ def validation_runs(dataset: Dataset, fit: Fit) -> ValidationRuns:
         warnings.append(f"{error}; nothing is compared on it.")
         return ValidationRuns((), (), tuple(warnings))
     there = at_runs(fit, runs)
-    kept, jumps = without_jumps(runs, in_start_frames(runs, there.residuals), fit.noise.noise)
-    if jumps:
-        warnings.append(f"{jumps} held-out poses contradict their neighbours; whitened χ² is without them.")
-    return ValidationRuns(runs, kept, tuple(warnings), {fit.model: there})
+    there = there.changed(inliers=inliers_of(runs, in_start_frames(runs, there.residuals), fit.noise.noise))
+    if there.jumps:
+        warnings.append(f"{there.jumps} held-out poses contradict their neighbours; whitened χ² is without them.")
+    return ValidationRuns(runs, there.inliers, tuple(warnings), {fit.model: there})
 
 
 def noise_runs(runs: Sequence[Trajectory], dataset: Dataset) -> tuple[Trajectory, ...]:

@@ -7,15 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from omnibench.data.dataset import Trajectory
 from omnibench.discover.fitting.extend import Extended, extend
 from omnibench.discover.fitting.model_fit import Fit
 from omnibench.discover.held_out.gaps import errors_on
 from omnibench.discover.held_out.validation_runs import ValidationRuns
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.result import Step
-from omnibench.fit.least_squares.noise import whiteners
-from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 
 
@@ -47,20 +44,19 @@ def step_name(group: Group) -> str:
 
 def _step(name: str, fit: Fit, extended: Fit, validation: ValidationRuns) -> Step:
     """Errors of a step's model; on held-out runs as ``compare_held_out`` has them."""
-    errors = errors_on(replace(extended, model=fit.model), validation) if validation.kept else None
+    errors = errors_on(replace(extended, model=fit.model), validation) if validation.runs else None
     return Step(
         name,
-        _chi2(extended.noise.noise, fit.runs, fit.residuals),
+        _chi2(fit.changed(noise=extended.noise)),
         None if errors is None else float(errors.chi2.mean()),
         _eq6(fit.nuisance_free_residuals),
         None if errors is None else float(errors.eq6.mean()),
     )
 
 
-def _chi2(noise: Noise, runs: Sequence[Trajectory], residuals: Sequence[Array]) -> float:
-    of_runs = zip(whiteners(noise, [run.pose_times[1:] for run in runs]), residuals, strict=True)
-    white = [whiten(values) for whiten, values in of_runs]
-    return float(sum(np.square(values).sum() for values in white) / sum(values.size for values in white))
+def _chi2(fit: Fit) -> float:
+    white = np.concatenate([weigh(values) for weigh, values in zip(fit.weightings, fit.residuals, strict=True)])
+    return float(np.square(white).mean())
 
 
 def _eq6(residuals: Sequence[Array]) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +18,6 @@ def located(
     screening: Screening,
     baseline: Extended,
     extended: Extended,
-    without: Sequence[str],
     rng: np.random.Generator,
 ) -> Selection:
     """The selection with all that the residuals depend on, before any effect and after those of an extended model.
@@ -27,14 +25,10 @@ def located(
     baseline: the plain matrix under the noise of the extended model.
     """
     where = together(selection.where, fine_structure(baseline.fit, rng))
-    return replace(
-        selection, where=where, left=all_left(extended, screening, without, rng) if extended.groups else where
-    )
+    return replace(selection, where=where, left=all_left(extended, screening, rng) if extended.groups else where)
 
 
-def all_left(
-    extended: Extended, screening: Screening, without: Sequence[str], rng: np.random.Generator
-) -> Significance:
+def all_left(extended: Extended, screening: Screening, rng: np.random.Generator) -> Significance:
     """Significance of generic bases and of fine structure beyond all that an extended model holds."""
-    bases = significance_left(extended, screening, without, rng)
+    bases = significance_left(extended, screening, rng)
     return together(bases, fine_structure(extended.fit, rng))

@@ -67,30 +67,20 @@ def screen_extended(extended: Extended, without: Sequence[str]) -> Screening:
     return _screened(extended.fit, extended.residuals_without_effects, _groups_at(extended.fit, without))
 
 
-def screen_again(extended: Extended, earlier: Screening, without: Sequence[str]) -> Screening:
-    """Screen as ``screen_extended``, with the columns of an earlier screening unless further poses were left out."""
-    groups = _groups_again(extended, earlier, without)
-    return _screened(extended.fit, extended.residuals_without_effects, groups)
+def screen_again(extended: Extended, earlier: Screening) -> Screening:
+    """Screen as ``screen_extended``, with the columns of an earlier screening."""
+    return _screened(extended.fit, extended.residuals_without_effects, earlier.groups)
 
 
-def significance_left(
-    extended: Extended, screening: Screening, without: Sequence[str], rng: np.random.Generator
-) -> Significance:
+def significance_left(extended: Extended, screening: Screening, rng: np.random.Generator) -> Significance:
     """Significance of the generic bases beyond all that an extended model holds, smooth terms among it."""
-    fit, groups = extended.fit, _groups_again(extended, screening, without)
+    fit, groups = extended.fit, screening.groups
     data = _whitened(fit, groups, fit.nuisance_free_residuals, extended.columns)
     width = extended.columns[0].shape[2]
     first = groups.bases[0].index[0] if groups.bases else 0
     bases = [replace(group, index=tuple(width + column - first for column in group.index)) for group in groups.bases]
     found = significance_of(data, range(width), bases, rng)
     return replace(found, groups=groups.bases)
-
-
-def _groups_again(extended: Extended, earlier: Screening, without: Sequence[str]) -> Groups:
-    """The groups of an earlier screening unless further poses were left out."""
-    fit = extended.fit
-    same_poses = earlier.groups.columns.rows == sum(len(residuals) for residuals in fit.residuals)
-    return earlier.groups if same_poses else _groups_at(fit, without)
 
 
 def _groups_at(fit: Fit, without: Sequence[str]) -> Groups:

@@ -172,7 +172,7 @@ class _Factor:
             bands[1] -= of_poses
         self._factor, failed = dpbtrf(bands, lower=1, overwrite_ab=1)
         if failed:
-            raise ValueError("noise or stamps are not finite")
+            raise DataError("the noise or the stamps of a run are not finite; omnibench check DATASET says more")
         self.log_determinant = float(2 * np.log(self._factor[0]).sum())
 
     def whiten(self, differences: Array) -> Array:

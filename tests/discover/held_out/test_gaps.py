@@ -94,7 +94,7 @@ def test_runs_of_the_validation_are_predicted_as_they_are() -> None:
     late = run_of(FORWARD, "go", "later", split="validation")
     late.poses[-1] += [0.3, 0.4, 0.1]
     model = extended_of(RUNS, left(1, 1, 1, 1))
-    _, held_out = compare_held_out(model, model, ValidationRuns((late,), (late,), ()), np.array([0, 1, 0, 1]))
+    _, held_out = compare_held_out(model, model, ValidationRuns((late,), (), ()), np.array([0, 1, 0, 1]))
     assert held_out.data == "session"
     assert held_out.position_m == pytest.approx((0.5, 0.5))
     assert held_out.heading_rad == pytest.approx((0.1, 0.1))
