@@ -19,7 +19,6 @@ from omnibench.fit.span import directions_kept, driven_span
 from omnibench.robot.arrays import Array
 from omnibench.robot.kinematics import Robot
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.planar import wrapped
 from omnibench.robot.stored.odometry_of_stored import odometry_of
 from omnibench.words import plural
 
@@ -63,8 +62,8 @@ def expected_gain(dataset: Dataset, *, clocks_agree: bool = True) -> Gain:
     before, after = [], []
     for number, out in enumerate(parts):
         rest = [run for other, part in enumerate(parts) if other != number for run in part]
-        before.append(_errors(robot, out, robot.inverse_kinematic_matrix))
-        after.append(_errors(robot, out, _fitted(robot, rest, walk)))
+        before.append(final_errors(OdometryModel.of_design(robot, "arc"), out))
+        after.append(final_errors(OdometryModel(robot, _fitted(robot, rest, walk), "arc"), out))
     held = [run for part in parts for run in part]
     verdict = judge(np.concatenate(before), np.concatenate(after), held)
     needed = {"better": True, "worse": False}.get(verdict.verdict)
@@ -126,10 +125,3 @@ def _by_references(robot: Robot, runs: Sequence[Trajectory], walk: Walk) -> Arra
         slopes, left = np.concatenate(columns), np.concatenate(residuals)
         steps = steps + np.linalg.solve(slopes.T @ slopes + np.eye(len(steps)), slopes.T @ left - steps)
     return design + (root @ steps).reshape(design.shape)
-
-
-def _errors(robot: Robot, runs: Sequence[Trajectory], matrix: Array) -> Array:
-    """Errors (Z, 3) of the final poses, or of references."""
-    errors = final_errors(OdometryModel(robot, matrix, "arc"), runs)
-    errors[:, 2] = wrapped(errors[:, 2])
-    return errors
