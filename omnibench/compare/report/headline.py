@@ -19,9 +19,10 @@ from omnibench.compare.report.wording import (
     position_unit,
 )
 from omnibench.compare.result import THEORETICAL_NAME, EntryStatistics
+from omnibench.fit.cost import NO_ERROR
 from omnibench.fit.evaluate import positions_and_headings
 from omnibench.report.blocks import Block, Callout, Fact, FigureGrid, LegendItem, Paragraph, Section, answer_section
-from omnibench.report.numbers import fixed, listing, percent, span, typeset, with_unit
+from omnibench.report.numbers import fixed, listing, percent, significant, span, typeset, with_unit
 from omnibench.report.path_pictures import CALIBRATED, paths_before_after
 from omnibench.words import plural
 
@@ -204,11 +205,13 @@ def _doubts(view: DatasetView, best: EntryStatistics) -> list[str]:
             f"{span(min(values), max(values), decimals)}. The verdict is about the run of median training cost."
         )
     lowest = min((entry.train_median for entry in view.statistics if entry.train_median is not None), default=None)
-    if best.train_median is not None and lowest and best.train_median > (1 + _ARRIVED) * lowest:
+    if best.train_median is not None and lowest is not None and best.train_median > (1 + _ARRIVED) * lowest + NO_ERROR:
+        above = f"{percent(best.train_median / lowest - 1)} above the lowest"
+        if lowest <= NO_ERROR:
+            above = f"{significant(best.train_median, 2)}, where the lowest leaves no error"
         doubts.append(
-            f"{best.label} has not found the minimum: its training cost is {percent(best.train_median / lowest - 1)} "
-            "above the lowest. That it does better on other data may be chance, or the splits differ in more than "
-            "noise."
+            f"{best.label} has not found the minimum: its training cost is {above}. That it does better on other data "
+            "may be chance, or the splits differ in more than noise."
         )
     lower = _apart(view, -1)
     if lower:
