@@ -76,7 +76,7 @@ def _no_winner(view: DatasetView, best: EntryStatistics | None) -> str:
         return "Only the design values gave an answer; there is no calibration to compare them with."
     return (
         f"No calibrator did better than the design values on the {SPLIT_NAMES[view.scored]} runs: {listing(answers)} "
-        f"ended above their cost, or level with it."
+        f"ended above their cost, or are not told apart from them."
     )
 
 
@@ -134,25 +134,27 @@ def _standing(view: DatasetView, best: EntryStatistics) -> str:
         return f"{best.label} is the only calibrator with an answer"
     if view.undecided:
         return f"Which entry is best cannot be said ({view.units[view.scored].words})"
-    others = len(view.level) - 1
+    others = len(view.not_told_apart) - 1
     if not others:
         return f"{best.label} is best"
     entries = "other entry is" if others == 1 else "other entries are"
-    design = any(entry.calibrator == THEORETICAL_NAME for entry in view.level)
-    return f"{_number(others)} {entries} level with it{', the design values among them' if design else ''}"
+    design = any(entry.calibrator == THEORETICAL_NAME for entry in view.not_told_apart)
+    return f"{_number(others)} {entries} not told apart from it{', the design values among them' if design else ''}"
 
 
 def _standing_at_length(view: DatasetView, best: EntryStatistics) -> str:
-    """The entries that are level with the best one; of these the lowest training cost decides."""
+    """The entries that are not told apart from the best one; of these the lowest training cost decides."""
     basis = f"The intervals: {view.units[view.scored].words}."
     if len(view.calibrated) > 1 and view.undecided:
         return f"{best.label} has the lowest training cost. {basis}"
-    level = ["the design values" if entry.calibrator == THEORETICAL_NAME else entry.label for entry in view.level]
-    if len(level) < 2:
+    rivals = [
+        "the design values" if entry.calibrator == THEORETICAL_NAME else entry.label for entry in view.not_told_apart
+    ]
+    if len(rivals) < 2:
         return basis
     return (
-        f"Level on the {SPLIT_NAMES[view.scored]} runs: {listing(level, 20)}; {best.label} has the lowest training "
-        f"cost of them. {basis}"
+        f"Not told apart on the {SPLIT_NAMES[view.scored]} runs: {listing(rivals, 20)}; {best.label} has the lowest "
+        f"training cost of them. {basis}"
     )
 
 
