@@ -19,13 +19,7 @@ from pydantic import Field, FiniteFloat, field_validator
 from omnibench.config import Model
 from omnibench.fit.parameterisation import Bounds, ParameterisationName, checked
 from omnibench.fit.shrinkage.prior import tolerance_of
-from omnibench.robot.kinematics import (
-    Array,
-    Robot,
-    inverse_kinematic_matrices,
-    relative_deviations,
-    wheel_rows,
-)
+from omnibench.robot.kinematics import Array, Robot, inverse_kinematic_matrices, relative_deviations, wheel_rows
 from omnibench.robot.robot_class import class_of
 from omnibench.robot.wheels.drive import CarDrive
 

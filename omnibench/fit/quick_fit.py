@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -30,42 +29,28 @@ def quick_fit(robot: Robot, runs: Sequence[Trajectory], integration: Integration
     if not posed:
         return _by_references(robot, runs)
     odometry = odometry_of([run.reference_log for run in posed], integration)
-    reference = np.concatenate([run.poses[1:] for run in posed])
-    span = driven_span(posed)
-    kept = directions_kept(robot, span, "shrink")
+    observed = np.concatenate([run.poses[1:] for run in posed])
+    kept = directions_kept(robot, driven_span(posed), "shrink")
     _, _, directions = np.linalg.svd(np.vstack([kept, np.zeros((1, len(robot.drive.names)))]))
-
-    def fitted(headed: Sequence[Trajectory]) -> Array:
-        return linear_fit(odometry, headed, reference, robot.inverse_kinematic_matrix, directions[len(kept) :])
-
-    matrix = fitted(posed)
-    if float(np.median(np.concatenate([np.diff(run.pose_times) for run in posed]))) > _SPARSE:
-        matrix = fitted([_headed(run, matrix[2]) for run in posed])
-    if default_cost(robot, len(posed)) == "trajectory":
+    directions = directions[len(kept) :]
+    matrix = linear_fit(odometry, posed, observed, robot.inverse_kinematic_matrix, directions)
+    sparse = float(np.median(np.concatenate([np.diff(run.pose_times) for run in posed]))) > _SPARSE
+    if default_cost(robot, len(posed)) == "final_pose":
+        odometry = odometry_of([run.final_log for run in posed], integration)
+        observed = np.array([run.final_pose for run in posed])
+    elif not sparse:
         return matrix
-    # Eq. (6) is a sum of norms: least squares that are weighted by 1 / norm lead to its minimum.
-    ends, observed = odometry_of([run.final_log for run in posed], integration), np.array([r.final_pose for r in posed])
-    free = np.kron(np.eye(3), directions[len(kept) :].T)
-    tried = []
+    # The cost is a sum of norms: least squares that are weighted by 1 / norm lead to its minimum.
+    free, tried = np.kron(np.eye(3), directions.T), []
     for number in range(_REWEIGHTED):
-        errors = ends.poses(matrix[None])[0] - observed
+        errors = odometry.poses(matrix[None])[0] - observed
         norms = np.linalg.norm(errors, axis=1)
         tried.append((float(norms.mean()), number, matrix))
         roots = 1 / np.sqrt(np.maximum(norms, _VANISHING * norms.mean() + NO_ERROR))[:, None]
-        columns = (ends.jacobian(matrix).reshape(*errors.shape, -1) @ free) * roots[..., None]
+        columns = (odometry.jacobian(matrix).reshape(*errors.shape, -1) @ free) * roots[..., None]
         step = np.linalg.lstsq(columns.reshape(errors.size, -1), (roots * errors).ravel(), rcond=None)[0]
         matrix = matrix - (free @ step).reshape(matrix.shape)
     return min(tried)[2]
-
-
-def _headed(run: Trajectory, row_3: Array) -> Trajectory:
-    """The run with headings at all its samples: those that row 3 of a matrix turns by, led through the poses'."""
-    edges = np.append(0.0, run.times)
-    turned = np.append(0.0, np.cumsum((run.signals @ row_3) * np.diff(edges)))
-    off = run.poses[:, 2] - np.interp(run.pose_times, edges, turned)
-    poses = np.tile(run.poses[:1], (len(edges), 1))
-    poses[1:, 2] = (turned + np.interp(edges, run.pose_times, off))[1:]
-    return replace(run, pose_times=edges, poses=poses, pose_covariances=None)
 
 
 def _by_references(robot: Robot, runs: Sequence[Trajectory]) -> Array:

@@ -99,14 +99,13 @@ def _matrix_table(run: CalibrationRun) -> Table:
         notes.append(only if listed else f"the design values are kept along {motions}, of which these data say nothing")
     if stopped := [*run.untouched, *run.result.at_bounds] if listed else []:
         notes.append(f"{_NONE} of what rests on {', '.join(stopped)}, held by the box or on a bound of it")
-    drive, design = calibration.robot.drive, calibration.robot.inverse_kinematic_matrix
+    drive = calibration.robot.drive
+    deviations = relative_deviations(calibration.matrix_array, calibration.robot.inverse_kinematic_matrix)
     signals = [f"wheel {name}" if drive.direct else name for name in drive.names]
     values = _cells(
         [
             [Cell(f"{value:+.7f}", _deviation(share)) for value, share in zip(row, shares, strict=True)]
-            for row, shares in zip(
-                calibration.matrix, relative_deviations(calibration.matrix_array, design), strict=True
-            )
+            for row, shares in zip(calibration.matrix, deviations, strict=True)
         ]
     )
     bounds = [

@@ -31,13 +31,13 @@ def expected_gain(dataset: Dataset, *, clocks_agree: bool = True) -> Gain:
     training = looked_at(dataset.split("train") or held_out)
     model = OdometryModel(robot, quick_fit(robot, training), "arc")
     verdict = verdict_on(model, training, looked_at(held_out) if dataset.split("train") else ())
-    if verdict.verdict == "unknown":
-        runs = plural(len(dataset.trajectories), "run")
-        return Gain(None, f"whether a calibration is needed cannot be told from {runs}: 4 of 3 commands can show it")
     needed = {"better": True, "worse": False}.get(verdict.verdict)
     small = verdict.improvement is not None and abs(verdict.improvement) < _SMALL
     if verdict.verdict == "undecided" and small and verdict.units >= _ENOUGH:
         needed = False
     if needed is None and not clocks_agree:
         return Gain(None, "whether a calibration is needed can be told once the clocks are matched")
+    if verdict.verdict == "unknown":
+        runs = plural(len(dataset.trajectories), "run")
+        return Gain(None, f"whether a calibration is needed cannot be told from {runs}; record four, of three commands")
     return Gain(needed, verdict.sentence)

@@ -17,12 +17,7 @@ from omnibench.live.estimation.robot_centre import RobotCentre
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.network.session import close_session, open_session
 from omnibench.live.node import LiveNode, load_effects
-from omnibench.live.replay.concatenated_drive import (
-    FULL_TURN,
-    ConcatenatedDrive,
-    concatenate_recording,
-    concatenated_truth,
-)
+from omnibench.live.replay.concatenated_drive import ConcatenatedDrive, concatenate_recording, concatenated_truth
 from omnibench.live.replay.delivery import WINDOW, DeliveryError
 from omnibench.live.replay.played_recording import Recording
 from omnibench.live.replay.replay_player import Player, PlayReport
@@ -231,7 +226,7 @@ def _evaluated(
         fused=None
         if fused is None
         else _fused_deviation(fused.stamps, _tracked(calibration, fused.poses), origin, drive, reference, chosen),
-        batch_difference=_difference(published, batch[rows]),
+        batch_difference=float(np.abs(published - batch[rows]).max()) if len(rows) else math.nan,
         health=health,
     )
 
@@ -255,14 +250,8 @@ def _fused_deviation(
     rows = _rows(stamps, origin, drive.wheel_times)
     known = np.isin(rows, chosen) & (drive.wheel_times[rows] > drive.slam_times[0] + 1.0)
     poses, reference = poses[known], reference[rows[known]]
-    turns = np.round((poses[:1, 2] - reference[:1, 2]) / FULL_TURN)
-    return _deviation(poses - [0.0, 0.0, 1.0] * (FULL_TURN * turns[:, None]), reference)
-
-
-def _difference(poses: Array, others: Array) -> float:
-    if not len(poses):
-        return math.nan
-    return float(np.abs(poses - others).max())
+    turns = np.round((poses[:1, 2] - reference[:1, 2]) / math.tau)
+    return _deviation(poses - [0.0, 0.0, 1.0] * (math.tau * turns[:, None]), reference)
 
 
 def _deviation(poses: Array, reference: Array) -> Deviation:
