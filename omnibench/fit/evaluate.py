@@ -162,9 +162,9 @@ def verdict_on(model: OdometryModel, training: Sequence[Trajectory], held_out: S
 
     Held-out runs decide if they are of ten units or more (commands, or runs where none repeats): an error that a
     calibration halves is told from chance in 27 % of sets of three units, 67 % of five and 94 % of ten; where few
-    commands count for most, in 17, 39 and 73 % (tests/benchmarks/improvement_coverage.py --power). If they are fewer,
-    and all runs have more units, cross-validation decides, unless its quick fits do not stand for the model: it has
-    effects, or does not gain on the training runs what a quick fit to these gains.
+    commands count for most, in 17, 39 and 73 % (tests/benchmarks/improvement_coverage.py, kinds usual and tails). If
+    they are fewer, and all runs have more units, cross-validation decides, unless its quick fits do not stand for the
+    model: it has effects, or does not gain on the training runs what a quick fit to these gains.
     """
     design = OdometryModel.of_design(model.robot, model.integration)
     verdict = nothing_held_out()
