@@ -201,9 +201,9 @@ def table(kinds: Sequence[str], units: Sequence[int], sets: int, others: bool) -
                 hits = share([interval.holds(true) for interval, true in cells])
                 widths = [high - low for low, high in (interval.known or (0, math.inf) for interval, _ in cells)]
                 without = np.mean([interval.known is None for interval, _ in cells])
-                above = np.mean([interval.low is not None and interval.low > 0 for interval, _ in cells])
+                above = 100 * np.mean([interval.low is not None and interval.low > 0 for interval, _ in cells])
                 words.append(
-                    f"{key} {hits} width {np.median(widths):.2f}, none {100 * without:.0f} %, above 0 {100 * above:.0f} %"
+                    f"{key} {hits} width {np.median(widths):.2f}, none {100 * without:.0f} %, above 0 {above:.0f} %"
                 )
             yield f"{name:8s} {commands:3d}  {'; '.join(words)}"
 
