@@ -95,8 +95,8 @@ def _best(competing: Sequence[ScoredRun], intervals: RatioIntervals) -> ScoredRu
     if not competing:
         return None
     lowest = min(competing, key=_judged_cost)
-    level = [run for run in competing if _against_best(run, lowest, intervals)[1] is not False]
-    return min(level, key=lambda run: (run.record.train_cost or 0.0, _judged_cost(run)))
+    rivals = [run for run in competing if _against_best(run, lowest, intervals)[1] is not False]
+    return min(rivals, key=lambda run: (run.record.train_cost or 0.0, _judged_cost(run)))
 
 
 def _statistics(

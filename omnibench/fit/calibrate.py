@@ -308,7 +308,7 @@ class _Fit:
                 validation_cost=plain.of_model(model, validation) if validation else None,
                 outcome=result.outcome,
                 reason=result.reason,
-                held_out=verdict_on(model, validation),
+                held_out=verdict_on(model, dataset.split("train"), validation),
             ),
         )
 

@@ -19,7 +19,7 @@ from pydantic import Field, FiniteFloat, field_validator
 from omnibench.config import Model
 from omnibench.fit.parameterisation import Bounds, ParameterisationName, checked
 from omnibench.fit.shrinkage.prior import tolerance_of
-from omnibench.robot.kinematics import Array, Robot, inverse_kinematic_matrices, wheel_rows
+from omnibench.robot.kinematics import Array, Robot, inverse_kinematic_matrices, relative_deviations, wheel_rows
 from omnibench.robot.robot_class import class_of
 from omnibench.robot.wheels.drive import CarDrive
 
@@ -253,6 +253,7 @@ class FittedParameter:
 
 def fitted_parameters(geometry: WheelGeometry, vector: Array) -> tuple[FittedParameter, ...]:
     """The physical parameters in a vector (n,) of a geometry."""
+    shares = relative_deviations(vector, geometry.start)
     return tuple(
         FittedParameter(
             name=name,
@@ -260,7 +261,7 @@ def fitted_parameters(geometry: WheelGeometry, vector: Array) -> tuple[FittedPar
             unit=unit_of(name),
             design=float(design),
             deviation=float(value - design),
-            deviation_percent=float(100 * (value - design) / design) if design else None,
+            deviation_percent=None if np.isnan(share) else float(100 * share),
         )
-        for name, value, design in zip(geometry.names, vector, geometry.start, strict=True)
+        for name, value, design, share in zip(geometry.names, vector, geometry.start, shares, strict=True)
     )

@@ -18,6 +18,7 @@ from omnibench.words import noun_for, plural
 
 _SHOWN = 6  # runs that are named; the rest are counted (chosen: two lines of a terminal)
 _MEANINGS = {"better": "better than the design", "worse": "worse than the design: do not use"}
+_BASES = {"held_out": "held out", "cross_validation": "cross-validated"}
 _HOLD_OUT = (
     "keep runs for validation (omnibench import ... --set validation=PATTERN), or evaluate the calibration on a "
     "recording that it was not fitted to (omnibench evaluate CALIBRATION DATASET)"
@@ -43,11 +44,15 @@ def unfitted_runs(dataset: Dataset, fitted: Collection[str]) -> tuple[Trajectory
 
 
 def judge(
-    design: Array, calibrated: Array, runs: Sequence[Trajectory], bootstrap: Bootstrap | None = None
+    design: Array,
+    calibrated: Array,
+    runs: Sequence[Trajectory],
+    bootstrap: Bootstrap | None = None,
+    basis: Literal["held_out", "cross_validation"] = "held_out",
 ) -> HeldOutVerdict:
     """The verdict by the final pose errors (Z, 3), m, m, rad, of the design values and of the calibration.
 
-    Of runs without poses they are what ``final_errors`` of evaluate.py says.
+    Of runs without poses they are what ``final_errors`` of evaluate.py says. basis: as in HeldOutVerdict.
     """
     if not runs:
         return nothing_held_out()
@@ -69,6 +74,7 @@ def judge(
         _MEANINGS[verdict] if verdict != "undecided" else _undecided(gain, units, same=bool((costs == before).all()))
     )
     return HeldOutVerdict(
+        basis=basis,
         verdict=verdict,
         runs=tuple(run.id for run in runs),
         design_position_m=positions[0] if positions else None,
@@ -81,7 +87,7 @@ def judge(
         unit=units.name,
         units=units.count,
         method=units.method,
-        sentence=f"held out ({plural(len(runs), 'run')}): {', '.join([*changes, meaning])}",
+        sentence=f"{_BASES[basis]} ({plural(len(runs), 'run')}): {', '.join([*changes, meaning])}",
         detail=f"{_gain_in_words(gain, units)}{noun_for(len(runs), 'run')}: {_named(runs)}",
     )
 

@@ -34,7 +34,9 @@ class ComparisonView(View):
         for entry in result.statistics[:_ENTRIES]:
             cost = next((entry.cost(split) for split in ("validation", "train") if entry.cost(split)), None)
             shown = "no answer" if cost is None else f"{cost.value:.6f}"
-            yield f"  {entry.dataset} {entry.label}: cost {shown}{', the best' if entry.is_best else ''}"
+            if cost is not None and entry.practically_equal is not False:
+                shown += ", the best" if entry.is_best else ", not told apart from the best"
+            yield f"  {entry.dataset} {entry.label}: cost {shown}"
 
     def tables(self) -> Mapping[str, Callable[[], pl.DataFrame]]:
         return {name: partial(result_table, self.shown, name) for name in ("statistics", "runs", "errors", "history")}

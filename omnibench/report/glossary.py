@@ -33,7 +33,7 @@ _WORDS: tuple[tuple[str, str, str], ...] = (
     ("bootstrap", r"bootstrap", "an interval from runs that are drawn again and again from those recorded"),
     ("Student's t", r"Student's t", "an interval from the spread of a few numbers"),
     ("entry", r"entry|entries", "a calibrator with its options, as the config lists it"),
-    ("level", r"level", "so near that chance could explain the difference"),
+    ("not told apart", r"not told apart", "chance could explain the difference"),
     ("seed", r"seeds?", "the start of the random numbers; another seed is another try"),
     ("box", r"box(?!\))", "the range that a search may take the matrix from"),
     ("matrix", r"matrix", "the numbers that turn wheel rates into the robot's motion (inverse kinematic matrix)"),

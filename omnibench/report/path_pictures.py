@@ -10,6 +10,7 @@ import numpy as np
 import plotly.graph_objects as go
 
 from omnibench.data.dataset import Trajectory
+from omnibench.fit.evaluate import final_errors
 from omnibench.report.blocks import Figure, FigureGrid, LegendItem
 from omnibench.report.numbers import fixed, listing
 from omnibench.report.recording.drawing import REFERENCE_ITEM
@@ -19,7 +20,7 @@ from omnibench.report.style import INK, THEORETICAL, plan, text
 from omnibench.report.traces import START, marks, path
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.planar import relative
+from omnibench.robot.planar import rotated
 from omnibench.words import plural
 
 DESIGN_ITEM = LegendItem("design", "design values", THEORETICAL, "dash")
@@ -55,17 +56,10 @@ def paths_before_after(runs: Sequence[Trajectory], models: Models, which: str) -
 
 
 def _final_errors(model: OdometryModel, runs: Sequence[Trajectory]) -> Array:
-    """Ends (Z, 3) by the odometry as seen from the reference's ends, m, m, rad."""
-    reported = model.reported([run.final_log for run in runs])
-    errors = np.array([_seen_from_end(run, poses[-1]) for run, poses in zip(runs, reported, strict=True)])
-    return errors.reshape(-1, 3)
-
-
-def _seen_from_end(run: Trajectory, pose: Array) -> Array:
-    """An end relative to the reference's, x and y along the axes of the run's start."""
-    error: Array = relative(run.start, pose) - relative(run.start, run.final_pose)
-    error[2] = pose[2] - run.final_pose[2]
-    return error
+    """Final errors (Z, 3) of the odometry, x and y along the axes of each run's start, m, m, rad."""
+    errors = final_errors(model, runs)
+    along_starts = rotated(errors, np.array([-run.start[2] for run in runs]))
+    return np.column_stack([along_starts, errors[:, 2]])
 
 
 def _typical(runs: Sequence[Trajectory], ends: Sequence[Array]) -> tuple[dict[str, Trajectory], str]:
@@ -99,7 +93,7 @@ def _paths(title: str, run: Trajectory, models: Models) -> Figure:
         (poses,) = model.reported([run.log(stamps)])
         traces += [path(item, poses, width), marks(item, 8, *poses[-1:, :2].T)]
         drawn.append(poses[:, :2])
-        words.append(_error_in_words(_seen_from_end(run, poses[-1])[None]))
+        words.append(_error_in_words(_final_errors(model, [run])))
     traces.append(marks(START, 9, *run.start[None, :2].T, hover="start"))
     points = np.vstack(drawn)
     middle = (np.nanmin(points, axis=0) + np.nanmax(points, axis=0)) / 2

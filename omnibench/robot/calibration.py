@@ -93,12 +93,15 @@ class Noise(Model):
 class HeldOutVerdict(Model):
     """Verdict on a calibration by held-out runs, beside the design values.
 
+    basis: the runs that were held out from this fit, or, where these are few, quick fits to four fifths of the commands
+    by turns, judged on the last fifth.
     verdict: of the errors of the final pose, Eq. (6). Better or worse: the 95 % interval of the improvement leaves out
     0; undecided: it does not, or the units are too few for one; unknown: nothing was held out. Positions (m) and
     headings (rad) are means over the runs. improvement: share of the design values' Eq. (6) that is gone. unit, units,
     method: what the interval rests on. sentence and detail: all of this in words.
     """
 
+    basis: Literal["held_out", "cross_validation"] = Field("held_out", exclude_if=lambda basis: basis == "held_out")
     verdict: Literal["better", "worse", "undecided", "unknown"]
     runs: tuple[str, ...] = ()
     design_position_m: float | None = None

@@ -44,6 +44,7 @@ from omnibench.views import Shown
 
 # Of the largest singular value: directions below it are rounding of design values, which have some digits.
 _RANK = 1e-6
+_ZERO = 1e-9  # m, rad, or either per rad of wheel: no length, angle or element of a real robot is smaller but for 0
 _ROUNDING = 1e-12  # of the largest element: a smaller one is no design value
 
 
@@ -294,6 +295,12 @@ def _design(robot: Robot) -> Array:
     matrix[:, :used] = allowed @ np.linalg.pinv(equations[:used] @ allowed)
     matrix[np.abs(matrix) < _ROUNDING * np.abs(matrix).max()] = 0.0
     return matrix
+
+
+def relative_deviations(values: Array, design: Array) -> Array:
+    """Shares (values - design) / design; NaN where the design value is 0 but for rounding, as m12 of Eq. (7)."""
+    shares: Array = (values - design) / np.where(np.abs(design) < _ZERO, np.nan, design)
+    return shares
 
 
 def wheel_equations(wheels: Sequence[Wheel]) -> Array:

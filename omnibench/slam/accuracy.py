@@ -109,7 +109,6 @@ def run_errors(trajectory: Trajectory, truth: TruePath) -> RunErrors:
     way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(truth.poses[:, :2], axis=0).T))])
     true = TruePath(truth.times, moved_to(trajectory.start, truth.poses)).at(times)
     errors = trajectory.poses[1:] - true
-    errors[:, 2] -= 2 * np.pi * np.round(errors[:, 2] / (2 * np.pi))
     covariances = trajectory.pose_covariances
     nees = None if covariances is None else _nees(errors, covariances[1:])
     in_robot = np.column_stack([rotated(errors, -true[:, 2]), errors[:, 2]])

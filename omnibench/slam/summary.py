@@ -10,7 +10,7 @@ from pydantic import Field
 from omnibench.config import Model
 from omnibench.data.dataset import Dataset
 from omnibench.robot.kinematics import Array
-from omnibench.robot.planar import interpolated, wrapped
+from omnibench.robot.planar import interpolated
 from omnibench.slam.accuracy import SlamAccuracy
 from omnibench.slam.slam_run import SlamPath
 
@@ -85,7 +85,7 @@ def distances(one: Dataset, other: Dataset) -> Distances | None:
     if not len(errors):
         return None
     position = np.hypot(errors[:, 0], errors[:, 1])
-    heading = np.abs(wrapped(errors[:, 2]))
+    heading = np.abs(errors[:, 2])
     return Distances(
         poses=len(errors),
         position_mean_m=float(position.mean()),
@@ -96,7 +96,8 @@ def distances(one: Dataset, other: Dataset) -> Distances | None:
 
 
 def _apart(one: tuple[Array, Array], other: tuple[Array, Array]) -> Array:
-    """Differences (K, 3) at the common times after the start; headings not wrapped."""
+    """Differences (K, 3) at the common times after the start; only whole turns at the start are taken away."""
     (times, poses), (dense_times, dense) = sorted((one, other), key=lambda path: len(path[0]))
     common = (times > _SAME_TIME) & (times >= dense_times[0] - _SAME_TIME) & (times <= dense_times[-1] + _SAME_TIME)
-    return poses[common] - interpolated(times[common], dense_times, dense)
+    turns = np.round((poses[0, 2] - dense[0, 2]) / (2 * np.pi))
+    return poses[common] - interpolated(times[common], dense_times, dense) - [0.0, 0.0, 2 * np.pi * turns]

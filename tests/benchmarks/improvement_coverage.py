@@ -182,7 +182,7 @@ def share(hits: Sequence[bool]) -> str:
 
 
 def table(kinds: Sequence[str], units: Sequence[int], sets: int, others: bool) -> Iterator[str]:
-    """A line for every kind and number of commands: how many % of the intervals hold the truth."""
+    """A line for every kind and number of commands: how many % of the intervals hold the truth, and lie above 0."""
     for name in kinds:
         truth = 0.0 if name == "whole" else improvement_of(KINDS[name])
         for commands in units:
@@ -201,7 +201,10 @@ def table(kinds: Sequence[str], units: Sequence[int], sets: int, others: bool) -
                 hits = share([interval.holds(true) for interval, true in cells])
                 widths = [high - low for low, high in (interval.known or (0, math.inf) for interval, _ in cells)]
                 without = np.mean([interval.known is None for interval, _ in cells])
-                words.append(f"{key} {hits} width {np.median(widths):.2f}, none {100 * without:.0f} %")
+                above = 100 * np.mean([interval.low is not None and interval.low > 0 for interval, _ in cells])
+                words.append(
+                    f"{key} {hits} width {np.median(widths):.2f}, none {100 * without:.0f} %, above 0 {above:.0f} %"
+                )
             yield f"{name:8s} {commands:3d}  {'; '.join(words)}"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 
 import numpy as np
 from export_samples import TRICYCLE
@@ -14,8 +15,10 @@ from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.inspect import inspect_dataset
 from omnibench.fit.problem import Budget
+from omnibench.robot.kinematics import Robot, Wheel
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
+from omnibench.testing.synthetic import PERIOD, synthetic_trajectories
 
 
 def a_dataset() -> Dataset:
@@ -47,3 +50,16 @@ def test_the_geometry_of_a_tricycle_is_shown_with_the_place_of_its_tracked_point
     print_calibration(console, searched)
     assert isinstance(console.file, io.StringIO)
     assert any(line.startswith("mount_x") for line in console.file.getvalue().splitlines())
+
+
+def test_an_element_that_is_0_but_for_rounding_has_no_share_of_the_design() -> None:
+    wheels = (Wheel(name=f"{n}", radius=0.05, distance=0.2, angle=n * 2 * np.pi / 3) for n in range(3))
+    robot, console = Robot(name="omni", wheels=tuple(wheels)), Console(file=io.StringIO(), width=160)
+    assert 0 < abs(robot.inverse_kinematic_matrix[0, 0]) < 1e-15
+    dataset = make_dataset("omni", robot, PERIOD, synthetic_trajectories(robot))
+    print_calibration(console, calibrate(dataset, "random_search", budget=Budget(evaluations=200)))
+    assert isinstance(console.file, io.StringIO)
+    shares = re.findall(r"([+-][\d.]+) %\)", console.file.getvalue())
+    assert len(shares) == 8
+    assert max(abs(float(share)) for share in shares) < 100
+    assert console.file.getvalue().count("(design 0)") == 1

@@ -15,12 +15,11 @@ from commands import CONFIGS
 from omnibench.cli.handbook_topics import find_topic
 from omnibench.compare.config import CompareConfig, PublishedResult
 from omnibench.compare.read_config import read_compare_config
-from omnibench.compare.report.matrices import differences
 from omnibench.data.importers.table1 import APR_02
 from omnibench.fit.parameterisation import make_bounds
 from omnibench.fit.uncertainty.physical import geometry_of
 from omnibench.robot.calibration import read_calibration
-from omnibench.robot.kinematics import Array
+from omnibench.robot.kinematics import Array, relative_deviations
 from omnibench.robot.published_matrices import published_matrix
 from omnibench.simulate.chain.lidar import Lidar
 from omnibench.simulate.chain.robot_config import RobotConfig
@@ -84,7 +83,7 @@ def test_the_live_calibration_that_is_shipped_is_eq_9_and_runs_as_the_papers() -
 
 
 def test_eq_11_follows_from_eq_8_and_9_but_for_m12() -> None:
-    shares = 100 * differences(published_matrix("palacin2023_eq8"), published_matrix("palacin2023_eq9")).ravel()
+    shares = 100 * relative_deviations(published_matrix("palacin2023_eq8"), published_matrix("palacin2023_eq9")).ravel()
     assert math.isnan(shares[1])  # Eq. (9) prints m12 as 0
     assert [cut_off(shares[i]) for i in range(9) if i != 1] == [EQ_11[i] for i in range(9) if i != 1]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,12 +12,17 @@ import numpy as np
 import pytest
 from fit_samples import noisy_trajectories
 
+from omnibench import check
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.fit.calibrate import calibrate
-from omnibench.fit.evaluate import evaluate
+from omnibench.fit.check.expected_gain import expected_gain
+from omnibench.fit.evaluate import evaluate, final_errors, verdict_on
 from omnibench.fit.held_out import judge
-from omnibench.robot.calibration import Calibration, HeldOutVerdict, read_calibration, write_calibration
-from omnibench.robot.kinematics import Array
+from omnibench.fit.problem import Budget
+from omnibench.robot.calibration import Calibration, EffectTerm, HeldOutVerdict, read_calibration, write_calibration
+from omnibench.robot.kinematics import Array, Robot, Wheel
+from omnibench.robot.model import OdometryModel
+from omnibench.robot.odometry import WheelLog
 from omnibench.slam.import_dataset import import_dataset
 from omnibench.testing.synthetic import synthetic_robot
 
@@ -44,6 +50,13 @@ def recordings(validating: int, name: str = "synthetic") -> Dataset:
     split = len(every) - validating
     held_out = (replace(run, split="validation") for run in every[split:])
     return make_dataset(name, ROBOT, 0.2, [*every[:split], *held_out], simulated=True)
+
+
+def errors_on(dataset: Dataset, calibration: Calibration) -> tuple[Array, Array]:
+    """Final errors (Z, 3) of the validation runs, by the design values and by a calibration."""
+    models = (OdometryModel.of_design(ROBOT, "arc"), calibration.model)
+    before, after = (final_errors(model, dataset.split("validation")) for model in models)
+    return before, after
 
 
 def verdict(calibration: Calibration) -> HeldOutVerdict:
@@ -84,27 +97,74 @@ def test_many_runs_of_one_or_two_commands_leave_it_undecided_without_an_interval
     assert f"no interval from {commands} command" in found.detail
 
 
-def test_without_held_out_runs_it_cannot_be_said_and_how_to_get_some_is() -> None:
-    found = verdict(calibrate(recordings(validating=0)).calibration)
+def test_without_held_out_runs_and_too_few_to_cross_validate_it_cannot_be_said_and_how_to_get_some_is() -> None:
+    three = make_dataset("few", ROBOT, 0.2, noisy_trajectories()[:3], simulated=True)
+    found = verdict(calibrate(three).calibration)
     assert (found.verdict, found.runs) == ("unknown", ())
     assert "cannot be said" in found.sentence
     assert "--set validation=" in found.detail
     assert "omnibench evaluate" in found.detail
 
 
-def test_calibrate_and_evaluate_end_with_the_same_verdict() -> None:
-    dataset = recordings(validating=6)
+@pytest.mark.parametrize(("validating", "basis"), [(0, "cross_validation"), (3, "cross_validation"), (10, "held_out")])
+def test_check_calibrate_and_evaluate_end_with_the_same_verdict(validating: int, basis: str) -> None:
+    dataset = recordings(validating)
     calibration = calibrate(dataset).calibration
     found = verdict(calibration)
+    assert found.basis == basis
     assert found == evaluate(calibration, dataset).held_out
-    assert found.verdict == "better"
-    assert found.runs == tuple(each.id for each in dataset.split("validation"))
+    report = check(dataset)
+    assert report.gain.partition("): ")[0] == found.sentence.partition("): ")[0]
+    assert report.needed == {"better": True, "undecided": False}[found.verdict]  # undecided: by less than a tenth
+
+
+def test_cross_validation_decides_where_three_runs_are_held_out_and_both_are_said() -> None:
+    dataset = recordings(validating=3)
+    found = verdict(calibrate(dataset).calibration)
+    alone = judge(*errors_on(dataset, calibrate(dataset).calibration), dataset.split("validation"))
+    assert (alone.verdict, found.verdict, found.units) == ("undecided", "better", 12)
+    assert found.sentence.startswith("cross-validated (12 runs): ")
+    assert f"too little was held out to decide: {alone.sentence}" in found.detail
+
+
+@pytest.mark.parametrize("calibrator", ["theoretical", "random_search"])
+def test_cross_validation_of_fits_does_not_stand_for_a_calibration_that_fits_worse(calibrator: str) -> None:
+    run = calibrate(recordings(validating=3), calibrator, budget=Budget(evaluations=2))
+    assert verdict(run.calibration).basis == "held_out"
+
+
+def test_cross_validation_does_not_stand_for_a_model_with_effects() -> None:
+    dataset = recordings(validating=3)
+    plain = calibrate(dataset).calibration.model
+    slip = EffectTerm(name="centripetal_slip", parameters={"k": 0.0}).term(ROBOT)
+    found = [
+        verdict_on(model, dataset.split("train"), dataset.split("validation")).basis
+        for model in (plain, replace(plain, terms=(slip,), sample_period=0.2))
+    ]
+    assert found == ["cross_validation", "held_out"]
+
+
+def test_check_counts_the_same_turns_of_the_heading_as_evaluate() -> None:
+    wheels = (Wheel(name=n, type="fixed", radius=0.05, x=0, y=y) for n, y in (("left", 0.1), ("right", -0.1)))
+    robot = Robot(name="wide", wheels=tuple(wheels))
+    model = OdometryModel(robot, robot.inverse_kinematic_matrix * [[1.0], [1.0], [0.5]], "arc")
+    times, runs = 0.2 * np.arange(1, 61), []
+    for number, (left, right) in enumerate([(-4, 4), (4, -4), (-3, 4), (4, -3), (3, 3), (-4, 3)] * 2):
+        log = WheelLog(
+            times, np.tile([left, right], (60, 1)) * (1 + number / 100), np.zeros(3), np.append(0.0, times[4::5])
+        )
+        poses, split = model.poses([log])[0], "train" if number < 6 else "validation"
+        runs.append(Trajectory(f"{number}", split, times, log.rates, log.stamps, poses, command=f"c{number % 6}"))
+    dataset = Dataset("wide", robot, 0.2, tuple(runs))
+    before = math.degrees(evaluate(calibrate(dataset).calibration, dataset).design["validation"].heading_mean_rad or 0)
+    assert before > 180
+    assert f", {before:.3f} deg ->" in expected_gain(dataset).sentence
 
 
 def test_all_runs_of_another_recording_are_held_out() -> None:
     calibration = calibrate(recordings(validating=0)).calibration
     found = evaluate(calibration, recordings(validating=0, name="another day")).held_out
-    assert found.verdict == "unknown"  # the same content: these runs were fitted
+    assert found.basis == "cross_validation"  # the same content: these runs were fitted, and none is held out
     other = make_dataset("another day", ROBOT, 0.2, noisy_trajectories(seed=1), simulated=True)
     assert len(evaluate(calibration, other).held_out.runs) == 12
 
@@ -149,7 +209,7 @@ def test_a_fitted_run_that_also_validates_under_another_name_is_not_held_out() -
     (first, *_) = dataset.split("train")
     twice = [*dataset.trajectories, replace(first, id="copy", split="validation")]
     calibration = calibrate(make_dataset("twice", ROBOT, 0.2, twice)).calibration
-    assert verdict(calibration).runs == tuple(run.id for run in dataset.split("validation"))
+    assert sorted(verdict(calibration).runs) == sorted(run.id for run in dataset.trajectories)
 
 
 def test_of_a_changed_data_set_nothing_is_held_out_where_a_calibration_knows_no_runs() -> None:

@@ -7,18 +7,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zenoh
+from drives import PERIOD
 from mcap_recordings import messages_of
 from nodes import asked, config_of, running, sent_one_by_one
 from received_messages import ReceivedMessages
 from sessions import until
-from steered import SWERVE, SteeredDrive, calibration, drive, recording
+from steered import DIFFERENTIAL, SWERVE, SteeredDrive, calibration, drive, recording
 
+from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.errors import DataError
 from omnibench.live.config import LiveConfig
 from omnibench.live.replay.demonstration import demonstrate
+from omnibench.live.replay.played_recording import Recording
 from omnibench.live.wire.messages import ODOMETRY, JointState
-from omnibench.robot.calibration import Calibration, EffectTerm, write_calibration
+from omnibench.robot.calibration import Calibration, EffectTerm, matrix_rows, write_calibration
 from omnibench.robot.kinematics import Array, Mount, Robot
+from omnibench.robot.odometry import WheelLog
 
 SLIPPING = (
     EffectTerm(name="acceleration_slip", parameters={"k": 0.08}),
@@ -78,6 +82,25 @@ def test_a_replay_shows_the_batch_odometry_of_the_tracked_point_and_is_recorded(
     assert shown.fused is not None
     assert shown.fused.final_position < 0.05
     assert len(messages_of(tmp_path / "run.mcap")["/base/joint_states"]) == shown.report.sent["joint_states"]
+
+
+def test_a_replay_counts_every_turn_by_which_the_odometry_is_off(tmp_path: Path) -> None:
+    design = DIFFERENTIAL.inverse_kinematic_matrix
+    using = calibration(DIFFERENTIAL, matrix=matrix_rows(design * [[1.0], [1.0], [0.4]]))
+    times, rates = PERIOD * np.arange(1, 401), np.tile([-4.0, 4.0], (400, 1))
+    log = WheelLog(times, rates, np.zeros(3), np.append(0.0, times[9::10]))
+    poses = using.model.poses([log])[0]
+    run = Trajectory("turn", "train", times, rates, log.stamps, poses)
+    made = config(tmp_path, using, replay={"speed": "max", "slam": {"period": 0.1, "delay": 0.0}})
+    shown = demonstrate(made, Recording(Dataset("turns", using.robot, PERIOD, (run,))))
+    headings = np.append(0.0, times * (design[2] @ rates[0]))
+    assert poses[-1, 2] > np.pi
+    assert 0.6 * headings[-1] > np.pi
+    assert shown.theoretical.heading == pytest.approx(float(np.sqrt(np.mean((0.6 * headings) ** 2))), rel=1e-6)
+    assert shown.calibrated.heading < 1e-9
+    assert shown.batch_difference < 1e-9
+    assert shown.fused is not None
+    assert shown.fused.heading < 0.05
 
 
 def test_info_names_steered_wheels_signals_and_the_tracked_point(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ from omnibench.report.numbers import noise_in_words
 from omnibench.robot.calibration import Calibration, HeldOutVerdict
 from omnibench.robot.export.c_header import left_out
 from omnibench.robot.export.formats import export_calibration
-from omnibench.robot.kinematics import Robot
+from omnibench.robot.kinematics import Robot, relative_deviations
 from omnibench.words import plural
 
 _NONE = "no interval"
@@ -99,12 +99,13 @@ def _matrix_table(run: CalibrationRun) -> Table:
         notes.append(only if listed else f"the design values are kept along {motions}, of which these data say nothing")
     if stopped := [*run.untouched, *run.result.at_bounds] if listed else []:
         notes.append(f"{_NONE} of what rests on {', '.join(stopped)}, held by the box or on a bound of it")
-    drive, design = calibration.robot.drive, calibration.robot.inverse_kinematic_matrix
+    drive = calibration.robot.drive
+    deviations = relative_deviations(calibration.matrix_array, calibration.robot.inverse_kinematic_matrix)
     signals = [f"wheel {name}" if drive.direct else name for name in drive.names]
     values = _cells(
         [
-            [Cell(f"{value:+.7f}", _deviation(value, first)) for value, first in zip(row, of_design, strict=True)]
-            for row, of_design in zip(calibration.matrix, design, strict=True)
+            [Cell(f"{value:+.7f}", _deviation(share)) for value, share in zip(row, shares, strict=True)]
+            for row, shares in zip(calibration.matrix, deviations, strict=True)
         ]
     )
     bounds = [
@@ -155,7 +156,7 @@ def _parameter_table(robot: Robot, parameters: Sequence[ParameterEstimate]) -> T
             low, high = (f"{factor * bound:.{decimals}f}" for bound in (parameter.low, parameter.high))
             interval = Cell("", f"{low} to {high} {unit}")
         values = (f"{factor * value:.{decimals}f} {unit}" for value in (start, parameter.value))
-        deviation = _deviation(parameter.value, start)
+        deviation = _deviation(float(relative_deviations(np.array(parameter.value), np.array(start))))
         if parameter.unit == "rad":  # an angle's zero is a convention, so that no share of it means anything
             deviation = f"{math.degrees(parameter.value - start):+.3f} deg"
         rows.append(Row.of(parameter.name, *values, deviation, interval))
@@ -234,7 +235,8 @@ def print_verdict_ending(
 ) -> None:
     """Print the last sentence of ``calibrate`` and ``evaluate``: use a calibration, record more, or look for faults."""
     if verdict.verdict == "better":
-        print_ending(f"{file} is better than the design on runs that were held out", *how_to_use(calibration, file))
+        basis = "on runs that were held out" if verdict.basis == "held_out" else "by cross-validation"
+        print_ending(f"{file} is better than the design {basis}", *how_to_use(calibration, file))
     elif verdict.verdict == "worse":
         look = ("omnibench", "inspect", *datasets)
         print_ending(f"{file} is worse than the design: do not use it", "see what the recordings lack", *look)
@@ -280,5 +282,5 @@ def _of_all(part: int, count: int) -> str:
     return {0: "none", count: "all"}.get(part, f"{part:,}")
 
 
-def _deviation(value: float, design: float) -> str:
-    return f"{100 * (value / design - 1):+.2f} %" if design else "design 0"
+def _deviation(share: float) -> str:
+    return "design 0" if math.isnan(share) else f"{100 * share:+.2f} %"

@@ -14,7 +14,7 @@ from omnibench.compare.report.path_figures import path_section
 from omnibench.compare.report.robot_section import robot_section
 from omnibench.compare.report.search_figures import search_section
 from omnibench.compare.report.view import SPLIT_NAMES, DatasetView, views
-from omnibench.compare.report.wording import cost_decimals, cost_in_words, improvement_in_words, level_in_words
+from omnibench.compare.report.wording import cost_decimals, cost_in_words, improvement_in_words, rivals_in_words
 from omnibench.compare.result import ComparisonResult
 from omnibench.errors import DataError
 from omnibench.report.blocks import (
@@ -114,7 +114,7 @@ def _overview(datasets: list[DatasetView]) -> Section:
     for view in datasets:
         best = view.best
         gained = improvement_in_words(best, view.scored, 1) if best is not None else (NOTHING, "")
-        label = "" if best is None else f"{best.label}{f', {words}' if (words := level_in_words(view)) else ''}"
+        label = "" if best is None else f"{best.label}{f', {words}' if (words := rivals_in_words(view)) else ''}"
         tiles.append(Fact(f"{view.name}: the cost fell by", gained[0], label))
     sentence = f"Calibrators compared on {plural(len(datasets), 'data set')}; each has a part of its own below."
     return answer_section(sentence, tiles, path_picture(datasets[0]), _overview_table(datasets))
@@ -129,7 +129,7 @@ def _overview_table(datasets: list[DatasetView]) -> Table:
         rows.append(
             Row.of(
                 Cell(view.name, "simulated" if view.dataset.simulated else ""),
-                NOTHING if best is None else Cell(best.label, level_in_words(view)),
+                NOTHING if best is None else Cell(best.label, rivals_in_words(view)),
                 SPLIT_NAMES[view.scored],
                 fixed(view.theoretical_cost(view.scored), decimals),
                 NOTHING if reached is None else fixed(reached.value, decimals),
@@ -148,7 +148,7 @@ def _overview_table(datasets: list[DatasetView]) -> Table:
         ),
         tuple(rows),
         f"The cost is {cost_in_words(datasets[0])} Small print: 95 % intervals. Of several that are "
-        "level, the entry of lowest training cost is named.",
+        "not told apart, the entry of lowest training cost is named.",
     )
 
 

@@ -18,9 +18,9 @@ from omnibench.report.style import INK, PALETTE, QUIET, plot, text, wrapped
 from omnibench.report.traces import joined, line, marks
 
 _ROW, _LINE = 11, 14  # px of an entry, and of each line of its label
-_BEST = LegendItem("best", "best, and level with it", PALETTE[0])
+_BEST = LegendItem("best", "best", PALETTE[0])
 _OTHER = LegendItem("other", "differs by more than chance", PALETTE[1])
-_OPEN = LegendItem("open", "not known whether it differs", QUIET)
+_OPEN = LegendItem("open", "not told apart", QUIET)
 
 
 @dataclass(frozen=True)
@@ -64,8 +64,8 @@ def _lines(view: DatasetView) -> list[_Line]:
     for entry, _ in view.calibrated:
         cost = entry.cost(view.scored)
         if cost is not None:
-            level = entry.is_best or entry.practically_equal
-            item = _BEST if level else _OPEN if entry.practically_equal is None else _OTHER
+            best = entry.is_best and not view.undecided
+            item = _BEST if best else _OTHER if entry.practically_equal is False else _OPEN
             lines.append(_Line(entry.label, cost, item))
     return sorted(lines, key=lambda each: each.cost.value)
 

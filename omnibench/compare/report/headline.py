@@ -19,9 +19,10 @@ from omnibench.compare.report.wording import (
     position_unit,
 )
 from omnibench.compare.result import THEORETICAL_NAME, EntryStatistics
+from omnibench.fit.cost import NO_ERROR
 from omnibench.fit.evaluate import positions_and_headings
 from omnibench.report.blocks import Block, Callout, Fact, FigureGrid, LegendItem, Paragraph, Section, answer_section
-from omnibench.report.numbers import fixed, listing, percent, span, typeset, with_unit
+from omnibench.report.numbers import fixed, listing, percent, significant, span, typeset, with_unit
 from omnibench.report.path_pictures import CALIBRATED, paths_before_after
 from omnibench.words import plural
 
@@ -75,7 +76,7 @@ def _no_winner(view: DatasetView, best: EntryStatistics | None) -> str:
         return "Only the design values gave an answer; there is no calibration to compare them with."
     return (
         f"No calibrator did better than the design values on the {SPLIT_NAMES[view.scored]} runs: {listing(answers)} "
-        f"ended above their cost, or level with it."
+        f"ended above their cost, or are not told apart from them."
     )
 
 
@@ -133,25 +134,27 @@ def _standing(view: DatasetView, best: EntryStatistics) -> str:
         return f"{best.label} is the only calibrator with an answer"
     if view.undecided:
         return f"Which entry is best cannot be said ({view.units[view.scored].words})"
-    others = len(view.level) - 1
+    others = len(view.not_told_apart) - 1
     if not others:
         return f"{best.label} is best"
     entries = "other entry is" if others == 1 else "other entries are"
-    design = any(entry.calibrator == THEORETICAL_NAME for entry in view.level)
-    return f"{_number(others)} {entries} level with it{', the design values among them' if design else ''}"
+    design = any(entry.calibrator == THEORETICAL_NAME for entry in view.not_told_apart)
+    return f"{_number(others)} {entries} not told apart from it{', the design values among them' if design else ''}"
 
 
 def _standing_at_length(view: DatasetView, best: EntryStatistics) -> str:
-    """The entries that are level with the best one; of these the lowest training cost decides."""
+    """The entries that are not told apart from the best one; of these the lowest training cost decides."""
     basis = f"The intervals: {view.units[view.scored].words}."
     if len(view.calibrated) > 1 and view.undecided:
         return f"{best.label} has the lowest training cost. {basis}"
-    level = ["the design values" if entry.calibrator == THEORETICAL_NAME else entry.label for entry in view.level]
-    if len(level) < 2:
+    rivals = [
+        "the design values" if entry.calibrator == THEORETICAL_NAME else entry.label for entry in view.not_told_apart
+    ]
+    if len(rivals) < 2:
         return basis
     return (
-        f"Level on the {SPLIT_NAMES[view.scored]} runs: {listing(level, 20)}; {best.label} has the lowest training "
-        f"cost of them. {basis}"
+        f"Not told apart on the {SPLIT_NAMES[view.scored]} runs: {listing(rivals, 20)}; {best.label} has the lowest "
+        f"training cost of them. {basis}"
     )
 
 
@@ -204,11 +207,13 @@ def _doubts(view: DatasetView, best: EntryStatistics) -> list[str]:
             f"{span(min(values), max(values), decimals)}. The verdict is about the run of median training cost."
         )
     lowest = min((entry.train_median for entry in view.statistics if entry.train_median is not None), default=None)
-    if best.train_median is not None and lowest and best.train_median > (1 + _ARRIVED) * lowest:
+    if best.train_median is not None and lowest is not None and best.train_median > (1 + _ARRIVED) * lowest + NO_ERROR:
+        above = f"{percent(best.train_median / lowest - 1)} above the lowest"
+        if lowest <= NO_ERROR:
+            above = f"{significant(best.train_median, 2)}, where the lowest leaves no error"
         doubts.append(
-            f"{best.label} has not found the minimum: its training cost is {percent(best.train_median / lowest - 1)} "
-            "above the lowest. That it does better on other data may be chance, or the splits differ in more than "
-            "noise."
+            f"{best.label} has not found the minimum: its training cost is {above}. That it does better on other data "
+            "may be chance, or the splits differ in more than noise."
         )
     lower = _apart(view, -1)
     if lower:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import math
 
-import numpy as np
-
 from omnibench.compare.report.view import DatasetView
 from omnibench.compare.report.wording import entry_cell, on_bounds
 from omnibench.compare.result import RunRecord
@@ -14,10 +12,7 @@ from omnibench.fit.geometry import FittedParameter
 from omnibench.fit.span import driven_span
 from omnibench.report.blocks import Block, Cell, Code, Column, Paragraph, Row, Section, Table
 from omnibench.report.numbers import NOTHING, fixed, significant
-from omnibench.robot.kinematics import Array
-
-# Relative to the largest element of its row: a smaller one is zero up to rounding (Eq. (7) gives m12 as 1e-17).
-_ZERO_SHARE = 1e-9
+from omnibench.robot.kinematics import Array, relative_deviations
 
 
 def matrix_section(view: DatasetView) -> Section:
@@ -40,13 +35,6 @@ def _blocks(view: DatasetView) -> tuple[Block, ...]:
         Code(matrices_as_text(view), "Matrices with all digits (YAML): rows x and y in m/rad, heading in rad/rad")
     )
     return tuple(blocks)
-
-
-def differences(matrix: Array, reference: Array) -> Array:
-    """D of Eq. (10), (11): reference * (1 + D) = matrix, element by element (3, M); NaN where the reference is 0."""
-    zero = np.abs(reference) <= _ZERO_SHARE * np.abs(reference).max(axis=1, keepdims=True)
-    quotient: Array = matrix / np.where(zero, np.nan, reference) - 1
-    return quotient
 
 
 def matrices_as_text(view: DatasetView) -> str:
@@ -129,7 +117,7 @@ def _difference_table(view: DatasetView, against: str | None, only: str | None =
         if run.matrix is None or entry.label == against or only not in (None, entry.label):
             continue
         matrix = run.matrix if project is None else reference + (run.matrix - reference) @ project
-        share = differences(matrix, reference).ravel()
+        share = relative_deviations(matrix, reference).ravel()  # D of Eq. (10), (11)
         moved = (matrix - reference).ravel()
         columns = zip(share, moved, _element_units(view), strict=True)
         cells = [_difference_cell(float(s), float(d), unit) for s, d, unit in columns]

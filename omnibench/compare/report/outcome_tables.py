@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from omnibench.compare.report.view import SPLIT_NAMES, DatasetView
-from omnibench.compare.report.wording import difference_in_words, entry_cell, interval_basis, level_in_words, on_bounds
+from omnibench.compare.report.wording import difference_in_words, entry_cell, interval_basis, on_bounds, rivals_in_words
 from omnibench.compare.result import BoxCertificate, EntryStatistics, RunRecord
 from omnibench.registry import calibrators
 from omnibench.report.blocks import Block, Cell, Column, Details, Row, Section, Table
@@ -159,10 +159,10 @@ def _verdict(view: DatasetView, entry: EntryStatistics) -> Cell:
     if entry.typical is None:
         return Cell("no answer")
     if entry.is_best:
-        return Cell("lowest training cost" if view.undecided else "best", level_in_words(view))
+        return Cell("lowest training cost" if view.undecided else "best", rivals_in_words(view))
     if entry.practically_equal is None or entry.difference is None:
         return Cell("undecided", interval_basis(view, view.scored))
-    if entry in view.level:
+    if entry in view.not_told_apart:
         return Cell("not told apart")
     if entry.practically_equal:  # the design values, as the headline has them
         return Cell("worse", "by its share of the cost")

@@ -98,8 +98,8 @@ class DatasetView:
         return next((entry for entry in self.statistics if entry.is_best and entry.typical is not None), None)
 
     @property
-    def level(self) -> list[EntryStatistics]:
-        """Entries that are practically equal to the best, itself among them.
+    def not_told_apart(self) -> list[EntryStatistics]:
+        """Entries whose difference from the best may be chance, itself among them.
 
         The design values are not, where the best one's improvement on them is more than chance.
         """

@@ -13,6 +13,7 @@ from omnibench.registry import costs
 from omnibench.report.blocks import Cell
 from omnibench.report.numbers import NOTHING, decimals_for, fixed, percent, significant, span
 from omnibench.robot.kinematics import Array
+from omnibench.words import plural
 
 NO_INTERVAL = "no interval"
 
@@ -39,9 +40,10 @@ def interval_in_words(interval: Interval | None, decimals: int) -> str:
     return NO_INTERVAL if interval.known is None else span(*interval.known, decimals)
 
 
-def level_in_words(view: DatasetView) -> str:
-    """Number of entries practically equal to the best, in words; empty where it is alone."""
-    return f"of {len(view.level)} that are level" if len(view.level) > 1 else ""
+def rivals_in_words(view: DatasetView) -> str:
+    """Number of entries that are not told apart from the best, in words; empty where there are none."""
+    others = len(view.not_told_apart) - 1
+    return f"not told apart from {plural(others, 'other')}" if others > 0 else ""
 
 
 def entry_cell(view: DatasetView, entry: EntryStatistics | None) -> Cell:

@@ -14,6 +14,7 @@ from omnibench.data.dataset import Trajectory
 from omnibench.discover.fitting.extend import Extended
 from omnibench.discover.fitting.model_fit import model_with
 from omnibench.discover.held_out.validation_runs import ValidationRuns
+from omnibench.fit.evaluate import final_errors
 from omnibench.fit.sessions.session_contrast import sessions_of
 from omnibench.fit.sessions.session_differences import SessionComparison, compare_sessions
 
@@ -35,6 +36,5 @@ def eq6_with_changes(extended: Extended, runs: Sequence[Trajectory], comparison:
     for name in dict.fromkeys(names):
         changed = model_with(model, model.matrix + changes.get(name, 0.0), model.terms)
         of_session = [run for run, other in zip(runs, names, strict=True) if other == name]
-        ends = np.concatenate(changed.reported([run.final_log for run in of_session]))
-        errors += np.linalg.norm(ends - [run.final_pose for run in of_session], axis=1).tolist()
+        errors += np.linalg.norm(final_errors(changed, of_session), axis=1).tolist()
     return float(np.mean(errors))

@@ -30,7 +30,7 @@ from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.robot.calibration import Calibration, read_calibration
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.planar import interpolated, moved_to, wrapped
+from omnibench.robot.planar import interpolated, moved_to
 from omnibench.words import plural
 
 _LAST_MESSAGES = 5.0  # s without any of the messages under way after which they count as lost; chosen
@@ -67,7 +67,7 @@ class Demonstration:
 
 
 class _Collector:
-    """Collects the messages of one topic in the order of arrival. stamps: ns; poses (K, 3)."""
+    """Collects the messages of one topic in the order of arrival. stamps: ns; poses (K, 3) with continuous headings."""
 
     def __init__(self, session: zenoh.Session, robot: str, topic: str, config: LiveConfig) -> None:
         self.stamps: list[int] = []
@@ -88,7 +88,8 @@ class _Collector:
 
     @property
     def poses(self) -> Array:
-        return np.array(self._poses).reshape(-1, 3)
+        poses = np.array(self._poses).reshape(-1, 3)
+        return np.column_stack([poses[:, :2], np.unwrap(poses[:, 2])])  # messages hold quaternions
 
     def close(self) -> None:
         self._subscription.close()
@@ -225,7 +226,7 @@ def _evaluated(
         fused=None
         if fused is None
         else _fused_deviation(fused.stamps, _tracked(calibration, fused.poses), origin, drive, reference, chosen),
-        batch_difference=_difference(published, batch[rows]),
+        batch_difference=float(np.abs(published - batch[rows]).max()) if len(rows) else math.nan,
         health=health,
     )
 
@@ -248,20 +249,14 @@ def _fused_deviation(
     """Deviation from 1 s after the first SLAM pose on: before, the robot's pose in the map is not known."""
     rows = _rows(stamps, origin, drive.wheel_times)
     known = np.isin(rows, chosen) & (drive.wheel_times[rows] > drive.slam_times[0] + 1.0)
-    return _deviation(poses[known], reference[rows[known]])
-
-
-def _difference(poses: Array, others: Array) -> float:
-    if not len(poses):
-        return math.nan
-    difference = poses - others
-    difference[:, 2] = wrapped(difference[:, 2])
-    return float(np.abs(difference).max())
+    poses, reference = poses[known], reference[rows[known]]
+    turns = np.round((poses[:1, 2] - reference[:1, 2]) / math.tau)
+    return _deviation(poses - [0.0, 0.0, 1.0] * (math.tau * turns[:, None]), reference)
 
 
 def _deviation(poses: Array, reference: Array) -> Deviation:
     if not len(poses):
         return Deviation(math.nan, math.nan, math.nan)
     distance = np.hypot(*(poses - reference)[:, :2].T)
-    heading = wrapped(poses[:, 2] - reference[:, 2])
+    heading = poses[:, 2] - reference[:, 2]
     return Deviation(float(np.sqrt(np.mean(distance**2))), float(np.sqrt(np.mean(heading**2))), float(distance[-1]))

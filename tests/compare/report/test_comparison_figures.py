@@ -9,26 +9,25 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from report_samples import APR02, config, flower, run, usual
 
-from omnibench.compare.report.matrices import differences
 from omnibench.compare.report.path_figures import chosen_trajectories
 from omnibench.compare.report.search_figures import TARGETS, courses, targets_reached, thinned
 from omnibench.compare.report.view import views
 from omnibench.report.recording.runs import describe
-from omnibench.robot.kinematics import Robot
+from omnibench.robot.kinematics import Robot, relative_deviations
 from omnibench.robot.published_matrices import published_matrix
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.simulate import simulate_dataset
 
 
 def test_differences_are_those_of_the_papers_equation_11() -> None:
-    found = 100 * differences(published_matrix("palacin2023_eq8"), published_matrix("palacin2023_eq9"))
+    found = 100 * relative_deviations(published_matrix("palacin2023_eq8"), published_matrix("palacin2023_eq9"))
     paper = [[1.091, np.nan, -0.671], [-0.358, 0.195, -0.572], [0.299, 0.103, 0.212]]
     np.testing.assert_array_equal(np.trunc(1000 * found) / 1000, np.array(paper))  # the paper cuts, it does not round
 
 
 def test_an_element_of_rounding_size_counts_as_zero() -> None:
     reference = np.array([[1.0, -1.2e-17, 1.0]] * 3)
-    assert np.isnan(differences(np.ones((3, 3)), reference)[:, 1]).all()
+    assert np.isnan(relative_deviations(np.ones((3, 3)), reference)[:, 1]).all()
 
 
 def trajectories(**changes: object):

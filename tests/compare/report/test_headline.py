@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -62,14 +63,33 @@ def test_a_search_that_won_without_finding_the_minimum_is_doubted(result: Compar
     assert "random_search has not found the minimum" in page(replace(result, statistics=tuple(lucky)), tmp_path).text
 
 
-def test_entries_that_noise_could_swap_are_level_and_the_training_cost_decides(tmp_path: Path) -> None:
+def test_entries_that_noise_could_swap_are_not_told_apart_and_the_training_cost_decides(tmp_path: Path) -> None:
     twins = [{"name": "closed_form", "label": name} for name in ("one", "other")]
     result = run(config(calibrators=["theoretical", *twins], seeds=[1]))
     told = page(result, tmp_path)
     best = next(entry.label for entry in result.statistics if entry.is_best)
-    assert f"Level on the held-out runs: one and other; {best} has the lowest" in told.text
+    assert f"Not told apart on the held-out runs: one and other; {best} has the lowest" in told.text
     assert "is best." not in told.text
-    assert told.row("Entries over their seeds", best)[-1] == "best | of 2 that are level"
+    assert told.row("Entries over their seeds", best)[-1] == "best | not told apart from 1 other"
+
+
+def test_an_entry_that_the_runs_hardly_judge_is_not_told_apart_and_not_drawn_as_the_best(
+    result: ComparisonResult, tmp_path: Path
+) -> None:
+    wide = Interval(0.07, -0.05, 0.2)
+    far = [
+        replace(e, difference=wide, practically_equal=True) if e.label == "random_search" else e
+        for e in result.statistics
+    ]
+    changed = replace(result, statistics=tuple(far))
+    told = page(changed, tmp_path)
+    assert "One other entry is not told apart from it." in told.text
+    assert not re.search(r"\blevel\b", told.text)
+    chart = changed.plot()
+    drawn = {words.split(":")[0]: trace for trace in chart.data for words in trace.text or ()}
+    assert drawn["closed_form"].marker.color != drawn["random_search"].marker.color
+    assert "random_search: cost" in (lines := repr(changed))
+    assert lines.count(", not told apart from the best") == 1
 
 
 def test_an_entry_below_the_best_by_more_than_noise_is_not_called_worse(

@@ -81,6 +81,15 @@ class TestGenetic:
         assert result.outcome is Outcome.CONVERGED
         assert result.reason == "best changed by 0.05 or less on average over 5 generations"
 
+    def test_by_default_it_stops_when_50_generations_change_the_best_by_a_millionth_on_average(self) -> None:
+        result = run("genetic", make_problem(RUNS, evaluations=20_000), population=40)
+        last = 40 + 38 * np.arange((result.evaluations - 40) // 38 + 1)  # of each generation; two are the elite
+        costs = np.array([step.cost for step in result.history])
+        best = costs[np.searchsorted([step.evaluations for step in result.history], last, "right") - 1]
+        averages = np.convolve(np.abs(np.diff(best)) / best[1:], np.full(50, 1 / 50), "valid")
+        assert averages[-1] <= 1e-6 < averages[:-1].min()
+        assert averages[0] > 1e-4
+
     def test_generations_that_run_out_are_no_convergence(self) -> None:
         result = run("genetic", make_problem(RUNS), generations=3)
         assert (result.outcome, result.reason) == (Outcome.BUDGET, "3 generations")
