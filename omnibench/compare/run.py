@@ -14,7 +14,7 @@ from omnibench.compare.execute import PRELOAD, execute, resumable
 from omnibench.compare.output import check_output, prepare_output, write_results
 from omnibench.compare.plan import UNBOUNDED, PlannedRun, load_datasets, make_plan
 from omnibench.compare.report.comparison_report import comparison_document
-from omnibench.compare.result import ComparisonResult, ScoredRun
+from omnibench.compare.result import ComparisonResult, EntryStatistics, ScoredRun
 from omnibench.compare.scoring import score
 from omnibench.compare.statistics import (
     design_costs,
@@ -23,12 +23,12 @@ from omnibench.compare.statistics import (
     is_mean,
     sessions_that_differ,
 )
-from omnibench.compare.uncertainties import typical_uncertainties
 from omnibench.data.dataset import Dataset
 from omnibench.environment import environment
 from omnibench.errors import ConfigError, UnknownNameError, require_type
 from omnibench.files import results_locked
 from omnibench.fit.calibrator import RunResult
+from omnibench.fit.uncertainty.uncertainty import NoCovarianceError, Uncertainty, uncertainty_of
 from omnibench.fit.uncertainty.unidentified import warnings_of_calibration
 from omnibench.jobs.backend_choice import BackendChoice, open_backend
 from omnibench.jobs.result_store import ResultStore
@@ -38,6 +38,25 @@ from omnibench.registry import PluginFailure
 from omnibench.report.render import write_document
 from omnibench.simulate.chain.robot_config import RobotConfig
 from omnibench.slam.slam_options import PRELOAD as SLAM_PRELOAD
+
+
+def typical_uncertainties(
+    plan: Sequence[PlannedRun],
+    results: Sequence[RunResult],
+    scored: Sequence[ScoredRun],
+    statistics: Sequence[EntryStatistics],
+) -> dict[tuple[str, str], Uncertainty]:
+    """The uncertainty of every entry's typical run, by data set and label; none where its answer is no minimum."""
+    typical = [entry.typical for entry in statistics]
+    uncertainties = {}
+    for run, result, done in zip(plan, results, scored, strict=True):
+        if run.box_name == UNBOUNDED or not any(done is one for one in typical):
+            continue
+        try:
+            uncertainties[run.dataset_name, run.label] = uncertainty_of(run.task.problem(), result)
+        except NoCovarianceError:
+            continue
+    return uncertainties
 
 
 def run_comparison(

@@ -1,17 +1,33 @@
-"""A study, from the config to the report: each step is a line of ``run_study``."""
+"""A study, from the config to the report: each step is a line of ``run_study``.
+
+Its folder has the effective config, summary.json, and one table with a row for each cell and method.
+"""
 
 from __future__ import annotations
 
+import math
 import os
+from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import polars as pl
+
 from omnibench.compare.effective_config import effective_cost, effective_options, load_calibrators
 from omnibench.compare.execute import PRELOAD, execute, resumable
+from omnibench.config import read_yaml, to_json, to_yaml
 from omnibench.environment import environment
 from omnibench.errors import DataError, require_type
-from omnibench.files import results_locked
+from omnibench.files import (
+    RESULTS,
+    check_results_folder,
+    link_latest,
+    new_results_folder,
+    results_locked,
+    write_table,
+    write_text,
+)
 from omnibench.fit.calibrator import RunResult
 from omnibench.jobs.backend_choice import BackendChoice, open_backend
 from omnibench.jobs.result_store import ResultStore
@@ -19,13 +35,112 @@ from omnibench.processes import one_thread_processes
 from omnibench.progress import Reporter, no_progress
 from omnibench.registry import PluginFailure
 from omnibench.report.render import write_document
-from omnibench.study.cells import make_cells
+from omnibench.study.cell_intervals import CellRatio
+from omnibench.study.cells import MethodInCell, StudyCell, make_cells
 from omnibench.study.config import StudyConfig
 from omnibench.study.judging import judge_fits
 from omnibench.study.report.study_report import study_document
-from omnibench.study.study_output import check_output, prepare_output, write_results
 from omnibench.study.study_plan import load_robots, plan_fits
 from omnibench.study.study_result import StudyResult
+
+# First line of config.yaml in a folder of results. A folder whose config.yaml lacks it is not written to.
+_MARK = "# The effective config of a study; the results beside it were made with it."
+_COLUMNS: dict[str, Any] = {
+    "robot": pl.String, "training": pl.String, "regime": pl.String, "judged": pl.String, "fitted": pl.Boolean,
+    "simulated": pl.Boolean, "method": pl.String, "family": pl.String, "status": pl.String, "reason": pl.String,
+    "fits": pl.Int64, "answers": pl.Int64, "runs": pl.Int64, "sessions": pl.Int64, "cost": pl.Float64,
+    "position_m": pl.Float64, "heading_deg": pl.Float64, "design_cost": pl.Float64, "design_position_m": pl.Float64,
+    "design_heading_deg": pl.Float64, "ratio": pl.Float64, "low": pl.Float64, "high": pl.Float64,
+    "family_low": pl.Float64, "family_high": pl.Float64, "unit": pl.String, "units": pl.String, "seconds": pl.Float64,
+    "numbers": pl.String,
+    "cost_name": pl.String, "unidentified": pl.String, "matrix": pl.List(pl.Float64),
+}  # fmt: skip
+
+
+def check_output(folder: Path | None, config: StudyConfig, *, force: bool = False) -> None:
+    """DataError: the folder of results holds anything but an earlier study of the same name, and not ``force``."""
+    if folder is None:
+        return
+    check_results_folder(folder, _MARK, "study", force=force)
+    if not force and (folder / "config.yaml").is_file():
+        name = read_yaml(folder / "config.yaml").get("name")
+        if name != config.name:
+            raise DataError(f"{folder}: holds the study {name!r}; name another folder for {config.name!r}, or --force")
+
+
+def prepare_output(config: StudyConfig, folder: Path | None, *, force: bool = False) -> Path:
+    """The folder to write to, with the effective config in it; default: ``results/<name>/<time>``, link ``latest``."""
+    check_output(folder, config, force=force)
+    chosen = folder or new_results_folder(RESULTS / config.name)
+    write_text(chosen / "config.yaml", f"{_MARK}\n{to_yaml(config)}")
+    if folder is None:
+        link_latest(chosen)
+    return chosen
+
+
+def write_results(result: StudyResult) -> None:
+    """Write the table and summary.json. DataError: the disk refuses."""
+    write_table(result.output / "study.parquet", study_table(result))
+    write_text(result.output / "summary.json", to_json(summary(result)) + "\n")
+
+
+def study_table(result: StudyResult) -> pl.DataFrame:
+    """A row for each cell and method, those without an answer among them. Ratios are to the design values, Eq. (6)."""
+    rows = [_row(result, cell, method) for cell in result.cells for method in cell.methods.values()] + [
+        _broken(name, reason) for name, reason in result.broken.items()
+    ]
+    return pl.DataFrame(rows, _COLUMNS, orient="row")
+
+
+def summary(result: StudyResult) -> dict[str, Any]:
+    """The content of summary.json."""
+    return {
+        "name": result.config.name,
+        "robots": {robot.name: {"runs": len(robot.dataset.trajectories), "simulated": robot.dataset.simulated}
+                   for robot in result.robots},
+        "broken": dict(result.broken),
+        "reference": result.config.reference,
+        "geometric_mean": result.geometric_mean,
+        "against_best": list(_against_best(result)),
+        "failures": list(result.failures),
+        "warnings": list(result.warnings),
+        "environment": result.environment.model_dump(),
+    }  # fmt: skip
+
+
+def _against_best(result: StudyResult) -> Iterator[dict[str, Any]]:
+    for each in result.against_best:
+        key = each.cell.key
+        family = each.ratio.in_family
+        yield {"robot": key.robot, "training": key.training, "judged": key.judged, "best": each.best,
+               "ratio": each.ratio.value, "low": family.low, "high": family.high, "unit": each.ratio.unit,
+               "verdict": each.ratio.verdict}  # fmt: skip
+
+
+def _row(result: StudyResult, cell: StudyCell, method: MethodInCell) -> dict[str, Any]:
+    key, robots = cell.key, {robot.name: robot for robot in result.robots}
+    ratio: CellRatio | None = cell.against_design(method.method, len(result.judged_cells))
+    heading = method.mean("heading")
+    return {
+        "robot": key.robot, "training": key.training, "regime": key.regime, "judged": key.judged, "fitted": key.fitted,
+        "simulated": robots[key.robot].dataset.simulated, "method": method.method, "family": method.family,
+        "status": method.status, "reason": method.reason, "fits": method.fits, "answers": method.answers,
+        "runs": len(set(cell.pairs.runs.tolist())), "sessions": cell.pairs.sessions, "cost": method.mean("cost"),
+        "position_m": method.mean("position"), "heading_deg": None if heading is None else math.degrees(heading),
+        "design_cost": float(cell.design["cost"].mean()),
+        "design_position_m": float(cell.design["position"].mean()),
+        "design_heading_deg": math.degrees(float(cell.design["heading"].mean())),
+        "ratio": ratio and ratio.value, "low": ratio and ratio.alone.low, "high": ratio and ratio.alone.high,
+        "family_low": ratio and ratio.in_family.low, "family_high": ratio and ratio.in_family.high,
+        "unit": ratio and ratio.unit, "units": ratio and ratio.units,
+        "seconds": method.seconds if result.config.timing else None,
+        "numbers": method.numbers, "cost_name": method.cost, "unidentified": method.unidentified,
+        "matrix": None if method.matrix is None else method.matrix.ravel().tolist(),
+    }  # fmt: skip
+
+
+def _broken(name: str, reason: str) -> dict[str, Any]:
+    return dict.fromkeys(_COLUMNS) | {"robot": name, "status": "recordings cannot be read", "reason": reason}
 
 
 def run_study(

@@ -13,8 +13,7 @@ from commands import flower, search, small, write_plugin
 import omnibench
 from omnibench.compare.config import CompareConfig
 from omnibench.compare.effective_config import effective_config, load_calibrators
-from omnibench.compare.plan import load_datasets, make_plan
-from omnibench.compare.run_key import shared_code
+from omnibench.compare.plan import load_datasets, make_plan, shared_code
 
 PACKAGE = Path(omnibench.__file__).parent
 # Imported by the code of runs, without a say in their results. What has one belongs to the key's files instead.

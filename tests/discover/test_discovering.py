@@ -17,7 +17,7 @@ from omnibench.discover.result import Discovery
 from omnibench.errors import UnknownNameError
 from omnibench.fit.evaluate import evaluate
 from omnibench.robot.calibration import read_calibration, write_calibration
-from omnibench.simulate.like import simulate_like
+from omnibench.simulate.simulation_request import simulate_like
 from omnibench.simulate.source import read_simulation
 
 

@@ -14,8 +14,12 @@ from wheeled_samples import DIFF
 
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.fit.inspect import inspect_dataset
-from omnibench.report.recording.driven_motions import driven_motions, missing_in_words, motion_table
-from omnibench.report.recording.inspection_report import inspection_document
+from omnibench.report.recording.inspection_report import (
+    driven_motions,
+    inspection_document,
+    missing_in_words,
+    motion_table,
+)
 from omnibench.report.render import write_document
 from omnibench.robot.kinematics import Robot
 

@@ -13,7 +13,7 @@ from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import DataError
 from omnibench.robot.calibration import Calibration, EffectTerm, Noise, matrix_rows
-from omnibench.simulate.like import simulate_like
+from omnibench.simulate.simulation_request import simulate_like
 from omnibench.testing import synthetic_robot, synthetic_trajectories
 
 ROBOT = synthetic_robot()

@@ -1,22 +1,27 @@
-"""The report of a comparison: one HTML file that opens offline."""
+"""The report of a comparison: one HTML file that opens offline, with its sections on the data and on the robot.
+
+The robot is shown as in Fig. 2 and 3 of the paper: its geometry as designed and as fitted, and its tracks.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from omnibench.compare.report.cost_tables import cost_section
-from omnibench.compare.report.data_section import data_section
 from omnibench.compare.report.error_figures import error_section
 from omnibench.compare.report.headline import answer_of, path_picture
 from omnibench.compare.report.matrices import matrix_section
 from omnibench.compare.report.outcome_tables import outcome_section
 from omnibench.compare.report.path_figures import path_section
-from omnibench.compare.report.robot_section import robot_section
 from omnibench.compare.report.search_figures import search_section
 from omnibench.compare.report.view import SPLIT_NAMES, DatasetView, views
 from omnibench.compare.report.wording import cost_decimals, cost_in_words, improvement_in_words, rivals_in_words
 from omnibench.compare.result import ComparisonResult
+from omnibench.data.dataset import SPLITS, Trajectory
 from omnibench.errors import DataError
+from omnibench.fit.uncertainty.physical import geometry_of
 from omnibench.report.blocks import (
     Badge,
     Block,
@@ -25,16 +30,150 @@ from omnibench.report.blocks import (
     Column,
     Document,
     Fact,
+    Facts,
+    Figure,
+    FigureGrid,
+    LegendItem,
     Row,
     Section,
     Table,
     answer_section,
     simulated_badge,
 )
-from omnibench.report.numbers import NOTHING, count, fixed, listing
+from omnibench.report.motions import MOST_MOTIONS, motion_items, motion_of
+from omnibench.report.numbers import NOTHING, count, fixed, listing, significant
+from omnibench.report.recording.scan_points import evenly
 from omnibench.report.recording.section import has_recording, recording_section
 from omnibench.report.reproduction import reproduction_section
+from omnibench.report.robot_figures import DESIGN, is_drawn, motion_system, parameters
+from omnibench.report.style import INK, PALETTE, plan
+from omnibench.report.traces import START, joined, line, marks
+from omnibench.robot.kinematics import Array, Robot, Wheel
+from omnibench.robot.planar import seen_from
 from omnibench.words import plural
+
+
+def data_section(view: DatasetView) -> Section:
+    """The section about the data: origin, amount, robot, and warnings on reading them."""
+    dataset = view.dataset
+    trajectories = dataset.trajectories
+    durations = np.array([trajectory.end for trajectory in trajectories])
+    commands = {trajectory.command for trajectory in trajectories} - {None}
+    sessions = {trajectory.session for trajectory in trajectories} - {None}
+    split_sizes = [f"{count(len(dataset.split(split)))} {SPLIT_NAMES[split]}" for split in SPLITS]
+    wheels = [_wheel(wheel) for wheel in dataset.robot.wheels]
+    facts = [
+        Fact("Data set", dataset.name, "simulated" if dataset.simulated else ""),
+        Fact("Description", dataset.description),
+        Fact("Source", dataset.source),
+        Fact("Licence", dataset.licence),
+        Fact("Trajectories", f"{count(len(trajectories))}: {listing(split_sizes)}"),
+        Fact("Commands", count(len(commands)) if commands else "not known"),
+        Fact("Sessions", listing(sorted(map(str, sessions))) if sessions else "not known"),
+        Fact(
+            "Duration",
+            f"{_range(durations)} s a run",
+            f"wheel samples every {significant(1e3 * dataset.sample_period, 3)} ms",
+        ),
+        Fact("Robot", dataset.robot.name, "; ".join(wheels)),
+        Fact("Odometry", "exact arcs" if view.config.integration == "arc" else "Euler steps, Eq. (1)"),
+        Fact("Content (SHA-256)", dataset.hash[:16]),
+    ]
+    shown_above = " ".join(view.warnings)
+    warnings = tuple(warning for warning in dataset.warnings if warning not in shown_above)
+    blocks = (
+        Facts(tuple(fact for fact in facts if fact.value)),
+        Callout("Warnings on reading the data", warnings, "warning"),
+    )
+    return Section("data", "Data", blocks, about="Where the recordings come from, and what they hold.", folded=True)
+
+
+def _wheel(wheel: Wheel) -> str:
+    """A wheel's design values: its place as it was given, angles in degrees."""
+    lengths = (("radius", wheel.radius), ("distance", wheel.distance), ("x", wheel.x), ("y", wheel.y))
+    angles = (("angle", wheel.angle), ("rollers", wheel.roller_angle or None))
+    parts = [
+        *([wheel.type] if wheel.type else []),
+        *(f"{name} {value:g} m".replace("-", "−") for name, value in lengths if value is not None),
+        *(f"{name} {fixed(np.degrees(value), 1)}°" for name, value in angles if value is not None),
+        *([] if wheel.driven else ["not driven"]),
+        *([] if wheel.measured else ["not measured"]),
+    ]
+    return f"{wheel.name}: {', '.join(parts)}"
+
+
+def _range(values: Array) -> str:
+    low, high = (significant(float(value), 3) for value in (values.min(), values.max()))
+    return low if low == high else f"{low} to {high}"
+
+
+_TRACKS = 72  # runs that are drawn at most: more cannot be told apart (chosen)
+_POSES = 60  # poses that a track is drawn with (chosen)
+
+
+def robot_section(view: DatasetView) -> tuple[Section, ...]:
+    """The robot where its wheels' positions are known; its tracks where no section on the recording shows them."""
+    robot = view.dataset.robot
+    grids = [] if has_recording(view.dataset) else [_tracks(view)]
+    if is_drawn(robot):
+        system, items = motion_system(robot)
+        fitted = _fitted(view)
+        legend = (*items, *(item for item, _ in fitted))
+        words = "As Fig. 2 and 3 of the paper. " if view.of_the_paper else ""
+        words += "A wheel's width is not known; its length is its diameter."
+        if fitted:
+            words += (
+                f" {fitted[0][0].label}: the geometry that has its matrix. It takes up whatever else is wrong with the "
+                "model, so that its wheels need not stand there."
+            )
+        grids.insert(0, FigureGrid((system, parameters(robot, fitted)), legend, 2, words))
+    about = "Its wheels as designed and as fitted."
+    return (Section("robot", "Robot", tuple(grids), about=about, folded=True),) if grids else ()
+
+
+def _fitted(view: DatasetView) -> list[tuple[LegendItem, Robot]]:
+    """The robot with the geometry of the best entry's matrix; empty where no geometry has it."""
+    best = view.best
+    if best is None or best.typical is None or best.typical.matrix is None or best.label not in view.styles:
+        return []
+    robot = view.dataset.robot
+    try:
+        radii, distances, angles = geometry_of(best.typical.matrix, robot).reshape(3, -1).tolist()
+        wheels = tuple(
+            wheel.model_copy(update={"radius": radius, "distance": distance, "angle": angle, "x": None, "y": None})
+            for wheel, radius, distance, angle in zip(robot.wheels, radii, distances, angles, strict=True)
+        )
+    except DataError:
+        return []
+    style = view.styles[best.label]
+    item = replace(style, key="fitted", colour=style.colour if style.colour != DESIGN.colour else INK, dash="dash")
+    return [(item, robot.model_copy(update={"wheels": wheels}))]
+
+
+def _tracks(view: DatasetView) -> FigureGrid:
+    """Reference paths of one run of each command from one start, a colour for each rate of turn."""
+    runs = view.dataset.split(view.scored)
+    first: dict[str, Trajectory] = {}
+    for run in runs:
+        first.setdefault(run.command or run.id, run)
+    distinct = list(first.values())
+    drawn = [distinct[index] for index in evenly(len(distinct), _TRACKS)]
+    motions = sorted({motion_of(run) for run in drawn}, key=lambda motion: (motion[1], motion[0]))
+    known = len(motions) <= MOST_MOTIONS and all(run.omega is not None for run in drawn)
+    items = motion_items(motions) if known else [LegendItem("track", "reference", PALETTE[0])]
+    traces = []
+    for index, item in enumerate(items):
+        paths = [
+            seen_from(run.start, run.poses[evenly(len(run.poses), _POSES)])
+            for run in drawn
+            if not known or motion_of(run) == motions[index]
+        ]
+        traces.append(line(item, 1.4, *joined([path[:, :2] for path in paths]).T, opacity=0.85))
+    traces.append(marks(START, 9, [0.0], [0.0], hover="start"))
+    title = f"Reference paths of {plural(len(drawn), 'run')} from one start, {SPLIT_NAMES[view.scored]}"
+    figure = Figure(title, plan(*traces), "Reference paths of the runs, x and y in metres", 460)
+    words = "One run of each command, moved to begin at the origin along x."
+    return FigureGrid((figure,), tuple(items), 1, words)
 
 
 def comparison_document(result: ComparisonResult) -> Document:

@@ -1,22 +1,151 @@
-"""Experiments that tell the members of a class of effects apart: the cheapest runs, chosen for this robot."""
+"""Experiments that tell the members of a class of effects apart: the cheapest runs, chosen for this robot.
+
+The plan of an experiment: in words that a person can drive by, and as a config that can be simulated.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from omnibench.config import to_yaml
 from omnibench.data.dataset import Dataset
-from omnibench.discover.experiments.candidate_runs import CandidateRun, candidate_runs, coarse, placed_seconds
-from omnibench.discover.experiments.driving_plan import commands_in_words, description_of, plan_config
-from omnibench.discover.experiments.run_choice import Choice, choose_runs
+from omnibench.discover.experiments.candidate_runs import (
+    PLACING,
+    RAMP,
+    CandidateRun,
+    candidate_runs,
+    coarse,
+    placed_seconds,
+)
+from omnibench.discover.experiments.run_choice import LONGEST, Choice, choose_runs
 from omnibench.discover.experiments.separation import Members, Separation
 from omnibench.discover.fitting.extend import Extended, columns_of
-from omnibench.discover.fitting.model_fit import at_runs
+from omnibench.discover.fitting.model_fit import Fit, at_runs
 from omnibench.discover.regressors.column_group import Group
-from omnibench.discover.result import Experiment, NamedEffect
+from omnibench.discover.result import Experiment, ExperimentCommand, NamedEffect
 from omnibench.fit.least_squares.whitened import Whitened
+from omnibench.report.numbers import listing
+from omnibench.robot.calibration import matrix_rows
+from omnibench.simulate.config import FlowerConfig
+from omnibench.words import plural
+
+_WAYS = {0: "ahead", 90: "left", 180: "backward", 270: "right"}  # directions of travel, deg
+_SHORTEST_POSES = 0.02  # s between the reference poses that are simulated: denser ones take long and tell little more
+
+
+def commands_in_words(chosen: Sequence[tuple[CandidateRun, int]]) -> tuple[ExperimentCommand, ...]:
+    """Commands of chosen runs in words, with their numbers."""
+    return tuple(
+        ExperimentCommand(_in_words(candidate), count, candidate.timed.duration) for candidate, count in chosen
+    )
+
+
+def description_of(
+    names: Sequence[str], runs: int, minutes: float, choice: Choice, inseparable: Sequence[tuple[str, str]]
+) -> str:
+    """How much to drive, and what it tells, in a few sentences."""
+    hour = f"within {LONGEST / 60:.0f} minutes"
+    if not runs:
+        return f"Nothing that this robot can drive {hour} surely tells {listing(list(names), last='from')}."
+    from_first = {first: [second for one, second in inseparable if one == first] for first, _ in inseparable}
+    pairs = "; nor ".join(f"{first} from {listing(others, last='or')}" for first, others in from_first.items())
+    alike = f" Nothing that it can drive {hour} surely tells {pairs}." if pairs else ""
+    settled = "the right name" if not inseparable else "the right name, as far as it can be told,"
+    return (
+        f"Drive {plural(runs, 'run')}, {minutes:.1f} minutes with {PLACING:.0f} s before each to place the robot. On "
+        f"both recordings together, discover then gives {settled} a weight of 95 % or more in "
+        f"{_cases(choice.chance)}; after {minutes:.1f} more minutes of the commands that were recorded, in "
+        f"{_cases(choice.chance_recorded)}.{alike}"
+    )
+
+
+def plan_config(
+    dataset: Dataset,
+    fit: Fit,
+    effects: Sequence[NamedEffect],
+    effect: NamedEffect,
+    chosen: Sequence[tuple[CandidateRun, int]],
+) -> str:
+    """The experiment as a config for ``omnibench simulate``, with the effects that were found as its truth."""
+    between = float(np.median(np.concatenate([np.diff(run.pose_times) for run in dataset.split("train")])))
+    variation = chosen[0][0].timed.variation
+    angles = [abs(angle) for candidate, _ in chosen for angle in _steering(candidate)]
+    config = FlowerConfig.model_validate(
+        {
+            "robot": dataset.robot.model_dump() | {"name": dataset.robot.name or "robot"},
+            "sample_period": dataset.sample_period,
+            "pose_period": max(between, dataset.sample_period, _SHORTEST_POSES),
+            "commands": {
+                "listed": [_listed(candidate, count) for candidate, count in chosen],
+                "ramp": RAMP,
+            }
+            | ({} if variation.is_none else {"variation": variation}),
+            "steering_limit_deg": min(math.degrees(max(angles)) + 1, 180.0) if angles else None,
+            "truth": {
+                "matrix": matrix_rows(fit.model.matrix),
+                "effects": [
+                    {"name": each.name, "parameters": {value.name: value.value for value in each.parameters}}
+                    for each in effects
+                    if each.stage != "actuator"
+                ],
+            },
+            "noise": fit.noise.noise.model_dump(),
+            "train": {"seed": 1, "distance": 1.0},
+        }
+    )
+    members = ", ".join((effect.name, *effect.confusable_with))
+    return to_yaml(
+        {
+            "name": f"{dataset.name}_experiment",
+            "description": f"Tells {members} apart; simulated with the first.",
+            "datasets": {"experiment": {"simulate": config.model_dump(mode="json", exclude_defaults=True)}},
+        }
+    )
+
+
+def _listed(candidate: CandidateRun, count: int) -> dict[str, float | int | None]:
+    command = candidate.timed.command
+    return {
+        "speed": command.speed,
+        "direction_deg": round(math.degrees(command.direction), 6),
+        "turn_rate": round(command.turn_rate, 4),
+        "duration": candidate.timed.duration,
+        "repetitions": count,
+        "heading_deg": candidate.heading,
+    }
+
+
+def _steering(candidate: CandidateRun) -> list[float]:
+    steering = candidate.run.steering
+    return [] if steering is None else [float(angle) for angle in steering.ravel()]
+
+
+def _in_words(candidate: CandidateRun) -> str:
+    """A run in words: where to, how fast, and how it turns."""
+    command = candidate.timed.command
+    end = "" if candidate.heading is None else f", from a heading of {candidate.heading:.0f}°"
+    variation = candidate.timed.variation
+    if variation.weave:
+        end += f", weaving by {variation.weave:g} rad/s every {variation.period:g} s"
+    if variation.reversals:
+        end += ", turning back halfway"
+    side = "left" if command.turn_rate > 0 else "right"
+    if not command.speed:
+        return f"turning {side} on the spot at {abs(command.turn_rate):.3g} rad/s{end}"
+    degrees = round(math.degrees(command.direction)) % 360
+    beside = f"{degrees}° left of ahead" if degrees < 180 else f"{360 - degrees}° right of ahead"
+    way = f"{_WAYS.get(degrees, beside)} at {command.speed:.3g} m/s"
+    if not command.turn_rate:
+        return f"{way}, straight{end}"
+    return f"{way}, curving {side} (radius {command.speed / abs(command.turn_rate):.2g} m){end}"
+
+
+def _cases(chance: float) -> str:
+    return f"{min(round(100 * chance), 99)} of 100 cases"
 
 
 def experiments_for(

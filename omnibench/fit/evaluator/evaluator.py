@@ -4,27 +4,150 @@ For a given row 3 of the matrix positions are linear in rows 1 and 2 (odometry.p
 
     G_j(m3) = sum_i a_ij exp(i m3.c_i)
 
-are smooth functions of row 3 alone. Over a box they are expanded once in Chebyshev polynomials (expansion.py), of
-which a singular value decomposition leaves some hundred combinations (moments.py). The poses of a population then are
-two matrix products, whatever the sampling rate. A recording whose heading the box turns too far for one expansion is
-cut into segments (expansion_plan.py), each in the frame of its anchor, whose heading is linear in row 3 too
-(segment_join.py).
+are smooth functions of row 3 alone. Over a box they are expanded once in Chebyshev polynomials, of which a singular
+value decomposition leaves some hundred combinations (expansion_plan.py). The poses of a population then are two matrix
+products, whatever the sampling rate. A recording whose heading the box turns too far for one expansion is cut into
+segments, each in the frame of its anchor, whose heading is linear in row 3 too; they are joined in the end.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.fit.evaluator.element_box import ElementBox
 from omnibench.fit.evaluator.expansion_plan import ExpansionPlan, make_plan
-from omnibench.fit.evaluator.moments import compress, moments_of
-from omnibench.fit.evaluator.segment_join import join_segments
+from omnibench.fit.evaluator.impulses import impulses
 from omnibench.processes import one_thread
 from omnibench.robot.kinematics import Array
-from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog
+from omnibench.robot.odometry import Complex, Integration, OdometryBatch, WheelLog
+
+
+def moments_of(plan: ExpansionPlan) -> Array:
+    """Coefficients (R, n, 2N) of the regressors at the R rows of all logs: real parts of the N wheels, then imaginary.
+
+    n: terms of the plan's basis.
+    """
+    return np.concatenate([_moments_of_log(plan, index) for index in range(len(plan.paths))])
+
+
+def compress(moments: Array, plan: ExpansionPlan) -> tuple[Array, float]:
+    """The fewest combinations (n, K) of terms that keep every row of moments (R, 2N, n) to ``plan.spare``.
+
+    Also returns a bound of what they neglect over a path, m: polynomials are at most 1, so it is a sum of residuals.
+    """
+    rows, components, terms = moments.shape
+    speed = np.tile(plan.box.speed, 2)
+    scaled = (moments * speed[:, None]).reshape(-1, terms)
+    _, _, directions = np.linalg.svd(np.linalg.qr(scaled, mode="r"), full_matrices=False)
+
+    def neglected(count: int) -> float:
+        kept = directions[:count]
+        residual = np.abs(scaled - (scaled @ kept.T) @ kept).sum(axis=1).reshape(rows, 2, components // 2)
+        return float(np.hypot(residual[:, 0], residual[:, 1]).sum(axis=1).max())
+
+    low, high = 0, len(directions)
+    while low < high:
+        middle = (low + high) // 2
+        low, high = (low, middle) if neglected(middle) <= plan.spare else (middle + 1, high)
+    return directions[:low].T, neglected(low) * max(map(len, plan.segments))
+
+
+def _moments_of_log(plan: ExpansionPlan, index: int) -> Array:
+    """The moments (R, n, 2N) of one log."""
+    path, basis = plan.paths[index], plan.basis
+    start = plan.logs[index].start[2]
+    centre, reach = plan.box.centre[2], np.where(plan.free, plan.box.reach[2], 0.0)
+    sums = []
+    for segment, ends in plan.row_ends(index):
+        angles, about = impulses(path, segment, plan.integration, plan.nodes)
+        heading = about @ centre + start
+        sources = np.concatenate([angles * np.cos(heading)[..., None], angles * np.sin(heading)[..., None]], axis=2)
+        wheels = about.shape[2]
+        coefficients = basis.coefficients(about.reshape(-1, wheels) * reach)
+        total = 0.0
+        for first, last in zip([segment.first, *ends[:-1]], ends, strict=True):
+            pieces = slice(first - segment.first, last - segment.first)
+            summed = slice(pieces.start * plan.nodes, pieces.stop * plan.nodes)
+            total = total + coefficients[:, summed] @ sources[pieces].reshape(-1, 2 * wheels)
+            sums.append(total)
+    return _times_powers_of_i(np.array(sums), basis.quarter_turns)
+
+
+def _times_powers_of_i(sums: Array, quarter_turns: NDArray[np.intp]) -> Array:
+    """Real and imaginary parts (R, n, 2N) of sums (R, n, 2N) of cosines and sines times i^quarter_turns (n,)."""
+    cosine, sine = np.split(sums, 2, axis=2)
+    real = np.choose(quarter_turns[:, None], [cosine, -sine, -cosine, sine])
+    imaginary = np.choose(quarter_turns[:, None], [sine, cosine, -sine, -cosine])
+    return np.concatenate([real, imaginary], axis=2)
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentJoin:
+    """Indices that join the rows of G segments to the S stamps.
+
+    row_of_stamp, log_of_stamp (S,). segment_of_row (R,). anchors (G, N): wheel angles of the segments' anchors, rad.
+    last_row, first_of_log (G,): the row at a segment's end, and the first segment of its log.
+    """
+
+    row_of_stamp: NDArray[np.intp]
+    log_of_stamp: NDArray[np.intp]
+    segment_of_row: NDArray[np.intp]
+    anchors: Array
+    last_row: NDArray[np.intp]
+    first_of_log: NDArray[np.intp]
+
+    def positions(self, displacements: Array, matrices: Array) -> Array:
+        """x and y (P, 2, S) relative to the start, m, from displacements (P, 2, R) within the rows' segments."""
+        if self._uncut:  # the anchors are the starts
+            alike = len(self.segment_of_row) == len(self.row_of_stamp)
+            return displacements if alike else displacements[:, :, self.row_of_stamp]
+        phase = matrices[:, 2] @ self.anchors.T
+        turn: Complex = (np.cos(phase) + 1j * np.sin(phase))[:, self.segment_of_row]
+        moved = (displacements[:, 0] + 1j * displacements[:, 1]) * turn
+        before = np.zeros((len(matrices), len(self.anchors) + 1), dtype=complex)
+        np.cumsum(moved[:, self.last_row], axis=1, out=before[:, 1:])
+        carried = before[:, :-1] - before[:, self.first_of_log]
+        at_rows = moved + carried[:, self.segment_of_row]
+        path = at_rows[:, self.row_of_stamp]
+        return np.stack([path.real, path.imag], axis=1)
+
+    @cached_property
+    def _uncut(self) -> bool:
+        return not self.anchors.any()
+
+
+def join_segments(plan: ExpansionPlan) -> SegmentJoin:
+    """The indices of a plan's rows, segments and stamps."""
+    row_of_stamp: list[int] = []
+    log_of_stamp: list[int] = []
+    segment_of_row: list[int] = []
+    last_row: list[int] = []
+    first_of_log: list[int] = []
+    for index, path in enumerate(plan.paths):
+        first = len(last_row)
+        row_at: dict[int, int] = {}
+        for _, ends in plan.row_ends(index):
+            row_at |= {end: len(segment_of_row) + offset for offset, end in enumerate(ends)}
+            segment_of_row += [len(last_row)] * len(ends)
+            last_row.append(len(segment_of_row) - 1)
+            first_of_log.append(first)
+        row_of_stamp += [row_at[end] for end in path.ends.tolist()]
+        log_of_stamp += [index] * len(path.ends)
+    anchors = np.array([segment.anchor for segments in plan.segments for segment in segments])
+    return SegmentJoin(
+        np.array(row_of_stamp),
+        np.array(log_of_stamp),
+        np.array(segment_of_row),
+        anchors,
+        np.array(last_row),
+        np.array(first_of_log),
+    )
+
 
 # Share of the largest pose: rounding of a direct sum of some thousand samples, which the check allows beside the bound.
 _ROUNDING = 1e-12

@@ -1,15 +1,19 @@
-"""State of one robot: its estimators, what came last, and what was refused."""
+"""State of one robot: its estimators, what came last, and what was refused.
+
+Published stamps: none is published twice, since listeners such as tf2 take a repeated stamp for repeated data.
+"""
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass, field
+from itertools import count
 
 from omnibench.live.estimation.counts import Counts
 from omnibench.live.estimation.extrapolation_monitor import ExtrapolationMonitor
 from omnibench.live.estimation.health import SwapRecord
 from omnibench.live.estimation.live_odometry import LiveOdometry
-from omnibench.live.estimation.published_stamps import PublishedStamps
 from omnibench.live.fusion.pose_fusion import Fusion, FusionSettings
 from omnibench.live.fusion.reference_correction import ReferenceCorrection
 from omnibench.live.fusion.timeline import Timeline
@@ -19,6 +23,37 @@ from omnibench.live.wheels.wheel_input import WheelInput, WheelSettings
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.wheels.drive import CarDrive
 from omnibench.robot.wheels.joint_choice import JointChoice
+
+
+class PublishedStamps:
+    """Stamps (ns) that were published, to be told apart from those that come when the robot's clock jumps back.
+
+    remembered: how many of the latest stamps are kept (some 80 bytes each). A stamp older than these can be published
+    twice by chance, after a clock that jumped back so far.
+    """
+
+    def __init__(self, remembered: int = 120_000) -> None:
+        self._remembered = remembered
+        self._order: deque[int] = deque()
+        self._known: set[int] = set()  # the stamps of _order, for looking up
+        self._shift = 1  # ns by which the last repeated stamp was moved; a recording in a loop moves all alike
+
+    def __len__(self) -> int:
+        return len(self._order)
+
+    def unique(self, stamp: int) -> int:
+        """``stamp``, or the next free one (ns) if it was published already; the result counts as published."""
+        if stamp in self._known:
+            if stamp + self._shift in self._known:
+                longer = count(self._shift + 1)
+                self._shift = next(shift for shift in longer if stamp + shift not in self._known)
+            stamp += self._shift
+        if len(self._order) == self._remembered:
+            self._known.remove(self._order.popleft())
+        self._order.append(stamp)
+        self._known.add(stamp)
+        return stamp
+
 
 _HISTORY = 5.0  # s of odometry that are remembered without fusion; chosen, as FusionSettings.history
 # Largest steering angles, rad, of a car, which drives by their tangents, and of others, 1600 turns one way; chosen.

@@ -4,25 +4,28 @@ A wheel sample is decoded, put in order and repaired, integrated to odometry wit
 of SLAM, and published. A pose of SLAM is decoded and checked, corrected for the calibration's effects on the
 reference (latency, lever arm of the LIDAR), and fused at its own time; the changed pose is published with the next
 wheel sample. There is no network here, and any thread may call.
+
+Calibration swap: another calibration takes over at the next wheel sample, if it is the same robot's.
 """
 
 from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
-from omnibench.errors import DataError
-from omnibench.live.estimation.calibration_swap import record_refused_swap, swap_calibration
+from omnibench.errors import DataError, OmnibenchError
 from omnibench.live.estimation.counts import Counts
-from omnibench.live.estimation.health import Health
+from omnibench.live.estimation.extrapolation_monitor import ExtrapolationMonitor
+from omnibench.live.estimation.health import Health, SwapRecord
 from omnibench.live.estimation.health_report import HealthReporter
 from omnibench.live.estimation.live_odometry import Motion
 from omnibench.live.estimation.pose_query import PoseAt, pose_at
-from omnibench.live.estimation.robot_state import new_state
+from omnibench.live.estimation.robot_state import RobotState, new_state, wheel_angle_effects
 from omnibench.live.estimation.saved_state import RobotMemory, SavedState
 from omnibench.live.estimation.state_writer import StateWriter, resume_state
 from omnibench.live.estimation.update import Update
@@ -35,6 +38,49 @@ from omnibench.live.wire.messages import JointState, MessageError, arrival_stamp
 from omnibench.live.wire.robot_messages import JointStateDecoder
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
+from omnibench.robot.signals import of_centre
+
+_OTHER_ROBOT = 0.5  # share of a row's largest element; chosen: no calibration moves a matrix so far from its design
+
+
+def swap_calibration(state: RobotState, calibration: Calibration) -> None:
+    """Continue with another calibration; poses do not jump. DataError: it is not this robot's, or cannot be run."""
+    try:
+        check_same_robot(calibration, state.calibration)
+        odometry = state.odometry.continued(calibration)
+        reference = state.reference.continued(calibration.model)
+    except OmnibenchError as error:
+        record_refused_swap(state, calibration.name, str(error))
+        raise DataError(str(error)) from None
+    state.calibration, state.odometry, state.reference = calibration, odometry, reference
+    state.monitor = ExtrapolationMonitor(state.name, calibration)
+    state.guessed_angles = wheel_angle_effects(calibration)
+    state.counts.swaps += 1
+    state.last_swap = SwapRecord(accepted=True, name=calibration.name, reason="runs", at=time.time())
+
+
+def record_refused_swap(state: RobotState, name: str | None, reason: str) -> None:
+    """Count a calibration that was sent and refused. name: the calibration's, if it could be read."""
+    state.counts.swaps_refused += 1
+    state.last_swap = SwapRecord(accepted=False, name=name, reason=reason, at=time.time())
+
+
+def check_same_robot(calibration: Calibration, running: Calibration) -> None:
+    """DataError: a calibration has other wheels than the running one, or its matrix is far off the design's.
+
+    The tracked point may be another one; matrices of the robot's centre are compared.
+    """
+    calibration.check_wheels(running.robot, "this robot")
+    matrix = of_centre(calibration.robot, calibration.matrix_array.T).T
+    for robot in (calibration.robot, running.robot):
+        centred = robot.model_copy(update={"mount": None})
+        off = np.abs(matrix - centred.inverse_kinematic_matrix).max(axis=1) / centred.row_scales
+        if off.max() > _OTHER_ROBOT:
+            raise DataError(
+                f"row {int(off.argmax()) + 1} of the matrix is {off.max():.0%} off the design of robot "
+                f"{robot.name!r}; is it another robot's, or in other units?"
+            )
+
 
 LOG = logging.getLogger("omnibench.live")
 _SECOND = 1e9  # ns

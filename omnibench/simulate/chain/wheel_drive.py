@@ -2,19 +2,143 @@
 
 Each motor moves its own share of the robot's inertia, independently of the other wheels. Wheel angles are continuous
 within a session; between its runs the robot stands.
+
+The inner loop of a wheel's drive, compiled: PID once a sample, motor and friction in exact steps of 0.1 ms.
+
+Within a step the voltage and the sign of the friction are constant, so current, rate and angle follow a linear
+equation whose exact solution is a matrix. Only the instant at which a wheel stops or breaks away is found to a step.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import expm
 
 from omnibench.errors import ConfigError
+from omnibench.robot.compiled import compiled
 from omnibench.robot.kinematics import Array
-from omnibench.simulate.chain.motor_loop import MotorSteps, Pid, drive_wheel, motor_steps
 from omnibench.simulate.chain.motors import TRUE_STEP, Controller, Encoder, Motor, motors_of_wheels
+
+_INNER = 10  # steps of the motor's equations within TRUE_STEP
+_STEP = TRUE_STEP / _INNER
+_STANDING = 1e-6  # ticks a sample; a lower target rate is rounding and counts as rest
+
+
+class MotorSteps(NamedTuple):
+    """Transition of a wheel's state in one step of 0.1 ms.
+
+    moving (3, 4): matrix from current (A), rate (rad/s), voltage (V) and friction (N m) to current, rate and angle
+    turned (rad). For a wheel that stands, the next current is held times the current plus fed (A/V) times the voltage.
+    torque: N m/A. static, coulomb: friction, N m.
+    """
+
+    moving: Array
+    held: float
+    fed: float
+    torque: float
+    static: float
+    coulomb: float
+
+
+class Pid(NamedTuple):
+    """Gains (V per rad/s, V per rad, V per rad/s2) and the greatest voltage, V."""
+
+    proportional: float
+    integral: float
+    derivative: float
+    supply: float
+
+
+def motor_steps(
+    resistance: float, inductance: float, torque: float, inertia: float, static: float, coulomb: float, viscous: float
+) -> MotorSteps:
+    """Transition of a motor. Units: ohm, H; at the wheel N m/A (= V s/rad), kg m2, N m, N m, N m s/rad."""
+    system = np.zeros((5, 5))  # state: current, rate, angle, voltage, friction; the last two are constant
+    system[0, [0, 1, 3]] = [-resistance / inductance, -torque / inductance, 1 / inductance]
+    system[1, [0, 1, 4]] = [torque / inertia, -viscous / inertia, -1 / inertia]
+    system[2, 1] = 1.0
+    moving = np.ascontiguousarray(expm(system * _STEP)[[0, 1, 2]][:, [0, 1, 3, 4]])
+    held = math.exp(-resistance / inductance * _STEP)
+    return MotorSteps(moving, held, (1 - held) / resistance, torque, static, coulomb)
+
+
+def drive_wheel(
+    motor: MotorSteps, pid: Pid, tick: float, targets: Array, start: float, sample_steps: int
+) -> tuple[Array, Array, Array]:
+    """One run of one wheel from rest at the angle ``start`` (rad) towards target rates (F,), rad/s.
+
+    tick: angle of an encoder tick, rad. sample_steps: milliseconds of a sample. Returns true angles (sample_steps F +
+    1,) at every millisecond, rad; the encoder's count (F,) at the end of every sample; voltages (F,), V.
+    """
+    angles, counts, voltages = _drive(motor, pid, tick, np.ascontiguousarray(targets, float), start, sample_steps)
+    return angles, counts, voltages
+
+
+@compiled
+def _drive(
+    motor: MotorSteps, pid: Pid, tick: float, targets: Array, start: float, sample_steps: int
+) -> tuple[Array, Array, Array]:
+    samples = len(targets)
+    period = sample_steps * TRUE_STEP
+    angles = np.empty(samples * sample_steps + 1)
+    counts, voltages = np.empty(samples), np.empty(samples)
+    angles[0] = angle = start
+    seen = math.floor(start / tick)
+    current = rate = integral = measured = before = 0.0
+    for sample in range(samples):
+        if abs(targets[sample]) * period < _STANDING * tick and abs(measured) * period < 1.5 * tick:
+            voltage, integral = (
+                0.0,
+                0.0,
+            )  # the motor brakes: a controller that answers to single ticks would never let it rest
+        else:
+            voltage, integral = _controlled(pid, targets[sample], measured, before, integral, period)
+        for step in range(sample_steps):
+            for _ in range(_INNER):
+                current, rate, turned = _stepped(motor, current, rate, voltage)
+                angle += turned
+            angles[sample * sample_steps + step + 1] = angle
+        count = math.floor(angle / tick)
+        measured, before, seen = (count - seen) * tick / period, measured, count
+        counts[sample], voltages[sample] = count, voltage
+    return angles, counts, voltages
+
+
+@compiled
+def _controlled(
+    pid: Pid, target: float, measured: float, before: float, integral: float, period: float
+) -> tuple[float, float]:
+    """Voltage of the next sample, V, and the integral, rad, which does not grow while the voltage is at its limit."""
+    error = target - measured
+    grown = integral + error * period
+    voltage = pid.proportional * error + pid.integral * grown - pid.derivative * (measured - before) / period
+    if abs(voltage) <= pid.supply:
+        return voltage, grown
+    return math.copysign(pid.supply, voltage), grown if error * voltage < 0.0 else integral
+
+
+@compiled
+def _stepped(motor: MotorSteps, current: float, rate: float, voltage: float) -> tuple[float, float, float]:
+    """Current, A, and rate, rad/s, after one step, and the angle turned in it, rad."""
+    direction = 0.0  # sign of the motion, against which friction acts
+    if rate != 0.0:
+        direction = math.copysign(1.0, rate)
+    elif abs(motor.torque * current) > motor.static:
+        direction = math.copysign(1.0, current)
+    elif motor.static > 0.0:
+        return motor.held * current + motor.fed * voltage, 0.0, 0.0
+    friction = direction * motor.coulomb
+    by = motor.moving
+    flowing = by[0, 0] * current + by[0, 1] * rate + by[0, 2] * voltage + by[0, 3] * friction
+    after = by[1, 0] * current + by[1, 1] * rate + by[1, 2] * voltage + by[1, 3] * friction
+    if motor.static > 0.0 and after * direction < 0.0:  # it stops within the step; friction turns no wheel round
+        return flowing, 0.0, 0.5 * rate * _STEP * rate / (rate - after)
+    return flowing, after, by[2, 0] * current + by[2, 1] * rate + by[2, 2] * voltage + by[2, 3] * friction
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ from report_samples import config, flower, run
 from omnibench.compare.report.matrices import differences, matrix_section
 from omnibench.compare.report.path_figures import chosen_trajectories, drawn_models
 from omnibench.compare.report.published_tables import published_blocks
-from omnibench.compare.report.search_diagram import search_diagram
+from omnibench.compare.report.search_figures import search_diagram
 from omnibench.compare.report.view import DatasetView, views
 from omnibench.report.blocks import Callout, Table
 

@@ -11,8 +11,7 @@ import pytest
 from report_samples import config, flower, run, usual
 from wheeled_samples import CAR, ROBOTS, TRICYCLE
 
-from omnibench.compare.report.data_section import data_section
-from omnibench.compare.report.robot_section import robot_section
+from omnibench.compare.report.comparison_report import data_section, robot_section
 from omnibench.compare.report.search_figures import search_section
 from omnibench.compare.report.view import DatasetView, views
 from omnibench.data.importers.table1 import APR_02

@@ -32,7 +32,7 @@ from bag_samples import (
 from hypothesis import given
 from hypothesis import strategies as st
 
-from omnibench.data.importers.rosbag.cutting import between_rests
+from omnibench.data.importers.rosbag.bag_recording import between_rests
 from omnibench.data.importers.runs.rests import find_rests
 from omnibench.robot.kinematics import Array
 

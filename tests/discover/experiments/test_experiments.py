@@ -13,7 +13,7 @@ from wheeled_samples import DIFF, SWERVE, TRICYCLE, driven
 from omnibench.data.joining import joined
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.experiments.candidate_runs import candidate_runs
-from omnibench.discover.experiments.driving_plan import description_of
+from omnibench.discover.experiments.experiments import description_of
 from omnibench.discover.experiments.run_choice import Choice
 from omnibench.discover.fitting.extend import fit_matrix
 from omnibench.discover.fitting.model_fit import Fit

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.report.before_after import EXTENDED, PLAIN, Panel
-from omnibench.discover.report.motor_figures import motor_grid
 from omnibench.discover.report.residuals import NORMAL_95, Residuals, shares
+from omnibench.discover.report.where_section import motor_grid
 
 
 @pytest.fixture(scope="module")

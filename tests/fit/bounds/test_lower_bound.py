@@ -11,8 +11,7 @@ import pytest
 from fit_samples import box_between, make_problem, noisy_trajectories
 
 from omnibench.data.dataset import Trajectory
-from omnibench.fit.bounds.dual_directions import into_unit_ball, least_sum_of_norms
-from omnibench.fit.bounds.lower_bound import LowerBounds
+from omnibench.fit.bounds.lower_bound import LowerBounds, into_unit_ball, least_sum_of_norms
 from omnibench.fit.bounds.stamp_sums import StampSums
 from omnibench.fit.certify import prove
 from omnibench.fit.cost import SumOfNorms

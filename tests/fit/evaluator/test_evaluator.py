@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from omnibench.data.dataset import Trajectory
 from omnibench.fit.evaluator.element_box import ElementBox
 from omnibench.fit.evaluator.evaluator import PoseEvaluator, make_evaluator
-from omnibench.fit.evaluator.expansion import Basis, degree_for
+from omnibench.fit.evaluator.expansion_plan import Basis, degree_for
 from omnibench.fit.evaluator.impulses import cut, impulses, make_path, quadrature
 from omnibench.fit.geometry import GeometryLimits
 from omnibench.fit.problem import CalibrationProblem

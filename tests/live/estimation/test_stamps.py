@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from omnibench.live.estimation.published_stamps import PublishedStamps
+from omnibench.live.estimation.robot_state import PublishedStamps
 
 PERIOD, SECOND = 10**7, 10**9  # ns
 

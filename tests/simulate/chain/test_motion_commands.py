@@ -18,10 +18,12 @@ from omnibench.simulate.chain.motion_commands import (
     CommandedMotion,
     CommandLink,
     MotionProfile,
+    Phase,
+    SetPoint,
+    SlewLimits,
     command_motion,
     target_rates,
 )
-from omnibench.simulate.chain.set_point import Phase, SetPoint, SlewLimits
 from omnibench.simulate.command import Command
 
 PERIOD, SETTLE, TURN = 0.01, 0.5, 6.0

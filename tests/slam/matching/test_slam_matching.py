@@ -16,10 +16,9 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.planar import compose, relative
 from omnibench.simulate.chain.floor_plan import RoomPlan, make_plan
 from omnibench.simulate.chain.lidar import Lidar, measure_scans
-from omnibench.slam.matching.correspondences import Correspondences
 from omnibench.slam.matching.map import ScanMap
 from omnibench.slam.matching.points import ScanPoints, noise_factor, scan_points
-from omnibench.slam.matching.scan_matching import Match, refine, search
+from omnibench.slam.matching.scan_matching import Correspondences, Match, refine, search
 from omnibench.slam.motion_within_scan import MotionWithinScan
 from omnibench.slam.pose_errors import FLOOR, PoseErrors
 from omnibench.slam.slam_options import SlamOptions

@@ -18,9 +18,9 @@ from omnibench.data.true_poses import TruePath
 from omnibench.robot.kinematics import Array
 from omnibench.simulate.chain.floor_plan import FloorPlan, RoomPlan, make_plan
 from omnibench.simulate.chain.lidar import Lidar, measure_scans
-from omnibench.slam.matching.correspondences import Correspondences
 from omnibench.slam.matching.map import ScanMap
 from omnibench.slam.matching.points import ScanPoints, scan_points
+from omnibench.slam.matching.scan_matching import Correspondences
 from omnibench.slam.motion_within_scan import MotionWithinScan
 from omnibench.slam.slam_dataset import slam_dataset
 from omnibench.slam.slam_options import SlamOptions
