@@ -104,7 +104,7 @@ def compare(
 
 def _is_study(given: Sequence[Path]) -> bool:
     """True if the one argument is the config of a study."""
-    from omnibench.study.read_study import is_study
+    from omnibench.study.study import is_study
 
     return len(given) == 1 and given[0].is_file() and is_study(given[0])
 
@@ -123,9 +123,8 @@ def _study(
     from omnibench.cli.terminal.comparisons.study_tables import print_study, print_study_ending
     from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.progress import Progress
-    from omnibench.study.read_study import read_study_config
     from omnibench.study.report.study_report import study_document
-    from omnibench.study.study import run_study
+    from omnibench.study.study import read_study_config, run_study
 
     config = read_study_config(file, data)
     folders = (*config.plugins, *(folder.resolve() for folder in plugins))

@@ -21,18 +21,20 @@ from omnibench.discover.experiments.experiments import experiments_for
 from omnibench.discover.fitting.extend import Extended, extend, fit_matrix, without_effects
 from omnibench.discover.fitting.model_fit import Fit
 from omnibench.discover.fitting.windows import in_windows
-from omnibench.discover.held_out.cross_validation import random_folds_of_repetitions
+from omnibench.discover.held_out.cross_validation import (
+    compare_with_validation,
+    eq6_with_changes,
+    random_folds_of_repetitions,
+)
 from omnibench.discover.held_out.gaps import compare_held_out
-from omnibench.discover.held_out.sessions import compare_with_validation, eq6_with_changes
 from omnibench.discover.held_out.validation_runs import noise_runs, validation_runs
 from omnibench.discover.held_out.waterfall import waterfall_steps
 from omnibench.discover.result import Discovery
 from omnibench.discover.selection.averaged_model import averaged
 from omnibench.discover.selection.candidate_groups import check_names
-from omnibench.discover.selection.competing_models import competing_models
+from omnibench.discover.selection.competing_models import competing_models, with_fitted_forms
 from omnibench.discover.selection.detectability import detectability_of
 from omnibench.discover.selection.extrapolation import extrapolations_of, faded
-from omnibench.discover.selection.fitted_forms import with_fitted_forms
 from omnibench.discover.selection.locating import all_left, located
 from omnibench.discover.selection.model_selection import Selection, select_effects
 from omnibench.discover.selection.motor_effects import select_motor_effects

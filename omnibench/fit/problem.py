@@ -18,8 +18,7 @@ from omnibench.errors import DataError
 from omnibench.fit.cost import Cost
 from omnibench.fit.evaluator.driven_frame import DrivenFrame
 from omnibench.fit.evaluator.element_box import ElementBox
-from omnibench.fit.evaluator.evaluator import PoseEvaluator, make_evaluator
-from omnibench.fit.evaluator.parted_evaluator import PartedEvaluator, make_parted_evaluator
+from omnibench.fit.evaluator.evaluator import PartedEvaluator, PoseEvaluator, make_evaluator, make_parted_evaluator
 from omnibench.fit.geometry import GeometryLimits, WheelGeometry
 from omnibench.fit.loss.end_poses import moved_ends_in_words, with_ends_from_others
 from omnibench.fit.loss.robust_cost import RobustCost, norms_of

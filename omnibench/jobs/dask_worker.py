@@ -1,6 +1,8 @@
 """The worker's side of the Dask backend: jobs run in processes of their own beneath the Dask worker.
 
 So limits, isolation and threads are those of the processes of one machine, and results are equal to the bit.
+
+The software that the results of jobs depend on, and where two machines differ in it.
 """
 
 from __future__ import annotations
@@ -10,12 +12,14 @@ import json
 import multiprocessing
 import os
 import pickle
+import platform
 import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import cache
+from importlib.metadata import entry_points, version
 from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
@@ -29,11 +33,38 @@ from omnibench.files import write_text
 from omnibench.jobs.job import BackendError, Job
 from omnibench.jobs.job_process import PRELOAD, JobEnd, JobProcess, process_for
 from omnibench.jobs.packing import PackedJob
-from omnibench.jobs.result_store import Store
-from omnibench.jobs.software import differences, software
+from omnibench.jobs.result_store import Store, code_digest
 from omnibench.processes import one_thread_processes
 from omnibench.progress import Progress, Reporter
-from omnibench.registry import PluginFailure, import_copies
+from omnibench.registry import REGISTRIES, PluginFailure, import_copies
+
+_PACKAGES = (
+    *("numpy", "scipy", "cvxpy", "clarabel", "nlopt", "cma", "polars", "numba", "pydantic", "shapely"),
+    *("dask", "distributed"),
+)
+_PACKAGE = Path(__file__).parents[1]
+
+
+@cache
+def software() -> dict[str, str]:
+    """Versions of Python and of packages, omnibench's code by its hash, and installed packages of plug-ins."""
+    points = {point for registry in REGISTRIES for point in entry_points(group=registry.group)}
+    return {
+        "Python": platform.python_version(),
+        "omnibench's code": code_digest(_PACKAGE, _PACKAGE.rglob("*.py"))[:10],
+        **{package: version(package) for package in _PACKAGES},
+        **{point.dist.name: point.dist.version for point in points if point.dist is not None},
+    }
+
+
+def differences(there: Mapping[str, str], here: Mapping[str, str]) -> list[str]:
+    """What another machine has in the place of what is here, in words."""
+    return [
+        f"{name} {there.get(name, 'missing')} (here: {here.get(name, 'missing')})"
+        for name in dict.fromkeys((*here, *there))
+        if here.get(name) != there.get(name)
+    ]
+
 
 _PERIOD = 0.2  # s between two reports of a job, and two looks whether it is still wanted; chosen
 _TOGETHER, _MOST_TOGETHER = 0.1, 50  # s and ends that wait for each other; chosen

@@ -1,35 +1,132 @@
-"""The node: every step from a config to robots whose samples become odometry on a Zenoh session."""
+"""The node: every step from a config to robots whose samples become odometry on a Zenoh session.
+
+Low latency for wheel samples: the interpreter's garbage collector and thread switching, while a node runs.
+
+A robot's tracker as the config describes it: calibration, joints, frames, and the state that the last run left.
+
+Diagnostics of all robots of a node, published once a second.
+"""
 
 from __future__ import annotations
 
+import gc
 import logging
+import math
+import sys
+import threading
 import time
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from functools import partial
 
-from omnibench.errors import require_type
+from omnibench.errors import one_line, require_type
 from omnibench.live.closing import Closing
-from omnibench.live.config import LiveConfig
+from omnibench.live.config import LiveConfig, RobotConfig
 from omnibench.live.control.query_server import QueryServer
 from omnibench.live.control.robot_info import robot_info
-from omnibench.live.diagnostics_timer import DiagnosticsTimer
 from omnibench.live.estimation.health import Health
 from omnibench.live.estimation.saved_state import RobotMemory
-from omnibench.live.intake import Intake
-from omnibench.live.low_latency import low_latency
+from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.network.presence import Claim
+from omnibench.live.network.rate_limiter import RateLimiter
 from omnibench.live.network.session import close_session, open_session
-from omnibench.live.robot_service import RobotService
-from omnibench.live.robot_setup import make_tracker
+from omnibench.live.robot_service import Intake, RobotService
 from omnibench.live.stopping import Stop
 from omnibench.live.wire.foxglove import PORT, FoxgloveServer
 from omnibench.live.wire.recorder import Recorder, free_path
 from omnibench.live.wire.topics import GraphNode, KeySpace
 from omnibench.registry import load_plugins
+from omnibench.robot.calibration import read_calibration
 from omnibench.words import plural
 
+_SWITCH_INTERVAL = 0.0005  # s that a busy thread keeps the interpreter while others wait; Python's own is 0.005
+
+_running = 0  # nodes of this process
+_lock = threading.Lock()
+_usual_interval = sys.getswitchinterval()
+
+
+@contextmanager
+def low_latency() -> Iterator[None]:
+    """While any node of this process is in this context, nothing else keeps the interpreter from a sample for long.
+
+    The garbage collector passes over the objects that are there at the start, and a busy thread (the query server with
+    a large calibration) gives way after 0.5 ms.
+    """
+    global _running
+    with _lock:
+        _running += 1
+        gc.collect()
+        gc.freeze()
+        sys.setswitchinterval(_SWITCH_INTERVAL)
+    try:
+        yield
+    finally:
+        with _lock:
+            _running -= 1
+            if not _running:
+                gc.unfreeze()
+                sys.setswitchinterval(_usual_interval)
+
+
 LOG = logging.getLogger("omnibench.live")
+
+
+def make_tracker(config: LiveConfig, robot: RobotConfig, memory: RobotMemory | None) -> RobotTracker:
+    """The tracker of one robot; with a memory it goes on where the last run stopped.
+
+    ConfigError or DataError: the calibration cannot be read, or the joints are not one for each wheel.
+    """
+    calibration = read_calibration(robot.calibration) if memory is None else memory.calibration(robot.calibration)
+    tracker = RobotTracker(
+        robot.name,
+        calibration,
+        wheels=robot.wheels,
+        fusion=config.fusion_of(robot),
+        frames=config.frames_of(robot),
+        stale_after=config.stale_after,
+        memory=memory,
+    )
+    saved = None if memory is None else memory.load()
+    if saved is not None:
+        tracker.resume(saved, time.monotonic(), time.time())
+        x, y, _ = saved.pose
+        LOG.info("%s: goes on at x %.3f m, y %.3f m of odom", robot.name, x, y)
+    return tracker
+
+
+_PERIOD = 1.0  # s, as ROS 2's diagnostics usually come
+
+
+class DiagnosticsTimer:
+    """Calls the services' ``publish_diagnostics`` once a second, in a thread of its own, until ``close``.
+
+    A robot whose diagnostics fail does not stop those of the others; each kind of its errors is logged once.
+    """
+
+    def __init__(self, services: Sequence[RobotService]) -> None:
+        self._services = services
+        self._log_limiter = RateLimiter(math.inf)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="diagnostics", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Publish no more."""
+        self._stop.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._stop.wait(_PERIOD):
+            for service in self._services:
+                try:
+                    service.publish_diagnostics()
+                except Exception as error:
+                    name, kind = service.tracker.name, type(error).__name__
+                    if self._log_limiter.allows(f"{name} {kind}"):
+                        LOG.error("%s: diagnostics: %s: %s", name, kind, one_line(str(error)))
+
+
 _PRESENCE_TIMEOUT = 2.0  # s, at most, for the tokens of other nodes' robots, which mostly come at once; chosen
 
 

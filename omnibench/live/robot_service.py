@@ -4,6 +4,13 @@ Updates of samples that had to wait: of a robot in real time only the newest is 
 
 A late pose of a robot is of use to nobody once a newer one is known, and to publish it makes the node later still. The
 samples of a replay are late by themselves, and whoever plays them wants every pose.
+
+Intake: what arrives for a node's robots is queued in Zenoh's threads, and worked off in one thread of the node.
+
+Zenoh's threads are then free to receive, and what waits can be seen: a robot whose samples wait for long gets all of
+them integrated at its turn and only the newest pose published (``robot_service``). Where the thread is busy it pauses
+for a moment between turns, so that messages come together: to hand the interpreter over for each one costs as much as
+to take it.
 """
 
 from __future__ import annotations
@@ -15,21 +22,62 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from queue import SimpleQueue
 from typing import Final
 
 import zenoh
 
+from omnibench.errors import one_line
 from omnibench.live.acknowledged_flows import AcknowledgedFlows
+from omnibench.live.closing import Closing
 from omnibench.live.estimation.counts import anomalies_in_words
 from omnibench.live.estimation.health import Health, diagnostic
 from omnibench.live.estimation.tracker import RobotTracker
-from omnibench.live.estimation.update import Update
-from omnibench.live.intake import Intake
 from omnibench.live.network.rate_limiter import RateLimiter
 from omnibench.live.wire.attachment import MissedMessages, flow_of
 from omnibench.live.wire.messages import Diagnostics
-from omnibench.live.wire.outputs import OUTPUTS
+from omnibench.live.wire.outputs import OUTPUTS, Update
 from omnibench.live.wire.topics import GraphNode
+
+LOG = logging.getLogger("omnibench.live")
+_PAUSE: Final = 0.002  # s between turns while the thread is busy; chosen
+_BUSY: Final = 0.5  # share of the time in which it works, from which on it pauses; chosen
+_SMOOTHING: Final = 0.1  # share of the latest turn in the mean; chosen
+
+
+class Intake(Closing):
+    """Runs the work that is handed to ``ready``, in turn, in a thread of its own until ``close``."""
+
+    def __init__(self) -> None:
+        self._work: SimpleQueue[Callable[[], object] | None] = SimpleQueue()
+        self._thread = threading.Thread(target=self._run, name="intake", daemon=True)
+        self._thread.start()
+
+    def ready(self, work: Callable[[], object]) -> None:
+        """Queue a piece of work, which must not raise. From any thread."""
+        self._work.put(work)
+
+    def close(self) -> None:
+        """Do what is queued, and no more."""
+        self._work.put(None)
+        self._thread.join()
+
+    def _run(self) -> None:
+        worked = spent = 0.0  # s, recent turns weighing most
+        last = time.perf_counter()
+        while (work := self._work.get()) is not None:
+            began = time.perf_counter()
+            try:
+                work()
+            except Exception as error:  # one robot must not silence the others
+                LOG.error("intake: %s: %s", type(error).__name__, one_line(str(error)))
+            now = time.perf_counter()
+            worked += _SMOOTHING * (now - began - worked)
+            spent += _SMOOTHING * (now - last - spent)
+            last = now
+            if worked > _BUSY * spent:
+                time.sleep(_PAUSE)
+
 
 LATE: Final = 0.1  # s that a sample has waited; chosen
 _FAST: Final = 2.0  # time by the stamps per time of arrival, from which on samples are those of a replay; chosen
@@ -74,7 +122,6 @@ class LateUpdates:
             self._publish(update)
 
 
-LOG = logging.getLogger("omnibench.live")
 _LONGEST_QUEUE: Final = 20_000  # messages that wait for one robot, 200 s at 100 Hz; chosen
 _LARGEST_QUEUE: Final = 32_000_000  # bytes that wait for one robot: 20,000 messages of 60 wheels; chosen
 _BATCH: Final = 500  # messages of one robot until the others have their turn; chosen

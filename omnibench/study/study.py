@@ -1,13 +1,15 @@
 """A study, from the config to the report: each step is a line of ``run_study``.
 
 Its folder has the effective config, summary.json, and one table with a row for each cell and method.
+
+Reading of a study's config, and telling it from a comparison's.
 """
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -16,9 +18,9 @@ import polars as pl
 
 from omnibench.compare.effective_config import effective_cost, effective_options, load_calibrators
 from omnibench.compare.execute import PRELOAD, execute, resumable
-from omnibench.config import read_yaml, to_json, to_yaml
+from omnibench.config import read_model, read_yaml, to_json, to_yaml
 from omnibench.environment import environment
-from omnibench.errors import DataError, require_type
+from omnibench.errors import ConfigError, DataError, UnknownNameError, require_type
 from omnibench.files import (
     RESULTS,
     check_results_folder,
@@ -42,6 +44,35 @@ from omnibench.study.judging import judge_fits
 from omnibench.study.report.study_report import study_document
 from omnibench.study.study_plan import load_robots, plan_fits
 from omnibench.study.study_result import StudyResult
+
+
+def is_study(path: Path) -> bool:
+    """True if a config names robots, as studies do. ConfigError: the file cannot be read."""
+    content = read_yaml(path)
+    return isinstance(content, Mapping) and "robots" in content
+
+
+def read_study_config(path: Path | str, data: Mapping[str, Path] | None = None) -> StudyConfig:
+    """Read a study's config; its paths come back absolute.
+
+    data: the folder of the recordings in the place of the config's under the name "", that of one robot under its name.
+    ConfigError in one line.
+    """
+    config = read_model(StudyConfig, Path(path))
+    places = dict(data or {})
+    base = places.pop("", config.data).resolve()
+    robots = dict(config.robots)
+    for name, place in places.items():
+        if name not in robots:
+            raise UnknownNameError("robot", name, robots, f"--data of {path}")
+        robots[name] = robots[name].model_copy(update={"path": (str(place.resolve()),)})
+    if not base.is_dir() and not all(Path(path).is_absolute() for robot in robots.values() for path in robot.path):
+        raise ConfigError(
+            f"{path}: the recordings are not at {base}; say where they are with --data DIR (omnibench guide data says "
+            "where the public ones come from)"
+        )
+    return config.model_copy(update={"data": base, "robots": robots})
+
 
 # First line of config.yaml in a folder of results. A folder whose config.yaml lacks it is not written to.
 _MARK = "# The effective config of a study; the results beside it were made with it."

@@ -17,8 +17,12 @@ import numpy as np
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.fusion.pose_fusion import FusionSettings
 from omnibench.live.replay.arrivals import ReplayConfig
-from omnibench.live.replay.concatenated_drive import ConcatenatedDrive, concatenate_recording, concatenated_truth
-from omnibench.live.replay.played_recording import load_recording
+from omnibench.live.replay.concatenated_drive import (
+    ConcatenatedDrive,
+    concatenate_recording,
+    concatenated_truth,
+    load_recording,
+)
 from omnibench.live.replay.replay_player import events
 from omnibench.live.wire.messages import JOINT_STATE, POSE_ESTIMATE, JointState, PoseEstimate
 from omnibench.robot.calibration import Calibration, read_calibration

@@ -24,7 +24,7 @@ from omnibench.robot.robot_class import class_of
 from omnibench.study.cells import make_cells
 from omnibench.study.config import MethodChoice, TrainingChoice
 from omnibench.study.judging import judge_fits
-from omnibench.study.read_study import read_study_config
+from omnibench.study.study import read_study_config
 from omnibench.study.study_plan import StudiedRobot, load_robots, plan_fits
 
 CONFIG = Path(__file__).parents[2] / "configs" / "real_robots.yaml"

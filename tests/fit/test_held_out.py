@@ -15,7 +15,7 @@ from fit_samples import noisy_trajectories
 from omnibench import check
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.fit.calibrate import calibrate
-from omnibench.fit.check.expected_gain import expected_gain
+from omnibench.fit.check.checking import expected_gain
 from omnibench.fit.evaluate import evaluate, final_errors, verdict_on
 from omnibench.fit.held_out import judge
 from omnibench.fit.problem import Budget

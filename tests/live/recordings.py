@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.live.replay.played_recording import Recording
+from omnibench.live.replay.concatenated_drive import Recording
 from omnibench.robot.calibration import EffectTerm
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel

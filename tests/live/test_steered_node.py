@@ -17,8 +17,8 @@ from steered import DIFFERENTIAL, SWERVE, SteeredDrive, calibration, drive, reco
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.errors import DataError
 from omnibench.live.config import LiveConfig
+from omnibench.live.replay.concatenated_drive import Recording
 from omnibench.live.replay.demonstration import demonstrate
-from omnibench.live.replay.played_recording import Recording
 from omnibench.live.wire.messages import ODOMETRY, JointState
 from omnibench.robot.calibration import Calibration, EffectTerm, matrix_rows, write_calibration
 from omnibench.robot.kinematics import Array, Mount, Robot

@@ -16,7 +16,7 @@ from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.storage import save_dataset
 from omnibench.robot.kinematics import Array, Robot, wheel_equations
 from omnibench.study.config import StudyConfig
-from omnibench.study.read_study import read_study_config
+from omnibench.study.study import read_study_config
 
 PERIOD, SAMPLES = 0.1, 40
 TWISTS = {

@@ -9,8 +9,7 @@ from commands import CONFIGS, RECORDINGS
 from shared_results import made_once, shared_folder
 
 from omnibench.study.config import StudyConfig, TrainingChoice
-from omnibench.study.read_study import read_study_config
-from omnibench.study.study import run_study, study_table
+from omnibench.study.study import read_study_config, run_study, study_table
 from omnibench.study.study_result import StudyResult
 from omnibench.study.trainings import divide
 

@@ -1,9 +1,12 @@
-"""The check of a recording, step by step: what is misread, what is missing, and whether a calibration is needed."""
+"""The check of a recording, step by step: what is misread, what is missing, and whether a calibration is needed.
+
+Whether a calibration is needed: the gain on runs that were not fitted, by the verdict of ``calibrate``.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,14 +23,49 @@ from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.importers.copied_reference import follows_the_wheels
 from omnibench.data.references.reference_units import odd_references
 from omnibench.data.stored.drawn_runs import count_drawn, drawn_runs
-from omnibench.fit.check.expected_gain import Gain, expected_gain
 from omnibench.fit.check.fixes import command, with_fixes
 from omnibench.fit.check.missing_motions import missing_motions, too_few
 from omnibench.fit.check.other_readings import read_otherwise
 from omnibench.fit.check.recording_source import RecordingSource, of_dataset, read_source, recorded
 from omnibench.fit.check.result import CheckReport, Verdict
+from omnibench.fit.evaluate import looked_at, verdict_on
 from omnibench.fit.observations.open_in_words import open_sentences
+from omnibench.fit.quick_fit import quick_fit
+from omnibench.robot.model import OdometryModel
 from omnibench.words import noun_for, plural
+
+_SMALL = 0.1  # share of the cost: a larger gain that is not significant is left open; chosen
+_ENOUGH = 10  # commands, from which on a gain would have shown if there were one; chosen
+
+
+@dataclass(frozen=True)
+class Gain:
+    """needed: as in CheckReport. sentence: the errors before and after."""
+
+    needed: bool | None
+    sentence: str
+
+
+def expected_gain(dataset: Dataset, *, clocks_agree: bool = True) -> Gain:
+    """The verdict on a quick fit to the training runs, as ``calibrate`` judges its own.
+
+    clocks_agree: False where the reference's clock is so far off that a gain which is not significant says nothing.
+    """
+    robot, held_out = dataset.robot, dataset.split("validation")
+    training = looked_at(dataset.split("train") or held_out)
+    model = OdometryModel(robot, quick_fit(robot, training), "arc")
+    verdict = verdict_on(model, training, looked_at(held_out) if dataset.split("train") else ())
+    needed = {"better": True, "worse": False}.get(verdict.verdict)
+    small = verdict.improvement is not None and abs(verdict.improvement) < _SMALL
+    if verdict.verdict == "undecided" and small and verdict.units >= _ENOUGH:
+        needed = False
+    if needed is None and not clocks_agree:
+        return Gain(None, "whether a calibration is needed can be told once the clocks are matched")
+    if verdict.verdict == "unknown":
+        runs = plural(len(dataset.trajectories), "run")
+        return Gain(None, f"whether a calibration is needed cannot be told from {runs}; record four, of three commands")
+    return Gain(needed, verdict.sentence)
+
 
 _REACHED = 0.05  # share of a run's time after which its last pose comes at least; chosen
 # Share of the runs' turns (squares of the whole runs') that the best matrix leaves: at most 0.005 on OptiOdom's

@@ -6,6 +6,8 @@ reference (latency, lever arm of the LIDAR), and fused at its own time; the chan
 wheel sample. There is no network here, and any thread may call.
 
 Calibration swap: another calibration takes over at the next wheel sample, if it is the same robot's.
+
+Pose query: where a robot was at a time of the last seconds.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,21 +26,45 @@ from omnibench.live.estimation.extrapolation_monitor import ExtrapolationMonitor
 from omnibench.live.estimation.health import Health, SwapRecord
 from omnibench.live.estimation.health_report import HealthReporter
 from omnibench.live.estimation.live_odometry import Motion
-from omnibench.live.estimation.pose_query import PoseAt, pose_at
 from omnibench.live.estimation.robot_state import RobotState, new_state, wheel_angle_effects
 from omnibench.live.estimation.saved_state import RobotMemory, SavedState
 from omnibench.live.estimation.state_writer import StateWriter, resume_state
-from omnibench.live.estimation.update import Update
 from omnibench.live.frames import Frames
 from omnibench.live.fusion.pose_fusion import Fusion, FusionSettings, Outcome
 from omnibench.live.fusion.pose_input import PoseInput
 from omnibench.live.fusion.timeline import Entry
 from omnibench.live.wheels.wheel_input import WheelSettings, WheelStep
 from omnibench.live.wire.messages import JointState, MessageError, arrival_stamp
+from omnibench.live.wire.outputs import Update
 from omnibench.live.wire.robot_messages import JointStateDecoder
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
 from omnibench.robot.signals import of_centre
+
+_SECOND = 1e9  # ns
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseAt:
+    """A robot's pose at ``stamp`` (ns). odometry: pose (3,) in odom. in_map: pose (3,) and covariance (3, 3)."""
+
+    stamp: int
+    odometry: Array
+    in_map: tuple[Array, Array] | None
+
+
+def pose_at(state: RobotState, stamp: int | None = None) -> PoseAt:
+    """The pose at a time (ns; default: of the last sample). DataError: nothing is remembered of that time."""
+    timeline = state.timeline
+    if not timeline.entries:
+        raise DataError(f"robot {state.name!r} has sent no wheel sample yet")
+    chosen = timeline.newest if stamp is None else stamp
+    odometry = timeline.odometry_at(chosen)
+    if odometry is None:
+        oldest, newest = timeline.oldest / _SECOND, timeline.newest / _SECOND
+        raise DataError(f"at: {chosen / _SECOND:.6f} s is not within {oldest:.6f} to {newest:.6f} s")
+    return PoseAt(chosen, odometry, state.fusion.at(chosen) if state.fusion else None)
+
 
 _OTHER_ROBOT = 0.5  # share of a row's largest element; chosen: no calibration moves a matrix so far from its design
 
@@ -83,7 +109,6 @@ def check_same_robot(calibration: Calibration, running: Calibration) -> None:
 
 
 LOG = logging.getLogger("omnibench.live")
-_SECOND = 1e9  # ns
 
 
 class RobotTracker:

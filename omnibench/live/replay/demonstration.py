@@ -17,9 +17,13 @@ from omnibench.live.estimation.robot_centre import RobotCentre
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.network.session import close_session, open_session
 from omnibench.live.node import LiveNode, load_effects
-from omnibench.live.replay.concatenated_drive import ConcatenatedDrive, concatenate_recording, concatenated_truth
+from omnibench.live.replay.concatenated_drive import (
+    ConcatenatedDrive,
+    Recording,
+    concatenate_recording,
+    concatenated_truth,
+)
 from omnibench.live.replay.delivery import WINDOW, DeliveryError
-from omnibench.live.replay.played_recording import Recording
 from omnibench.live.replay.replay_player import Player, PlayReport
 from omnibench.live.stopping import wait_until
 from omnibench.live.wheels.joints import joints_of

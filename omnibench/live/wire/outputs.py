@@ -1,6 +1,8 @@
 """Outputs: the topics that a node publishes of every update, one function a topic that makes its message.
 
 To add an output, write its function and its row in OUTPUTS; a message type that is new goes to messages.py.
+
+Update: the estimates after one wheel sample, from which every output is made.
 """
 
 from __future__ import annotations
@@ -9,12 +11,27 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
-from omnibench.live.estimation.update import Update
 from omnibench.live.frames import Frames
 from omnibench.live.wire.messages import ODOMETRY, TRANSFORMS, MessageType, Odometry, Transform
 from omnibench.live.wire.robot_messages import OdometryEncoder, TransformsEncoder
 from omnibench.robot.kinematics import Array
 from omnibench.robot.planar import correction
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Update:
+    """Estimates after one wheel sample; poses (3,) in m, m, rad, twists (3,) in m/s, m/s, rad/s, covariances (3, 3).
+
+    stamp: ns, never published before. pose, covariance: of the robot in odom. twist, twist_covariance: in the robot's
+    frame. in_map: fused pose and its covariance; None without fusion.
+    """
+
+    stamp: int
+    pose: Array
+    covariance: Array
+    twist: Array
+    twist_covariance: Array
+    in_map: tuple[Array, Array] | None = None
 
 
 @dataclass(frozen=True)

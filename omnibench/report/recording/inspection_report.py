@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.fit.check.motion_kinds import SHARE, motion_kinds, turning
+from omnibench.fit.check.missing_motions import SHARE, motion_kinds, turning
 from omnibench.fit.inspect import Inspection
 from omnibench.fit.uncertainty.identifiability import UNTOLD
 from omnibench.report.blocks import (

@@ -10,7 +10,7 @@ from learned_samples import a_learned_calibration
 from omnibench.config import to_yaml
 from omnibench.live.control.orders import LONGEST
 from omnibench.live.estimation.tracker import RobotTracker
-from omnibench.live.estimation.update import Update
+from omnibench.live.wire.outputs import Update
 from omnibench.robot.calibration import Calibration, parse_calibration
 from omnibench.robot.effects.weights import MOST_BYTES, encode_weights
 from omnibench.testing.synthetic import synthetic_robot

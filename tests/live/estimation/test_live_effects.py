@@ -23,7 +23,6 @@ from sessions import free_port
 from omnibench.config import to_yaml
 from omnibench.live.estimation.live_odometry import LiveOdometry
 from omnibench.live.estimation.tracker import RobotTracker
-from omnibench.live.estimation.update import Update
 from omnibench.live.fusion.pose_fusion import FusionSettings
 from omnibench.live.node import LiveNode
 from omnibench.live.replay.arrivals import ReplayConfig
@@ -31,6 +30,7 @@ from omnibench.live.replay.concatenated_drive import concatenate_recording, conc
 from omnibench.live.replay.replay_player import events
 from omnibench.live.wheels.wheel_input import WheelStep
 from omnibench.live.wire.messages import JOINT_STATE, JointState
+from omnibench.live.wire.outputs import Update
 from omnibench.robot.calibration import Calibration, EffectTerm, Noise, covariance_rows, matrix_rows, write_calibration
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, WheelLog

@@ -15,10 +15,10 @@ from steered import CAR, DIFFERENTIAL, SKID, SWERVE, TRICYCLE, calibration, driv
 from omnibench.errors import DataError
 from omnibench.live.estimation.saved_state import RobotMemory
 from omnibench.live.estimation.tracker import RobotTracker
-from omnibench.live.estimation.update import Update
 from omnibench.live.fusion.pose_fusion import FusionSettings
 from omnibench.live.wheels.wheel_input import WheelSettings
 from omnibench.live.wire.messages import JOINT_STATE
+from omnibench.live.wire.outputs import Update
 from omnibench.robot.calibration import Calibration, EffectTerm, Noise, covariance_rows, matrix_rows
 from omnibench.robot.kinematics import Array, Mount, Robot
 from omnibench.robot.odometry import Integration, OdometryBatch

@@ -19,9 +19,9 @@ from hypothesis import strategies as st
 from omnibench.errors import ConfigError, DataError
 from omnibench.live.estimation.saved_state import RobotMemory, SavedState
 from omnibench.live.estimation.tracker import RobotTracker
-from omnibench.live.estimation.update import Update
 from omnibench.live.fusion.pose_fusion import FusionSettings
 from omnibench.live.wire.messages import JOINT_STATE, JointState
+from omnibench.live.wire.outputs import Update
 from omnibench.robot.calibration import EffectTerm, matrix_rows
 from omnibench.robot.odometry import Integration
 

@@ -7,8 +7,8 @@ import pytest
 from drives import EXACT, ORIGIN, PERIOD, calibration, drive, slam
 
 from omnibench.live.estimation.tracker import RobotTracker
-from omnibench.live.estimation.update import Update
 from omnibench.live.fusion.pose_fusion import FusionSettings
+from omnibench.live.wire.outputs import Update
 from omnibench.robot.calibration import Calibration, EffectTerm
 from omnibench.robot.kinematics import Array
 from omnibench.robot.planar import compose, moved_to

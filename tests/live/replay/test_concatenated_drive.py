@@ -16,12 +16,12 @@ from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.errors import ConfigError, DataError
 from omnibench.live.replay.concatenated_drive import (
     ConcatenatedDrive,
+    Recording,
     concatenate_recording,
     concatenate_runs,
     concatenated_truth,
     true_start_poses,
 )
-from omnibench.live.replay.played_recording import Recording
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog

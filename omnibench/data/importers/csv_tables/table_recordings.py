@@ -2,6 +2,8 @@
 
 Distances, turns, positions and the like stand in a table of their own: a row for each, with its kind, value and
 standard deviation.
+
+The rows of a table that belong to each run.
 """
 
 from __future__ import annotations
@@ -22,8 +24,7 @@ from omnibench.data.importers.csv_tables.column_words import check_units
 from omnibench.data.importers.csv_tables.csv_options import CsvOptions
 from omnibench.data.importers.csv_tables.missing_columns import missing_error
 from omnibench.data.importers.csv_tables.table_files import TablePair, load
-from omnibench.data.importers.csv_tables.table_rows import Rows, rows_by_run
-from omnibench.data.importers.csv_tables.wanted_columns import WantedColumns, pose_columns, wheel_columns
+from omnibench.data.importers.csv_tables.wanted_columns import WantedColumns, pose_columns, run_column, wheel_columns
 from omnibench.data.importers.runs.recorded_streams import RecordedStreams
 from omnibench.data.importers.runs.reference_options import RADIANS, SECONDS
 from omnibench.data.importers.runs.reference_stream import ReferenceStream
@@ -35,6 +36,22 @@ from omnibench.data.references.run_references import KINDS, References
 from omnibench.errors import DataError, nearest
 from omnibench.robot.kinematics import Array
 from omnibench.words import plural, some
+
+Rows = NDArray[np.intp]
+
+
+def rows_by_run(table: CellTable | None, options: CsvOptions) -> dict[str | None, Rows | None]:
+    """The rows of each run that a column names; {None: None} for a table of one run."""
+    column = None if table is None else run_column(options, table)
+    if table is None or column is None:
+        return {None: None}
+    rows: dict[str | None, list[int]] = {}
+    for row, run in enumerate(table.texts(column)):
+        rows.setdefault(run, []).append(row)
+    if "" in rows:
+        raise table.fail(rows[""][0], f"{column} is missing; name the run of every row")
+    return {run: np.array(of_run) for run, of_run in rows.items()}
+
 
 _KIND = "kind"
 
