@@ -1,6 +1,6 @@
 """A comparison, from the config to the report: each step is a line of ``run_comparison``.
 
-Proven lower bounds: how far below the runs of a comparison any optimiser could get, box by box.
+Certificates are proven lower bounds: how far below its runs any optimiser could get, box by box.
 """
 
 from __future__ import annotations

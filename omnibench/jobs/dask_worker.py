@@ -2,7 +2,7 @@
 
 So limits, isolation and threads are those of the processes of one machine, and results are equal to the bit.
 
-The software that the results of jobs depend on, and where two machines differ in it.
+The software that results depend on is compared before the first job.
 """
 
 from __future__ import annotations

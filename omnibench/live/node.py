@@ -1,10 +1,7 @@
 """The node: every step from a config to robots whose samples become odometry on a Zenoh session.
 
-Low latency for wheel samples: the interpreter's garbage collector and thread switching, while a node runs.
-
-A robot's tracker as the config describes it: calibration, joints, frames, and the state that the last run left.
-
-Diagnostics of all robots of a node, published once a second.
+While it runs, the interpreter's garbage collector and thread switching are set for wheel samples of low latency, and
+the diagnostics of all its robots are published once a second.
 """
 
 from __future__ import annotations
@@ -20,18 +17,17 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 
 from omnibench.errors import one_line, require_type
-from omnibench.live.closing import Closing
 from omnibench.live.config import LiveConfig, RobotConfig
 from omnibench.live.control.query_server import QueryServer
 from omnibench.live.control.robot_info import robot_info
 from omnibench.live.estimation.health import Health
 from omnibench.live.estimation.saved_state import RobotMemory
 from omnibench.live.estimation.tracker import RobotTracker
+from omnibench.live.network.callbacks import RateLimiter
 from omnibench.live.network.presence import Claim
-from omnibench.live.network.rate_limiter import RateLimiter
 from omnibench.live.network.session import close_session, open_session
 from omnibench.live.robot_service import Intake, RobotService
-from omnibench.live.stopping import Stop
+from omnibench.live.stopping import Closing, Stop
 from omnibench.live.wire.foxglove import PORT, FoxgloveServer
 from omnibench.live.wire.recorder import Recorder, free_path
 from omnibench.live.wire.topics import GraphNode, KeySpace

@@ -12,13 +12,12 @@ from typing import Final
 import zenoh
 
 from omnibench.errors import DataError
-from omnibench.live.closing import Closing
 from omnibench.live.control.request_queue import source_of
 from omnibench.live.estimation.counts import anomalies_among
 from omnibench.live.network.callbacks import direct
 from omnibench.live.network.presence import Presence, checked_robot, nothing_received
 from omnibench.live.robot_status import HealthSummary, OdometryStatus, RobotStatus
-from omnibench.live.stopping import wait_until
+from omnibench.live.stopping import Closing, wait_until
 from omnibench.live.wire.attachment import MissedMessages
 from omnibench.live.wire.messages import DIAGNOSTICS, ODOMETRY, MessageError, Odometry
 from omnibench.live.wire.topics import KeySpace

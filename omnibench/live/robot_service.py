@@ -1,9 +1,8 @@
 """One robot on Zenoh: its inputs, its outputs, and the token that shows that it is alive.
 
-Updates of samples that had to wait: of a robot in real time only the newest is published, of a replay all are.
-
-A late pose of a robot is of use to nobody once a newer one is known, and to publish it makes the node later still. The
-samples of a replay are late by themselves, and whoever plays them wants every pose.
+Of samples that had to wait only the newest update of a robot in real time is published, and all of a replay. A late
+pose of a robot is of use to nobody once a newer one is known, and to publish it makes the node later still. The samples
+of a replay are late by themselves, and whoever plays them wants every pose.
 
 Intake: what arrives for a node's robots is queued in Zenoh's threads, and worked off in one thread of the node.
 
@@ -29,11 +28,11 @@ import zenoh
 
 from omnibench.errors import one_line
 from omnibench.live.acknowledged_flows import AcknowledgedFlows
-from omnibench.live.closing import Closing
 from omnibench.live.estimation.counts import anomalies_in_words
 from omnibench.live.estimation.health import Health, diagnostic
 from omnibench.live.estimation.tracker import RobotTracker
-from omnibench.live.network.rate_limiter import RateLimiter
+from omnibench.live.network.callbacks import RateLimiter
+from omnibench.live.stopping import Closing
 from omnibench.live.wire.attachment import MissedMessages, flow_of
 from omnibench.live.wire.messages import Diagnostics
 from omnibench.live.wire.outputs import OUTPUTS, Update

@@ -6,8 +6,24 @@ import math
 import signal
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Self
+
+
+class Closing(ABC):
+    """Context manager whose end calls ``close``."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """End the work and release what it holds."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
 
 class Stop(threading.Event):

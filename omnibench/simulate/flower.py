@@ -15,9 +15,8 @@ from omnibench.robot.kinematics import Array, Robot
 from omnibench.simulate.command import Command, straight_and_pivot, wheels_of
 from omnibench.simulate.config import FlowerConfig, Session
 from omnibench.simulate.driving.timed_command import TimedCommand
-from omnibench.simulate.pose_noise import reference_noise
 from omnibench.simulate.simulation import Simulation
-from omnibench.simulate.truth import TrueRobot, true_record
+from omnibench.simulate.truth import TrueRobot, reference_noise, true_record
 from omnibench.simulate.variation import STEADY, Variation
 from omnibench.words import plural
 

@@ -1,4 +1,4 @@
-"""The truth behind simulated recordings: the true robot, and its record in the truth folder."""
+"""The truth behind simulated recordings: the true robot, its record in the truth folder, and the noise of its poses."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pydantic import Field
 from omnibench.config import Model
 from omnibench.errors import UnknownNameError
 from omnibench.registry import effects
-from omnibench.robot.calibration import EffectTerm, Row, matrix_rows
+from omnibench.robot.calibration import EffectTerm, Noise, Row, matrix_rows
 from omnibench.robot.corrected import Corrected, check_needs, corrected, needs_of
 from omnibench.robot.effects.effect import ActuatorEffect
 from omnibench.robot.effects.term import Term, check_applies
@@ -37,6 +37,21 @@ from omnibench.simulate.mechanics import (
 from omnibench.simulate.true_motion import TrueMotion
 from omnibench.simulate.variation import Variation
 from omnibench.simulate.wheel_contacts import WheelContacts
+
+
+def reference_noise(noise: Noise, times: Array, rng: np.random.Generator) -> Array:
+    """Noise (K, 3) of the reference poses in m, m, rad; none at t = 0, where the start pose is exact."""
+    white = np.array([noise.pose_position, noise.pose_position, noise.pose_heading])
+    walk = np.array([noise.walk_position, noise.walk_position, noise.walk_heading])
+    bias = np.array([noise.bias_position, noise.bias_position, noise.bias_heading])
+    steps = np.sqrt(np.diff(times))[:, None] * rng.standard_normal((len(times) - 1, 3))
+    after_start = (
+        bias * rng.standard_normal(3)
+        + walk * np.cumsum(steps, axis=0)
+        + white * rng.standard_normal((len(times) - 1, 3))
+    )
+    return np.vstack([np.zeros(3), after_start])
+
 
 _SETTLES = 3  # corrections of a car's rates for the effects on them, each of which leaves some 1 % of the one before
 

@@ -1,8 +1,6 @@
 """A study, from the config to the report: each step is a line of ``run_study``.
 
 Its folder has the effective config, summary.json, and one table with a row for each cell and method.
-
-Reading of a study's config, and telling it from a comparison's.
 """
 
 from __future__ import annotations

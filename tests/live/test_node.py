@@ -19,7 +19,7 @@ from sessions import until
 
 from omnibench.errors import ConfigError, DataError
 from omnibench.live.config import LiveConfig, read_live_config
-from omnibench.live.network.rate_limiter import RateLimiter
+from omnibench.live.network.callbacks import RateLimiter
 from omnibench.live.node import LiveNode
 from omnibench.live.replay.arrivals import ReplayConfig
 from omnibench.live.replay.concatenated_drive import concatenate_runs

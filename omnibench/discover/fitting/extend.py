@@ -210,6 +210,6 @@ def _size(step: Array, covariance: Array) -> float:
 
 def _covariance(fit: Fit, data: Whitened) -> EstimatedCovariance:
     """Covariance (p, p) of the fitted numbers: by the noise model, or by the runs where they scatter more."""
-    unit = 1 / np.sqrt(np.maximum(np.diag(data.information), 1e-300))
+    unit = given(data, []).scale(range(len(data.information)))
     covariance = FitCovariance(data, fit.runs, fit.noise, unit)
     return covariance.chosen(covariance.scatter_stands)[0]

@@ -16,9 +16,8 @@ from omnibench.fit.least_squares.noise import FIRST_NOISE, NoiseEstimate, estima
 from omnibench.fit.least_squares.nuisance_noise import noise_of_fit
 from omnibench.fit.least_squares.nuisances import Nuisances
 from omnibench.fit.least_squares.repetitions import differences_between_repetitions
-from omnibench.fit.least_squares.start_frames import in_start_frames
 from omnibench.fit.least_squares.trajectory_fit import TrajectoryFit
-from omnibench.fit.least_squares.usable_runs import with_poses
+from omnibench.fit.least_squares.usable_runs import in_start_frames, with_poses
 from omnibench.fit.least_squares.whitened import Whitened, whitened, without
 from omnibench.robot.effects.term import Term
 from omnibench.robot.kinematics import Array, Robot

@@ -13,10 +13,9 @@ With g_z the fall of Q_z by further columns, over Z runs, these are confirmed if
 
     mean of g_z > c sd of g_z / sqrt(Z).                                                                            (3)
 
-Sessions of training and validation runs compared by a discovery's model, and what their changes make of its errors.
-
-Where both sessions are trained on, tyre_wear is an effect of the catalogue as any other. Where one is held out, the
-change that explains its deviation is fitted here, beside the model.
+Sessions of training and validation runs are compared by the discovery's model. Where both sessions are trained on,
+tyre_wear is an effect of the catalogue as any other. Where one is held out, the change that explains its deviation is
+fitted here, beside the model.
 """
 
 from __future__ import annotations

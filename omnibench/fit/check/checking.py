@@ -1,6 +1,6 @@
 """The check of a recording, step by step: what is misread, what is missing, and whether a calibration is needed.
 
-Whether a calibration is needed: the gain on runs that were not fitted, by the verdict of ``calibrate``.
+It is needed if it gains on runs that were not fitted, by the verdict of ``calibrate``.
 """
 
 from __future__ import annotations

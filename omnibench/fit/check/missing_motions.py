@@ -1,6 +1,6 @@
 """Motions that a recording lacks, and runs and repetitions that are too few, in words.
 
-Kinds of motion by their twists: those that a check finds missing, and those that a report shows as driven.
+A kind of motion is told by its twist; reports show those that were driven.
 """
 
 from __future__ import annotations

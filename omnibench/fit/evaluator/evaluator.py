@@ -8,8 +8,7 @@ are smooth functions of row 3 alone. Over a box they are expanded once in Chebys
 value decomposition leaves some hundred combinations (expansion_plan.py). The poses of a population then are two matrix
 products, whatever the sampling rate. A recording whose heading the box turns too far for one expansion is cut into
 segments, each in the frame of its anchor, whose heading is linear in row 3 too; they are joined in the end.
-
-The fast evaluator of runs that are read where they are used: one for each part of them.
+Runs that are read from files have an evaluator for each part of them.
 """
 
 from __future__ import annotations

@@ -29,8 +29,8 @@ from scipy.special import chdtri
 from omnibench.fit.least_squares.noise import LEAST_WHITE, NoiseEstimate, Whitener, estimate_noise
 from omnibench.fit.least_squares.nuisances import TURN
 from omnibench.fit.least_squares.repetitions import Differences, differences_between_repetitions
-from omnibench.fit.least_squares.start_frames import in_start_frames
 from omnibench.fit.least_squares.trajectory_fit import TrajectoryFit
+from omnibench.fit.least_squares.usable_runs import in_start_frames
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 

@@ -14,6 +14,7 @@ from omnibench.robot.kinematics import Array
 # far above rounding. Half of it and twice change no calibration (tests/benchmarks/constants_fit.py) and no discovery
 # (tests/benchmarks/constants.py).
 _DETERMINED = 1e-6
+_NOTHING = 1e-22  # share of the largest information: with _DETERMINED, columns of 1e-14 of its size are rounding
 _KEPT = 4  # Schur complements that are kept: beyond the matrix and beyond all effects, with forms or without (chosen)
 
 
@@ -130,17 +131,22 @@ class Given:
         return self._roots[key]
 
     def _roots_of(self, index: list[int]) -> Array:
-        scale = 1 / np.sqrt(np.maximum(self.total[index], 1e-300))
+        scale = self.scale(index)
         inner = self.information[np.ix_(index, index)] * np.outer(scale, scale)
         values, vectors = np.linalg.eigh(inner)
         known = values > _DETERMINED
         roots: Array = scale[:, None] * vectors[:, known] / np.sqrt(values[known])
         return roots
 
+    def scale(self, index: Sequence[int]) -> Array:
+        """Units (n,) in which columns have length one; of signals that no motion drives they are not their own."""
+        least = max(_NOTHING * float(self.total.max(initial=0.0)), 1e-300)
+        scale: Array = 1 / np.sqrt(np.maximum(self.total[list(index)], least))
+        return scale
+
     def share_left(self, index: Sequence[int]) -> float:
         """The largest share of itself that any direction of some columns keeps beyond those that are fitted, 0 to 1."""
-        index = list(index)
-        scale = 1 / np.sqrt(np.maximum(self.total[index], 1e-300))
+        index, scale = list(index), self.scale(index)
         return float(np.linalg.eigvalsh(self.information[np.ix_(index, index)] * np.outer(scale, scale))[-1])
 
     def estimate(self, index: Sequence[int]) -> tuple[Array, Array]:

@@ -57,8 +57,8 @@ from omnibench.errors import DataError
 from omnibench.fit.least_squares.noise import whiteners
 from omnibench.fit.least_squares.repetitions import common_poses, grouped
 from omnibench.fit.least_squares.roots import roots_of
-from omnibench.fit.least_squares.start_frames import in_start_frames
 from omnibench.fit.least_squares.trajectory_fit import TrajectoryFit
+from omnibench.fit.least_squares.usable_runs import in_start_frames
 from omnibench.fit.least_squares.whitened import whitened
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array

@@ -1,10 +1,8 @@
 """Uncertainty of a calibration: covariance of the matrix elements and of the wheels' physical parameters.
 
-Score vectors of runs under a robust loss, for the sandwich.
-
-With the ratios x = r / s of the norms r_i of weighted errors e_i to their scale s, psi(x) = x w(x) and u = e / |e|, a
-run's share of the loss sum_i p_i s^2 rho(x_i) has, with the derivatives J_i of e_i by the fitted numbers, the score and
-the Hessian
+Under a robust loss the sandwich takes these score vectors of the runs. With the ratios x = r / s of the norms r_i of
+weighted errors e_i to their scale s, psi(x) = x w(x) and u = e / |e|, a run's share of the loss sum_i p_i s^2 rho(x_i)
+has, with the derivatives J_i of e_i by the fitted numbers, the score and the Hessian
 
     sum_i p_i w(x_i) J_i'e_i,   sum_i p_i J_i' (w(x_i) (1 - u_i u_i') + psi'(x_i) u_i u_i') J_i.               (1)
 

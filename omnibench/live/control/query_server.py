@@ -19,8 +19,7 @@ from omnibench.live.control.orders import LONGEST, read_pose, read_sent_calibrat
 from omnibench.live.control.request_queue import MOST_WAITING, Request, RequestQueue, client_of
 from omnibench.live.estimation.saved_state import RobotMemory
 from omnibench.live.estimation.tracker import RobotTracker
-from omnibench.live.network.callbacks import direct
-from omnibench.live.network.rate_limiter import RateLimiter
+from omnibench.live.network.callbacks import RateLimiter, direct
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
 

@@ -5,9 +5,8 @@ of SLAM, and published. A pose of SLAM is decoded and checked, corrected for the
 reference (latency, lever arm of the LIDAR), and fused at its own time; the changed pose is published with the next
 wheel sample. There is no network here, and any thread may call.
 
-Calibration swap: another calibration takes over at the next wheel sample, if it is the same robot's.
-
-Pose query: where a robot was at a time of the last seconds.
+Another calibration of the same robot takes over at the next wheel sample. A query asks where the robot was at a time of
+the last seconds.
 """
 
 from __future__ import annotations

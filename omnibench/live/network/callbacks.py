@@ -1,7 +1,12 @@
-"""Callbacks that Zenoh calls in its own threads, without a queue in between, and answers collected by them."""
+"""Callbacks that Zenoh calls in its own threads, without a queue in between, and answers collected by them.
+
+A rate limiter bounds how often a message of the same kind is logged.
+"""
 
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Callable
 from threading import Event
 from typing import Any, Final
@@ -10,6 +15,28 @@ import zenoh
 from zenoh.handlers import Callback
 
 from omnibench.live.stopping import wait_until
+
+PERIOD: Final = 10.0  # s between two lines of the same kind; chosen
+
+
+class RateLimiter:
+    """Allows one line of each kind in ``period`` s (infinity: one in all). Safe to call from any thread."""
+
+    def __init__(self, period: float = PERIOD) -> None:
+        self._period = period
+        self._last: dict[str, float] = {}  # kind -> when a line was allowed, within the period
+        self._lock = threading.Lock()
+
+    def allows(self, kind: str) -> bool:
+        """True if a line of this kind may be logged now, which then counts as logged."""
+        now = time.monotonic()
+        with self._lock:
+            self._last = {other: at for other, at in self._last.items() if now - at < self._period}
+            if kind in self._last:
+                return False
+            self._last[kind] = now
+            return True
+
 
 _LOOK: Final = 0.002  # s between two looks at whether all have answered; chosen
 

@@ -5,7 +5,7 @@ stands still. With S_i the start pose of run i in the drive and p(t) its referen
 
     S_i p(0)^-1 p(t).
 
-A recording to replay: a data set's folder, or a comparison's config, whose data set is simulated when loaded.
+The recording is a data set's folder, or a comparison's config, whose data set is simulated when loaded.
 """
 
 from __future__ import annotations

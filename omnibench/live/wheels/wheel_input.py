@@ -22,7 +22,7 @@ from omnibench.live.wheels.steering_input import REORDERED, SteeringInput
 from omnibench.live.wheels.wheel_angles import WheelAngles
 from omnibench.live.wire.messages import JointState, MessageError
 from omnibench.robot.kinematics import Array
-from omnibench.robot.wheels.fastest import FASTEST, FASTEST_RIM, fastest_rates
+from omnibench.robot.wheels.drive import FASTEST, FASTEST_RIM, fastest_rates
 from omnibench.robot.wheels.joint_choice import JointChoice
 
 _SECOND = 1e9  # ns

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 import zenoh
 
 from omnibench.errors import ConfigError
-from omnibench.live.closing import Closing
+from omnibench.live.stopping import Closing
 from omnibench.live.wire.topic_listener import Arrival, TopicListener
 from omnibench.live.wire.topics import TOPICS, KeySpace
 

@@ -2,7 +2,7 @@
 
 To add an output, write its function and its row in OUTPUTS; a message type that is new goes to messages.py.
 
-Update: the estimates after one wheel sample, from which every output is made.
+An update has the estimates after one wheel sample, from which every output is made.
 """
 
 from __future__ import annotations

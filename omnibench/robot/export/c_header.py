@@ -1,6 +1,6 @@
 """Export of a calibration as a self-contained C99 header: the matrix and one step of the odometry.
 
-C99 code for the drive signals of robots with steered wheels, as wheels/drive.py computes them.
+Drive signals of robots with steered wheels are computed as in wheels/drive.py.
 """
 
 from __future__ import annotations

@@ -30,6 +30,15 @@ from numpy.typing import NDArray
 from omnibench.robot.arrays import Array
 from omnibench.robot.wheels.wheel import Wheel
 
+FASTEST = 100.0  # rad/s; chosen, above the wheels of usual robots
+FASTEST_RIM = 5.0  # m/s, of small wheels, which turn faster; chosen
+
+
+def fastest_rates(radii: Array) -> Array:
+    """Rates (N,), rad/s, that no wheels of radii (N,), m, exceed."""
+    rates: Array = np.maximum(FASTEST, FASTEST_RIM / radii)
+    return rates
+
 
 @dataclass(frozen=True)
 class Drive:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given as cases
 from hypothesis import strategies as st
 
@@ -75,3 +76,22 @@ def test_a_direction_that_others_make_is_no_direction() -> None:
     )
     assert given(twice, [0, 1]).rank([6]) == 0
     assert given(twice, [0, 1]).chi_square([6]) == 0.0
+
+
+@pytest.mark.parametrize("size", [1e-17, 1e-140])
+def test_a_signal_that_no_motion_drives_is_not_estimated_from_its_rounding(size: float) -> None:
+    """As of two wheels that share an encoder: DART's car got a matrix of 1e137, and discover a traceback."""
+    data, *_ = random_data(1, 5, np.zeros(3))
+    rounding = np.random.default_rng(2)
+    columns = tuple(np.column_stack([each, size * rounding.normal(0, 1, len(each))]) for each in data.columns)
+    undriven = type(data)(
+        data.residuals,
+        columns,
+        sum(each.T @ each for each in columns),
+        np.array([each.T @ own for each, own in zip(columns, data.residuals, strict=True)]),
+    )
+    values, covariance = given(undriven, []).estimate(range(7))
+    assert values[:6] == pytest.approx(given(data, []).estimate(range(6))[0], rel=1e-9)
+    assert abs(values[6] * size) < 1e-12
+    assert np.isfinite(covariance).all()
+    assert given(undriven, []).rank([6]) == 0

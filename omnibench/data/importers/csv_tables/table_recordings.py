@@ -2,8 +2,6 @@
 
 Distances, turns, positions and the like stand in a table of their own: a row for each, with its kind, value and
 standard deviation.
-
-The rows of a table that belong to each run.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Reference poses of a recording, and what the options make of them.
-
-Distances, turns, positions and the like of a recording, read as the options say.
-"""
+"""Reference poses of a recording, and what the options make of them."""
 
 from __future__ import annotations
 
