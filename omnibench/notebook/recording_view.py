@@ -16,8 +16,8 @@ from omnibench.data.references.run_references import References
 from omnibench.data.tables.dataset_tables import tables_of
 from omnibench.notebook.single_figure import drawn
 from omnibench.report.blocks import Figure, FigureGrid
-from omnibench.report.recording.drawing import REFERENCE_ITEM
 from omnibench.report.recording.room_figures import all_runs
+from omnibench.report.recording.scan_points import REFERENCE_ITEM
 from omnibench.report.style import plan
 from omnibench.report.traces import START, marks, path
 from omnibench.views import View

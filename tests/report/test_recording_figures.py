@@ -13,11 +13,10 @@ from recording_samples import COMMANDS, NOISE, TICK, Sample, sample
 from wheeled_samples import ROBOTS, driven
 
 from omnibench.data.scans import Mount, Scanner, ScansInMemory, TrajectoryScans
-from omnibench.report.recording.drawing import ODOMETRY_ITEM
 from omnibench.report.recording.player import player
 from omnibench.report.recording.room_figures import all_runs
 from omnibench.report.recording.runs import representative_runs
-from omnibench.report.recording.scan_points import scan_points, thinned
+from omnibench.report.recording.scan_points import ODOMETRY_ITEM, scan_points, thinned
 from omnibench.report.recording.wheel_figures import rate_step, wheel_rates
 from omnibench.report.robot_figures import is_placed
 from omnibench.robot.kinematics import Robot, Wheel

@@ -189,7 +189,8 @@ def _descend(fit: Fit, groups: Sequence[Group], values: Array) -> tuple[Fit, Arr
         else:
             fit, values, data = before
             break
-        if _size(step, covariance) < _STILL:
+        deviations = np.maximum(np.sqrt(np.diag(covariance)), 1e-300)
+        if float((np.abs(step) / deviations).max()) < _STILL:
             break
     return fit, values, data, columns
 
@@ -201,11 +202,6 @@ def _bends(groups: Sequence[Group]) -> bool:
 
 def _chi_square(data: Whitened) -> float:
     return sum(float(np.square(of_run).sum()) for of_run in data.residuals)
-
-
-def _size(step: Array, covariance: Array) -> float:
-    deviations = np.sqrt(np.diag(covariance))
-    return float((np.abs(step) / np.maximum(deviations, 1e-300)).max())
 
 
 def _covariance(fit: Fit, data: Whitened) -> EstimatedCovariance:

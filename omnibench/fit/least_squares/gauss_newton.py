@@ -153,17 +153,14 @@ def descend(fit: BoxedFit, weightings: Sequence[Weighting], tolerance: float) ->
         lower, size = _step(fit, weightings)
         settled = size < tolerance and lower is not None
         if lower is None:
-            settled = size < 10 * tolerance and _is_finite(fit)  # rounding hides the decrease
+            finite = bool(np.isfinite(fit.problem.cost(fit.vector[None])[0]))
+            settled = size < 10 * tolerance and finite  # rounding hides the decrease
             break
         fit = lower
         if settled:
             break
     fit = fit.with_nuisances(replace(fit.trajectories.nuisances, deviations=deviations))
     return Descent(fit, fit.linearised(weightings), settled)
-
-
-def _is_finite(fit: BoxedFit) -> bool:
-    return bool(np.isfinite(fit.problem.cost(fit.vector[None])[0]))
 
 
 def _step(fit: BoxedFit, weightings: Sequence[Weighting]) -> tuple[BoxedFit | None, float]:

@@ -12,15 +12,17 @@ from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.true_poses import TruePath
 from omnibench.report.blocks import LegendItem, Player
 from omnibench.report.numbers import listing
-from omnibench.report.recording.drawing import (
+from omnibench.report.recording.scan_points import (
     ODOMETRY_ITEM,
     PLAN_ITEM,
     REFERENCE_ITEM,
     SCANS,
     SCANS_ITEM,
     TRUTH_ITEM,
+    evenly,
+    poses_at,
+    scan_points,
 )
-from omnibench.report.recording.scan_points import evenly, poses_at, scan_points
 from omnibench.report.robot_figures import is_placed
 from omnibench.report.style import INK
 from omnibench.robot.kinematics import Array, Robot

@@ -12,15 +12,17 @@ from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.true_poses import TruePath
 from omnibench.report.blocks import Figure, FigureGrid, LegendItem
 from omnibench.report.numbers import count, round_down
-from omnibench.report.recording.drawing import (
+from omnibench.report.recording.scan_points import (
     COVARIANCE_ITEM,
     ODOMETRY_ITEM,
     PLAN_ITEM,
     REFERENCE_ITEM,
     SCANS_ITEM,
     TRUTH_ITEM,
+    evenly,
+    scan_points,
+    thinned,
 )
-from omnibench.report.recording.scan_points import evenly, scan_points, thinned
 from omnibench.report.style import plan
 from omnibench.report.traces import START, joined, line, marks, path
 from omnibench.robot.kinematics import Array

@@ -1,4 +1,4 @@
-"""Scan points of a run in the frame of its reference poses."""
+"""Scan points of a run in the frame of its reference poses, and the legend that figures of a recording share."""
 
 from __future__ import annotations
 
@@ -6,8 +6,20 @@ import numpy as np
 
 from omnibench.data.dataset import Trajectory
 from omnibench.data.scans import Scanner, TrajectoryScans
+from omnibench.report.blocks import LegendItem
+from omnibench.report.style import INK, PALETTE, REFERENCE, THEORETICAL
 from omnibench.robot.kinematics import Array
 from omnibench.robot.planar import compose, interpolated
+
+SCANS, TRUTH, COVARIANCE, PLAN = "#7c8894", INK, PALETTE[0], "#b8977e"
+
+REFERENCE_ITEM = LegendItem("reference", "reference poses", REFERENCE)
+ODOMETRY_ITEM = LegendItem("odometry", "odometry by the design values", THEORETICAL, "dash")
+TRUTH_ITEM = LegendItem("truth", "true path", TRUTH, "dot")
+SCANS_ITEM = LegendItem("scans", "scan points", SCANS)
+PLAN_ITEM = LegendItem("plan", "floor plan (truth)", PLAN)
+COVARIANCE_ITEM = LegendItem("covariance", "covariance", COVARIANCE)
+
 
 _GOES_ON = 0.1  # s of motion after the last pose: longer than a scan takes
 

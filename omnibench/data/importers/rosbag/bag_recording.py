@@ -27,8 +27,7 @@ from omnibench.data.importers.rosbag.topic_choice import (
 from omnibench.data.importers.rosbag.transform_poses import read_transforms
 from omnibench.data.importers.runs.cut_run import cut_run
 from omnibench.data.importers.runs.reference_stream import ReferenceStream
-from omnibench.data.importers.runs.rests import departure, find_rests
-from omnibench.data.importers.runs.run_spans import Span, breaks, from_rest, parted
+from omnibench.data.importers.runs.run_spans import Span, breaks, departure, find_rests, from_rest, parted
 from omnibench.data.importers.wheel_samples import Losses, WheelSamples, wheel_samples
 from omnibench.errors import DataError, one_line
 from omnibench.robot.kinematics import Array

@@ -35,7 +35,7 @@ from omnibench.data.importers.rosbag.message_streams import MessageFilter, Stamp
 from omnibench.data.importers.rosbag.rosbag_options import RosbagOptions
 from omnibench.data.importers.rosbag.topic_choice import FIX
 from omnibench.data.importers.runs.reference_stream import measured_as
-from omnibench.data.importers.runs.rests import find_rests
+from omnibench.data.importers.runs.run_spans import find_rests
 from omnibench.data.importers.wheel_samples import WheelSamples
 from omnibench.data.references.run_references import Reference, References
 from omnibench.errors import DataError
