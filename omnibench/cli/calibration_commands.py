@@ -281,12 +281,12 @@ def export(
 
     load_given_plugins(plugins)
     exported = export_calibration(read_calibration(calibration), to)
+    file = output / exported.file_name if output is not None and output.is_dir() else output
+    refuse_existing(file, force=force)
     warn(exported.warnings)
-    if output is None:
+    if file is None:
         typer.echo(exported.text, nl=False)
         print_ending(f"{to}: printed, not written", "write it to a file with -o FILE")
     else:
-        file = output / exported.file_name if output.is_dir() else output
-        refuse_existing(file, force=force)
         write_text(file, exported.text)
         print_ending(f"{file} is written for {to}", "load it where the robot's odometry is computed")

@@ -54,7 +54,7 @@ def test_a_robot_that_is_not_there_is_one_line_with_the_nearest_that_is(
 
 def test_control_characters_of_a_robot_do_not_reach_the_terminal(loopback: Loopback, apr02: AnnouncedRobot) -> None:
     apr02.answer_health("stale", "\x1b[2Jgone \u202eback\x07")
-    run = omnibench("listen", "apr02", "--connect", loopback.address, "--seconds", "1")
+    run = omnibench("listen", "apr02", "--connect", loopback.address, "--seconds", "4")
     assert "apr02: no odometry yet, stale: ?[2Jgone ?back?" in run.stdout
     assert (run.stdout + run.stderr).replace("\n", "").isprintable()
 

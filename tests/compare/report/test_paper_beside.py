@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from report_samples import config, flower, run
 
-from omnibench.compare.report.matrices import differences, matrix_section
+from omnibench.compare.report.matrices import matrix_section
 from omnibench.compare.report.path_figures import chosen_trajectories, drawn_models
 from omnibench.compare.report.published_tables import published_blocks
 from omnibench.compare.report.search_figures import search_diagram
 from omnibench.compare.report.view import DatasetView, views
 from omnibench.report.blocks import Callout, Table
+from omnibench.robot.kinematics import relative_deviations
 
 LABELS = {"genetic": "Non-parametric IK", "parametric (GA)": "Parametric IK"}
 COSTS = {"theoretical_train_cost": 0.1234, "train_cost": 0.0215}
@@ -61,7 +62,7 @@ def test_eq_11_is_printed_for_the_parametric_matrix_over_the_genetic_one(view: D
     )
     (row,) = table.rows
     matrices = {entry.label: np.array(run.matrix) for entry, run in view.calibrated}
-    shares = 100 * differences(matrices["parametric (GA)"], matrices["genetic"]).ravel()
+    shares = 100 * relative_deviations(matrices["parametric (GA)"], matrices["genetic"]).ravel()
     assert row.cells[0].text == "parametric (GA)"
     shown = [cell.text.replace("−", "-") for cell in row.cells[1:]]
     assert [text for text in shown if "%" in text] == [f"{share:+.3f} %" for share in shares if np.isfinite(share)]
