@@ -140,7 +140,7 @@ def test_a_mistake_in_a_config_is_one_line(changes: dict[str, Any], parts: list[
 @pytest.mark.parametrize(
     ("text", "part"),
     [
-        ("[" * 3000, "nested too deeply"),
+        ("[" * 3000, "exceeded maximum nesting depth"),
         ("name: 2023-99-99\n", "not valid YAML: month must be in 1..12"),
         ("name: 0b_\n", "not valid YAML: invalid literal for int()"),
         ("name: [\n", "not valid YAML: "),
