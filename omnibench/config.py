@@ -183,10 +183,7 @@ def _line(event: Any) -> int:
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes what the loader would otherwise take for a number, and writes out what stands twice."""
-
-    def ignore_aliases(self, data: Any) -> bool:  # noqa: ARG002
-        return True
+    """Quotes what the loader would otherwise take for a number."""
 
 
 _Dumper.yaml_implicit_resolvers = _Scalars.yaml_implicit_resolvers
