@@ -43,5 +43,5 @@ def test_the_fitted_member_is_said_and_held_by_the_model(saturating: Discovery, 
     assert effect.form.startswith("0.")
     assert effect.form.endswith("times as large at large accelerations as at the other end")
     write_calibration(saturating.extended, tmp_path / "model.yaml")
-    (term,) = read_calibration(tmp_path / "model.yaml").effects
+    (term,) = (each for each in read_calibration(tmp_path / "model.yaml").effects if each.name == effect.name)
     assert {"k", "k:acceleration:1", "acceleration:high"} <= set(term.parameters)
