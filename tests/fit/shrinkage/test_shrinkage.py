@@ -80,7 +80,8 @@ def test_the_posterior_weighs_design_and_data_by_their_variances() -> None:
 
 def test_a_posterior_variance_has_the_degrees_of_freedom_of_the_part_that_the_data_estimate() -> None:
     """Satterthwaite: 2 E^2 / Var of a sum of an exact part and one, w, whose variance is 2 w^2 / f."""
-    free, shrunk_little, run = calibrate(RECORDING, unidentified="keep"), shrunk(1e3), shrunk(0.01)
+    free = calibrate(RECORDING, "trajectory_ml", unidentified="keep")
+    shrunk_little, run = (shrunk(tolerance, calibrator="trajectory_ml") for tolerance in (1e3, 0.003))
     assert free.uncertainty is not None
     assert run.uncertainty is not None
     posterior = run.uncertainty.covariance

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from drives import EXACT, ORIGIN, PERIOD, slam
 from steered import CAR, DIFFERENTIAL, SKID, SWERVE, TRICYCLE, calibration, drive, only
 
 from omnibench.errors import DataError
-from omnibench.live.estimation.saved_state import RobotMemory
+from omnibench.live.estimation.saved_state import RobotMemory, SavedState
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.fusion.pose_fusion import FusionSettings
 from omnibench.live.wheels.wheel_input import WheelSettings
@@ -171,15 +170,12 @@ class TestRestarts:
         uninterrupted = odometry(fed(RobotTracker("base", path.using), path.payloads()))
         np.testing.assert_allclose(found, uninterrupted, atol=1e-12)
 
-    def test_a_state_of_an_earlier_version_has_no_steering_and_waits_for_it(self, tmp_path: Path) -> None:
+    def test_a_robot_whose_saved_state_has_no_steering_waits_for_it(self) -> None:
         path = drive(0.1)
         state = {"sequence": 5, "stamp": ORIGIN, "wall": 1.8e9, "positions": path.angles[0].tolist()}
         state |= {"pose": [1.0, 2.0, 0.3], "covariance": (1e-4 * np.eye(3)).ravel().tolist()}
-        (tmp_path / "base.state.json").write_text(json.dumps(state))
-        saved = RobotMemory(tmp_path, "base").load()
-        assert saved is not None
         robot = RobotTracker("base", path.using)
-        robot.resume(saved, 0.0, 1.8e9)
+        robot.resume(SavedState(**state), 0.0, 1.8e9)
         bare = path.samples()[1]
         assert robot.take_wheels(JOINT_STATE.encode(only(bare, *bare.names[:4])), PERIOD) == []
         updates = fed(robot, path.payloads()[2:], 2 * PERIOD)
