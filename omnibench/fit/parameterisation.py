@@ -137,8 +137,7 @@ class MatrixElements:
 
     @property
     def prior_root(self) -> Array:
-        tolerance = tolerance_of(self.robot, self.tolerance)
-        return self.projection @ prior_root(self.robot, tolerance, fitted_mount=not self.known_mount)
+        return self.projection @ prior_root(self.robot, tolerance_of(self.robot, self.tolerance))
 
     @cached_property
     def rows(self) -> Array:

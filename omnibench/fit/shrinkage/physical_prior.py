@@ -12,7 +12,10 @@ the angle turns into each other:
 
     D = a K0 [0 -1; 1 0] on these two.                                                              (2)
 
-The tracked point of a robot that cannot slide may stand elsewhere, where it is fitted by default: Eq. (2) of prior.py.
+Where the tracked point of a robot is not known (prior.py), it stands at (x, y) from where the robot says, and looks
+into the direction b: the rows of x and y change by
+
+    D_1 = -y K0_3 + b K0_2,    D_2 = x K0_3 - b K0_1.                                               (3)
 
 Every wheel that turns loses the rate -d (effect ``wheel_dead_zone``), d being normal, too.
 """
@@ -26,11 +29,12 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from omnibench.fit.shrinkage.prior import POINT, YAW, default_mount, point_changes
+from omnibench.fit.shrinkage.prior import default_mount
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.robot_class import RobotClass, class_of
 
 _OFFSET = 0.1  # rad, of a steering angle's zero: a mounted encoder is trued to some degrees
+_POINT, _YAW = 0.05, 0.035  # m, rad: a tracker that is not on the axle's middle; of the corelli tricycle by 0.1 m
 
 
 @dataclass(frozen=True)
@@ -68,7 +72,7 @@ def physical_tolerance(robot: Robot) -> PhysicalTolerance:
 
 
 def physical_prior_root(robot: Robot, tolerance: PhysicalTolerance) -> Array:
-    """A root (3M, k) of the covariance of the matrix elements, row by row, about the design: Eq. (1) and (2).
+    """A root (3M, k) of the covariance of the matrix elements, row by row, about the design: Eq. (1) to (3).
 
     Rows that no wheel drives (the sideways one of a robot that cannot slide) move with the tracked point alone.
     """
@@ -83,7 +87,13 @@ def physical_prior_root(robot: Robot, tolerance: PhysicalTolerance) -> Array:
             roots.append(root)
     roots += [_turned(design, pair) * _OFFSET for pair in _pairs(robot, columns)]
     if default_mount(robot) == "fit" and not robot.slides:
-        roots += point_changes(robot, POINT, YAW)
+        x, y, heading = design
+        none = np.zeros_like(x)
+        roots += [
+            _POINT * np.array([none, heading, none]),
+            _POINT * np.array([-heading, none, none]),
+            _YAW * np.array([y, -x, none]),
+        ]
     return np.array([root.ravel() for root in roots]).T
 
 

@@ -5,10 +5,7 @@ With the design K0 and the largest element s_i of its row i, the elements of a r
     k_ij = k0_ij (1 + g_i) + s_i e_ij                                                             (1)
 
 with independent normal e_ij, for wheels that are not as drawn, and g_i, for what shortens a whole motion: rollers that
-slip, tyres that skid in a turn. The tracked point, where it is fitted, and the point about which a skid-steered base
-turns may stand at (x, y) from where the robot says, and look into the direction b. The rows of x and y then change by
-
-    D_1 = -y K0_3 + b K0_2,    D_2 = x K0_3 - b K0_1.                                             (2)
+slip, tyres that skid in a turn.
 """
 
 from __future__ import annotations
@@ -28,23 +25,17 @@ MountChoice = Literal["known", "fit"]
 
 @dataclass(frozen=True)
 class Tolerance:
-    """Standard deviations: of every element (e, share of the row's largest), each row's factor (g) and the point.
-
-    point, yaw: of x and y, m, and of b, rad, Eq. (2).
-    """
+    """Standard deviations: of every element (e, share of the row's largest) and of each row's factor (g), Eq. (1)."""
 
     elements: float
     rows: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    point: float = 0.0
-    yaw: float = 0.0
 
 
 # Radius and place of a wheel are known to 1 or 2 %. What all wheels share is known less well: the load on tyres, which
 # changes their radii, and the track on which they turn (Borenstein and Feng, IEEE T-RA 12:869, 1996, sections 2 and 3).
 # Rollers lose or gain some per cent of a motion, 8 on the mecanum base of OptiOdom; a skid-steered base turns by 0.5 to
 # 0.8 of what its track says (Mandow et al., IROS 2007). Half of each and twice: tests/benchmarks/shrink_study.py.
-POINT, YAW = 0.05, 0.035  # m, rad: a tracker that is not on the axle's middle; of the corelli tricycle by 0.1 m
-_USUAL = Tolerance(0.02, (0.05, 0.05, 0.05), POINT, YAW)
+_USUAL = Tolerance(0.02, (0.05, 0.05, 0.05))
 TOLERANCES: Mapping[RobotClass, Tolerance] = MappingProxyType(
     {
         "differential": _USUAL,
@@ -52,8 +43,8 @@ TOLERANCES: Mapping[RobotClass, Tolerance] = MappingProxyType(
         "car": _USUAL,
         "swerve": _USUAL,
         "omni": _USUAL,
-        "mecanum": Tolerance(0.02, (0.06, 0.06, 0.06), POINT, YAW),
-        "skid": Tolerance(0.02, (0.05, 0.05, 0.2), POINT, YAW),
+        "mecanum": Tolerance(0.02, (0.06, 0.06, 0.06)),
+        "skid": Tolerance(0.02, (0.05, 0.05, 0.2)),
         "mixed": _USUAL,
     }
 )
@@ -64,25 +55,16 @@ _UNKNOWN_MOUNTS: frozenset[RobotClass] = frozenset({"tricycle", "car"})
 
 
 def tolerance_of(robot: Robot, elements: float | None = None) -> Tolerance:
-    """The tolerance of a robot's class; elements: another share for the elements, and nothing else is off."""
+    """The tolerance of a robot's class; elements: another share for the elements, without factors of rows."""
     return TOLERANCES[class_of(robot)] if elements is None else Tolerance(elements)
 
 
-def prior_root(robot: Robot, tolerance: Tolerance, *, fitted_mount: bool = False) -> Array:
-    """A root (3M, k) of the covariance of the matrix elements, row by row, about the design: Eq. (1) and (2)."""
+def prior_root(robot: Robot, tolerance: Tolerance) -> Array:
+    """A root (3M, 3M + 3) of the covariance of the matrix elements, row by row, about the design: Eq. (1)."""
     design = robot.inverse_kinematic_matrix
     elements = np.diag(np.repeat(tolerance.elements * robot.row_scales, design.shape[1]))
     rows = [share * (np.eye(3)[:, [row]] * design).ravel() for row, share in enumerate(tolerance.rows)]
-    point = point_changes(robot, tolerance.point, tolerance.yaw) if fitted_mount or robot.skid else []
-    return np.column_stack([elements, *rows, *point])
-
-
-def point_changes(robot: Robot, point: float, yaw: float) -> list[Array]:
-    """Changes (3M,) of the elements by a tracked point that is off by ``point`` (m) or ``yaw``: Eq. (2)."""
-    x, y, heading = robot.inverse_kinematic_matrix
-    none = np.zeros_like(x)
-    changes = [none, point * heading, none], [-point * heading, none, none], [yaw * y, -yaw * x, none]
-    return [np.concatenate(change) for change in changes]
+    return np.column_stack([elements, *rows])
 
 
 def default_unidentified(robot: Robot) -> Literal["keep", "shrink"]:

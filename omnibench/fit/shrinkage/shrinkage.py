@@ -1,22 +1,14 @@
 """Shrinkage: what data say of a matrix, weighed against how well its design is known (empirical Bayes).
 
-A calibrator's answer k has the covariance W by the noise model of its data. The matrices of robots of one class have
-the covariance P = R R' about their designs k0 (prior.py). For normal errors the posterior covariance and mean are
+A calibrator's answer k has the covariance S, by the data. The matrices of robots of one class have the covariance
+P = R R' about their designs k0 (prior.py). For normal errors the posterior covariance and mean are
 
-    C = R (1 + R' J R)^-1 R',    k0 + C J (k - k0),    J = W^+                                        (1)
+    C = R (1 + R' S^+ R)^-1 R',    k0 + C S^+ (k - k0)                                                (1)
 
 (Lindley and Smith, J. R. Stat. Soc. B 34:1, 1972). Along what the data tell well J is large, and k stands; along what
-they hardly tell it is small, and the design does. W is estimated from the same data, which makes it empirical Bayes
+they hardly tell it is small, and the design does. S is estimated from the same data, which makes it empirical Bayes
 (Efron and Morris, J. Am. Stat. Assoc. 70:311, 1975). Directions that only slip may have driven keep the design, as
-without shrinkage: W tells of the noise of the runs, and slip may be the same in all of them.
-
-The scatter of the runs gives the covariance S of k whether or not the noise model is right, but not with enough degrees
-of freedom to weigh by it: correlations that few runs show by chance would carry what the design says of one row into
-another. So it only says how uncertain (1) is, whose mean squared error for any J is
-
-    C J S J C + (1 - C J) P (1 - C J)',                                                               (2)
-
-which is C if S is W.
+without shrinkage: S tells of the scatter of the runs, and slip may be the same in all of them.
 """
 
 from __future__ import annotations
@@ -43,10 +35,9 @@ _ROUNDING = 1e-10  # share of the largest variance: a smaller one is rounding of
 
 @dataclass(frozen=True, eq=False)
 class _Knowledge:
-    """What the data say: J (n, n), J S J (n, n) of Eq. (2), degrees of freedom (n,) of S, noise, source in words."""
+    """What the data say: information S^+ (n, n), degrees of freedom (n,) of its estimate, noise, source in words."""
 
     information: Array
-    scatter: Array
     degrees_of_freedom: Array
     noise: Noise | None
     words: str
@@ -66,12 +57,7 @@ def shrunk(problem: CalibrationProblem, result: RunResult, *, fitted: bool = Tru
     root = problem.parameterisation.prior_root * problem.free[:, None]
     # eigh bears information of any size: data without noise have so much that 1 + S is singular to rounding
     strengths, directions = np.linalg.eigh(root.T @ known.information @ root)
-    beside = root @ directions @ np.diag(1 / (1 + np.maximum(strengths, 0.0))) @ directions.T  # (1 - C J) R
-    posterior = beside @ root.T
-    of_data = posterior @ known.scatter @ posterior
-    covariance = of_data + beside @ beside.T  # Eq. (2)
-    # The prior's part is exact: degrees of freedom are the data's over the square of its share (Satterthwaite 1946).
-    shares = np.clip(np.diag(of_data) / np.maximum(np.diag(covariance), 1e-300), 1e-9, 1.0)
+    posterior = root @ directions @ np.diag(1 / (1 + np.maximum(strengths, 0.0))) @ directions.T @ root.T
     deviation = problem.parameterisation.projection @ (result.vector - problem.start)
     vector = problem.settled(problem.start + posterior @ known.information @ deviation)
     cost = float(problem.values(vector[None])[0])
@@ -81,8 +67,8 @@ def shrunk(problem: CalibrationProblem, result: RunResult, *, fitted: bool = Tru
         vector=vector,
         matrix=problem.matrix(vector),
         cost=cost,
-        covariance=None if misled else covariance,
-        degrees_of_freedom=np.minimum(known.degrees_of_freedom / np.square(shares), MANY),
+        covariance=None if misled else posterior,
+        degrees_of_freedom=_freedom(posterior, known),
         noise=known.noise,
         shrinkage=Shrinkage(result.cost, f"the design's tolerance and {known.words}"),
         reason=f"{result.reason}; shrunk to the design, which changes the cost by {_added(problem, result.cost, cost)}",
@@ -112,14 +98,13 @@ def _knowledge(problem: CalibrationProblem, result: RunResult) -> _Knowledge:
         except NoCovarianceError:
             pass
         else:
-            weights = np.linalg.pinv(slopes @ answer.model @ slopes.T, rcond=_ROUNDING, hermitian=True) @ slopes
-            scatter = weights.T @ slopes @ answer.of_vector.matrix @ slopes.T @ weights
+            told = slopes @ answer.steadied @ slopes.T
+            information = slopes.T @ np.linalg.pinv(told, rcond=_ROUNDING, hermitian=True) @ slopes
             freedom = np.broadcast_to(answer.of_vector.degrees_of_freedom, problem.size)
-            return _Knowledge(slopes.T @ weights, scatter, np.array(freedom), answer.noise, answer.source)
+            return _Knowledge(information, np.array(freedom), answer.noise, answer.source)
     every, noise, words = _information(problem, result.matrix)
     columns = unit[:, None] * slopes
-    information = columns.T @ every @ columns
-    return _Knowledge(information, information, np.full(problem.size, MANY), noise, words)
+    return _Knowledge(columns.T @ every @ columns, np.full(problem.size, MANY), noise, words)
 
 
 def _information(problem: CalibrationProblem, matrix: Array) -> tuple[Array, Noise | None, str]:
@@ -135,3 +120,14 @@ def _information(problem: CalibrationProblem, matrix: Array) -> tuple[Array, Noi
     if measured:
         total = total + information_of_references(problem.robot, measured, problem.integration, poses=False)
     return total, noise, words
+
+
+def _freedom(posterior: Array, known: _Knowledge) -> Array:
+    """Degrees of freedom (n,) of the posterior variances, which are C S^+ C from the data and else from the prior.
+
+    The prior's part is exact, so that they are those of the data over the square of its share (Satterthwaite 1946).
+    """
+    parts, whole = np.diag(posterior @ known.information @ posterior), np.maximum(np.diag(posterior), 1e-300)
+    shares = np.clip(parts / whole, 1e-9, 1.0)
+    freedom: Array = np.minimum(known.degrees_of_freedom / np.square(shares), MANY)
+    return freedom

@@ -96,6 +96,7 @@ _FEWEST_CLUSTERS = 4
 # times the true ones with 12 runs, and twice as wide, those of Laplace's errors are a third too large
 # (tests/benchmarks/kernel_width.py).
 _KERNEL = 0.7
+_LEAST_SEEN = 0.1  # share of the working model's variance; see Sandwich.steadied
 _INTERPOLATED = 1e-6  # share of the median error: smaller ones were made zero by the fit, up to rounding
 
 
@@ -133,6 +134,15 @@ class Sandwich:
     words: str
     clustered: bool = False
     lack_of_fit: bool = False
+
+    @property
+    def steadied(self) -> Array:
+        """The covariance, in no direction smaller than a share of the working model's: few runs may not scatter there.
+
+        Of n runs' scatter in d directions the smallest eigenvalue is (1 - sqrt(d/n))^2 of the true one (Marchenko and
+        Pastur, Math. USSR-Sb. 1:457, 1967), which is a tenth for n near 2 d; fewer runs say nothing of that direction.
+        """
+        return wider(self.covariance, _LEAST_SEEN * self.model)
 
 
 def scores_of_runs(

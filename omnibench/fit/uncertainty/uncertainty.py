@@ -180,11 +180,11 @@ def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertaint
 class AnswerCovariance:
     """The covariance of a searched vector, the noise of the reference poses; basis and source as in Uncertainty.
 
-    model (n, n): the covariance by the noise model alone, at the size that the scatter shows.
+    steadied (n, n): the covariance, where it rests on the scatter of few runs drawn to a working model's.
     """
 
     of_vector: EstimatedCovariance
-    model: Array
+    steadied: Array
     noise: Noise
     basis: Basis
     source: str
@@ -200,7 +200,7 @@ def covariance_of_answer(problem: CalibrationProblem, result: RunResult) -> Answ
     if result.covariance is None:
         scatter = _by_scatter(problem, result, noise)
         estimated = EstimatedCovariance(scatter.covariance, scatter.effective_freedom)
-        return AnswerCovariance(estimated, scatter.model, noise, "scatter", scatter.words)
+        return AnswerCovariance(estimated, scatter.steadied, noise, "scatter", scatter.words)
     freedom = np.inf if result.degrees_of_freedom is None else result.degrees_of_freedom
     basis: Basis = "likelihood" if result.shrinkage is None else "posterior"
     source = "the calibrator's own (see its reason)" if result.shrinkage is None else result.shrinkage.source
