@@ -75,13 +75,15 @@ def open_backend(
     from omnibench.jobs.dask_cluster import checked_requirements, dask_client, say_cluster
 
     address = None if choice.name == "dask" else choice.name
-    if choice.name.startswith("tcp:"):
-        way = "with tls://HOST:PORT it asks for certificates (omnibench guide scale)"
-        report(
-            Progress("tcp", result=f"warning: whoever reaches {choice.name} runs code on its workers and here; {way}")
-        )
     with dask_client(address, choice.workers, choice.tls, report) as client:
         backend = DaskBackend(client, checked_requirements(client, preload), report)
+        if choice.name.startswith("tcp:"):
+            way = "with tls://HOST:PORT it asks for certificates (omnibench guide scale)"
+            report(
+                Progress(
+                    "tcp", result=f"warning: whoever reaches {choice.name} runs code on its workers and here; {way}"
+                )
+            )
         say_cluster(client, report)
         yield backend
 

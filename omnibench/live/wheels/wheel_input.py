@@ -1,9 +1,4 @@
-"""From wheel messages to wheel steps: messages are put in order, repaired or refused, and counted.
-
-A message is late, doubled, or next. One whose stamp is too far from the last one waits until others confirm the new
-time (a clock that jumped); one after a silence that this machine's clock saw too is a step of unknown path. Messages
-that hold steering joints alone make no step; their angles are those of the next wheel sample.
-"""
+"""From wheel messages to wheel steps: messages are put in order, repaired or refused, and counted."""
 
 from __future__ import annotations
 
@@ -26,8 +21,7 @@ from omnibench.robot.wheels.drive import FASTEST, FASTEST_RIM, fastest_rates
 from omnibench.robot.wheels.joint_choice import JointChoice
 
 _SECOND = 1e9  # ns
-# All of these are chosen.
-_CONFIRMATION = 3  # stamps in a row that confirm a new time of the sender's clock
+_CONFIRMATION = 3  # stamps in a row that confirm a new time of the sender's clock (chosen, as all here)
 _SET_BACK = 3  # late samples in a row; so many are of a clock that was set back, and not out of order
 _SLACK = 0.1  # s, by which arrivals may scatter
 _LEARNING = 10  # samples, whose lower quartile gives the first period, so that lost ones do not lengthen it
