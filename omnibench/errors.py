@@ -29,7 +29,7 @@ def visible(text: str) -> str:
 
 
 _SHORT = reprlib.Repr()
-_SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother = 2, 60, 60
+_SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother = 2, 60, 61  # 61: too long, shown by its type
 
 
 def shown(value: object) -> str:

@@ -154,6 +154,7 @@ def results_locked(folder: Path) -> Iterator[None]:
     import fcntl
 
     made = [parent for parent in (folder, *folder.parents) if not parent.exists()]
+    check_place(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(folder, os.O_RDONLY)

@@ -87,15 +87,15 @@ def test_what_came_when_too_many_waited_is_counted(tmp_path: Path) -> None:
 
 
 def test_large_messages_that_wait_are_bounded_by_their_bytes(tmp_path: Path) -> None:
-    megabyte = bytes(1_000_000)
+    half_megabyte = bytes(500_000)
     with running(config_of(tmp_path)) as (node, session):
         service = node._services[0]
         wheels = session.declare_publisher("apr/joint_states", congestion_control=zenoh.CongestionControl.BLOCK)
         until(lambda: wheels.matching_status.matching, "the node's subscription")
         with service._working:
-            for _ in range(50):
-                wheels.put(megabyte)
-            until(lambda: node.health("apr").counts["overflow"] == 18, "the messages that had no place")
-        until(lambda: node.health("apr").counts["undecodable"] == 32, "the messages that had")
+            for _ in range(100):
+                wheels.put(half_megabyte)
+            until(lambda: node.health("apr").counts["overflow"] == 36, "the messages that had no place")
+        until(lambda: node.health("apr").counts["undecodable"] == 64, "the messages that had")
         wheels.put(JOINT_STATE.encode(drive(1.0).samples()[0]))  # and there is room again
         until(lambda: node.health("apr").counts["samples"] == 1, "a sample")

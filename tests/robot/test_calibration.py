@@ -355,7 +355,7 @@ def test_binary_content_is_refused_in_one_line_that_names_the_file(tmp_path: Pat
         ({"covariance": (-np.eye(9)).tolist()}, "covariance is not positive semi-definite"),
         ({"covariance": np.triu(np.ones((9, 9))).tolist()}, "covariance is not symmetric"),
         ({"noise": {"walk_position": 1e200}}, "noise.walk_position: Input should be less than or equal to 1000"),
-        ({"name": "\ud800"}, "name: contains characters that cannot be printed"),
+        ({"name": "\ud800"}, "name: Input should be a valid string"),
     ],
 )
 def test_what_no_calibration_can_be_is_refused(changes: dict[str, object], reason: str) -> None:

@@ -246,6 +246,7 @@ class TestTheTruth:
         assert {file.name for file in (tmp_path / "data").iterdir()} == {
             "dataset.yaml",
             "trajectories.parquet",
+            "commands.parquet",
             "wheels.parquet",
             "poses.parquet",
             "scans.parquet",

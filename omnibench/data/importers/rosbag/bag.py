@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from omnibench.config import read_yaml
-from omnibench.errors import DataError, UnknownNameError
+from omnibench.errors import ConfigError, DataError, UnknownNameError
 from omnibench.files import check_file
 from omnibench.words import plural
 
@@ -114,7 +114,10 @@ def open_bag(path: Path, recorded: Sequence[str] = ()) -> Iterator[Bag]:
     from rosbags.typesys import Stores, get_typestore
 
     if path.is_dir() and (path / _METADATA).exists():
-        read_yaml(path / _METADATA)  # within limits, which rosbags has not
+        try:
+            read_yaml(path / _METADATA)  # within limits, which rosbags has not
+        except ConfigError as error:
+            raise DataError(str(error)) from None
     for file in sorted(path.iterdir()) if path.is_dir() else [path]:
         if file.suffix in _SUFFIXES:
             check_file(file)
