@@ -210,6 +210,7 @@ def main() -> None:
         name: prior.Tolerance(
             arguments.factor * each.elements,
             tuple(arguments.factor * row for row in each.rows),  # type: ignore[arg-type]
+            arguments.factor * each.centre,
         )
         for name, each in prior.TOLERANCES.items()
     }
