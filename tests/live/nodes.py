@@ -135,3 +135,9 @@ def sent_one_by_one(publisher: zenoh.Publisher, samples: list[JointState], heard
 def as_text(chosen: Calibration) -> str:
     """A calibration file's content."""
     return to_yaml(chosen)
+
+
+def peak_memory(process: int) -> int:
+    """The most memory that a process has had, in MB."""
+    lines = Path(f"/proc/{process}/status").read_text(encoding="ascii").splitlines()
+    return next(int(line.split()[1]) // 1024 for line in lines if line.startswith("VmHWM"))

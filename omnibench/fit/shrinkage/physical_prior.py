@@ -29,7 +29,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from omnibench.fit.shrinkage.prior import default_mount
+from omnibench.fit.shrinkage.prior import changes_by_centre, default_mount
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.robot_class import RobotClass, class_of
 
@@ -87,13 +87,8 @@ def physical_prior_root(robot: Robot, tolerance: PhysicalTolerance) -> Array:
             roots.append(root)
     roots += [_turned(design, pair) * _OFFSET for pair in _pairs(robot, columns)]
     if default_mount(robot) == "fit" and not robot.slides:
-        x, y, heading = design
-        none = np.zeros_like(x)
-        roots += [
-            _POINT * np.array([none, heading, none]),
-            _POINT * np.array([-heading, none, none]),
-            _YAW * np.array([y, -x, none]),
-        ]
+        x, y, _ = design
+        roots += [*(_POINT * changes_by_centre(robot)), _YAW * np.array([y, -x, np.zeros_like(x)])]
     return np.array([root.ravel() for root in roots]).T
 
 

@@ -73,12 +73,15 @@ def prior_root(robot: Robot, tolerance: Tolerance) -> Array:
     design = robot.inverse_kinematic_matrix
     elements = np.diag(np.repeat(tolerance.elements * robot.row_scales, design.shape[1]))
     rows = [share * (np.eye(3)[:, [row]] * design).ravel() for row, share in enumerate(tolerance.rows)]
-    still = np.zeros_like(design[2])
-    centre = [
-        tolerance.centre * np.concatenate([still, design[2], still]),
-        tolerance.centre * np.concatenate([-design[2], still, still]),
-    ]
-    return np.column_stack([elements, *rows, *(centre if tolerance.centre else ())])
+    centre = tolerance.centre * changes_by_centre(robot).reshape(2, -1)
+    return np.column_stack([elements, *rows, *centre])
+
+
+def changes_by_centre(robot: Robot) -> Array:
+    """Derivatives (2, 3, M) of the matrix by the x and the y of the point that turns on the spot, 1/m: Eq. (2)."""
+    turning = robot.inverse_kinematic_matrix[2]
+    still = np.zeros_like(turning)
+    return np.array([[still, turning, still], [-turning, still, still]])
 
 
 def default_unidentified(robot: Robot) -> Literal["keep", "shrink"]:

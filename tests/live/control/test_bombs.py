@@ -6,14 +6,13 @@ import os
 import threading
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import zenoh
 from drives import drive
-from nodes import Command, asked, write_node
+from nodes import Command, asked, peak_memory, write_node
 from sessions import free_port, raw_session, until
 
 from omnibench.live.wire.messages import JOINT_STATE
@@ -50,12 +49,6 @@ def node(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[int, zenoh.
         driving.join()
         subscriber.undeclare()
         session.close()
-
-
-def peak_memory(process: int) -> int:
-    """The most memory that a process has had, in MB."""
-    lines = Path(f"/proc/{process}/status").read_text(encoding="ascii").splitlines()
-    return next(int(line.split()[1]) // 1024 for line in lines if line.startswith("VmHWM"))
 
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="memory is read from /proc")

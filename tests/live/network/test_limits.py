@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import socket
 import time
 from contextlib import ExitStack
@@ -11,7 +10,7 @@ from pathlib import Path
 import pytest
 import zenoh
 from drives import drive
-from nodes import Command, sent, write_node
+from nodes import Command, peak_memory, sent, write_node
 from routers import ACCESS, RouterProcess, member, mutual, running, user, works
 from sessions import free_port, until
 
@@ -19,13 +18,6 @@ from omnibench.live.network.session import open_session
 from omnibench.live.network.session_config import SessionConfig, User
 
 BLOCK = zenoh.CongestionControl.BLOCK
-
-
-def peak_memory(process: int) -> float:
-    """Largest resident memory of a process so far, MB."""
-    match = re.search(r"VmHWM:\s+(\d+) kB", Path(f"/proc/{process}/status").read_text())
-    assert match is not None
-    return int(match[1]) / 1000
 
 
 def test_large_messages_of_a_viewer_cost_a_node_no_memory_and_no_odometry(keys: Path, tmp_path: Path) -> None:
