@@ -18,11 +18,12 @@ if TYPE_CHECKING:
 
 _PACKAGE = os.path.dirname(__file__)
 _INTERRUPTED = 130  # exit code after Ctrl-C; of another signal once it has come
-_PROGRAM = __name__ == "__main__" or os.path.basename(sys.argv[0]) == "omnibench"  # not imported by another
+# Not imported by another program, nor by a process that this one starts for its jobs.
+_PROGRAM = __name__ == "__main__" or (
+    os.path.basename(sys.argv[0]) == "omnibench" and sys.modules["__main__"].__name__ != "__mp_main__"
+)
 _at_work = False  # True while ``main`` runs
 _BEGINS_ANEW = "interrupted; the same command begins anew"  # where a command keeps nothing on the way
-_LINEAR_ALGEBRA = ("numpy.linalg", "numpy.linalg.linalg", "_flapack")  # modules of the errors of numpy and LAPACK
-_NOT_COMPUTABLE = "the equations have no finite solution; omnibench check DATASET says what may be wrong with it"
 _COMMANDS = os.path.join(_PACKAGE, "cli")
 
 
@@ -94,7 +95,7 @@ def _run(command: Any) -> None:
 
     import typer
 
-    from omnibench.errors import Interrupted, OmnibenchError
+    from omnibench.errors import Interrupted, OmnibenchError, computable
 
     _replace_closed_streams()
     for stream in (sys.stdout, sys.stderr):
@@ -105,7 +106,7 @@ def _run(command: Any) -> None:
             _fail(f"error: {argument}: this name is not in UTF-8; rename the file or folder")
     usage_error: Any = typer.BadParameter.__mro__[1]  # click's UsageError, wherever this Typer keeps it
     try:
-        code = command.main(prog_name="omnibench", standalone_mode=False)
+        code = computable(command.main)(prog_name="omnibench", standalone_mode=False)
     except usage_error as error:
         if type(error).__name__ == "NoArgsIsHelpError":  # nothing was typed: the message is the whole help
             _fail(error.format_message())
@@ -125,10 +126,6 @@ def _run(command: Any) -> None:
         _fail(_with_notes("error: out of memory; make the data or the budget smaller", error))
     except OSError as error:  # a disk or a terminal that failed unexpectedly
         _fail(_with_notes(f"error: {error.filename or 'output'}: {error.strerror or error}", error))
-    except Exception as error:
-        if type(error).__module__ not in _LINEAR_ALGEBRA and "infs or NaNs" not in str(error):
-            raise
-        _fail(_with_notes(f"error: {_NOT_COMPUTABLE} ({error})", error))
     else:
         if code == 130:  # newer versions of Typer return this after Ctrl-C
             _fail(_BEGINS_ANEW, _INTERRUPTED)

@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import math
 import reprlib
-from collections.abc import Iterable, Sized
+import unicodedata
+from collections.abc import Callable, Iterable, Sized
 from difflib import get_close_matches
+from functools import wraps
 from numbers import Integral, Real
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 _HOLDERS = ("calibration", "config", "dataset", "robot")  # attributes of results in which another argument lies
+_DIRECTIONS = "\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069"  # marks of writing directions
+_LINEAR_ALGEBRA = ("numpy.linalg", "numpy.linalg.linalg", "_flapack")  # modules of the errors of numpy and LAPACK
 _LONGEST = 2000  # characters of a message; a plug-in's may have millions (chosen: a screen of a terminal)
 
 
@@ -25,7 +32,11 @@ def visible(text: str) -> str:
     """A text with ? for each control character that is no line break: those of terminals, and of writing directions."""
     if text.isprintable():
         return text
-    return "".join(letter if letter.isprintable() or letter == "\n" else "?" for letter in text)
+    return "".join("?" if _controls(letter) and letter != "\n" else letter for letter in text)
+
+
+def _controls(letter: str) -> bool:
+    return unicodedata.category(letter) in ("Cc", "Cs", "Zl", "Zp") or letter in _DIRECTIONS
 
 
 _SHORT = reprlib.Repr()
@@ -114,3 +125,21 @@ def nearest(name: str, known: Iterable[str]) -> str:
     alike = get_close_matches(name, names, cutoff=0.5)  # short names with one letter wrong, and chance
     matches = get_close_matches(name, names, n=1) or [known_name for known_name in alike if known_name[0] == name[0]]
     return f"did you mean {matches[0]!r}? " if matches else ""
+
+
+def computable(function: Callable[P, R]) -> Callable[P, R]:
+    """A function that raises DataError in one line where linear algebra fails, as for data that are not finite."""
+
+    @wraps(function)
+    def call(*args: P.args, **options: P.kwargs) -> R:
+        try:
+            return function(*args, **options)
+        except Exception as error:
+            if type(error).__module__ not in _LINEAR_ALGEBRA and "infs or NaNs" not in str(error):
+                raise
+            way = "omnibench check DATASET says what may be wrong with it"
+            failure = DataError(f"the equations have no finite solution; {way} ({error})")
+            failure.__notes__ = getattr(error, "__notes__", [])
+            raise failure from error
+
+    return call

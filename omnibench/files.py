@@ -80,9 +80,12 @@ def read_bytes(path: Path, most: int = MOST_TEXT, *, text: bool = False) -> byte
     check_file(path, most, text=text)
     try:
         with path.open("rb") as file:
-            return file.read(most)  # of /proc no sizes are known
+            content = file.read(most + 1)  # of /proc no sizes are known
     except OSError as error:
         raise DataError(f"{path}: cannot be read: {error.strerror or error}") from None
+    if len(content) > most:
+        raise DataError(f"{path}: has more than the {most:,} bytes that such a file may have")
+    return content
 
 
 def read_text(path: Path, most: int = MOST_TEXT) -> str:

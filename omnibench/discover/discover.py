@@ -47,7 +47,7 @@ from omnibench.discover.selection.screening import (
 )
 from omnibench.discover.selection.unknown_term import add_smooth_terms
 from omnibench.discover.verdict import lacks_a_name, verdict_of
-from omnibench.errors import DataError, require_type
+from omnibench.errors import DataError, computable, require_type
 from omnibench.fit.least_squares.usable_runs import usable_runs
 from omnibench.progress import Reporter, Stages, no_progress
 from omnibench.robot.calibration import Calibration
@@ -59,6 +59,7 @@ from omnibench.robot.kinematics import Array
 _EXPLAINED = 0.5
 
 
+@computable
 def discover_effects(
     dataset: Dataset,
     *,

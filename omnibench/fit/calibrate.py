@@ -9,7 +9,7 @@ from typing import Any, get_args
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.splits import training_split
 from omnibench.environment import package_versions
-from omnibench.errors import ConfigError, require_choice, require_range, require_type
+from omnibench.errors import ConfigError, computable, require_choice, require_range, require_type
 from omnibench.fit.calibrator import Calibrator, RunResult, as_answered, run_calibrator
 from omnibench.fit.cost import Cost
 from omnibench.fit.evaluate import verdict_on
@@ -83,6 +83,7 @@ class CalibrationRun(Shown):
         return tuple(name for name in self.result.held if sideways or not name.startswith("m2"))
 
 
+@computable
 def calibrate(
     dataset: Dataset,
     calibrator: str | None = None,

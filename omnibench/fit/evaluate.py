@@ -14,7 +14,7 @@ from omnibench.data.dataset import SPLITS, Dataset, Trajectory
 from omnibench.data.domain_check import extrapolation_warning, share_outside
 from omnibench.data.references.run_references import UNITS, ReferenceKind
 from omnibench.data.stored.drawn_runs import drawn_runs, in_memory
-from omnibench.errors import require_type
+from omnibench.errors import computable, require_type
 from omnibench.fit.check.missing_motions import command_names
 from omnibench.fit.held_out import judge, nothing_held_out, unfitted_runs
 from omnibench.fit.observations.reference_errors import errors_by_kind, mean_errors, measured_parts
@@ -30,7 +30,7 @@ from omnibench.views import Shown
 _PARTS = 5  # of the commands, each left out once by cross-validation
 _FEWEST_CROSSED = 4  # runs, below which nothing can be left out
 _MOST = 120  # runs that quick fits look at; chosen: a second
-# Share of what a quick fit gains on the training runs: a model that gains less is not judged by quick fits. Chosen.
+# Share of what a quick fit gains on all runs: a model that gains less is not judged by quick fits. Chosen.
 _AS_GOOD = 0.9
 
 
@@ -88,6 +88,7 @@ class Evaluation(Shown, Model):
     warnings: tuple[str, ...] = ()
 
 
+@computable
 def evaluate(calibration: Calibration, dataset: Dataset) -> Evaluation:
     """Errors of a calibration on every split of a data set.
 
@@ -163,20 +164,21 @@ def verdict_on(model: OdometryModel, training: Sequence[Trajectory], held_out: S
     Held-out runs decide if they are of ten units or more (commands, or runs where none repeats): an error that a
     calibration halves is told from chance in 27 % of sets of three units, 67 % of five and 94 % of ten; where few
     commands count for most, in 17, 39 and 73 % (tests/benchmarks/improvement_coverage.py, kinds usual and tails). If
-    they are fewer, and all runs have more units, cross-validation decides, unless its quick fits do not stand for the
-    model: it has effects, or does not gain on the training runs what a quick fit to these gains.
+    they are fewer, and all runs have more units, cross-validation decides, unless they say worse, or quick fits do not
+    stand for the model: it has effects, or does not gain on all runs what a quick fit to these gains.
     """
     design = OdometryModel.of_design(model.robot, model.integration)
     verdict = nothing_held_out()
     if held_out:
         verdict = judge(final_errors(design, held_out), final_errors(model, held_out), held_out)
-    training, every = looked_at(training), looked_at([*training, *held_out])
-    if verdict.units >= BOOTSTRAPPED or model.terms or not training or len(every) < _FEWEST_CROSSED:
+    every = looked_at([*training, *held_out])
+    decided = verdict.units >= BOOTSTRAPPED or verdict.verdict == "worse"
+    if decided or model.terms or not training or len(every) < _FEWEST_CROSSED:
         return verdict
     names = command_names(every)
     runs = [replace(run, command=name) for run, name in zip(every, names, strict=True)]
     units = units_of(runs).count
-    if units <= verdict.units or units < FEWEST or not _gains_as_quick_fits(model, training):
+    if units <= verdict.units or units < FEWEST or not _gains_as_quick_fits(model, every):
         return verdict
     part_of = {name: number % _PARTS for number, name in enumerate(sorted(set(names)))}
     errors, parts = [], list[Trajectory]()
@@ -195,19 +197,19 @@ def verdict_on(model: OdometryModel, training: Sequence[Trajectory], held_out: S
     return crossed.model_copy(update={"detail": f"{crossed.detail.rpartition('; ')[0]}; {manner}"})
 
 
-def _gains_as_quick_fits(model: OdometryModel, training: Sequence[Trajectory]) -> bool:
-    """True if a quick fit to the training runs says how a model does: the model gains at least nine tenths as much."""
-    matrices = (model.robot.inverse_kinematic_matrix, quick_fit(model.robot, training, model.integration), model.matrix)
+def _gains_as_quick_fits(model: OdometryModel, runs: Sequence[Trajectory]) -> bool:
+    """True if a quick fit to the runs says how a model does: the model gains at least nine tenths as much."""
+    matrices = (model.robot.inverse_kinematic_matrix, quick_fit(model.robot, runs, model.integration), model.matrix)
     design, quick, fitted = (
-        float(np.linalg.norm(final_errors(replace(model, matrix=matrix), training), axis=1).mean())
-        for matrix in matrices
+        float(np.linalg.norm(final_errors(replace(model, matrix=matrix), runs), axis=1).mean()) for matrix in matrices
     )
     return design - fitted >= _AS_GOOD * (design - quick) if quick < design else fitted >= design
 
 
 def looked_at(runs: Sequence[Trajectory]) -> list[Trajectory]:
-    """The runs that quick fits look at: of very many some, in memory."""
-    return [in_memory(run) for run in drawn_runs(runs[:: max(1, -(-len(runs) // _MOST))])]
+    """The runs that quick fits look at: of very many some that chance has drawn, in memory."""
+    drawn = np.sort(np.random.default_rng(0).permutation(len(runs))[:_MOST]).tolist()
+    return [in_memory(run) for run in drawn_runs([runs[index] for index in drawn])]
 
 
 def final_errors(model: OdometryModel, trajectories: Sequence[Trajectory]) -> Array:

@@ -56,5 +56,6 @@ def _part(run: Trajectory, driven: slice, seen: slice, begin: float, end: float)
         pose_covariances=None if run.pose_covariances is None else run.pose_covariances[seen],
         started_at=None if run.started_at is None else run.started_at + begin,
         command=None,
+        sent=None,
         **fields,
     )

@@ -23,6 +23,7 @@ from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.importers.copied_reference import follows_the_wheels
 from omnibench.data.references.reference_units import odd_references
 from omnibench.data.stored.drawn_runs import count_drawn, drawn_runs
+from omnibench.errors import computable
 from omnibench.fit.check.fixes import command, with_fixes
 from omnibench.fit.check.missing_motions import missing_motions, too_few
 from omnibench.fit.check.other_readings import read_otherwise
@@ -117,6 +118,7 @@ _SPOILED = ("reference_frozen", "reference_is_odometry")  # after which the whee
 _ORDER = {"error": 0, "warning": 1, "note": 2}
 
 
+@computable
 def check(
     source: Dataset | Path | str,
     *,

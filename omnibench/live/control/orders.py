@@ -15,7 +15,8 @@ LONGEST: Final = 1 << 17  # bytes of a request: 48 KiB of weights, in base64, an
 _NANOSECONDS: Final = 10**14  # values of ``at`` from this on are ns: as s they would be 3 million years from now
 _LAST: Final = 2**63 - 1  # ns, the last time in 64 bits
 _LONGEST_NUMBER: Final = 40  # characters of a time; chosen
-_MOST_VALUES: Final = 5_000  # of a request, far above a calibration of twelve wheels; chosen: more would delay samples
+_MOST_VALUES: Final = 5_000  # of a calibration, of up to some 20 wheels; chosen: more would delay samples
+_VALUES_OF_POSE: Final = 20
 
 
 class PoseOrder(Model):
@@ -37,7 +38,7 @@ def read_pose(payload: bytes, parameters: dict[str, str]) -> PoseOrder:
         text = payload.decode()
     except UnicodeDecodeError:
         raise ConfigError(f"{where}: the payload is not text; send x, y (m) and theta (rad) in JSON") from None
-    return validate(PoseOrder, parse_yaml(text, where, _MOST_VALUES), where)  # JSON is a part of YAML
+    return validate(PoseOrder, parse_yaml(text, where, _VALUES_OF_POSE), where)  # JSON is a part of YAML
 
 
 def read_time(text: str) -> int:

@@ -183,9 +183,13 @@ def open_session(config: SessionConfig, purpose: str, stop: Stop | None = None) 
         )
     elif config.listening and config.access is None and (config.tls or config.users_file):
         LOG.warning(
-            "%s has no access rules, so that everybody with %s may do everything, as swap calibrations; give access",
+            "%s has no access rules, so that everybody %s may do everything, as swap calibrations; give access",
             purpose,
-            f"a certificate of {config.tls.ca}" if config.tls else f"a password of {config.users_file}",
+            f"with a password of {config.users_file}"
+            if config.users_file
+            else f"with a certificate of {config.tls.ca}"
+            if config.tls and config.tls.mutual
+            else "who reaches it",
         )
     return session
 

@@ -239,8 +239,7 @@ class WheelInput:
             )
         if len(self._places) > 16:  # so that a sender of ever new names cannot fill the memory
             self._places.clear()
-        places = None if chosen is None else np.array(chosen)
-        self._places[names] = places
+        places = self._places[names] = None if chosen is None else np.array(chosen)
         return places
 
     def _has(self, joint: str, names: tuple[str, ...]) -> bool:
@@ -277,7 +276,9 @@ class WheelInput:
         if self._counting and sample.positions is not None and self._angles.known is not None:
             rates = self._rates if sample.velocities is None else sample.velocities
             angles, counted = self._angles.turned(sample.positions, rates, elapsed)
-            return self._taken(sample, elapsed, angles, angles / elapsed, 0.0 if counted else elapsed, counted)
+            if elapsed >= 0.5 * self.period:  # two that arrive at once tell no rate
+                rates = angles / elapsed
+            return self._taken(sample, elapsed, angles, rates, 0.0 if counted else elapsed, counted)
         return self._by_rates(sample, elapsed, elapsed, blind=unseen)
 
     def _after_silence(self, sample: _Sample, elapsed: float, *, restarted: bool = False) -> WheelStep:
@@ -329,15 +330,16 @@ class WheelInput:
 
         skipped: samples of the period that never came, by their numbers.
         """
+        bunched = self._settings.stamps == "arrival"  # the time between two then tells no period
         self._stamped = _MEMORY * self._stamped + elapsed
         self._waited = _MEMORY * self._waited + waited
-        if len(self._learnt) < _LEARNING:
+        if len(self._learnt) < _LEARNING and not bunched:
             self._counts.missing += skipped
             self._learnt.append(elapsed / (1 + skipped))
             self.period = sorted(self._learnt)[len(self._learnt) // 4]
             return
         periods = elapsed / self.period
-        whole = max(math.floor(periods + 0.3), 1)
+        whole = 1 + skipped if bunched else max(math.floor(periods + 0.3), 1)
         self._counts.missing += whole - 1
         self._counts.irregular += abs(periods - whole) > _IRREGULAR
         self.period += _SMOOTHING * (elapsed / whole - self.period)

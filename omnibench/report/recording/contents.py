@@ -63,7 +63,7 @@ def _commands(runs: Sequence[Trajectory]) -> Row:
 
 
 def _sent(runs: Sequence[Trajectory]) -> Row:
-    sent = [run.sent for run in runs if run.sent is not None]
+    sent = [run.sent for run in runs if run.sent is not None and len(run.sent)]
     if not sent:
         return _missing("Sent commands", "(v, α, ω, t_r)")
     number, longest = sum(map(len, sent)), max(float(commands[:, 4].max()) for commands in sent)

@@ -100,6 +100,18 @@ def test_angles_within_one_turn_are_unwrapped_without_being_told(low: float) -> 
     assert receiver.counts.counter_restarts == 0
 
 
+@pytest.mark.parametrize("every", [2, 200])
+def test_messages_that_arrive_at_once_add_no_turns_and_are_not_missing(every: int) -> None:
+    """Every second, or rarely one, waits for the next, and the times of arrival count."""
+    receiver = Receiver(stamps="arrival")
+    numbers = np.arange(1500)
+    arrivals = (numbers + (numbers % every == every - 2)) * PERIOD - (numbers % every == every - 2) * 5e-5
+    for number, arrival in zip(numbers.tolist(), arrivals.tolist(), strict=True):
+        receiver.take(at(arrival, *[math.remainder(10.0 * number * PERIOD, 2 * math.pi)] * 3))
+    np.testing.assert_allclose(receiver.driven, 10.0 * numbers[-1] * PERIOD, atol=1e-6)
+    assert receiver.counts.missing == receiver.counts.counter_restarts == 0
+
+
 def test_a_counter_of_any_length_is_unwrapped_when_the_length_is_told() -> None:
     path, length = drive(3.0), 1.7
     receiver = Receiver(wrap=length)

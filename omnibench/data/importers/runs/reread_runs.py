@@ -144,6 +144,8 @@ def _parts(run: Trajectory, streams: RecordedStreams, options: ReferenceOptions,
         rows = recorded[cut.kept]
         targets, odometry = (None if array is None else array[rows] for array in (run.targets, run.odometry))
         sent = None if run.sent is None else run.sent - np.array([cut.zero, 0, 0, 0, 0])
+        if sent is not None:  # those that hold at some time of the part
+            sent = sent[(sent[:, 0] > -sent[:, 4]) & (sent[:, 0] < cut.trajectory.times[-1])]
         whole = cut.zero == 0 and len(cut.kept) == len(run.times)
         distance = run.distance if whole else None
         made = replace(cut.trajectory, targets=targets, odometry=odometry, sent=sent, distance=distance)
