@@ -55,6 +55,8 @@ def check_file(path: Path, most: int | None = None, *, text: bool = False) -> No
         if not stat.S_ISREG(status.st_mode):
             kind = _SPECIAL.get(stat.S_IFMT(status.st_mode), "special file")
             raise DataError(f"{path}: is a {kind}; write its content to a file, and name that")
+        if status.st_size == 0 and path.resolve().is_relative_to("/proc"):
+            raise DataError(f"{path}: has no size, as the system makes it; write its content to a file, and name that")
         if most is not None and status.st_size > most:
             raise DataError(f"{path}: has {status.st_size:,} bytes, more than the {most:,} that such a file may have")
         with path.open("rb") as file:
@@ -80,7 +82,7 @@ def read_bytes(path: Path, most: int = MOST_TEXT, *, text: bool = False) -> byte
     check_file(path, most, text=text)
     try:
         with path.open("rb") as file:
-            content = file.read(most + 1)  # of /proc no sizes are known
+            content = file.read(most + 1)  # it may grow
     except OSError as error:
         raise DataError(f"{path}: cannot be read: {error.strerror or error}") from None
     if len(content) > most:

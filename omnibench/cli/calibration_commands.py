@@ -275,6 +275,7 @@ def export(
 
     ros2_controllers takes the controller of the robot's kind, and says what it cannot hold of the calibration.
     """
+    from omnibench.errors import visible
     from omnibench.files import refuse_existing, write_text
     from omnibench.robot.calibration import read_calibration
     from omnibench.robot.export.formats import export_calibration
@@ -285,7 +286,7 @@ def export(
     refuse_existing(file, force=force)
     warn(exported.warnings)
     if file is None:
-        typer.echo(exported.text, nl=False)
+        typer.echo(visible(exported.text), nl=False)
         print_ending(f"{to}: printed, not written", "write it to a file with -o FILE")
     else:
         write_text(file, exported.text)

@@ -33,7 +33,7 @@ FramesChoice = Annotated[Annotated[Literal["prefixed"], Tag("name")] | Annotated
 class RobotConfig(Model):
     """One robot of a node."""
 
-    name: str = Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", description="begins its topics: <name>/odom")
+    name: str = Field(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,199}$", description="begins its topics: <name>/odom")
     calibration: RelativePath = Field(description="calibration file")
     wheels: WheelSettings = WheelSettings()
     fusion: FusionChoice | None = Field(None, description="default: the node's")
@@ -57,7 +57,9 @@ class ReplaySource(ReplayConfig):
 class LiveConfig(Model):
     """A node."""
 
-    name: str = Field("omnibench", pattern=r"^[A-Za-z][A-Za-z0-9_]*$", description="the node's name in the ROS graph")
+    name: str = Field(
+        "omnibench", pattern=r"^[A-Za-z][A-Za-z0-9_]{0,199}$", description="the node's name in the ROS graph"
+    )
     description: str = ""
     robots: tuple[RobotConfig, ...] = Field((), description="may be empty for a router")
     fusion: FusionChoice = Field("none", description="of SLAM poses: none, ekf, or its settings")

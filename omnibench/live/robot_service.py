@@ -7,7 +7,7 @@ of a replay are late by themselves, and whoever plays them wants every pose.
 Intake: what arrives for a node's robots is queued in Zenoh's threads, and worked off in one thread of the node.
 
 Zenoh's threads are then free to receive, and what waits can be seen: a robot whose samples wait for long gets all of
-them integrated at its turn and only the newest pose published (``robot_service``). Where the thread is busy it pauses
+them integrated at its turn and only the newest pose published (`RobotService`). Where the thread is busy it pauses
 for a moment between turns, so that messages come together: to hand the interpreter over for each one costs as much as
 to take it.
 """
@@ -141,7 +141,7 @@ class RobotService:
 
     Messages are queued in Zenoh's threads and taken in that of ``intake``, in the order in which they came. Where they
     come faster than they can be taken, all are integrated and only the newest of the late ones is published
-    (``late_updates``), but for those of an acknowledged flow, whose sender waits. A message that fails is counted and
+    (`LateUpdates`), but for those of an acknowledged flow, whose sender waits. A message that fails is counted and
     logged.
     """
 

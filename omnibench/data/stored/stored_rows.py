@@ -26,8 +26,9 @@ from omnibench.robot.kinematics import Array
 
 MOST_IN_MEMORY = 5_000_000  # wheel samples that are kept: 200 MB of three wheels' (chosen)
 BLOCK_ROWS = 500_000  # rows of a block, of whole runs: 16 MB of four columns (chosen)
-_LARGE = 1 << 29  # bytes in memory up to which a file may be packed as tightly as it likes; chosen
-_PACKED = 1000  # times smaller than in memory: stamps, which increase, do not pack so tightly; chosen
+_LARGE = 1 << 27  # bytes in memory up to which a file may be packed as tightly as it likes; chosen
+_PACKED = 100  # times smaller than in memory: stamps, which increase, do not pack so tightly; chosen
+_LONGEST_CELL = 10_000  # bytes of a text in a table, of which names are the longest; chosen
 _BLOCKS_KEPT = 4  # blocks in memory, those of all files together (chosen)
 
 Value = TypeVar("Value")
@@ -99,13 +100,17 @@ def count_rows(file: Path) -> int:
 
 
 def read_parquet(file: Path) -> pl.DataFrame:
-    """A whole Parquet file. DataError as for count_rows; a column holds lists."""
+    """A whole Parquet file. DataError as for count_rows; a column holds lists, or a text that is no name."""
     count_rows(file)
     for column, kind in types_of(file).items():
         if kind.is_nested():
             raise DataError(f"{file}: column {column!r} holds {kind}, expected names or numbers")
     with readable(file):
-        return pl.read_parquet(file, glob=False)
+        frame = pl.read_parquet(file, glob=False)
+    for column, longest in frame.select(pl.col(pl.String).str.len_bytes().max()).to_dicts()[0].items():
+        if (longest or 0) > _LONGEST_CELL:
+            raise DataError(f"{file}: column {column!r} has a text of {longest:,} bytes, expected names or numbers")
+    return frame
 
 
 def types_of(file: Path) -> pl.Schema:

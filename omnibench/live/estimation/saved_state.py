@@ -22,7 +22,7 @@ from pydantic import Field, FiniteFloat, ValidationError, model_validator
 
 from omnibench.config import Model, read_model, to_yaml
 from omnibench.errors import ConfigError, DataError
-from omnibench.files import read_bytes, remove, write_text
+from omnibench.files import check_file, read_bytes, remove, write_text
 from omnibench.robot.calibration import Calibration, read_calibration
 
 LOG = logging.getLogger("omnibench.live")
@@ -85,6 +85,8 @@ class RobotMemory:
         self._swapped = folder / f"{robot}.calibration.yaml"
         try:
             folder.mkdir(parents=True, exist_ok=True)
+            if self._path.exists():
+                check_file(self._path)
             self._file: int | None = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o644)
         except OSError as error:
             raise ConfigError(f"{self._path}: cannot be written: {error.strerror}; choose another `state`") from None

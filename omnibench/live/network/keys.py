@@ -21,7 +21,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from omnibench.errors import ConfigError
-from omnibench.files import replacing
+from omnibench.files import read_text, replacing
 from omnibench.live.network.tls_files import read_certificate, read_key
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
@@ -183,7 +183,7 @@ def _passwords(folder: Path, names: Sequence[str], *, keep: bool) -> dict[Path, 
     """Files with a password for each name, and the router's file with all; ``keep`` the passwords it holds already."""
     path = folder / "users.txt"
     passwords = {name: secrets.token_urlsafe(18) for name in names}
-    lines = path.read_text(encoding="utf-8").splitlines() if keep and path.exists() else []
+    lines = read_text(path).splitlines() if keep and path.exists() else []
     lines += [f"{name}:{password}" for name, password in passwords.items()]
     files = {folder / f"{name}.password": f"{password}\n".encode() for name, password in passwords.items()}
     return files | {path: "".join(f"{line}\n" for line in lines).encode()}

@@ -46,7 +46,7 @@ def find_tables(source: Path, options: CsvOptions, warnings: list[str]) -> list[
     """The tables under a folder, or those of a file, by the names of files, else by what their headers hold."""
     if source.is_file():
         return [_of_file(source, options)]
-    files = sorted(file for file in source.rglob("*") if file.is_file())
+    files = sorted(file for file in source.rglob("*") if not file.is_dir())
     wheels, poses, measured = (
         _by_suffix(source, files, suffixes)
         for suffixes in (_wheel_suffixes(options), _pose_suffixes(options), REFERENCE_SUFFIXES)
@@ -79,7 +79,7 @@ def _common(folder: Path) -> Path | None:
 
 def file_called(folder: Path, names: Sequence[str], *, other_than: Path | None = None) -> Path | None:
     """The file of a folder that has one of the names, the first first, in any case of letters."""
-    files = {file.name.lower(): file for file in sorted(folder.iterdir()) if file.is_file() and file != other_than}
+    files = {file.name.lower(): file for file in sorted(folder.iterdir()) if not file.is_dir() and file != other_than}
     return next((files[name.lower()] for name in names if name.lower() in files), None)
 
 

@@ -119,7 +119,7 @@ def open_bag(path: Path, recorded: Sequence[str] = ()) -> Iterator[Bag]:
         except ConfigError as error:
             raise DataError(str(error)) from None
     for file in sorted(path.iterdir()) if path.is_dir() else [path]:
-        if file.suffix in _SUFFIXES:
+        if not file.is_dir():
             check_file(file)
     with _damage_as_error(path):
         # Bags before ROS 2 Iron do not hold the definitions of their types; those used here never changed.
