@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,13 +29,14 @@ from omnibench.discover.held_out.cross_validation import (
 from omnibench.discover.held_out.gaps import compare_held_out
 from omnibench.discover.held_out.validation_runs import noise_runs, validation_runs
 from omnibench.discover.held_out.waterfall import waterfall_steps
+from omnibench.discover.regressors.fine_structure import fine_structure
+from omnibench.discover.regressors.significance import Significance, together
 from omnibench.discover.result import Discovery
 from omnibench.discover.selection.averaged_model import averaged
 from omnibench.discover.selection.candidate_groups import check_names
 from omnibench.discover.selection.competing_models import competing_models, with_fitted_forms
 from omnibench.discover.selection.detectability import detectability_of
 from omnibench.discover.selection.extrapolation import extrapolations_of, faded
-from omnibench.discover.selection.locating import all_left, located
 from omnibench.discover.selection.model_selection import Selection, select_effects
 from omnibench.discover.selection.motor_effects import select_motor_effects
 from omnibench.discover.selection.named_effects import named_effects
@@ -44,6 +45,7 @@ from omnibench.discover.selection.screening import (
     screen_again,
     screen_extended,
     screen_plain,
+    significance_left,
 )
 from omnibench.discover.selection.unknown_term import add_smooth_terms
 from omnibench.discover.verdict import lacks_a_name, verdict_of
@@ -215,3 +217,24 @@ def _start_matrix(dataset: Dataset, calibration: Calibration | None) -> Array:
         )
     calibration.check_wheels(dataset.robot, f"the data set {dataset.name}")
     return calibration.matrix_array
+
+
+def located(
+    selection: Selection,
+    screening: Screening,
+    baseline: Extended,
+    extended: Extended,
+    rng: np.random.Generator,
+) -> Selection:
+    """The selection with all that the residuals depend on, before any effect and after those of an extended model.
+
+    baseline: the plain matrix under the noise of the extended model.
+    """
+    where = together(selection.where, fine_structure(baseline.fit, rng))
+    return replace(selection, where=where, left=all_left(extended, screening, rng) if extended.groups else where)
+
+
+def all_left(extended: Extended, screening: Screening, rng: np.random.Generator) -> Significance:
+    """Significance of generic bases and of fine structure beyond all that an extended model holds."""
+    bases = significance_left(extended, screening, rng)
+    return together(bases, fine_structure(extended.fit, rng))

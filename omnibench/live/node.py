@@ -12,14 +12,15 @@ import math
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
+from typing import Any
 
+from omnibench.environment import package_versions
 from omnibench.errors import one_line, require_type
-from omnibench.live.config import LiveConfig, RobotConfig
+from omnibench.live.config import LiveConfig, RobotConfig, robot_called
 from omnibench.live.control.query_server import QueryServer
-from omnibench.live.control.robot_info import robot_info
 from omnibench.live.estimation.health import Health
 from omnibench.live.estimation.saved_state import RobotMemory
 from omnibench.live.estimation.tracker import RobotTracker
@@ -30,7 +31,7 @@ from omnibench.live.robot_service import Intake, RobotService
 from omnibench.live.stopping import Closing, Stop
 from omnibench.live.wire.foxglove import PORT, FoxgloveServer
 from omnibench.live.wire.recorder import Recorder, free_path
-from omnibench.live.wire.topics import GraphNode, KeySpace
+from omnibench.live.wire.topics import TOPICS, GraphNode, KeySpace
 from omnibench.registry import load_plugins
 from omnibench.robot.calibration import read_calibration
 from omnibench.words import plural
@@ -238,3 +239,24 @@ def _warn_of_shared_frames(robots: Sequence[str], others: Sequence[str]) -> None
             "`frames: prefixed` makes them %s/odom and %s/base_link",
             *(name, ", ".join(others), name, name),
         )
+
+
+def robot_info(config: LiveConfig, keys: KeySpace, tracker: RobotTracker) -> Mapping[str, Any]:
+    """Wheels, calibration, topics' keys, frames, fusion settings and versions of a robot of the node ``config``."""
+    robot, drive = robot_called(config, tracker.name), tracker.calibration.robot.drive
+    return {
+        "robot": tracker.name,
+        "node": config.name,
+        "wheels": drive.wheels,
+        "steered": drive.steered,
+        "signals": drive.names,
+        "mount": tracker.calibration.robot.mount,
+        "calibration": tracker.calibration.name,
+        "integration": tracker.calibration.integration,
+        "profile": config.profile,
+        "domain": config.domain,
+        "topics": {topic: keys.key(tracker.name, topic) for topic in TOPICS},
+        "frames": config.frames_of(robot),
+        "fusion": config.fusion_of(robot),
+        "versions": package_versions(),
+    }

@@ -1,6 +1,22 @@
-"""Fine structure: how the motion between poses depends on heading, place and time, finer than whole columns show.
+"""Fine structure: how the motion between poses depends on heading, place, time, wheels' angles and joints of the floor.
 
-Scores are those of local_scores.py: one product of matrices for all functions, however many.
+It is finer than whole columns show, and found by scores: how much better the residuals would be explained by changes of
+the motion in single samples. An error of the motion in one sample, a displacement d and a turn e (paths.py, Eq. (1),
+from the run's start), moves the pose at every later stamp j by d + i z_j e and by e. Let h_j be the inverse covariance
+of the residuals times these, by which half the chi-square falls as the pose at stamp j moves. The motion in a sample
+before stamp k then lowers it by
+
+    g_d = sum over j >= k of h_j,    g_e = sum over j >= k of h_j(heading) + Re(conj(i z_j) h_j),                  (1)
+
+and the score of a function f of a covariate in a mode m of motion (along the way, across it, turning per way or by the
+rate of turn) is the sum of f m g over a run's samples: one product of matrices for all functions, however many.
+
+With s_z the scores of run z for the d columns of a basis, s their sum over Z runs and S = sum of s_z s_z',
+
+    Q = q / (1 - q / Z),    q = s' S^-1 s                                                                          (2)
+
+is the statistic of Hotelling ("The generalization of Student's ratio", Annals of Mathematical Statistics 2, 1931), of d
+degrees of freedom where nothing is missing, whatever the noise is taken for. S stays the same where signs are flipped.
 """
 
 from __future__ import annotations
@@ -12,17 +28,15 @@ from functools import partial
 from itertools import pairwise, product
 
 import numpy as np
+from numpy.typing import NDArray
 
 from omnibench.discover.fitting.model_fit import Fit, paths_of
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.regressors.covariate_bases import Basis, area_of
-from omnibench.discover.regressors.floor_joints import floor_joints
-from omnibench.discover.regressors.local_scores import independent_scores, pull_in_modes
 from omnibench.discover.regressors.paths import Paths
 from omnibench.discover.regressors.significance import Significance, significance_of_scores, together
-from omnibench.discover.regressors.wheel_waves import waves_of_wheels
 from omnibench.robot.effects.effect import Values
-from omnibench.robot.effects.smooth.motion import beyond, bump
+from omnibench.robot.effects.smooth.motion import MODES, beyond, bump
 from omnibench.robot.kinematics import Array
 
 _COARSE = 0.1  # s: wheel samples are merged up to this duration
@@ -64,7 +78,7 @@ def fine_structure(fit: Fit, rng: np.random.Generator) -> Significance | None:
 
 
 def _families(fit: Fit) -> Iterator[tuple[list[tuple[Group, Array]], bool]]:
-    """Groups of each kind with their scores (Z, d), and whether these are to be studentised (local_scores.py, Eq. (2)).
+    """Groups of each kind with their scores (Z, d), and whether these are to be studentised, Eq. (2).
 
     The paths of one are given up before those of the next are made.
     """
@@ -204,3 +218,183 @@ def _patches(places: Array) -> list[dict[str, float]]:
         if (bump(places, patch) > np.exp(-1)).mean() > _SEEN:
             patches.append(patch)
     return patches
+
+
+_LOW, _HIGH = 0.1, 6.0  # waves a turn; slower ones look like radii, for faster ones there are whole columns (chosen)
+_MOST = 1500  # numbers of waves; over angles that tell more apart, the higher ones are left out (chosen)
+_WIDTH = 0.1  # w, rad: the fastest wave moves on by 0.6 rad, by which it shows at 98 % (chosen)
+_TOGETHER = 300_000  # scores of runs and numbers of waves that are computed at once (chosen)
+_TURNS = 10  # over all runs, from which on waves a turn can be told from a radius (chosen)
+
+
+def waves_of_wheels(fit: Fit, paths: Paths) -> Iterator[tuple[Group, Array]]:
+    """Groups of waves of all wheels, each so many times a turn, and their scores (Z, d).
+
+    Gears and belts turn otherwise than the wheels that they drive: any number of times a turn counts. With phi the
+    angle of a wheel and g_z the pull of a change of its rate in proportion to the rate, the scores of run z for n
+    waves a turn are
+
+        s_z(n) = sum over samples of g_z exp(i n phi) = exp(i n phi_0) sum over bins b of G_zb exp(i n b w),        (3)
+
+    with phi_0 the angle at the start of the run and G_zb the sum of g_z where phi - phi_0 is in bin b of width w. Waves
+    with different n are told apart if they fall out of step over all angles that the wheel had.
+    """
+    angles = paths.signals.wheel_angles
+    if angles is None:
+        return
+    span = float(np.ptp(angles, axis=0).max())
+    if span < 2 * np.pi * _TURNS:
+        return
+    numbers = np.arange(_LOW, _HIGH, np.pi / span)[:_MOST]
+    rates = paths.signals.rates
+    changes = [paths.changes(paths.by_rates(rates * unit)) for unit in np.eye(rates.shape[1])]
+    pull, at_once = pull_by(fit, paths, changes), max(1, _TOGETHER // len(paths.logs))
+    for first in range(0, len(numbers), at_once):
+        some = numbers[first : first + at_once]
+        waves = [_scores_of_waves(paths, angles[:, wheel], pull[:, wheel], some) for wheel in range(rates.shape[1])]
+        parts = [part[..., None] for scores in waves for part in (scores.real, scores.imag)]
+        independent = independent_scores(np.concatenate(parts, axis=2))
+        for number, of_runs in zip(some.tolist(), independent, strict=True):
+            if of_runs.shape[1]:
+                detail, tries = f"the angle of the wheels, {number:.3g} times a turn", len(numbers)
+                basis = Basis("wheel angle", "wheel", detail, None, tries, "smooth_wheel_angle", {"harmonic": number})
+                yield Group("covariate", "wheel angle", (), tries=tries, basis=basis), of_runs.astype(np.float32)
+
+
+def _scores_of_waves(paths: Paths, angles: Array, pull: Array, numbers: Array) -> Array:
+    """Scores (Z, B) of waves of one wheel, B numbers of times a turn, Eq. (3)."""
+    firsts = np.searchsorted(paths.owner, np.arange(len(paths.logs)))
+    start = angles[firsts]
+    bins = np.round((angles - start[paths.owner]) / _WIDTH).astype(np.intp)
+    low = bins.min()
+    count = int(bins.max() - low) + 1
+    cells = np.bincount(paths.owner * count + bins - low, pull, len(firsts) * count).reshape(-1, count)
+    waves = np.exp(1j * _WIDTH * (low + np.arange(count))[:, None] * numbers)
+    scores: Array = np.exp(1j * start[:, None] * numbers) * (cells @ waves)
+    return scores
+
+
+_NORMALS = 45  # normals within a right angle: at 1 m from the middle the nearest is half a bin off at most
+_JOINT_WIDTH = 0.03  # m, of a bin: wheels meet a joint within a part of their own size; chosen
+_MOST_BINS = 300  # each way: on larger floors bins are wider (chosen)
+_CROSSED = 5  # runs that must cross a bin: the scatter of fewer says nothing (chosen)
+_OUTLYING = 0.005  # share of the samples beyond the bins on either side
+_MOST_LINES = 40  # candidates in each direction and across it: so many tiles of 0.3 m lie over 6 m both ways (chosen)
+_SURE = 2.0  # standard deviations by which a line must show to be a candidate of a model: by chance one in 22 does
+# Modes, by their numbers in MODES, that joints change together: the wheels are held up, or the robot is knocked round.
+_CHANGES = {"slow the robot": (0, 3), "turn the robot": (2,)}
+
+
+def floor_joints(paths: Paths, pull: Array) -> Iterator[tuple[Group, Array]]:
+    """Groups of lines in one direction and across it, and their scores (Z, d). pull (F, 4): of each sample and mode.
+
+    At joints, as between tiles, something happens to the motion within centimetres of parallel lines. Across lines
+    with the normal n a place p has the coordinate u = n . p. Let s_zb be the score of run z for a change of the motion
+    in bin b of u alone, beyond a change of the same size everywhere. With the bins of n and of the direction across it
+    together, since tiles have joints both ways,
+
+        Q = sum over b of (sum over z of s_zb)^2 / (sum over z of s_zb^2)                                           (4)
+
+    has the expectation of the number of bins where nothing is missing. Scores of neighbouring bins go along with each
+    other, as a pose shows all that happened before: how far Q exceeds its expectation by chance is found by changing
+    the signs of whole runs (significance.py, Eq. (2)).
+    """
+    if float(np.ptp(paths.middle[:, :2], axis=0).max()) < 2 * _JOINT_WIDTH:
+        return
+    for normal in (np.pi / 2 / _NORMALS * np.arange(_NORMALS)).tolist():
+        bins = [_Bins.of(paths, angle) for angle in (normal, normal + np.pi / 2)]
+        for words, modes in _CHANGES.items():
+            of_samples = pull[:, list(modes)].sum(axis=1)
+            scores = [of_axis.scores(paths.owner, of_samples) for of_axis in bins]
+            together = np.concatenate(scores, axis=1)
+            if together.shape[1]:
+                lines = [line for both in zip(bins, scores, strict=True) for line in _lines_of_joints(*both)]
+                parts = tuple(shapes for _, shapes in sorted(lines, key=lambda line: -line[0])[:_MOST_LINES])
+                detail, tries = f"joints of the floor that {words}, such as tiles have", _NORMALS * len(_CHANGES)
+                basis = Basis("place", "body", detail, None, tries, "smooth_joint", {"normal": normal}, parts)
+                yield Group("covariate", "place", (), tries=tries, basis=basis), together
+
+
+def _lines_of_joints(bins: _Bins, scores: Array) -> Iterator[tuple[float, dict[str, float]]]:
+    """The lines in whose bins most happens, by how many standard deviations."""
+    for distance, score in zip(bins.middles[bins.kept].tolist(), np.abs(scores.sum(axis=0)).tolist(), strict=True):
+        if score > _SURE:
+            yield score, {"normal": bins.normal, "distance": distance, "width": bins.width}
+
+
+@dataclass(frozen=True, eq=False)
+class _Bins:
+    """Bins across lines: their middles (B,) and width, m; the bin (F,) of each sample, B for none; and those to use.
+
+    share (B + 1,): of the samples in each.
+    """
+
+    normal: float
+    middles: Array
+    width: float
+    number: NDArray[np.intp]
+    kept: NDArray[np.intp]
+    share: Array
+
+    @staticmethod
+    def of(paths: Paths, normal: float) -> _Bins:
+        """The bins over the places of some paths, but for the outermost ones."""
+        across = paths.middle[:, :2] @ [np.cos(normal), np.sin(normal)]
+        low, high = np.quantile(across, [_OUTLYING, 1 - _OUTLYING])
+        width = max(_JOINT_WIDTH, float(high - low) / _MOST_BINS)
+        count = max(int(np.ceil((high - low) / width)), 1)
+        place = np.floor((across - low) / width).astype(np.intp)
+        number = np.where((place >= 0) & (place < count), place, count)
+        runs = len(paths.logs)
+        crossed = np.bincount(np.unique(number * runs + paths.owner) // runs, minlength=count + 1)
+        kept = np.flatnonzero(crossed[:count] >= _CROSSED)
+        share = np.bincount(number, minlength=count + 1) / len(number)
+        return _Bins(normal, low + (np.arange(count) + 0.5) * width, width, number, kept, share)
+
+    def scores(self, owner: NDArray[np.intp], pull: Array) -> Array:
+        """Scores (Z, d) of the bins to use, of unit variance in sum, Eq. (4). owner (F,): the run of each sample."""
+        count, runs = len(self.share), int(owner[-1]) + 1
+        scores = np.bincount(owner * count + self.number, pull, runs * count).reshape(runs, count)
+        scores -= scores.sum(axis=1, keepdims=True) * self.share  # the matrix holds what is the same everywhere
+        of_bins = scores[:, self.kept]
+        normed: Array = of_bins / np.sqrt(np.maximum(np.square(of_bins).sum(axis=0), 1e-300))
+        return normed.astype(np.float32)  # there are many, and no more digits are needed
+
+
+_ROUNDING = 1e-16  # share of the largest column's square below which a column is what rounding leaves
+_RANK = 1e-6  # share of a column's square that must be left beyond the others of its basis
+
+
+def pull_in_modes(fit: Fit, paths: Paths) -> Array:
+    """The pull (F, 4) of changes of each sample's motion in the modes in which smooth effects act."""
+    return pull_by(fit, paths, [paths.by_modes[mode] for mode in MODES])
+
+
+def pull_by(fit: Fit, paths: Paths, changes: Sequence[Array]) -> Array:
+    """The pull (F, m): by how much half the chi-square falls with m changes (F, 3) of (z, theta) in each sample."""
+    pull = np.zeros((len(paths.owner), len(changes)))
+    first = 0
+    for log, part, gradient in zip(paths.logs, paths.parts, fit.weighted_residuals, strict=True):
+        rows = slice(first, first + len(log.times))
+        first = rows.stop
+        lever = paths.lever[part]
+        swing = lever[:, 0] * gradient[:, 1] - lever[:, 1] * gradient[:, 0] + gradient[:, 2]
+        later = np.column_stack([gradient[:, :2], swing])[::-1].cumsum(axis=0)[::-1]
+        stamp = np.searchsorted(log.stamps, log.times - paths.signals.durations[rows] / 2)
+        moved = np.vstack([later, np.zeros(3)])[stamp]
+        for mode, change in enumerate(changes):
+            pull[rows, mode] = (change[rows] * moved).sum(axis=1)  # Eq. (1)
+    return pull
+
+
+def independent_scores(scores: Array) -> list[Array]:
+    """Scores (Z, B, d) of B bases as independent ones (Z, d) whose sums have unit variance, Eq. (2)."""
+    of_bases = np.ascontiguousarray(scores.transpose(1, 0, 2))
+    square = of_bases.transpose(0, 2, 1) @ of_bases
+    sizes_of = np.diagonal(square, axis1=1, axis2=2)
+    there = sizes_of > _ROUNDING * sizes_of.max(initial=0.0)  # a function that is the same everywhere leaves no more
+    scale = np.where(there, 1 / np.sqrt(np.maximum(sizes_of, 1e-300)), 0.0)
+    sizes, vectors = np.linalg.eigh(square * scale[:, :, None] * scale[:, None, :])
+    known = sizes > _RANK
+    independent = of_bases @ (scale[:, :, None] * vectors / np.sqrt(np.where(known, sizes, 1.0))[:, None, :])
+    return [of_runs[:, rows] for of_runs, rows in zip(independent, known, strict=True)]

@@ -88,8 +88,9 @@ def test_calibrated_evaluated_checked_and_inspected_as_in_memory(
     monkeypatch.setattr(odometry_of_stored, "_HELD", 10**9)
     held = load_dataset(tmp_path / "saved")
     expected = calibrate(held).calibration
-    assert found.matrix_array == pytest.approx(expected.matrix_array, rel=1e-9, abs=1e-12)
-    assert np.array(found.covariance) == pytest.approx(np.array(expected.covariance), rel=1e-6, abs=1e-18)
+    # Held and stored samples are summed in another order, and a fit ends with a step below 1e-9.
+    assert found.matrix_array == pytest.approx(expected.matrix_array, rel=1e-8, abs=1e-11)
+    assert np.array(found.covariance) == pytest.approx(np.array(expected.covariance), rel=1e-5, abs=1e-15)
     assert told[0].splits["all"].cost == pytest.approx(evaluate(found, held).splits["all"].cost, rel=1e-9)
     assert [finding.what for finding in told[1].findings] == [finding.what for finding in check(held).findings]
     numbers = inspect_dataset(held)
