@@ -1,11 +1,4 @@
-"""The data sets of a comparison, its runs (data sets x calibrators x seeds), and the problem that each run is given.
-
-The key of a run's stored result: it changes with everything that the result depends on, the code included.
-
-The code behind a run is what all runs share (``robot/``, ``fit/``, trajectories, the problem that a run is given) and
-the files of the calibrators and the cost that it names. Files in ``fit/calibrators/`` that it does not name are left
-out, so that a new calibrator does not discard the stored runs of the others; none of them imports another.
-"""
+"""The data sets of a comparison, its runs (data sets x calibrators x seeds), and each run's problem and key."""
 
 from __future__ import annotations
 
@@ -46,7 +39,12 @@ _NO_PART = "fit/check/*.py"  # judges recordings before they are fitted
 
 
 def run_key(config: CompareConfig, dataset: Dataset, entry: CalibratorEntry, seed: int) -> str:
-    """The key of one entry's run on one data set with one seed."""
+    """The key of one entry's run on one data set with one seed: it changes with all that the result depends on.
+
+    The code behind a run is what all runs share (``robot/``, ``fit/``, trajectories, the problem that a run is given)
+    and the files of the calibrators and the cost that it names. Files in ``fit/calibrators/`` that it does not name are
+    left out, so that a new calibrator does not discard the stored runs of the others; none of them imports another.
+    """
     return content_key(
         {
             "data": dataset.hash,

@@ -1,16 +1,4 @@
-"""One robot on Zenoh: its inputs, its outputs, and the token that shows that it is alive.
-
-Of samples that had to wait only the newest update of a robot in real time is published, and all of a replay. A late
-pose of a robot is of use to nobody once a newer one is known, and to publish it makes the node later still. The samples
-of a replay are late by themselves, and whoever plays them wants every pose.
-
-Intake: what arrives for a node's robots is queued in Zenoh's threads, and worked off in one thread of the node.
-
-Zenoh's threads are then free to receive, and what waits can be seen: a robot whose samples wait for long gets all of
-them integrated at its turn and only the newest pose published (`RobotService`). Where the thread is busy it pauses
-for a moment between turns, so that messages come together: to hand the interpreter over for each one costs as much as
-to take it.
-"""
+"""One robot on Zenoh: its inputs, its outputs, and the token that shows that it is alive."""
 
 from __future__ import annotations
 
@@ -45,7 +33,12 @@ _SMOOTHING: Final = 0.1  # share of the latest turn in the mean; chosen
 
 
 class Intake(Closing):
-    """Runs the work that is handed to ``ready``, in turn, in a thread of its own until ``close``."""
+    """Runs the work that is handed to ``ready``, in turn, in a thread of its own until ``close``.
+
+    Zenoh's threads are then free to receive, and what waits can be seen. Where the thread is busy it pauses for a
+    moment between turns, so that messages come together: to hand the interpreter over for each one costs as much as
+    to take it.
+    """
 
     def __init__(self) -> None:
         self._work: SimpleQueue[Callable[[], object] | None] = SimpleQueue()
@@ -84,7 +77,12 @@ _SECOND: Final = 1e9  # ns
 
 
 class LateUpdates:
-    """The late updates of one robot that are not published yet. unpublished: those that never will be, so far."""
+    """The late updates of one robot that are not published yet. unpublished: those that never will be, so far.
+
+    Only the newest one of a robot in real time is published, and all of a replay. A late pose of a robot is of use to
+    nobody once a newer one is known, and to publish it makes the node later still. The samples of a replay are late by
+    themselves, and whoever plays them wants every pose.
+    """
 
     def __init__(self, publish: Callable[[Update], None]) -> None:
         self.unpublished = 0

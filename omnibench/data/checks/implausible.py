@@ -1,4 +1,4 @@
-"""What a recording warns of: the explanation of its misfit to the design model, if one stands out.
+"""Warnings of a recording: the explanation of its misfit to the design model, by units and wheels, if one stands out.
 
 The angle of one wheel may make the wheels contradict each other, whatever the reference is. Of a robot that has more
 drive signals than ways to move, a twist gives signals in the range of E Z only (E: from twist to signals, Z: the twists

@@ -2,8 +2,6 @@
 
 Where several effects explain the same residuals, each in its place makes a model of its own. The one that best predicts
 commands that its fit did not see, in the paper's cost, is used; what the models disagree on is not known.
-
-Of a family of effects, the fitted forms are those that the recordings ask for.
 """
 
 from __future__ import annotations

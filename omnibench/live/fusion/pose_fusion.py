@@ -2,8 +2,6 @@
 
 A pose that comes late is inserted where it belongs, and the motions and poses after it are filtered again. A gate
 refuses poses whose normalised innovation is too large; several refused poses that agree replace the filter's.
-
-Poses that the gate rejected one after another; when they agree with each other, it is the filter that errs.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Callbacks that Zenoh calls in its own threads, without a queue in between, and answers collected by them.
-
-A rate limiter bounds how often a message of the same kind is logged.
-"""
+"""Callbacks in Zenoh's own threads, answers to a query collected by them, and a rate limiter of log lines."""
 
 from __future__ import annotations
 

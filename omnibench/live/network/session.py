@@ -1,6 +1,6 @@
-"""Opening Zenoh sessions, by default on loopback and without scouting; one line says why a session does not open.
+"""Opening of Zenoh sessions, by default on loopback and without scouting.
 
-Zenoh only reports that it could not connect: the reason is found by trying each step.
+Zenoh only reports that it could not connect: the reason, in one line, is found by trying each step.
 """
 
 from __future__ import annotations

@@ -4,8 +4,6 @@ A run goes from its first reference pose to its last; wheel samples after that a
 stands still. With S_i the start pose of run i in the drive and p(t) its reference, the concatenated pose is
 
     S_i p(0)^-1 p(t).
-
-The recording is a data set's folder, or a comparison's config, whose data set is simulated when loaded.
 """
 
 from __future__ import annotations

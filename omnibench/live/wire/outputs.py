@@ -1,8 +1,6 @@
 """Outputs: the topics that a node publishes of every update, one function a topic that makes its message.
 
 To add an output, write its function and its row in OUTPUTS; a message type that is new goes to messages.py.
-
-An update has the estimates after one wheel sample, from which every output is made.
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
 """Recording of live topics into an MCAP file that Foxglove, rosbags and mcap-ros2-support open.
 
-An MCAP file of ROS 2 messages that can be read at any time, even if its writer was killed or the disk was full.
-
-Each ``flush`` writes a chunk followed by the end of a file without an index, in one call; the next chunk overwrites
-that end. The file is therefore valid after each flush, and rosbags, mcap and Foxglove open it whatever happens to the
-writer. ``complete`` adds the index.
+`McapFile` can be read at any time, even if its writer was killed or the disk was full. Each ``flush`` writes a chunk
+followed by the end of a file without an index, in one call; the next chunk overwrites that end. The file is therefore
+valid after each flush, and rosbags, mcap and Foxglove open it whatever happens to the writer. ``complete`` adds the
+index.
 """
 
 from __future__ import annotations

@@ -2,10 +2,6 @@
 
 Palacin et al. 2023, section 2.1: the planner sends (v, alpha, omega, t_r) every 300 ms, and no command is valid for
 longer than 500 ms, so that the robot stops when its computer does.
-
-The set point's scale from 0 (rest) to 1 (full speed) over time, with limited slope and jerk.
-
-A course of the scale is a sequence of phases of constant jerk in closed form; nothing is sampled.
 """
 
 from __future__ import annotations
@@ -52,7 +48,10 @@ class Phase:
 
 @dataclass(frozen=True)
 class SetPoint:
-    """A course of the scale: its phases in time; the last goes on for ever."""
+    """A course of the set point's scale, from 0 (rest) to 1 (full speed), with limited slope and jerk.
+
+    Its phases of constant jerk are in closed form; nothing is sampled. The last goes on for ever.
+    """
 
     limits: SlewLimits
     phases: tuple[Phase, ...] = (Phase(0.0, 0.0, 0.0),)

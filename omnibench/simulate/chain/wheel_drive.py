@@ -3,10 +3,9 @@
 Each motor moves its own share of the robot's inertia, independently of the other wheels. Wheel angles are continuous
 within a session; between its runs the robot stands.
 
-The inner loop of a wheel's drive, compiled: PID once a sample, motor and friction in exact steps of 0.1 ms.
-
-Within a step the voltage and the sign of the friction are constant, so current, rate and angle follow a linear
-equation whose exact solution is a matrix. Only the instant at which a wheel stops or breaks away is found to a step.
+The inner loop of a wheel's drive is compiled: PID once a sample, motor and friction in exact steps of 0.1 ms. Within a
+step the voltage and the sign of the friction are constant, so current, rate and angle follow a linear equation whose
+exact solution is a matrix. Only the instant at which a wheel stops or breaks away is found to a step.
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
 """References that the sensors of a recording give each of its runs.
 
-Headings of an inertial sensor (sensor_msgs/Imu): its orientation where it tells one, else its rate of turn.
-
-East and north of points by latitude and longitude, in the plane that touches the ellipsoid WGS 84 at an origin.
-
-A point of latitude phi, longitude lambda and height h above the ellipsoid has the geocentric coordinates
+An inertial sensor (sensor_msgs/Imu) gives headings, by its orientation where it tells one, else by its rate of turn. A
+receiver of satellites (sensor_msgs/NavSatFix) gives positions, east and north of the first fix, in the plane that
+touches the ellipsoid WGS 84 there. A point of latitude phi, longitude lambda and height h above the ellipsoid has the
+geocentric coordinates
 
     X = (N + h) cos phi cos lambda,  Y = (N + h) cos phi sin lambda,  Z = (N (1 - e^2) + h) sin phi,       (1)
     N = a / sqrt(1 - e^2 sin^2 phi),
@@ -16,8 +15,6 @@ and east and north of an origin (phi0, lambda0) are
 
 Source: NIMA TR8350.2, World Geodetic System 1984. The plane shortens a way at a distance d by d^2 / (2 R^2): 1 mm in a
 km at d = 9 km.
-
-Positions of a receiver of satellites (sensor_msgs/NavSatFix), east and north of the first fix.
 """
 
 from __future__ import annotations
