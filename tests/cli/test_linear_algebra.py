@@ -10,7 +10,9 @@ import pytest
 import scipy.linalg
 from scipy.linalg.lapack import dtbtrs
 
+import omnibench
 from omnibench.__main__ import _run
+from omnibench.errors import computable
 
 UNKNOWN = np.full((3, 3), np.nan)
 
@@ -35,6 +37,14 @@ def test_a_failure_of_linear_algebra_is_one_line(
     assert ended.value.code == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("error: the equations have no finite solution; omnibench check DATASET says")
+
+
+@pytest.mark.parametrize("name", ["calibrate", "check", "discover_effects", "evaluate"])
+def test_from_python_it_is_one_of_the_errors_that_are_told(name: str) -> None:
+    function = getattr(omnibench, name)
+    assert function is not function.__wrapped__
+    with pytest.raises(omnibench.OmnibenchError, match="no finite solution"):
+        computable(lambda: np.linalg.inv(np.zeros((2, 2))))()
 
 
 def test_other_mistakes_of_the_program_stay_visible() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -131,6 +132,38 @@ def test_cross_validation_decides_where_three_runs_are_held_out_and_both_are_sai
 def test_cross_validation_of_fits_does_not_stand_for_a_calibration_that_fits_worse(calibrator: str) -> None:
     run = calibrate(recordings(validating=3), calibrator, budget=Budget(evaluations=2))
     assert verdict(run.calibration).basis == "held_out"
+
+
+def driven(split: str, turns: bool, matrix: Array) -> list[Trajectory]:
+    """Three runs each of five straight or turning commands, by the odometry of a matrix and with noise."""
+    rng, model, runs = np.random.default_rng(3), OdometryModel(ROBOT, matrix, "arc"), []
+    backwards = np.linalg.pinv(ROBOT.inverse_kinematic_matrix)
+    times = 0.2 * np.arange(1, 31)
+    for command, repetition in product(range(5), range(3)):
+        twist = (0, 0, 0.3 + 0.1 * command) if turns else (0.3 * math.cos(command), 0.3 * math.sin(command), 0)
+        log = WheelLog(times, np.tile(backwards @ twist, (30, 1)), np.zeros(3), np.append(0.0, times[4::5]))
+        poses = model.poses([log])[0]
+        poses[1:] += 0.003 * rng.standard_normal(poses[1:].shape)
+        name = f"{split}{turns}{command}"
+        runs.append(Trajectory(f"{name}-{repetition}", split, times, log.rates, log.stamps, poses, command=name))
+    return runs
+
+
+def test_a_calibration_that_changes_nothing_on_the_held_out_runs_is_not_called_better() -> None:
+    """It was fitted to straight runs, and turns were held out; fits that see the turns would correct them."""
+    design = ROBOT.inverse_kinematic_matrix
+    truth, fitted = design * [[1.03], [1.03], [0.95]], design * [[1.03], [1.03], [1.0]]
+    model = OdometryModel(ROBOT, fitted, "arc")
+    found = verdict_on(model, driven("train", False, truth), driven("validation", True, truth))
+    assert (found.basis, found.verdict) == ("held_out", "undecided")
+
+
+def test_held_out_runs_that_err_more_by_far_are_not_outvoted() -> None:
+    """In the session that was held out the wheels are as drawn, in the other one they are not."""
+    design = ROBOT.inverse_kinematic_matrix
+    runs = [*driven("train", False, 1.03 * design), *driven("validation", False, 0.99 * design)]
+    found = verdict(calibrate(make_dataset("x", ROBOT, 0.2, runs)).calibration)
+    assert (found.basis, found.verdict) == ("held_out", "worse")
 
 
 def test_cross_validation_does_not_stand_for_a_model_with_effects() -> None:

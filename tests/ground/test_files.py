@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from omnibench.errors import DataError, one_line
+from omnibench.errors import DataError, one_line, visible
 from omnibench.files import (
     check_results_folder,
     link_latest,
@@ -28,6 +28,11 @@ def test_a_link_goes_on_pointing_to_the_file_that_is_written(tmp_path: Path) -> 
     write_text(tmp_path / "link.yaml", "new")
     assert (tmp_path / "link.yaml").is_symlink()
     assert (tmp_path / "file.yaml").read_text() == "new"
+
+
+def test_what_controls_a_terminal_is_replaced_in_messages_and_spaces_of_other_scripts_stay() -> None:
+    assert one_line("a\x1b[31m \u202ebc\u3000d\u00a0e") == "a?[31m ?bc d e"
+    assert visible("a\u3000b\u200dc\nd\x07") == "a\u3000b\u200dc\nd?"
 
 
 def test_a_pipe_is_written_to_and_stays_a_pipe(tmp_path: Path) -> None:

@@ -182,15 +182,13 @@ def open_session(config: SessionConfig, purpose: str, stop: Stop | None = None) 
             ", ".join(config.unprotected),
         )
     elif config.listening and config.access is None and (config.tls or config.users_file):
-        LOG.warning(
-            "%s has no access rules, so that everybody %s may do everything, as swap calibrations; give access",
-            purpose,
-            f"with a password of {config.users_file}"
-            if config.users_file
-            else f"with a certificate of {config.tls.ca}"
-            if config.tls and config.tls.mutual
-            else "who reaches it",
-        )
+        who, way = f"with a password of {config.users_file}", "give access"
+        if config.tls and not config.users_file:
+            who = f"with a certificate of {config.tls.ca}"
+            if not config.tls.mutual:
+                who, way = "who reaches it", "give tls mutual: true, and access"
+        said = "%s has no access rules, so that everybody %s may do everything, as swap calibrations; %s"
+        LOG.warning(said, purpose, who, way)
     return session
 
 

@@ -143,6 +143,39 @@ def test_a_bag_with_special_metadata_is_refused(tmp_path: Path, made: Callable[[
     assert_refused(run_here("import", "rosbag", "bag", "-o", "new", cwd=tmp_path), "metadata.yaml: ", words)
 
 
+def test_a_pipe_among_the_files_of_a_bag_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag" / "metadata.yaml").write_text("rosbag2_bagfile_information: {relative_file_paths: [data.xyz]}\n")
+    pipe(tmp_path / "bag" / "data.xyz")
+    (tmp_path / "robot.yaml").write_text(APR_02.model_dump_json())
+    assert_refused(run_here("import", "rosbag", "bag", "-o", "new", cwd=tmp_path), "data.xyz: is a pipe")
+
+
+def test_a_pipe_among_the_tables_of_a_folder_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "log").mkdir()
+    (tmp_path / "log" / "robot.yaml").write_text(APR_02.model_dump_json())
+    rows = "".join(f"{0.1 * number},1,1,1,0,0,0\n" for number in range(1, 30))
+    (tmp_path / "log" / "run.csv").write_text(f"t,omega_a,omega_b,omega_c,x,y,theta\n{rows}")
+    pipe(tmp_path / "log" / "runs.csv")
+    assert_refused(run_here("import", "csv", "log", "-o", "new", cwd=tmp_path), "runs.csv: is a pipe")
+
+
+@pytest.mark.skipif(not Path("/proc/self/pagemap").exists(), reason="files that the system makes are those of Linux")
+def test_a_file_that_the_system_makes_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "calibration.yaml").symlink_to("/proc/self/pagemap")
+    with pytest.raises(DataError, match=r"calibration\.yaml: has no size"):
+        read_text(tmp_path / "calibration.yaml")
+
+
+def test_a_table_with_a_text_that_is_no_name_is_refused(folder: Path) -> None:
+    (folder / "poses.csv").unlink()
+    columns = dict.fromkeys(("t", "x", "y", "theta"), 0.0)
+    frame = pl.DataFrame({"trajectory": ["x" * 3_000_000] * 20, **{name: [0.0] * 20 for name in columns}})
+    frame.write_parquet(folder / "poses.parquet")
+    with pytest.raises(DataError, match=r"'trajectory' has a text of 3,000,000 bytes"):
+        load_dataset(folder)
+
+
 def test_names_that_are_not_in_utf_8_are_refused_in_one_line(folder: Path) -> None:
     name = os.fsdecode(b"d\xe4ta")
     folder.rename(folder.with_name(name))

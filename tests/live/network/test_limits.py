@@ -72,20 +72,21 @@ def test_a_user_logs_in_within_five_seconds_beside_150_idle_connections(users: R
             works(session, users)
 
 
-@pytest.mark.parametrize("by", ["a certificate of", "a password of"])
+@pytest.mark.parametrize("by", ["with a certificate of", "with a password of", "who reaches it"])
 def test_a_router_without_access_rules_says_in_one_line_that_no_roles_hold(
     by: str, keys: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    config = mutual(keys)
-    if by == "a password of":
+    config, way = mutual(keys), "give access"
+    if by == "with a password of":
         config = {"listen": f"tcp/127.0.0.1:{free_port()}", "users_file": str(keys / "users.txt"), "access": ACCESS}
-    for access in (True, False):
+    configs = [config, {key: value for key, value in config.items() if key != "access"}]
+    if by == "who reaches it":
+        configs, way = [configs[1] | {"tls": {**config["tls"], "mutual": False}}], "give tls mutual: true, and access"
+    for each in configs:
         caplog.clear()
-        if not access:
-            del config["access"]
-        with open_session(SessionConfig.model_validate(config), "node apr"):
+        with open_session(SessionConfig.model_validate(each), "node apr"):
             pass
         lines = [record.getMessage() for record in caplog.records if "no access rules" in record.getMessage()]
-        assert len(lines) == (not access)
-    assert f"everybody with {by} {keys}" in lines[0]
-    assert lines[0].endswith("may do everything, as swap calibrations; give access")
+        assert len(lines) == ("access" not in each)
+    assert f"everybody {by}" in lines[0]
+    assert lines[0].endswith(f"may do everything, as swap calibrations; {way}")
