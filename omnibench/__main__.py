@@ -95,7 +95,7 @@ def _run(command: Any) -> None:
 
     import typer
 
-    from omnibench.errors import Interrupted, OmnibenchError, computable
+    from omnibench.errors import Interrupted, OmnibenchError, not_computable
 
     _replace_closed_streams()
     for stream in (sys.stdout, sys.stderr):
@@ -106,7 +106,7 @@ def _run(command: Any) -> None:
             _fail(f"error: {argument}: this name is not in UTF-8; rename the file or folder")
     usage_error: Any = typer.BadParameter.__mro__[1]  # click's UsageError, wherever this Typer keeps it
     try:
-        code = computable(command.main)(prog_name="omnibench", standalone_mode=False)
+        code = command.main(prog_name="omnibench", standalone_mode=False)
     except usage_error as error:
         if type(error).__name__ == "NoArgsIsHelpError":  # nothing was typed: the message is the whole help
             _fail(error.format_message())
@@ -126,6 +126,10 @@ def _run(command: Any) -> None:
         _fail(_with_notes("error: out of memory; make the data or the budget smaller", error))
     except OSError as error:  # a disk or a terminal that failed unexpectedly
         _fail(_with_notes(f"error: {error.filename or 'output'}: {error.strerror or error}", error))
+    except Exception as error:
+        if (reason := not_computable(error)) is None:
+            raise
+        _fail(_with_notes(f"error: {reason}", error))
     else:
         if code == 130:  # newer versions of Typer return this after Ctrl-C
             _fail(_BEGINS_ANEW, _INTERRUPTED)

@@ -127,19 +127,23 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return f"did you mean {matches[0]!r}? " if matches else ""
 
 
+def not_computable(error: Exception) -> str | None:
+    """What an error of linear algebra means, as for data that are not finite; None of any other error."""
+    if type(error).__module__ not in _LINEAR_ALGEBRA and "infs or NaNs" not in str(error):
+        return None
+    return f"the equations have no finite solution; omnibench check DATASET says what may be wrong with it ({error})"
+
+
 def computable(function: Callable[P, R]) -> Callable[P, R]:
-    """A function that raises DataError in one line where linear algebra fails, as for data that are not finite."""
+    """A function that raises DataError in one line where linear algebra fails."""
 
     @wraps(function)
     def call(*args: P.args, **options: P.kwargs) -> R:
         try:
             return function(*args, **options)
         except Exception as error:
-            if type(error).__module__ not in _LINEAR_ALGEBRA and "infs or NaNs" not in str(error):
+            if (reason := not_computable(error)) is None:
                 raise
-            way = "omnibench check DATASET says what may be wrong with it"
-            failure = DataError(f"the equations have no finite solution; {way} ({error})")
-            failure.__notes__ = getattr(error, "__notes__", [])
-            raise failure from error
+            raise DataError(reason) from error
 
     return call

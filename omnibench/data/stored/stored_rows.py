@@ -28,7 +28,7 @@ MOST_IN_MEMORY = 5_000_000  # wheel samples that are kept: 200 MB of three wheel
 BLOCK_ROWS = 500_000  # rows of a block, of whole runs: 16 MB of four columns (chosen)
 _LARGE = 1 << 27  # bytes in memory up to which a file may be packed as tightly as it likes; chosen
 _PACKED = 100  # times smaller than in memory: stamps, which increase, do not pack so tightly; chosen
-_LONGEST_CELL = 10_000  # bytes of a text in a table, of which names are the longest; chosen
+_LONGEST_CELL = 10_000  # characters of a text in a table, of which names are the longest; chosen
 _BLOCKS_KEPT = 4  # blocks in memory, those of all files together (chosen)
 
 Value = TypeVar("Value")
@@ -107,9 +107,11 @@ def read_parquet(file: Path) -> pl.DataFrame:
             raise DataError(f"{file}: column {column!r} holds {kind}, expected names or numbers")
     with readable(file):
         frame = pl.read_parquet(file, glob=False)
-    for column, longest in frame.select(pl.col(pl.String).str.len_bytes().max()).to_dicts()[0].items():
-        if (longest or 0) > _LONGEST_CELL:
-            raise DataError(f"{file}: column {column!r} has a text of {longest:,} bytes, expected names or numbers")
+    for cells in frame.select(pl.col(pl.String).str.len_chars().max()).to_dicts():
+        for column, longest in cells.items():
+            if (longest or 0) > _LONGEST_CELL:
+                text = f"a text of {longest:,} characters"
+                raise DataError(f"{file}: column {column!r} has {text}, expected names or numbers")
     return frame
 
 

@@ -172,7 +172,7 @@ def test_a_table_with_a_text_that_is_no_name_is_refused(folder: Path) -> None:
     columns = dict.fromkeys(("t", "x", "y", "theta"), 0.0)
     frame = pl.DataFrame({"trajectory": ["x" * 3_000_000] * 20, **{name: [0.0] * 20 for name in columns}})
     frame.write_parquet(folder / "poses.parquet")
-    with pytest.raises(DataError, match=r"'trajectory' has a text of 3,000,000 bytes"):
+    with pytest.raises(DataError, match=r"'trajectory' has a text of 3,000,000 characters"):
         load_dataset(folder)
 
 

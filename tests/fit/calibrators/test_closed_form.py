@@ -207,7 +207,7 @@ def test_the_reason_says_newton_steps_where_no_cone_program_was_solved() -> None
     stamps = sum(len(run.pose_times) - 1 for run in runs)
     many = [replace(run, id=f"{run.id}-{copy}") for copy in range(-(-1000 // stamps)) for run in runs]
     result = closed_form(make_problem(many, cost="trajectory"))
-    assert re.fullmatch(r"step below 1e-09 after \d+ Newton steps", result.reason)
+    assert re.fullmatch(r"(step below 1e-09|no part of .* lowers the cost) after \d+ Newton steps", result.reason)
 
 
 def test_too_few_programs_are_not_called_converged() -> None:
