@@ -128,7 +128,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 
 def not_computable(error: Exception) -> str | None:
-    """What an error of linear algebra means, as for data that are not finite; None of any other error."""
+    """The message for an error of linear algebra, as for data that are not finite; None for any other error."""
     if type(error).__module__ not in _LINEAR_ALGEBRA and "infs or NaNs" not in str(error):
         return None
     return f"the equations have no finite solution; omnibench check DATASET says what may be wrong with it ({error})"

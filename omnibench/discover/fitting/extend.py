@@ -35,7 +35,7 @@ from omnibench.robot.odometry import split_by
 
 # tests/benchmarks/constants.py varies each number by 0.5 and 2: on a small set with heading drift no verdict and no
 # name changes.
-_ROUNDS = 12  # that fit model, noise and outliers by turns until these stay, at most; recordings here need three
+_ROUNDS = 12  # rounds, at most, that fit model, noise and outliers by turns; recordings here settle in three
 _NEAR = 0.02  # share of the largest component of the noise by which two noises may differ, see is_near
 _STEPS = 4  # Gauss-Newton steps, at most
 _HALVINGS = 10  # tries of a step that leads too far, each half of the one before: at last 1 / 512 of it

@@ -221,7 +221,7 @@ def _patches(places: Array) -> list[dict[str, float]]:
 
 
 _LOW, _HIGH = 0.1, 6.0  # waves a turn; slower ones look like radii, for faster ones there are whole columns (chosen)
-_MOST = 1500  # numbers of waves; over angles that tell more apart, the higher ones are left out (chosen)
+_MOST_NUMBERS = 1500  # of waves; over angles that tell more apart, the higher ones are left out (chosen)
 _WIDTH = 0.1  # w, rad: the fastest wave moves on by 0.6 rad, by which it shows at 98 % (chosen)
 _TOGETHER = 300_000  # scores of runs and numbers of waves that are computed at once (chosen)
 _TURNS = 10  # over all runs, from which on waves a turn can be told from a radius (chosen)
@@ -245,7 +245,7 @@ def waves_of_wheels(fit: Fit, paths: Paths) -> Iterator[tuple[Group, Array]]:
     span = float(np.ptp(angles, axis=0).max())
     if span < 2 * np.pi * _TURNS:
         return
-    numbers = np.arange(_LOW, _HIGH, np.pi / span)[:_MOST]
+    numbers = np.arange(_LOW, _HIGH, np.pi / span)[:_MOST_NUMBERS]
     rates = paths.signals.rates
     changes = [paths.changes(paths.by_rates(rates * unit)) for unit in np.eye(rates.shape[1])]
     pull, at_once = pull_by(fit, paths, changes), max(1, _TOGETHER // len(paths.logs))
@@ -306,18 +306,18 @@ def floor_joints(paths: Paths, pull: Array) -> Iterator[tuple[Group, Array]]:
         for words, modes in _CHANGES.items():
             of_samples = pull[:, list(modes)].sum(axis=1)
             scores = [of_axis.scores(paths.owner, of_samples) for of_axis in bins]
-            together = np.concatenate(scores, axis=1)
-            if together.shape[1]:
+            both_ways = np.concatenate(scores, axis=1)
+            if both_ways.shape[1]:
                 lines = [line for both in zip(bins, scores, strict=True) for line in _lines_of_joints(*both)]
                 parts = tuple(shapes for _, shapes in sorted(lines, key=lambda line: -line[0])[:_MOST_LINES])
                 detail, tries = f"joints of the floor that {words}, such as tiles have", _NORMALS * len(_CHANGES)
                 basis = Basis("place", "body", detail, None, tries, "smooth_joint", {"normal": normal}, parts)
-                yield Group("covariate", "place", (), tries=tries, basis=basis), together
+                yield Group("covariate", "place", (), tries=tries, basis=basis), both_ways
 
 
 def _lines_of_joints(bins: _Bins, scores: Array) -> Iterator[tuple[float, dict[str, float]]]:
     """The lines in whose bins most happens, by how many standard deviations."""
-    for distance, score in zip(bins.middles[bins.kept].tolist(), np.abs(scores.sum(axis=0)).tolist(), strict=True):
+    for distance, score in zip(bins.middles[bins.crossed].tolist(), np.abs(scores.sum(axis=0)).tolist(), strict=True):
         if score > _SURE:
             yield score, {"normal": bins.normal, "distance": distance, "width": bins.width}
 
@@ -333,7 +333,7 @@ class _Bins:
     middles: Array
     width: float
     number: NDArray[np.intp]
-    kept: NDArray[np.intp]
+    crossed: NDArray[np.intp]
     share: Array
 
     @staticmethod
@@ -346,17 +346,17 @@ class _Bins:
         place = np.floor((across - low) / width).astype(np.intp)
         number = np.where((place >= 0) & (place < count), place, count)
         runs = len(paths.logs)
-        crossed = np.bincount(np.unique(number * runs + paths.owner) // runs, minlength=count + 1)
-        kept = np.flatnonzero(crossed[:count] >= _CROSSED)
+        crossings = np.bincount(np.unique(number * runs + paths.owner) // runs, minlength=count + 1)
+        crossed = np.flatnonzero(crossings[:count] >= _CROSSED)
         share = np.bincount(number, minlength=count + 1) / len(number)
-        return _Bins(normal, low + (np.arange(count) + 0.5) * width, width, number, kept, share)
+        return _Bins(normal, low + (np.arange(count) + 0.5) * width, width, number, crossed, share)
 
     def scores(self, owner: NDArray[np.intp], pull: Array) -> Array:
         """Scores (Z, d) of the bins to use, of unit variance in sum, Eq. (4). owner (F,): the run of each sample."""
         count, runs = len(self.share), int(owner[-1]) + 1
         scores = np.bincount(owner * count + self.number, pull, runs * count).reshape(runs, count)
         scores -= scores.sum(axis=1, keepdims=True) * self.share  # the matrix holds what is the same everywhere
-        of_bins = scores[:, self.kept]
+        of_bins = scores[:, self.crossed]
         normed: Array = of_bins / np.sqrt(np.maximum(np.square(of_bins).sum(axis=0), 1e-300))
         return normed.astype(np.float32)  # there are many, and no more digits are needed
 

@@ -42,7 +42,7 @@ class Tolerance:
 # changes their radii, and the track on which they turn (Borenstein and Feng, IEEE T-RA 12:869, 1996, sections 2 and 3).
 # Rollers lose or gain some per cent of a motion, 8 on the mecanum base of OptiOdom; a skid-steered base turns by 0.5 to
 # 0.8 of what its track says (Mandow et al., IROS 2007), about a point that is off by the load and the ground. Without
-# that point 80 % of its intervals hold the truth (tests/benchmarks/shrink_coverage.py). Half of each and twice:
+# that point, the intervals of its turn hold the truth in 80 % (tests/benchmarks/shrink_coverage.py). Half and twice:
 # tests/benchmarks/shrink_study.py.
 _USUAL = Tolerance(0.02, (0.05, 0.05, 0.05))
 TOLERANCES: Mapping[RobotClass, Tolerance] = MappingProxyType(

@@ -113,9 +113,9 @@ def without_jumps(
     if loss == "squares":
         return list(runs), list(residuals)
     near = poses_near(residuals, loss)
-    kept = [
+    shortened = [
         (with_poses(run, np.append(0, 1 + np.flatnonzero(chosen))), of_run[chosen])
         for run, of_run, chosen in zip(runs, residuals, near, strict=True)
         if chosen.any()
     ]
-    return [run for run, _ in kept], [of_run for _, of_run in kept]
+    return [run for run, _ in shortened], [of_run for _, of_run in shortened]

@@ -15,8 +15,8 @@ LONGEST: Final = 1 << 17  # bytes of a request: 48 KiB of weights, in base64, an
 _NANOSECONDS: Final = 10**14  # values of ``at`` from this on are ns: as s they would be 3 million years from now
 _LAST: Final = 2**63 - 1  # ns, the last time in 64 bits
 _LONGEST_NUMBER: Final = 40  # characters of a time; chosen
-_MOST_VALUES: Final = 5_000  # of a calibration, of up to some 20 wheels; chosen: more would delay samples
-_VALUES_OF_POSE: Final = 20
+_VALUES_OF_CALIBRATION: Final = 5_000  # at most, of some 20 wheels; chosen: more would delay samples
+_VALUES_OF_POSE: Final = 20  # at most; its five fields are eleven
 
 
 class PoseOrder(Model):
@@ -64,4 +64,4 @@ def read_sent_calibration(payload: bytes, where: str) -> Calibration:
         text = payload.decode()
     except UnicodeDecodeError as error:
         raise DataError(f"{where}: not a text in UTF-8: {error}") from None
-    return parse_calibration(text, where, _MOST_VALUES)
+    return parse_calibration(text, where, _VALUES_OF_CALIBRATION)
