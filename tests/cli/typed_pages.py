@@ -11,15 +11,18 @@ import re
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import IO
 
 LONGEST = 900  # s, of one command
-ENOUGH = 8.0  # s after which the reader of a command that runs until Ctrl-C has seen enough
+ENOUGH = 8.0  # s after it began to work, when the reader of a command that runs until Ctrl-C has seen enough
 _STREAMS = ("live", "replay", "listen", "record")  # run until Ctrl-C, or as long as the recording that they play
+_SILENT = ("replay",)  # prints nothing into a file until it has ended
 _TYPED = re.compile(r"^    ((?:omnibench|cd) (?:.*\\\n)*.*)$", re.MULTILINE)
 # ``live`` ends the one before: one node runs a robot. A file is read once ``record`` has ended.
 _ENDED_BY = {"live": ("listen", "record", "replay", "live"), "import": ("record",)}
@@ -46,7 +49,7 @@ class Terminal:
     before: Callable[[str, Path], None] = lambda _command, _folder: None
     environment: dict[str, str] = field(default_factory=lambda: os.environ | {"PATH": _path()})
     seconds: dict[str, float] = field(default_factory=dict)
-    _running: list[tuple[str, subprocess.Popen[str]]] = field(default_factory=list)
+    _running: list[tuple[str, subprocess.Popen[bytes], IO[bytes]]] = field(default_factory=list)
 
     def type(self, line: str) -> None:
         """Run one line to its end, or, where it runs until Ctrl-C, leave it running. AssertionError: it failed."""
@@ -68,39 +71,46 @@ class Terminal:
             return None
         for verb in _ENDED_BY.get(words[1], ()):
             self._end(verb)
+        screen = tempfile.TemporaryFile("a+b")  # noqa: SIM115 - it stays open as long as the command runs
         process = subprocess.Popen(
             ["bash", "-c", f"exec {command}"],
             cwd=self.folder,
             env=self.environment,
             stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
+            stdout=screen,
             stderr=subprocess.STDOUT,
-            text=True,
             start_new_session=True,
         )
         if words[1] not in _STREAMS:
-            return _assert_fine(command, process, process.communicate(timeout=LONGEST)[0])
-        self._running.append((words[1], process))
+            process.wait(LONGEST)
+            return _assert_fine(command, process, _printed(screen))
+        self._running.append((words[1], process, screen))
+        ends = time.monotonic() + LONGEST
+        starts = words[1] not in _SILENT  # which takes as long as ENOUGH on a busy machine
+        while starts and process.poll() is None and time.monotonic() < ends:
+            time.sleep(0.1)
+            starts = not _works(_printed(screen))
         time.sleep(ENOUGH)
         if process.poll() not in (None, 0):
-            _assert_fine(command, process, process.communicate()[0])
+            _assert_fine(command, process, _printed(screen))
         return None
 
     def _end(self, verb: str) -> None:
         """Press Ctrl-C where a verb runs. AssertionError: one had failed, or did not end in order."""
-        ended = [process for name, process in self._running if name == verb]
-        self._running = [(name, process) for name, process in self._running if name != verb]
-        for process in ended:
+        ended = [(process, screen) for name, process, screen in self._running if name == verb]
+        self._running = [running for running in self._running if running[0] != verb]
+        for process, _ in ended:
             if process.poll() is None:
                 process.send_signal(signal.SIGINT)
-        printed = [process.communicate(timeout=60)[0] for process in ended]
-        for process, text in zip(ended, printed, strict=True):
+        for process, screen in ended:
+            process.wait(60)
+            text = _printed(screen)
             assert process.returncode in (0, 130), text
             assert "Traceback" not in text, text
 
     def kill(self) -> None:
         """End whatever runs still, in no order."""
-        for _, process in self._running:
+        for _, process, _ in self._running:
             process.kill()
 
 
@@ -115,7 +125,18 @@ def terminal(folder: Path, before: Callable[[str, Path], None] | None = None) ->
         opened.kill()
 
 
-def _assert_fine(command: str, process: subprocess.Popen[str], printed: str) -> None:
+def _printed(screen: IO[bytes]) -> str:
+    """What stands on a command's screen so far."""
+    screen.seek(0)
+    return screen.read().decode()
+
+
+def _works(printed: str) -> bool:
+    """Whether a command has printed more than the line on plug-ins, which comes before all else."""
+    return any(not line.startswith("plug-ins") for line in printed.splitlines())
+
+
+def _assert_fine(command: str, process: subprocess.Popen[bytes], printed: str) -> None:
     assert process.returncode == 0, f"{command}\nexit {process.returncode}\n{printed}"
     assert "Traceback" not in printed, f"{command}\n{printed}"
 
