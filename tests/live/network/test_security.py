@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -122,8 +123,10 @@ class TestZenohsOwnLog:
     ) -> None:
         line = re.search(r"RUST_LOG=(\S+)", find_topic("live").text)
         assert line is not None
-        monkeypatch.setenv("RUST_LOG", line[1] if asked else "off")
-        with running(tmp_path / "router", mutual(keys)) as router:
+        with ExitStack() as entered:
+            with monkeypatch.context() as environment:  # of the router's process: in this one Zenoh would log for ever
+                environment.setenv("RUST_LOG", line[1] if asked else "off")
+                router = entered.enter_context(running(tmp_path / "router", mutual(keys)))
             refusal(member(router, keys / "other", "apr02", ca=keys / "ca.pem"))
             with open_session(member(router, keys, "apr02"), "apr02") as session:
                 session.put("apr03/joint_states", b"forged")
