@@ -158,9 +158,9 @@ def without_seconds(output: Path) -> list[dict[str, Any]]:
     return [{name: value for name, value in run.items() if name not in timed} for run in summary(output)["runs"]]
 
 
-def files_of(folder: Path) -> dict[str, tuple[int, bytes]]:
+def files_of(folder: Path, pattern: str = "*") -> dict[str, tuple[int, bytes]]:
     """Time of change and content of every file."""
-    files = (file for file in folder.rglob("*") if file.is_file())
+    files = (file for file in folder.rglob(pattern) if file.is_file())
     return {str(file.relative_to(folder)): (file.stat().st_mtime_ns, file.read_bytes()) for file in files}
 
 

@@ -103,7 +103,7 @@ class Terminal:
             if process.poll() is None:
                 process.send_signal(signal.SIGINT)
         for process, screen in ended:
-            process.wait(60)
+            process.wait(LONGEST)
             text = _printed(screen)
             assert process.returncode in (0, 130), text
             assert "Traceback" not in text, text

@@ -34,6 +34,8 @@ from omnibench.data.storage import save_dataset
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.simulate import simulate_dataset
 
+WHOLE = "[!.]*"  # files; one that a killed process was writing begins with a dot
+
 # Ends soon after its file is there, and not before: what Ctrl-C finds under way.
 WAITING = """
 @calibrators.register("waiting")
@@ -208,7 +210,7 @@ def test_the_runs_end_with_a_comparison_that_is_killed_which_then_goes_on(name: 
     _, stderr = process.communicate(timeout=PATIENCE)
     assert "Traceback" not in stderr
     assert wait_until_gone(process.pid) == []
-    before = files_of(tmp_path / "out" / "runs")
+    before = files_of(tmp_path / "out" / "runs", WHOLE)
     (tmp_path / "go").touch()
     run = compared(config, tmp_path / "out")
     assert run.stderr.count("kept from an earlier run") == len(before) > 0
@@ -267,7 +269,7 @@ def test_a_killed_comparison_of_runs_that_are_killed_hang_or_want_memory_goes_on
     process.kill()
     process.communicate(timeout=PATIENCE)
     assert wait_until_gone(process.pid) == []
-    before, began = files_of(tmp_path / "out" / "runs"), tries(tmp_path)
+    before, began = files_of(tmp_path / "out" / "runs", WHOLE), tries(tmp_path)
     assert 0 < len(before) < len(entries)
 
     run = omnibench("compare", config, "--output", tmp_path / "out")

@@ -23,6 +23,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 from dask_samples import program, scheduler, searched_first, worker
 from job_samples import IMPORTING_THIS, Answer, Notes, jobs_of, wait_for
+from timing import PATIENCE
 
 import omnibench as package
 import omnibench.jobs.dask_backend as dask_backend
@@ -67,11 +68,9 @@ def test_a_wrong_backend_is_named(name: str, message: str) -> None:
     assert message in str(refused.value)
 
 
-def test_a_scheduler_that_nobody_started_is_one_line_soon(tmp_path: Path) -> None:
-    began = time.monotonic()
+def test_a_scheduler_that_nobody_started_is_one_line(tmp_path: Path) -> None:
     run = omnibench("compare", write_config(tmp_path), "-o", tmp_path / "out", "--backend", "tcp://127.0.0.1:9")
     assert_refused(run, "no Dask scheduler answers at tcp://127.0.0.1:9", "start one (dask scheduler)")
-    assert time.monotonic() - began < 60
 
 
 def test_a_scheduler_without_tls_is_joined_with_a_line_that_says_who_runs_code_there(
@@ -182,7 +181,7 @@ class TestPlugins:
             process = subprocess.Popen(
                 [sys.executable, "-c", MOVES, str(config), str(tmp_path / "out"), address, str(hidden)], env=ENVIRONMENT
             )
-            assert process.wait(timeout=60) == 0
+            assert process.wait(timeout=PATIENCE) == 0
         (row,) = [run for run in summary(tmp_path / "out")["runs"] if run["calibrator"] == "needs"]
         assert (row["outcome"], row["reason"]) == ("converged", "from a package")
 
@@ -255,7 +254,7 @@ def test_when_the_client_is_killed_its_jobs_end_and_it_goes_on_when_started_agai
         client.wait()
         wait_for(lambda: time.time() - (tmp_path / "alive").stat().st_mtime > 1)
         (tmp_path / "go_on").touch()
-        subprocess.run(command, env=IMPORTING_THIS, check=True, timeout=60)
+        subprocess.run(command, env=IMPORTING_THIS, check=True, timeout=PATIENCE)
     assert len(list((tmp_path / "store").glob("*.json"))) == 5
 
 
@@ -264,7 +263,7 @@ def test_ctrl_c_in_a_terminal_is_left_to_the_client(tmp_path: Path) -> None:
     client = subprocess.Popen(command, env=IMPORTING_THIS, stderr=subprocess.PIPE, text=True, start_new_session=True)
     wait_for((tmp_path / "alive").exists)
     os.killpg(client.pid, signal.SIGINT)  # a terminal sends it to all of its processes
-    assert client.communicate(timeout=60)[1] == "interrupted\n"
+    assert client.communicate(timeout=PATIENCE)[1] == "interrupted\n"
 
 
 def test_a_web_server_is_no_scheduler() -> None:
@@ -283,7 +282,7 @@ def test_a_scheduler_that_is_killed_is_one_line(tmp_path: Path) -> None:
         client = subprocess.Popen(command, env=IMPORTING_THIS, stderr=subprocess.PIPE, text=True)
         wait_for((tmp_path / "alive").exists)
         process.kill()
-        told = client.communicate(timeout=60)[1]
+        told = client.communicate(timeout=PATIENCE)[1]
     assert told == f"the Dask scheduler {place} is lost; start it again, then the same command\n"
 
 

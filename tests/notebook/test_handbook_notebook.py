@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from timing import PATIENCE
 
 from omnibench.cli.handbook_topics import HANDBOOK
 from omnibench.robot.calibration import read_calibration
@@ -20,7 +21,7 @@ def test_a_notebook_runs_and_finds_the_robot(file: Path, tmp_path: Path) -> None
     nbformat = pytest.importorskip("nbformat")
     pytest.importorskip("ipykernel")
     notebook: Any = nbformat.read(file, as_version=4)
-    nbclient.NotebookClient(notebook, timeout=120, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    nbclient.NotebookClient(notebook, timeout=int(PATIENCE), resources={"metadata": {"path": str(tmp_path)}}).execute()
     shown = [set(output["data"]) for cell in notebook.cells for output in cell.get("outputs", ()) if "data" in output]
     assert sum("application/vnd.plotly.v1+json" in kinds for kinds in shown) == 4
     assert sum("text/html" in kinds for kinds in shown) >= 3

@@ -15,6 +15,7 @@ import pytest
 from commands import assert_refused, omnibench, run_here
 from sample_robots import APR_02
 from storage_samples import a_trajectory
+from timing import PATIENCE
 
 from omnibench.config import read_yaml
 from omnibench.data.dataset import make_dataset
@@ -208,7 +209,7 @@ def test_a_plugin_whose_import_never_ends_is_refused_by_every_command(tmp_path: 
     program = "import omnibench.registry as registry; registry._IMPORT_SECONDS = 0.5\n"
     program += f"import sys; sys.argv = ['omnibench', 'list', '--plugins', {str(tmp_path)!r}]\n"
     program += "from omnibench.__main__ import main; main()"
-    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=100, check=False)
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=PATIENCE, check=False)
     assert run.returncode == 0
     assert "loop.py cannot be imported: PluginError: " in run.stderr
     assert "not imported within 0.5 s" in run.stderr

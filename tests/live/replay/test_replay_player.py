@@ -14,6 +14,7 @@ import pytest
 from recordings import random_dataset
 from replayed import DRIVE, ORIGIN, TOPICS, config, of, played, same
 from sessions import Loopback, until
+from timing import PATIENCE
 
 from omnibench.errors import ConfigError
 from omnibench.live.replay.concatenated_drive import ConcatenatedDrive, concatenate_runs
@@ -149,7 +150,7 @@ class TestPlayer:
         thread.start()
         time.sleep(0.2)  # it would have played all of it by now
         node = Listener(loopback)
-        thread.join(60)
+        thread.join(PATIENCE)
         until(lambda: node.count == reports[0].total, "all messages")
         assert min(message.stamp for message in node.messages("joint_states")) == ORIGIN
 
