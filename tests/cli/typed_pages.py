@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import IO
 
 LONGEST = 900  # s, of one command
-ENOUGH = 8.0  # s after it began to work, when the reader of a command that runs until Ctrl-C has seen enough
+ENOUGH = 8.0  # s: how long a reader watches a command that runs until Ctrl-C, once it works
 _STREAMS = ("live", "replay", "listen", "record")  # run until Ctrl-C, or as long as the recording that they play
 _SILENT = ("replay",)  # prints nothing into a file until it has ended
 _TYPED = re.compile(r"^    ((?:omnibench|cd) (?:.*\\\n)*.*)$", re.MULTILINE)
@@ -86,7 +86,7 @@ class Terminal:
             return _assert_fine(command, process, _printed(screen))
         self._running.append((words[1], process, screen))
         ends = time.monotonic() + LONGEST
-        starts = words[1] not in _SILENT  # which takes as long as ENOUGH on a busy machine
+        starts = words[1] not in _SILENT  # on a busy machine the start takes longer than ENOUGH
         while starts and process.poll() is None and time.monotonic() < ends:
             time.sleep(0.1)
             starts = not _works(_printed(screen))
@@ -132,7 +132,7 @@ def _printed(screen: IO[bytes]) -> str:
 
 
 def _works(printed: str) -> bool:
-    """Whether a command has printed more than the line on plug-ins, which comes before all else."""
+    """True once a command has printed more than the line on plug-ins, which comes before all else."""
     return any(not line.startswith("plug-ins") for line in printed.splitlines())
 
 

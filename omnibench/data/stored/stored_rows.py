@@ -107,11 +107,11 @@ def read_parquet(file: Path) -> pl.DataFrame:
             raise DataError(f"{file}: column {column!r} holds {kind}, expected names or numbers")
     with readable(file):
         frame = pl.read_parquet(file, glob=False)
-    for cells in frame.select(pl.col(pl.String).str.len_chars().max()).to_dicts():
-        for column, longest in cells.items():
-            if (longest or 0) > _LONGEST_CELL:
-                text = f"a text of {longest:,} characters"
-                raise DataError(f"{file}: column {column!r} has {text}, expected names or numbers")
+    for lengths in frame.select(pl.col(pl.String).str.len_chars()).iter_columns():
+        longest = lengths.fill_null(0).to_numpy().max(initial=0)
+        if longest > _LONGEST_CELL:
+            text = f"a text of {longest:,} characters"
+            raise DataError(f"{file}: column {lengths.name!r} has {text}, expected names or numbers")
     return frame
 
 

@@ -221,7 +221,7 @@ def _patches(places: Array) -> list[dict[str, float]]:
 
 
 _LOW, _HIGH = 0.1, 6.0  # waves a turn; slower ones look like radii, for faster ones there are whole columns (chosen)
-_MOST_NUMBERS = 1500  # of waves; over angles that tell more apart, the higher ones are left out (chosen)
+_MAX_WAVES = 1500  # wave numbers that are tried; if the angles resolve more, the highest are left out (chosen)
 _WIDTH = 0.1  # w, rad: the fastest wave moves on by 0.6 rad, by which it shows at 98 % (chosen)
 _TOGETHER = 300_000  # scores of runs and numbers of waves that are computed at once (chosen)
 _TURNS = 10  # over all runs, from which on waves a turn can be told from a radius (chosen)
@@ -245,7 +245,7 @@ def waves_of_wheels(fit: Fit, paths: Paths) -> Iterator[tuple[Group, Array]]:
     span = float(np.ptp(angles, axis=0).max())
     if span < 2 * np.pi * _TURNS:
         return
-    numbers = np.arange(_LOW, _HIGH, np.pi / span)[:_MOST_NUMBERS]
+    numbers = np.arange(_LOW, _HIGH, np.pi / span)[:_MAX_WAVES]
     rates = paths.signals.rates
     changes = [paths.changes(paths.by_rates(rates * unit)) for unit in np.eye(rates.shape[1])]
     pull, at_once = pull_by(fit, paths, changes), max(1, _TOGETHER // len(paths.logs))

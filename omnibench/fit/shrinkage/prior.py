@@ -41,9 +41,9 @@ class Tolerance:
 # Radius and place of a wheel are known to 1 or 2 %. What all wheels share is known less well: the load on tyres, which
 # changes their radii, and the track on which they turn (Borenstein and Feng, IEEE T-RA 12:869, 1996, sections 2 and 3).
 # Rollers lose or gain some per cent of a motion, 8 on the mecanum base of OptiOdom; a skid-steered base turns by 0.5 to
-# 0.8 of what its track says (Mandow et al., IROS 2007), about a point that is off by the load and the ground. Without
-# that point, the intervals of its turn hold the truth in 80 % (tests/benchmarks/shrink_coverage.py). Half and twice:
-# tests/benchmarks/shrink_study.py.
+# 0.8 of what its track says (Mandow et al., IROS 2007), about a centre that load and ground shift by some cm. If
+# the centre is taken for known, only 80 % of the 95 % intervals of a skid base's turn hold the truth
+# (tests/benchmarks/shrink_coverage.py). tests/benchmarks/shrink_study.py fits with half and twice these tolerances.
 _USUAL = Tolerance(0.02, (0.05, 0.05, 0.05))
 TOLERANCES: Mapping[RobotClass, Tolerance] = MappingProxyType(
     {

@@ -15,8 +15,8 @@ LONGEST: Final = 1 << 17  # bytes of a request: 48 KiB of weights, in base64, an
 _NANOSECONDS: Final = 10**14  # values of ``at`` from this on are ns: as s they would be 3 million years from now
 _LAST: Final = 2**63 - 1  # ns, the last time in 64 bits
 _LONGEST_NUMBER: Final = 40  # characters of a time; chosen
-_VALUES_OF_CALIBRATION: Final = 5_000  # at most, of some 20 wheels; chosen: more would delay samples
-_VALUES_OF_POSE: Final = 20  # at most; its five fields are eleven
+_MAX_CALIBRATION_VALUES: Final = 5_000  # enough for 20 wheels; parsing more would delay samples (chosen)
+_MAX_POSE_VALUES: Final = 20  # a mapping with all five keys and their values counts as eleven
 
 
 class PoseOrder(Model):
@@ -38,7 +38,7 @@ def read_pose(payload: bytes, parameters: dict[str, str]) -> PoseOrder:
         text = payload.decode()
     except UnicodeDecodeError:
         raise ConfigError(f"{where}: the payload is not text; send x, y (m) and theta (rad) in JSON") from None
-    return validate(PoseOrder, parse_yaml(text, where, _VALUES_OF_POSE), where)  # JSON is a part of YAML
+    return validate(PoseOrder, parse_yaml(text, where, _MAX_POSE_VALUES), where)  # JSON is a part of YAML
 
 
 def read_time(text: str) -> int:
@@ -64,4 +64,4 @@ def read_sent_calibration(payload: bytes, where: str) -> Calibration:
         text = payload.decode()
     except UnicodeDecodeError as error:
         raise DataError(f"{where}: not a text in UTF-8: {error}") from None
-    return parse_calibration(text, where, _VALUES_OF_CALIBRATION)
+    return parse_calibration(text, where, _MAX_CALIBRATION_VALUES)
