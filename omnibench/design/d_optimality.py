@@ -32,7 +32,7 @@ from omnibench.words import plural
 Counts = NDArray[np.intp]
 
 # Half of each of these numbers and twice give the same designs of twelve commands; only a _NEAR of 2e-4 takes another
-# one, whose standard deviations differ by 0.03 % (tests/benchmarks/constants_fit.py).
+# one, whose standard deviations differ by 0.03 % (tests/studies/constants_fit.py).
 # Information added in every direction, as a share of that of an average candidate: designs of the first few runs, whose
 # determinant is zero, can then be compared. Much smaller, and rounding would decide between them.
 _RIDGE = 1e-6

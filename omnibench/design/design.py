@@ -223,7 +223,7 @@ def _physical_spread(slopes: Array, covariance: Array, robot: Robot) -> Physical
 
 
 # Half of each of these numbers (or of the distance from 1) and twice choose the same runs of twelve commands
-# (tests/benchmarks/constants_fit.py).
+# (tests/studies/constants_fit.py).
 # Share of the bound: the recommended design is the smallest that reaches it. The rest is worth 0.5 % of a deviation.
 GOOD_EFFICIENCY = 0.99
 _MOST_STEPS = 400  # runs: designs are listed up to the baseline's number, but no further than this

@@ -26,7 +26,7 @@ from omnibench.discover.selection.screening import Screening
 
 # delta of the generic bases, which no effect has the form of. With it the likeliest covariate is right in 72 % of 57
 # blind sets, of which 80 % is said, and the second in 11 %, of which 7 % is said. Half of it says 99 % of 72 %, 1.5
-# times 31 % of 51 % (tests/benchmarks/place_study.py).
+# times 31 % of 51 % (tests/studies/place_study.py).
 _DISCREPANCY = 0.2
 _SHOWN = 0.01  # chance up to which a dependence is mentioned; verdicts count those below CHANCE alone
 

@@ -56,7 +56,7 @@ from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
 
 # Effects that the first selection gave up are kept if, once they are fitted in full, less than this share of the
-# chi-square that they left to first order remains. tests/benchmarks/constants.py varies it by 0.5 and 2, and no verdict
+# chi-square that they left to first order remains. tests/studies/constants.py varies it by 0.5 and 2, and no verdict
 # changes.
 _EXPLAINED = 0.5
 

@@ -40,7 +40,7 @@ from omnibench.views import Brief
 
 _TIMED = 3  # parts whose mean time stands for that of all: the whole box and its first two parts
 # Parts of proofs to a gap of 0.1 %: the median and the fewest of twelve of simulated data (61 to 379), and the 901 of
-# the real omni3 in the box paper. A tenth of the gap takes about twice as many (tests/benchmarks/proof_parts.py).
+# the real omni3 in the box paper. A tenth of the gap takes about twice as many (tests/studies/proof_parts.py).
 _PARTS, _FEW_PARTS, _MANY_PARTS = 150, 60, 900
 _PARTS_GAP = 1e-3
 # Parts that are cut at once by a backend, and how often each, however many workers it has: a cut takes 10 to 20 ms, to

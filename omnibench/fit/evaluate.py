@@ -163,7 +163,7 @@ def verdict_on(model: OdometryModel, training: Sequence[Trajectory], held_out: S
 
     Held-out runs decide if they are of ten units or more (commands, or runs where none repeats): an error that a
     calibration halves is told from chance in 27 % of sets of three units, 67 % of five and 94 % of ten; where few
-    commands count for most, in 17, 39 and 73 % (tests/benchmarks/improvement_coverage.py, kinds usual and tails). If
+    commands count for most, in 17, 39 and 73 % (tests/studies/improvement_coverage.py, kinds usual and tails). If
     they are fewer, and all runs have more units, cross-validation decides, unless they say worse, or quick fits do not
     stand for the model: it has effects, or does not gain on all runs what a quick fit to these gains.
     """

@@ -24,7 +24,7 @@ from omnibench.robot.robot_class import class_of
 from omnibench.robot.wheels.drive import CarDrive
 
 # Share of each parameter's scale: step of central differences, near the cube root of the rounding (Press et al.,
-# Numerical Recipes, 2007, section 5.7). Half of it and twice change nothing (tests/benchmarks/constants_fit.py).
+# Numerical Recipes, 2007, section 5.7). Half of it and twice change nothing (tests/studies/constants_fit.py).
 _STEP = 1e-6
 Deviation = FiniteFloat | tuple[FiniteFloat, FiniteFloat]
 # A skid-steered base turns as if its wheels stood up to twice as far apart (Mandow et al., IROS 2007).

@@ -12,7 +12,7 @@ from omnibench.registry import Options
 from omnibench.robot.kinematics import Array
 
 # m, rad: replaces a cost that is not finite, since NLopt's searches cannot compare NaN. Any number above all costs will
-# do; half of it and twice change nothing (tests/benchmarks/constants_fit.py).
+# do; half of it and twice change nothing (tests/studies/constants_fit.py).
 _LARGE = 1e10
 _REASONS = {
     nlopt.SUCCESS: "done",

@@ -40,7 +40,7 @@ from omnibench.robot.stored.odometry_of_stored import StoredOdometry
 _PROGRESS_PERIOD = 0.1  # s, least time between two reports of progress: ten a second are all that a reader sees
 _MOST_POSES = 4_000_000  # poses of candidates that are held together, 0.1 GB (chosen)
 # Evaluations from which on the fast evaluator repays the time it takes to build. Both ways give the same costs to 1e-11
-# m; half of it and twice change no estimate (tests/benchmarks/constants_fit.py).
+# m; half of it and twice change no estimate (tests/studies/constants_fit.py).
 _WORTH_BUILDING = 50
 # Of runs that are read where they are used: building takes 19 us a sample, one evaluation 0.05 us (chosen).
 _WORTH_BUILDING_OF_STORED = 400

@@ -18,19 +18,19 @@ State = Literal["driven", "weak", "undriven"]
 
 # Share of the strongest direction below which a direction holds noise and no motion. Half of it changes nothing; with
 # twice, slip of 2 % counts as no motion in the place of a weak one, and both keep the design
-# (tests/benchmarks/constants_fit.py).
+# (tests/studies/constants_fit.py).
 _NULL_SHARE = 1e-2
 
 # Share of the strongest direction below which slip alone may explain what was driven. Slip of 1 % of the strongest
 # motion changes the matrix along a direction driven with a tenth of it by 10 %, more than a calibration corrects. Festo
 # Robotino runs without commanded turns have 0.051 and 0.053 along the direction that turns the robot (slip, uneven
 # motors); recordings with commanded turns have 0.53 (omni3) and 0.56 (flower of the APR-02).
-# On the simulated recordings of tests/benchmarks/constants_fit.py half of it and twice change nothing; with half of it
+# On the simulated recordings of tests/studies/constants_fit.py half of it and twice change nothing; with half of it
 # Robotino's would count as driven.
 WEAK_SHARE = 0.1
 
 # The following decide on names of directions alone; half of each and twice give the same names
-# (tests/benchmarks/constants_fit.py).
+# (tests/studies/constants_fit.py).
 _SAME_DIRECTION = 0.99  # cosine from which on a direction is called by one of the robot's motions: 8 degrees
 _ALMOST = math.tan(math.radians(5))  # ratio of speeds below which the smaller one is not mentioned
 _NO_MOTION = 0.05  # m per metre that the wheels roll: a direction that moves the robot less only slips

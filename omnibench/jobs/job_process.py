@@ -23,7 +23,7 @@ from omnibench.jobs.packing import PackedJob
 from omnibench.processes import end_with_parent, interrupts_deferred, main_module_hidden, one_thread
 from omnibench.progress import Progress
 
-# s after its start in which a process takes further jobs: to start one costs 20 ms (tests/benchmarks/job_overhead.py),
+# s after its start in which a process takes further jobs: to start one costs 20 ms (tests/studies/job_overhead.py),
 # 2 % of that; what jobs leave behind in it (memory, caches) is that of a second.
 _YOUNG = 1.0
 _OWN = 60.0  # s, for jobs of our own code, which leave nothing behind but what they share: data need not go again

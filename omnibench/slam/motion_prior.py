@@ -16,7 +16,7 @@ from omnibench.robot.planar import compose, relative, unit_twist
 from omnibench.slam.motion_within_scan import MotionWithinScan, smoothed
 from omnibench.slam.slam_options import SlamOptions
 
-# The study tests/benchmarks/constants_slam.py varies these numbers by 0.5 and 2. In three rooms SLAM's median error
+# The study tests/studies/constants_slam.py varies these numbers by 0.5 and 2. In three rooms SLAM's median error
 # stays between 1.07 and 1.08 mm and the median NEES between 2.3 and 2.7 (3 for an honest covariance).
 _ARM = 0.3  # m: lever arm that turns a rotation into a distance
 _PER_LENGTH: Array = np.array([1.0, 1.0, 1 / _ARM])  # m, m, rad for each m of the way

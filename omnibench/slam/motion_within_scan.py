@@ -10,7 +10,7 @@ import numpy as np
 from omnibench.robot.kinematics import Array
 from omnibench.robot.planar import relative, unit_twist
 
-# The study tests/benchmarks/constants_slam.py varies these numbers by 0.5 and 2. In three rooms SLAM's median error
+# The study tests/studies/constants_slam.py varies these numbers by 0.5 and 2. In three rooms SLAM's median error
 # stays at 1.07 mm and the median NEES between 2.5 and 2.6 (3 for an honest covariance).
 _AROUND = 0.25  # s of odometry besides the scan's own time that the fit takes in
 _INSTANT = 0.02  # s between the odometry poses of the fit

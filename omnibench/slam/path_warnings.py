@@ -14,7 +14,7 @@ from omnibench.slam.matching.scan_matching import LOST, Match
 from omnibench.slam.motion_prior import length
 from omnibench.slam.slam_options import SlamOptions
 
-# The study tests/benchmarks/constants_slam.py varies these numbers by 0.5 and 2. In three rooms, in round ones, with a
+# The study tests/studies/constants_slam.py varies these numbers by 0.5 and 2. In three rooms, in round ones, with a
 # quick robot and with a mirrored scanner the warnings stay the same, except that _DEGENERATE = 1 warns always and
 # _BEYOND = 10 misses the mirrored scanner.
 _DEGENERATE = 0.5  # observability below which a direction counts as not measured by a scan

@@ -38,8 +38,8 @@ from omnibench.robot.planar import rotation
 from omnibench.slam.matching.scan_matching import Match
 
 # m^2, m^2, rad^2: least covariance that is stated, for a start pose that is exact by definition. A hundredth of the
-# variances that poses of SLAM have (tests/benchmarks/slam_study.py), so that a covariance can be inverted. Half of it
-# and twice change stated deviations by 3 % at most (tests/benchmarks/constants_slam.py).
+# variances that poses of SLAM have (tests/studies/slam_study.py), so that a covariance can be inverted. Half of it
+# and twice change stated deviations by 3 % at most (tests/studies/constants_slam.py).
 FLOOR: Array = np.diag([1e-4, 1e-4, 1e-5]) ** 2
 
 

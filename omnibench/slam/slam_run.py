@@ -19,7 +19,7 @@ from omnibench.slam.path_warnings import PathWarning, path_warnings
 from omnibench.slam.pose_errors import PoseErrors
 from omnibench.slam.slam_options import SlamOptions
 
-# The study tests/benchmarks/constants_slam.py varies these numbers by 0.5 and 2. In three rooms _SKEWED moves poses by
+# The study tests/studies/constants_slam.py varies these numbers by 0.5 and 2. In three rooms _SKEWED moves poses by
 # 0.2 of their deviations at most, the others not at all.
 _SKEWED = 1e-3  # m or rad of unknown motion between a scan's first and last ray: less does not matter
 _CORRECTIONS = 4  # times at most that the motion within a scan is corrected

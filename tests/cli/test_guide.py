@@ -24,7 +24,7 @@ BY_NAME = {topic.name: topic for topic in topics()}
 TYPED = sorted({command for page in PAGES for command in commands_in(page.read_text(encoding="utf-8"))})
 
 _LINK = re.compile(r"\]\(([^)#:]+)(?:#[^)]*)?\)")
-_IN_THE_CLONE = re.compile(r"\b((?:tests/benchmarks|configs)/[\w./-]+\.(?:py|yaml))")
+_IN_THE_CLONE = re.compile(r"\b((?:tests/studies|configs)/[\w./-]+\.(?:py|yaml))")
 _PYTHON = re.compile(r"```python\n(.*?)```", re.DOTALL)
 
 

@@ -45,7 +45,7 @@ def endpoint(config: Path) -> str:
     return str(yaml.safe_load(config.read_text())["zenoh"]["listen"])
 
 
-@pytest.mark.parametrize("loops", [0, pytest.param(2, marks=pytest.mark.study)])
+@pytest.mark.parametrize("loops", [0, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_replay_to_a_node_is_one_command_and_shows_that_odom_is_the_batch_odometry(
     workplace: Path, loops: int
 ) -> None:

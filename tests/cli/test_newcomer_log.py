@@ -43,7 +43,7 @@ def typed_on(line: str, machine: Machine) -> list[str]:
     return shlex.split(options.replace("=N", f"={machine.ticks}"))
 
 
-@pytest.mark.parametrize("robot", ["diff", pytest.param("mecanum", marks=pytest.mark.study)])
+@pytest.mark.parametrize("robot", ["diff", pytest.param("mecanum", marks=pytest.mark.slow)])
 def test_four_commands_lead_from_a_strange_log_to_the_true_calibration(robot: str, tmp_path: Path) -> None:
     machine = log_of(robot, tmp_path)
     first = ["import", "csv", "logs", "-o", "data", "--set", "robot=robot.yaml"]

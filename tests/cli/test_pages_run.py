@@ -63,7 +63,7 @@ def test_nothing_is_below_the_exact_optimum_in_the_same_box(paper: dict[str, dic
 
 
 def test_the_exact_optimum_takes_a_handful_of_evaluations(paper: dict[str, dict[str, Any]]) -> None:
-    assert paper["closed_form"]["evaluations"] <= 10  # times are measured in tests/benchmarks
+    assert paper["closed_form"]["evaluations"] <= 10  # times are measured in tests/studies
     assert paper["closed_form"]["outcome"] == "converged"
 
 

@@ -33,7 +33,7 @@ def fewer_runs(command: str, folder: Path) -> None:
 
 @pytest.fixture(
     scope="module",
-    params=[fewer_runs, pytest.param(prepare, marks=pytest.mark.study)],
+    params=[fewer_runs, pytest.param(prepare, marks=pytest.mark.slow)],
     ids=["with 12 runs", "with all runs"],
 )
 def reader(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:

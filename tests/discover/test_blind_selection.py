@@ -1,6 +1,6 @@
 """A few blind sets, a third of the benchmark's in size, so that the suite notices when discover goes blind.
 
-The rates are those of the study, tests/benchmarks/discover_study.py.
+The rates are those of the study, tests/studies/discover_study.py.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def test_where_nothing_is_hidden_nothing_is_named() -> None:
     assert judged("null", level=0.0, noise="mixed").outcome in ("none", "unknown")
 
 
-@pytest.mark.study
+@pytest.mark.slow
 def test_two_strong_effects_both_get_their_names() -> None:
     assert judged("pair", "thermal_radius_drift", "wheel_eccentricity").both_right
 

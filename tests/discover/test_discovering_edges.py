@@ -29,7 +29,7 @@ def turned(run: Trajectory, angle: float) -> Trajectory:
     return replace(run, poses=poses)
 
 
-@pytest.mark.study
+@pytest.mark.slow
 def test_start_headings_that_scatter_are_not_taken_for_clocks_and_hide_no_delay() -> None:
     rng = np.random.default_rng(6)
     dataset = with_runs(simulated(DELAY, repetitions=4, validation=None), lambda run: turned(run, rng.normal(0, 0.03)))

@@ -114,7 +114,7 @@ def test_the_extended_model_and_the_report_are_made_for_robots_that_steer(name: 
 
 @pytest.mark.parametrize("recording", [tricyc, diff], ids=["tricyc", "diff"])
 def test_real_recordings_go_through_and_what_is_said_of_them_is_consistent(recording: Callable[[], Dataset]) -> None:
-    # Fewer runs and poses, for time; tests/benchmarks/wheeled_discovery.py takes all.
+    # Fewer runs and poses, for time; tests/studies/wheeled_discovery.py takes all.
     runs = [
         replace(run, pose_times=run.pose_times[::_SPARSE], poses=run.poses[::_SPARSE])
         for run in recording().trajectories[::5]

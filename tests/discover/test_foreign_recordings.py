@@ -15,7 +15,7 @@ from foreign_study import KINDS, Result, table
 import omnibench
 from omnibench.robot.model import OdometryModel
 
-FOREIGN = Path(__file__).parents[1] / "benchmarks" / "foreign"
+FOREIGN = Path(__file__).parents[1] / "studies" / "foreign"
 
 
 @pytest.mark.parametrize("file", sorted(FOREIGN.glob("*.py")), ids=lambda file: file.stem)

@@ -27,7 +27,7 @@ def recorded(variant: str) -> Dataset:
     return simulate_dataset(config_of(variant, 5, **FEW), variant).dataset
 
 
-@pytest.mark.study
+@pytest.mark.slow
 def test_no_effect_is_named_that_the_simulated_robot_does_not_have() -> None:
     found = discover_effects(recorded("coarse"))
     assert not false_names(found)

@@ -160,7 +160,7 @@ def test_of_one_run_nothing_is_held_out_and_there_is_no_floor() -> None:
         assert "held out" not in words
 
 
-@pytest.mark.study
+@pytest.mark.slow
 def test_what_is_left_over_is_looked_for_again_once_a_smooth_term_is_added() -> None:
     dataset = session_set("small", 3, effect="speed_dependent_radius")
     plain, smooth = (

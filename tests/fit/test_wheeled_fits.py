@@ -55,7 +55,7 @@ def test_a_known_tracked_point_is_no_slide() -> None:
 
 @pytest.mark.parametrize(
     "robot",
-    [DIFFERENTIAL, *(pytest.param(robot, marks=pytest.mark.study) for robot in (TRICYCLE, CAR))],
+    [DIFFERENTIAL, *(pytest.param(robot, marks=pytest.mark.slow) for robot in (TRICYCLE, CAR))],
     ids=lambda robot: robot.name,
 )
 def test_the_geometry_is_found_by_a_search(robot: Robot) -> None:

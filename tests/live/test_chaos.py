@@ -1,4 +1,4 @@
-"""The suite of faults (tests/benchmarks/chaos.py), for some seconds, and what its account would notice."""
+"""The suite of faults (tests/studies/chaos.py), for some seconds, and what its account would notice."""
 
 from __future__ import annotations
 

@@ -287,7 +287,7 @@ def test_nonsense_on_any_topic_is_counted_and_the_stream_lives(tmp_path: Path) -
 
 
 def test_memory_stays_flat_over_many_samples(tmp_path: Path) -> None:
-    """Ten minutes at 100 Hz; tests/benchmarks/live_memory.py takes an hour."""
+    """Ten minutes at 100 Hz; tests/studies/live_memory.py takes an hour."""
     path = drive(60.0)
     with running(config_of(tmp_path)) as (node, session):
         wheels, poses = wheels_of(session), session.declare_publisher("apr/slam_pose", congestion_control=_BLOCK)

@@ -27,7 +27,7 @@ _UNUSED = LegendItem("unused", "candidates not chosen", "#d4d9df")
 _BASELINE = LegendItem("", "baseline", QUIET, symbol="diamond")
 # rad: a run that turns by less is drawn as straight; nothing else hangs on it. Before calibration the simulated APR-02
 # seems to turn by 0.1 to 2.7 degrees in six straight runs: five are drawn as straight, three with half of it and six
-# with twice (tests/benchmarks/constants_fit.py).
+# with twice (tests/studies/constants_fit.py).
 _STRAIGHT_BELOW = math.radians(2)
 _HEIGHT = 380  # px: the paths end within the first 900 of the page
 _ROW_DASHES: tuple[Dash, ...] = ("solid", "dash", "dot")

@@ -15,7 +15,7 @@ from omnibench.report.blocks import Cell, Column, Row, RowRole, Table
 from omnibench.report.numbers import NOTHING, count, fixed, percent, significant
 
 # Designs in the table against the number of runs, beside the chosen one and the baseline. Only the table's length hangs
-# on it: 6 and 15 lines in the place of 9 with half of it and with twice (tests/benchmarks/constants_fit.py).
+# on it: 6 and 15 lines in the place of 9 with half of it and with twice (tests/studies/constants_fit.py).
 _ROWS = 7
 _COMMAND_COLUMNS = (
     Column("Command", numeric=False),

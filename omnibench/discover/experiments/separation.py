@@ -48,7 +48,7 @@ from omnibench.fit.least_squares.whitened import Given, Whitened
 from omnibench.robot.kinematics import Array
 
 _DRAWS = 8  # draws of each member's values: half and twice as many change the minutes of omni3's plan by under 10 %
-_PLAUSIBLE = 3.0  # times the plausible size: a larger effect is not to be expected (tests/benchmarks/hidden/sets.py)
+_PLAUSIBLE = 3.0  # times the plausible size: a larger effect is not to be expected (tests/studies/hidden/sets.py)
 # s: radii change by so much with temperature, pressure and load within a day (chosen). A change by 0.3 % of all radii
 # leaves the names of a small flower right, one by 1 % makes a class of them again.
 _CHANGE = 0.002

@@ -33,7 +33,7 @@ from omnibench.robot.effects.term import Term
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import split_by
 
-# tests/benchmarks/constants.py varies each number by 0.5 and 2: on a small set with heading drift no verdict and no
+# tests/studies/constants.py varies each number by 0.5 and 2: on a small set with heading drift no verdict and no
 # name changes.
 _ROUNDS = 12  # rounds, at most, that fit model, noise and outliers by turns; recordings here settle in three
 _NEAR = 0.02  # share of the largest component of the noise by which two noises may differ, see is_near

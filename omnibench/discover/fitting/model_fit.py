@@ -30,7 +30,7 @@ _TOGETHER = 30_000  # samples whose paths are computed at once (chosen)
 # effects: where encoders tick, start headings raise twice the log-likelihood by 10, and with them an effect was named
 # that the simulated robot does not have (tests/discover/test_robot_recordings.py). Clocks of omni3 and of a hidden set
 # raise it by 31 to 230; the level asks for 16. Half or twice of it: the same answers in 12 of 12 sets
-# (tests/benchmarks/constants.py).
+# (tests/studies/constants.py).
 _CHANCE = 1e-4
 
 

@@ -22,7 +22,7 @@ from omnibench.fit.least_squares.noise import Whitener, whiteners
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 
-# tests/benchmarks/constants.py varies each number by 0.5 and 2: on a small set with heading drift no verdict and no
+# tests/studies/constants.py varies each number by 0.5 and 2: on a small set with heading drift no verdict and no
 # name changes.
 _JUMP = 4.5  # score, Eq. (1), from which on a pose is an outlier: noise alone makes it of one normal pose in 49,000
 _MOST_JUMPS = 0.1  # share of a run's poses that may be outliers

@@ -41,7 +41,7 @@ from omnibench.robot.effects.smooth.wheels import (
 from omnibench.robot.effects.wheel_angle import mean_waves
 from omnibench.robot.kinematics import Array
 
-# tests/benchmarks/constants.py varies each number by 0.5 and 2: on a small set with heading drift no verdict and no
+# tests/studies/constants.py varies each number by 0.5 and 2: on a small set with heading drift no verdict and no
 # name changes.
 _ORDERS = 6  # smooth functions of time
 _FREQUENCIES = 32  # frequencies at which errors of a clock are tried: about as many as 80 stamps a run tell apart

@@ -17,7 +17,7 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import RunSamples
 from omnibench.robot.signals import Signals
 
-# tests/benchmarks/constants.py varies it by 0.5 and 2: on a small set with heading drift no verdict and no name
+# tests/studies/constants.py varies it by 0.5 and 2: on a small set with heading drift no verdict and no name
 # changes.
 _STEP = 0.1  # share of the plausible range: step of a reference effect's parameter for its slope
 

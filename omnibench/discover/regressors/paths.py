@@ -28,7 +28,7 @@ from omnibench.robot.odometry import RunSamples, WheelLog
 from omnibench.robot.path import PathBatch
 from omnibench.robot.signals import Signals, signals_of_runs
 
-# tests/benchmarks/constants.py varies it by 0.5 and 2: on a small set with heading drift no verdict and no name
+# tests/studies/constants.py varies it by 0.5 and 2: on a small set with heading drift no verdict and no name
 # changes.
 _LAST = 5  # samples at the end of a run whose mean velocity leads on to stamps after it, as WheelLog.continued does
 # Samples in a part, a stamp counting as 8: a part's numbers stay in the processor's cache, and its columns are few

@@ -42,7 +42,7 @@ from omnibench.discover.regressors.column_group import Group, best_shapes
 from omnibench.fit.least_squares.whitened import Given, Whitened, given
 from omnibench.robot.kinematics import Array
 
-# tests/benchmarks/constants.py varies each number by 0.5 and 2 on small blind sets: no verdict and no name changes.
+# tests/studies/constants.py varies each number by 0.5 and 2 on small blind sets: no verdict and no name changes.
 _TOGETHER = 2000  # columns whose signs are changed at once, so that memory is small (chosen)
 _FLIPS = 499  # B; Eq. (3) gives chances smaller than 1 / B (at 5 %, 99 would do: Davison and Hinkley, section 4.2.5)
 _TAIL = 0.1  # k / B: Knijnenburg et al. fit no more than a quarter of the flips

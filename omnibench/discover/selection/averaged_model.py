@@ -10,7 +10,7 @@ deviation of a parameter about 0, and errors that are normal with an unknown var
 "Using stacking to average Bayesian predictive distributions", Bayesian Analysis 13, 2018). |e|^2 is in the units of
 Eq. (6) of the paper. Folds of whole kinds of motions (one turn rate, one direction) are left out: without one of its
 four kinds the matrix of omni3's circles is not determined, whatever the effect, and what these folds prefer errs by
-5.2 deg on its squares, where Eq. (1) errs by 1.4 (tests/benchmarks/real_discovery.py).
+5.2 deg on its squares, where Eq. (1) errs by 1.4 (tests/studies/real_discovery.py).
 
 All corrections are linear in their parameters. So the average of models with matrices K_c and parameters b_c, of
 covariance S_c where both are one vector t_c that is 0 for what a member does not hold, is a model with the terms of

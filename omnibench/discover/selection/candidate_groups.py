@@ -20,7 +20,7 @@ from omnibench.robot.effects.effect import Effect, MotionEffect, Parameter, Refe
 from omnibench.robot.effects.forms import Forms, form_profile, forms_of
 from omnibench.robot.kinematics import Array, Robot
 
-# Shapes of an effect: with more of them, one comes near enough to any other form. tests/benchmarks/constants.py varies
+# Shapes of an effect: with more of them, one comes near enough to any other form. tests/studies/constants.py varies
 # it by 0.5 and 2: on a small set with heading drift no verdict and no name changes.
 _FEW = 6
 

@@ -66,7 +66,7 @@ evidence beside each of the names in the textbook's form, too, with N of Eq. (3)
 columns count that keep a hundredth of themselves beyond the matrix, and of that a hundredth beyond the names in all
 their forms. Neither side has prior odds.                                                                           (10)
 
-The rates of right and wrong names to which all this leads are printed by tests/benchmarks/discover_study.py.
+The rates of right and wrong names to which all this leads are printed by tests/studies/discover_study.py.
 """
 
 from __future__ import annotations
@@ -84,9 +84,9 @@ from omnibench.discover.regressors.significance import Significance
 from omnibench.fit.least_squares.whitened import Given
 from omnibench.robot.kinematics import Array
 
-# tests/benchmarks/evidence_study.py prints again what is measured here, on 38 blind sets with one strong effect, 30
+# tests/studies/evidence_study.py prints again what is measured here, on 38 blind sets with one strong effect, 30
 # with two, 24 with what no catalogue has, and 32 with one effect in a distorted form. If one of these numbers is half
-# or twice as large, no verdict and no name changes on the twelve small sets of tests/benchmarks/constants.py.
+# or twice as large, no verdict and no name changes on the twelve small sets of tests/studies/constants.py.
 #
 # delta, along the other effect in whose direction the catalogue's form is farthest off: below 0.09 in nine sets of ten,
 # 0.06 in half of them.

@@ -30,7 +30,7 @@ from omnibench.discover.selection.evidence import (
 from omnibench.discover.selection.screening import Screening
 from omnibench.fit.least_squares.whitened import Given
 
-# tests/benchmarks/constants.py varies each number by 0.5 and 2 on small blind sets: but for what is said here, no
+# tests/studies/constants.py varies each number by 0.5 and 2 on small blind sets: but for what is said here, no
 # verdict and no name changes.
 SURE = 0.95  # weight of a name from which on it counts as sure, as the verdict "named" is defined
 CHANCE = 0.002  # probability that an effect is named where none is missing: in one robot of 500
@@ -40,7 +40,7 @@ ABSORBED = 1e-4
 _MOST = 3  # effects that are named, at most: one more than the studies hide in a robot
 # Kinds of motion for each effect: with fewer, several effects and the matrix cancel on the motions driven, and err on
 # others: with 3 effects from the squares of a robot with two wheels, its circles ended 5.3 deg off instead of 3.1
-# (tests/benchmarks/real_discovery.py, diff).
+# (tests/studies/real_discovery.py, diff).
 _FOR_ONE = 4
 _CLEARLY = 3.0  # standard deviations by which generic bases must find something for a larger set to explain it
 _MOSTLY = 0.3  # share of it that the larger set may leave

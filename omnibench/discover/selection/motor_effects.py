@@ -30,7 +30,7 @@ from omnibench.registry import effects
 from omnibench.robot.effects.effect import ActuatorEffect, Parameter
 from omnibench.robot.kinematics import Array, Robot
 
-# tests/benchmarks/constants.py varies each number by 0.5 and 2: on a small set with motor lag no verdict and no name
+# tests/studies/constants.py varies each number by 0.5 and 2: on a small set with motor lag no verdict and no name
 # changes.
 _MEDIAN = 0.6745  # standard deviations: the median of the size of a normal number
 _LEAST = 0.1  # share of the mean difference of neighbouring samples that the noise is at least: ramps take few samples

@@ -19,7 +19,7 @@ from omnibench.discover.selection.encoder_quantisation import EncoderQuantisatio
 from omnibench.fit.least_squares.whitened import Given, Whitened, given
 from omnibench.robot.kinematics import Array
 
-# s: shorter wheel samples are merged up to this duration, as covariates vary more slowly. tests/benchmarks/constants.py
+# s: shorter wheel samples are merged up to this duration, as covariates vary more slowly. tests/studies/constants.py
 # varies it by 0.5 and 2: on a small set with heading drift no verdict and no name changes.
 _COARSE = 0.03
 

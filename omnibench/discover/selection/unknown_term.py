@@ -41,14 +41,14 @@ from omnibench.robot.effects.smooth.motion import SmoothJoint
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.words import plural
 
-# tests/benchmarks/constants.py varies each number by 0.5 and 2, also where nothing has a name: what is said of gaps on
+# tests/studies/constants.py varies each number by 0.5 and 2, also where nothing has a name: what is said of gaps on
 # held-out runs changes only at half the price, where none of the wet patch's counts as closed.
 _GRID = 6  # patches of the map along each side of the area
 _MOST = 5  # bases that are put together, at most
 _FINE = 8  # bases of fine structure, at most: neighbours of the surest are among them
 # Kinds of motion without which a gain on those held out says nothing of other paths. On recordings of real robots terms
 # gained where 36 kinds were driven (robotino: a quarter of Eq. (6)), and lost with 4 to 8 of them (omni3's circles:
-# 107 mm to 112 mm on squares; diff: 7 mm to 17 mm), see tests/benchmarks/real_discovery.py.
+# 107 mm to 112 mm on squares; diff: 7 mm to 17 mm), see tests/studies/real_discovery.py.
 _KINDS = 12
 _FAMILIES = 2  # effects of the catalogue that are tried
 _ROUNDS = 3  # most terms that are added one after another: as many as effects are named

@@ -84,7 +84,7 @@ from omnibench.fit.problem import CalibrationProblem
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Complex, OdometryBatch
 
-# These numbers change how tight a bound is, not whether it holds. In tests/benchmarks/constants_fit.py each is halved
+# These numbers change how tight a bound is, not whether it holds. In tests/studies/constants_fit.py each is halved
 # and doubled: _SMOOTHING and _SETTLED then move the bound by 4 % and 0.3 % of the gap that is asked for, the others not
 # at all.
 _STEPS = 25  # steps of the reweighted least squares
@@ -145,7 +145,7 @@ def into_unit_ball(directions: Array) -> tuple[Array, Array, Array]:
 
 # m or rad per rad: slope of phi that is assumed beside Eq. (B8), so that a part whose width does no harm to first order
 # is cut all the same. It decides only where nothing else does: a proof has the same parts with half of it and with
-# twice (tests/benchmarks/constants_fit.py).
+# twice (tests/studies/constants_fit.py).
 _IMBALANCE = 1e-9
 
 

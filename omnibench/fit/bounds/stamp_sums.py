@@ -38,7 +38,7 @@ from omnibench.robot.odometry import Complex, Integration, WheelLog
 from omnibench.robot.stored.odometry_of_stored import are_many
 
 # m: error of the quadrature of arcs, which bounds subtract: a millionth of the millimetre that poses are known to.
-# Half of it and twice move a bound by 6e-6 of the gap that is asked for (tests/benchmarks/constants_fit.py).
+# Half of it and twice move a bound by 6e-6 of the gap that is asked for (tests/studies/constants_fit.py).
 QUADRATURE = 1e-9
 
 

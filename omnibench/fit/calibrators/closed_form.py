@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from omnibench.fit.loss.sum_of_norms import SumOfNormsProgram
 
 # The matrices of closed_form are the same with half of each of these numbers and with twice
-# (tests/benchmarks/constants_fit.py).
+# (tests/studies/constants_fit.py).
 _MOST_HALVINGS = 30  # lengths of one step that are tried, each half the one before: down to a billionth
 _FLAT = 1e-6  # share of the matrix's range: a smaller step that does not lower the cost is rounding of the solver
 _STILL = 1e-9  # m or rad per rad: a smaller last step ends the least squares that references are begun with

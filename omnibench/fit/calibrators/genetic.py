@@ -14,7 +14,7 @@ from omnibench.registry import Options, calibrators
 from omnibench.robot.kinematics import Array
 
 # Least step of the mutation, as a share of the box. The fittest of 20 generations is the same with half of it and with
-# twice (tests/benchmarks/constants_fit.py).
+# twice (tests/studies/constants_fit.py).
 _SMALLEST_STEP = 1e-8
 
 

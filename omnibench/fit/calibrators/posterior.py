@@ -28,7 +28,7 @@ has a last row and column for d. Where h is straight, a stretch whose weighted e
 
     H_s = J^T (1 - e e^T / |e|^2) J.                                                                       (4)
 
-tests/benchmarks/posterior_coverage.py: with slip that differs from run to run the errors are 1.1 to 1.4 stated standard
+tests/studies/posterior_coverage.py: with slip that differs from run to run the errors are 1.1 to 1.4 stated standard
 deviations from six runs on, and 1.4 (ahead) and 2.1 (turning) of four runs.
 
 Source: maximum a posteriori estimate with variances by empirical Bayes, as the shrinkage of shrinkage.py, but along

@@ -47,7 +47,7 @@ from omnibench.registry import Options, calibrators
 from omnibench.robot.kinematics import Array
 
 # Rounds of noise and fit settle after two or three; only where the clocks' errors are estimated, too, do they take more
-# than five. In tests/benchmarks/constants_fit.py five rounds at most, or a change of 0.2, move an estimate with clocks
+# than five. In tests/studies/constants_fit.py five rounds at most, or a change of 0.2, move an estimate with clocks
 # by 0.1 and 0.2 of its standard deviation; 20 rounds, a change of 0.05 and half and twice _NEAR move none.
 _MOST_ROUNDS = 10
 _FIRST_WEIGHTS = 5  # fits with Huber's weights before the noise is estimated from poses that are not off

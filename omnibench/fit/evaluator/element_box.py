@@ -12,7 +12,7 @@ from omnibench.robot.kinematics import Array
 
 # Share by which the box of a curved parameterisation is widened beyond its linear reach. Candidates outside are
 # integrated directly, so that it decides on speed alone: half of it and twice change costs by 4e-14 m and the memory by
-# a third at most (tests/benchmarks/constants_fit.py).
+# a third at most (tests/studies/constants_fit.py).
 _MARGIN = 0.1
 _ROUNDING = 1e-9, 1e-15  # shares of the reach and of a row's largest element by which a box is widened against rounding
 

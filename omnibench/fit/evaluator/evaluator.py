@@ -184,7 +184,7 @@ def join_segments(plan: ExpansionPlan) -> SegmentJoin:
 # Share of the largest pose: rounding of a direct sum of some thousand samples, which the check allows beside the bound.
 _ROUNDING = 1e-12
 # Values of the large product at a time, 2 MB, so that they stay in the processor's cache. It changes the order of sums
-# alone, hence costs by 1e-16 m (tests/benchmarks/constants_fit.py); bench_evaluator.py measures the speed.
+# alone, hence costs by 1e-16 m (tests/studies/constants_fit.py); bench_evaluator.py measures the speed.
 _BLOCK = 250_000
 
 

@@ -27,10 +27,10 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, WheelLog
 
 # Terms of a basis, at most: it bounds memory. Half of it and twice choose the same bases
-# (tests/benchmarks/constants_fit.py).
+# (tests/studies/constants_fit.py).
 _MOST_TERMS = 3000
 # rad: beyond it the power series of J_n loses digits, since its alternating terms add up to I_0(4) = 11 (Abramowitz and
-# Stegun 1964, 9.1.10 and 9.6.10). Half of it and twice choose the same bases (tests/benchmarks/constants_fit.py).
+# Stegun 1964, 9.1.10 and 9.6.10). Half of it and twice choose the same bases (tests/studies/constants_fit.py).
 _LARGEST_ANGLE = 4.0
 _ROUNDING = 1e-17  # share of the first term of a power series: less than a tenth of the rounding of its sum
 
@@ -143,10 +143,10 @@ def _power_series(order: int, square: Array) -> Array:
 
 # Largest error of a position by truncation, by quadrature and by the decomposition, as shares of the longest path (at
 # least 1 m): some ten times the rounding of direct integration. They bound sums of absolute values; half of each and
-# twice change costs by 1e-13 m and the memory by a tenth at most (tests/benchmarks/constants_fit.py).
+# twice change costs by 1e-13 m and the memory by a tenth at most (tests/studies/constants_fit.py).
 _TRUNCATION, _QUADRATURE, _DECOMPOSITION = 1e-12, 1e-12, 5e-12
 # The numbers from here on decide only which way is faster (bench_evaluator.py). Half of each and twice change costs by
-# 5e-14 m and the memory by less than a factor of two (tests/benchmarks/constants_fit.py).
+# 5e-14 m and the memory by less than a factor of two (tests/studies/constants_fit.py).
 # How far the box may turn the heading of a segment about its anchor, rad; infinity leaves recordings whole.
 _LIMITS = (np.inf, 2.0, 1.0, 0.5, 0.25)
 # Time that a sample of direct integration, a segment and a term of the basis take, in units of one multiplication and

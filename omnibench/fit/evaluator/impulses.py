@@ -20,10 +20,10 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, WheelLog
 
 # Nodes of the quadrature, at most: samples that need more turn by radians. Half of it and twice change nothing
-# (tests/benchmarks/constants_fit.py).
+# (tests/studies/constants_fit.py).
 _MOST_NODES = 8
 # Pieces of a segment, at most, so that the time of cutting is linear in the length of a recording. Half of it and twice
-# change nothing (tests/benchmarks/constants_fit.py).
+# change nothing (tests/studies/constants_fit.py).
 _LONGEST_SEGMENT = 4096
 
 

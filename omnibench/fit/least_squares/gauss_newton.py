@@ -22,7 +22,7 @@ from omnibench.robot.model import OdometryModel
 
 # Estimates of four recordings are the same with half of each of these numbers and with twice, except that shares of
 # (0.5, 0.15, 0), without the whole step, move one with clocks by 0.15 of its standard deviation and a stated deviation
-# by 14 %, and (2, 0.6, 0) by 0.008 and 0.5 % (tests/benchmarks/constants_fit.py).
+# by 14 %, and (2, 0.6, 0) by 0.008 and 0.5 % (tests/studies/constants_fit.py).
 _MOST_STEPS = 25  # Gauss-Newton steps
 _MOST_HALVINGS = 8  # lengths of one step that are tried, each half the one before
 _SHARES = (1.0, 0.3, 0.0)  # parts of the nuisances' step that every run tries

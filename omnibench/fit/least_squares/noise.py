@@ -25,19 +25,19 @@ from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 
 # White noise, m or rad, that keeps the covariance regular where there is neither white noise nor walk: a millionth of
-# the millimetre that poses are known to. Half of it and twice change nothing (tests/benchmarks/constants_fit.py).
+# the millimetre that poses are known to. Half of it and twice change nothing (tests/studies/constants_fit.py).
 LEAST_WHITE = 1e-9
 # Range of the search: logarithms of the components as shares of the residuals' RMS. Half as wide, it moves estimates by
 # 1e-4 of their standard deviations at most, twice as wide by 2e-3; either moves these deviations by 0.1 %
-# (tests/benchmarks/constants_fit.py).
+# (tests/studies/constants_fit.py).
 _LOGARITHMS = (np.log(1e-4), np.log(1e2))
 # Change of twice the log-likelihood below which a component is set to zero: nothing beside 2.7, a test at 5 % (Self
-# and Liang 1987). Half of it and twice change nothing (tests/benchmarks/constants_fit.py).
+# and Liang 1987). Half of it and twice change nothing (tests/studies/constants_fit.py).
 _NO_LOSS = 1e-3
 _WIDE = 200  # columns from which on a row at a time is faster than LAPACK, which takes every column by itself
 _COORDINATES = (("position", slice(0, 2)), ("heading", slice(2, 3)))
 # First guess of the noise, replaced after one fit: 1 cm or 0.01 rad, and as much again in a second. Half of it and
-# twice move estimates by 0.002 of their standard deviations at most (tests/benchmarks/constants_fit.py).
+# twice move estimates by 0.002 of their standard deviations at most (tests/studies/constants_fit.py).
 FIRST_NOISE = Noise(pose_position=0.01, pose_heading=0.01, walk_position=0.01, walk_heading=0.01)
 
 

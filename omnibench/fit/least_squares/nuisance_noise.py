@@ -40,11 +40,11 @@ _NAMES = ("pose_position", "walk_position", "bias_position", "pose_heading", "wa
 CHANCE = 0.05
 # Share of the critical value that a nuisance alone must gain before all components are fitted with it: the others do
 # not add four times as much. Half of this and twice give the same estimates from right and wrong starts
-# (tests/benchmarks/constants_fit.py).
+# (tests/studies/constants_fit.py).
 _PROMISING = 0.25
 # rad, s, s per s: largest deviations that are searched, 17 degrees and several times those of clocks that are
 # synchronised by hand (0.2 s, 0.003). Half and twice as wide, the search finds the same to 1e-5
-# (tests/benchmarks/constants_fit.py).
+# (tests/studies/constants_fit.py).
 _LARGEST = np.array([0.3, 0.5, 0.02])
 
 

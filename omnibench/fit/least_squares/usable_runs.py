@@ -24,7 +24,7 @@ def in_start_frames(runs: Sequence[Trajectory], values: Sequence[Array]) -> list
     return turned
 
 
-# tests/benchmarks/constants.py varies each number by 0.5 and 2: on a small set with heading drift no verdict and no
+# tests/studies/constants.py varies each number by 0.5 and 2: on a small set with heading drift no verdict and no
 # name changes.
 _MOST_STAMPS = 80  # reference poses used of a run: neighbours in denser references share their errors
 _STANDING = 1e-3  # rad/s: slower wheels count as standing; one of 0.1 m moves 0.1 mm in a second

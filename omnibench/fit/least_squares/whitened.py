@@ -11,8 +11,8 @@ from omnibench.fit.least_squares.nuisances import Weighting, weighed_together
 from omnibench.robot.kinematics import Array
 
 # Share of a direction's information that must be left beyond other columns for it to count: a thousandth of its length,
-# far above rounding. Half of it and twice change no calibration (tests/benchmarks/constants_fit.py) and no discovery
-# (tests/benchmarks/constants.py).
+# far above rounding. Half of it and twice change no calibration (tests/studies/constants_fit.py) and no discovery
+# (tests/studies/constants.py).
 _DETERMINED = 1e-6
 _NOTHING = 1e-22  # share of the largest information: with _DETERMINED, columns of 1e-14 of its size are rounding
 _KEPT = 4  # Schur complements that are kept: beyond the matrix and beyond all effects, with forms or without (chosen)

@@ -25,7 +25,7 @@ from omnibench.robot.kinematics import Array
 _ACCURACY = {"tol_gap_abs": 1e-12, "tol_gap_rel": 1e-12, "tol_feas": 1e-12}
 
 # Stamps from which on the program is compiled anew for every step: prepared, it would take memory that grows with their
-# square. Both ways solve the same program; half of it and twice change nothing (tests/benchmarks/constants_fit.py).
+# square. Both ways solve the same program; half of it and twice change nothing (tests/studies/constants_fit.py).
 _MOST_PREPARED = 5000
 
 # Stamps from which on Newton's method is tried first: it takes an eighth of the program's time there, and none of 36

@@ -37,7 +37,7 @@ from omnibench.robot.model import OdometryModel
 from omnibench.words import plural
 
 # Chance at which sessions are said to differ that do not, over all that is tested: strict, as one such answer in a
-# hundred is too many, and enough to see 0.5 % of one radius in 60 + 60 runs (tests/benchmarks/session_study.py).
+# hundred is too many, and enough to see 0.5 % of one radius in 60 + 60 runs (tests/studies/session_study.py).
 CHANCE = 0.001
 # Level of the tests for nuisances, that of discover (discover/fitting/model_fit.py).
 _NUISANCES = 1e-4

@@ -48,7 +48,7 @@ class PhysicalTolerance:
 
 
 # Tolerances were chosen once, while looking at the recordings of configs/real_robots.yaml: half and twice of each make
-# 0.90 to 1.15 times the error of a robot (tests/benchmarks/prior_study.py). The lost rate of omni wheels, whose rollers
+# 0.90 to 1.15 times the error of a robot (tests/studies/prior_study.py). The lost rate of omni wheels, whose rollers
 # creep, is ten times that of tyres.
 _TYRES = PhysicalTolerance(0.01, (0.02, 0.02, 0.05), 0.002, 0.004)
 _STEERED = PhysicalTolerance(0.02, (0.02, 0.02, 0.05), 0.005, 0.01)

@@ -43,7 +43,7 @@ class Tolerance:
 # Rollers lose or gain some per cent of a motion, 8 on the mecanum base of OptiOdom; a skid-steered base turns by 0.5 to
 # 0.8 of what its track says (Mandow et al., IROS 2007), about a centre that load and ground shift by some cm. If
 # the centre is taken for known, only 80 % of the 95 % intervals of a skid base's turn hold the truth
-# (tests/benchmarks/shrink_coverage.py). tests/benchmarks/shrink_study.py fits with half and twice these tolerances.
+# (tests/studies/shrink_coverage.py). tests/studies/shrink_study.py fits with half and twice these tolerances.
 _USUAL = Tolerance(0.02, (0.05, 0.05, 0.05))
 TOLERANCES: Mapping[RobotClass, Tolerance] = MappingProxyType(
     {
@@ -88,7 +88,7 @@ def default_unidentified(robot: Robot) -> Literal["keep", "shrink"]:
     """The treatment of what data hardly drive: shrunk for robots whose wheels say their types, else kept as ever.
 
     On omni wheels all is kept: a matrix fitted to the circles of OptiOdom's omni3 and shrunk errs by 0.20 m on its
-    squares, in the place of 0.10 m (tests/benchmarks/shrink_study.py). Its runs differ by more than the matrix can say,
+    squares, in the place of 0.10 m (tests/studies/shrink_study.py). Its runs differ by more than the matrix can say,
     and what they say of one row hangs on the others.
     """
     return "shrink" if says_types(robot) and class_of(robot) != "omni" else "keep"

@@ -32,7 +32,7 @@ from omnibench.robot.stored.odometry_of_stored import odometry_of
 ROWS = ("x", "y", "heading")
 # Standard deviation, as a share of a row's largest element, above which the row counts as rough along a direction:
 # calibrations change rows by a few per cent, and the box about the design is +-25 % wide. Half of it and twice say the
-# same of three recordings (tests/benchmarks/constants_fit.py).
+# same of three recordings (tests/studies/constants_fit.py).
 LARGEST_DEVIATION = 0.10
 UNTOLD = 10.0  # the same share from which on references other than poses tell nothing, as other sentences say
 _OPEN = 1e-14  # share of the largest eigenvalue of the information: less is rounding, and the direction is open

@@ -12,7 +12,7 @@ from omnibench.fit.parameterisation import MatrixElements
 from omnibench.robot.kinematics import Array, Robot
 
 # Both are far above the rounding of derivatives (1e-10) and below any share that a direction of wheel rates can have;
-# half of each and twice name the same parameters (tests/benchmarks/constants_fit.py).
+# half of each and twice name the same parameters (tests/studies/constants_fit.py).
 _UNIDENTIFIED = 1e-3  # share of a parameter's axis in the unidentified space from which on it is not identified
 _NO_CHANGE = 1e-6  # share of the largest singular value below which a change of the geometry leaves the matrix as it is
 _ROUNDING = 1e-12  # strength of a change, in units of its scale, that is none: nothing of the matrix may be known

@@ -37,7 +37,7 @@ without unit u (Tukey 1958), and g the logarithm, which knows that costs are pos
 
 Two units or one have no interval.
 
-tests/benchmarks/improvement_coverage.py tells how often the intervals hold the truth.
+tests/studies/improvement_coverage.py tells how often the intervals hold the truth.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ from omnibench.words import plural
 UnitName = Literal["command", "run"]
 FEWEST = 3  # units of an interval: that of two would reach 13 standard errors to either side
 # Fewest units that are resampled. Of five commands 37 to 67 % of the bootstrapped intervals have no bounds, of ten 0 to
-# 11 % (tests/benchmarks/improvement_coverage.py --methods --kinds usual tails unequal).
+# 11 % (tests/studies/improvement_coverage.py --methods --kinds usual tails unequal).
 BOOTSTRAPPED = 10
 _WIDEST = 30.0  # logarithm of a ratio: e^30 stands for what cannot be bounded
 _ALIKE = 1e-12  # share of the numerators: differences between units below it are rounding

@@ -49,7 +49,7 @@ number of directions in which the scatter was seen,
 
 Repetitions that agree exactly are exceeded by whatever scatter there is. Clusters that differ little, by half to once
 the noise of a run, are often missed: then 84 to 92 % of the 95 % intervals of a linear model hold the truth, with 4 to
-12 clusters, and 92 % of closed_form's with 5 (tests/benchmarks/interval_coverage.py --only slight, 60 sets).
+12 clusters, and 92 % of closed_form's with 5 (tests/studies/interval_coverage.py --only slight, 60 sets).
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import OdometryBatch
 from omnibench.words import plural
 
-# Ten calibrations of tests/benchmarks/constants_fit.py have the same covariance with half of each number below and with
+# Ten calibrations of tests/studies/constants_fit.py have the same covariance with half of each number below and with
 # twice, but for the kernel and the level of doubt. They have 12 commands or more, of which none alone determines a
 # direction, so that they say nothing of _LEAST_FREE and _FEWEST_CLUSTERS.
 # Level of the F test by which clusters that scatter more than repetitions explain show a lack of fit: strict, since one
@@ -81,11 +81,11 @@ from omnibench.words import plural
 CHANCE = 0.001
 # Level of the same test by which intervals rest on the clusters. A test that decides what an interval rests on must not
 # be strict: of closed_form's intervals from five sessions whose scales differ by 2 %, 83 % hold the truth at 0.001 and
-# 96 % at 0.05, in 55 sets, and sets of equal sessions lose nothing (tests/benchmarks/interval_coverage.py --doubt).
+# 96 % at 0.05, in 55 sets, and sets of equal sessions lose nothing (tests/studies/interval_coverage.py --doubt).
 DOUBT = 0.05
 # Least eigenvalue of 1 - L_c, by which the correction of Bell and McCaffrey divides; below it the noise model makes up
 # for the difference, Eq. (5). With a single run that turns, beside 5, 8 and 12 straight ones, 95, 95 and 91 % of
-# closed_form's intervals of the elements hold the truth, 82 sets (tests/benchmarks/interval_coverage.py --only turn).
+# closed_form's intervals of the elements hold the truth, 82 sets (tests/studies/interval_coverage.py --only turn).
 # A smaller one lets in the rounding of scores that the fit made zero; half and twice were not tried.
 _LEAST_FREE = 0.05
 # Fewer clusters are not tested: the 95 % interval of a variance spans a factor of 43 with four, of 146 with three.
@@ -94,7 +94,7 @@ _FEWEST_CLUSTERS = 4
 # estimates: Silverman, Density Estimation, 1986, section 3.3). Stated deviations of medians then are 0.78 to 1.19 times
 # the true ones in the median, for four distributions and 12 to 144 runs; half as wide, a tenth of them are 2.6 to 3.8
 # times the true ones with 12 runs, and twice as wide, those of Laplace's errors are a third too large
-# (tests/benchmarks/kernel_width.py).
+# (tests/studies/kernel_width.py).
 _KERNEL = 0.7
 _LEAST_SEEN = 0.1  # share of the working model's variance; see Sandwich.steadied
 _INTERPOLATED = 1e-6  # share of the median error: smaller ones were made zero by the fit, up to rounding

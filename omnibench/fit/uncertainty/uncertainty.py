@@ -101,13 +101,13 @@ def _correction(curvatures: Array, shares: Array, numbers: int, hessians: Array)
 
 
 # The check that an answer is a minimum says the same with half of _MOST_STEPS and _NO_GAIN and with twice
-# (tests/benchmarks/constants_fit.py).
+# (tests/studies/constants_fit.py).
 _MOST_STEPS = 20  # steps
 _NO_GAIN = 1e-4  # relative decrease of the cost that ends the steps
 # Least share 1 - p/n of the errors' numbers beyond those fitted by which the curvature is corrected: first order in p/n
 # says nothing below it. Four runs, the fewest for the nine elements of three wheels, leave just as much. With half of
 # it nothing changes; with twice, deviations from four runs are 29 % smaller, and of the 95 % intervals from four and
-# five runs 99.5 % hold the truth in the place of 99.8 %, in 60 sets each (tests/benchmarks/constants_fit.py).
+# five runs 99.5 % hold the truth in the place of 99.8 %, in 60 sets each (tests/studies/constants_fit.py).
 _LEAST_LEFT = 0.25
 
 
@@ -247,7 +247,7 @@ def runs_without_heading(problem: CalibrationProblem) -> list[str]:
 
     The heading is then fitted to noise, which makes lengths wrong by more than the runs scatter: with 8 of 28 runs
     turning on the spot 74 % of the 95 % intervals hold the truth, without them 97 %, 40 and 24 sets
-    (tests/benchmarks/reference_coverage.py --robots diff --kinds position --calibrator closed_form).
+    (tests/studies/reference_coverage.py --robots diff --kinds position --calibrator closed_form).
     """
     if not isinstance(problem.odometry, ReferenceBatch):
         return []

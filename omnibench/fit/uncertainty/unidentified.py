@@ -10,7 +10,7 @@ from omnibench.fit.span import Unidentified, WheelDirection, driven_span, wheel_
 from omnibench.robot.kinematics import Robot
 
 # Share of the strongest direction: one that is driven less is mentioned, since slip counts five times as much along it.
-# Half of it and twice say the same of three recordings (tests/benchmarks/constants_fit.py).
+# Half of it and twice say the same of three recordings (tests/studies/constants_fit.py).
 _LITTLE_SHARE = 0.2
 
 

@@ -17,7 +17,7 @@ _Float = NDArray[np.float64]
 _Int = NDArray[np.int64]
 _Fit = tuple[float, float, float, float, float, float, float]
 
-# The study tests/benchmarks/constants_slam.py varies these numbers by 0.5 and 2. In three rooms SLAM's median error,
+# The study tests/studies/constants_slam.py varies these numbers by 0.5 and 2. In three rooms SLAM's median error,
 # 1.07 mm as they are, is 0.98 to 1.25 mm and the median NEES, 2.5, is 2.4 to 3.3 (3 for an honest covariance).
 # Worse are a seed of 16 points (1.5 mm), outliers beyond 2 deviations (1.8 mm) and fits of no fewer than 12 points (no
 # lines).

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from omnibench.robot.kinematics import Array
 
 # rad: a line with a larger standard deviation of its direction is dropped. With half of it and with twice, SLAM's
-# median error in three rooms is 1.15 and 1.03 mm in the place of 1.07 mm (tests/benchmarks/constants_slam.py).
+# median error in three rooms is 1.15 and 1.03 mm in the place of 1.07 mm (tests/studies/constants_slam.py).
 _TILT = 0.05
 
 

@@ -17,7 +17,7 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.planar import rotation
 from omnibench.slam.matching.lines import Lines
 
-# The study tests/benchmarks/constants_slam.py varies these numbers by 0.5 and 2. In three rooms SLAM's median error
+# The study tests/studies/constants_slam.py varies these numbers by 0.5 and 2. In three rooms SLAM's median error
 # stays between 0.95 and 1.09 mm (1.07 mm as they are) and the median NEES between 2.2 and 2.6.
 _CROSS = 1e-3  # m between the points of a cross
 _FEWEST = 20  # points that a map needs to be matched against

@@ -16,7 +16,7 @@ from omnibench.slam.matching.map import ScanMap
 from omnibench.slam.matching.points import ScanPoints
 from omnibench.slam.slam_options import SlamOptions
 
-# The study tests/benchmarks/constants_slam.py varies these numbers by 0.5 and 2. In three rooms the median error stays
+# The study tests/studies/constants_slam.py varies these numbers by 0.5 and 2. In three rooms the median error stays
 # between 1.04 and 1.14 mm (1.07 mm as they are) and the median NEES between 2.3 and 2.7 (3 for an honest covariance).
 _OUTLIER = 4.0  # standard deviations: a point farther from a surface does not match it
 _PARALLEL = 0.9  # least cosine between the normals of a point and of its surface
@@ -130,7 +130,7 @@ def _slopes(directions: Array, seen: Array) -> Array:
     return np.column_stack([directions, directions[:, 1] * seen[:, 0] - directions[:, 0] * seen[:, 1]])
 
 
-# The study tests/benchmarks/constants_slam.py varies these numbers by 0.5 and 2. In three rooms poses change by a
+# The study tests/studies/constants_slam.py varies these numbers by 0.5 and 2. In three rooms poses change by a
 # hundredth of their deviations at most. Where scans mislead (round rooms, a quick robot, a mirrored scanner) they stay
 # the same but for three: with LOST = 0.1 a scan at a wrong pose counts (NEES 5.2 for 3.6); _CONVINCING = 0.3 moves a
 # quick robot by 0.7 deviations; and with _FALSE = 1 or _TRUE = 0.4, which exclude each other, a round room seems to

@@ -67,11 +67,11 @@ def on_clean(robot: Robot, calibrator: str, cost: str, seed: int = 1) -> float:
 @pytest.mark.parametrize(
     ("calibrator", "cost", "robot"),
     [
-        pytest.param("least_squares", "trajectory", TRICYCLE, id="least_squares", marks=pytest.mark.study),
-        pytest.param("trajectory_ml", "trajectory", DIFF, id="trajectory_ml of diff", marks=pytest.mark.study),
+        pytest.param("least_squares", "trajectory", TRICYCLE, id="least_squares", marks=pytest.mark.slow),
+        pytest.param("trajectory_ml", "trajectory", DIFF, id="trajectory_ml of diff", marks=pytest.mark.slow),
         pytest.param("trajectory_ml", "trajectory", TRICYCLE, id="trajectory_ml of tricycle"),
         pytest.param("closed_form", "final_pose", TRICYCLE, id="closed_form"),
-        pytest.param("crs", "trajectory", DIFF, id="crs", marks=pytest.mark.study),
+        pytest.param("crs", "trajectory", DIFF, id="crs", marks=pytest.mark.slow),
     ],
 )
 def test_five_percent_of_poses_off_by_a_metre_cost_five_percent_at_most(
@@ -107,7 +107,7 @@ def test_headings_that_jump_cost_five_percent_at_most(loss: LossName) -> None:
 
 
 @pytest.mark.parametrize(
-    "calibrator", ["least_squares", pytest.param("trajectory_ml", marks=pytest.mark.study), "closed_form"]
+    "calibrator", ["least_squares", pytest.param("trajectory_ml", marks=pytest.mark.slow), "closed_form"]
 )
 def test_real_recordings_with_jumps_are_calibrated_as_without(calibrator: str) -> None:
     if not RECORDINGS.exists():
@@ -122,7 +122,7 @@ def test_real_recordings_with_jumps_are_calibrated_as_without(calibrator: str) -
     assert error(calibrate(jumping, calibrator, cost="trajectory", loss="huber"), judged) <= 1.05 * base
 
 
-@pytest.mark.parametrize("loss", ["huber", pytest.param("student_t", marks=pytest.mark.study)])
+@pytest.mark.parametrize("loss", ["huber", pytest.param("student_t", marks=pytest.mark.slow)])
 def test_closed_form_reaches_what_a_long_search_finds(loss: LossName) -> None:
     found = {}
     for name in ("closed_form", "crs"):
@@ -133,7 +133,7 @@ def test_closed_form_reaches_what_a_long_search_finds(loss: LossName) -> None:
     assert found["closed_form"] == pytest.approx(found["crs"], rel=1e-6)
 
 
-@pytest.mark.parametrize("loss", ["huber", pytest.param("student_t", marks=pytest.mark.study)])
+@pytest.mark.parametrize("loss", ["huber", pytest.param("student_t", marks=pytest.mark.slow)])
 def test_intervals_of_a_robust_fit_are_about_as_wide_as_those_of_squares_on_normal_errors(loss: LossName) -> None:
     clean, jumping, _ = recording(DIFF)
     usual = calibrate(clean, "trajectory_ml", unidentified="keep").uncertainty

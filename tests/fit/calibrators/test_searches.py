@@ -38,7 +38,7 @@ def optimum() -> float:
     ("name", "options", "evaluations", "excess"),
     [
         ("crs", {}, 12_000, 1e-6),
-        pytest.param("isres", {}, 12_000, 1e-1, marks=pytest.mark.study),
+        pytest.param("isres", {}, 12_000, 1e-1, marks=pytest.mark.slow),
         ("genetic", {}, 12_000, 5e-2),
         ("genetic", {"mutation": "gaussian", "generations": 60}, 12_000, 1e-1),
         ("random_search", {"candidates": 2_000}, 12_000, 2.0),
@@ -120,7 +120,7 @@ class TestGenetic:
 class TestNlopt:
     """Controlled random search and ISRES."""
 
-    @pytest.mark.parametrize("name", ["crs", pytest.param("isres", marks=pytest.mark.study)])
+    @pytest.mark.parametrize("name", ["crs", pytest.param("isres", marks=pytest.mark.slow)])
     def test_a_wider_tolerance_ends_the_search_earlier(self, name: str) -> None:
         evaluations = [run(name, make_problem(RUNS), tolerance=each).evaluations for each in (1e-1, 1e-3)]
         assert evaluations[0] < evaluations[1]

@@ -25,7 +25,7 @@ from omnibench.fit.observations.reference_rows import reference_rows
 from omnibench.robot.odometry import Integration
 from omnibench.robot.stored.odometry_of_stored import StoredOdometry
 
-STUDY = Path(__file__).parents[2] / "benchmarks"
+STUDY = Path(__file__).parents[2] / "studies"
 TIMES = 0.1 * np.arange(1, 101)
 
 
@@ -121,7 +121,7 @@ def test_exact_references_give_the_true_matrix(study, calibrator: str, monkeypat
 def test_intervals_hold_the_truth(study, kind: str) -> None:
     found = [study.covered(study.Case("diff", kind), seed) for seed in range(6)]
     errors = np.concatenate([each.combinations for each in found])
-    assert (np.abs(errors) < 1).mean() > 0.75  # the study of 300 sets is tests/benchmarks/reference_coverage.py
+    assert (np.abs(errors) < 1).mean() > 0.75  # the study of 300 sets is tests/studies/reference_coverage.py
 
 
 def test_turns_that_share_the_offset_of_a_gyro_have_errors_within_their_intervals(study) -> None:

@@ -17,7 +17,7 @@ from omnibench.registry import calibrators, costs
 from omnibench.simulate.simulate import simulate_dataset
 from omnibench.simulate.source import read_simulation
 
-STUDY = Path(__file__).parents[2] / "benchmarks" / "bootstrap_coverage.py"
+STUDY = Path(__file__).parents[2] / "studies" / "bootstrap_coverage.py"
 
 
 def study():

@@ -15,7 +15,7 @@ from scipy import stats
 
 from omnibench.fit.uncertainty.ratio_intervals import Bootstrap, RatioIntervals, Units, units_of
 
-STUDIES = Path(__file__).parents[2] / "benchmarks"
+STUDIES = Path(__file__).parents[2] / "studies"
 BOOTSTRAP = Bootstrap(resamples=2000, seed=1)
 
 

@@ -33,7 +33,7 @@ from omnibench.simulate.simulate import simulate_dataset
 from omnibench.simulate.source import read_simulation
 from omnibench.testing.synthetic import synthetic_robot, true_robot
 
-STUDY = Path(__file__).parents[2] / "benchmarks" / "uncertainty_coverage.py"
+STUDY = Path(__file__).parents[2] / "studies" / "uncertainty_coverage.py"
 ROBOT = synthetic_robot()
 TRUTH = true_robot(ROBOT).inverse_kinematic_matrix
 NOISE = Noise(pose_position=0.004, pose_heading=0.006, walk_position=0.002, bias_heading=0.003)
