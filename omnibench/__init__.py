@@ -16,7 +16,7 @@ _PUBLIC = {
     "References": "data.references.run_references",
     "Robot": "robot.kinematics",
     "Trajectory": "data.dataset",
-    "Wheel": "robot.wheels.wheel",
+    "Wheel": "robot.kinematics",
     "calibrate": "fit.calibrate",
     "check": "fit.check.checking",
     "certify_optimum": "fit.certify",
@@ -79,7 +79,7 @@ if TYPE_CHECKING:  # imports for type checkers; tests/ground/test_package.py hol
     from omnibench.robot.dead_reckoning import odometry as odometry
     from omnibench.robot.export.formats import export_calibration as export_calibration
     from omnibench.robot.kinematics import Robot as Robot
-    from omnibench.robot.wheels.wheel import Wheel as Wheel
+    from omnibench.robot.kinematics import Wheel as Wheel
     from omnibench.simulate.simulate import simulate_dataset as simulate_dataset
     from omnibench.simulate.source import read_simulation as read_simulation
     from omnibench.slam.import_dataset import import_dataset as import_dataset

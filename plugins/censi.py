@@ -55,10 +55,8 @@ from omnibench.errors import NotApplicableError
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
-from omnibench.robot.kinematics import Array, Mount, Robot
+from omnibench.robot.kinematics import Array, Mount, Robot, class_of, relative
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.planar import relative
-from omnibench.robot.robot_class import class_of
 from omnibench.words import plural
 
 # Of the normal equations, in units of their diagonals: rounding would be seen above it (chosen).

@@ -12,7 +12,7 @@ from omnibench.errors import NotApplicableError
 from omnibench.fit.calibrator import Calibrator, Outcome, Solution
 from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.problem import BudgetSpent, CalibrationProblem
-from omnibench.fit.shrinkage.shrunk_matrix import closed_form_result
+from omnibench.fit.shrinkage import closed_form_result
 from omnibench.progress import Progress
 from omnibench.registry import calibrators
 from omnibench.robot.calibration import ModelExtension

@@ -42,7 +42,7 @@ from scipy.optimize import least_squares
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import NotApplicableError
 from omnibench.fit.calibrator import Calibrator, Solution
-from omnibench.fit.differential.axle import TWO_WHEELS, axle_length, has_two_wheels, with_axle
+from omnibench.fit.differential import TWO_WHEELS, axle_length, has_two_wheels, with_axle
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
 from omnibench.robot.kinematics import Array, Robot

@@ -39,8 +39,7 @@ from omnibench.errors import NotApplicableError
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
-from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.robot_class import class_of
+from omnibench.robot.kinematics import Array, Robot, class_of
 from omnibench.words import plural
 
 # Of the larger singular value of Eq. (2): below it the steering angle was the same all the time, and noise alone would

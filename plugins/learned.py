@@ -37,16 +37,15 @@ from pydantic import Field
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import NotApplicableError, PluginError
 from omnibench.fit.calibrator import Calibrator, Outcome, RunResult, Solution, model_of_answer
-from omnibench.fit.observations.motion_windows import MotionWindows, motions_in_windows
+from omnibench.fit.motion_windows import MotionWindows, motions_in_windows
 from omnibench.fit.problem import CalibrationProblem
-from omnibench.fit.shrinkage.shrunk_matrix import shrunk_closed_form
-from omnibench.fit.uncertainty.uncertainty import NoCovarianceError, uncertainty_of
+from omnibench.fit.shrinkage import shrunk_closed_form
+from omnibench.fit.uncertainty import NoCovarianceError, uncertainty_of
 from omnibench.registry import Options, calibrators
 from omnibench.robot.calibration import EffectTerm, ModelExtension, covariance_rows, matrix_rows
-from omnibench.robot.domain.fade import GROWTH
-from omnibench.robot.domain.training_domain import motions_of, representatives
-from omnibench.robot.effects.learned.network import Network
-from omnibench.robot.effects.weights import encode_weights
+from omnibench.robot.corrections import GROWTH, motions_of, representatives
+from omnibench.robot.effects.effect import encode_weights
+from omnibench.robot.effects.learned import Network
 from omnibench.robot.kinematics import Array
 from omnibench.robot.signals import of_centre
 

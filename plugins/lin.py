@@ -36,9 +36,8 @@ from omnibench.errors import NotApplicableError
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
-from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.kinematics import Array, Robot, class_of
 from omnibench.robot.odometry import Complex, Integration, OdometryBatch
-from omnibench.robot.robot_class import class_of
 
 _UNDRIVEN = 1e-6  # of the largest singular value: smaller ones are rounding
 # The same, for the third one of the wheels' angles: below it the paths lack a motion, which noise alone would fit.

@@ -52,9 +52,8 @@ from omnibench.errors import NotApplicableError
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
-from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.kinematics import Array, Robot, RobotClass, class_of
 from omnibench.robot.odometry import Integration, chord_shares
-from omnibench.robot.robot_class import RobotClass, class_of
 from omnibench.words import plural
 
 _GROWTH, _CUT = 1.005, 0.5  # factors on a step when the derivative keeps its sign, and when it does not

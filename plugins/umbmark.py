@@ -42,8 +42,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from omnibench.fit.calibrator import Calibrator, Solution
-from omnibench.fit.differential.axle import TWO_WHEELS, axle_length, has_two_wheels
-from omnibench.fit.differential.driven_squares import Square, squares_both_ways
+from omnibench.fit.differential import TWO_WHEELS, Square, axle_length, has_two_wheels, squares_both_ways
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import calibrators
 from omnibench.robot.kinematics import Robot

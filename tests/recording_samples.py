@@ -13,7 +13,7 @@ from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.scans import ScansInMemory
 from omnibench.data.true_poses import TruePath
 from omnibench.robot.kinematics import Array, wheel_equations
-from omnibench.robot.path import Path
+from omnibench.robot.odometry import Path
 from omnibench.simulate.chain.floor_plan import FloorPlan, RoomPlan, make_plan
 from omnibench.simulate.chain.lidar import Lidar, measure_scans, scan_stamps
 

@@ -117,7 +117,7 @@ def calibrate(
     if cost is not None:
         costs.entry(cost, "--cost")
     refuse_existing(output, force=force)
-    tls, preload = tls_files(tls_ca, tls_cert, tls_key), ("omnibench.fit.uncertainty.bootstrap",)
+    tls, preload = tls_files(tls_ca, tls_cert, tls_key), ("omnibench.fit.bootstrap",)
     with (
         redirect_stdout(sys.stderr),
         ProgressDisplay() as watch,

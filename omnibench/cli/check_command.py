@@ -66,8 +66,7 @@ def check(
     from omnibench.errors import PluginError
     from omnibench.files import refuse_existing
     from omnibench.fit.check.checking import check_recording
-    from omnibench.fit.check.fixes import next_command
-    from omnibench.fit.check.recording_source import read_source
+    from omnibench.fit.check.fixes import next_command, read_source
     from omnibench.registry import load_plugin_file, load_plugins
 
     refuse_existing(report, force=force)

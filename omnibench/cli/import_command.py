@@ -22,8 +22,8 @@ from omnibench.errors import ConfigError, DataError
 from omnibench.words import plural
 
 if TYPE_CHECKING:
-    from omnibench.fit.check.recording_source import RecordingSource
-    from omnibench.fit.check.result import CheckReport
+    from omnibench.fit.check.checking import CheckReport
+    from omnibench.fit.check.fixes import RecordingSource
 
 import_app = typer.Typer()
 
@@ -91,7 +91,7 @@ def import_(
     from omnibench.data.splits import division_in_words
     from omnibench.data.storage import check_dataset_folder, save_dataset
     from omnibench.files import refuse_existing, resolved
-    from omnibench.fit.check.recording_source import RecordingSource
+    from omnibench.fit.check.fixes import RecordingSource
     from omnibench.registry import importers
     from omnibench.slam.import_dataset import import_dataset
 

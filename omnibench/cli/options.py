@@ -61,7 +61,7 @@ Plugins = Annotated[
 
 
 # Modules that jobs which read a data set share.
-_READING = ("omnibench.data.checks.clock_findings", "omnibench.robot.stored.path_sums_loaded")
+_READING = ("omnibench.data.checks.clock_findings", "omnibench.robot.compiled_beforehand")
 BackendName = Annotated[
     str | None,
     typer.Option(
@@ -115,7 +115,7 @@ def asked_backend(
             yield None
         return
     from omnibench.jobs.backend_choice import BackendChoice, open_backend
-    from omnibench.robot.stored.odometry_of_stored import read_by
+    from omnibench.robot.stored_odometry import read_by
 
     choice = BackendChoice(name=name, workers=workers or os.cpu_count() or 1, tls=tls)
     with open_backend(choice, (*_READING, *preload), report) as backend, read_by(backend), reading_told_to(report):

@@ -9,12 +9,12 @@ from pydantic import AfterValidator, Field, field_validator
 from omnibench.config import Model, Positive, RelativePath, printable
 from omnibench.data.dataset import Split
 from omnibench.fit.geometry import GeometryLimits
-from omnibench.fit.loss.losses import LossName
+from omnibench.fit.loss import LossName
 from omnibench.fit.parameterisation import Box, ParameterisationName
+from omnibench.fit.prior import MountChoice
 from omnibench.fit.problem import Budget
-from omnibench.fit.shrinkage.prior import MountChoice
+from omnibench.fit.ratio_intervals import Bootstrap
 from omnibench.fit.span import Unidentified
-from omnibench.fit.uncertainty.ratio_intervals import Bootstrap
 from omnibench.jobs.backend_choice import name_flaw
 from omnibench.jobs.scheduler_tls import TlsFiles
 from omnibench.robot.odometry import Integration

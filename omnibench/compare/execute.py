@@ -14,7 +14,7 @@ from omnibench.compare.plan import PlannedRun, RunTask
 from omnibench.errors import DataError, Interrupted
 from omnibench.fit.calibrator import Outcome, RunResult, Timing, describe_error, run_calibrator
 from omnibench.fit.problem import CalibrationProblem
-from omnibench.fit.shrinkage.shrinkage import shrunk
+from omnibench.fit.shrinkage import shrunk
 from omnibench.jobs.job import Backend, BackendError, Failure, Job, JobWatch, run_jobs
 from omnibench.jobs.result_store import ResultStore
 from omnibench.processes import interrupts_not_in_callbacks
@@ -25,7 +25,7 @@ from omnibench.words import plural
 _GRACE = 10.0  # s after the budget's time: a run that has not stopped by then is killed (chosen)
 _REFERENCES = 5  # evaluations that a machine is measured by: the best is one that nothing disturbed (chosen)
 # Modules that the processes share, so that they need not be imported for every run.
-PRELOAD = ("omnibench.compare.execute", "omnibench.fit.loss.sum_of_norms", "nlopt")
+PRELOAD = ("omnibench.compare.execute", "omnibench.fit.sum_of_norms", "nlopt")
 
 
 def execute(

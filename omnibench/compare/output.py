@@ -25,7 +25,7 @@ from omnibench.files import (
     write_table,
     write_text,
 )
-from omnibench.fit.uncertainty.ratio_intervals import Interval
+from omnibench.fit.ratio_intervals import Interval
 from omnibench.robot.calibration import (
     Calibration,
     ModelExtension,

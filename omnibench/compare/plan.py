@@ -16,7 +16,7 @@ from omnibench.data.splits import training_split
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import as_answered
 from omnibench.fit.geometry import GeometryLimits
-from omnibench.fit.loss.robust_cost import with_loss
+from omnibench.fit.loss import with_loss
 from omnibench.fit.parameterisation import Box, ParameterisationName
 from omnibench.fit.problem import CalibrationProblem, make_parameterisation
 from omnibench.jobs.result_store import code_digest, content_key

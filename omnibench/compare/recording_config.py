@@ -16,8 +16,8 @@ from omnibench.data.storage import load_dataset
 from omnibench.data.stored.dataset_folders import dataset_folders, in_few_words
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import Calibrator
+from omnibench.fit.prior import default_cost, default_unidentified
 from omnibench.fit.problem import make_parameterisation
-from omnibench.fit.shrinkage.prior import default_cost, default_unidentified
 from omnibench.registry import Entry, calibrators, load_plugins
 
 _EVALUATIONS, _SECONDS = 10_000, 30.0  # of each run; s; chosen: on two cores a first look takes a minute or two

@@ -18,8 +18,8 @@ from omnibench.fit.calibrator import Outcome
 from omnibench.fit.geometry import FittedParameter
 from omnibench.fit.parameterisation import ParameterisationName
 from omnibench.fit.problem import Improvement
-from omnibench.fit.uncertainty.ratio_intervals import Interval, Units
-from omnibench.fit.uncertainty.uncertainty import Uncertainty
+from omnibench.fit.ratio_intervals import Interval, Units
+from omnibench.fit.uncertainty import Uncertainty
 from omnibench.registry import calibrators
 from omnibench.robot.calibration import HeldOutVerdict, ModelExtension, Noise, Row
 from omnibench.robot.kinematics import Array

@@ -35,8 +35,8 @@ from omnibench.files import results_locked
 from omnibench.fit.calibrator import RunResult
 from omnibench.fit.certify import prove, proven_gap
 from omnibench.fit.cost import SumOfNorms
-from omnibench.fit.uncertainty.uncertainty import NoCovarianceError, Uncertainty, uncertainty_of
-from omnibench.fit.uncertainty.unidentified import warnings_of_calibration
+from omnibench.fit.identifiability import warnings_of_calibration
+from omnibench.fit.uncertainty import NoCovarianceError, Uncertainty, uncertainty_of
 from omnibench.jobs.backend_choice import BackendChoice, open_backend
 from omnibench.jobs.result_store import ResultStore
 from omnibench.processes import one_thread_processes

@@ -17,15 +17,15 @@ from omnibench.fit.calibrator import Outcome, RunResult, describe_error
 from omnibench.fit.cost import Cost
 from omnibench.fit.evaluate import final_errors, positions_and_headings
 from omnibench.fit.geometry import FittedParameter, WheelGeometry, fitted_parameters
-from omnibench.fit.observations.reference_errors import with_mean_errors
 from omnibench.fit.parameterisation import make_bounds
-from omnibench.fit.uncertainty.ratio_intervals import UnitName, units_of
+from omnibench.fit.ratio_intervals import UnitName, units_of
+from omnibench.fit.reference_rows import with_mean_errors
 from omnibench.registry import calibrators, costs
 from omnibench.robot.calibration import extended_model, matrix_rows
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
-from omnibench.robot.stored.odometry_of_stored import odometry_of
+from omnibench.robot.stored_odometry import odometry_of
 
 
 class SplitScorer:

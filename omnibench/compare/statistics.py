@@ -9,9 +9,9 @@ import numpy as np
 
 from omnibench.compare.result import EntryStatistics, EntryVerdict, RunRecord, ScoredRun, SplitScore, SplitStatistics
 from omnibench.data.dataset import Dataset, Split
-from omnibench.fit.held_out import judge, nothing_held_out
-from omnibench.fit.sessions.session_differences import compare_sessions
-from omnibench.fit.uncertainty.ratio_intervals import Bootstrap, Interval, RatioIntervals
+from omnibench.fit.evaluate import judge, nothing_held_out
+from omnibench.fit.ratio_intervals import Bootstrap, Interval, RatioIntervals
+from omnibench.fit.sessions import compare_sessions
 from omnibench.registry import calibrators
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration

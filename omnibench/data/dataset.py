@@ -23,10 +23,8 @@ from omnibench.data.scans import Scans
 from omnibench.data.stored.periods import median_period, period_of
 from omnibench.data.stored.stored_rows import in_file, noted
 from omnibench.errors import DataError, nearest, require_type
-from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.kinematics import Array, Drive, Robot, in_the_middle, interpolated
 from omnibench.robot.odometry import WheelLog, kept_with_samples
-from omnibench.robot.planar import interpolated
-from omnibench.robot.wheels.drive import Drive, in_the_middle
 from omnibench.views import Shown
 from omnibench.words import plural
 

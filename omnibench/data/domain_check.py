@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from omnibench.data.dataset import Trajectory
 from omnibench.robot.calibration import Calibration
-from omnibench.robot.domain.training_domain import TrainingDomain, extrapolation_consequence, motions_of
+from omnibench.robot.corrections import TrainingDomain, extrapolation_consequence, motions_of
 from omnibench.robot.kinematics import Array
 
 _NAMED = 3  # commands that the warning names; the others are counted

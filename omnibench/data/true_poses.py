@@ -13,8 +13,7 @@ from omnibench.config import read_yaml, validate
 from omnibench.data.tables.table import read_table
 from omnibench.errors import DataError
 from omnibench.files import write_table
-from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.planar import interpolated
+from omnibench.robot.kinematics import Array, Robot, interpolated
 
 TRUTH_FILE = "truth.yaml"
 POSES_FILE = "poses.parquet"

@@ -15,8 +15,8 @@ from omnibench.data.storage import load_whole
 from omnibench.design.config import DesignConfig
 from omnibench.design.d_optimality import Counts
 from omnibench.errors import ConfigError, DataError, OmnibenchError, UnknownNameError
+from omnibench.fit.identifiability import identifiability
 from omnibench.fit.span import aligned, direction_in_words, driven_span, motion_in_words
-from omnibench.fit.uncertainty.identifiability import identifiability
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Robot
 from omnibench.robot.model import OdometryModel

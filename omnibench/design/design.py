@@ -40,13 +40,12 @@ from omnibench.design.result import (
 )
 from omnibench.errors import ConfigError, require_choice, require_range
 from omnibench.fit.geometry import WheelGeometry
+from omnibench.fit.identifiability import is_invertible
+from omnibench.fit.information import information_of_runs
 from omnibench.fit.span import direction_in_words, driven_span
-from omnibench.fit.uncertainty.information import information_of_runs
-from omnibench.fit.uncertainty.physical import is_invertible
 from omnibench.robot.calibration import Noise
-from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.kinematics import Array, Robot, relative
 from omnibench.robot.odometry import Integration
-from omnibench.robot.planar import relative
 from omnibench.words import plural
 
 USES: tuple[Use, ...] = get_args(Use)

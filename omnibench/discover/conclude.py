@@ -32,7 +32,7 @@ from omnibench.discover.selection.model_selection import Selection
 from omnibench.discover.selection.named_effects import candidates_of
 from omnibench.discover.selection.screening import Screening
 from omnibench.discover.verdict import headline_of, sessions_in_words, worn
-from omnibench.fit.sessions.session_differences import SessionComparison
+from omnibench.fit.sessions import SessionComparison
 from omnibench.robot.kinematics import Array
 
 _WORSE = 1.05  # times the plain matrix's error; nothing but a warning hangs on it

@@ -50,7 +50,7 @@ from omnibench.discover.selection.screening import (
 from omnibench.discover.selection.unknown_term import add_smooth_terms
 from omnibench.discover.verdict import lacks_a_name, verdict_of
 from omnibench.errors import DataError, computable, require_type
-from omnibench.fit.least_squares.usable_runs import usable_runs
+from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.progress import Reporter, Stages, no_progress
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array

@@ -14,8 +14,8 @@ from pydantic.dataclasses import dataclass
 from pydantic_core import to_jsonable_python
 
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.fit.least_squares.noise import NoiseEstimate
-from omnibench.fit.sessions.session_differences import SessionComparison
+from omnibench.fit.noise import NoiseEstimate
+from omnibench.fit.sessions import SessionComparison
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.effects.effect import Stage
 from omnibench.robot.kinematics import Array

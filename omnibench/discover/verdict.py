@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 
 from omnibench.discover.result import CovariateDependence, HeldOut, NamedEffect, Verdict
 from omnibench.discover.selection.model_selection import CHANCE, SURE
-from omnibench.fit.sessions.session_differences import SessionComparison
+from omnibench.fit.sessions import SessionComparison
 
 _Dependences = Sequence[CovariateDependence]
 _PLACES = 2  # covariates that a headline names, as what shows in one often shows in another, too (chosen)

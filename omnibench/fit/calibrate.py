@@ -10,14 +10,14 @@ from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.splits import training_split
 from omnibench.environment import package_versions
 from omnibench.errors import ConfigError, computable, require_choice, require_range, require_type
+from omnibench.fit.bootstrap import ElementIntervals, bootstrap_intervals
 from omnibench.fit.calibrator import Calibrator, RunResult, as_answered, run_calibrator
 from omnibench.fit.cost import Cost
 from omnibench.fit.evaluate import verdict_on
 from omnibench.fit.geometry import FittedParameter, GeometryLimits, WheelGeometry, fitted_parameters
-from omnibench.fit.loss.losses import LossName
-from omnibench.fit.loss.robust_cost import with_loss
-from omnibench.fit.observations.open_combinations import with_open_combinations
-from omnibench.fit.observations.open_in_words import open_sentences
+from omnibench.fit.identifiability import inseparable_in_words, kept_motions, warnings_of_calibration
+from omnibench.fit.loss import LossName, with_loss
+from omnibench.fit.open_combinations import open_sentences, with_open_combinations
 from omnibench.fit.parameterisation import (
     Box,
     BoxName,
@@ -25,16 +25,13 @@ from omnibench.fit.parameterisation import (
     MatrixElements,
     ParameterisationName,
 )
+from omnibench.fit.prior import MountChoice, default_cost, default_mount, default_unidentified
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
-from omnibench.fit.shrinkage.prior import MountChoice, default_cost, default_mount, default_unidentified
-from omnibench.fit.shrinkage.shrinkage import shrunk
+from omnibench.fit.ratio_intervals import FEWEST, Units, units_of
+from omnibench.fit.shrinkage import shrunk
 from omnibench.fit.span import Unidentified, WheelDirection, driven_span, unidentified_directions
 from omnibench.fit.steering_fit import SteeringChoice, SteeringFit, corrected_runs, on_bounds, words_of
-from omnibench.fit.uncertainty.bootstrap import ElementIntervals, bootstrap_intervals
-from omnibench.fit.uncertainty.physical import inseparable_in_words
-from omnibench.fit.uncertainty.ratio_intervals import FEWEST, Units, units_of
-from omnibench.fit.uncertainty.uncertainty import NoCovarianceError, Uncertainty, uncertainty_of
-from omnibench.fit.uncertainty.unidentified import kept_motions, warnings_of_calibration
+from omnibench.fit.uncertainty import NoCovarianceError, Uncertainty, uncertainty_of
 from omnibench.jobs.job import Backend
 from omnibench.progress import Reporter, no_progress, renamed
 from omnibench.registry import calibrators, costs
@@ -48,7 +45,7 @@ from omnibench.robot.calibration import (
     fitted_calibration,
     matrix_rows,
 )
-from omnibench.robot.effects.term import Term
+from omnibench.robot.effects.effect import Term
 from omnibench.robot.kinematics import Robot
 from omnibench.robot.odometry import Integration
 from omnibench.views import Shown

@@ -14,8 +14,8 @@ from pydantic import BaseModel
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import ConfigError, NotApplicableError, OmnibenchError, PluginError, one_line
 from omnibench.fit.parameterisation import ParameterisationName
+from omnibench.fit.prior import MountChoice
 from omnibench.fit.problem import BudgetSpent, CalibrationProblem, Improvement
-from omnibench.fit.shrinkage.prior import MountChoice
 from omnibench.fit.span import Unidentified
 from omnibench.jobs.memory import memory_limit
 from omnibench.registry import AnyOptions, Options, PluginFailure, calibrators

@@ -7,6 +7,94 @@ cut into have the bounds b(P) of bounds/lower_bound.py, and M is the best matrix
     gap = 1 - min b(P) / F(M).                                                                     (C2)
 
 The part with the lowest bound, which alone can raise the minimum, is cut in two until the gap is as small as wanted.
+
+Sums over the samples up to each stamp, of which a lower bound is made, and the error of computing them.
+
+At row 3 = m3 + d, with the angles a_k that sample k drives and c_k before it along the fitted directions,
+
+    S_sj(d) = sum_k a_kj exp(i (m3.C_k + d.c_k)),   dS_sj/dd_l = i sum_k a_kj c_kl exp(...)        (S1)
+    |d^2 S_sj / dd_l dd_m| <= sum_k |a_kj c_kl c_km|.                                              (S2)
+
+An Euler step is one sample k. An arc is an integral along the sample, taken by Gauss-Legendre quadrature with enough
+nodes that its error (impulses.py) sums up to q = 1e-9 m at most over a run, for every matrix of the box.
+
+Rounding: with u = 2^-53, n additions into one number are wrong by less than 1.01 n u of the largest magnitude that
+their partial sums have (Higham, Accuracy and Stability of Numerical Algorithms, 2002, sections 3.1 and 4.2). With L the
+longest path of the box (m) and A the largest heading that it allows at any sample (rad), partial sums of phases are at
+most A and those of the sums at most L: the phases are wrong by at most 1.01 n u A, hence the sums by 1.01 n u (1 + A)
+L. In a part of the box the slopes are multiplied by delta with |delta.c_k| <= C, the bounds of curvature by C^2 / 2.
+Offsets and headings are differences of numbers of size P. Altogether the rounding is below
+
+    e = 8 n u (1 + L) (2 + A) (1 + C)^2 (1 + P).                                                   (S3)
+
+The factor 8 covers the few operations on each term; n are the samples, the stamps and 1000 for all else, which are some
+dozens.
+
+Lower bounds of a sum of norms over a box of matrices.
+
+The cost of a matrix M is
+
+    F(M) = sum_s share_s |W e_s(M)|                                                              (B1)
+
+with e_s the pose error (x, y, heading) at stamp s and W the diagonal matrix of its weights. Duality of the norm
+(|v| >= u.v for |u| <= 1) bounds it by a function that is simpler: for any vectors u_s in the unit ball
+
+    F(M) >= phi(M) = sum_s share_s u_s.W e_s(M).                                                 (B2)
+
+The choice of u_s decides how tight the bound is, not whether it holds.
+
+Matrices are M = M0 + D Q with the design M0 and orthonormal directions Q (r, N) of the wheel rates that are fitted, so
+that four wheels on three degrees of freedom have r = 3, too. A part of the box bounds the deviations D (3, r); where
+r < N the whole is the least such part that contains the box, so that the bound holds, but stays apart from the least
+cost of the box if the part holds a better matrix. With
+zeta_j = D_1j + i D_2j, the driven angles a_k of sample k and c_k before it, both along Q, position errors x + iy are
+
+    o_s + S_s0(d) + sum_j zeta_j S_sj(d),   S_sj(d) = sum_k a_kj exp(i (m3.C_k + d.c_k)),        (B3)
+
+d being row 3 of D, a_k0 the design's own displacement and m3.C_k its heading; heading errors are linear in d. Summed
+over the stamps with v_s = share_s (W u_s)_x - i share_s (W u_s)_y,
+
+    phi = k_0 + k.d + Re H_0(d) + sum_j Re(zeta_j H_j(d)),   H_j(d) = sum_s v_s S_sj(d).         (B4)
+
+About the middle of the part, d = middle + delta with |delta_l| <= rho_l, each H_j is expanded once. From
+|exp(ix) - 1 - ix| <= x^2 / 2
+
+    H_j(d) = H_j + dH_j.delta + R_j,   |R_j| <= 1/2 sum_lm rho_l rho_m B_jlm,                    (B5)
+    B_jlm = sum_s |v_s| sum_k |a_kj c_kl c_km|.
+
+Without the R_j, phi is linear in delta for given zeta and linear in zeta for given delta. Its least value over the box
+of zeta is a minimum of functions that are linear in delta, so that it is concave in delta and least at a corner of the
+box of delta (Al-Khayyal and Falk, Math. Oper. Res. 8:273, 1983; Horst and Tuy, Global Optimization, 1996, ch. I). With
+h_j = H_j + dH_j.delta there,
+
+    L = min over the corners of  k_0 + k.d + Re(H_0 + dH_0.delta)
+        + sum_j [min over D_1j of D_1j Re h_j + min over D_2j of -D_2j Im h_j]                   (B6)
+    F >= L - 1/2 sum_lm rho_l rho_m (B_0lm + sum_j max|zeta_j| B_jlm) - w (q + e),               (B7)
+
+w the largest weight, q the error of the quadrature of arcs and e that of rounding (stamp_sums.py). u_s with heading
+components alone have H = 0: they are taken where others prove nothing beyond the part that was cut, as in wide boxes.
+
+The part is cut where its width takes most from (B7), which is at most
+
+    row 1: width_j sum_l |Re dH_jl| rho_l,   row 2: width_j sum_l |Im dH_jl| rho_l,              (B8)
+    row 3: both, summed over j, and rho_l sum_m (B_0lm + sum_j max|zeta_j| B_jlm) rho_m.
+
+Vectors u_s in the unit ball that make a lower bound tight: the dual solution of a sum of norms in a box.
+
+The bound holds for any u_s; the best are u_s = e_s / |e_s| at the minimiser of the sum of norms
+
+    sum_s share_s |e_s|,   e_s = r_s + J_s v,   lower <= v <= upper,                              (D1)
+
+because sum_s share_s J_s^T u_s vanishes there (or points out of the box), so that phi does not fall with v. Iteratively
+reweighted least squares (Daubechies, DeVore, Fornasier and Guentuerk, Comm. Pure Appl. Math. 63:1, 2010) minimises
+
+    sum_s share_s w_s |r_s + J_s v|^2   with   w_s = 1 / sqrt(|e_s|^2 + eps^2)                    (D2)
+
+at the e_s before, with eps falling in steps. The residuals times w_s of the last step,
+
+    u_s = w_s e_s,                                                                                (D3)
+
+solve its normal equations exactly, so that they are balanced even where residuals vanish.
 """
 
 from __future__ import annotations
@@ -14,20 +102,24 @@ from __future__ import annotations
 import heapq
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import get_args
+from itertools import product
+from operator import itemgetter
+from typing import NamedTuple, get_args
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
 
 from omnibench.config import Model
 from omnibench.data.dataset import Dataset
 from omnibench.data.splits import training_split
-from omnibench.errors import DataError, require_choice, require_range, require_type
-from omnibench.fit.bounds.lower_bound import LowerBounds, Node
-from omnibench.fit.bounds.stamp_sums import QUADRATURE
+from omnibench.errors import ConfigError, DataError, require_choice, require_range, require_type
 from omnibench.fit.calibrator import run_calibrator
-from omnibench.fit.parameterisation import Box, BoxName, ExplicitBox
+from omnibench.fit.cost import SumOfNorms
+from omnibench.fit.evaluator import ElementBox, Path, cut, impulses, make_path, quadrature
+from omnibench.fit.parameterisation import Box, BoxName, ExplicitBox, MatrixElements
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
 from omnibench.jobs.gathering import gathered
 from omnibench.jobs.job import Backend
@@ -36,7 +128,363 @@ from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.registry import calibrators, costs
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
+from omnibench.robot.odometry import Complex, Integration, OdometryBatch, WheelLog
+from omnibench.robot.stored_odometry import are_many
 from omnibench.views import Brief
+
+# m: error of the quadrature of arcs, which bounds subtract: a millionth of the millimetre that poses are known to.
+# Half of it and twice move a bound by 6e-6 of the gap that is asked for (tests/studies/constants_fit.py).
+QUADRATURE = 1e-9
+
+
+class StampSums:
+    """The sums of Eq. (S1). curvature (S, 1 + r, r, r): bounds of their second derivatives, Eq. (S2).
+
+    fitted (r, N): orthonormal directions of wheel rates. elements: a box that holds all matrices of the problem's box.
+    ConfigError where arcs are too long for the quadrature.
+    """
+
+    def __init__(self, problem: CalibrationProblem, fitted: Array, elements: ElementBox) -> None:
+        design = problem.start.reshape(3, -1)
+        logs = problem.objective.logs(problem.trajectories)
+        integration = problem.integration
+        paths = _Paths(logs, integration) if are_many(logs) else [make_path(log, integration) for log in logs]
+        row, speed = elements.largest[2], elements.speed
+        nodes = quadrature(paths, row, speed, QUADRATURE, integration)
+        if nodes is None:
+            raise ConfigError("samples turn too far for a lower bound with arcs; use integration euler")
+        self._quadrature = QUADRATURE if integration == "arc" else 0.0
+        columns = _Columns(paths, [float(log.start[2]) for log in logs], design, fitted, row, integration, nodes)
+        self._runs: Iterable[_RunColumns] = columns if isinstance(paths, _Paths) else list(columns)
+        self.curvature = np.concatenate([of_run.curvature for of_run in self._runs])
+        reaches = np.array([[(np.abs(path.angles) @ speed).sum(), _most(path.before, row)] for path in paths])
+        longest, angle = reaches.max(axis=0).tolist()
+        self._farthest = np.max([np.abs(of_run.turns).max(axis=0) for of_run in self._runs], axis=0)  # |c|: (r,)
+        additions = nodes * max(len(path.angles) for path in paths) + len(self.curvature) + 1000
+        self._rounding = 4 * np.finfo(float).eps * additions * (1 + longest) * (2 + angle)  # eps = 2 u
+
+    def at(self, row_3: Array) -> tuple[Complex, Complex]:
+        """Sums (S, 1 + r) and slopes (S, 1 + r, r) at deviations (r,) of row 3, Eq. (S1).
+
+        The first of the 1 + r is the design's displacement, the others are the regressors of rows 1 and 2.
+        """
+        sums = np.concatenate([of_run.up_to_stamps(row_3) for of_run in self._runs])  # (S, (2 + r)(1 + r))
+        size = len(row_3)
+        parts = sums.reshape(len(sums), 1 + size, 2 + size)
+        whole = np.concatenate([parts[:, :, :1] + 1j * parts[:, :, 1:2], parts[:, :, 2:]], axis=2)
+        return whole[:, 0], 1j * np.moveaxis(whole[:, 1:], 1, 2)
+
+    def error(self, reach: Array, size: float) -> float:
+        """Error, m or rad, of quadrature and rounding, q + e of Eq. (S3), in a part of half-widths ``reach`` (r,).
+
+        size: magnitude P of poses and references.
+        """
+        turned = float(self._farthest @ reach)
+        return self._quadrature + self._rounding * (1 + turned) ** 2 * (1 + size)
+
+
+def _most(before: Array, row: Array) -> float:
+    """The largest heading, rad, that a row of magnitudes allows at the pieces of a path."""
+    return float((np.abs(before) @ row).max(initial=0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class _Paths:
+    """The paths of logs, made anew whenever they are gone through, as their samples are read then."""
+
+    logs: Sequence[WheelLog]
+    integration: Integration
+
+    def __iter__(self) -> Iterator[Path]:
+        return (make_path(log, self.integration) for log in self.logs)
+
+
+@dataclass(frozen=True, eq=False)
+class _Columns:
+    """Terms of the sums of each run, computed whenever it is gone through.
+
+    headings: of the runs' starts, rad. row: the largest magnitudes of row 3. Else as in StampSums.
+    """
+
+    paths: Iterable[Path]
+    headings: Sequence[float]
+    design: Array
+    fitted: Array
+    row: Array
+    integration: Integration
+    nodes: int
+
+    def __iter__(self) -> Iterator[_RunColumns]:
+        for path, heading in zip(self.paths, self.headings, strict=True):
+            yield self._of(path, heading)
+
+    def _of(self, path: Path, heading: float) -> _RunColumns:
+        design, fitted = self.design, self.fitted
+        (whole,) = cut(path, self.row, np.inf)
+        # One row of zeros more: the sum up to a stamp at the end, or at t = 0, then begins at a row that exists.
+        angles, before = (
+            np.vstack([np.reshape(part, (-1, design.shape[1])), np.zeros((1, design.shape[1]))])
+            for part in impulses(path, whole, self.integration, self.nodes)
+        )
+        moved, turns = angles @ (design[0] + 1j * design[1]), before @ fitted.T
+        sources = np.column_stack([moved.real, moved.imag, angles @ fitted.T])
+        columns = np.concatenate([sources, *(sources * turn[:, None] for turn in turns.T)], axis=1)
+        sizes = np.column_stack([np.abs(moved), np.abs(angles @ fitted.T)])
+        return _RunColumns(columns, before @ design[2] + heading, turns, path.ends * self.nodes, sizes)
+
+
+@dataclass(frozen=True, eq=False)
+class _RunColumns:
+    """A run's impulses, n: columns (n, (2 + r)(1 + r)), phase (n,) at the design, turns (n, r) along the fitted
+    directions, sizes (n, 1 + r) of Eq. (S2); ends (S,): the impulses up to each stamp.
+    """
+
+    columns: Array
+    phase: Array
+    turns: Array
+    ends: NDArray[np.intp]
+    sizes: Array
+
+    @property
+    def curvature(self) -> Array:
+        """Bounds (S, 1 + r, r, r) of the second derivatives, Eq. (S2)."""
+        pairs = np.einsum("ij,il,im->ijlm", self.sizes, np.abs(self.turns), np.abs(self.turns))
+        sums: Array = np.cumsum(np.roll(pairs, 1, axis=0), axis=0)[self.ends]  # the row of zeros comes first
+        return sums
+
+    def up_to_stamps(self, row_3: Array) -> Complex:
+        """Sums (S, c) of columns (n, c) times exp(i (phase + turns.row_3)) up to each stamp."""
+        columns, ends = self.columns, self.ends
+        angle = self.phase + self.turns @ row_3
+        cosine, sine = np.cos(angle), np.sin(angle)
+        if len(ends) == 1:
+            last = int(ends[0])
+            return (cosine[:last] @ columns[:last] + 1j * (sine[:last] @ columns[:last]))[None]
+        firsts = np.concatenate([[0], ends[:-1]])
+        between: Complex = np.add.reduceat(columns * cosine[:, None], firsts) + 1j * np.add.reduceat(
+            columns * sine[:, None], firsts
+        )
+        between[firsts == ends] = 0.0  # reduceat returns the first row for an empty part
+        return np.cumsum(between, axis=0)
+
+
+# These numbers change how tight a bound is, not whether it holds. In tests/studies/constants_fit.py each is halved
+# and doubled: _SMOOTHING and _SETTLED then move the bound by 4 % and 0.3 % of the gap that is asked for, the others not
+# at all.
+_STEPS = 25  # steps of the reweighted least squares
+_SMOOTHING = 3.0  # digits: eps falls to this negative power of ten of the mean norm
+# The reweighting ends when no deviation changes by more, in units in which the normal equations' diagonal is 1.
+_SETTLED = 1e-5
+_RIDGE = 1e-13  # added to the normalised normal equations, which are singular where the data leave a direction open
+_INSIDE = 1 - 1e-14  # length of the vectors: the margin covers the rounding of their norm, some 1e-15
+
+
+class Minimum(NamedTuple):
+    """An approximate minimiser (n,) of Eq. (D1) and its directions (S, k), Eq. (D3)."""
+
+    point: Array
+    directions: Array
+
+
+def least_sum_of_norms(
+    residuals: Array, jacobian: Array, shares: Array, lower: Array, upper: Array, begin: Array
+) -> Minimum:
+    """Minimise sum_s shares_s |residuals_s + jacobian_s v| over v (n,) in the box; residuals (S, k)."""
+    free = (upper > lower) & (np.abs(jacobian).max(axis=(0, 1)) > 0)
+    point = np.clip(begin, lower, upper)
+    errors = residuals + jacobian @ point
+    weights = 1 / np.maximum(np.linalg.norm(errors, axis=1), 1e-300)
+    fixed, moving = residuals + jacobian[:, :, ~free] @ point[~free], jacobian[:, :, free]
+    columns = moving.reshape(fixed.size, moving.shape[2])
+    for step in range(_STEPS if free.any() else 0):
+        lengths = np.linalg.norm(errors, axis=1)
+        weights = 1 / np.hypot(lengths, 1e-12 + lengths.mean() * 10.0 ** -min(1 + step / 2, _SMOOTHING))  # Eq. (D2)
+        weighted = columns * np.repeat(shares * weights, fixed.shape[1])[:, None]
+        normal, target = weighted.T @ columns, weighted.T @ fixed.ravel()
+        scale = 1 / np.sqrt(np.diag(normal))
+        factor = np.linalg.cholesky(normal * np.outer(scale, scale) + _RIDGE * np.eye(len(scale))).T
+        wanted = -np.linalg.solve(factor.T, scale * target)
+        best = scale * np.linalg.solve(factor, wanted)
+        if (best < lower[free]).any() or (best > upper[free]).any():
+            best = lsq_linear(factor / scale, wanted, (lower[free], upper[free]), method="bvls").x
+        settled = 1 + step / 2 > _SMOOTHING and np.abs((best - point[free]) / scale).max() < _SETTLED
+        point[free] = np.clip(best, lower[free], upper[free])
+        errors = fixed + moving @ point[free]
+        if settled:
+            break
+    return Minimum(point, errors * weights[:, None])  # Eq. (D3)
+
+
+def into_unit_ball(directions: Array) -> tuple[Array, Array, Array]:
+    """Vectors (S, k) of length about one in the unit ball: shrunk by one factor, each by its own, or all of length one.
+
+    The first keeps the balance between the vectors, the second the short ones of residuals that vanish; the third is
+    exact in a box without width.
+    """
+    lengths = np.linalg.norm(directions, axis=1)
+    one_by_one = directions / np.maximum(1.0, lengths)[:, None] * _INSIDE
+    of_length_one = directions / np.maximum(1e-300, lengths)[:, None] * _INSIDE
+    return directions / max(1.0, float(lengths.max())) * _INSIDE, one_by_one, of_length_one
+
+
+# m or rad per rad: slope of phi that is assumed beside Eq. (B8), so that a part whose width does no harm to first order
+# is cut all the same. It decides only where nothing else does: a proof has the same parts with half of it and with
+# twice (tests/studies/constants_fit.py).
+_IMBALANCE = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Node(ElementBox):
+    """A part of the box, given by its deviations (3, r), with its proven bound.
+
+    bound: no matrix in it costs less. good (3, r): deviations of a matrix in it with a low cost. looseness (3, r): by
+    how much the width in each deviation may lower the bound, Eq. (B8).
+    """
+
+    bound: float
+    good: Array
+    looseness: Array
+
+
+class LowerBounds:
+    """Lower bounds of a problem's cost over parts of its box.
+
+    ConfigError for another parameterisation than the matrix, or a cost that is no sum of norms.
+    """
+
+    def __init__(self, problem: CalibrationProblem) -> None:
+        parameterisation, objective = problem.parameterisation, problem.objective
+        if not isinstance(parameterisation, MatrixElements):
+            raise ConfigError(
+                "a lower bound needs the matrix parameterisation; its box contains what a geometry can do"
+            )
+        if not isinstance(objective, SumOfNorms):
+            raise ConfigError(f"a lower bound needs a cost that is a sum of norms, which {objective.name} is not")
+        odometry = problem.odometry
+        if not isinstance(odometry, OdometryBatch):
+            raise ConfigError(
+                "a lower bound is proven for reference poses alone; of runs with distances, turns and other references "
+                "no bound is known, and their calibration cannot be certified"
+            )
+        self._design = problem.start.reshape(3, -1)
+        self._fitted = _complement(parameterisation.null, self._design.shape[1])
+        self._box = self._deviations_of_box(problem)
+        owner = odometry.trajectory
+        self._shares = objective.shares(owner)
+        self._weights = np.array(objective.weights)
+        elements = ElementBox.of(parameterisation, problem.lower, problem.upper)
+        self._stamps = StampSums(problem, self._fitted, elements)
+        start = np.array([run.start for run in problem.trajectories])[owner]
+        self._offset = start[:, 0] - problem.reference[:, 0] + 1j * (start[:, 1] - problem.reference[:, 1])
+        self._turned = odometry.driven @ self._fitted.T
+        self._heading = start[:, 2] + odometry.driven @ self._design[2] - problem.reference[:, 2]
+        self._size = float(np.abs(problem.reference).max()) + float(np.abs(start).max())
+
+    def root(self, vector: Array) -> Node:
+        """The whole box; ``vector`` (n,): first guess of a good matrix."""
+        near = (vector.reshape(3, -1) - self._design) @ self._fitted.T
+        return self._node(self._box, near)
+
+    def split(self, node: Node) -> tuple[Node, Node]:
+        """The node cut in two where its width lowers the bound most; both parts inherit the node's bound.
+
+        Row 3 is halved. Rows 1 and 2, in which the cost is convex, are cut halfway between the good matrix and the
+        farther side: the part without the good matrix is usually ruled out at once.
+        """
+        row, column = np.unravel_index(int(np.argmax(node.looseness)), node.looseness.shape)
+        low, high = float(node.lower[row, column]), float(node.upper[row, column])
+        border = (low + high) / 2
+        if row < 2:
+            good = float(node.good[row, column])
+            border = (good + (high if high - good > good - low else low)) / 2
+        below, above = node.upper.copy(), node.lower.copy()
+        below[row, column] = above[row, column] = border
+        parts = ElementBox(node.lower, below), ElementBox(above, node.upper)
+        return self._node(parts[0], node.good, node.bound), self._node(parts[1], node.good, node.bound)
+
+    def vector(self, deviations: Array) -> Array:
+        """Deviations (3, r) as a vector (n,) of the problem."""
+        matrix: Array = self._design + deviations @ self._fitted
+        return matrix.ravel()
+
+    def _deviations_of_box(self, problem: CalibrationProblem) -> ElementBox:
+        """The least part (3, r) whose deviations contain those of all vectors in the problem's box."""
+        low = problem.lower.reshape(3, -1) - self._design
+        high = problem.upper.reshape(3, -1) - self._design
+        positive, negative = np.maximum(self._fitted, 0).T, np.minimum(self._fitted, 0).T
+        return ElementBox(low @ positive + high @ negative, high @ positive + low @ negative)
+
+    def _node(self, part: ElementBox, near: Array, proven: float = 0.0) -> Node:
+        """A part of the box with its bound; near (3, r): first guess of a good matrix; proven: bound of the whole."""
+        begin = np.clip(near, part.lower, part.upper)
+        sums, slopes = self._stamps.at(part.centre[2])
+        residuals, jacobian = self._linearised(part, sums, slopes, begin[:2])
+        middle = part.centre * [[0.0], [0.0], [1.0]]
+        box = (part.lower - middle).ravel(), (part.upper - middle).ravel(), (begin - middle).ravel()
+        point, directions = least_sum_of_norms(residuals, jacobian, self._shares, *box)
+        bounds = [self._dual_bound(part, sums, slopes, scaled) for scaled in into_unit_ball(directions)]
+        bound, looseness = max(bounds, key=itemgetter(0))
+        if self._weights[2] and bound <= proven:
+            turns = least_sum_of_norms(residuals[:, 2:], jacobian[:, 2:], self._shares, *box).directions
+            headings = np.column_stack([np.zeros((len(turns), 2)), turns])
+            proven = max(proven, *(self._dual_bound(part, sums, slopes, each)[0] for each in into_unit_ball(headings)))
+        return Node(part.lower, part.upper, max(proven, bound), point.reshape(3, -1) + middle, looseness)
+
+    def _linearised(self, part: ElementBox, sums: Complex, slopes: Complex, rows_12: Array) -> tuple[Array, Array]:
+        """Weighted errors (S, 3) of the part's middle in row 3 and no deviation in rows 1 and 2, and their slopes.
+
+        The slopes (S, 3, 3r) are those at rows 1 and 2 of ``rows_12`` (2, r), Eq. (B3) and (B5).
+        """
+        zeta = rows_12[0] + 1j * rows_12[1]
+        moved = self._offset + sums[:, 0]
+        turning = slopes[:, 0] + np.einsum("sjl,j->sl", slopes[:, 1:], zeta)
+        driving = sums[:, 1:]
+        residuals = np.stack([moved.real, moved.imag, self._heading + self._turned @ part.centre[2]], axis=1)
+        still = np.zeros_like(driving.real)
+        jacobian = np.stack(
+            [
+                np.concatenate([driving.real, -driving.imag, turning.real], axis=1),
+                np.concatenate([driving.imag, driving.real, turning.imag], axis=1),
+                np.concatenate([still, still, self._turned], axis=1),
+            ],
+            axis=1,
+        )
+        return residuals * self._weights, jacobian * self._weights[:, None]
+
+    def _dual_bound(self, part: ElementBox, sums: Complex, slopes: Complex, directions: Array) -> tuple[float, Array]:
+        """Bound (B7) of a part for u_s = ``directions`` (S, 3), and its looseness (3, r), Eq. (B8)."""
+        lower, upper, reach = part.lower[:2], part.upper[:2], part.reach[2]
+        weighted = directions * self._weights * self._shares[:, None]
+        along = weighted[:, 0] - 1j * weighted[:, 1]  # v_s of Eq. (B4)
+        value = along @ sums
+        slope = np.tensordot(along, slopes, (0, 0))  # dH: (1 + r, r)
+        curvature = np.tensordot(np.abs(along), self._stamps.curvature, (0, 0))  # B of Eq. (B5): (1 + r, r, r)
+        corners = np.array(list(product(*((-side, side) for side in reach)))).T  # (r, 2^r)
+        turned = weighted[:, 2] @ self._turned
+        constant = (
+            (along @ self._offset).real + value[0].real + weighted[:, 2] @ self._heading + turned @ part.centre[2]
+        )
+        total = constant + (turned + slope[0].real) @ corners  # Eq. (B6), first line
+        at_corners = value[1:, None] + slope[1:] @ corners
+        for row, factor in enumerate((at_corners.real, -at_corners.imag)):  # Eq. (B6), second line
+            total += np.minimum(factor * lower[row][:, None], factor * upper[row][:, None]).sum(axis=0)
+        bending = np.tensordot(np.append(1.0, part.speed), curvature, (0, 0))  # (r, r)
+        remainder = reach @ bending @ reach / 2
+        widths = upper - lower
+        bilinear = widths[..., None] * np.abs([slope[1:].real, slope[1:].imag]) * reach  # (2, r, r)
+        in_rows_12 = bilinear.sum(axis=2) + widths * _IMBALANCE
+        in_row_3 = bilinear.sum(axis=(0, 1)) + reach * (bending @ reach + _IMBALANCE)
+        error = float(np.abs(self._weights).max()) * self._stamps.error(reach, self._size)
+        return float(total.min() - remainder - error), np.vstack([in_rows_12, in_row_3])  # Eq. (B7), (B8)
+
+
+def _complement(null: Array, wheels: int) -> Array:
+    """Orthonormal directions (r, N) of wheel rates across the null ones; the unit vectors if there are none."""
+    if len(null) == 0:
+        return np.eye(wheels)
+    _, _, directions = np.linalg.svd(np.eye(wheels) - null.T @ null)
+    return directions[: wheels - len(null)]
+
 
 _TIMED = 3  # parts whose mean time stands for that of all: the whole box and its first two parts
 # Parts of proofs to a gap of 0.1 %: the median and the fewest of twelve of simulated data (61 to 379), and the 901 of

@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
-from omnibench.fit.observations.reference_batch import ReferenceBatch, predicted_by
-from omnibench.fit.observations.reference_rows import ReferenceRows, reference_rows
+from omnibench.fit.reference_rows import ReferenceBatch, ReferenceRows, predicted_by, reference_rows
 from omnibench.registry import Options, costs
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog
-from omnibench.robot.stored.odometry_of_stored import odometry_of
+from omnibench.robot.stored_odometry import odometry_of
 
 NO_ERROR = 1e-9  # m, rad: smaller errors are rounding
 

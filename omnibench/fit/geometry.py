@@ -18,10 +18,16 @@ from pydantic import Field, FiniteFloat, field_validator
 
 from omnibench.config import Model
 from omnibench.fit.parameterisation import Bounds, ParameterisationName, checked
-from omnibench.fit.shrinkage.prior import tolerance_of
-from omnibench.robot.kinematics import Array, Robot, inverse_kinematic_matrices, relative_deviations, wheel_rows
-from omnibench.robot.robot_class import class_of
-from omnibench.robot.wheels.drive import CarDrive
+from omnibench.fit.prior import tolerance_of
+from omnibench.robot.kinematics import (
+    Array,
+    CarDrive,
+    Robot,
+    class_of,
+    inverse_kinematic_matrices,
+    relative_deviations,
+    wheel_rows,
+)
 
 # Share of each parameter's scale: step of central differences, near the cube root of the rounding (Press et al.,
 # Numerical Recipes, 2007, section 5.7). Half of it and twice change nothing (tests/studies/constants_fit.py).

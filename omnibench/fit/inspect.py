@@ -11,8 +11,8 @@ from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory
 from omnibench.data.references.run_references import KINDS, ReferenceKind
 from omnibench.data.scans import Scans
 from omnibench.errors import require_type
+from omnibench.fit.identifiability import Identifiability, identifiability
 from omnibench.fit.span import direction_in_words, driven_span
-from omnibench.fit.uncertainty.identifiability import Identifiability, identifiability
 from omnibench.robot.model import OdometryModel
 from omnibench.words import plural
 

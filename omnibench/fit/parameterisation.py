@@ -11,7 +11,7 @@ from pydantic import FiniteFloat
 
 from omnibench.config import Model
 from omnibench.errors import ConfigError
-from omnibench.fit.shrinkage.prior import prior_root, tolerance_of
+from omnibench.fit.prior import prior_root, tolerance_of
 from omnibench.robot.kinematics import Array, Robot
 
 ParameterisationName = Literal["matrix", "geometry"]

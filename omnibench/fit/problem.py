@@ -16,26 +16,30 @@ from omnibench.data.dataset import Trajectory
 from omnibench.data.stored.periods import median_period
 from omnibench.errors import DataError
 from omnibench.fit.cost import Cost
-from omnibench.fit.evaluator.driven_frame import DrivenFrame
-from omnibench.fit.evaluator.element_box import ElementBox
-from omnibench.fit.evaluator.evaluator import PartedEvaluator, PoseEvaluator, make_evaluator, make_parted_evaluator
+from omnibench.fit.evaluator import (
+    DrivenFrame,
+    ElementBox,
+    PartedEvaluator,
+    PoseEvaluator,
+    make_evaluator,
+    make_parted_evaluator,
+)
 from omnibench.fit.geometry import GeometryLimits, WheelGeometry
-from omnibench.fit.loss.end_poses import moved_ends_in_words, with_ends_from_others
-from omnibench.fit.loss.robust_cost import RobustCost, norms_of
-from omnibench.fit.observations.open_combinations import with_open_combinations
-from omnibench.fit.observations.reference_batch import ReferenceBatch
+from omnibench.fit.loss import RobustCost, moved_ends_in_words, norms_of, with_ends_from_others
+from omnibench.fit.open_combinations import with_open_combinations
 from omnibench.fit.parameterisation import (
     Box,
     MatrixElements,
     Parameterisation,
     ParameterisationName,
 )
-from omnibench.fit.shrinkage.prior import MountChoice, default_mount
+from omnibench.fit.prior import MountChoice, default_mount
+from omnibench.fit.reference_rows import ReferenceBatch
 from omnibench.fit.span import Unidentified, directions_kept, driven_span
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import Integration, OdometryBatch
-from omnibench.robot.stored.odometry_of_stored import StoredOdometry
+from omnibench.robot.stored_odometry import StoredOdometry
 
 _PROGRESS_PERIOD = 0.1  # s, least time between two reports of progress: ten a second are all that a reader sees
 _MOST_POSES = 4_000_000  # poses of candidates that are held together, 0.1 GB (chosen)

@@ -25,16 +25,14 @@ from omnibench.data.dataset import Trajectory
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.cost import Cost
-from omnibench.fit.loss.end_poses import with_ends_from_others
-from omnibench.fit.loss.robust_cost import RobustCost, norms_of, with_loss
+from omnibench.fit.loss import RobustCost, norms_of, with_ends_from_others, with_loss
 from omnibench.fit.parameterisation import Box
+from omnibench.fit.prior import MountChoice
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
-from omnibench.fit.shrinkage.prior import MountChoice
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.registry import calibrators, effects
-from omnibench.robot.corrected import corrected, needs_of
-from omnibench.robot.effects.effect import Parameter
-from omnibench.robot.effects.term import Term
+from omnibench.robot.corrections import corrected, needs_of
+from omnibench.robot.effects.effect import Parameter, Term
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import Integration
 from omnibench.robot.signals import signals_of

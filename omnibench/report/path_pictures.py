@@ -17,9 +17,8 @@ from omnibench.report.recording.runs import ON_THE_SPOT, kinds_of, motion_titles
 from omnibench.report.recording.scan_points import REFERENCE_ITEM, evenly
 from omnibench.report.style import INK, THEORETICAL, plan, text
 from omnibench.report.traces import START, marks, path
-from omnibench.robot.kinematics import Array
+from omnibench.robot.kinematics import Array, rotated
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.planar import rotated
 from omnibench.words import plural
 
 DESIGN_ITEM = LegendItem("design", "design values", THEORETICAL, "dash")

@@ -32,8 +32,8 @@ from omnibench.config import (
 )
 from omnibench.errors import ConfigError, DataError, require_type, shown
 from omnibench.files import write_text
-from omnibench.robot.domain.fade import Fade
-from omnibench.robot.effects.term import Term, make_term
+from omnibench.robot.corrections import Fade
+from omnibench.robot.effects.effect import Term, make_term
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration

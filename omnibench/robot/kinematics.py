@@ -14,16 +14,43 @@ A fixed wheel does not slide along its axle, which is the condition
 The twists that all conditions allow have an orthonormal basis Z (3, D). With the equations E (M, 3) of all signals the
 matrix is K = Z (E Z)^+, which gives the least-squares twist among them. A skid-steered robot slides; the condition then
 is that the mean of its fixed wheels does not.
+
+Drive signals: the quantities u (M,) in which a robot's twist is linear, twist = K u, from what its wheels measure.
+
+Let omega_i be the rate of wheel i and phi_j the steering angle of wheel j, both in the middle of a sample. A wheel
+that rolls in a fixed direction, or on rollers, has the signal omega_i. A steered wheel whose rate is measured moves the
+robot over itself by
+
+    r omega (cos phi, sin phi)                                                    (1)
+
+along x and y, and has the two signals omega cos phi and omega sin phi; K then holds its radius, its place and the
+offset of its steering angle. A car steers by wheels of which only the angle is measured. Its rear wheels, at the rates
+omega_i, have the mean rate m. With w the rate of turn and v the speed of the middle of its rear axle, a front wheel at
+(L_j, y_j) from there rolls without sliding if
+
+    tan phi_j = L_j w / (v - y_j w),  so that  w / v = tan phi_j / (L_j + y_j tan phi_j),       (2)
+
+by which every steered wheel gives the tangent t_j = L w / v of the one on the middle line, L ahead, with L the mean of
+L_j. The car's signals are m, m t with t the mean of t_j, and, of two rear wheels, the difference of their rates.
+
+phi of sample k is the mean of phi(k-1) and phi(k), measured at the ends of the samples; the first sample holds phi(1).
+
+Algebra of planar poses (x, y, heading), m, m, rad. Headings are not wrapped.
+
+Functions of two arrays (..., 3) take every pose with its counterpart, by NumPy's rules of broadcasting.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from types import MappingProxyType
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from pydantic import (
     ConfigDict,
     Field,
@@ -35,12 +62,365 @@ from pydantic import (
 )
 
 from omnibench.config import Model, Name
+from omnibench.errors import UnknownNameError
 from omnibench.robot.arrays import Array as Array
 from omnibench.robot.arrays import JsonArray as JsonArray
-from omnibench.robot.wheels.drive import CarDrive, Drive, drive_of
-from omnibench.robot.wheels.wheel import Wheel as Wheel
-from omnibench.robot.wheels.wheel import in_degrees_too, in_radians, looks_like_radians
 from omnibench.views import Shown
+
+WheelType = Literal["omni", "mecanum", "fixed", "steered"]
+
+_FORWARD = 0.0  # rad, the direction of rolling where none is given
+_FARTHEST = 1e3  # m
+_ON_AN_AXIS = 1e-9  # m2: a wheel ahead of the centre, or beside it, may have its rollers either way
+
+
+def in_radians(content: Any, *keys: str) -> Any:
+    """A mapping in which each of some angles, rad, may stand in degrees under its key with ``_deg`` at the end."""
+    if not isinstance(content, dict):
+        return content
+    content = dict(content)
+    for key in keys:
+        degrees = f"{key}_deg"
+        if degrees not in content:
+            continue
+        if key in content:
+            raise ValueError(f"{key} and {degrees} are both given; keep one")
+        if isinstance(content[degrees], bool) or not isinstance(content[degrees], int | float):
+            raise ValueError(f"{degrees} must be a number (given: {content[degrees]!r})")
+        content[key] = math.radians(content.pop(degrees))
+    return content
+
+
+def _with_usual_rollers(content: Any) -> Any:
+    """A mecanum wheel by x and y with the rollers that it usually has, where none are given.
+
+    Four such wheels show an X from above: the lever arm of each is ``abs(x) + abs(y)`` where it rolls forward.
+    """
+    if not isinstance(content, dict) or content.get("type") != "mecanum" or content.get("roller_angle") is not None:
+        return content
+    place = [content.get(key) for key in ("x", "y", "angle")]
+    x, y, axle = (value if isinstance(value, int | float) else None for value in place)
+    if x is None or y is None:
+        return content
+    rolling = _FORWARD if axle is None else axle + math.pi / 2
+    ahead, left = x * math.cos(rolling) + y * math.sin(rolling), y * math.cos(rolling) - x * math.sin(rolling)
+    if abs(ahead * left) < _ON_AN_AXIS:
+        return content
+    return content | {"roller_angle": math.copysign(math.pi / 4, ahead * left)}
+
+
+def looks_like_radians(angle: float | None) -> float | None:
+    """The angle, rad. ValueError: no angle is that large."""
+    if angle is not None and abs(angle) > 4 * math.pi:
+        raise ValueError(f"{angle:g} cannot be an angle in rad; is it in degrees?")
+    return angle
+
+
+def in_degrees_too(*keys: str) -> Callable[[dict[str, Any]], None]:
+    """Adds to a model's JSON schema the keys that ``in_radians`` takes."""
+
+    def add(schema: dict[str, Any]) -> None:
+        schema["properties"] |= {f"{key}_deg": {"type": "number", "description": f"{key} in degrees"} for key in keys}
+
+    return add
+
+
+class Wheel(Model):
+    """Design values of one wheel, in the robot's frame (x forward, y left).
+
+    The place of an omni or mecanum wheel is given as in Fig. 2 of Palacin et al. 2023 by ``distance``, the lever arm
+    of its driving force about the centre, and ``angle``, the direction of its axle: for an omni wheel whose axle points
+    at the centre its position in polar coordinates; for a mecanum wheel at (lx, ly) with rollers at 45 degrees and its
+    axle along y +pi/2 (left) or -pi/2 (right), and ``abs(lx) + abs(ly)``. Or by x, y and the axle's angle.
+    By x and y a mecanum wheel has the rollers of the usual arrangement, an X from above, unless it says others.
+    A fixed wheel has x, y and, as ``angle``, the direction in which it rolls; a steered one x and y.
+    driven: False for a steered wheel whose rate is not measured. measured: False for a wheel that only guides.
+    """
+
+    model_config = ConfigDict(json_schema_extra=in_degrees_too("angle", "roller_angle"))
+
+    name: Name = Field(min_length=1, pattern=r"^[A-Za-z0-9_]+$", description="ends the column names: omega_<name>")
+    radius: FiniteFloat = Field(ge=1e-6, le=1e3, description="m")
+    type: WheelType | None = Field(None, description="default: omni or mecanum, by the roller angle")
+    distance: FiniteFloat | None = Field(
+        None, ge=1e-6, le=_FARTHEST, description="lever arm about the robot's centre, m"
+    )
+    angle: FiniteFloat | None = Field(
+        None, description="direction of the axle (omni, mecanum) or of rolling (fixed, default 0), rad"
+    )
+    x: FiniteFloat | None = Field(None, ge=-_FARTHEST, le=_FARTHEST, description="in front of the robot's centre, m")
+    y: FiniteFloat | None = Field(None, ge=-_FARTHEST, le=_FARTHEST, description="to the left of the centre, m")
+    roller_angle: FiniteFloat = Field(0.0, gt=-1.5, lt=1.5, description="0 omni, +-pi/4 mecanum; rad")
+    driven: bool = Field(True, description="steered wheels: false if only the steering angle is measured")
+    measured: bool = Field(True, description="false for a wheel that only guides or rolls along")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _angles_in_radians(cls, content: Any) -> Any:
+        return _with_usual_rollers(in_radians(content, "angle", "roller_angle"))
+
+    @field_validator("angle")
+    @classmethod
+    def _looks_like_radians(cls, angle: float | None) -> float | None:
+        return looks_like_radians(angle)
+
+    @model_validator(mode="after")
+    def _is_placed(self) -> Wheel:
+        if self.kind in ("fixed", "steered"):
+            self._stands_at_x_y()
+        elif self.distance is None and (self.x is None or self.y is None):
+            missing = "distance" if self.x is None and self.y is None else "x" if self.x is None else "y"
+            raise ValueError(f"{missing} is missing; give distance and angle (of the axle), or x, y and angle")
+        elif self.distance is not None and (self.x is not None or self.y is not None):
+            raise ValueError("distance and x, y are both given; keep one")
+        elif self.angle is None and (self.kind == "omni" or self.distance is not None):
+            raise ValueError("angle (of the axle) is missing")
+        if self.type in ("fixed", "steered") and self.roller_angle:
+            raise ValueError(f"a {self.type} wheel has no rollers; leave roller_angle out, or is it a mecanum wheel?")
+        if self.type == "mecanum" and not self.roller_angle:
+            raise ValueError("roller_angle of a mecanum wheel is missing: +-pi/4, or roller_angle_deg: +-45")
+        return self
+
+    def _stands_at_x_y(self) -> None:
+        if self.distance is not None:
+            raise ValueError(f"a {self.type} wheel has x and y in the place of distance")
+        for key in ("x", "y"):
+            if getattr(self, key) is None:
+                raise ValueError(f"{key} of a {self.type} wheel is missing (m, x forward, y left)")
+        if self.type == "steered" and self.angle is not None:
+            raise ValueError("a steered wheel has no angle: its steering angle is 0 where it rolls forward")
+
+    @model_serializer(mode="wrap")
+    def _without_defaults(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Only what is said, so that files, hashes and documents of omni wheels stay as they were."""
+        plain: dict[str, Any] = {
+            "type": None,
+            "distance": None,
+            "angle": None,
+            "x": None,
+            "y": None,
+            "driven": True,
+            "measured": True,
+        }
+        if self.type in ("fixed", "steered"):
+            plain["roller_angle"] = 0.0
+        written: dict[str, Any] = write(self)
+        return {key: value for key, value in written.items() if key not in plain or value != plain[key]}
+
+    @property
+    def kind(self) -> WheelType:
+        """The type, of a wheel without one by its rollers."""
+        return self.type or ("mecanum" if self.roller_angle else "omni")
+
+    @property
+    def has_rate(self) -> bool:
+        """True if its rate is measured."""
+        return self.measured and (self.kind != "steered" or self.driven)
+
+    @property
+    def has_steering(self) -> bool:
+        """True if its steering angle is measured."""
+        return self.measured and self.kind == "steered"
+
+    @property
+    def rolling(self) -> float:
+        """Direction in which a positive rate drives the robot over this wheel, rad; of a steered one at angle 0."""
+        if self.kind in ("fixed", "steered") or self.angle is None:
+            return self.angle or _FORWARD
+        return self.angle + math.pi / 2
+
+    @property
+    def axle(self) -> float:
+        """Direction of the axle, rad, a quarter turn clockwise from that of rolling."""
+        if self.kind in ("omni", "mecanum") and self.angle is not None:
+            return self.angle
+        return self.rolling - math.pi / 2
+
+    @property
+    def position(self) -> tuple[float, float]:
+        """Position x, y, m; of a wheel given by its lever arm on the line of its axle."""
+        if self.x is not None and self.y is not None:
+            return self.x, self.y
+        assert self.distance is not None  # it is placed
+        assert self.angle is not None
+        return self.distance * math.cos(self.angle), self.distance * math.sin(self.angle)
+
+    @property
+    def lever(self) -> float:
+        """Lever arm of the driving force about the robot's centre, m; above 0 where it turns counter-clockwise."""
+        if self.distance is not None:
+            return self.distance
+        x, y = self.position
+        cosine, sine = math.cos(self.rolling), math.sin(self.rolling)
+        return x * sine - y * cosine - math.tan(self.roller_angle) * (x * cosine + y * sine)
+
+    @property
+    def outward(self) -> float:
+        """Direction of the wheel as seen from the robot's centre, rad; where only a lever arm is given, of its axle."""
+        if self.distance is not None and self.angle is not None:
+            return self.angle
+        x, y = self.position
+        return math.atan2(y, x)
+
+    @property
+    def reach(self) -> float:
+        """Distance from the robot's centre as what counts when it turns, m: the lever arm where that is given."""
+        return self.distance if self.distance is not None else math.hypot(*self.position)
+
+
+FASTEST = 100.0  # rad/s; chosen, above the wheels of usual robots
+FASTEST_RIM = 5.0  # m/s, of small wheels, which turn faster; chosen
+
+
+def fastest_rates(radii: Array) -> Array:
+    """Rates (N,), rad/s, that no wheels of radii (N,), m, exceed."""
+    rates: Array = np.maximum(FASTEST, FASTEST_RIM / radii)
+    return rates
+
+
+@dataclass(frozen=True)
+class Drive:
+    """The drive signals of a robot's measured wheels: Eq. (1) of each steered wheel, the rates of the others.
+
+    wheels (N): names of the wheels with a measured rate. steered (S): of those with a measured steering angle. names
+    (M): of the signals. pairs (N): index of the steering angle that turns each wheel; -1 for one that does not steer.
+    """
+
+    wheels: tuple[str, ...]
+    steered: tuple[str, ...]
+    names: tuple[str, ...]
+    pairs: tuple[int, ...]
+
+    @property
+    def direct(self) -> bool:
+        """True if the wheel rates are the signals."""
+        return not self.steered
+
+    def signals(self, rates: Array, steering: Array | None) -> Array:
+        """Signals (F, M) of mean wheel rates (F, N), rad/s, at steering angles (F, S) in the samples' middles, rad."""
+        if self.direct:
+            return rates
+        assert steering is not None  # there are steered wheels
+        wheels, factors = self._columns
+        table = np.concatenate([np.ones((len(rates), 1)), np.cos(steering), np.sin(steering)], axis=1)
+        return rates.take(wheels, axis=1) * table.take(factors, axis=1)
+
+    @cached_property
+    def _columns(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Of each signal (M) the wheel, and the column of 1, cos phi (S), sin phi (S) by which its rate counts."""
+        columns: list[tuple[int, int]] = []
+        for wheel, pair in enumerate(self.pairs):
+            columns += [(wheel, 0)] if pair < 0 else [(wheel, 1 + pair), (wheel, 1 + pair + len(self.steered))]
+        wheels, factors = np.array(columns).T
+        return wheels, factors
+
+    def slopes(self, rates: Array, steering: Array | None) -> tuple[Array, Array]:
+        """Derivatives (F, M, N) and (F, M, S) of the signals by the rates and by the steering angles in the middles."""
+        by_rate = np.zeros((len(rates), len(self.names), len(self.wheels)))
+        by_angle = np.zeros((len(rates), len(self.names), len(self.steered)))
+        signal = 0
+        for wheel, pair in enumerate(self.pairs):
+            if pair < 0:
+                by_rate[:, signal, wheel] = 1
+                signal += 1
+                continue
+            assert steering is not None  # this wheel steers
+            cosine, sine, both = np.cos(steering[:, pair]), np.sin(steering[:, pair]), slice(signal, signal + 2)
+            by_rate[:, both, wheel] = np.column_stack([cosine, sine])
+            by_angle[:, both, pair] = rates[:, wheel, None] * np.column_stack([-sine, cosine])
+            signal += 2
+        return by_rate, by_angle
+
+    def commands(self, signals: Array) -> tuple[Array, Array]:
+        """Wheel rates (F, N), rad/s, and steering angles (F, S), rad, that give signals (F, M): what to command.
+
+        Steering angles lie within half a turn, and the rates of steered wheels are not negative; one that stands steers
+        straight ahead.
+        """
+        rates, steering = np.empty((len(signals), len(self.wheels))), np.zeros((len(signals), len(self.steered)))
+        signal = 0
+        for wheel, pair in enumerate(self.pairs):
+            if pair < 0:
+                rates[:, wheel] = signals[:, signal]
+                signal += 1
+            else:
+                along, across = signals[:, signal], signals[:, signal + 1]
+                rates[:, wheel], steering[:, pair] = np.hypot(along, across), np.arctan2(across, along)
+                signal += 2
+        return rates, steering
+
+
+@dataclass(frozen=True)
+class CarDrive(Drive):
+    """The drive signals of a car: mean rate, mean rate times the tangent of Eq. (2), and difference of two rates.
+
+    ahead (S): L_j and y_j of every steered wheel as in Eq. (2), m.
+    """
+
+    ahead: tuple[tuple[float, float], ...]
+
+    def signals(self, rates: Array, steering: Array | None) -> Array:
+        assert steering is not None  # a car steers
+        mean = rates.mean(axis=1)
+        columns = [mean, mean * self._tangent(steering)]
+        if rates.shape[1] == 2:
+            columns.append(rates[:, 1] - rates[:, 0])
+        return np.stack(columns, axis=1)
+
+    def slopes(self, rates: Array, steering: Array | None) -> tuple[Array, Array]:
+        assert steering is not None  # a car steers
+        wheels = len(self.wheels)
+        by_rate = np.zeros((len(rates), len(self.names), wheels))
+        by_angle = np.zeros((len(rates), len(self.names), len(self.steered)))
+        by_rate[:, 0] = 1 / wheels
+        by_rate[:, 1] = self._tangent(steering)[:, None] / wheels
+        by_rate[:, 2:] = (-1, 1)[:wheels]
+        along, across = np.array(self.ahead).T
+        tangents = np.tan(steering)
+        slopes = along.mean() * along * (1 + tangents**2) / (along + across * tangents) ** 2 / len(along)
+        by_angle[:, 1] = rates.mean(axis=1, keepdims=True) * slopes
+        return by_rate, by_angle
+
+    def commands(self, signals: Array) -> tuple[Array, Array]:
+        mean = signals[:, 0]
+        tangent = np.divide(signals[:, 1], mean, out=np.zeros(len(mean)), where=mean != 0)[:, None]
+        along, across = np.array(self.ahead).T
+        steering: Array = np.arctan(along * tangent / (along.mean() - across * tangent))
+        rates = np.repeat(mean[:, None], len(self.wheels), axis=1)
+        if signals.shape[1] == 3:
+            rates += signals[:, 2:] * (-0.5, 0.5)
+        return rates, steering
+
+    def _tangent(self, steering: Array) -> Array:
+        """Mean t (F,) of the tangents by which the steering angles (F, S) turn the car, Eq. (2)."""
+        along, across = np.array(self.ahead).T
+        tangents = np.tan(steering)
+        mean: Array = (along.mean() * tangents / (along + across * tangents)).mean(axis=1)
+        return mean
+
+
+@lru_cache(maxsize=64)
+def drive_of(wheels: tuple[Wheel, ...]) -> Drive:
+    """The drive signals of a robot's wheels; those that are not measured are left out."""
+    rolling = [wheel for wheel in wheels if wheel.has_rate]
+    steered = [wheel for wheel in wheels if wheel.has_steering]
+    names, angles = tuple(wheel.name for wheel in rolling), tuple(wheel.name for wheel in steered)
+    pairs = tuple(angles.index(wheel.name) if wheel.has_steering else -1 for wheel in rolling)
+    guiding = [wheel.position for wheel in steered if not wheel.has_rate]
+    if guiding and rolling:
+        x, y = np.mean([wheel.position for wheel in rolling], axis=0).tolist()
+        ahead = tuple((front - x, left - y) for front, left in guiding)
+        return CarDrive(names, angles, ("mean", "mean_tan", "difference")[: 1 + len(rolling)], pairs, ahead)
+    signals = ((name,) if pair < 0 else (f"{name}_cos", f"{name}_sin") for name, pair in zip(names, pairs, strict=True))
+    return Drive(names, angles, tuple(name for each in signals for name in each), pairs)
+
+
+def in_the_middle(steering: Array) -> Array:
+    """Steering angles (F, S) in the middles of the samples from those at their ends, rad; the first one holds."""
+    before = np.vstack([steering[:1], steering[:-1]])
+    middle: Array = (before + steering) / 2
+    return middle
+
 
 # Of the largest singular value: directions below it are rounding of design values, which have some digits.
 _RANK = 1e-6
@@ -366,3 +746,137 @@ def _eq_3(r: Array, R: Array, d: Array) -> Array:
     ]
     determinant = Ra * sin_bc - Rb * sin_ac + Rc * sin_ab
     return np.moveaxis(np.array(rows), (0, 1), (-2, -1)) / determinant[..., None, None]
+
+
+RobotClass = Literal["omni", "mecanum", "differential", "skid", "tricycle", "car", "swerve", "mixed"]
+
+
+def class_of(robot: Robot) -> RobotClass:
+    """The class of a robot by its measured wheels.
+
+    differential: fixed wheels on one axle. tricycle: steered driven wheels beside fixed ones that guide. swerve:
+    steered driven wheels alone. mixed: measured wheels of several kinds.
+    """
+    if isinstance(robot.drive, CarDrive):
+        return "car"
+    kinds = {wheel.kind for wheel in robot.measured}
+    if len(kinds) > 1:
+        return "mixed"
+    (kind,) = kinds
+    if kind == "fixed":
+        return "skid" if robot.skid else "differential"
+    if kind == "steered":
+        return "tricycle" if any(wheel.kind == "fixed" for wheel in robot.wheels) else "swerve"
+    return kind
+
+
+# Standard deviations of measured poses, m and rad, beyond which a covariance means that it is unknown (chosen).
+_LEAST_SIGMA, _LARGEST_SIGMA = 1e-7, 1e7
+
+
+def rotation(angle: float) -> Array:
+    """Matrix (3, 3) that turns a pose's or a twist's (x, y, heading) counter-clockwise by an angle, rad."""
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+
+
+def rotated(vectors: Array, angles: Array | float) -> Array:
+    """Vectors (..., 2), turned counter-clockwise by angles (...), rad; of vectors (..., 3) the first two elements."""
+    cosine, sine = np.cos(angles), np.sin(angles)
+    x, y = vectors[..., 0], vectors[..., 1]
+    return np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=-1)
+
+
+def placed(pose: Array, points: Array) -> Array:
+    """Points (..., 2) given in the frame of a pose (..., 3), in the frame of the pose's parent."""
+    return pose[..., :2] + rotated(points, pose[..., 2])
+
+
+def seen_from(pose: Array, points: Array) -> Array:
+    """Points (..., 2) as seen from a pose (..., 3): the inverse of ``placed``."""
+    return rotated(points[..., :2] - pose[..., :2], -pose[..., 2])
+
+
+def compose(first: Array, second: Array) -> Array:
+    """Composition (..., 3) of poses: ``second``, given in the frame ``first``, in the frame of ``first``'s parent."""
+    return np.concatenate([placed(first, second), (first + second)[..., 2:]], axis=-1)
+
+
+def relative(first: Array, second: Array) -> Array:
+    """``second`` (..., 3) as seen from ``first``, so that compose(first, relative(first, second)) is ``second``."""
+    return np.concatenate([seen_from(first, second), (second - first)[..., 2:]], axis=-1)
+
+
+def moved_to(start: Array, poses: Array) -> Array:
+    """A path (K, 3), K >= 1, moved rigidly so that it begins at the pose ``start`` (3,)."""
+    return compose(start, relative(poses[0], poses))
+
+
+def interpolated(times: Array | float, stamps: Array, rows: Array) -> Array:
+    """Rows (..., n) at times (...), s, by straight lines between the rows (K, n) at the stamps (K,); held beyond."""
+    return np.stack([np.interp(times, stamps, column) for column in rows.T], axis=-1)
+
+
+def wrapped(angles: Array) -> Array:
+    """Angles in [-pi, pi), rad, that differ from the given ones by whole turns."""
+    return (angles + np.pi) % (2 * np.pi) - np.pi
+
+
+def unit_twist(motion: Array) -> Array:
+    """The constant twist that makes a motion in unit time: the logarithm map of SE(2).
+
+    motion (..., 3): the pose after it as seen from before, m, m, rad. ``advance`` by arcs is the inverse. Beyond half a
+    turn the twist grows without bound towards a whole turn; it is limited to the length of half a turn.
+    """
+    half = motion[..., 2:] / 2
+    longer = 1 / np.sinc(np.minimum(np.abs(half), np.pi / 2) / np.pi)
+    return np.concatenate([rotated(motion, -half[..., 0]) * longer, motion[..., 2:]], axis=-1)
+
+
+def correction(in_map: Array, in_odom: Array) -> Array:
+    """Pose (3,) of frame odom in frame map, from the robot's pose (3,) in both (REP-105)."""
+    x, y, heading = in_map.tolist()
+    odom_x, odom_y, odom_heading = in_odom.tolist()
+    turned = heading - odom_heading
+    cosine, sine = math.cos(turned), math.sin(turned)
+    return np.array([x - cosine * odom_x + sine * odom_y, y - sine * odom_x - cosine * odom_y, turned])
+
+
+def pose_covariance(position_sigma: float, heading_sigma_deg: float) -> Array:
+    """Covariance (3, 3) of a pose by its standard deviations, m and deg."""
+    return np.diag([position_sigma, position_sigma, math.radians(heading_sigma_deg)]) ** 2
+
+
+def usable_covariances(covariances: Array) -> NDArray[np.bool_]:
+    """True for poses' covariances (..., 3, 3), m and rad; False for what senders write where they do not know them."""
+    possible = np.asarray((np.abs(covariances) <= _LARGEST_SIGMA**2).all(axis=(-2, -1)))
+    filled = np.where(possible[..., None, None], covariances, np.eye(3))
+    symmetric = np.isclose(filled, np.swapaxes(filled, -2, -1)).all(axis=(-2, -1))
+    usable: NDArray[np.bool_] = possible & symmetric & (np.linalg.eigvalsh(filled)[..., 0] >= _LEAST_SIGMA**2)
+    return usable
+
+
+_ROWS: Mapping[str, tuple[tuple[float, float, float], ...]] = MappingProxyType(
+    {
+        # Eq. (8): the parametric calibration of the authors' earlier work.
+        "palacin2023_eq8": (
+            (-0.0892930568372762, -0.0005606566978203, 0.0867466159313470),
+            (0.0520955668635434, -0.1010213675626970, 0.0533117820461363),
+            (0.2364093797047320, 0.2341358647406650, 0.2353792947863630),
+        ),
+        # Eq. (9): the genetic, non-parametric calibration of the article.
+        "palacin2023_eq9": (
+            (-0.0883286476963123, 0.0000000000000000, 0.0873330402667908),
+            (0.0522829495809178, -0.1008246738469390, 0.0536189007203205),
+            (0.2357044251338890, 0.2338948216993490, 0.2348793373133590),
+        ),
+    }
+)
+PUBLISHED = tuple(_ROWS)
+
+
+def published_matrix(name: str) -> Array:
+    """A published inverse kinematic matrix (3, 3) of the APR-02. UnknownNameError lists the names."""
+    if name not in _ROWS:
+        raise UnknownNameError("published matrix", name, _ROWS)
+    return np.array(_ROWS[name])

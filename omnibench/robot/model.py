@@ -12,15 +12,12 @@ from functools import cached_property
 
 import numpy as np
 
-from omnibench.robot.corrected import check_needs, needs_of
-from omnibench.robot.domain.fade import Fade, faded_twists
-from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect
-from omnibench.robot.effects.term import Term
+from omnibench.robot.corrections import Fade, check_needs, faded_twists, needs_of
+from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect, Term
 from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.odometry import Integration, OdometryStream, RunSamples, WheelLog, advance, split_by
-from omnibench.robot.path import PathBatch
+from omnibench.robot.odometry import Integration, OdometryStream, PathBatch, RunSamples, WheelLog, advance, split_by
 from omnibench.robot.signals import SignalStream, signals_of_runs
-from omnibench.robot.stored.odometry_of_stored import StoredOdometry, are_many
+from omnibench.robot.stored_odometry import StoredOdometry, are_many
 
 # Chord by length of an arc. Below it the arc ends where it began, and no motion in the robot's frame displaces its end.
 _NO_STRETCH = 1e-6

@@ -11,10 +11,8 @@ from functools import reduce
 import numpy as np
 from numpy.typing import NDArray
 
-from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.odometry import RunSamples, WheelLog, advance
-from omnibench.robot.path import PathBatch
-from omnibench.robot.planar import compose
+from omnibench.robot.kinematics import Array, Robot, compose
+from omnibench.robot.odometry import PathBatch, RunSamples, WheelLog, advance
 
 _STANDING = 1e-4  # m/s: a slower caster stands; and a way of its direction, of length 1, that is none; chosen
 STILL = 1e-3  # rad/s: a slower wheel counts as standing; chosen

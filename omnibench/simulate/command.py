@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.robot_class import class_of
+from omnibench.robot.kinematics import Array, Robot, class_of
 
 # Largest steering angles where none is given, deg (chosen): a tricycle's front wheel nearly reaches the turn on the
 # spot, a car's wheels 30 to 40 deg; any other module drives backward in the place of turning further than 90.

@@ -12,9 +12,8 @@ from omnibench.config import Model, Positive
 from omnibench.data.dataset import Split
 from omnibench.errors import UnknownNameError
 from omnibench.robot.calibration import EffectTerm, Noise
-from omnibench.robot.kinematics import Robot
+from omnibench.robot.kinematics import PUBLISHED, Robot
 from omnibench.robot.odometry import Integration
-from omnibench.robot.published_matrices import PUBLISHED
 from omnibench.simulate.command import (
     Command,
     beyond_steering,

@@ -13,15 +13,20 @@ from omnibench.config import Model
 from omnibench.errors import UnknownNameError
 from omnibench.registry import effects
 from omnibench.robot.calibration import EffectTerm, Noise, Row, matrix_rows
-from omnibench.robot.corrected import Corrected, check_needs, corrected, needs_of
-from omnibench.robot.effects.effect import ActuatorEffect
-from omnibench.robot.effects.term import Term, check_applies
-from omnibench.robot.kinematics import Array, Mount, Robot, Wheel, inverse_kinematic_matrix
+from omnibench.robot.corrections import Corrected, check_needs, corrected, needs_of
+from omnibench.robot.effects.effect import ActuatorEffect, Term, check_applies
+from omnibench.robot.kinematics import (
+    Array,
+    Mount,
+    Robot,
+    Wheel,
+    in_the_middle,
+    inverse_kinematic_matrix,
+    published_matrix,
+)
 from omnibench.robot.model import OdometryModel, reported_poses
 from omnibench.robot.odometry import Integration, WheelLog
-from omnibench.robot.published_matrices import published_matrix
 from omnibench.robot.signals import of_centre, signals_of
-from omnibench.robot.wheels.drive import in_the_middle
 from omnibench.simulate.config import EncoderNoise, Tolerances, Truth
 from omnibench.simulate.mechanics import (
     BODY,

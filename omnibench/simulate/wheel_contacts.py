@@ -21,8 +21,7 @@ from functools import cached_property
 
 import numpy as np
 
-from omnibench.robot.kinematics import Array, Mount, Robot, Wheel
-from omnibench.robot.wheels.drive import CarDrive
+from omnibench.robot.kinematics import Array, CarDrive, Mount, Robot, Wheel
 
 _NO_FRICTION = 1e-9  # share of the friction along the wheels that stands for none across: less is lost to rounding
 _STEP = 1e-6  # tangent of the steering angle by which a car's matrix is differentiated

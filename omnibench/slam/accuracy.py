@@ -13,8 +13,7 @@ from omnibench.config import Model
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.true_poses import TruePath
 from omnibench.errors import DataError
-from omnibench.robot.kinematics import Array
-from omnibench.robot.planar import moved_to, rotated
+from omnibench.robot.kinematics import Array, moved_to, rotated
 
 # Share of the largest variance below which a covariance counts as singular: rounding of its eigenvalues.
 _SINGULAR = 1e-14

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from omnibench.robot.kinematics import Array
-from omnibench.robot.planar import compose, relative, unit_twist
+from omnibench.robot.kinematics import Array, compose, relative, unit_twist
 from omnibench.slam.motion_within_scan import MotionWithinScan, smoothed
 from omnibench.slam.slam_options import SlamOptions
 

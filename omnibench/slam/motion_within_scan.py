@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from omnibench.robot.kinematics import Array
-from omnibench.robot.planar import relative, unit_twist
+from omnibench.robot.kinematics import Array, relative, unit_twist
 
 # The study tests/studies/constants_slam.py varies these numbers by 0.5 and 2. In three rooms SLAM's median error
 # stays at 1.07 mm and the median NEES between 2.5 and 2.6 (3 for an honest covariance).

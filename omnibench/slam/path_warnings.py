@@ -8,8 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from omnibench.robot.kinematics import Array
-from omnibench.robot.planar import relative
+from omnibench.robot.kinematics import Array, relative
 from omnibench.slam.matching.scan_matching import LOST, Match
 from omnibench.slam.motion_prior import length
 from omnibench.slam.slam_options import SlamOptions

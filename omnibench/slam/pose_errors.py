@@ -33,8 +33,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from omnibench.robot.kinematics import Array
-from omnibench.robot.planar import rotation
+from omnibench.robot.kinematics import Array, rotation
 from omnibench.slam.matching.scan_matching import Match
 
 # m^2, m^2, rad^2: least covariance that is stated, for a start pose that is exact by definition. A hundredth of the

@@ -19,9 +19,8 @@ from omnibench.jobs.job import Failure, Job, JobWatch, run_jobs
 from omnibench.jobs.local_backends import local_backend
 from omnibench.jobs.result_store import ResultStore, code_digest, content_key
 from omnibench.progress import Progress, Reporter, no_progress
-from omnibench.robot.kinematics import Array
+from omnibench.robot.kinematics import Array, relative
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.planar import relative
 from omnibench.slam.motion_prior import length, odometry_deviations
 from omnibench.slam.path_warnings import PathWarning, merged_warning
 from omnibench.slam.pose_errors import FLOOR

@@ -9,8 +9,7 @@ from pydantic import Field
 
 from omnibench.config import Model
 from omnibench.data.dataset import Dataset
-from omnibench.robot.kinematics import Array
-from omnibench.robot.planar import interpolated
+from omnibench.robot.kinematics import Array, interpolated
 from omnibench.slam.accuracy import SlamAccuracy
 from omnibench.slam.slam_run import SlamPath
 

@@ -32,8 +32,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from omnibench.fit.uncertainty.intervals import INTERVAL
-from omnibench.fit.uncertainty.ratio_intervals import FEWEST, Interval
+from omnibench.fit.information import INTERVAL
+from omnibench.fit.ratio_intervals import FEWEST, Interval
 from omnibench.robot.kinematics import Array
 from omnibench.words import plural
 

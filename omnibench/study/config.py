@@ -10,10 +10,10 @@ from pydantic import AfterValidator, ConfigDict, Field, field_validator, model_v
 from omnibench.compare.config import LEAST_MEMORY, CalibratorEntry, CostChoice, known_backend
 from omnibench.config import Model, NonNegative, Positive, RelativePath, printable
 from omnibench.data.splits import Names
-from omnibench.fit.loss.losses import LossName
+from omnibench.fit.loss import LossName
 from omnibench.fit.parameterisation import Box
+from omnibench.fit.prior import MountChoice
 from omnibench.fit.problem import Budget
-from omnibench.fit.shrinkage.prior import MountChoice
 from omnibench.fit.span import Unidentified
 from omnibench.jobs.scheduler_tls import TlsFiles
 from omnibench.robot.odometry import Integration

@@ -10,12 +10,12 @@ import numpy as np
 from omnibench.errors import OmnibenchError
 from omnibench.fit.calibrator import Outcome, RunResult
 from omnibench.fit.evaluate import final_errors
-from omnibench.fit.observations.reference_errors import with_mean_errors
+from omnibench.fit.reference_rows import with_mean_errors
 from omnibench.progress import Progress, Reporter
 from omnibench.robot.calibration import extended_model
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration
-from omnibench.robot.stored.odometry_of_stored import odometry_of
+from omnibench.robot.stored_odometry import odometry_of
 from omnibench.study.study_plan import PlannedFit, StudiedRobot
 
 _TOGETHER = 64  # matrices that are judged at once (chosen: 164 runs of 1,200 samples take 0.1 GB)

@@ -11,8 +11,7 @@ import numpy as np
 
 from omnibench.data.dataset import Trajectory
 from omnibench.data.splits import repetitions
-from omnibench.robot.kinematics import Array
-from omnibench.robot.planar import interpolated
+from omnibench.robot.kinematics import Array, interpolated
 from omnibench.study.config import RECORDED, RegimeChoice
 
 AS_RECORDED = RECORDED

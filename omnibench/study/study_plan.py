@@ -12,8 +12,8 @@ from omnibench.compare.plan import UNBOUNDED, PlannedRun
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.errors import ConfigError, OmnibenchError, PluginError, nearest
 from omnibench.fit.calibrator import refusal_of
+from omnibench.fit.prior import default_cost, default_unidentified
 from omnibench.fit.problem import make_parameterisation
-from omnibench.fit.shrinkage.prior import default_cost, default_unidentified
 from omnibench.progress import Progress, Reporter
 from omnibench.registry import calibrators
 from omnibench.study.config import MethodChoice, RegimeChoice, StudyConfig

@@ -23,9 +23,8 @@ from omnibench.jobs.local_backends import Processes
 from omnibench.jobs.result_store import ResultStore
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.registry import REGISTRIES, Entry, Registry, calibrators, costs, effects, importers, registered_from
-from omnibench.testing.calibrator_cases import CalibratorConformance
+from omnibench.testing.calibrator_cases import CalibratorConformance, CostConformance
 from omnibench.testing.conformance import CaseOutcome, CaseResult, Conformance, load_plugin, run_cases
-from omnibench.testing.cost_cases import CostConformance
 from omnibench.testing.effect_cases import EffectConformance
 from omnibench.testing.importer_cases import ImporterConformance
 

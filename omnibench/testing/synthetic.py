@@ -16,12 +16,9 @@ from omnibench.fit.geometry import GeometryLimits
 from omnibench.fit.parameterisation import ParameterisationName
 from omnibench.fit.problem import Budget, BudgetSpent, CalibrationProblem, make_parameterisation
 from omnibench.registry import Options
-from omnibench.robot.kinematics import Array, Robot, Wheel, wheel_equations
+from omnibench.robot.kinematics import Array, CarDrive, Robot, Wheel, WheelType, class_of, wheel_equations
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, WheelLog
-from omnibench.robot.robot_class import class_of
-from omnibench.robot.wheels.drive import CarDrive
-from omnibench.robot.wheels.wheel import WheelType
 
 PERIOD = 0.2  # s between wheel samples
 _SAMPLES = 20  # wheel samples of a run

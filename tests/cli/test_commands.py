@@ -27,7 +27,7 @@ from timing import PATIENCE
 
 from omnibench.data.storage import load_dataset
 from omnibench.robot.calibration import EffectTerm, read_calibration, write_calibration
-from omnibench.robot.published_matrices import published_matrix
+from omnibench.robot.kinematics import published_matrix
 from omnibench.testing.synthetic import synthetic_robot
 
 

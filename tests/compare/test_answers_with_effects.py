@@ -17,8 +17,8 @@ from omnibench.fit.calibrator import Outcome, run_calibrator
 from omnibench.fit.evaluate import evaluate
 from omnibench.registry import calibrators, costs, effects
 from omnibench.robot.calibration import EffectTerm, ModelExtension, read_calibration
+from omnibench.robot.kinematics import published_matrix
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.published_matrices import published_matrix
 
 DRIFTING = """
 import numpy as np

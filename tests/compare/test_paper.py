@@ -16,11 +16,10 @@ from omnibench.cli.handbook_topics import find_topic
 from omnibench.compare.config import CompareConfig, PublishedResult
 from omnibench.compare.read_config import read_compare_config
 from omnibench.data.importers.table1 import APR_02
+from omnibench.fit.identifiability import geometry_of
 from omnibench.fit.parameterisation import make_bounds
-from omnibench.fit.uncertainty.physical import geometry_of
 from omnibench.robot.calibration import read_calibration
-from omnibench.robot.kinematics import Array, relative_deviations
-from omnibench.robot.published_matrices import published_matrix
+from omnibench.robot.kinematics import Array, published_matrix, relative_deviations
 from omnibench.simulate.chain.lidar import Lidar
 from omnibench.simulate.chain.robot_config import RobotConfig
 

@@ -20,8 +20,7 @@ from omnibench.data.storage import save_dataset
 from omnibench.errors import PluginError
 from omnibench.fit.calibrator import Outcome, RunResult
 from omnibench.fit.cost import Cost
-from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.published_matrices import published_matrix
+from omnibench.robot.kinematics import Array, Robot, published_matrix
 
 TRUE = published_matrix("palacin2023_eq8")
 WIDE = {"lower": [[-1.0] * 3] * 3, "upper": [[1.0] * 3] * 3}

@@ -16,7 +16,7 @@ from omnibench.compare.statistics import NEGLIGIBLE_SHARE, entry_statistics, is_
 from omnibench.data.dataset import Split
 from omnibench.fit.calibrator import Outcome
 from omnibench.fit.cost import SumOfNorms
-from omnibench.fit.uncertainty.ratio_intervals import Interval, Units
+from omnibench.fit.ratio_intervals import Interval, Units
 from omnibench.robot.kinematics import Array
 
 BOOTSTRAP = Bootstrap(resamples=1000, seed=3)

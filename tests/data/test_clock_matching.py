@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from omnibench.data.clock_matching import ClockMatch, Streams, match_clocks
 from omnibench.data.dataset import Dataset
 from omnibench.robot.kinematics import Array, Robot, Wheel
-from omnibench.robot.path import Path
+from omnibench.robot.odometry import Path
 
 ROBOT = Robot(
     name="base",

@@ -23,7 +23,7 @@ from omnibench.design.design import design_experiment
 from omnibench.design.report.design_wording import equal_in_words
 from omnibench.design.result import Design, SetDesign
 from omnibench.errors import ConfigError, DataError, OmnibenchError
-from omnibench.fit.uncertainty.information import information_of_runs
+from omnibench.fit.information import information_of_runs
 from omnibench.robot.kinematics import Array
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.simulate import simulate_dataset

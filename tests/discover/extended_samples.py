@@ -11,9 +11,9 @@ from discovery_samples import APR02
 from omnibench.data.dataset import Split, Trajectory
 from omnibench.discover.fitting.extend import Extended
 from omnibench.discover.fitting.model_fit import Fit
-from omnibench.fit.least_squares.noise import NoiseEstimate
-from omnibench.fit.least_squares.nuisances import Nuisances
-from omnibench.fit.uncertainty.intervals import EstimatedCovariance
+from omnibench.fit.information import EstimatedCovariance
+from omnibench.fit.noise import NoiseEstimate
+from omnibench.fit.trajectory_fit import Nuisances
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Robot
 from omnibench.robot.model import OdometryModel

@@ -16,7 +16,7 @@ from omnibench.discover.regressors.column_store import ColumnStore
 from omnibench.discover.regressors.covariate_bases import Basis
 from omnibench.discover.selection.candidate_groups import Groups
 from omnibench.discover.selection.screening import Screening
-from omnibench.fit.least_squares.whitened import Whitened
+from omnibench.fit.trajectory_fit import Whitened
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import Parameter
 

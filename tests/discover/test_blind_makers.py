@@ -19,7 +19,7 @@ from hidden.pairs import PAIRS
 from hidden.sets import LEVELS, make_set
 from hidden.signature import Sight, projected
 
-from omnibench.robot.effects.term import make_term
+from omnibench.robot.effects.effect import make_term
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog

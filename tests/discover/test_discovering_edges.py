@@ -13,7 +13,7 @@ from omnibench.discover.discover import discover_effects
 from omnibench.discover.fitting.extend import fit_matrix
 from omnibench.errors import DataError
 from omnibench.fit.evaluate import evaluate
-from omnibench.fit.least_squares.usable_runs import usable_runs
+from omnibench.fit.trajectory_fit import usable_runs
 
 
 def with_runs(dataset: Dataset, change) -> Dataset:

@@ -13,7 +13,7 @@ from omnibench.discover import discover
 from omnibench.discover.result import Discovery
 from omnibench.discover.selection.model_selection import Selection
 from omnibench.discover.selection.screening import Screening
-from omnibench.fit.least_squares.whitened import Given
+from omnibench.fit.trajectory_fit import Given
 from omnibench.progress import Progress
 from omnibench.robot.odometry import OdometryBatch
 

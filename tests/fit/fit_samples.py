@@ -11,8 +11,7 @@ import numpy as np
 from omnibench.data.dataset import Trajectory
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.geometry import GeometryLimits
-from omnibench.fit.loss.losses import LossName
-from omnibench.fit.loss.robust_cost import with_loss
+from omnibench.fit.loss import LossName, with_loss
 from omnibench.fit.parameterisation import Box, ExplicitBox, ParameterisationName
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
 from omnibench.progress import Reporter, no_progress

@@ -19,13 +19,12 @@ from omnibench.cli.terminal.calibration_tables import print_certificate
 from omnibench.compare.read_config import read_compare_config
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.errors import ConfigError, DataError
-from omnibench.fit.bounds.lower_bound import LowerBounds
 from omnibench.fit.calibrate import calibrate
-from omnibench.fit.certify import certify_optimum, prove
+from omnibench.fit.certify import LowerBounds, certify_optimum, prove
 from omnibench.fit.cost import Cost, SumOfNorms
-from omnibench.fit.loss.sum_of_norms import SumOfNormsProgram
 from omnibench.fit.parameterisation import Box
 from omnibench.fit.problem import CalibrationProblem
+from omnibench.fit.sum_of_norms import SumOfNormsProgram
 from omnibench.progress import Progress
 from omnibench.registry import Options, calibrators
 from omnibench.robot.calibration import Calibration, EffectTerm, matrix_rows

@@ -24,9 +24,9 @@ from omnibench.config import parse_settings, to_yaml
 from omnibench.data.checks.option_words import as_yaml
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.references.run_references import Reference, References
+from omnibench.fit.check.checking import CheckReport
 from omnibench.fit.check.missing_motions import command_names
-from omnibench.fit.check.result import CheckReport
-from omnibench.robot.path import Path as Driven
+from omnibench.robot.odometry import Path as Driven
 from omnibench.simulate.simulate import simulate_dataset
 
 Change = Callable[[Trajectory], Trajectory]

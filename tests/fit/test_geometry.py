@@ -10,7 +10,7 @@ import pytest
 from sample_robots import APR_02, CAR, DIFFERENTIAL, MECANUM, SKID, SWERVE, TRICYCLE, WHEELED
 
 from omnibench.fit.geometry import WheelGeometry
-from omnibench.fit.uncertainty.physical import identified_parameters
+from omnibench.fit.identifiability import identified_parameters
 from omnibench.robot.kinematics import Array, Mount, Robot
 
 

@@ -17,8 +17,7 @@ from omnibench import check
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.check.checking import expected_gain
-from omnibench.fit.evaluate import evaluate, final_errors, verdict_on
-from omnibench.fit.held_out import judge
+from omnibench.fit.evaluate import evaluate, final_errors, judge, verdict_on
 from omnibench.fit.problem import Budget
 from omnibench.robot.calibration import Calibration, EffectTerm, HeldOutVerdict, read_calibration, write_calibration
 from omnibench.robot.kinematics import Array, Robot, Wheel

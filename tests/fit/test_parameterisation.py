@@ -16,8 +16,7 @@ from omnibench.config import validate
 from omnibench.errors import ConfigError
 from omnibench.fit.geometry import GeometryLimits, WheelGeometry
 from omnibench.fit.parameterisation import Box, MatrixElements, make_bounds
-from omnibench.robot.kinematics import Array, Robot, inverse_kinematic_matrix
-from omnibench.robot.published_matrices import published_matrix
+from omnibench.robot.kinematics import Array, Robot, inverse_kinematic_matrix, published_matrix
 from omnibench.testing.synthetic import synthetic_robot
 
 DESIGN = APR_02.inverse_kinematic_matrix

@@ -10,8 +10,7 @@ import numpy as np
 from sample_robots import APR_02, WHEELED
 
 from omnibench.registry import effects
-from omnibench.robot.effects.effect import Effect, MotionEffect, ReferenceEffect
-from omnibench.robot.effects.term import Term, make_term
+from omnibench.robot.effects.effect import Effect, MotionEffect, ReferenceEffect, Term, make_term
 from omnibench.robot.kinematics import Robot, Wheel
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, OdometryStream, WheelLog

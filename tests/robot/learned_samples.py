@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from omnibench.robot.calibration import Calibration, EffectTerm, ModelExtension, covariance_rows, matrix_rows
-from omnibench.robot.domain.fade import GROWTH
-from omnibench.robot.effects.learned.network import Network
-from omnibench.robot.effects.weights import encode_weights
+from omnibench.robot.corrections import GROWTH
+from omnibench.robot.effects.effect import encode_weights
+from omnibench.robot.effects.learned import Network
 from omnibench.robot.kinematics import Robot
 
 

@@ -30,8 +30,7 @@ from omnibench.robot.calibration import (
     write_calibration,
 )
 from omnibench.robot.effects.effect import MotionEffect, Parameter, Values
-from omnibench.robot.kinematics import Array
-from omnibench.robot.published_matrices import published_matrix
+from omnibench.robot.kinematics import Array, published_matrix
 from omnibench.robot.signals import Signals
 
 PROVENANCE = Provenance(

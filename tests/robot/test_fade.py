@@ -11,8 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sample_robots import APR_02
 
-from omnibench.robot.domain.fade import Fade
-from omnibench.robot.domain.training_domain import motions_of, representatives
+from omnibench.robot.corrections import Fade, motions_of, representatives
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog

@@ -19,9 +19,9 @@ from omnibench.robot.kinematics import (
     Wheel,
     inverse_kinematic_matrices,
     inverse_kinematic_matrix,
+    published_matrix,
     wheel_equations,
 )
-from omnibench.robot.published_matrices import published_matrix
 
 # Eq. (7) of the article, as printed.
 EQ_7 = np.array(

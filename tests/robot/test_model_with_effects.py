@@ -15,12 +15,10 @@ from timing import processor_time
 
 from omnibench.errors import DataError, PluginError
 from omnibench.registry import effects
-from omnibench.robot.effects.effect import MotionEffect, Stage, Values
-from omnibench.robot.effects.term import make_term
+from omnibench.robot.effects.effect import MotionEffect, Stage, Values, make_term
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog, advance
-from omnibench.robot.path import Path
+from omnibench.robot.odometry import Integration, OdometryBatch, Path, WheelLog, advance
 from omnibench.robot.signals import Signals, signals_of
 
 BOTH: tuple[Integration, ...] = ("euler", "arc")

@@ -11,10 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sample_robots import APR_02
 
-from omnibench.robot.kinematics import Array
+from omnibench.robot.kinematics import Array, published_matrix
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, OdometryBatch, OdometryStream, WheelLog
-from omnibench.robot.published_matrices import published_matrix
 
 BOTH: tuple[Integration, ...] = ("euler", "arc")
 MATRIX = published_matrix("palacin2023_eq8")

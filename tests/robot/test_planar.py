@@ -7,16 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from omnibench.robot.kinematics import compose, correction, interpolated, moved_to, relative, unit_twist, wrapped
 from omnibench.robot.odometry import advance
-from omnibench.robot.planar import (
-    compose,
-    correction,
-    interpolated,
-    moved_to,
-    relative,
-    unit_twist,
-    wrapped,
-)
 
 POSES = arrays(float, 3, elements=st.floats(-10, 10))
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from sample_robots import APR_02
 
-from omnibench.robot.domain.training_domain import (
+from omnibench.robot.corrections import (
     TrainingDomain,
     extrapolated_share,
     extrapolation_consequence,

@@ -13,10 +13,9 @@ from sample_robots import APR_02, CAR, DIFFERENTIAL, MECANUM, SKID, SWERVE, TRIC
 
 from omnibench.config import to_yaml, validate
 from omnibench.errors import ConfigError
-from omnibench.robot.kinematics import Array, Mount, Robot
+from omnibench.robot.kinematics import Array, Mount, Robot, class_of
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, WheelLog
-from omnibench.robot.robot_class import class_of
 
 EVERY = [pytest.param(robot, id=robot.name) for robot in (APR_02, *WHEELED)]
 STEERED = [pytest.param(robot, id=robot.name) for robot in (TRICYCLE, CAR, SWERVE)]

@@ -19,9 +19,8 @@ from omnibench.data.dataset import Dataset, Split
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import ConfigError
 from omnibench.fit.evaluate import ModelErrors
-from omnibench.robot.kinematics import Array
+from omnibench.robot.kinematics import Array, published_matrix
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.published_matrices import published_matrix
 from omnibench.simulate.config import EncoderNoise, FlowerConfig
 from omnibench.simulate.simulate import simulate_dataset
 from omnibench.simulate.simulation import Simulation

@@ -18,11 +18,9 @@ from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.errors import ConfigError, DataError, OmnibenchError
 from omnibench.fit.evaluate import final_errors
 from omnibench.robot.calibration import EffectTerm
-from omnibench.robot.kinematics import Array, wheel_equations
+from omnibench.robot.kinematics import Array, moved_to, published_matrix, wheel_equations
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
-from omnibench.robot.planar import moved_to
-from omnibench.robot.published_matrices import published_matrix
 from omnibench.simulate.command import Command
 from omnibench.simulate.config import EncoderNoise, FlowerConfig
 from omnibench.simulate.driving.command_config import Commands

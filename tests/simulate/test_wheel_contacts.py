@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from sample_robots import APR_02
 
 from omnibench.robot.kinematics import Mount, Robot, Wheel
-from omnibench.robot.path import Path
+from omnibench.robot.odometry import Path
 from omnibench.simulate.true_motion import TrueMotion
 from omnibench.simulate.wheel_contacts import WheelContacts
 

@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from omnibench.robot.kinematics import Array
+from omnibench.robot.kinematics import Array, compose, relative
 from omnibench.robot.odometry import advance
-from omnibench.robot.planar import compose, relative
 from omnibench.slam.motion_prior import LastPosePrior, OdometryPrior
 from omnibench.slam.motion_within_scan import smoothed
 from omnibench.slam.slam_options import SlamOptions

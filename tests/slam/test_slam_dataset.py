@@ -15,8 +15,8 @@ from omnibench.data.scans import ScansInMemory, TrajectoryScans
 from omnibench.data.true_poses import TruePath
 from omnibench.errors import DataError
 from omnibench.progress import Progress
+from omnibench.robot.kinematics import published_matrix
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.published_matrices import published_matrix
 from omnibench.simulate.chain.floor_plan import RoomPlan, make_plan
 from omnibench.simulate.chain.lidar import Lidar
 from omnibench.slam.accuracy import run_errors, slam_accuracy

@@ -16,10 +16,10 @@ import numpy as np
 from scipy.stats import binom
 
 from omnibench.compare.read_config import read_compare_config
+from omnibench.fit.bootstrap import bootstrap_intervals
 from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
-from omnibench.fit.uncertainty.bootstrap import bootstrap_intervals
-from omnibench.fit.uncertainty.ratio_intervals import UnitName, units_of
+from omnibench.fit.ratio_intervals import UnitName, units_of
 from omnibench.registry import calibrators, costs
 from omnibench.simulate.simulate import simulate_dataset
 from omnibench.simulate.source import read_simulation

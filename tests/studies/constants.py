@@ -28,7 +28,7 @@ from omnibench.discover.result import Discovery
 from omnibench.processes import one_thread
 
 PACKAGE = "omnibench.discover"
-RUNS = "omnibench.fit.least_squares.usable_runs"  # what discover begins with
+RUNS = "omnibench.fit.trajectory_fit"  # what discover begins with
 FACTORS = (0.5, 2.0)
 SURE = 0.95  # weight from which on a name is stated with confidence: the verdict "named" in the design
 # What is the same whatever the constants after the screening are, and what none of those before the end can change.

@@ -26,11 +26,9 @@ from omnibench.design.report.tables import effort_table
 from omnibench.design.result import Chosen
 from omnibench.fit.calibrate import CalibrationRun, calibrate
 from omnibench.fit.certify import certify_optimum
-from omnibench.fit.least_squares.nuisance_noise import noise_of_fit
-from omnibench.fit.least_squares.nuisances import Nuisances
-from omnibench.fit.least_squares.trajectory_fit import TrajectoryFit
+from omnibench.fit.identifiability import identifiability
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
-from omnibench.fit.uncertainty.identifiability import identifiability
+from omnibench.fit.trajectory_fit import Nuisances, TrajectoryFit, noise_of_fit
 from omnibench.registry import costs
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
@@ -280,7 +278,7 @@ PARTS = {
     "evaluator": Part("omnibench.fit.evaluator", answers_of_evaluator),
     "design": Part("omnibench.design", answers_of_design, ("omnibench.design.report",)),
     "design_report": Part("omnibench.design.report", answers_of_design_report),
-    "few_runs": Part("omnibench.fit.uncertainty.uncertainty", answers_of_few_runs),
+    "few_runs": Part("omnibench.fit.uncertainty", answers_of_few_runs),
     "checks": Part("omnibench.data.checks", answers_of_checks),
 }
 

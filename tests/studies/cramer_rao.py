@@ -18,8 +18,8 @@ import numpy as np
 from scipy import stats
 
 from omnibench.fit.calibrator import run_calibrator
+from omnibench.fit.information import EstimatedCovariance
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
-from omnibench.fit.uncertainty.intervals import EstimatedCovariance
 from omnibench.registry import calibrators, costs
 from omnibench.robot.kinematics import Array, Robot, Wheel, wheel_equations
 from omnibench.robot.model import OdometryModel

@@ -32,8 +32,7 @@ from omnibench.discover.regressors.significance import significance_of
 from omnibench.discover.selection.evidence import credibility_of, effect_sets, indices_of, joint_share
 from omnibench.discover.selection.model_selection import ABSORBED, SURE
 from omnibench.discover.selection.screening import Screening, screen_again, screen_plain
-from omnibench.fit.least_squares.usable_runs import usable_runs
-from omnibench.fit.least_squares.whitened import Given
+from omnibench.fit.trajectory_fit import Given, usable_runs
 from omnibench.processes import one_thread
 
 FIRST_SEED = 1000  # those below are the exam of discover_study.py

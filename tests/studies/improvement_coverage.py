@@ -36,9 +36,9 @@ from scipy.special import stdtrit
 from scipy.stats import binomtest
 
 from omnibench.data.dataset import Split, Trajectory, make_dataset
+from omnibench.fit import ratio_intervals
 from omnibench.fit.calibrate import calibrate
-from omnibench.fit.uncertainty import ratio_intervals
-from omnibench.fit.uncertainty.ratio_intervals import Bootstrap, Interval, RatioIntervals, Units
+from omnibench.fit.ratio_intervals import Bootstrap, Interval, RatioIntervals, Units
 from omnibench.robot.kinematics import Array
 
 REPETITIONS = 5

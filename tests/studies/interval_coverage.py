@@ -43,10 +43,10 @@ from scipy.stats import binomtest
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.discover.fitting.extend import extend, fit_matrix
 from omnibench.discover.regressors.column_group import Group
+from omnibench.fit import sandwich
 from omnibench.fit.calibrate import calibrate
-from omnibench.fit.least_squares.usable_runs import usable_runs
 from omnibench.fit.problem import Budget
-from omnibench.fit.uncertainty import sandwich
+from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.processes import one_thread
 from omnibench.registry import effects
 from omnibench.robot.kinematics import Array, Robot, Wheel

@@ -15,7 +15,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-import omnibench.fit.uncertainty.sandwich as module
+import omnibench.fit.sandwich as module
 from omnibench.data.dataset import Trajectory
 from omnibench.registry import costs
 from omnibench.robot.calibration import Noise

@@ -23,7 +23,7 @@ from omnibench.discover.fitting.extend import fit_matrix
 from omnibench.discover.regressors.significance import Significance, significance_of
 from omnibench.discover.selection.model_selection import CHANCE
 from omnibench.discover.selection.screening import screen_plain
-from omnibench.fit.least_squares.usable_runs import usable_runs
+from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.processes import one_thread
 from omnibench.registry import effects
 

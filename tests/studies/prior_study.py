@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
+from omnibench.fit import prior
 from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.calibrators import posterior
-from omnibench.fit.shrinkage import physical_prior
 from omnibench.registry import calibrators, load_plugins
-from omnibench.robot.robot_class import class_of
+from omnibench.robot.kinematics import class_of
 from omnibench.study.cells import make_cells
 from omnibench.study.config import MethodChoice, TrainingChoice
 from omnibench.study.judging import judge_fits
@@ -28,7 +28,7 @@ from omnibench.study.study import read_study_config
 from omnibench.study.study_plan import StudiedRobot, load_robots, plan_fits
 
 CONFIG = Path(__file__).parents[2] / "configs" / "real_robots.yaml"
-TOLERANCES: dict[str, Callable[[physical_prior.PhysicalTolerance, float], physical_prior.PhysicalTolerance]] = {
+TOLERANCES: dict[str, Callable[[prior.PhysicalTolerance, float], prior.PhysicalTolerance]] = {
     "radius": lambda given, factor: replace(given, radius=factor * given.radius),
     "rows": lambda given, factor: replace(given, rows=tuple(factor * share for share in given.rows)),  # type: ignore[arg-type]
     "elements": lambda given, factor: replace(given, elements=factor * given.elements),
@@ -91,12 +91,12 @@ def variants() -> Iterator[tuple[str, Callable[[StudiedRobot], Any]]]:
 
 @contextmanager
 def _tolerance(robot: StudiedRobot, change: Callable[..., Any], factor: float) -> Iterator[None]:
-    kind, before = class_of(robot.dataset.robot), dict(physical_prior._TOLERANCES)
-    physical_prior._TOLERANCES = before | {kind: change(before[kind], factor)}  # type: ignore[misc]
+    kind, before = class_of(robot.dataset.robot), dict(prior._TOLERANCES)
+    prior._TOLERANCES = before | {kind: change(before[kind], factor)}  # type: ignore[misc]
     try:
         yield
     finally:
-        physical_prior._TOLERANCES = before  # type: ignore[misc]
+        prior._TOLERANCES = before  # type: ignore[misc]
 
 
 @contextmanager

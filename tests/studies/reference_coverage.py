@@ -30,8 +30,8 @@ from scipy.stats import norm
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.references.run_references import Reference, References
 from omnibench.fit.calibrate import calibrate
-from omnibench.fit.observations.open_combinations import WORST
-from omnibench.fit.shrinkage.prior import prior_root, tolerance_of
+from omnibench.fit.open_combinations import WORST
+from omnibench.fit.prior import prior_root, tolerance_of
 from omnibench.fit.span import Unidentified
 from omnibench.processes import one_thread
 from omnibench.robot.calibration import matrix_rows

@@ -32,9 +32,9 @@ from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.errors import OmnibenchError
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.evaluate import final_errors
-from omnibench.fit.least_squares.usable_runs import usable_runs
-from omnibench.fit.loss.losses import LossName
+from omnibench.fit.loss import LossName
 from omnibench.fit.problem import Budget
+from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.registry import load_plugin_file
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel

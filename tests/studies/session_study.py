@@ -24,8 +24,8 @@ from hidden.session_sets import session_set
 from omnibench.data.dataset import Dataset
 from omnibench.discover.fitting.extend import extend, fit_matrix
 from omnibench.discover.regressors.column_group import Group
-from omnibench.fit.least_squares.usable_runs import usable_runs
-from omnibench.fit.sessions.session_differences import SessionComparison, compare_sessions
+from omnibench.fit.sessions import SessionComparison, compare_sessions
+from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.processes import one_thread
 from omnibench.registry import effects
 from omnibench.robot.model import OdometryModel

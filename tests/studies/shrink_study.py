@@ -32,11 +32,11 @@ from corelli import corelli_dataset, half
 
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.errors import OmnibenchError
+from omnibench.fit import prior
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
-from omnibench.fit.shrinkage import prior
-from omnibench.fit.shrinkage.shrinkage import shrunk
+from omnibench.fit.shrinkage import shrunk
 from omnibench.registry import calibrators, costs, load_plugin_file
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel

@@ -22,10 +22,9 @@ import numpy as np
 from omnibench.data.scans import TrajectoryScans
 from omnibench.data.true_poses import TruePath
 from omnibench.processes import one_thread
-from omnibench.robot.kinematics import Array, Robot, Wheel
+from omnibench.robot.kinematics import Array, Robot, Wheel, published_matrix
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
-from omnibench.robot.published_matrices import published_matrix
 from omnibench.simulate.chain.floor_plan import FloorPlan, RoomPlan, make_plan
 from omnibench.simulate.chain.lidar import Lidar, measure_scans, scan_stamps
 from omnibench.simulate.chain.motion_commands import CommandLink, MotionProfile, command_motion, target_rates

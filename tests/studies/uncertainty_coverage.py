@@ -19,7 +19,7 @@ import numpy as np
 from scipy.stats import binomtest
 
 from omnibench.fit.calibrate import calibrate
-from omnibench.fit.uncertainty.physical import geometry_of
+from omnibench.fit.identifiability import geometry_of
 from omnibench.simulate.simulate import simulate_dataset
 from omnibench.simulate.source import read_simulation
 

@@ -15,8 +15,7 @@ from omnibench.errors import ConfigError, NotApplicableError, PluginError
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.problem import BudgetSpent, CalibrationProblem
 from omnibench.registry import Options
-from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.robot_class import RobotClass, class_of
+from omnibench.robot.kinematics import Array, Robot, RobotClass, class_of
 from omnibench.testing import (
     CalibratorConformance,
     Nonconformance,

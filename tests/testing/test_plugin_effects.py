@@ -13,7 +13,7 @@ from commands import Command, Printed, assert_refused, flower, omnibench
 from omnibench.data.storage import load_dataset
 from omnibench.registry import load_plugins
 from omnibench.robot.calibration import Calibration, read_calibration, write_calibration
-from omnibench.robot.domain.training_domain import motions_of, representatives
+from omnibench.robot.corrections import motions_of, representatives
 
 TRUE_K = 0.15  # s/m
 COMMANDS = {"speeds": [0.1, 0.4], "directions_deg": [0, 120, 240], "turn_rates": [-0.5, 0.5], "ramp": 0.3}

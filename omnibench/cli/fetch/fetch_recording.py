@@ -24,7 +24,7 @@ from omnibench.data.dataset import Dataset
 from omnibench.data.storage import check_dataset_folder, save_dataset
 from omnibench.errors import ConfigError, DataError, PluginError
 from omnibench.files import check_place, refuse_existing, write_files
-from omnibench.fit.check.recording_source import recognised
+from omnibench.fit.check.fixes import recognised
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.registry import importers, load_plugin_file
 from omnibench.slam.import_dataset import import_dataset

@@ -13,13 +13,12 @@ from rich.console import Console
 from omnibench.cli.terminal.console import print_ending
 from omnibench.cli.terminal.tables import print_table
 from omnibench.errors import ConfigError
-from omnibench.fit.bounds.stamp_sums import QUADRATURE
+from omnibench.fit.bootstrap import ElementIntervals
 from omnibench.fit.calibrate import CalibrationRun
-from omnibench.fit.certify import CertifiedCalibration
+from omnibench.fit.certify import QUADRATURE, CertifiedCalibration
 from omnibench.fit.evaluate import Evaluation
 from omnibench.fit.geometry import WheelGeometry
-from omnibench.fit.uncertainty.bootstrap import ElementIntervals
-from omnibench.fit.uncertainty.physical import ParameterEstimate
+from omnibench.fit.identifiability import ParameterEstimate
 from omnibench.report.blocks import Cell, Column, Row, Table
 from omnibench.report.numbers import noise_in_words
 from omnibench.robot.calibration import Calibration, HeldOutVerdict

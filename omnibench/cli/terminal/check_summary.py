@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from omnibench.data.checks.finding import Finding
-    from omnibench.fit.check.result import CheckReport
+    from omnibench.fit.check.checking import CheckReport
 
 _NEEDED = {True: "a calibration is needed", False: "a calibration is hardly needed", None: ""}
 

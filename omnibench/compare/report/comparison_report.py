@@ -21,7 +21,7 @@ from omnibench.compare.report.wording import cost_decimals, cost_in_words, impro
 from omnibench.compare.result import ComparisonResult
 from omnibench.data.dataset import SPLITS, Trajectory
 from omnibench.errors import DataError
-from omnibench.fit.uncertainty.physical import geometry_of
+from omnibench.fit.identifiability import geometry_of
 from omnibench.report.blocks import (
     Badge,
     Block,
@@ -48,8 +48,7 @@ from omnibench.report.reproduction import reproduction_section
 from omnibench.report.robot_figures import DESIGN, is_drawn, motion_system, parameters
 from omnibench.report.style import INK, PALETTE, plan
 from omnibench.report.traces import START, joined, line, marks
-from omnibench.robot.kinematics import Array, Robot, Wheel
-from omnibench.robot.planar import seen_from
+from omnibench.robot.kinematics import Array, Robot, Wheel, seen_from
 from omnibench.words import plural
 
 

@@ -11,7 +11,7 @@ import plotly.graph_objects as go
 from omnibench.compare.report.view import SPLIT_NAMES, THEORETICAL_STYLE, DatasetView
 from omnibench.compare.report.wording import cost_decimals, interval_basis, interval_in_words
 from omnibench.compare.result import THEORETICAL_NAME
-from omnibench.fit.uncertainty.ratio_intervals import Interval
+from omnibench.fit.ratio_intervals import Interval
 from omnibench.report.blocks import Figure, FigureGrid, LegendItem
 from omnibench.report.numbers import fixed
 from omnibench.report.style import INK, PALETTE, QUIET, plot, text, wrapped

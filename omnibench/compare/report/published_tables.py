@@ -13,8 +13,8 @@ from omnibench.compare.report.view import SPLIT_NAMES, DatasetView
 from omnibench.compare.report.wording import NO_INTERVAL, cost_decimals
 from omnibench.compare.result import THEORETICAL_NAME
 from omnibench.data.dataset import SPLITS, Split, Trajectory
-from omnibench.fit.least_squares.repetitions import grouped
-from omnibench.fit.uncertainty.ratio_intervals import Interval
+from omnibench.fit.noise import grouped
+from omnibench.fit.ratio_intervals import Interval
 from omnibench.registry import calibrators
 from omnibench.report.blocks import Block, Callout, Cell, Column, Row, Table
 from omnibench.report.numbers import NOTHING, count, fixed, listing, percent, seconds, span

@@ -18,8 +18,8 @@ from omnibench.compare.result import (
 )
 from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory
 from omnibench.fit.evaluate import final_errors
-from omnibench.fit.observations.reference_errors import measured_parts
-from omnibench.fit.uncertainty.ratio_intervals import Interval, Units, units_of
+from omnibench.fit.ratio_intervals import Interval, Units, units_of
+from omnibench.fit.reference_rows import measured_parts
 from omnibench.registry import calibrators
 from omnibench.report.blocks import LegendItem
 from omnibench.report.numbers import NOTHING, count, seconds

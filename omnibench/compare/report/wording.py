@@ -8,7 +8,7 @@ from omnibench.compare.plan import UNBOUNDED
 from omnibench.compare.report.view import THEORETICAL_STYLE, DatasetView
 from omnibench.compare.result import THEORETICAL_NAME, EntryStatistics, RunRecord
 from omnibench.data.dataset import Split
-from omnibench.fit.uncertainty.ratio_intervals import Interval
+from omnibench.fit.ratio_intervals import Interval
 from omnibench.registry import costs
 from omnibench.report.blocks import Cell
 from omnibench.report.numbers import NOTHING, decimals_for, fixed, percent, significant, span

@@ -15,7 +15,7 @@ from omnibench.data.stored.drawn_runs import MOST_DRAWN, drawn_runs
 from omnibench.jobs.gathering import gathered
 from omnibench.progress import Reporter
 from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.stored.odometry_of_stored import together, workers
+from omnibench.robot.stored_odometry import together, workers
 
 # s that a clock must be off, and in standard errors, to be told (chosen: simulated runs, whose clocks are right, are
 # below); from _SPOILS, s, on it spoils a fit.

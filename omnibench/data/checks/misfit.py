@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from omnibench.data.checks.misreading import Misreading, Reading
 from omnibench.data.stored.drawn_runs import in_memory
-from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.kinematics import Array, Robot, wrapped
 from omnibench.robot.odometry import OdometryBatch, WheelLog
-from omnibench.robot.planar import wrapped
 
 _MOST_TRAJECTORIES = 24  # trajectories checked, at most (chosen)
 # Samples checked, at most, of which some are taken together, and stamps of each run (chosen: they keep a check of 24

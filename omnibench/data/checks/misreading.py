@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 
 from omnibench.data.checks.finding import Finding, Kind
-from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.kinematics import Array, Robot, rotation
 from omnibench.robot.odometry import WheelLog
-from omnibench.robot.planar import rotation
 
 _ARRANGED = 4  # wheels of which every order and sign is tried, at most; of more only one mistake
 # Other units by the size of the SI unit in them: of wheel rates, and of positions.

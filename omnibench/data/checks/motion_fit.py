@@ -17,9 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from omnibench.robot.kinematics import Array
+from omnibench.robot.kinematics import Array, interpolated
 from omnibench.robot.odometry import Complex, WheelLog
-from omnibench.robot.planar import interpolated
 
 _WINDOW = 1.0  # s between two poses: long beside their noise, short beside the drift of headings; chosen
 _LONGEST = 3.0  # s: a longer window turns too far for straight lines between its poses; chosen

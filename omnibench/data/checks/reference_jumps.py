@@ -9,8 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.planar import relative, wrapped
+from omnibench.robot.kinematics import Array, Robot, relative, wrapped
 
 # A step is a jump if it differs from the odometry's by more than this, m and rad, and by more than the share of the
 # way; chosen: above the scatter of motion capture and of matched scans, and the errors of a design.

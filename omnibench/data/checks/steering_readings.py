@@ -21,10 +21,8 @@ from omnibench.data.checks.misreading import (
     scaled,
     wheels_in_words,
 )
-from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.kinematics import Array, CarDrive, Drive, Robot, rotation
 from omnibench.robot.odometry import WheelLog
-from omnibench.robot.planar import rotation
-from omnibench.robot.wheels.drive import CarDrive, Drive
 
 DEGREE = math.pi / 180
 # Factors of steering angles that are tried, 1.25 apart; nearer to 1 than 1.6 is what a calibration is for (chosen).

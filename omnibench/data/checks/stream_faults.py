@@ -17,7 +17,7 @@ from omnibench.jobs.gathering import gathered
 from omnibench.progress import Reporter
 from omnibench.robot.kinematics import Array, Robot, wheel_equations
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.stored.odometry_of_stored import together, workers
+from omnibench.robot.stored_odometry import together, workers
 from omnibench.words import plural, some
 
 # Gaps that are told, s, and as a multiple of the usual period (chosen: a Robotino's log has gaps of 0.24 s at 31 ms).

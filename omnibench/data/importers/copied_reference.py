@@ -20,9 +20,7 @@ from itertools import product
 import numpy as np
 
 from omnibench.data.dataset import Trajectory
-from omnibench.robot.kinematics import Array
-from omnibench.robot.planar import interpolated
-from omnibench.robot.wheels.drive import in_the_middle
+from omnibench.robot.kinematics import Array, in_the_middle, interpolated
 
 _INTERVAL = 1.0  # s
 _COPIED = 5e-4  # rad; chosen between the two above, and nearer to odometry: to refuse a good reference is worse

@@ -23,8 +23,7 @@ from omnibench.data.importers.encoder_counts import (
 )
 from omnibench.data.importers.runs.reference_options import ReferenceOptions
 from omnibench.errors import DataError, nearest
-from omnibench.robot.kinematics import Array
-from omnibench.robot.wheels.drive import fastest_rates
+from omnibench.robot.kinematics import Array, fastest_rates
 from omnibench.words import plural
 
 Position = Literal["rad", "deg", "rev", "ticks"]

@@ -10,7 +10,7 @@ import numpy as np
 
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.fitting.model_fit import Fit
-from omnibench.robot.domain.training_domain import motions_of
+from omnibench.robot.corrections import motions_of
 from omnibench.robot.effects.effect import Effect
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel

@@ -27,7 +27,7 @@ from omnibench.discover.fitting.extend import Extended, columns_of
 from omnibench.discover.fitting.model_fit import Fit, at_runs
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.result import Experiment, ExperimentCommand, NamedEffect
-from omnibench.fit.least_squares.whitened import Whitened
+from omnibench.fit.trajectory_fit import Whitened
 from omnibench.report.numbers import listing
 from omnibench.robot.calibration import matrix_rows
 from omnibench.simulate.config import FlowerConfig

@@ -44,7 +44,7 @@ from scipy.stats import norm
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.selection.evidence import DISCREPANCY, log_evidence
 from omnibench.discover.selection.model_selection import SURE
-from omnibench.fit.least_squares.whitened import Given, Whitened
+from omnibench.fit.trajectory_fit import Given, Whitened
 from omnibench.robot.kinematics import Array
 
 _DRAWS = 8  # draws of each member's values: half and twice as many change the minutes of omni3's plan by under 10 %

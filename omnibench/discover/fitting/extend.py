@@ -24,12 +24,11 @@ from omnibench.discover.fitting.model_fit import (
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.regressors.effect_slopes import slopes_by
 from omnibench.discover.regressors.paths import Paths
-from omnibench.fit.least_squares.noise import is_near
-from omnibench.fit.least_squares.trajectory_covariance import FitCovariance
-from omnibench.fit.least_squares.whitened import Whitened, given
-from omnibench.fit.uncertainty.intervals import EstimatedCovariance
-from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect
-from omnibench.robot.effects.term import Term
+from omnibench.fit.calibrators.trajectory_ml import FitCovariance
+from omnibench.fit.information import EstimatedCovariance
+from omnibench.fit.noise import is_near
+from omnibench.fit.trajectory_fit import Whitened, given
+from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect, Term
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import split_by
 

@@ -12,14 +12,18 @@ from numpy.typing import NDArray
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.fitting.outliers import InlierWhitener, inliers_of
 from omnibench.discover.regressors.paths import Paths, blocks_of, make_paths
-from omnibench.fit.least_squares.noise import FIRST_NOISE, NoiseEstimate, estimate_noise
-from omnibench.fit.least_squares.nuisance_noise import noise_of_fit
-from omnibench.fit.least_squares.nuisances import Nuisances
-from omnibench.fit.least_squares.repetitions import differences_between_repetitions
-from omnibench.fit.least_squares.trajectory_fit import TrajectoryFit
-from omnibench.fit.least_squares.usable_runs import in_start_frames, with_poses
-from omnibench.fit.least_squares.whitened import Whitened, whitened, without
-from omnibench.robot.effects.term import Term
+from omnibench.fit.noise import FIRST_NOISE, NoiseEstimate, differences_between_repetitions, estimate_noise
+from omnibench.fit.trajectory_fit import (
+    Nuisances,
+    TrajectoryFit,
+    Whitened,
+    in_start_frames,
+    noise_of_fit,
+    whitened,
+    with_poses,
+    without,
+)
+from omnibench.robot.effects.effect import Term
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog

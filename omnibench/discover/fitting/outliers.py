@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
-from omnibench.fit.least_squares.noise import Whitener, whiteners
+from omnibench.fit.noise import Whitener, whiteners
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 

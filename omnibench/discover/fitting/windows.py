@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from omnibench.data.dataset import Trajectory
-from omnibench.fit.least_squares.repetitions import grouped
+from omnibench.fit.noise import grouped
 
 _ENOUGH = 30  # runs that are not cut: signs of fewer are flipped in too few ways for chances of 0.002 to be known well
 _MOST = 60  # windows of all drives, at most; chosen

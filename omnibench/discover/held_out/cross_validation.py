@@ -30,11 +30,10 @@ from omnibench.discover.fitting.extend import Extended
 from omnibench.discover.fitting.model_fit import Fit, model_with
 from omnibench.discover.held_out.validation_runs import ValidationRuns
 from omnibench.fit.evaluate import final_errors
-from omnibench.fit.least_squares.repetitions import grouped
-from omnibench.fit.least_squares.whitened import Given, Whitened
-from omnibench.fit.sessions.session_contrast import sessions_of
-from omnibench.fit.sessions.session_differences import SessionComparison, compare_sessions
-from omnibench.robot.domain.training_domain import kinds_of_motion
+from omnibench.fit.noise import grouped
+from omnibench.fit.sessions import SessionComparison, compare_sessions, sessions_of
+from omnibench.fit.trajectory_fit import Given, Whitened
+from omnibench.robot.corrections import kinds_of_motion
 from omnibench.robot.kinematics import Array
 
 

@@ -27,9 +27,8 @@ from omnibench.discover.held_out.cross_validation import (
 )
 from omnibench.discover.held_out.validation_runs import ValidationRuns
 from omnibench.discover.result import Gap, HeldOut
-from omnibench.fit.least_squares.noise import whiteners
-from omnibench.fit.least_squares.nuisance_noise import differences_without_nuisances
-from omnibench.fit.least_squares.whitened import whitened
+from omnibench.fit.noise import whiteners
+from omnibench.fit.trajectory_fit import differences_without_nuisances, whitened
 from omnibench.robot.kinematics import Array
 
 

@@ -12,8 +12,8 @@ from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.discover.fitting.model_fit import Fit, at_runs
 from omnibench.discover.fitting.outliers import inliers_of
 from omnibench.errors import DataError
-from omnibench.fit.least_squares.repetitions import repeating_runs
-from omnibench.fit.least_squares.usable_runs import in_start_frames, usable_runs
+from omnibench.fit.noise import repeating_runs
+from omnibench.fit.trajectory_fit import in_start_frames, usable_runs
 from omnibench.robot.model import OdometryModel
 
 # Times, and s more than, the latest training run, from where on a session's time counts as new. Nothing but a warning

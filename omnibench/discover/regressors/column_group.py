@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from omnibench.discover.regressors.covariate_bases import Basis
-from omnibench.robot.effects.effect import Effect, Parameter
-from omnibench.robot.effects.forms import Forms
+from omnibench.robot.effects.effect import Effect, Forms, Parameter
 
 Kind = Literal["matrix", "effect", "covariate"]
 

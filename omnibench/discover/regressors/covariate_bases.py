@@ -18,27 +18,27 @@ from omnibench.data.dataset import Trajectory
 from omnibench.discover.regressors.effect_slopes import slopes_by, slopes_by_delay
 from omnibench.discover.regressors.paths import Paths
 from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect, Stage
-from omnibench.robot.effects.smooth.motion import (
+from omnibench.robot.effects.smooth import (
+    HARMONICS,
+    SmoothAcceleration,
     SmoothCommand,
     SmoothCourse,
     SmoothEffect,
     SmoothElapsedTime,
     SmoothHeading,
+    SmoothMap,
     SmoothOrderOfRuns,
     SmoothPatch,
     SmoothPlace,
-    bump,
-    lever,
-)
-from omnibench.robot.effects.smooth.reference import SmoothMap, SmoothStamps, SmoothStampWave
-from omnibench.robot.effects.smooth.wheels import (
-    HARMONICS,
-    SmoothAcceleration,
+    SmoothStamps,
+    SmoothStampWave,
     SmoothWheelAngle,
     SmoothWheelRate,
+    bump,
     hat_functions,
+    lever,
+    mean_waves,
 )
-from omnibench.robot.effects.wheel_angle import mean_waves
 from omnibench.robot.kinematics import Array
 
 # tests/studies/constants.py varies each number by 0.5 and 2: on a small set with heading drift no verdict and no

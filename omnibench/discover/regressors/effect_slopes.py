@@ -8,11 +8,9 @@ import numpy as np
 
 from omnibench.discover.regressors.paths import Paths, along_ends, part_of
 from omnibench.errors import PluginError
-from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect
-from omnibench.robot.effects.forms import correction_of
-from omnibench.robot.effects.reference_time import ReferenceTimeOffset
-from omnibench.robot.effects.smooth.motion import SmoothEffect
-from omnibench.robot.effects.smooth.reference import BentMap
+from omnibench.robot.effects.drift import ReferenceTimeOffset
+from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect, correction_of
+from omnibench.robot.effects.smooth import BentMap, SmoothEffect
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import RunSamples
 from omnibench.robot.signals import Signals

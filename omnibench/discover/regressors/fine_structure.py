@@ -36,7 +36,7 @@ from omnibench.discover.regressors.covariate_bases import Basis, area_of
 from omnibench.discover.regressors.paths import Paths
 from omnibench.discover.regressors.significance import Significance, significance_of_scores, together
 from omnibench.robot.effects.effect import Values
-from omnibench.robot.effects.smooth.motion import MODES, beyond, bump
+from omnibench.robot.effects.smooth import MODES, beyond, bump
 from omnibench.robot.kinematics import Array
 
 _COARSE = 0.1  # s: wheel samples are merged up to this duration

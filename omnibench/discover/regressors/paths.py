@@ -22,10 +22,9 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from omnibench.registry import effects
-from omnibench.robot.effects.smooth.motion import MODES, direction
+from omnibench.robot.effects.smooth import MODES, direction
 from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.odometry import RunSamples, WheelLog
-from omnibench.robot.path import PathBatch
+from omnibench.robot.odometry import PathBatch, RunSamples, WheelLog
 from omnibench.robot.signals import Signals, signals_of_runs
 
 # tests/studies/constants.py varies it by 0.5 and 2: on a small set with heading drift no verdict and no name

@@ -39,7 +39,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from omnibench.discover.regressors.column_group import Group, best_shapes
-from omnibench.fit.least_squares.whitened import Given, Whitened, given
+from omnibench.fit.trajectory_fit import Given, Whitened, given
 from omnibench.robot.kinematics import Array
 
 # tests/studies/constants.py varies each number by 0.5 and 2 on small blind sets: no verdict and no name changes.

@@ -18,10 +18,8 @@ from numpy.typing import NDArray
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.regressors.paths import Paths, make_paths
 from omnibench.discover.result import Discovery
-from omnibench.fit.least_squares.noise import Whitener
-from omnibench.fit.least_squares.repetitions import grouped
-from omnibench.robot.kinematics import Array
-from omnibench.robot.planar import relative, rotation
+from omnibench.fit.noise import Whitener, grouped
+from omnibench.robot.kinematics import Array, relative, rotation
 
 # Standard deviations that hold 95 % of a normal distribution, on a line and in the plane.
 NORMAL_95 = 1.96  # standard deviations within which 95 % of a normal number lie

@@ -15,8 +15,7 @@ from omnibench.discover.report.motion_figures import CovariateFigure, fitted_cur
 from omnibench.discover.report.residuals import NORMAL_95, Residuals
 from omnibench.report.blocks import FigureGrid
 from omnibench.report.numbers import fixed
-from omnibench.robot.kinematics import Array
-from omnibench.robot.planar import interpolated, rotated
+from omnibench.robot.kinematics import Array, interpolated, rotated
 from omnibench.words import plural
 
 _TIMES = 14  # times at which the mean residual is drawn; only the drawing hangs on it

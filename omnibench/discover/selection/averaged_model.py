@@ -30,7 +30,7 @@ from omnibench.discover.fitting.extend import Extended, columns_of, terms_of
 from omnibench.discover.fitting.model_fit import at_model, model_with
 from omnibench.discover.held_out.cross_validation import folds_of_commands, held_out_residuals
 from omnibench.discover.regressors.column_group import Group
-from omnibench.fit.uncertainty.intervals import EstimatedCovariance
+from omnibench.fit.information import EstimatedCovariance
 from omnibench.robot.kinematics import Array
 
 _LEAST = 0.01  # weight below which a member is left out: a term less, for a hundredth of its correction; chosen

@@ -16,8 +16,15 @@ from omnibench.discover.regressors.covariate_bases import Columns, generic_bases
 from omnibench.discover.regressors.effect_slopes import correction_along, slopes_by, slopes_by_corrections
 from omnibench.discover.regressors.paths import Paths
 from omnibench.registry import effects
-from omnibench.robot.effects.effect import Effect, MotionEffect, Parameter, ReferenceEffect
-from omnibench.robot.effects.forms import Forms, form_profile, forms_of
+from omnibench.robot.effects.effect import (
+    Effect,
+    Forms,
+    MotionEffect,
+    Parameter,
+    ReferenceEffect,
+    form_profile,
+    forms_of,
+)
 from omnibench.robot.kinematics import Array, Robot
 
 # Shapes of an effect: with more of them, one comes near enough to any other form. tests/studies/constants.py varies

@@ -17,7 +17,7 @@ from omnibench.discover.held_out.cross_validation import folds_of_commands, held
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.selection.model_selection import Selection
 from omnibench.discover.selection.screening import Screening
-from omnibench.fit.least_squares.whitened import given
+from omnibench.fit.trajectory_fit import given
 from omnibench.robot.kinematics import Array
 
 # Share of a column that must be left beyond the others, as in unknown_term.py: much of a form is another matrix.

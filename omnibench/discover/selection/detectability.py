@@ -32,7 +32,7 @@ from omnibench.discover.result import Absorbed, Hidden
 from omnibench.discover.selection.candidate_groups import Missing
 from omnibench.discover.selection.model_selection import ABSORBED, Selection
 from omnibench.discover.selection.screening import Screening
-from omnibench.fit.least_squares.whitened import Given, given
+from omnibench.fit.trajectory_fit import Given, given
 from omnibench.registry import effects
 from omnibench.robot.kinematics import Array
 

@@ -24,11 +24,9 @@ import numpy as np
 
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.fitting.model_fit import Fit
-from omnibench.fit.least_squares.repetitions import grouped
-from omnibench.fit.least_squares.whitened import Whitened, given
-from omnibench.robot.kinematics import Array
-from omnibench.robot.planar import rotated
-from omnibench.robot.wheels.drive import in_the_middle
+from omnibench.fit.noise import grouped
+from omnibench.fit.trajectory_fit import Whitened, given
+from omnibench.robot.kinematics import Array, in_the_middle, rotated
 
 _FEWEST = 50  # samples in which a wheel turns (chosen): with fewer, the smallest gap need not be one tick
 _DECADES = 20.0  # -log10 of the chance, Eq. (2), that angles are multiples: no set of recordings has so many (chosen)

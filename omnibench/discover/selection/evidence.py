@@ -81,7 +81,7 @@ from scipy.integrate import quad
 
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.regressors.significance import Significance
-from omnibench.fit.least_squares.whitened import Given
+from omnibench.fit.trajectory_fit import Given
 from omnibench.robot.kinematics import Array
 
 # tests/studies/evidence_study.py prints again what is measured here, on 38 blind sets with one strong effect, 30

@@ -23,9 +23,8 @@ from omnibench.data.dataset import Trajectory
 from omnibench.discover.fitting.extend import Extended, columns_at
 from omnibench.discover.held_out.cross_validation import folds_of_commands, held_out_residuals
 from omnibench.discover.result import Extrapolation
-from omnibench.fit.least_squares.repetitions import grouped
-from omnibench.robot.domain.fade import Fade
-from omnibench.robot.domain.training_domain import extrapolated_share, motions_of, representatives
+from omnibench.fit.noise import grouped
+from omnibench.robot.corrections import Fade, extrapolated_share, motions_of, representatives
 from omnibench.robot.kinematics import Array
 
 _QUANTILE = 2.45  # sqrt(-2 ln 0.05), Eq. (2)

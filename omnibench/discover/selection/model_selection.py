@@ -28,7 +28,7 @@ from omnibench.discover.selection.evidence import (
     names_of,
 )
 from omnibench.discover.selection.screening import Screening
-from omnibench.fit.least_squares.whitened import Given
+from omnibench.fit.trajectory_fit import Given
 
 # tests/studies/constants.py varies each number by 0.5 and 2 on small blind sets: but for what is said here, no
 # verdict and no name changes.

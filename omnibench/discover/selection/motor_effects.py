@@ -24,8 +24,8 @@ from omnibench.discover.regressors.covariate_bases import Basis
 from omnibench.discover.selection.candidate_groups import Groups
 from omnibench.discover.selection.model_selection import Selection, select_effects
 from omnibench.discover.selection.screening import Screening
-from omnibench.fit.least_squares.whitened import Whitened
-from omnibench.fit.uncertainty.intervals import EstimatedCovariance
+from omnibench.fit.information import EstimatedCovariance
+from omnibench.fit.trajectory_fit import Whitened
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import ActuatorEffect, Parameter
 from omnibench.robot.kinematics import Array, Robot

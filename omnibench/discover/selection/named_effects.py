@@ -13,7 +13,7 @@ from omnibench.discover.result import Candidate, EstimatedParameter, NamedEffect
 from omnibench.discover.selection.competing_models import CompetingModels
 from omnibench.discover.selection.model_selection import SURE, Selection
 from omnibench.discover.selection.motor_effects import MotorEffects
-from omnibench.robot.effects.forms import form_in_words
+from omnibench.robot.effects.effect import form_in_words
 from omnibench.robot.kinematics import Array, Robot
 
 

@@ -16,7 +16,7 @@ from omnibench.discover.regressors.column_store import ColumnStore
 from omnibench.discover.regressors.significance import Significance, significance_of
 from omnibench.discover.selection.candidate_groups import Groups, make_groups
 from omnibench.discover.selection.encoder_quantisation import EncoderQuantisation
-from omnibench.fit.least_squares.whitened import Given, Whitened, given
+from omnibench.fit.trajectory_fit import Given, Whitened, given
 from omnibench.robot.kinematics import Array
 
 # s: shorter wheel samples are merged up to this duration, as covariates vary more slowly. tests/studies/constants.py

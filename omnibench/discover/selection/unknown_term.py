@@ -35,9 +35,9 @@ from omnibench.discover.regressors.significance import Significance
 from omnibench.discover.selection.competing_models import CompetingModels
 from omnibench.discover.selection.model_selection import CHANCE
 from omnibench.discover.selection.screening import Screening
-from omnibench.fit.least_squares.whitened import Given, Whitened, given
+from omnibench.fit.trajectory_fit import Given, Whitened, given
 from omnibench.registry import effects
-from omnibench.robot.effects.smooth.motion import SmoothJoint
+from omnibench.robot.effects.smooth import SmoothJoint
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.words import plural
 

@@ -20,10 +20,9 @@ from pydantic import Field
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.cost import SumOfNorms
-from omnibench.fit.least_squares.reweighted import reweighted_minimum
+from omnibench.fit.gauss_newton import reweighted_minimum
 from omnibench.fit.linear_fit import linear_fit
-from omnibench.fit.loss.losses import Huber, Squares
-from omnibench.fit.loss.robust_cost import RobustCost, norms_of
+from omnibench.fit.loss import Huber, RobustCost, Squares, norms_of
 from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
@@ -32,7 +31,7 @@ from omnibench.robot.odometry import OdometryBatch
 from omnibench.words import plural
 
 if TYPE_CHECKING:
-    from omnibench.fit.loss.sum_of_norms import SumOfNormsProgram
+    from omnibench.fit.sum_of_norms import SumOfNormsProgram
 
 # The matrices of closed_form are the same with half of each of these numbers and with twice
 # (tests/studies/constants_fit.py).
@@ -60,11 +59,11 @@ class ClosedForm(Calibrator):
 
     def __init__(self, options: ClosedFormOptions) -> None:
         super().__init__(options)
-        import omnibench.fit.loss.sum_of_norms  # noqa: F401 (importing cvxpy takes a second: do it before time is measured)
+        import omnibench.fit.sum_of_norms  # noqa: F401 (importing cvxpy takes a second: do it before time is measured)
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """The optimum in the box. ConfigError for another parameterisation or a cost that is no sum of norms."""
-        from omnibench.fit.loss.sum_of_norms import SolverError
+        from omnibench.fit.sum_of_norms import SolverError
 
         if not isinstance(problem.parameterisation, MatrixElements):
             raise ConfigError("closed_form works on the matrix parameterisation; search the geometry with another")
@@ -139,7 +138,7 @@ def linear_start(problem: CalibrationProblem) -> Array:
 
 def cone_program(problem: CalibrationProblem, objective: SumOfNorms, vector: Array) -> SumOfNormsProgram:
     """A program for the best step from ``vector``: the cost with the poses linearised there."""
-    from omnibench.fit.loss.sum_of_norms import SumOfNormsProgram
+    from omnibench.fit.sum_of_norms import SumOfNormsProgram
 
     return SumOfNormsProgram(*program_data(problem, objective, vector))
 

@@ -25,11 +25,9 @@ from numpy.typing import NDArray
 
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import Calibrator, Solution
-from omnibench.fit.least_squares.gauss_newton import bounded_step
-from omnibench.fit.least_squares.reweighted import reweighted_minimum
+from omnibench.fit.gauss_newton import bounded_step, reweighted_minimum
 from omnibench.fit.linear_fit import linear_system
-from omnibench.fit.loss.losses import Huber, Loss, Squares
-from omnibench.fit.loss.robust_cost import RobustCost, norms_of
+from omnibench.fit.loss import Huber, Loss, RobustCost, Squares, norms_of
 from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
@@ -50,7 +48,7 @@ class LeastSquares(Calibrator):
 
     def __init__(self, options: Options) -> None:
         super().__init__(options)
-        import omnibench.fit.loss.sum_of_norms  # noqa: F401 (importing cvxpy takes a second: before time is measured)
+        import omnibench.fit.sum_of_norms  # noqa: F401 (importing cvxpy takes a second: before time is measured)
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """Minimise Eq. (2). ConfigError for another parameterisation or a cost that is no sum of norms."""
@@ -130,7 +128,7 @@ class _LinearErrors:
         """The vector (n,) of the box that minimises Eq. (2)."""
         import cvxpy as cp
 
-        from omnibench.fit.loss.sum_of_norms import solve_program
+        from omnibench.fit.sum_of_norms import solve_program
 
         problem, unit = self._problem, self.unit
         factors = np.sqrt(self.shares)[:, None] * self._weights

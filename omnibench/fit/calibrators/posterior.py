@@ -48,12 +48,12 @@ from omnibench.config import NonNegative
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError, NotApplicableError
 from omnibench.fit.calibrator import Calibrator, Solution
+from omnibench.fit.prior import physical_prior_root, physical_tolerance
 from omnibench.fit.problem import CalibrationProblem
-from omnibench.fit.shrinkage.physical_prior import physical_prior_root, physical_tolerance
 from omnibench.fit.steering_fit import corrected_runs
 from omnibench.registry import Options, calibrators
 from omnibench.robot.calibration import EffectTerm, ModelExtension, covariance_rows
-from omnibench.robot.effects.term import Term, make_term
+from omnibench.robot.effects.effect import Term, make_term
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import OdometryBatch
 

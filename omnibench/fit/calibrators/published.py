@@ -9,7 +9,21 @@ from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
-from omnibench.robot.published_matrices import PUBLISHED, published_matrix
+from omnibench.robot.kinematics import PUBLISHED, published_matrix
+
+
+@calibrators.register("theoretical")
+class Theoretical(Calibrator):
+    """The design values, unchanged, against which every calibration is measured."""
+
+    bounded = False
+    fitted = False
+    stochastic = False
+
+    def calibrate(self, problem: CalibrationProblem) -> Solution:
+        """The start vector."""
+        problem.cost(problem.start[None])
+        return Solution(problem.start, "the design values")
 
 
 class PublishedOptions(Options):

@@ -8,14 +8,17 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from textwrap import wrap
+from typing import Any, Literal
 
 import numpy as np
+from pydantic import Field
 from xxhash import xxh3_64_intdigest
 
+from omnibench.config import Model
 from omnibench.data.checks.clock_findings import clock_findings, clocks_of
-from omnibench.data.checks.finding import Finding, findings_of
-from omnibench.data.checks.misread_search import Explained, Recorded, search
+from omnibench.data.checks.finding import Finding, FindingWarning, findings_of
+from omnibench.data.checks.misread_search import UNRELATED, Explained, Recorded, search
 from omnibench.data.checks.motion_fit import Windows, continuous
 from omnibench.data.checks.stream_faults import runs_in_words, stream_faults
 from omnibench.data.clock_matching import ClockMatch
@@ -24,16 +27,114 @@ from omnibench.data.importers.copied_reference import follows_the_wheels
 from omnibench.data.references.reference_units import odd_references
 from omnibench.data.stored.drawn_runs import count_drawn, drawn_runs
 from omnibench.errors import computable
-from omnibench.fit.check.fixes import command, with_fixes
+from omnibench.fit.check.fixes import (
+    CannotBeTypedError,
+    RecordingSource,
+    attempt,
+    command,
+    mended_options,
+    odd_times,
+    of_dataset,
+    other_times,
+    read_source,
+    recorded,
+    with_fixes,
+)
 from omnibench.fit.check.missing_motions import missing_motions, too_few
-from omnibench.fit.check.other_readings import read_otherwise
-from omnibench.fit.check.recording_source import RecordingSource, of_dataset, read_source, recorded
-from omnibench.fit.check.result import CheckReport, Verdict
 from omnibench.fit.evaluate import looked_at, verdict_on
-from omnibench.fit.observations.open_in_words import open_sentences
-from omnibench.fit.quick_fit import quick_fit
+from omnibench.fit.linear_fit import quick_fit
+from omnibench.fit.open_combinations import open_sentences
 from omnibench.robot.model import OdometryModel
+from omnibench.views import screenful
 from omnibench.words import noun_for, plural
+
+_WIDTH = 110  # characters of a line of a report at a Python prompt
+Verdict = Literal["ready", "fix", "record more"]
+
+
+class CheckReport(Model):
+    """The check of one recording.
+
+    needed: True if a calibration gains more than chance on runs that it was not fitted to, False if it does not; None
+    if that cannot be told. sentence: the verdict in words. gain: what cross-validation says. command: the import with
+    all fixes that can be typed; empty if there is none. clocks: of the runs that have poses, in their order; None where
+    one does not show.
+    """
+
+    verdict: Verdict
+    needed: bool | None
+    findings: tuple[Finding, ...]
+    sentence: str
+    gain: str
+    command: str = ""
+    clocks: tuple[ClockMatch | None, ...] = Field((), exclude=True, repr=False)
+
+    def __repr__(self) -> str:
+        found = [f"{each.severity}: {each.what} [{each.where}]" for each in self.findings]
+        typed = ["its .command mends what can be mended"] if self.command else []
+        said = [f"{self.verdict}: {self.sentence}", *found, *filter(None, [self.gain]), *typed]
+        return "\n".join(screenful([line for text in said for line in wrap(text, _WIDTH, subsequent_indent="    ")]))
+
+
+_QUANTITIES = {"": "positions", "/sample": "increments since the row before", "/s": "rates"}
+
+
+def read_otherwise(read: RecordingSource, explained: Explained) -> RecordingSource | None:
+    """The recording by other units, with the findings that say so; None where none makes more sense of it.
+
+    explained: what the search for misreadings tells of it. Tried are the units that reading it warned of, where the
+    search tells something else, and wheels that count positions in the place of rates or increments, and the like,
+    where no matrix explains the motion, with other units of time where the times are odd.
+    """
+    if not read.readable:
+        return None
+    warned = _unit_warnings(read)
+    if {finding.kind for finding in warned} - {mistake.kind for mistake in explained.mistakes}:
+        other = _mended(read, warned)
+        return None if other is None or _unit_warnings(other) or search(recorded(other.dataset)).mistakes else other
+    senseless = explained.unexplained > UNRELATED or (not explained.told and odd_times(read.dataset))
+    if senseless and not any(finding.kind == "wheel_unit" for finding in read.findings):
+        return next(filter(None, (_mended(read, findings) for findings in _other_units(read))), None)
+    return None
+
+
+def _other_units(read: RecordingSource) -> Iterator[list[Finding]]:
+    """Findings that another quantity of the wheels would mend, each with another unit of times that are odd."""
+    odd = odd_times(read.dataset)
+    times = [[finding] for finding in other_times(read.importer, read.options)] if odd else [[]]
+    return ([*time, quantity] for time in times for quantity in _other_quantities(read))
+
+
+def _unit_warnings(read: RecordingSource) -> list[Finding]:
+    """The findings of units that reading the recording warned of."""
+    return [each.finding for each in read.dataset.warnings if isinstance(each, FindingWarning) and each.unit]
+
+
+def _mended(read: RecordingSource, findings: list[Finding]) -> RecordingSource | None:
+    """The recording read anew without the mistakes of findings, old and new; None if it makes no sense then."""
+    found = (*read.findings, *findings)
+    try:
+        options = mended_options(read, read.importer, read.options, [finding.changes for finding in found])
+    except CannotBeTypedError:
+        return None
+    dataset = attempt(read.importer, read.source, options)
+    return None if dataset is None else replace(read, dataset=dataset, findings=found)
+
+
+def _other_quantities(read: RecordingSource) -> Iterator[Finding]:
+    present = str(read.options.get("wheel_unit", "rad/s"))
+    unit, _, per = present.partition("/")
+    for ending, quantity in _QUANTITIES.items():
+        if unit != "rpm" and ending.lstrip("/") != per:
+            yield Finding(
+                kind="wheel_unit",
+                what=f"the wheels look like {quantity} ({unit}{ending}); they are read as "
+                f"{_QUANTITIES[present.removeprefix(unit)]} ({present})",
+                where="all wheels",
+                severity="error",
+                changes={"wheel_quantity": f"{unit}{ending}"},
+            )
+
 
 _SMALL = 0.1  # share of the cost: a larger gain that is not significant is left open; chosen
 _ENOUGH = 10  # commands, from which on a gain would have shown if there were one; chosen
@@ -152,7 +253,7 @@ def check_recording(read: RecordingSource) -> CheckReport:
     frozen = any(fault.kind in ("steering_frozen", "wheel_dead") and not fault.changes for fault in faults)
     if not frozen and not spoiled and (otherwise := read_otherwise(read, explained)) is not None:
         return check_recording(otherwise).model_copy(update={"clocks": tuple(clocks)})
-    misread = [] if frozen else list(_misreadings(explained)) if explained.told else _warned(dataset)
+    misread = [] if frozen else list(_misreadings(explained)) if explained.told else _reading_errors(dataset)
     if misread:  # wheels that are misread tell no jumps
         faults = [fault for fault in faults if fault.kind != "reference_jump"]
     odd = _odd_references(dataset) if explained.told else []
@@ -244,7 +345,7 @@ def _misreadings(explained: Explained) -> Iterator[Finding]:
         yield mistake.finding(alike)
 
 
-def _warned(dataset: Dataset) -> list[Finding]:
+def _reading_errors(dataset: Dataset) -> list[Finding]:
     """Findings that reading a data set warned of, where the search for misreadings needs more poses than there are."""
     return [finding for finding in findings_of(dataset.warnings) if finding.severity == "error"]
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from omnibench.live.wheels.wheel_input import WheelStep
 from omnibench.robot.calibration import Calibration
-from omnibench.robot.domain.training_domain import TrainingDomain, extrapolation_consequence
+from omnibench.robot.corrections import TrainingDomain, extrapolation_consequence
 from omnibench.robot.kinematics import Array
 
 LOG = logging.getLogger("omnibench.live")

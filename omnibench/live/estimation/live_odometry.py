@@ -25,9 +25,8 @@ import numpy as np
 from omnibench.live.estimation.robot_centre import RobotCentre, carried
 from omnibench.live.wheels.wheel_input import WheelStep
 from omnibench.robot.calibration import Calibration, Noise
-from omnibench.robot.kinematics import Array
+from omnibench.robot.kinematics import Array, relative, unit_twist
 from omnibench.robot.odometry import Integration, OdometryStream
-from omnibench.robot.planar import relative, unit_twist
 
 LOG = logging.getLogger("omnibench.live")
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from omnibench.robot.kinematics import Array, Mount
-from omnibench.robot.planar import compose, relative
+from omnibench.robot.kinematics import Array, Mount, compose, relative
 
 
 class RobotCentre:

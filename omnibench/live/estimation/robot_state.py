@@ -21,8 +21,8 @@ from omnibench.live.wheels.joints import joints_of
 from omnibench.live.wheels.steering_input import SteeringInput
 from omnibench.live.wheels.wheel_input import WheelInput, WheelSettings
 from omnibench.robot.calibration import Calibration
-from omnibench.robot.wheels.drive import CarDrive
-from omnibench.robot.wheels.joint_choice import JointChoice
+from omnibench.robot.joint_choice import JointChoice
+from omnibench.robot.kinematics import CarDrive
 
 
 class PublishedStamps:

@@ -21,8 +21,7 @@ from omnibench.live.estimation.live_odometry import Motion
 from omnibench.live.fusion.pose_filter import PoseFilter, innovation_of
 from omnibench.live.fusion.reference_correction import of_centre, turned
 from omnibench.live.fusion.timeline import Entry, PoseMeasurement, Timeline
-from omnibench.robot.kinematics import Array
-from omnibench.robot.planar import compose, relative
+from omnibench.robot.kinematics import Array, compose, relative
 
 # Covariance of odometry's error from one rejected pose to another, m, rad; chosen.
 _DRIFT = np.diag([0.1**2, 0.1**2, 0.1**2])

@@ -13,8 +13,7 @@ from omnibench.live.fusion.pose_fusion import FusionSettings
 from omnibench.live.fusion.timeline import PoseMeasurement
 from omnibench.live.wire.messages import POSE_ESTIMATE, MessageError, PoseEstimate, arrival_stamp
 from omnibench.robot.calibration import Calibration
-from omnibench.robot.kinematics import Array
-from omnibench.robot.planar import pose_covariance, usable_covariances
+from omnibench.robot.kinematics import Array, pose_covariance, usable_covariances
 
 LOG = logging.getLogger("omnibench.live")
 _FARTHEST = 1e7  # m; chosen: no robot drives as far from its map's origin

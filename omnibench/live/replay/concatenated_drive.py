@@ -22,9 +22,8 @@ from omnibench.data.true_poses import TruePath
 from omnibench.errors import ConfigError, DataError
 from omnibench.progress import Reporter, no_progress
 from omnibench.registry import load_plugins
-from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.kinematics import Array, Robot, compose, moved_to, relative, rotation
 from omnibench.robot.odometry import WheelLog
-from omnibench.robot.planar import compose, moved_to, relative, rotation
 from omnibench.simulate.flower import true_steering
 from omnibench.simulate.source import read_simulation
 from omnibench.simulate.truth import TruthRecord

@@ -32,9 +32,8 @@ from omnibench.live.wire.subscriber import Subscription, subscribe
 from omnibench.live.wire.topics import GraphNode
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.robot.calibration import Calibration, read_calibration
-from omnibench.robot.kinematics import Array
+from omnibench.robot.kinematics import Array, interpolated, moved_to
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.planar import interpolated, moved_to
 from omnibench.words import plural
 
 _LAST_MESSAGES = 5.0  # s without any of the messages under way after which they count as lost; chosen

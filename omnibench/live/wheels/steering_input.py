@@ -10,8 +10,8 @@ import numpy as np
 
 from omnibench.live.estimation.counts import Counts
 from omnibench.live.wire.messages import JointState, MessageError
+from omnibench.robot.joint_choice import JointChoice
 from omnibench.robot.kinematics import Array
-from omnibench.robot.wheels.joint_choice import JointChoice
 
 REORDERED: Final = 0.2  # s; a message that is late by less is out of order, or the clock was set back a little; chosen
 _SECOND = 1e9  # ns

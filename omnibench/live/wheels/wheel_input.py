@@ -16,9 +16,8 @@ from omnibench.live.estimation.counts import Counts
 from omnibench.live.wheels.steering_input import REORDERED, SteeringInput
 from omnibench.live.wheels.wheel_angles import WheelAngles
 from omnibench.live.wire.messages import JointState, MessageError
-from omnibench.robot.kinematics import Array
-from omnibench.robot.wheels.drive import FASTEST, FASTEST_RIM, fastest_rates
-from omnibench.robot.wheels.joint_choice import JointChoice
+from omnibench.robot.joint_choice import JointChoice
+from omnibench.robot.kinematics import FASTEST, FASTEST_RIM, Array, fastest_rates
 
 _SECOND = 1e9  # ns
 _CONFIRMATION = 3  # stamps in a row that confirm a new time of the sender's clock (chosen, as all here)

@@ -12,8 +12,7 @@ from typing import Any, Final
 from omnibench.live.frames import Frames
 from omnibench.live.wire.messages import ODOMETRY, TRANSFORMS, MessageType, Odometry, Transform
 from omnibench.live.wire.robot_messages import OdometryEncoder, TransformsEncoder
-from omnibench.robot.kinematics import Array
-from omnibench.robot.planar import correction
+from omnibench.robot.kinematics import Array, correction
 
 
 @dataclass(frozen=True, slots=True, eq=False)

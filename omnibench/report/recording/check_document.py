@@ -9,7 +9,7 @@ import numpy as np
 from omnibench.data.checks.finding import Finding
 from omnibench.data.clock_matching import ClockMatch
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.fit.check.result import CheckReport
+from omnibench.fit.check.checking import CheckReport
 from omnibench.report.blocks import (
     Block,
     Code,

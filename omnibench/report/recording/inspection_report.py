@@ -12,8 +12,8 @@ import numpy as np
 
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.fit.check.missing_motions import SHARE, motion_kinds, turning
+from omnibench.fit.identifiability import UNTOLD
 from omnibench.fit.inspect import Inspection
-from omnibench.fit.uncertainty.identifiability import UNTOLD
 from omnibench.report.blocks import (
     Callout,
     Cell,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
+from omnibench.fit.identifiability import ROWS, UNTOLD
 from omnibench.fit.inspect import Inspection
-from omnibench.fit.uncertainty.identifiability import ROWS, UNTOLD
 from omnibench.report.blocks import Column, Row, Table
 from omnibench.report.numbers import NOTHING, fixed, significant, with_unit
 

@@ -25,9 +25,8 @@ from omnibench.report.recording.scan_points import (
 )
 from omnibench.report.robot_figures import is_placed
 from omnibench.report.style import INK
-from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.kinematics import Array, Robot, compose, interpolated, placed
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.planar import compose, interpolated, placed
 
 _FRAMES = 240  # frames drawn of a run (chosen: steps of the slider that can be told apart)
 _MEAN_OVER = 0.1  # s; wheel rates are means over this time before each frame

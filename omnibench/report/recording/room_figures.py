@@ -25,9 +25,8 @@ from omnibench.report.recording.scan_points import (
 )
 from omnibench.report.style import plan
 from omnibench.report.traces import START, joined, line, marks, path
-from omnibench.robot.kinematics import Array
+from omnibench.robot.kinematics import Array, placed, seen_from
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.planar import placed, seen_from
 from omnibench.words import plural
 
 # How much one figure draws (chosen: more cannot be told apart on a screen).

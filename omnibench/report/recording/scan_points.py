@@ -8,8 +8,7 @@ from omnibench.data.dataset import Trajectory
 from omnibench.data.scans import Scanner, TrajectoryScans
 from omnibench.report.blocks import LegendItem
 from omnibench.report.style import INK, PALETTE, REFERENCE, THEORETICAL
-from omnibench.robot.kinematics import Array
-from omnibench.robot.planar import compose, interpolated
+from omnibench.robot.kinematics import Array, compose, interpolated
 
 SCANS, TRUTH, COVARIANCE, PLAN = "#7c8894", INK, PALETTE[0], "#b8977e"
 

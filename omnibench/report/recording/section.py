@@ -38,9 +38,8 @@ from omnibench.report.recording.slam_tables import accuracy_tiles, bias_table, e
 from omnibench.report.recording.wheel_figures import wheel_rates
 from omnibench.report.style import INK, PALETTE, QUIET, plot
 from omnibench.report.traces import coordinates, joined, line
-from omnibench.robot.kinematics import Array
+from omnibench.robot.kinematics import Array, placed, seen_from
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.planar import placed, seen_from
 from omnibench.slam.accuracy import RunErrors, SlamAccuracy, run_errors, slam_accuracy
 from omnibench.words import plural
 

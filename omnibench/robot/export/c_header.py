@@ -8,8 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from omnibench.robot.calibration import Calibration
-from omnibench.robot.kinematics import Array
-from omnibench.robot.wheels.drive import CarDrive, Drive
+from omnibench.robot.kinematics import Array, CarDrive, Drive
 
 
 def definitions(upper: str, drive: Drive) -> str:

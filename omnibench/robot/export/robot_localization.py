@@ -14,15 +14,17 @@ import numpy as np
 
 from omnibench.errors import ConfigError, one_line
 from omnibench.robot.calibration import Calibration
-from omnibench.robot.export.controller import Parameter, covariance_parameters, to_node
-from omnibench.robot.export.odometry_noise import (
+from omnibench.robot.export.ros2_controllers import (
+    Parameter,
+    RemainingError,
+    controller,
+    covariance_parameters,
     interval_in_words,
     matrix_deviations,
     pose_variances,
+    to_node,
     twist_variances,
 )
-from omnibench.robot.export.remaining import RemainingError
-from omnibench.robot.export.ros2_controllers import controller
 from omnibench.robot.kinematics import Array, Mount
 
 # m2/s and rad2/s, then as often per s2 and s4: x, y, z, roll, pitch, yaw, their velocities, accelerations. The

@@ -12,8 +12,7 @@ from omnibench.config import Model, NonNegative, Positive
 from omnibench.data.scans import Mount, Scanner, TrajectoryScans
 from omnibench.data.true_poses import TruePath
 from omnibench.errors import DataError
-from omnibench.robot.kinematics import Array
-from omnibench.robot.planar import compose
+from omnibench.robot.kinematics import Array, compose
 from omnibench.simulate.chain.floor_plan import FloorPlan
 
 _SHORTEST_PERIOD = 0.001  # s between scans; a shorter one is a mistake of units

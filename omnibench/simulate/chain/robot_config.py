@@ -12,8 +12,7 @@ import numpy as np
 from pydantic import Field, FiniteFloat, field_validator, model_validator
 
 from omnibench.config import Model, Positive
-from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.robot_class import class_of
+from omnibench.robot.kinematics import Array, Robot, class_of
 from omnibench.simulate.chain.floor_plan import RoomPlan
 from omnibench.simulate.chain.lidar import Lidar
 from omnibench.simulate.chain.motion_commands import CommandLink, MotionProfile

@@ -13,11 +13,9 @@ from omnibench.data.scans import ScansInMemory, TrajectoryScans
 from omnibench.data.true_poses import TruePath
 from omnibench.errors import DataError
 from omnibench.progress import Progress, Reporter, no_progress
-from omnibench.robot.kinematics import Array, Mount
+from omnibench.robot.kinematics import Array, Mount, compose, placed, seen_from
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.odometry import WheelLog
-from omnibench.robot.path import Path
-from omnibench.robot.planar import compose, placed, seen_from
+from omnibench.robot.odometry import Path, WheelLog
 from omnibench.simulate.chain.floor_plan import FloorPlan, make_plan
 from omnibench.simulate.chain.lidar import measure_scans, scan_stamps
 from omnibench.simulate.chain.motion_commands import CommandedMotion, command_motion, target_rates

@@ -13,8 +13,7 @@ import numpy as np
 import small_gicp
 from numpy.typing import NDArray
 
-from omnibench.robot.kinematics import Array
-from omnibench.robot.planar import rotation
+from omnibench.robot.kinematics import Array, rotation
 from omnibench.slam.matching.lines import Lines
 
 # The study tests/studies/constants_slam.py varies these numbers by 0.5 and 2. In three rooms SLAM's median error

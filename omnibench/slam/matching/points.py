@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.scans import Ranges, Scanner
-from omnibench.robot.kinematics import Array
-from omnibench.robot.planar import rotated
+from omnibench.robot.kinematics import Array, rotated
 from omnibench.slam.matching.lines import Lines, fit_lines
 from omnibench.slam.motion_within_scan import MotionWithinScan
 

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from omnibench.robot.kinematics import Array
-from omnibench.robot.planar import rotation
+from omnibench.robot.kinematics import Array, rotation
 from omnibench.slam.matching.map import ScanMap
 from omnibench.slam.matching.points import ScanPoints
 from omnibench.slam.slam_options import SlamOptions

@@ -15,7 +15,7 @@ from omnibench.compare.plan import load_datasets
 from omnibench.compare.result import ComparisonResult
 from omnibench.data.dataset import Trajectory, make_dataset
 from omnibench.data.references.run_references import Reference, References
-from omnibench.fit.uncertainty.ratio_intervals import Interval
+from omnibench.fit.ratio_intervals import Interval
 from omnibench.robot.kinematics import Robot
 
 

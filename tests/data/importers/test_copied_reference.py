@@ -8,8 +8,7 @@ from sample_robots import APR_02, WHEELED
 
 from omnibench.data.dataset import Trajectory, make_dataset
 from omnibench.data.importers.copied_reference import follows_the_wheels
-from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.wheels.drive import CarDrive
+from omnibench.robot.kinematics import Array, CarDrive, Robot
 
 PERIOD, SAMPLES = 0.02, 3000  # s: a minute of driving
 EVERY = 3  # samples from one reference pose to the next

@@ -26,10 +26,9 @@ from bag_samples import (
 )
 
 from omnibench.errors import ConfigError, DataError
-from omnibench.robot.kinematics import Array
+from omnibench.robot.kinematics import Array, compose, relative
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, WheelLog
-from omnibench.robot.planar import compose, relative
 
 WHEELS_ONLY = [each for each in messages(DRIVE) if each.topic == WHEELS]
 OWN = "is the robot's own odometry: .* --set pose_topic=NAME of an independent reference"

@@ -18,7 +18,7 @@ from wheeled_samples import CAR, DIFF, SWERVE, driven
 
 import omnibench.data.stored.periods as periods
 import omnibench.data.stored.stored_wheels as stored_wheels
-import omnibench.robot.stored.odometry_of_stored as odometry_of_stored
+import omnibench.robot.stored_odometry as odometry_of_stored
 from omnibench.data.dataset import Dataset
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.data.stored.dataset_folders import in_few_words
@@ -26,9 +26,8 @@ from omnibench.data.stored.drawn_runs import drawn_runs, in_memory
 from omnibench.data.stored.periods import median_period
 from omnibench.data.stored.stored_rows import StoredRows
 from omnibench.errors import DataError
-from omnibench.fit.bounds.lower_bound import LowerBounds
 from omnibench.fit.calibrate import calibrate
-from omnibench.fit.certify import certify_optimum
+from omnibench.fit.certify import LowerBounds, certify_optimum
 from omnibench.fit.check.checking import check
 from omnibench.fit.evaluate import evaluate
 from omnibench.fit.inspect import inspect_dataset

@@ -17,7 +17,7 @@ from omnibench.discover.experiments.experiments import description_of
 from omnibench.discover.experiments.run_choice import Choice
 from omnibench.discover.fitting.extend import fit_matrix
 from omnibench.discover.fitting.model_fit import Fit
-from omnibench.fit.least_squares.usable_runs import usable_runs
+from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.registry import effects
 from omnibench.robot.kinematics import Robot
 from omnibench.simulate.config import FlowerConfig

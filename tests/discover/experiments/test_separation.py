@@ -10,7 +10,7 @@ import pytest
 from omnibench.discover.experiments.run_choice import choose_runs
 from omnibench.discover.experiments.separation import Members, Separation
 from omnibench.discover.selection.evidence import DISCREPANCY, log_evidence
-from omnibench.fit.least_squares.whitened import Whitened
+from omnibench.fit.trajectory_fit import Whitened
 from omnibench.robot.kinematics import Array
 
 # One column that is fitted in any case, and one for each of three effects, which look alike in the recorded runs.

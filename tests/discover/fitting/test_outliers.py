@@ -16,8 +16,8 @@ from omnibench.discover.fitting.extend import Extended, extend, fit_matrix
 from omnibench.discover.fitting.model_fit import Fit, with_noise
 from omnibench.discover.fitting.outliers import InlierWhitener, inliers_of
 from omnibench.discover.regressors.column_group import Group
-from omnibench.fit.least_squares.noise import Whitener
-from omnibench.fit.least_squares.usable_runs import usable_runs
+from omnibench.fit.noise import Whitener
+from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.registry import effects
 from omnibench.robot.calibration import Noise
 

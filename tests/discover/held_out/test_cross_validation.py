@@ -20,7 +20,7 @@ from omnibench.discover.held_out.cross_validation import (
     random_folds_of_repetitions,
     values_of_other_folds,
 )
-from omnibench.fit.least_squares.whitened import Whitened
+from omnibench.fit.trajectory_fit import Whitened
 
 
 def runs_of(*commands: str | None, session: str = "s1") -> list[Trajectory]:

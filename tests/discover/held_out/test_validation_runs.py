@@ -9,7 +9,7 @@ from discovery_samples import simulated
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.fitting.extend import fit_matrix
 from omnibench.discover.held_out.validation_runs import validation_runs
-from omnibench.fit.least_squares.usable_runs import usable_runs
+from omnibench.fit.trajectory_fit import usable_runs
 
 
 def test_validation_runs_that_all_stand_are_left_out_with_a_warning() -> None:

@@ -14,7 +14,7 @@ from omnibench.discover.fitting.extend import fit_matrix
 from omnibench.discover.fitting.model_fit import Fit, paths_of
 from omnibench.discover.regressors.fine_structure import fine_structure
 from omnibench.discover.regressors.significance import Significance
-from omnibench.fit.least_squares.usable_runs import usable_runs
+from omnibench.fit.trajectory_fit import usable_runs
 
 CHANCE = 0.002
 

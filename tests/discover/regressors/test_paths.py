@@ -12,10 +12,9 @@ from omnibench.config import validate
 from omnibench.discover.fitting.extend import fit_matrix
 from omnibench.discover.fitting.model_fit import Fit, paths_of
 from omnibench.discover.regressors.effect_slopes import slopes_by
-from omnibench.fit.least_squares.usable_runs import usable_runs
+from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.registry import effects
-from omnibench.robot.effects.effect import ActuatorEffect
-from omnibench.robot.effects.term import make_term
+from omnibench.robot.effects.effect import ActuatorEffect, make_term
 from omnibench.robot.model import OdometryModel
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.simulate import simulate_dataset

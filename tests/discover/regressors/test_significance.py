@@ -9,7 +9,7 @@ from screening_samples import FIRST, SECOND, THIRD, screening
 
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.regressors.significance import Family, Significance, significance_of, together
-from omnibench.fit.least_squares.whitened import Whitened
+from omnibench.fit.trajectory_fit import Whitened
 
 GROUPS = tuple(Group("covariate", f"group {start}", tuple(range(start, start + 2))) for start in range(2, 22, 2))
 

@@ -13,7 +13,7 @@ from omnibench.discover.fitting.model_fit import Fit
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.selection.averaged_model import averaged
 from omnibench.discover.selection.screening import screen_plain
-from omnibench.fit.least_squares.usable_runs import usable_runs
+from omnibench.fit.trajectory_fit import usable_runs
 
 RIGHT, WRONG = "rotation_translation_coupling", "acceleration_slip"
 

@@ -14,7 +14,7 @@ from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.selection.competing_models import CompetingModels, competing_models
 from omnibench.discover.selection.model_selection import Selection, select_effects
 from omnibench.discover.selection.screening import screen_plain
-from omnibench.fit.least_squares.usable_runs import usable_runs
+from omnibench.fit.trajectory_fit import usable_runs
 
 Fitted = tuple[Fit, Selection, dict[str, Group]]
 RIGHT, WRONG = "rotation_translation_coupling", "acceleration_slip"

@@ -12,7 +12,7 @@ from omnibench.discover.selection.candidate_groups import Missing
 from omnibench.discover.selection.detectability import detectability_of
 from omnibench.discover.selection.model_selection import select_effects
 from omnibench.discover.selection.screening import Screening, screen_again, screen_extended, screen_plain
-from omnibench.fit.least_squares.usable_runs import usable_runs
+from omnibench.fit.trajectory_fit import usable_runs
 
 LEFT_OUT = ("heading_drift",)
 

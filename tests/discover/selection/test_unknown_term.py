@@ -20,8 +20,8 @@ from omnibench.discover.selection.competing_models import CompetingModels
 from omnibench.discover.selection.model_selection import Selection, select_effects
 from omnibench.discover.selection.screening import Screening, screen_plain
 from omnibench.discover.selection.unknown_term import add_smooth_terms, chosen_functions
-from omnibench.fit.least_squares.noise import Whitener
-from omnibench.fit.least_squares.usable_runs import usable_runs
+from omnibench.fit.noise import Whitener
+from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.registry import effects
 from omnibench.robot.calibration import Calibration, read_calibration, write_calibration
 

@@ -11,11 +11,9 @@ import pytest
 from fit_samples import box_between, make_problem, noisy_trajectories
 
 from omnibench.data.dataset import Trajectory
-from omnibench.fit.bounds.lower_bound import LowerBounds, into_unit_ball, least_sum_of_norms
-from omnibench.fit.bounds.stamp_sums import StampSums
-from omnibench.fit.certify import prove
+from omnibench.fit.certify import LowerBounds, StampSums, into_unit_ball, least_sum_of_norms, prove
 from omnibench.fit.cost import SumOfNorms
-from omnibench.fit.evaluator.element_box import ElementBox
+from omnibench.fit.evaluator import ElementBox
 from omnibench.fit.parameterisation import Box
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options

@@ -17,7 +17,7 @@ from omnibench.data.dataset import Trajectory
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.calibrator import Outcome, RunResult, model_of_answer, run_calibrator
 from omnibench.fit.evaluate import final_errors
-from omnibench.fit.shrinkage.physical_prior import physical_prior_root, physical_tolerance
+from omnibench.fit.prior import physical_prior_root, physical_tolerance
 from omnibench.registry import calibrators
 from omnibench.robot.kinematics import Array, Mount, Robot
 from omnibench.robot.model import OdometryModel

@@ -22,10 +22,9 @@ from omnibench.fit.calibrate import CalibrationRun, calibrate
 from omnibench.fit.calibrator import Outcome, run_calibrator
 from omnibench.fit.certify import certify_optimum
 from omnibench.fit.evaluate import evaluate, final_errors
-from omnibench.fit.least_squares.usable_runs import usable_runs
-from omnibench.fit.loss.losses import LossName
-from omnibench.fit.loss.robust_cost import RobustCost, with_loss
+from omnibench.fit.loss import LossName, RobustCost, with_loss
 from omnibench.fit.problem import Budget
+from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.registry import calibrators, costs, load_plugin_file
 from omnibench.robot.calibration import read_calibration, write_calibration
 from omnibench.robot.kinematics import Robot

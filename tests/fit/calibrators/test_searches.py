@@ -16,7 +16,7 @@ from omnibench.fit.calibrator import Outcome, RunResult, run_calibrator
 from omnibench.fit.geometry import GeometryLimits
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import calibrators
-from omnibench.robot.published_matrices import published_matrix
+from omnibench.robot.kinematics import published_matrix
 from omnibench.testing.synthetic import synthetic_robot, synthetic_trajectories, true_robot
 
 RUNS = noisy_trajectories()

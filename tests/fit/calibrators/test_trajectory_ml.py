@@ -13,12 +13,11 @@ from omnibench.data.dataset import Trajectory
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import Outcome, RunResult, run_calibrator
 from omnibench.fit.calibrators.trajectory_ml import TrajectoryML, TrajectoryMLOptions
-from omnibench.fit.least_squares.nuisances import TURN
 from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
+from omnibench.fit.trajectory_fit import TURN
 from omnibench.registry import calibrators, costs
-from omnibench.robot.kinematics import Array
-from omnibench.robot.published_matrices import published_matrix
+from omnibench.robot.kinematics import Array, published_matrix
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.simulate import simulate_dataset
 

@@ -11,10 +11,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from omnibench.data.dataset import Trajectory
-from omnibench.fit.evaluator.element_box import ElementBox
-from omnibench.fit.evaluator.evaluator import PoseEvaluator, make_evaluator
-from omnibench.fit.evaluator.expansion_plan import Basis, degree_for
-from omnibench.fit.evaluator.impulses import cut, impulses, make_path, quadrature
+from omnibench.fit.evaluator import (
+    Basis,
+    ElementBox,
+    PoseEvaluator,
+    cut,
+    degree_for,
+    impulses,
+    make_evaluator,
+    make_path,
+    quadrature,
+)
 from omnibench.fit.geometry import GeometryLimits
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import calibrators, costs

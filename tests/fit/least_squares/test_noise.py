@@ -12,8 +12,14 @@ from numpy.testing import assert_allclose
 
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
-from omnibench.fit.least_squares.noise import Whitener, covariance_of_sums, estimate_noise
-from omnibench.fit.least_squares.repetitions import Difference, Differences, differences_between_repetitions
+from omnibench.fit.noise import (
+    Difference,
+    Differences,
+    Whitener,
+    covariance_of_sums,
+    differences_between_repetitions,
+    estimate_noise,
+)
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 from omnibench.simulate.config import FlowerConfig

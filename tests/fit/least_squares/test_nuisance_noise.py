@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from omnibench.data.dataset import Trajectory
-from omnibench.fit.least_squares.nuisance_noise import SeparateNoise, separate_nuisances
-from omnibench.fit.least_squares.nuisances import TURN
-from omnibench.fit.least_squares.repetitions import Differences, differences_between_repetitions
+from omnibench.fit.noise import Differences, differences_between_repetitions
+from omnibench.fit.trajectory_fit import TURN, SeparateNoise, separate_nuisances
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from omnibench.data.dataset import Trajectory
-from omnibench.fit.least_squares.repetitions import repeating_runs, repetitions_of_commands
+from omnibench.fit.noise import repeating_runs, repetitions_of_commands
 
 Split = Literal["train", "validation"]
 

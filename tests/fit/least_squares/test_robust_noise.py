@@ -10,11 +10,11 @@ from fit_samples import make_problem, noisy_trajectories
 from hypothesis import given
 from hypothesis import strategies as st
 
-from omnibench.fit.least_squares.gauss_newton import first_fit
-from omnibench.fit.least_squares.noise import ExtraVariance, Whitener
-from omnibench.fit.least_squares.robust_noise import robust_noise
-from omnibench.fit.least_squares.trajectory_fit import TrajectoryFit
-from omnibench.fit.loss.losses import LossName
+from omnibench.fit.calibrators.trajectory_ml import robust_noise
+from omnibench.fit.gauss_newton import first_fit
+from omnibench.fit.loss import LossName
+from omnibench.fit.noise import ExtraVariance, Whitener
+from omnibench.fit.trajectory_fit import TrajectoryFit
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 

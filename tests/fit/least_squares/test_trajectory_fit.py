@@ -8,10 +8,10 @@ from fit_samples import make_problem
 from hypothesis import given
 from hypothesis import strategies as st
 
-from omnibench.fit.least_squares.gauss_newton import BoxedFit, bounded_step, first_fit
-from omnibench.fit.least_squares.noise import whiteners
-from omnibench.fit.least_squares.nuisances import OFFSET, SLOPE, TURN, Nuisances
-from omnibench.fit.loss.cost_weights import cost_weightings
+from omnibench.fit.gauss_newton import BoxedFit, bounded_step, first_fit
+from omnibench.fit.loss import cost_weightings
+from omnibench.fit.noise import whiteners
+from omnibench.fit.trajectory_fit import OFFSET, SLOPE, TURN, Nuisances
 from omnibench.registry import costs
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array

@@ -10,8 +10,7 @@ from discovery_samples import simulated
 
 from omnibench.discover.fitting.extend import fit_matrix
 from omnibench.errors import DataError
-from omnibench.fit.least_squares.nuisances import log_of
-from omnibench.fit.least_squares.usable_runs import usable_runs
+from omnibench.fit.trajectory_fit import log_of, usable_runs
 
 
 def fit_of(runs, dataset):

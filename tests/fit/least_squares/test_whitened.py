@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given as cases
 from hypothesis import strategies as st
 
-from omnibench.fit.least_squares.noise import whiteners
-from omnibench.fit.least_squares.whitened import given, whitened
+from omnibench.fit.noise import whiteners
+from omnibench.fit.trajectory_fit import given, whitened
 from omnibench.robot.calibration import Noise
 
 NOISE = Noise(pose_position=0.01, pose_heading=0.02, walk_position=0.005, walk_heading=0.01, bias_position=0.02)

@@ -9,8 +9,7 @@ import pytest
 from fit_samples import noisy_trajectories
 
 from omnibench.data.dataset import Trajectory
-from omnibench.fit.loss.end_poses import with_ends_from_others
-from omnibench.fit.loss.losses import Huber
+from omnibench.fit.loss import Huber, with_ends_from_others
 from omnibench.testing.synthetic import synthetic_robot
 
 ROBOT = synthetic_robot(3)

@@ -7,7 +7,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from omnibench.fit.loss.sum_of_norms import SolverError, SumOfNormsProgram
+from omnibench.fit.sum_of_norms import SolverError, SumOfNormsProgram
 from omnibench.robot.kinematics import Array
 
 

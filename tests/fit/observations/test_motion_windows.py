@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from omnibench.data.dataset import Trajectory
-from omnibench.fit.observations.motion_windows import MotionWindows, motions_in_windows
+from omnibench.fit.motion_windows import MotionWindows, motions_in_windows
 
 RADIUS, TURN = 2.0, 0.5  # m, rad/s
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from sample_robots import APR_02
 
-import omnibench.robot.stored.odometry_of_stored as odometry_of_stored
+import omnibench.robot.stored_odometry as odometry_of_stored
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.references.run_references import Reference, References
 from omnibench.data.storage import load_dataset, save_dataset
@@ -19,11 +19,10 @@ from omnibench.fit.calibrate import calibrate
 from omnibench.fit.certify import certify_optimum
 from omnibench.fit.evaluate import evaluate
 from omnibench.fit.inspect import inspect_dataset
-from omnibench.fit.observations.reference_batch import ReferenceBatch
-from omnibench.fit.observations.reference_fit import ReferenceFit
-from omnibench.fit.observations.reference_rows import reference_rows
+from omnibench.fit.reference_fit import ReferenceFit
+from omnibench.fit.reference_rows import ReferenceBatch, reference_rows
 from omnibench.robot.odometry import Integration
-from omnibench.robot.stored.odometry_of_stored import StoredOdometry
+from omnibench.robot.stored_odometry import StoredOdometry
 
 STUDY = Path(__file__).parents[2] / "studies"
 TIMES = 0.1 * np.arange(1, 101)

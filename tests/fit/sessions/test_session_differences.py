@@ -9,7 +9,7 @@ from hidden.session_sets import session_set
 from session_study import answer, cases, print_table
 
 from omnibench.data.dataset import Dataset
-from omnibench.fit.sessions.session_differences import SessionComparison, compare_sessions
+from omnibench.fit.sessions import SessionComparison, compare_sessions
 from omnibench.robot.model import OdometryModel
 
 

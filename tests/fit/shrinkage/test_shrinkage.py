@@ -17,7 +17,7 @@ from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrate import CalibrationRun, calibrate
 from omnibench.fit.certify import certify_optimum
-from omnibench.fit.shrinkage.prior import TOLERANCES, default_mount, default_unidentified, prior_root, tolerance_of
+from omnibench.fit.prior import TOLERANCES, default_mount, default_unidentified, prior_root, tolerance_of
 from omnibench.robot.kinematics import Array
 from omnibench.testing.synthetic import synthetic_robot
 

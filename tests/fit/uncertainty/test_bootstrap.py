@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from omnibench.errors import ConfigError
+from omnibench.fit.bootstrap import bootstrap_intervals
 from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.calibrators.closed_form import cone_program
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
-from omnibench.fit.uncertainty.bootstrap import bootstrap_intervals
 from omnibench.registry import calibrators, costs
 from omnibench.simulate.simulate import simulate_dataset
 from omnibench.simulate.source import read_simulation

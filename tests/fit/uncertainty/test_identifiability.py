@@ -14,11 +14,16 @@ from omnibench.data.dataset import Dataset
 from omnibench.errors import DataError
 from omnibench.fit.calibrators.closed_form import linear_start
 from omnibench.fit.geometry import WheelGeometry
+from omnibench.fit.identifiability import (
+    Identifiability,
+    deviations_along,
+    identifiability,
+    identified_parameters,
+    known_slopes,
+    warnings_of_calibration,
+)
 from omnibench.fit.inspect import inspect_dataset
 from omnibench.fit.span import aligned, driven_span, unidentified_directions
-from omnibench.fit.uncertainty.identifiability import Identifiability, deviations_along, identifiability
-from omnibench.fit.uncertainty.physical import identified_parameters, known_slopes
-from omnibench.fit.uncertainty.unidentified import warnings_of_calibration
 from omnibench.testing.synthetic import synthetic_robot
 
 ROBOT = synthetic_robot()

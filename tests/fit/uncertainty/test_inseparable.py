@@ -8,8 +8,8 @@ from wheeled_samples import CAR, DIFF, driven
 
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.geometry import WheelGeometry
+from omnibench.fit.identifiability import identified_parameters, inseparable_in_words, inseparable_parameters
 from omnibench.fit.problem import Budget
-from omnibench.fit.uncertainty.physical import identified_parameters, inseparable_in_words, inseparable_parameters
 from omnibench.robot.kinematics import Robot
 
 KNOWN = np.empty((0, 2))  # no direction of wheel rates is unknown

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from omnibench.fit.uncertainty.intervals import EstimatedCovariance
+from omnibench.fit.information import EstimatedCovariance
 
 MATRIX = np.array([[4.0, 1.0], [1.0, 9.0]])
 

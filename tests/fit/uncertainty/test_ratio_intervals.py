@@ -13,7 +13,7 @@ import pytest
 from fit_samples import noisy_trajectories
 from scipy import stats
 
-from omnibench.fit.uncertainty.ratio_intervals import Bootstrap, RatioIntervals, Units, units_of
+from omnibench.fit.ratio_intervals import Bootstrap, RatioIntervals, Units, units_of
 
 STUDIES = Path(__file__).parents[2] / "studies"
 BOOTSTRAP = Bootstrap(resamples=2000, seed=1)

@@ -9,8 +9,8 @@ import pytest
 
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
-from omnibench.fit.uncertainty.intervals import EstimatedCovariance
-from omnibench.fit.uncertainty.sandwich import Scores, sandwich, scores_of_runs
+from omnibench.fit.information import EstimatedCovariance
+from omnibench.fit.sandwich import Scores, sandwich, scores_of_runs
 from omnibench.registry import costs
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array

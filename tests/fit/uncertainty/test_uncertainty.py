@@ -17,14 +17,14 @@ from motions import FLOWER, RING, driven
 
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
+from omnibench.fit.bootstrap import bootstrap_intervals
 from omnibench.fit.calibrator import RunResult, run_calibrator
 from omnibench.fit.geometry import WheelGeometry
+from omnibench.fit.identifiability import geometry_of, identified_parameters
+from omnibench.fit.information import information_of_run, information_of_runs
 from omnibench.fit.parameterisation import ExplicitBox
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
-from omnibench.fit.uncertainty.bootstrap import bootstrap_intervals
-from omnibench.fit.uncertainty.information import information_of_run, information_of_runs
-from omnibench.fit.uncertainty.physical import geometry_of, identified_parameters
-from omnibench.fit.uncertainty.uncertainty import NoCovarianceError, Uncertainty, uncertainty_of
+from omnibench.fit.uncertainty import NoCovarianceError, Uncertainty, uncertainty_of
 from omnibench.registry import calibrators, costs
 from omnibench.robot.calibration import Noise, matrix_rows
 from omnibench.robot.kinematics import Array, inverse_kinematic_matrices

@@ -12,7 +12,7 @@ from omnibench.live.control.orders import LONGEST
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.wire.outputs import Update
 from omnibench.robot.calibration import Calibration, parse_calibration
-from omnibench.robot.effects.weights import MOST_BYTES, encode_weights
+from omnibench.robot.effects.effect import MOST_BYTES, encode_weights
 from omnibench.testing.synthetic import synthetic_robot
 
 DRIVEN = [[20.0, 0.0, 0.0]]  # m/s, m/s, rad/s: so fast that all that is driven here is near to it

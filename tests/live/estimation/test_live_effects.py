@@ -32,9 +32,8 @@ from omnibench.live.wheels.wheel_input import WheelStep
 from omnibench.live.wire.messages import JOINT_STATE, JointState
 from omnibench.live.wire.outputs import Update
 from omnibench.robot.calibration import Calibration, EffectTerm, Noise, covariance_rows, matrix_rows, write_calibration
-from omnibench.robot.kinematics import Array
+from omnibench.robot.kinematics import Array, relative
 from omnibench.robot.odometry import Integration, WheelLog
-from omnibench.robot.planar import relative
 from omnibench.testing import synthetic_robot
 from omnibench.testing.synthetic import true_robot
 

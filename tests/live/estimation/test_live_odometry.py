@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from omnibench.live.estimation.live_odometry import LiveOdometry
 from omnibench.live.wheels.wheel_input import WheelStep
 from omnibench.robot.calibration import Calibration, Noise, Provenance
+from omnibench.robot.kinematics import rotation
 from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog
-from omnibench.robot.planar import rotation
 
 
 def driven(odometry: LiveOdometry, angles: np.ndarray, durations: np.ndarray) -> LiveOdometry:

@@ -19,9 +19,8 @@ from omnibench.live.wheels.wheel_input import WheelSettings
 from omnibench.live.wire.messages import JOINT_STATE
 from omnibench.live.wire.outputs import Update
 from omnibench.robot.calibration import Calibration, EffectTerm, Noise, covariance_rows, matrix_rows
-from omnibench.robot.kinematics import Array, Mount, Robot
+from omnibench.robot.kinematics import Array, Mount, Robot, compose, moved_to, relative
 from omnibench.robot.odometry import Integration, OdometryBatch
-from omnibench.robot.planar import compose, moved_to, relative
 
 MOUNT = Mount(x=0.3, y=-0.1, yaw=0.4)
 EFFECTS = (

@@ -10,8 +10,7 @@ from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.fusion.pose_fusion import FusionSettings
 from omnibench.live.wire.outputs import Update
 from omnibench.robot.calibration import Calibration, EffectTerm
-from omnibench.robot.kinematics import Array
-from omnibench.robot.planar import compose, moved_to
+from omnibench.robot.kinematics import Array, compose, moved_to
 
 LATE = EffectTerm(name="reference_time_offset", parameters={"tau": 0.12})
 

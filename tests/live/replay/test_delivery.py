@@ -29,7 +29,7 @@ from omnibench.live.replay.replay_player import Player
 from omnibench.live.wire.attachment import packed
 from omnibench.live.wire.messages import JOINT_STATE
 from omnibench.live.wire.topics import GraphNode, KeySpace
-from omnibench.robot.planar import relative
+from omnibench.robot.kinematics import relative
 
 LONG = concatenate_runs(random_dataset(7, 5, samples=2000), pause=0.1)  # 10,000 samples: many times the window
 PART = 1000  # messages that are played before the test does something

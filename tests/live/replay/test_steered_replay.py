@@ -17,8 +17,7 @@ from omnibench.live.replay.concatenated_drive import ConcatenatedDrive, concaten
 from omnibench.live.replay.replay_player import events
 from omnibench.live.wheels.wheel_input import WheelSettings
 from omnibench.live.wire.messages import JOINT_STATE, JointState
-from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.planar import moved_to
+from omnibench.robot.kinematics import Array, Robot, moved_to
 
 
 def played(drive: ConcatenatedDrive, names: tuple[str, ...] | None = None, **changes: Any) -> list[JointState]:

@@ -14,8 +14,16 @@ from hypothesis import strategies as st
 from sample_robots import APR_02
 
 from omnibench.registry import effects
-from omnibench.robot.effects.effect import ActuatorEffect, Effect, MotionEffect, Need, ReferenceEffect, Values
-from omnibench.robot.effects.term import Term, make_term
+from omnibench.robot.effects.effect import (
+    ActuatorEffect,
+    Effect,
+    MotionEffect,
+    Need,
+    ReferenceEffect,
+    Term,
+    Values,
+    make_term,
+)
 from omnibench.robot.kinematics import Array
 from omnibench.robot.signals import Signals, signals_of
 

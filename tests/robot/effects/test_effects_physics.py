@@ -13,8 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sample_robots import APR_02
 
-from omnibench.robot.effects.effect import Values
-from omnibench.robot.effects.term import Term
+from omnibench.robot.effects.effect import Term, Values
 from omnibench.robot.kinematics import Array, wheel_equations
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog

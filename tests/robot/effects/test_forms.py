@@ -11,9 +11,7 @@ from sample_robots import APR_02
 
 from omnibench.errors import UnknownNameError
 from omnibench.registry import effects
-from omnibench.robot.effects.effect import MotionEffect
-from omnibench.robot.effects.forms import Forms, correction_of, form_in_words, forms_of
-from omnibench.robot.effects.term import Term, make_term
+from omnibench.robot.effects.effect import Forms, MotionEffect, Term, correction_of, form_in_words, forms_of, make_term
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import WheelLog
 from omnibench.robot.signals import Signals, signals_of

@@ -15,9 +15,8 @@ from sample_robots import APR_02
 from omnibench.errors import DataError
 from omnibench.registry import effects
 from omnibench.robot.calibration import EffectTerm, extended_model, read_calibration, write_calibration
-from omnibench.robot.effects.learned.network import unpacked
-from omnibench.robot.effects.term import make_term
-from omnibench.robot.effects.weights import MOST_BYTES, decode_weights
+from omnibench.robot.effects.effect import MOST_BYTES, decode_weights, make_term
+from omnibench.robot.effects.learned import unpacked
 from omnibench.robot.export.c_header import c_header
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel

@@ -15,8 +15,7 @@ from sample_robots import APR_02
 
 from omnibench.registry import effects
 from omnibench.robot.calibration import Calibration, EffectTerm, matrix_rows, read_calibration, write_calibration
-from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect
-from omnibench.robot.effects.term import make_term
+from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect, make_term
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, advance
 from omnibench.robot.signals import Signals, signals_of

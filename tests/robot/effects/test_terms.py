@@ -13,8 +13,7 @@ from sample_robots import APR_02
 
 from omnibench.errors import DataError, OmnibenchError, UnknownNameError
 from omnibench.registry import effects
-from omnibench.robot.effects.effect import Effect
-from omnibench.robot.effects.term import make_term
+from omnibench.robot.effects.effect import Effect, make_term
 
 
 def test_a_term_keeps_its_parameters_in_the_given_order() -> None:

@@ -15,8 +15,7 @@ from sample_robots import APR_02, CAR, DIFFERENTIAL, MECANUM, SKID, SWERVE, TRIC
 
 from omnibench.errors import DataError
 from omnibench.registry import effects
-from omnibench.robot.effects.effect import MotionEffect, Values
-from omnibench.robot.effects.term import make_term
+from omnibench.robot.effects.effect import MotionEffect, Values, make_term
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog

@@ -14,9 +14,8 @@ from sample_robots import APR_02
 
 from omnibench.robot.calibration import Provenance, matrix_rows
 from omnibench.robot.export.formats import Export, export_calibration
-from omnibench.robot.kinematics import Array, Robot, Wheel
+from omnibench.robot.kinematics import Array, Robot, Wheel, published_matrix
 from omnibench.robot.odometry import Integration, OdometryStream
-from omnibench.robot.published_matrices import published_matrix
 
 COMPILER = shutil.which("cc") or shutil.which("gcc")
 needs_compiler = pytest.mark.skipif(COMPILER is None, reason="no C compiler (cc or gcc) on this machine")

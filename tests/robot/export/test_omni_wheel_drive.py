@@ -15,10 +15,8 @@ from scipy.optimize import minimize
 from omnibench.errors import ConfigError
 from omnibench.robot.calibration import Calibration, Noise, matrix_rows
 from omnibench.robot.export.formats import EXPORT_FORMATS, Export, export_calibration
-from omnibench.robot.export.omni_wheel_drive import OmniWheelDrive, closest_omni_wheel_drive
-from omnibench.robot.export.remaining import remaining_error
-from omnibench.robot.kinematics import Array, Robot, Wheel
-from omnibench.robot.published_matrices import published_matrix
+from omnibench.robot.export.ros2_controllers import OmniWheelDrive, closest_omni_wheel_drive, remaining_error
+from omnibench.robot.kinematics import Array, Robot, Wheel, published_matrix
 
 
 def robot(*angles_deg: float, radius: float = 0.148, distance: float = 0.195) -> Robot:

@@ -12,7 +12,7 @@ from sample_robots import APR_02
 from omnibench.errors import ConfigError
 from omnibench.robot.calibration import covariance_rows
 from omnibench.robot.export.formats import export_calibration
-from omnibench.robot.export.odometry_noise import matrix_deviations
+from omnibench.robot.export.ros2_controllers import matrix_deviations
 from omnibench.robot.kinematics import Array, Mount, Robot
 
 _PLANAR = [0, 1, 5, 6, 7, 11]  # x, y, yaw, vx, vy, vyaw of the filter's 15 states

@@ -35,7 +35,7 @@ from hypothesis import strategies as st
 from omnibench.errors import ConfigError
 from omnibench.robot.calibration import Provenance
 from omnibench.robot.export.formats import EXPORT_FORMATS, Export, export_calibration
-from omnibench.robot.export.remaining import RemainingError
+from omnibench.robot.export.ros2_controllers import RemainingError
 from omnibench.robot.kinematics import Array, Mount, Robot
 
 Rates = dict[str, Array]  # of joints, rad/s, and angles of steering joints, rad

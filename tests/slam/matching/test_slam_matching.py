@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from omnibench.data.scans import Ranges
 from omnibench.data.true_poses import TruePath
-from omnibench.robot.kinematics import Array
-from omnibench.robot.planar import compose, relative
+from omnibench.robot.kinematics import Array, compose, relative
 from omnibench.simulate.chain.floor_plan import RoomPlan, make_plan
 from omnibench.simulate.chain.lidar import Lidar, measure_scans
 from omnibench.slam.matching.map import ScanMap

@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chaos.witness import Heard
-from omnibench.robot.kinematics import Array
-from omnibench.robot.planar import wrapped
+from omnibench.robot.kinematics import Array, wrapped
 
 EXACT: Final = 1e-9  # m, rad; largest difference of odom from the batch odometry
 _LONGEST: Final = 100  # periods from sample to sample; beyond it, 1 s, the node counts a gap

@@ -8,7 +8,7 @@ import numpy as np
 
 from omnibench.config import Model
 from omnibench.discover.result import Discovery, NamedEffect
-from omnibench.fit.least_squares.noise import Whitener
+from omnibench.fit.noise import Whitener
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 

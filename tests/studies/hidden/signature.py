@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from omnibench.fit.least_squares.noise import Whitener
+from omnibench.fit.noise import Whitener
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 

@@ -26,8 +26,7 @@ from omnibench.data.splits import Names, complete, divided
 from omnibench.errors import DataError
 from omnibench.files import read_text
 from omnibench.registry import Options, importers
-from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.wheels.drive import in_the_middle
+from omnibench.robot.kinematics import Array, Robot, in_the_middle
 from omnibench.words import plural
 
 

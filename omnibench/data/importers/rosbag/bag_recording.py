@@ -30,8 +30,7 @@ from omnibench.data.importers.runs.reference_stream import ReferenceStream
 from omnibench.data.importers.runs.run_spans import Span, breaks, departure, find_rests, from_rest, parted
 from omnibench.data.importers.wheel_samples import Losses, WheelSamples, wheel_samples
 from omnibench.errors import DataError, one_line
-from omnibench.robot.kinematics import Array
-from omnibench.robot.planar import interpolated
+from omnibench.robot.kinematics import Array, interpolated
 from omnibench.words import plural
 
 

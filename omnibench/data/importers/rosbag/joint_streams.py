@@ -18,9 +18,8 @@ from omnibench.data.importers.rosbag.rosbag_options import RosbagOptions, Use
 from omnibench.data.importers.rosbag.topic_choice import JointTopics
 from omnibench.data.importers.wheel_samples import WheelReadings
 from omnibench.errors import DataError
-from omnibench.robot.kinematics import Array
-from omnibench.robot.planar import interpolated
-from omnibench.robot.wheels.joint_choice import JointChoice
+from omnibench.robot.joint_choice import JointChoice
+from omnibench.robot.kinematics import Array, interpolated
 
 # A longer gap while the robot drives ends a stretch, since a constant twist does not describe it (chosen):
 _LONGEST_GAP = 0.5  # s, and

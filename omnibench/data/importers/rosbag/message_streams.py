@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from omnibench.data.importers.orientation import planar_headings
 from omnibench.data.importers.rosbag.bag import Bag, Record, Topic
 from omnibench.errors import DataError
-from omnibench.robot.kinematics import Array
-from omnibench.robot.planar import pose_covariance, usable_covariances
+from omnibench.robot.kinematics import Array, pose_covariance, usable_covariances
 from omnibench.words import plural
 
 T = TypeVar("T")

@@ -12,8 +12,7 @@ from omnibench.data.importers.rosbag.bag import Bag, Topic
 from omnibench.data.importers.rosbag.message_streams import PoseStream, read_poses
 from omnibench.data.importers.rosbag.scanner_frames import fixed_transforms
 from omnibench.errors import ConfigError, nearest
-from omnibench.robot.kinematics import Array
-from omnibench.robot.planar import compose, interpolated
+from omnibench.robot.kinematics import Array, compose, interpolated
 
 
 def read_transforms(bag: Bag, topic: Topic, frames: Sequence[str], warnings: list[str]) -> PoseStream:

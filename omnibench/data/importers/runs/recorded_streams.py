@@ -11,8 +11,7 @@ from omnibench.data.clock_matching import Streams, match_clocks
 from omnibench.data.importers.runs.reference_options import ReferenceOptions
 from omnibench.data.importers.runs.reference_stream import ReferenceStream
 from omnibench.data.importers.wheel_samples import WheelSamples
-from omnibench.robot.kinematics import Robot
-from omnibench.robot.wheels.drive import in_the_middle
+from omnibench.robot.kinematics import Robot, in_the_middle
 from omnibench.words import some
 
 _UNKNOWN = 5.0  # s, by which an offset is looked for where wheels and poses are of different epochs; chosen

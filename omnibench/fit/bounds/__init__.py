@@ -1,1 +1,0 @@
-"""A proven lower bound of the cost over a box."""

@@ -1,1 +1,0 @@
-"""Differential drives with two wheels: their axle, and the squares that calibrations drive with them."""

@@ -1,0 +1,734 @@
+"""Poses of many candidate matrices at once, from moments of the wheel angles that were summed up once.
+
+For a given row 3 of the matrix positions are linear in rows 1 and 2 (odometry.py), and their regressors
+
+    G_j(m3) = sum_i a_ij exp(i m3.c_i)
+
+are smooth functions of row 3 alone. Over a box they are expanded once in Chebyshev polynomials, of which a singular
+value decomposition leaves some hundred combinations (expansion_plan.py). The poses of a population then are two matrix
+products, whatever the sampling rate. A recording whose heading the box turns too far for one expansion is cut into
+segments, each in the frame of its anchor, whose heading is linear in row 3 too; they are joined in the end.
+Runs that are read from files have an evaluator for each part of them.
+
+Recordings and matrices in the coordinates of the directions that the recordings drive.
+
+Along directions that a calibration keeps at the design K0, matrices do not differ. With orthonormal rows Q (r, M) of
+the others, a matrix K moves the robot by
+
+    K u = (K Q') (Q u) + K0 (u - Q'Q u),                                                          (1)
+
+so that it is a matrix of r + 3 columns, K Q' and the identity, for the signals Q u and the design's twist by the rest.
+The evaluator's expansion grows fast with the number of columns whose row 3 varies, which are then r in the place of M:
+three for a mecanum base that does not slip, and for a swerve base whose modules are steered as they should be.
+
+Odometry as a sum of exponentials, and its cutting into segments that one expansion can express.
+
+The displacement up to a stamp is x + iy = sum_i (m1 + i m2).a_i exp(i m3.c_i): an impulse a_i (wheel angles driven,
+rad) in the heading that the robot has after the wheel angles c_i. An Euler step is one impulse. An arc is an integral
+of exp(i m3.c) along the sample, taken by Gauss-Legendre quadrature, whose error is bounded by
+
+    |error| <= |(m1 + i m2).a| * (q!)^4 / ((2q + 1) (2q)!^3) * (m3.a)^(2q)      for q nodes.
+
+Plan of the expansion of recordings: the cut into segments that makes a candidate cheapest.
+
+Chebyshev expansion of sums of exponentials exp(i m3.c) over a box of row 3, with a proven bound of its error.
+
+With m3 = centre + reach * d and d in [-1, 1]^N, each exponential is exp(i centre.c) times a product over the wheels of
+(Jacobi-Anger)
+
+    exp(i z d) = J_0(z) + 2 sum_n i^n J_n(z) T_n(d),        z = reach_j c_j.
+
+Terms of total degree above D are left out. From |J_n(z)| <= |z/2|^n / n! they sum to at most
+2^N sum_{n > D} (zeta/2)^n / n!, zeta = sum_j |z_j|.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import product
+from math import comb, factorial
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnibench.fit.parameterisation import MatrixElements, ParameterisationName
+from omnibench.processes import one_thread
+from omnibench.robot.kinematics import Array
+from omnibench.robot.odometry import Complex, Integration, OdometryBatch, WheelLog
+from omnibench.robot.stored_odometry import together
+
+# Share by which the box of a curved parameterisation is widened beyond its linear reach. Candidates outside are
+# integrated directly, so that it decides on speed alone: half of it and twice change costs by 4e-14 m and the memory by
+# a third at most (tests/studies/constants_fit.py).
+_MARGIN = 0.1
+_WIDENED = 1e-9, 1e-15  # shares of the reach and of a row's largest element by which a box is widened against rounding
+
+
+class _Matrices(Protocol):
+    """What a box is made around."""
+
+    @property
+    def name(self) -> ParameterisationName: ...
+    def matrices(self, vectors: Array) -> Array: ...
+
+
+@dataclass(frozen=True, eq=False)
+class ElementBox:
+    """Bounds ``lower`` and ``upper`` (3, N) of the matrix elements."""
+
+    lower: Array
+    upper: Array
+
+    @classmethod
+    def of(cls, parameterisation: _Matrices, lower: Array, upper: Array) -> ElementBox:
+        """The box around the matrices of all vectors between ``lower`` and ``upper`` (n,).
+
+        It holds all of them where the matrix is linear in the vector, and nearly all where it is curved.
+        """
+        middle, half = (lower + upper) / 2, (upper - lower) / 2
+        centre, *moved = parameterisation.matrices(middle + np.vstack([np.zeros(len(half)), np.diag(half)]))
+        reach: Array = np.abs(np.array(moved) - centre).sum(axis=0)
+        reach *= 1 + (_WIDENED[0] if parameterisation.name == "matrix" else _MARGIN)
+        slack = _WIDENED[1] * np.abs(centre).max(axis=1, keepdims=True)
+        return cls(centre - reach - slack, centre + reach + slack)
+
+    @property
+    def centre(self) -> Array:
+        """The middle (3, N)."""
+        return (self.lower + self.upper) / 2
+
+    @property
+    def reach(self) -> Array:
+        """Half-widths (3, N)."""
+        return (self.upper - self.lower) / 2
+
+    @property
+    def largest(self) -> Array:
+        """The largest magnitudes (3, N) of the elements."""
+        return np.maximum(np.abs(self.lower), np.abs(self.upper))
+
+    @property
+    def speed(self) -> Array:
+        """The largest |m1j + i m2j| (N,) in the box, m per rad."""
+        speed: Array = np.hypot(*self.largest[:2])
+        return speed
+
+
+@dataclass(frozen=True, eq=False)
+class DrivenFrame:
+    """The coordinates: ``driven`` Q (r, M), and the design K0 (3, M) of Eq. (1)."""
+
+    searched: MatrixElements
+    driven: Array
+    design: Array
+
+    @classmethod
+    def of(cls, searched: MatrixElements) -> DrivenFrame:
+        """The frame of the directions along which a parameterisation does not keep the design."""
+        signals = searched.null.shape[1]
+        _, _, directions = np.linalg.svd(np.vstack([searched.null, np.zeros((signals, signals))]))
+        return cls(searched, directions[len(searched.null) :], searched.robot.inverse_kinematic_matrix)
+
+    @property
+    def name(self) -> ParameterisationName:
+        return self.searched.name
+
+    def matrices(self, vectors: Array) -> Array:
+        """Matrices (P, 3, r + 3) of vectors (P, n)."""
+        return self.seen(self.searched.matrices(vectors))
+
+    def seen(self, matrices: Array) -> Array:
+        """Matrices (P, 3, M) in the frame, (P, 3, r + 3)."""
+        rest = np.broadcast_to(np.eye(3), (len(matrices), 3, 3))
+        return np.concatenate([matrices @ self.driven.T, rest], axis=2)
+
+    def logs(self, logs: Sequence[WheelLog]) -> list[WheelLog]:
+        """Logs whose signals are those of the frame."""
+        moved = []
+        for log in logs:
+            along = log.signals @ self.driven.T
+            rest = (log.signals - along @ self.driven) @ self.design.T
+            moved.append(replace(log, rates=np.hstack([along, rest]), wheel_angles=None, steering=None, drive=None))
+        return moved
+
+
+# Nodes of the quadrature, at most: samples that need more turn by radians. Half of it and twice change nothing
+# (tests/studies/constants_fit.py).
+_MOST_NODES = 8
+# Pieces of a segment, at most, so that the time of cutting is linear in the length of a recording. Half of it and twice
+# change nothing (tests/studies/constants_fit.py).
+_LONGEST_SEGMENT = 4096
+
+
+@dataclass(frozen=True)
+class Path:
+    """One log in pieces of samples, none of which has a stamp inside.
+
+    angles, before (n, N): wheel angles driven in each piece and before its heading, rad. ends (S,): number of pieces
+    up to each stamp. driven (S, N): wheel angles driven up to each stamp, rad.
+    """
+
+    angles: Array
+    before: Array
+    ends: NDArray[np.intp]
+    driven: Array
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Pieces ``first`` to ``last`` (not included) of a path; ``anchor`` (N,): wheel angles that headings are about."""
+
+    first: int
+    last: int
+    anchor: Array
+
+
+def make_path(log: WheelLog, integration: Integration) -> Path:
+    """The samples of a log up to its last stamp, cut where stamps lie within them."""
+    bounds = np.concatenate([[0.0], log.times])
+    stamps = np.minimum(log.stamps, log.times[-1])
+    cuts = np.unique(np.concatenate([bounds[bounds < stamps[-1]], stamps]))
+    cuts = np.unique(np.concatenate([[0.0], cuts]))
+    sample = np.searchsorted(log.times, cuts[1:])
+    durations = np.diff(bounds)
+    driven = np.concatenate([np.zeros((1, log.signals.shape[1])), np.cumsum(log.signals * durations[:, None], axis=0)])
+    angles = log.signals[sample] * np.diff(cuts)[:, None]
+    before = driven[sample]
+    if integration == "arc":  # an arc may be cut anywhere; an Euler step keeps the heading of its sample's start
+        before = before + log.signals[sample] * (cuts[:-1] - bounds[sample])[:, None]
+    ends = np.searchsorted(cuts, stamps)
+    reached = np.concatenate([np.zeros((1, angles.shape[1])), np.cumsum(angles, axis=0)])
+    return Path(angles, before, ends, reached[ends])
+
+
+def quadrature(
+    paths: Iterable[Path], row: Array, weight: Array, tolerance: float, integration: Integration
+) -> int | None:
+    """Gauss-Legendre nodes that a piece needs for an error of at most ``tolerance`` (m) over a path; None: too many.
+
+    row (N,): the largest absolute elements of row 3; weight (N,): those of rows 1 and 2 together (m per rad).
+    """
+    if integration == "euler":
+        return 1
+    for nodes in range(1, _MOST_NODES + 1):
+        factor = factorial(nodes) ** 4 / ((2 * nodes + 1) * factorial(2 * nodes) ** 3)
+        worst = max(
+            float((np.abs(path.angles) @ weight * (np.abs(path.angles) @ row) ** (2 * nodes)).sum()) for path in paths
+        )
+        if factor * worst <= tolerance:
+            return nodes
+    return None
+
+
+def cut(path: Path, reach: Array, limit: float) -> list[Segment]:
+    """Segments in which the box turns headings about the anchor's by at most ``limit``, rad.
+
+    reach (N,): half-width of row 3's box. An infinite limit leaves the path whole, anchored at its start.
+    """
+    count, wheels = path.angles.shape
+    if np.isinf(limit):
+        return [Segment(0, count, np.zeros(wheels))]
+    segments = []
+    first = 0
+    while first < count:
+        window = slice(first, first + _LONGEST_SEGMENT)
+        begin, end = path.before[window], path.before[window] + path.angles[window]
+        low = np.minimum.accumulate(np.minimum(begin, end))
+        high = np.maximum.accumulate(np.maximum(begin, end))
+        fitting = int(np.searchsorted((high - low) @ reach / 2 > limit, True))
+        length = max(1, fitting)
+        segments.append(Segment(first, first + length, (low[length - 1] + high[length - 1]) / 2))
+        first += length
+    return segments
+
+
+def impulses(path: Path, segment: Segment, integration: Integration, nodes: int) -> tuple[Array, Array]:
+    """Impulses (n, q, N) of a segment's pieces and the wheel angles (n, q, N) of their headings about the anchor."""
+    angles = path.angles[segment.first : segment.last, None, :]
+    before = path.before[segment.first : segment.last, None, :] - segment.anchor
+    if integration == "euler":
+        return angles, before
+    place, share = _gauss_legendre(nodes)
+    return angles * share[:, None], before + angles * place[:, None]
+
+
+def _gauss_legendre(nodes: int) -> tuple[Array, Array]:
+    """Places and weights on [0, 1]."""
+    place, weight = np.polynomial.legendre.leggauss(nodes)
+    return (place + 1) / 2, weight / 2
+
+
+# Terms of a basis, at most: it bounds memory. Half of it and twice choose the same bases
+# (tests/studies/constants_fit.py).
+_MOST_TERMS = 3000
+# rad: beyond it the power series of J_n loses digits, since its alternating terms add up to I_0(4) = 11 (Abramowitz and
+# Stegun 1964, 9.1.10 and 9.6.10). Half of it and twice choose the same bases (tests/studies/constants_fit.py).
+_LARGEST_ANGLE = 4.0
+_LAST_TERM = 1e-17  # share of the first term of a power series: less than a tenth of the rounding of its sum
+
+
+@dataclass(frozen=True)
+class Basis:
+    """Products of Chebyshev polynomials, one for each wheel, of total degree ``degree`` or less.
+
+    orders (n, N): order of each wheel's polynomial in the n products; always 0 for an element without width.
+    """
+
+    degree: int
+    orders: NDArray[np.intp]
+
+    @classmethod
+    def make(cls, degree: int, free: NDArray[np.bool_]) -> Basis:
+        """All products of total degree ``degree`` or less in the free wheels (N,)."""
+        ranges = (range(degree + 1) if wheel else range(1) for wheel in free)
+        return cls(degree, np.array([orders for orders in product(*ranges) if sum(orders) <= degree], dtype=np.intp))
+
+    def values(self, places: Array) -> Array:
+        """The products (n, P) at places (P, N) in [-1, 1]."""
+        angle = np.arccos(np.clip(places.T, -1.0, 1.0))
+        polynomials = np.cos(angle[:, None, :] * np.arange(self.degree + 1)[:, None])  # (N, D + 1, P)
+        first, *others = self.orders.T
+        values: Array = polynomials[0][first]
+        for wheel, orders in enumerate(others, 1):
+            values *= polynomials[wheel][orders]
+        return values
+
+    def coefficients(self, angles: Array) -> Array:
+        """Coefficients (n, M) of exp(i sum_j z_j d_j) for z = angles (M, N), each to be times i^(total degree)."""
+        factors = _bessel(angles.T, self.degree)  # (N, D + 1, M)
+        first, *others = self.orders.T
+        values: Array = factors[0][first]
+        for wheel, orders in enumerate(others, 1):
+            values *= factors[wheel][orders]
+        return values
+
+    @property
+    def quarter_turns(self) -> NDArray[np.intp]:
+        """Total degree (n,) modulo 4: the power of i that belongs to each term."""
+        turns: NDArray[np.intp] = self.orders.sum(axis=1) % 4
+        return turns
+
+
+def degree_for(
+    zeta: Array, steps: Array, firsts: NDArray[np.intp], tolerance: float, wheels: int
+) -> tuple[int | None, float]:
+    """Lowest degree whose truncation error over every path is within ``tolerance`` (m), and the bound of that error.
+
+    zeta (M,): sum of the angles |z_j| of each exponential, rad. steps (M,): its factor, m. firsts (Z,): index of each
+    path's first exponential. The degree is None if it would need too many terms.
+    """
+    if zeta.max(initial=0.0) > _LARGEST_ANGLE:
+        return None, 0.0
+    half, power = zeta / 2, steps * truncation_factor(zeta, wheels)
+    degree = -1
+    while True:
+        degree += 1
+        if comb(degree + wheels, wheels) > _MOST_TERMS:
+            return None, 0.0
+        power = power * half / (degree + 1)
+        neglected = float(np.add.reduceat(power, firsts).max())
+        if neglected <= tolerance:
+            return degree, neglected
+
+
+def truncation_factor(zeta: Array, wheels: int) -> Array:
+    """The factor of (zeta/2)^(D + 1) / (D + 1)! in the bound of the terms above degree D.
+
+    It follows from sum_{n > D} x^n / n! <= x^(D + 1) / (D + 1)! * exp(x).
+    """
+    factor: Array = 2.0**wheels * np.exp(zeta / 2)
+    return factor
+
+
+def _bessel(angles: Array, degree: int) -> Array:
+    """J_0, 2 J_1, ..., 2 J_degree at angles (N, M): (N, degree + 1, M).
+
+    With J_n(z) = (z/2)^n j_n(z) the downward recurrence j_{n-1} = n j_n - (z/2)^2 j_{n+1} is stable and free of
+    divisions; it starts from the power series of the two highest orders.
+    """
+    half = angles / 2
+    square = half * half
+    scaled: Array = np.empty((len(angles), degree + 2, angles.shape[1]))
+    for order in (degree + 1, degree):
+        scaled[:, order] = _power_series(order, square)
+    for order in range(degree, 0, -1):
+        scaled[:, order - 1] = order * scaled[:, order] - square * scaled[:, order + 1]
+    power = 2 * half
+    for order in range(1, degree + 1):
+        scaled[:, order] *= power
+        power = power * half
+    return scaled[:, : degree + 1]
+
+
+def _power_series(order: int, square: Array) -> Array:
+    """sum_m (-square)^m / (m! (order + m)!), to rounding."""
+    largest = float(square.max(initial=0.0))
+    terms = 1
+    while largest**terms / (factorial(terms) * factorial(order + terms)) * factorial(order) > _LAST_TERM:
+        terms += 1
+    total = np.full(square.shape, 1.0 / (factorial(terms) * factorial(order + terms)))
+    for m in range(terms - 1, -1, -1):
+        total *= -square
+        total += 1.0 / (factorial(m) * factorial(order + m))
+    return total
+
+
+# Largest error of a position by truncation, by quadrature and by the decomposition, as shares of the longest path (at
+# least 1 m): some ten times the rounding of direct integration. They bound sums of absolute values; half of each and
+# twice change costs by 1e-13 m and the memory by a tenth at most (tests/studies/constants_fit.py).
+_TRUNCATION, _QUADRATURE, _DECOMPOSITION = 1e-12, 1e-12, 5e-12
+# The numbers from here on decide only which way is faster (bench_evaluator.py). Half of each and twice change costs by
+# 5e-14 m and the memory by less than a factor of two (tests/studies/constants_fit.py).
+# How far the box may turn the heading of a segment about its anchor, rad; infinity leaves recordings whole.
+_LIMITS = (np.inf, 2.0, 1.0, 0.5, 0.25)
+# Time that a sample of direct integration, a segment and a term of the basis take, in units of one multiplication and
+# addition of a matrix product.
+_SAMPLE, _SEGMENT, _TERM = 400.0, 1000.0, 100.0
+_MOST_BYTES = 48e6  # bytes of the large matrix product, at most
+_RANK, _POWER = 1.65, 0.7  # likely rank of the decomposition of n terms: a power law through omnibench's recordings
+_NO_WIDTH = 1e-14  # share of row 3's largest element: one with less width in the box is fixed, up to rounding
+
+
+@dataclass(frozen=True, eq=False)
+class ExpansionPlan:
+    """Logs cut into segments, the basis of their expansion, and bounds of what is neglected.
+
+    paths, segments: one for each log. nodes: number of quadrature nodes within a piece. free (N,): wheels whose element
+    of row 3 has a width in the box. error: bound of truncation and quadrature, m. spare: what the decomposition may
+    neglect in a row, m. A row is a place on a path where a displacement is wanted: a stamp, or the start of the next
+    segment.
+    """
+
+    logs: Sequence[WheelLog]
+    box: ElementBox
+    integration: Integration
+    paths: list[Path]
+    segments: list[list[Segment]]
+    nodes: int
+    basis: Basis
+    free: NDArray[np.bool_]
+    error: float
+    spare: float
+
+    def row_ends(self, index: int) -> list[tuple[Segment, list[int]]]:
+        """The segments of a path, each with the number of pieces up to each of its rows."""
+        path, segments = self.paths[index], self.segments[index]
+        rows = []
+        for number, segment in enumerate(segments, 1):
+            stamps = path.ends[(path.ends > segment.first) & (path.ends <= segment.last)]
+            onward = [segment.last] if number < len(segments) else []
+            rows.append((segment, sorted({*stamps.tolist(), *onward})))
+        return rows
+
+
+def make_plan(logs: Sequence[WheelLog], integration: Integration, box: ElementBox) -> ExpansionPlan | None:
+    """The cheapest plan for matrices in a box; None where direct integration is faster."""
+    if any(len(log.stamps) == 0 or log.stamps[0] <= 0 for log in logs) or not np.isfinite(box.reach).all():
+        return None
+    paths = [make_path(log, integration) for log in logs]
+    row, speed = box.largest[2], box.speed
+    lengths = [float((np.abs(path.angles) @ speed).sum()) for path in paths]
+    length = max(1.0, *lengths)
+    nodes = quadrature(paths, row, speed, _QUADRATURE * length, integration)
+    if nodes is None:
+        return None
+    free = box.reach[2] > _NO_WIDTH * np.abs(box.centre[2]).max()
+    wheels = int(free.sum())
+    steps = np.concatenate([np.abs(path.angles) @ speed for path in paths])
+    firsts = np.cumsum([0, *(len(path.angles) for path in paths[:-1])])
+    cheapest, chosen = _SAMPLE * len(steps), None
+    for limit in _LIMITS:
+        segments = [cut(path, box.reach[2], limit) for path in paths]
+        zeta = np.concatenate(
+            [_largest_turns(path, parts, box.reach[2]) for path, parts in zip(paths, segments, strict=True)]
+        )
+        degree, neglected = degree_for(zeta, steps, firsts, _TRUNCATION * length, wheels)
+        if degree is None:
+            continue
+        terms, count = comb(degree + wheels, wheels), sum(map(len, segments))
+        rows = max(sum(len(path.ends) for path in paths), count)
+        rank = _likely_rank(terms)
+        values = 2 * len(row) * rows * rank
+        cost = values + terms * (rank + _TERM) + (0.0 if np.isinf(limit) else _SEGMENT * count)
+        if 8 * values < _MOST_BYTES and cost < cheapest:
+            cheapest, chosen = cost, (segments, degree, neglected)
+    if chosen is None:
+        return None
+    segments, degree, neglected = chosen
+    error = _QUADRATURE * length * (nodes > 1) + neglected
+    spare = _DECOMPOSITION * length / max(map(len, segments))
+    basis = Basis.make(degree, free)
+    return ExpansionPlan(logs, box, integration, paths, segments, nodes, basis, free, error, spare)
+
+
+def _likely_rank(terms: int) -> float:
+    """Rank that the decomposition will have for so many terms."""
+    return min(float(terms), _RANK * terms**_POWER)
+
+
+def _largest_turns(path: Path, segments: list[Segment], reach: Array) -> Array:
+    """The most (n,) that the box turns the heading of each piece about its anchor, rad."""
+    anchors = np.repeat([s.anchor for s in segments], [s.last - s.first for s in segments], axis=0)
+    begin = path.before - anchors
+    turns: Array = np.maximum(np.abs(begin), np.abs(begin + path.angles)) @ reach
+    return turns
+
+
+@dataclass(frozen=True, eq=False)
+class PartedEvaluator:
+    """Poses at the stamps of many logs, as PoseEvaluator gives them, by the evaluators of parts of the logs."""
+
+    parts: Sequence[PoseEvaluator]
+
+    def covers(self, matrices: Array) -> NDArray[np.bool_]:
+        """True (P,) for the matrices (P, 3, N) that lie in the box."""
+        return self.parts[0].covers(matrices)
+
+    def poses(self, matrices: Array) -> Array:
+        """Poses (P, S, 3) of matrices (P, 3, N) in the box, see PoseEvaluator."""
+        return np.concatenate([part.poses(matrices) for part in self.parts], axis=1)
+
+
+def make_parted_evaluator(
+    logs: Sequence[WheelLog], integration: Integration, box: ElementBox, frame: DrivenFrame | None
+) -> PartedEvaluator | None:
+    """The evaluator of logs for matrices in a box; None where that of a part is None. frame: of the matrices."""
+    parts = []
+    for part in together(logs):
+        seen = part if frame is None else frame.logs(part)
+        evaluator = make_evaluator(OdometryBatch(seen, integration), seen, integration, box)
+        if evaluator is None:
+            return None
+        parts.append(evaluator)
+    return PartedEvaluator(parts)
+
+
+def moments_of(plan: ExpansionPlan) -> Array:
+    """Coefficients (R, n, 2N) of the regressors at the R rows of all logs: real parts of the N wheels, then imaginary.
+
+    n: terms of the plan's basis.
+    """
+    return np.concatenate([_moments_of_log(plan, index) for index in range(len(plan.paths))])
+
+
+def compress(moments: Array, plan: ExpansionPlan) -> tuple[Array, float]:
+    """The fewest combinations (n, K) of terms that keep every row of moments (R, 2N, n) to ``plan.spare``.
+
+    Also returns a bound of what they neglect over a path, m: polynomials are at most 1, so it is a sum of residuals.
+    """
+    rows, components, terms = moments.shape
+    speed = np.tile(plan.box.speed, 2)
+    scaled = (moments * speed[:, None]).reshape(-1, terms)
+    _, _, directions = np.linalg.svd(np.linalg.qr(scaled, mode="r"), full_matrices=False)
+
+    def neglected(count: int) -> float:
+        kept = directions[:count]
+        residual = np.abs(scaled - (scaled @ kept.T) @ kept).sum(axis=1).reshape(rows, 2, components // 2)
+        return float(np.hypot(residual[:, 0], residual[:, 1]).sum(axis=1).max())
+
+    low, high = 0, len(directions)
+    while low < high:
+        middle = (low + high) // 2
+        low, high = (low, middle) if neglected(middle) <= plan.spare else (middle + 1, high)
+    return directions[:low].T, neglected(low) * max(map(len, plan.segments))
+
+
+def _moments_of_log(plan: ExpansionPlan, index: int) -> Array:
+    """The moments (R, n, 2N) of one log."""
+    path, basis = plan.paths[index], plan.basis
+    start = plan.logs[index].start[2]
+    centre, reach = plan.box.centre[2], np.where(plan.free, plan.box.reach[2], 0.0)
+    sums = []
+    for segment, ends in plan.row_ends(index):
+        angles, about = impulses(path, segment, plan.integration, plan.nodes)
+        heading = about @ centre + start
+        sources = np.concatenate([angles * np.cos(heading)[..., None], angles * np.sin(heading)[..., None]], axis=2)
+        wheels = about.shape[2]
+        coefficients = basis.coefficients(about.reshape(-1, wheels) * reach)
+        total = 0.0
+        for first, last in zip([segment.first, *ends[:-1]], ends, strict=True):
+            pieces = slice(first - segment.first, last - segment.first)
+            summed = slice(pieces.start * plan.nodes, pieces.stop * plan.nodes)
+            total = total + coefficients[:, summed] @ sources[pieces].reshape(-1, 2 * wheels)
+            sums.append(total)
+    return _times_powers_of_i(np.array(sums), basis.quarter_turns)
+
+
+def _times_powers_of_i(sums: Array, quarter_turns: NDArray[np.intp]) -> Array:
+    """Real and imaginary parts (R, n, 2N) of sums (R, n, 2N) of cosines and sines times i^quarter_turns (n,)."""
+    cosine, sine = np.split(sums, 2, axis=2)
+    real = np.choose(quarter_turns[:, None], [cosine, -sine, -cosine, sine])
+    imaginary = np.choose(quarter_turns[:, None], [sine, cosine, -sine, -cosine])
+    return np.concatenate([real, imaginary], axis=2)
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentJoin:
+    """Indices that join the rows of G segments to the S stamps.
+
+    row_of_stamp, log_of_stamp (S,). segment_of_row (R,). anchors (G, N): wheel angles of the segments' anchors, rad.
+    last_row, first_of_log (G,): the row at a segment's end, and the first segment of its log.
+    """
+
+    row_of_stamp: NDArray[np.intp]
+    log_of_stamp: NDArray[np.intp]
+    segment_of_row: NDArray[np.intp]
+    anchors: Array
+    last_row: NDArray[np.intp]
+    first_of_log: NDArray[np.intp]
+
+    def positions(self, displacements: Array, matrices: Array) -> Array:
+        """x and y (P, 2, S) relative to the start, m, from displacements (P, 2, R) within the rows' segments."""
+        if self._uncut:  # the anchors are the starts
+            alike = len(self.segment_of_row) == len(self.row_of_stamp)
+            return displacements if alike else displacements[:, :, self.row_of_stamp]
+        phase = matrices[:, 2] @ self.anchors.T
+        turn: Complex = (np.cos(phase) + 1j * np.sin(phase))[:, self.segment_of_row]
+        moved = (displacements[:, 0] + 1j * displacements[:, 1]) * turn
+        before = np.zeros((len(matrices), len(self.anchors) + 1), dtype=complex)
+        np.cumsum(moved[:, self.last_row], axis=1, out=before[:, 1:])
+        carried = before[:, :-1] - before[:, self.first_of_log]
+        at_rows = moved + carried[:, self.segment_of_row]
+        path = at_rows[:, self.row_of_stamp]
+        return np.stack([path.real, path.imag], axis=1)
+
+    @cached_property
+    def _uncut(self) -> bool:
+        return not self.anchors.any()
+
+
+def join_segments(plan: ExpansionPlan) -> SegmentJoin:
+    """The indices of a plan's rows, segments and stamps."""
+    row_of_stamp: list[int] = []
+    log_of_stamp: list[int] = []
+    segment_of_row: list[int] = []
+    last_row: list[int] = []
+    first_of_log: list[int] = []
+    for index, path in enumerate(plan.paths):
+        first = len(last_row)
+        row_at: dict[int, int] = {}
+        for _, ends in plan.row_ends(index):
+            row_at |= {end: len(segment_of_row) + offset for offset, end in enumerate(ends)}
+            segment_of_row += [len(last_row)] * len(ends)
+            last_row.append(len(segment_of_row) - 1)
+            first_of_log.append(first)
+        row_of_stamp += [row_at[end] for end in path.ends.tolist()]
+        log_of_stamp += [index] * len(path.ends)
+    anchors = np.array([segment.anchor for segments in plan.segments for segment in segments])
+    return SegmentJoin(
+        np.array(row_of_stamp),
+        np.array(log_of_stamp),
+        np.array(segment_of_row),
+        anchors,
+        np.array(last_row),
+        np.array(first_of_log),
+    )
+
+
+# Share of the largest pose: rounding of a direct sum of some thousand samples, which the check allows beside the bound.
+_ROUNDING = 1e-12
+# Values of the large product at a time, 2 MB, so that they stay in the processor's cache. It changes the order of sums
+# alone, hence costs by 1e-16 m (tests/studies/constants_fit.py); bench_evaluator.py measures the speed.
+_BLOCK = 250_000
+
+
+class PoseEvaluator:
+    """Poses at the stamps of some logs, for candidate matrices in a box. Made by :func:`make_evaluator`.
+
+    error_bound: largest difference of a position from direct integration, m.
+    """
+
+    def __init__(self, plan: ExpansionPlan) -> None:
+        box = plan.box
+        self._box = box
+        self._centre = box.centre[2]
+        self._scale = np.where(plan.free, box.reach[2], 1.0)
+        self._basis = plan.basis
+        moments = moments_of(plan)  # (R, n, 2N)
+        rows, terms, components = moments.shape
+        moments = np.ascontiguousarray(np.swapaxes(moments, 1, 2))
+        combinations, dropped = compress(moments, plan)
+        self.error_bound = plan.error + dropped
+        self._combinations = np.ascontiguousarray(combinations.T)  # (K, n)
+        left = (moments.reshape(-1, terms) @ combinations).reshape(rows, components, -1)
+        self._product = np.ascontiguousarray(np.transpose(left, (2, 1, 0)).reshape(-1, components * rows))  # (K, 2N R)
+        self._join = join_segments(plan)
+        starts = np.array([log.start for log in plan.logs])[self._join.log_of_stamp]
+        self._start = np.ascontiguousarray(starts.T)
+        self._driven = np.concatenate([path.driven for path in plan.paths]).T
+
+    @property
+    def size(self) -> int:
+        """Memory that is kept, bytes."""
+        return int(self._product.nbytes + self._combinations.nbytes + self._driven.nbytes + self._start.nbytes)
+
+    @property
+    def combinations(self) -> int:
+        """Number of combinations of polynomials that stand for the recordings."""
+        return len(self._combinations)
+
+    @property
+    def segments(self) -> int:
+        """Number of segments that the recordings are cut into."""
+        return len(self._join.anchors)
+
+    def covers(self, matrices: Array) -> NDArray[np.bool_]:
+        """True (P,) for the matrices (P, 3, N) that lie in the box."""
+        inside = (matrices >= self._box.lower) & (matrices <= self._box.upper)
+        return np.asarray(inside.all(axis=(1, 2)))
+
+    def poses(self, matrices: Array) -> Array:
+        """Poses (P, S, 3) in m, m, rad of matrices (P, 3, N) in the box. Headings are not wrapped."""
+        if len(matrices) == 1:
+            return self._poses(matrices)
+        with one_thread():
+            return self._poses(matrices)
+
+    def _poses(self, matrices: Array) -> Array:
+        result = np.empty((len(matrices), *self._start.shape))
+        block = max(1, _BLOCK // self._product.shape[1])
+        for first in range(0, len(matrices), block):
+            part = slice(first, first + block)
+            positions = self._join.positions(self._displacements(matrices[part]), matrices[part])
+            np.add(positions, self._start[:2], out=result[part, :2])
+        np.add(matrices[:, 2] @ self._driven, self._start[2], out=result[:, 2])
+        return np.swapaxes(result, 1, 2)
+
+    def _displacements(self, matrices: Array) -> Array:
+        """x and y (P, 2, R) of every row relative to its segment's start, in the frame of its anchor, m."""
+        features = self._combinations @ self._basis.values((matrices[:, 2] - self._centre) / self._scale)
+        first, second = matrices[:, 0], matrices[:, 1]
+        weights = np.concatenate([first, -second, second, first], axis=1).reshape(len(matrices), 2, -1)
+        regressors = (features.T @ self._product).reshape(len(matrices), weights.shape[2], -1)
+        displacements: Array = weights @ regressors
+        return displacements
+
+
+def make_evaluator(
+    odometry: OdometryBatch, logs: Sequence[WheelLog], integration: Integration, box: ElementBox
+) -> PoseEvaluator | None:
+    """The evaluator of logs for matrices in a box, checked against direct integration by ``odometry``.
+
+    None where direct integration is faster, or the check finds a larger error than the bound.
+    """
+    plan = make_plan(logs, integration, box)
+    if plan is None:
+        return None
+    with one_thread():
+        evaluator = PoseEvaluator(plan)
+    return evaluator if _agrees(evaluator, odometry, box) else None
+
+
+def _agrees(evaluator: PoseEvaluator, odometry: OdometryBatch, box: ElementBox) -> bool:
+    """True if both ways give the same poses, up to the bound and rounding, at the box's centre and some corners."""
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(3, *box.centre.shape))
+    matrices = np.concatenate([box.centre[None], box.centre + signs * box.reach])
+    direct = odometry.poses(matrices)
+    fast = evaluator.poses(matrices)
+    if fast.shape != direct.shape:
+        return False
+    length = max(1.0, float(np.abs(direct).max()))
+    return bool(np.abs(fast - direct).max() <= evaluator.error_bound + _ROUNDING * length)

@@ -1,1 +1,0 @@
-"""Poses of many candidate matrices at once."""

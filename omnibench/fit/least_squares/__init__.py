@@ -1,1 +1,0 @@
-"""Weighted least squares of whole reference trajectories: noise, nuisances, steps."""

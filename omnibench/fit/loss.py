@@ -1,0 +1,407 @@
+"""Robust losses of pose errors, with a scale that is estimated from the same errors.
+
+Errors have the norms r_i of d coordinates, with shares p_i that sum to one. A scale s turns them into x_i = r_i / s.
+
+``huber``, with rho(x) = x^2/2 up to c and c x - c^2/2 beyond, takes the scale and the numbers fitted that minimise
+
+    Q(s) = s (sum_i p_i rho(x_i) + b / 2),   b = E min(R, c)^2,   R^2 ~ chi2(d),                            (1)
+
+the concomitant scale of Huber's Proposal 2 (Huber, Robust Statistics, 1981, sections 7.7 and 7.8): at the minimum
+
+    sum_i p_i min(x_i, c)^2 = b,                                                                          (2)
+
+so that s is the standard deviation of a coordinate of normal errors. Q is convex in s and the errors at once.
+
+``student_t`` takes errors for multivariate t with n = 4 degrees of freedom, which serves unless their number is
+estimated (Lange, Little and Taylor, J. Am. Stat. Assoc. 84:881, 1989, section 5). Minus the log-likelihood of one
+coordinate, up to a constant, and its minimum over s are
+
+    L(s) = ln s + (n + d) / (2 d) sum_i p_i ln(1 + x_i^2 / n),                                            (3)
+    sum_i p_i (n + d) x_i^2 / (n + x_i^2) = d.                                                            (4)
+
+The cost of a candidate is min Q or exp(min L), in the unit of the errors: a function of the candidate alone, as smooth
+as the errors. Its derivatives by the errors are those of a weighted sum of squares with the weights
+
+    w(x) = min(1, c / x)   and   w(x) = (n + d) / (n + x^2).                                              (5)
+
+Both sides of (2) and (4) that depend on q = 1/s^2 are concave in it and grow, so that Newton's steps from q = 0
+approach the root from one side, without fail.
+
+Starts and ends of runs whose reference pose has jumped, taken from the poses beside them.
+
+A start that is off shifts or turns every pose of its run, and no weight of single poses mends that. With the motions of
+the design robot from pose to pose, each of the three poses beside the end of a run says where that end was; the median
+of the three is what they agree on. An end that differs from it by far more than those of other runs do, by their weight
+under a robust loss, has jumped. Over so short a way the design is good enough; what it leaves is left to the loss.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtr
+
+from omnibench.data.dataset import Trajectory
+from omnibench.errors import ConfigError
+from omnibench.fit.cost import Cost, SumOfNorms
+from omnibench.fit.noise import LEAST_WHITE
+from omnibench.robot.kinematics import Array, Robot, compose, relative
+from omnibench.robot.model import OdometryModel
+from omnibench.robot.odometry import Integration
+from omnibench.words import plural
+
+LossName = Literal["squares", "huber", "student_t"]
+
+# Smallest scale, m or rad: smaller errors are rounding, of which the likelihood of Eq. (3) could grow without bound. A
+# tenth of NO_ERROR in fit/cost.py, so that the costs of such errors are rounding, too.
+LEAST_SCALE = 1e-10
+# Norms of d coordinates beyond which Huber's loss is linear. Each leaves 95 % of the efficiency of squares for normal
+# errors, as 1.345 does for one coordinate (Holland and Welsch, Comm. Stat. A 6:813, 1977; Huber 1981, section 4.2).
+CORNERS: Mapping[int, float] = MappingProxyType({1: 1.345, 2: 1.501, 3: 1.628})
+# Share of the weight of a small error below which a pose counts as one that has jumped, and is left out of estimates
+# that have no loss: errors of more than 8 (huber) or 4 (student_t) of their scales.
+OFF = 0.2
+DEGREES_OF_FREEDOM = 4.0  # Lange, Little and Taylor 1989
+_MOST_STEPS = (
+    100  # Newton's steps for the scale; errors of one size take 5, with a twentieth of them 100 times as large 15
+)
+_SAMPLE = 2000  # norms of which more are not needed to find where Newton's steps begin: they then take two or three
+_SETTLED = 1e-13  # relative change of 1/s^2 that ends them
+
+
+class Loss(ABC):
+    """A loss of the norms of errors of ``coordinates`` d coordinates."""
+
+    name: LossName
+
+    def __init__(self, coordinates: int) -> None:
+        self.coordinates = coordinates
+
+    @abstractmethod
+    def scales(self, norms: Array, shares: Array) -> Array:
+        """Scales (P,) of P sets of norms (P, S) with shares (S,)."""
+
+    @abstractmethod
+    def costs(self, norms: Array, shares: Array) -> Array:
+        """Costs (P,), in the unit of the norms (P, S), at the scales that minimise them; NaN of norms that are NaN."""
+
+    @abstractmethod
+    def weights(self, ratios: Array) -> Array:
+        """Weights w (...), Eq. (5), of ratios x (...) of norms to their scale."""
+
+    def is_near(self, norms: Array, shares: Array) -> NDArray[np.bool_]:
+        """True (S,) for the norms (S,) that are not far off the others, by their weights."""
+        ratios = norms / self.scales(norms[None], shares)[0]
+        return np.asarray(self.weights(ratios) >= OFF * self.weights(np.zeros(1)))
+
+    def mean_curvature(self, ratios: Array, shares: Array) -> float:
+        """Mean second derivative of the loss over the d directions of errors at ratios (S,), over the mean weight."""
+        weights = self.weights(ratios)
+        return max(1 + float(self.slopes(ratios) @ shares) / (self.coordinates * float(weights @ shares)), OFF)
+
+    @abstractmethod
+    def slopes(self, ratios: Array) -> Array:
+        """Derivatives x w'(x) (...) of the weights by the logarithm of the ratios x (...)."""
+
+
+class ScaledLoss(Loss):
+    """A loss whose scale is estimated with the norms."""
+
+    def scales(self, norms: Array, shares: Array) -> Array:
+        """Scales (P,) of P sets of norms (P, S) with shares (S,): the roots of Eq. (2) or (4)."""
+        squares = np.square(norms)
+        start: Array = np.zeros(len(norms))
+        with np.errstate(all="ignore"):
+            if (every := len(shares) // _SAMPLE) > 1:
+                some = shares[::every]
+                start = self._precisions(squares[:, ::every], some / some.sum(), start)
+            scales = self._precisions(squares, shares, start) ** -0.5
+            return np.where((squares > 0).any(axis=1), scales, LEAST_SCALE)
+
+    def _precisions(self, squares: Array, shares: Array, start: Array) -> Array:
+        """Roots q (P,) of Eq. (2) or (4) for squared norms (P, S), from a start (P,); 0 where there is none.
+
+        A step to the left of 0, which only a start to the right of the root can lead to, begins again at 0.
+        """
+        precision: Array = start
+        for _ in range(_MOST_STEPS):
+            value, slope = self._equation(squares * precision[:, None])
+            moved = precision + (self._target - value @ shares) / ((slope * squares) @ shares)
+            before = precision
+            precision = np.where(np.isfinite(moved) & (moved > 0), np.minimum(moved, LEAST_SCALE**-2), 0.0)
+            if (np.abs(precision - before) <= _SETTLED * precision).all():
+                break
+        return precision
+
+    def costs(self, norms: Array, shares: Array) -> Array:
+        """Costs (P,), in the unit of the norms (P, S), at the scales that minimise them; NaN of norms that are NaN."""
+        return self._costs(norms, self.scales(norms, shares), shares)
+
+    @property
+    @abstractmethod
+    def _target(self) -> float:
+        """The right side of Eq. (2) or (4)."""
+
+    @abstractmethod
+    def _equation(self, squares: Array) -> tuple[Array, Array]:
+        """The terms of the left side of Eq. (2) or (4) at squared ratios, and their derivatives by these."""
+
+    @abstractmethod
+    def _costs(self, norms: Array, scales: Array, shares: Array) -> Array:
+        """Eq. (1) or the exponential of Eq. (3)."""
+
+
+class Huber(ScaledLoss):
+    """Squares of small errors and magnitudes of large ones, Eq. (1)."""
+
+    name: LossName = "huber"
+
+    def __init__(self, coordinates: int) -> None:
+        super().__init__(coordinates)
+        self.corner = CORNERS[coordinates]
+        square = self.corner**2
+        inside = float(coordinates * chdtr(coordinates + 2, square))  # E R^2 of R < c
+        self._mean = inside + square * (1 - float(chdtr(coordinates, square)))  # b of Eq. (1)
+
+    def weights(self, ratios: Array) -> Array:
+        """min(1, c / x)."""
+        return np.asarray(self.corner / np.maximum(ratios, self.corner))
+
+    def slopes(self, ratios: Array) -> Array:
+        """-c / x beyond the corner, 0 before."""
+        return np.where(ratios > self.corner, -self.weights(ratios), 0.0)
+
+    @property
+    def _target(self) -> float:
+        return self._mean
+
+    def _equation(self, squares: Array) -> tuple[Array, Array]:
+        return np.minimum(squares, self.corner**2), np.where(squares < self.corner**2, 1.0, 0.0)
+
+    def _costs(self, norms: Array, scales: Array, shares: Array) -> Array:
+        ratios = norms / scales[:, None]
+        small = np.minimum(ratios, self.corner)
+        total: Array = scales * ((small * (ratios - small / 2)) @ shares + self._mean / 2)
+        return total
+
+
+class StudentT(ScaledLoss):
+    """Minus the log-likelihood of Student's t with four degrees of freedom, Eq. (3)."""
+
+    name: LossName = "student_t"
+
+    def weights(self, ratios: Array) -> Array:
+        """(n + d) / (n + x^2)."""
+        return np.asarray((DEGREES_OF_FREEDOM + self.coordinates) / (DEGREES_OF_FREEDOM + np.square(ratios)))
+
+    def slopes(self, ratios: Array) -> Array:
+        """-2 x^2 (n + d) / (n + x^2)^2."""
+        squares = np.square(ratios)
+        return np.asarray(-2 * squares / (DEGREES_OF_FREEDOM + squares) * self.weights(ratios))
+
+    @property
+    def _target(self) -> float:
+        return float(self.coordinates)
+
+    def _equation(self, squares: Array) -> tuple[Array, Array]:
+        total = DEGREES_OF_FREEDOM + self.coordinates
+        left = DEGREES_OF_FREEDOM + squares
+        return total * squares / left, total * DEGREES_OF_FREEDOM / np.square(left)
+
+    def _costs(self, norms: Array, scales: Array, shares: Array) -> Array:
+        logarithms = np.log1p(np.square(norms / scales[:, None]) / DEGREES_OF_FREEDOM) @ shares
+        power = (DEGREES_OF_FREEDOM + self.coordinates) / (2 * self.coordinates)
+        total: Array = scales * np.exp(power * logarithms)
+        return total
+
+
+class Squares(Loss):
+    """Squares, whatever their size: the cost is their root mean square, which has no scale."""
+
+    name: LossName = "squares"
+
+    def costs(self, norms: Array, shares: Array) -> Array:
+        """Root mean squares (P,) of norms (P, S)."""
+        return np.asarray(np.sqrt(np.square(norms) @ shares))
+
+    def scales(self, norms: Array, shares: Array) -> Array:  # noqa: ARG002 (none is needed)
+        """1 for every set of norms (P, S)."""
+        return np.ones(len(norms))
+
+    def weights(self, ratios: Array) -> Array:
+        """1 for every ratio."""
+        return np.ones(ratios.shape)
+
+    def slopes(self, ratios: Array) -> Array:
+        """0 for every ratio."""
+        return np.zeros(ratios.shape)
+
+
+def make_loss(name: LossName, coordinates: int) -> Loss | None:
+    """The loss of that name for errors of some coordinates; None for squares, which bound nothing."""
+    kinds: dict[str, type[Loss]] = {"huber": Huber, "student_t": StudentT}
+    return kinds[name](coordinates) if name in kinds else None
+
+
+_BESIDE = 3  # poses beside an end that tell where it was: the fewest of which one may be off, too
+_NAMED = 5  # runs that a sentence names
+_FEWEST_RUNS = 5  # fewer ends do not tell how far an end usually is from what the poses beside it say
+
+
+def with_ends_from_others(
+    runs: Sequence[Trajectory], robot: Robot, integration: Integration, loss: Loss, *, last: bool
+) -> tuple[tuple[Trajectory, ...], tuple[str, ...]]:
+    """The runs, starts that have jumped replaced by what the next poses say, and the names of those runs.
+
+    loss: of three coordinates, m and rad alike. last: the last poses are treated alike, for a cost that uses no others.
+    """
+    if len(runs) < _FEWEST_RUNS:
+        return tuple(runs), ()
+    design = OdometryModel.of_design(robot, integration)
+    moved, names = list(runs), set()
+    for end in (0, -1) if last else (0,):
+        known = [index for index, run in enumerate(runs) if len(run.poses) > _BESIDE]
+        if len(known) < _FEWEST_RUNS:
+            continue
+        told = np.array([_told(design, runs[index], end) for index in known])
+        off = np.linalg.norm(told - [runs[index].poses[end] for index in known], axis=1)
+        near = loss.is_near(off, np.full(len(off), 1 / len(off)))
+        for index, pose in ((known[place], told[place]) for place in np.flatnonzero(~near)):
+            poses = moved[index].poses.copy()
+            poses[end] = pose
+            moved[index] = replace(moved[index], poses=poses)
+            names.add(runs[index].id)
+    return tuple(moved), tuple(run.id for run in runs if run.id in names)
+
+
+def moved_ends_in_words(names: Sequence[str], runs: int, *, last: bool) -> tuple[str, ...]:
+    """A sentence on the runs (``names``) of all (their number) whose start or end has jumped; none where none has."""
+    if not names:
+        return ()
+    which = "start or end" if last else "start"
+    named = f"{', '.join(names[:_NAMED])}{' ...' if len(names) > _NAMED else ''}"
+    return (
+        f"{plural(len(names), 'run')} of {runs} ({named}): the reference pose at the {which} is far from what the "
+        "poses beside it say, which are used in its place",
+    )
+
+
+def _told(design: OdometryModel, run: Trajectory, end: int) -> Array:
+    """The pose (3,) of an end, 0 or -1, that the poses beside it say by the design's motions."""
+    beside = np.arange(1, 1 + _BESIDE) if end == 0 else np.arange(-1 - _BESIDE, -1)
+    (path,) = design.poses([run.reference_log])
+    path = np.vstack([run.start, path])
+    return np.asarray(np.median(compose(run.poses[beside], relative(path[beside], path[end])), axis=0))
+
+
+class RobustCost(Cost):
+    """The norms of a cost's pose errors under a loss with an estimated scale, Eq. (1) to (4) of losses.py.
+
+    base: the cost, whose stamps, norms and shares these are. Single poses that are far off have a bounded influence. A
+    start that is off, or at costs of the final pose an end, spoils a run: its poses then are far off together.
+    """
+
+    def __init__(self, base: SumOfNorms, loss: Loss) -> None:
+        super().__init__(base.options)
+        self.base, self.loss = base, loss
+        self.name, self.stamps, self.rounding = base.name, base.stamps, base.rounding
+
+    @property
+    def coordinates(self) -> tuple[float, float, float]:
+        """The weights of the cost."""
+        return self.base.weights
+
+    @property
+    def of_poses(self) -> Loss:
+        """The same loss of whole poses, m, m, rad."""
+        return type(self.loss)(3)
+
+    def combine(self, errors: Array, trajectory: NDArray[np.intp]) -> Array:
+        """Costs (P,), m: at the scale of each candidate's own errors."""
+        return self.loss.costs(self.base.norms(errors), self.base.shares(trajectory))
+
+    def weights(self, errors: Array, trajectory: NDArray[np.intp]) -> Array:
+        """Weights (S,), Eq. (5), of errors (S, 3) of one candidate; 1 or less for Huber's, for t up to (n + d) / n."""
+        return self.loss.weights(self.ratios(errors, trajectory))
+
+    def ratios(self, errors: Array, trajectory: NDArray[np.intp]) -> Array:
+        """Norms (S,) of errors (S, 3) of one candidate over their scale."""
+        norms = self.base.norms(errors)
+        ratios: Array = norms / self.loss.scales(norms[None], self.base.shares(trajectory))[0]
+        return ratios
+
+
+def with_loss(cost: Cost, loss: LossName) -> Cost:
+    """The cost with a loss; itself for squares. ConfigError: another loss, and the cost is no sum of norms."""
+    if loss == "squares":
+        return cost
+    if not isinstance(cost, SumOfNorms):
+        raise ConfigError(f"loss: {loss} weighs norms of pose errors, and the cost {cost.name} is no sum of norms")
+    chosen = make_loss(loss, sum(map(bool, cost.weights)))
+    assert chosen is not None  # only squares have none
+    return RobustCost(cost, chosen)
+
+
+def loss_of(cost: Cost) -> LossName:
+    """The loss of a cost."""
+    return cost.loss.name if isinstance(cost, RobustCost) else "squares"
+
+
+def norms_of(cost: Cost) -> SumOfNorms | None:
+    """The sum of norms that a cost is, or whose norms a robust loss weighs; None for other costs."""
+    base = cost.base if isinstance(cost, RobustCost) else cost
+    return base if isinstance(base, SumOfNorms) else None
+
+
+@dataclass(frozen=True, eq=False)
+class CostWeighting:
+    """Scales a run's pose residuals by ``scale`` (3,) or (k, 3); last_alone: all but the last pose are left out."""
+
+    scale: Array
+    last_alone: bool
+
+    def __call__(self, residuals: Array) -> Array:
+        """Weighted residuals (k, 3) or derivatives (k, 3, n)."""
+        chosen = residuals[-1:] if self.last_alone else residuals
+        weighted: Array = chosen * self.scale.reshape(*self.scale.shape, *([1] * (residuals.ndim - 2)))
+        return weighted
+
+
+def cost_weightings(cost: Cost, trajectories: Sequence[Trajectory], residuals: Sequence[Array]) -> list[CostWeighting]:
+    """The weighting of every run, at the cost's stamps: equal for all runs, normalised to unit mean square over them.
+
+    A cost that is no sum of norms has no weights; m and rad then count alike. A robust one has weights of its poses,
+    which are those of the residuals.
+    """
+    base = norms_of(cost)
+    weights = np.array((1.0, 1.0, 1.0) if base is None else base.weights)
+    last_alone = cost.stamps == "final"
+    raw = [
+        CostWeighting(weights / np.sqrt(1 if last_alone else len(run.pose_times) - 1), last_alone)
+        for run in trajectories
+    ]
+    if isinstance(cost, RobustCost):
+        errors, owner = _at_stamps(cost, residuals)
+        roots = np.sqrt(cost.weights(errors, owner))[:, None]
+        raw = [CostWeighting(roots[owner == run] * weigh.scale, last_alone) for run, weigh in enumerate(raw)]
+    squares = [float(np.square(weigh(errors)).sum()) for weigh, errors in zip(raw, residuals, strict=True)]
+    size = max(float(np.sqrt(np.mean(squares))), LEAST_WHITE)
+    return [CostWeighting(weigh.scale / size, last_alone) for weigh in raw]
+
+
+def mean_curvature(cost: RobustCost, residuals: Sequence[Array]) -> float:
+    """Mean second derivative of a robust cost's loss over the mean of its weights, at every run's residuals (K, 3)."""
+    errors, owner = _at_stamps(cost, residuals)
+    return cost.loss.mean_curvature(cost.ratios(errors, owner), cost.base.shares(owner))
+
+
+def _at_stamps(cost: Cost, residuals: Sequence[Array]) -> tuple[Array, NDArray[np.intp]]:
+    """The residuals (S, 3) at a cost's stamps, of those (K, 3) of every run, and the run (S,) of each."""
+    chosen = [of_run[-1:] if cost.stamps == "final" else of_run for of_run in residuals]
+    return np.concatenate(chosen), np.repeat(np.arange(len(chosen)), [len(of_run) for of_run in chosen])

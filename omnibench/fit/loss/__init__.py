@@ -1,1 +1,0 @@
-"""How pose errors make one number: norms, their weights, and losses that bound the influence of single poses."""

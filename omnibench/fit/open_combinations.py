@@ -1,0 +1,164 @@
+"""Combinations of matrix elements that references other than poses leave open, and that keep the design values.
+
+In units of the largest element of each row, the references have the information A about the elements that may be
+fitted. Along an eigenvector with the eigenvalue a their standard deviation is 1/sqrt(a). Where that is larger than the
+design's own, the references say nothing that is worth having: distances never tell of turning, and positions
+whose frame is not the robot's do not tell which way the robot's x axis points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnibench.data.dataset import Trajectory
+from omnibench.data.references.run_references import UNITS
+from omnibench.fit.parameterisation import MatrixElements, Parameterisation
+from omnibench.fit.prior import default_mount
+from omnibench.fit.reference_rows import ReferenceBatch, reference_rows
+from omnibench.fit.span import Unidentified, directions_kept, driven_span
+from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.odometry import Integration
+from omnibench.words import plural
+
+# Share of a row's largest element: a larger standard deviation tells less than the design does, whose wheels are known
+# to 2 % and their common errors to 5 % (shrinkage/prior.py), and two of them and a half reach the box of 25 %.
+WORST = 0.10
+# Standard deviation, m and rad, for which reference poses count beside the others: that of a first guess (noise.py).
+_OF_POSES = 0.01
+
+
+# Share, squared, of an element in the open directions from which on it counts as open: what 5 % of the design there
+# leave of it is then 0.2 % (as _UNIDENTIFIED of uncertainty/physical.py).
+_SHARE = 1e-3
+
+
+def with_open_combinations(searched: MatrixElements, runs: Sequence[Trajectory]) -> MatrixElements:
+    """The elements, less the combinations that the runs' references leave open; as they are where all have poses."""
+    if all(run.references is None for run in runs):
+        return searched
+    directions = open_directions(searched, information_of_references(searched.robot, runs))
+    return replace(searched, open=directions)
+
+
+def elements_open(searched: Parameterisation) -> NDArray[np.bool_]:
+    """True (3M,) for the matrix elements that depend on a combination which is left open and keeps the design."""
+    if not isinstance(searched, MatrixElements) or searched.open is None:
+        return np.zeros(searched.slopes(searched.start).shape[0], dtype=bool)
+    return np.asarray(np.square(searched.open).sum(axis=0) > _SHARE)
+
+
+def information_of_references(
+    robot: Robot, runs: Sequence[Trajectory], integration: Integration = "arc", *, poses: bool = True
+) -> Array:
+    """Information (3M, 3M) of the references of some runs about the elements at the design; poses: of these, too."""
+    rows = reference_rows(runs, "reference" if poses else "none")
+    sigmas = np.where(rows.of_references[:, None], rows.whole_sigmas, _OF_POSES)
+    weights = np.where(rows.measured, 1 / np.nan_to_num(sigmas, nan=1.0), 0.0)
+    design = robot.inverse_kinematic_matrix
+    jacobian = ReferenceBatch(rows, integration).jacobian(design).reshape(len(rows.trajectory), 3, -1)
+    columns = (jacobian * weights[..., None]).reshape(-1, design.size)
+    information: Array = columns.T @ columns
+    return information
+
+
+def open_directions(searched: MatrixElements, information: Array) -> Array:
+    """Directions (q, 3M), orthonormal in units of the rows' largest elements, that an information leaves open."""
+    units = searched.units
+    basis = np.linalg.svd(searched.projection * units / units[:, None])
+    allowed = basis.U[:, basis.S > _SHARE]
+    columns = units[:, None] * allowed
+    values, vectors = np.linalg.eigh(columns.T @ information @ columns)
+    directions: Array = (allowed @ vectors[:, values < WORST**-2.0]).T
+    return directions
+
+
+_MOST = 0.9  # share, squared, of a motion's part in the open combinations from which on it is called open; chosen
+
+
+def open_sentences(robot: Robot, runs: Sequence[Trajectory], unidentified: Unidentified = "keep") -> tuple[str, ...]:
+    """A sentence for each part of the matrix that the runs' references leave open; none where all runs have poses."""
+    if all(run.references is None for run in runs):
+        return ()
+    kept = directions_kept(robot, driven_span(runs), unidentified)
+    searched = MatrixElements(robot, "row", kept, default_mount(robot) == "known")
+    searched = with_open_combinations(searched, runs)
+    end = "keeps the design values" if unidentified != "shrink" else "rests on the design and its tolerance"
+    return tuple(_sentences(searched, runs, end))
+
+
+def _of_several(end: str) -> str:
+    """The end of a sentence on several things: keep and rest for keeps and rests."""
+    return end.replace("keeps ", "keep ").replace("rests ", "rest ")
+
+
+def _sentences(searched: MatrixElements, runs: Sequence[Trajectory], end: str) -> Iterator[str]:
+    angles = any(run.has_poses or _has(run, "rad") for run in runs)
+    left = searched.open
+    if left is None or not len(left):
+        if not angles:
+            yield (
+                "no reference tells the heading: row 3 (heading) is known only through the places that the robot "
+                "reached on curves; measure turned angles (kind turn) to know it better"
+            )
+        return
+    signals = searched.start.size // 3
+    driven = np.linalg.svd(np.eye(signals) - searched.null.T @ searched.null)
+    motions = driven.U[:, driven.S > 0.5].T  # directions of drive signals along which the matrix is searched
+    shares = [_share(left, row, motions) for row in range(3)]
+    said = np.zeros((0, left.shape[1]))
+    if min(shares[2]) > _MOST:
+        said = np.vstack([said, *[_element(left, 2, motion) for motion in motions]])
+        yield (
+            f"no reference tells of turning: row 3 (heading) of the matrix {end}; measure turned angles (kind turn), "
+            "headings, or where the robot ends after curves (kind displacement)"
+        )
+    if min(shares[0]) > _MOST and (not searched.rows[1, 1] or min(shares[1]) > _MOST):
+        said = np.vstack([said, *[_element(left, row, motion) for row in (0, 1) for motion in motions]])
+        yield (
+            f"no reference tells of lengths: rows 1 (x) and 2 (y) of the matrix {_of_several(end)}; "
+            "measure distances or displacements"
+        )
+    turned = _turned(searched)
+    if searched.rows[1, 1] and np.linalg.norm(left @ turned) ** 2 > _MOST * float(turned @ turned) > 0:
+        said = np.vstack([said, turned])
+        yield (
+            "no reference tells which way the robot's x axis points: distances, and positions in a frame in which the "
+            f"start is not known, are the same for all of them; the direction of x {end}; measure a displacement "
+            "from the start"
+        )
+    rest = len(left) - int(np.linalg.matrix_rank(left @ said.T, tol=0.3)) if len(said) else len(left)
+    if rest > 0:
+        yield (
+            f"{plural(rest, 'further combination' if len(said) else 'combination')} of matrix elements that the "
+            f"references tell to worse than 10 % {end if rest == 1 else _of_several(end)}: "
+            "drive other motions, or measure more exactly"
+        )
+
+
+def _has(run: Trajectory, unit: str) -> bool:
+    return run.references is not None and any(UNITS[kind] == unit for kind in run.references.kinds.tolist())
+
+
+def _share(left: Array, row: int, motions: Array) -> list[float]:
+    """Squared shares of a row's parts along motions (q, M) in the open combinations."""
+    return [float(np.square(left @ _element(left, row, motion)).sum()) for motion in motions]
+
+
+def _element(left: Array, row: int, motion: Array) -> Array:
+    """The combination (3M,) of elements that is a row's along a motion (M,)."""
+    element = np.zeros((3, len(motion)))
+    element[row] = motion
+    assert element.size == left.shape[1]
+    return element.ravel()
+
+
+def _turned(searched: MatrixElements) -> Array:
+    """The change (3M,) of the elements, in units of their rows' largest, when the robot's frame is turned."""
+    design = searched.start.reshape(3, -1)
+    change = np.vstack([-design[1], design[0], np.zeros(design.shape[1])]).ravel()
+    turned: Array = replace(searched, open=None).projection @ change / searched.units
+    return turned

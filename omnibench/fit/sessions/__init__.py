@@ -1,1 +1,0 @@
-"""Comparison of sessions: whether robot or reference changed between them."""

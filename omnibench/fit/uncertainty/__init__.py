@@ -1,1 +1,0 @@
-"""Precision with which recordings determine a calibration: covariance, intervals, identifiability."""

@@ -1,0 +1,717 @@
+"""Smooth functions of a covariate for unknown effects: changes of the motion along, across and in turning.
+
+They describe an error without its cause, and are never proposed as names. A change in turning is proportional to the
+distance that the wheels move, so that a standing robot is never changed. No function extrapolates beyond the data: each
+is constant there or fades to zero.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+from numpy.polynomial import chebyshev
+
+from omnibench.registry import effects
+from omnibench.robot.effects.effect import MotionEffect, Parameter, ReferenceEffect, Values
+from omnibench.robot.effects.wheels import has_rollers, of_wheels, one_for_each_wheel
+from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.signals import STILL, Signals
+
+SURFACES = ("x", "y", "xx", "xy", "yy", "xxx", "xxy", "xyy", "yyy")
+_LARGEST = 0.1  # plausible size of a coefficient, a share of the motion; chosen
+_SLOW = 1e-3  # m/s, below which the direction of travel is ill-defined; chosen
+MODES = {
+    "along": "along the way",
+    "across": "across the way, to the left",
+    "turn": "in turning, per way of the wheels",
+    "rotation": "of the rate of turn",
+}
+ALL_MODES = tuple(MODES)
+
+
+def scale(name: str, unit: str, low: float, high: float, usual: float, description: str) -> Parameter:
+    """A parameter that sets the range of a function; usual: the value to try."""
+    return Parameter(name, unit, low, high, description, choices=(usual,))
+
+
+def shared(modes: Sequence[str], labels: Sequence[str], of_what: str) -> tuple[Parameter, ...]:
+    """Coefficients ``<mode>_<label>``, each a share of the motion."""
+    return tuple(
+        Parameter(f"{mode}_{label}", "1", -_LARGEST, _LARGEST, f"change {MODES[mode]}, with {label} of {of_what}")
+        for mode in modes
+        for label in labels
+    )
+
+
+def direction(mode: str, signals: Signals) -> Array:
+    """The change of the twist (F, 3) by a mode at a share of 1."""
+    twists = signals.twists
+    changes = np.zeros(twists.shape)
+    if mode == "along":
+        changes[:, :2] = twists[:, :2]
+    elif mode == "across":
+        changes[:, 0], changes[:, 1] = -twists[:, 1], twists[:, 0]
+    elif mode == "rotation":
+        changes[:, 2] = twists[:, 2]
+    else:
+        changes[:, 2] = np.abs(twists[:, 2]) + np.hypot(twists[:, 0], twists[:, 1]) / lever(signals.robot)
+    return changes
+
+
+def lever(robot: Robot) -> float:
+    """Mean lever arm of the wheels, m, which converts turning to speed at the wheels."""
+    return robot.reach
+
+
+def waves(angle: Array, harmonics: Sequence[float]) -> Array:
+    """Cosines and sines (F, 2 m) of m multiples of an angle (F,)."""
+    return np.concatenate([[np.cos(multiple * angle), np.sin(multiple * angle)] for multiple in harmonics]).T
+
+
+def surfaces(inside: Array) -> Array:
+    """The nine monomials (F, 9) of degree 1 to 3 in x and y of points (F, 2)."""
+    x, y = inside.T
+    return np.column_stack([x, y, x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3])
+
+
+def inside_of(places: Array, values: Values) -> Array:
+    """Positions (F, 2) relative to the centre, in units of the reach; those beyond 1 are moved to the unit circle."""
+    away = (places - [values["centre_x"], values["centre_y"]]) / values["reach"]
+    return away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1.0)
+
+
+def bump(places: Array, values: Values) -> Array:
+    """A Gaussian function (F, 1) of positions (F, 2), with value 1 at the centre."""
+    away = (places - [values["centre_x"], values["centre_y"]]) / values["radius"]
+    return np.exp(-np.square(away).sum(axis=1, keepdims=True))
+
+
+def across(places: Array, values: Values) -> Array:
+    """Distances (F,) of positions (F, 2) from a line, on the side of its normal positive, m."""
+    distances: Array = places @ [np.cos(values["normal"]), np.sin(values["normal"])] - values["distance"]
+    return distances
+
+
+def beyond(places: Array, values: Values) -> Array:
+    """A soft step (F, 1) of positions (F, 2), from 0 to 1 across a line."""
+    return (0.5 + 0.5 * np.tanh(across(places, values) / values["width"]))[:, None]
+
+
+AREA = (
+    scale("centre_x", "m", -1e6, 1e6, 0.0, "middle of the places that were seen"),
+    scale("centre_y", "m", -1e6, 1e6, 0.0, "middle of the places that were seen"),
+    scale("reach", "m", 1e-6, 1e6, 2.0, "how far from there places were seen"),
+)
+PATCH = (
+    *AREA[:2],
+    scale("radius", "m", 1e-6, 1e6, 2.0, "from the centre, where 1/e of the change is left"),
+)
+
+
+LINE = (
+    scale("normal", "rad", -7.0, 7.0, 0.0, "direction across the line, in the reference's frame"),
+    scale("distance", "m", -1e6, 1e6, 0.0, "of the line from the reference's origin along that direction"),
+)
+
+
+class WithoutCause:
+    """Attributes of effects that describe an error and not its cause, and so are not in the catalogue."""
+
+    physics = "None: a function that was fitted to what the model left, without a cause."
+    source = "fitted to data"
+    in_catalogue = False
+
+
+class SmoothEffect(WithoutCause, MotionEffect):
+    """Changes of the motion that depend on a covariate: for each of ``modes`` a sum of the ``labels`` functions."""
+
+    stage = "body"
+    modes: ClassVar[tuple[str, ...]] = ("along", "across", "turn")
+    labels: ClassVar[tuple[str, ...]]
+
+    @abstractmethod
+    def shares(self, signals: Signals, values: Values) -> Array:
+        """Values (F, J) of the J functions."""
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        shares, added = self.shares(signals, values), np.zeros(signals.twists.shape)
+        for mode in self.modes:
+            factors = np.array([values[f"{mode}_{label}"] for label in self.labels])
+            if factors.any():
+                added += (shares @ factors)[:, None] * direction(mode, signals)
+        return added
+
+
+_TIMES = tuple(str(order) for order in range(16))
+
+
+@effects.register("smooth_elapsed_time")
+class SmoothElapsedTime(SmoothEffect):
+    """Unknown effect: cosines of the time since the start of a run; after the longest run seen the value is held."""
+
+    shows_in = "elapsed time"
+    labels = _TIMES
+    fixed_parameters = (
+        *shared(SmoothEffect.modes, _TIMES, "the time since the start"),
+        scale("duration", "s", 1e-3, 1e6, 5.0, "of the longest run that was seen"),
+    )
+
+    def shares(self, signals: Signals, values: Values) -> Array:
+        part = np.clip(signals.elapsed / values["duration"], 0.0, 1.0)
+        return np.cos(np.pi * np.arange(len(_TIMES)) * part[:, None])
+
+
+_TURNS = ("cos1", "sin1", "cos2", "sin2", "cos3", "sin3")
+
+
+@effects.register("smooth_time_wave")
+class SmoothTimeWave(SmoothEffect):
+    """Unknown effect: a wave of the time since the start of a run; after the longest run seen the value is held."""
+
+    shows_in = "elapsed time"
+    modes = ALL_MODES
+    labels = ("cos", "sin")
+    fixed_parameters = (
+        *shared(ALL_MODES, labels, "the time since the start"),
+        scale("frequency", "Hz", 1e-6, 1e6, 1.0, "waves in a second"),
+        scale("duration", "s", 1e-3, 1e6, 5.0, "of the longest run that was seen"),
+    )
+
+    def shares(self, signals: Signals, values: Values) -> Array:
+        return waves(2 * np.pi * np.minimum(signals.elapsed, values["duration"]), (values["frequency"],))
+
+
+@effects.register("smooth_heading")
+class SmoothHeading(SmoothEffect):
+    """Unknown effect: the first three harmonics of the robot's heading."""
+
+    shows_in = "heading"
+    needs = frozenset({"poses"})
+    labels = _TURNS
+    fixed_parameters = shared(SmoothEffect.modes, _TURNS, "the heading")
+
+    def shares(self, signals: Signals, values: Values) -> Array:  # noqa: ARG002
+        assert signals.poses is not None  # they are needed
+        return waves(signals.poses[:, 2], (1, 2, 3))
+
+
+@effects.register("smooth_heading_wave")
+class SmoothHeadingWave(SmoothEffect):
+    """Unknown effect: a wave of the robot's heading, so many times a turn."""
+
+    shows_in = "heading"
+    needs = frozenset({"poses"})
+    modes = ALL_MODES
+    labels = ("cos", "sin")
+    fixed_parameters = (
+        *shared(ALL_MODES, labels, "the heading"),
+        scale("harmonic", "1", 1.0, 64.0, 4.0, "waves in a turn of the robot"),
+    )
+
+    def shares(self, signals: Signals, values: Values) -> Array:
+        assert signals.poses is not None  # they are needed
+        return waves(signals.poses[:, 2], (values["harmonic"],))
+
+
+@effects.register("smooth_course")
+class SmoothCourse(SmoothEffect):
+    """Unknown effect: a steady push along the way in the world, and two harmonics of the direction of travel there.
+
+    The harmonics fade to zero below 1 mm/s, where there is no direction of travel.
+    """
+
+    shows_in = "heading"
+    needs = frozenset({"poses"})
+    labels = _TURNS[:4]
+    fixed_parameters = (
+        Parameter("east", "1", -_LARGEST, _LARGEST, "push along x of the reference, of the speed"),
+        Parameter("north", "1", -_LARGEST, _LARGEST, "push along y of the reference, of the speed"),
+        *shared(SmoothEffect.modes, labels, "the direction of travel"),
+    )
+
+    def shares(self, signals: Signals, values: Values) -> Array:  # noqa: ARG002
+        assert signals.poses is not None  # they are needed
+        forward, left, _ = signals.twists.T
+        driving = np.minimum(1.0, np.hypot(forward, left) / _SLOW)
+        return driving[:, None] * waves(signals.poses[:, 2] + np.arctan2(left, forward), (1, 2))
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        assert signals.poses is not None
+        added = super().correction(signals, values)
+        push = complex(values["east"], values["north"]) * np.exp(-1j * signals.poses[:, 2])
+        push *= np.hypot(signals.twists[:, 0], signals.twists[:, 1])
+        added[:, 0] += push.real
+        added[:, 1] += push.imag
+        return added
+
+
+@effects.register("smooth_place")
+class SmoothPlace(SmoothEffect):
+    """Unknown effect: polynomials of degree 3 in the place on the floor; beyond the places seen the value is held."""
+
+    shows_in = "place"
+    needs = frozenset({"poses"})
+    labels = SURFACES
+    fixed_parameters = (*shared(SmoothEffect.modes, SURFACES, "the place"), *AREA)
+
+    def shares(self, signals: Signals, values: Values) -> Array:
+        assert signals.poses is not None  # they are needed
+        return surfaces(inside_of(signals.poses[:, :2], values))
+
+
+@effects.register("smooth_patch")
+class SmoothPatch(SmoothEffect):
+    """Unknown effect: a round patch of the floor, outside of which the change fades to zero."""
+
+    shows_in = "place"
+    needs = frozenset({"poses"})
+    modes = ALL_MODES
+    labels = ("bump",)
+    fixed_parameters = (*shared(ALL_MODES, labels, "the place"), *PATCH)
+
+    def shares(self, signals: Signals, values: Values) -> Array:
+        assert signals.poses is not None  # they are needed
+        return bump(signals.poses[:, :2], values)
+
+
+@effects.register("smooth_place_wave")
+class SmoothPlaceWave(SmoothEffect):
+    """Unknown effect: a plane wave over the floor, as of tiles; beyond the places seen the value is held."""
+
+    shows_in = "place"
+    needs = frozenset({"poses"})
+    modes = ALL_MODES
+    labels = ("cos", "sin")
+    fixed_parameters = (
+        *shared(ALL_MODES, labels, "the place"),
+        scale("along_x", "rad/m", -1e3, 1e3, 10.0, "phase per way along x of the reference"),
+        scale("along_y", "rad/m", -1e3, 1e3, 0.0, "phase per way along y of the reference"),
+        *AREA,
+    )
+
+    def shares(self, signals: Signals, values: Values) -> Array:
+        assert signals.poses is not None  # they are needed
+        held = values["reach"] * inside_of(signals.poses[:, :2], values)
+        return waves(held @ [values["along_x"], values["along_y"]], (1.0,))
+
+
+@effects.register("smooth_edge")
+class SmoothEdge(SmoothEffect):
+    """Unknown effect: the floor beyond a straight line, as a carpet's edge."""
+
+    shows_in = "place"
+    needs = frozenset({"poses"})
+    modes = ALL_MODES
+    labels = ("beyond",)
+    fixed_parameters = (
+        *shared(ALL_MODES, labels, "the line"),
+        *LINE,
+        scale("width", "m", 1e-6, 1e6, 0.05, "over which the change sets in"),
+    )
+
+    def shares(self, signals: Signals, values: Values) -> Array:
+        assert signals.poses is not None  # they are needed
+        return beyond(signals.poses[:, :2], values)
+
+
+@effects.register("smooth_joint")
+class SmoothJoint(SmoothEffect):
+    """Unknown effect: a joint of the floor along a straight line, as between two rows of tiles."""
+
+    shows_in = "place"
+    needs = frozenset({"poses"})
+    modes = ALL_MODES
+    labels = ("joint",)
+    fixed_parameters = (
+        *shared(ALL_MODES, labels, "the line"),
+        *LINE,
+        scale("width", "m", 1e-6, 1e6, 0.03, "across the joint, where 1/e of the change is left on either side"),
+    )
+
+    def shares(self, signals: Signals, values: Values) -> Array:
+        assert signals.poses is not None  # they are needed
+        return np.exp(-np.square(across(signals.poses[:, :2], values) / values["width"]))[:, None]
+
+
+@effects.register("smooth_command")
+class SmoothCommand(SmoothEffect):
+    """Unknown effect: motions near one, by direction of travel and turning; for all others the change fades to zero."""
+
+    shows_in = "command"
+    labels = ("bump",)
+    fixed_parameters = (
+        *shared(SmoothEffect.modes, labels, "the motion"),
+        scale("vx", "m/s", -1e3, 1e3, 0.2, "the motion, forwards"),
+        scale("vy", "m/s", -1e3, 1e3, 0.0, "the motion, to the left"),
+        scale("omega", "rad/s", -1e3, 1e3, 0.0, "the motion, turning"),
+        scale("width", "m/s", 1e-9, 1e3, 0.3, "how far other motions are, at the wheels, where 61 % of it is left"),
+    )
+
+    def shares(self, signals: Signals, values: Values) -> Array:
+        away = signals.twists - [values["vx"], values["vy"], values["omega"]]
+        away = away * [1.0, 1.0, lever(signals.robot)] / values["width"]
+        return np.exp(-np.square(away).sum(axis=1, keepdims=True) / 2)
+
+
+@effects.register("smooth_session_wave")
+class SmoothSessionWave(SmoothEffect):
+    """Unknown effect: a wave of the time since the session's start; after the longest seen the value is held."""
+
+    shows_in = "order of runs"
+    needs = frozenset({"session_time"})
+    modes = ALL_MODES
+    labels = ("cos", "sin")
+    fixed_parameters = (
+        *shared(ALL_MODES, labels, "the session's time"),
+        scale("frequency", "Hz", 1e-9, 1e6, 1e-3, "waves in a second"),
+        scale("duration", "s", 1e-3, 1e9, 3600.0, "of the longest session that was seen"),
+    )
+
+    def shares(self, signals: Signals, values: Values) -> Array:
+        assert signals.session_time is not None  # it is needed
+        return waves(2 * np.pi * np.minimum(signals.session_time, values["duration"]), (values["frequency"],))
+
+
+@effects.register("smooth_order_of_runs")
+class SmoothOrderOfRuns(SmoothEffect):
+    """Unknown effect: polynomials of the time since the session's start; after the longest seen the value is held."""
+
+    shows_in = "order of runs"
+    needs = frozenset({"session_time"})
+    modes = ("along", "rotation", "turn")
+    labels = tuple(str(order) for order in range(1, 13))
+    fixed_parameters = (
+        *shared(modes, labels, "the session's time"),
+        scale("duration", "s", 1e-3, 1e9, 3600.0, "of the longest session that was seen"),
+    )
+
+    def shares(self, signals: Signals, values: Values) -> Array:
+        assert signals.session_time is not None  # it is needed
+        unit = np.clip(2 * signals.session_time / values["duration"] - 1, -1.0, 1.0)
+        functions: Array = chebyshev.chebvander(unit, len(self.labels))[:, 1:]
+        return functions
+
+
+def mean_waves(signals: Signals, wheel: int, harmonic: float) -> Array:
+    """Means (F, 2) of omega cos(n phi) and omega sin(n phi) of a wheel over each sample; harmonic: n.
+
+    phi turns at the constant rate omega. With phi in the middle of a sample of duration d the means are cos(n phi) and
+    sin(n phi) times 2 sin(n omega d / 2) / (n d).
+    """
+    assert signals.wheel_angles is not None  # they are needed
+    half = harmonic / 2 * signals.durations
+    amplitude = np.sin(half * signals.rates[:, wheel]) / half
+    means: Array = amplitude[:, None] * waves(signals.wheel_angles[:, wheel], (harmonic,))
+    return means
+
+
+def ripple(signals: Signals, harmonic: float, values: Values) -> Array:
+    """Mean of omega (a cos(n phi) + b sin(n phi)) over each sample (F, N).
+
+    harmonic: n. values: a_<wheel> and b_<wheel>.
+    """
+    assert signals.wheel_angles is not None  # they are needed
+    if len(signals.rates) == 1:
+        return _ripple_of_one_sample(signals, signals.wheel_angles, harmonic, values)
+    added = np.zeros(signals.rates.shape)
+    for wheel, name in enumerate(signals.robot.wheel_names):
+        amplitudes = np.array([values[f"a_{name}"], values[f"b_{name}"]])
+        if amplitudes.any():
+            added[:, wheel] = mean_waves(signals, wheel, harmonic) @ amplitudes
+    return added
+
+
+def _ripple_of_one_sample(signals: Signals, angles: Array, harmonic: float, values: Values) -> Array:
+    """``ripple`` of one sample in Python floats, which are faster than NumPy for a few wheels in a stream."""
+    half = harmonic / 2 * float(signals.durations[0])
+    samples = zip(signals.robot.measured, signals.rates[0].tolist(), angles[0].tolist(), strict=True)
+    added = []
+    for wheel, rate, angle in samples:
+        a, b, phase = values[f"a_{wheel.name}"], values[f"b_{wheel.name}"], harmonic * angle
+        added.append((a * math.cos(phase) + b * math.sin(phase)) * math.sin(half * rate) / half)
+    return np.array([added])
+
+
+@effects.register("wheel_eccentricity")
+class WheelEccentricity(MotionEffect):
+    """A wheel's radius changes over one turn: r (1 + a cos phi + b sin phi)."""
+
+    stage = "wheel"
+    physics = "The axle does not stand in the middle of the wheel."
+    source = "first principles"
+    shows_in = "wheel angle"
+    needs = frozenset({"wheel_angles"})
+
+    def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
+        return (
+            *one_for_each_wheel(robot, "a", "1", -0.02, 0.02, "share of the radius, with the cosine of the angle"),
+            *one_for_each_wheel(robot, "b", "1", -0.02, 0.02, "share of the radius, with the sine of the angle"),
+        )
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        return ripple(signals, 1.0, values)
+
+
+@effects.register("roller_ripple")
+class RollerRipple(MotionEffect):
+    """A wheel's radius changes from roller to roller: r (1 + a cos(n phi) + b sin(n phi)), n rollers."""
+
+    stage = "wheel"
+    physics = "The rollers do not make a perfect circle: the wheel sinks in between two of them."
+    source = "first principles"
+    shows_in = "wheel angle"
+    needs = frozenset({"wheel_angles"})
+    only_for = "robots with a wheel on rollers"
+
+    def applies(self, robot: Robot) -> bool:
+        return has_rollers(robot)
+
+    def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
+        counts = tuple(float(count) for count in range(3, 17))
+        return (
+            *one_for_each_wheel(robot, "a", "1", -0.03, 0.03, "share of the radius, with the cosine of n angles"),
+            *one_for_each_wheel(robot, "b", "1", -0.03, 0.03, "share of the radius, with the sine of n angles"),
+            Parameter("rollers", "1", 2, 64, "rollers along a wheel's circumference, n", choices=counts),
+        )
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        return ripple(signals, values["rollers"], values)
+
+
+KNOTS = 8  # knots of the function of each wheel's rate; chosen
+_COMMON_KNOTS = 33  # knots of the function that all wheels share; chosen
+HARMONICS = (0.5, *(float(number) for number in range(1, 17)), 1.5, 2.5, 3.5)  # waves in a turn of a wheel; chosen
+
+_TOP = scale("top", "rad/s", 1e-6, 1e6, 6.0, "the fastest rate that was seen; knots are spread from -top to top")
+
+
+def hat_functions(rates: Array, top: float) -> Array:
+    """Piecewise linear hat functions (..., 8) of rates between -top and top, rad/s, constant beyond.
+
+    Zero for standing wheels.
+    """
+    return np.stack([_between_knots(rates, top, heights) for heights in np.eye(KNOTS)], axis=-1)
+
+
+def _between_knots(rates: Array, top: float, heights: Array) -> Array:
+    """The piecewise linear function (...) of rates with given heights at the knots; zero for standing wheels."""
+    interpolated: Array = np.interp(rates, np.linspace(-top, top, len(heights)), heights)
+    return np.where(np.abs(rates) > STILL, interpolated, 0.0)
+
+
+@effects.register("smooth_wheel_rate")
+class SmoothWheelRate(WithoutCause, MotionEffect):
+    """Unknown effect: a piecewise linear function of each wheel's rate, which holds its value beyond the rates seen."""
+
+    stage = "wheel"
+    shows_in = "wheel rate"
+
+    def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
+        at_knots = [
+            one_for_each_wheel(robot, f"change_{knot}", "rad/s", -0.02, 0.02, f"change at knot {knot} of 0 to 7")
+            for knot in range(KNOTS)
+        ]
+        return (*(parameter for knot in at_knots for parameter in knot), _TOP)
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        heights = np.array([of_wheels(signals.robot, f"change_{knot}", values) for knot in range(KNOTS)])
+        wheels = zip(signals.rates.T, heights.T, strict=True)
+        return np.column_stack([_between_knots(rates, values["top"], at_knots) for rates, at_knots in wheels])
+
+
+@effects.register("smooth_common_rate")
+class SmoothCommonRate(WithoutCause, MotionEffect):
+    """Unknown effect: a finer function of the wheel rate, the same for all wheels, held beyond the rates seen."""
+
+    stage = "wheel"
+    shows_in = "wheel rate"
+    fixed_parameters = (
+        *(
+            Parameter(f"change_{knot}", "rad/s", -0.02, 0.02, f"change at knot {knot} of 0 to {_COMMON_KNOTS - 1}")
+            for knot in range(_COMMON_KNOTS)
+        ),
+        _TOP,
+    )
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        heights = np.array([values[f"change_{knot}"] for knot in range(_COMMON_KNOTS)])
+        return _between_knots(signals.rates, values["top"], heights)
+
+
+@effects.register("smooth_wheel_angle")
+class SmoothWheelAngle(WithoutCause, MotionEffect):
+    """Unknown effect: a wave of each wheel's angle, so many times a turn."""
+
+    stage = "wheel"
+    shows_in = "wheel angle"
+    needs = frozenset({"wheel_angles"})
+
+    def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
+        return (
+            *one_for_each_wheel(robot, "a", "1", -0.03, 0.03, "share of the radius, with the cosine"),
+            *one_for_each_wheel(robot, "b", "1", -0.03, 0.03, "share of the radius, with the sine"),
+            Parameter("harmonic", "1", 0.1, 256.0, "waves in a turn of the wheel", choices=HARMONICS),
+        )
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        return ripple(signals, values["harmonic"], values)
+
+
+_OF_ACCELERATION = (
+    Parameter("straight", "s", -0.1, 0.1, "change of the velocity, of the acceleration"),
+    Parameter("aside", "s", -0.1, 0.1, "change of the velocity to the left of the acceleration, of its size"),
+    Parameter("about_x", "rad s/m", -0.1, 0.1, "change of the rate of turn, of the acceleration forwards"),
+    Parameter("about_y", "rad s/m", -0.1, 0.1, "change of the rate of turn, of the acceleration to the left"),
+    Parameter("about_omega", "s", -0.1, 0.1, "change of the rate of turn, of its own rate of change"),
+    Parameter("about_size", "rad s/m", -0.1, 0.1, "change of the rate of turn, of the acceleration's size"),
+    Parameter("about_turning", "s", -0.1, 0.1, "change of the rate of turn, of the size of its rate of change"),
+    Parameter("along", "s2/m", -0.1, 0.1, "change along the way, of the speed times the acceleration's size"),
+    Parameter("across", "s2/m", -0.1, 0.1, "change across the way, of the speed times the acceleration's size"),
+    Parameter("rotation", "s2/m", -0.1, 0.1, "change of the rate of turn, of itself times the acceleration's size"),
+)
+
+
+@effects.register("smooth_acceleration")
+class SmoothAcceleration(WithoutCause, MotionEffect):
+    """Unknown effect: changes that grow with the acceleration, up to the largest that was seen, and then no more."""
+
+    stage = "body"
+    shows_in = "acceleration"
+    fixed_parameters = (
+        *_OF_ACCELERATION,
+        scale("top", "m/s2", 1e-9, 1e9, 10.0, "the largest acceleration that was seen"),
+        scale("top_turning", "rad/s2", 1e-9, 1e9, 50.0, "the largest change of the rate of turn that was seen"),
+    )
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        forward, left, angular = signals.accelerations.T
+        size = np.hypot(forward, left)
+        limit = np.minimum(1.0, values["top"] / np.maximum(size, 1e-300))
+        forward, left, size = limit * forward, limit * left, limit * size
+        angular = np.clip(angular, -values["top_turning"], values["top_turning"])
+        zeros = np.zeros(len(size))
+        turning = values["about_x"] * forward + values["about_y"] * left + values["about_omega"] * angular
+        turning = turning + values["about_size"] * size + values["about_turning"] * np.abs(angular)
+        added = values["straight"] * np.column_stack([forward, left, zeros])
+        added += values["aside"] * np.column_stack([-left, forward, zeros])
+        added[:, 2] += turning
+        for mode in ("along", "across", "rotation"):
+            added += values[mode] * size[:, None] * direction(mode, signals)
+        return added
+
+
+_AXES = {"x": "m", "y": "m", "theta": "rad"}
+_ROUNDS = 200  # steps of the fixed-point iteration that inverts a map, at most; chosen
+_SAME = 1e-13  # m, rad: a smaller change ends the iteration
+
+
+class BentMap(WithoutCause, ReferenceEffect):
+    """A distorted map: reported poses are shifted by functions of the position, relative to the run's start.
+
+    ``corrected`` assumes that the map is invertible.
+    """
+
+    shows_in = "place"
+    axes = tuple(_AXES)
+    labels: ClassVar[tuple[str, ...]]
+
+    @abstractmethod
+    def functions(self, places: Array, values: Values) -> Array:
+        """Values (K, J) of the J functions at positions (K, 2), m."""
+
+    def reported(self, poses: Array, start: Array, values: Values) -> Array:
+        return poses + self._shift(poses, start, values)
+
+    def corrected(self, poses: Array, start: Array, values: Values) -> Array:
+        true = poses
+        for _ in range(_ROUNDS):
+            before, true = true, poses - self._shift(true, start, values)
+            if np.abs(true - before).max(initial=0.0) < _SAME:
+                break
+        return true
+
+    def _shift(self, poses: Array, start: Array, values: Values) -> Array:
+        """Shift (K, 3) of reported poses relative to the shift of the start, m, m, rad."""
+        factors = np.array([[values[f"{axis}_{label}"] for label in self.labels] for axis in _AXES])
+        there = self.functions(poses[:, :2], values) - self.functions(start[None, :2], values)
+        shift: Array = there @ factors.T
+        return shift
+
+
+def _shifts(labels: Sequence[str]) -> tuple[Parameter, ...]:
+    """Coefficients ``<axis>_<label>``."""
+    return tuple(
+        Parameter(f"{axis}_{label}", unit, -0.01, 0.01, f"shift of {axis}, with {label} of the place")
+        for axis, unit in _AXES.items()
+        for label in labels
+    )
+
+
+@effects.register("smooth_map")
+class SmoothMap(BentMap):
+    """Unknown effect: a bent map, by polynomials of degree 3 in the place; beyond the places seen the value is held."""
+
+    labels = SURFACES
+    fixed_parameters = (*_shifts(SURFACES), *AREA)
+
+    def functions(self, places: Array, values: Values) -> Array:
+        return surfaces(inside_of(places, values))
+
+
+@effects.register("smooth_map_patch")
+class SmoothMapPatch(BentMap):
+    """Unknown effect: a round patch of the map that is shifted, outside of which the shift fades to zero."""
+
+    labels = ("bump",)
+    fixed_parameters = (*_shifts(labels), *PATCH)
+
+    def functions(self, places: Array, values: Values) -> Array:
+        return bump(places, values)
+
+
+@effects.register("smooth_stamps")
+class SmoothStamps(WithoutCause, ReferenceEffect):
+    """Unknown effect: delays that grow with the stamp, up to the last one seen, and that alternate."""
+
+    shows_in = "stamps"
+    fixed_parameters = (
+        *(
+            Parameter(f"{what}_{kind}", "s", -0.1, 0.1, f"by how much earlier the {what} was taken, {words}")
+            for what in ("position", "heading")
+            for kind, words in (
+                ("always", "always"),
+                ("late", "at the last stamp, more than at 0"),
+                ("alternating", "every other pose, and later those between"),
+            )
+        ),
+        scale("duration", "s", 1e-3, 1e6, 30.0, "the last stamp that was seen"),
+        scale("period", "s", 1e-6, 1e6, 0.25, "from one pose to the next"),
+    )
+
+    def delays(self, stamps: Array, values: Values) -> tuple[Array, Array]:
+        late, turns = np.clip(stamps / values["duration"], 0.0, 1.0), (-1.0) ** np.rint(stamps / values["period"])
+        position, heading = (
+            values[f"{what}_always"] + values[f"{what}_late"] * late + values[f"{what}_alternating"] * turns
+            for what in ("position", "heading")
+        )
+        return position, heading
+
+
+@effects.register("smooth_stamp_wave")
+class SmoothStampWave(WithoutCause, ReferenceEffect):
+    """Unknown effect: a delay of the poses that swings with their stamps, at one frequency."""
+
+    shows_in = "stamps"
+    fixed_parameters = (
+        Parameter("cos", "s", -0.1, 0.1, "by how much earlier the pose was taken, with the cosine"),
+        Parameter("sin", "s", -0.1, 0.1, "by how much earlier the pose was taken, with the sine"),
+        scale("frequency", "Hz", 1e-6, 1e6, 1.0, "swings in a second"),
+    )
+
+    def delays(self, stamps: Array, values: Values) -> tuple[Array, Array]:
+        swing = waves(2 * np.pi * values["frequency"] * stamps, (1,)) @ np.array([values["cos"], values["sin"]])
+        return swing, swing

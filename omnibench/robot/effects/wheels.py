@@ -1,0 +1,489 @@
+"""Parameters with one value for each wheel, named by a prefix and the wheel's name."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from omnibench.registry import effects
+from omnibench.robot.effects.effect import MotionEffect, Parameter, ReferenceEffect, Values
+from omnibench.robot.kinematics import Array, Robot, class_of
+from omnibench.robot.odometry import Complex
+from omnibench.robot.signals import Signals
+
+
+def has_rollers(robot: Robot) -> bool:
+    """True if a wheel with a measured rate has rollers."""
+    return any(wheel.kind in ("omni", "mecanum") for wheel in robot.measured)
+
+
+def one_for_each_wheel(
+    robot: Robot, prefix: str, unit: str, low: float, high: float, description: str
+) -> tuple[Parameter, ...]:
+    """The parameters ``prefix_<wheel>`` of a robot's wheels."""
+    return tuple(
+        Parameter(f"{prefix}_{name}", unit, low, high, f"{description}, wheel {name}") for name in robot.wheel_names
+    )
+
+
+def of_wheels(robot: Robot, prefix: str, values: Values) -> Array:
+    """The values (N,) of the parameters ``prefix_<wheel>``."""
+    return np.array([values[f"{prefix}_{name}"] for name in robot.wheel_names])
+
+
+_RADIUS_OF = "radius_"
+
+
+@effects.register("speed_dependent_radius")
+class SpeedDependentRadius(MotionEffect):
+    """The radius of all wheels changes with their rate: r (1 + k abs(omega))."""
+
+    stage = "wheel"
+    physics = "A soft tread grows with the rate of its wheel, or is pressed flatter by what drives it."
+    source = "H. B. Pacejka, Tire and Vehicle Dynamics (effective rolling radius)"
+    shows_in = "wheel rate"
+    fixed_parameters = (Parameter("k", "s/rad", -0.02, 0.02, "relative change of the radius per rad/s"),)
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        return values["k"] * np.abs(signals.rates) * signals.rates
+
+
+@effects.register("direction_dependent_radius")
+class DirectionDependentRadius(MotionEffect):
+    """A wheel drives farther one way than the other: omega + k_i abs(omega)."""
+
+    stage = "wheel"
+    physics = "Rollers, tread or backlash give way differently when a wheel turns backwards."
+    source = "first principles"
+    shows_in = "command"
+
+    def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
+        return one_for_each_wheel(robot, "k", "1", -0.01, 0.01, "half the relative difference between both directions")
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        return of_wheels(signals.robot, "k", values) * np.abs(signals.rates)
+
+
+@effects.register("thermal_radius_drift")
+class ThermalRadiusDrift(MotionEffect):
+    """The radius of all wheels drifts in the course of a session: r (1 + k session time)."""
+
+    stage = "wheel"
+    physics = "Treads warm up while they roll and expand, or soften and sink in."
+    source = "first principles"
+    shows_in = "order of runs"
+    needs = frozenset({"session_time"})
+    # 2 % within 1000 s; over hours the drift levels off, and its mean rate is smaller.
+    fixed_parameters = (Parameter("k", "1/s", -2e-5, 2e-5, "relative change of the radius per second of the session"),)
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        assert signals.session_time is not None  # it is needed
+        return (values["k"] * signals.session_time)[:, None] * signals.rates
+
+
+@effects.register("tyre_wear")
+class TyreWear(MotionEffect):
+    """The radius of all wheels differs from session to session: r (1 + radius_session)."""
+
+    stage = "wheel"
+    physics = "Treads wear off, or are changed or pumped up, between two sessions."
+    source = (
+        "J. Borenstein and L. Feng, Measurement and correction of systematic odometry errors in mobile robots, 1996"
+    )
+    shows_in = "order of runs"
+    needs = frozenset({"session"})
+
+    def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
+        return tuple(
+            Parameter(f"{_RADIUS_OF}{session}", "1", -0.01, 0.01, f"relative to the radius of session {sessions[0]}")
+            for session in sessions[1:]
+        )
+
+    def accepts(self, parameter: str) -> bool:
+        return parameter.startswith(_RADIUS_OF)
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        """The correction; zero in a session without a radius of its own."""
+        return values.get(f"{_RADIUS_OF}{signals.session}", 0.0) * signals.rates
+
+
+_PACEJKA = "H. B. Pacejka, Tire and Vehicle Dynamics"
+_WOBBLES = 4  # wheels: three stand on any floor, of four one may be lighter
+
+
+def _centripetal(twists: Array) -> Array:
+    """w x v (F, 2) of twists (F, 3), m/s2."""
+    across: Array = twists[:, 2:] * twists[:, 1::-1]  # w vy, w vx
+    across[:, 0] *= -1
+    return across
+
+
+@effects.register("acceleration_slip")
+class AccelerationSlip(MotionEffect):
+    """The robot falls behind while it accelerates: v - k dv/dt, in the robot's frame."""
+
+    stage = "body"
+    physics = "Slip of the wheels grows with the force that accelerates the robot."
+    source = f"{_PACEJKA} (longitudinal slip in proportion to the force)"
+    shows_in = "acceleration"
+    fixed_parameters = (Parameter("k", "s", 0.0, 0.1, "velocity that is lost per acceleration"),)
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        added = np.zeros(signals.twists.shape)
+        added[:, :2] = -values["k"] * signals.accelerations[:, :2]
+        return added
+
+
+@effects.register("centripetal_slip")
+class CentripetalSlip(MotionEffect):
+    """The robot slides across while it turns: v + k w x v."""
+
+    stage = "body"
+    physics = "Slip of the wheels grows with the force that keeps the robot on its curve."
+    source = f"{_PACEJKA} (side slip in proportion to the force)"
+    shows_in = "command"
+    form_covariates = ("centripetal acceleration",)
+    fixed_parameters = (
+        Parameter("k", "s", 0.0, 0.1, "velocity towards the inside of the curve per centripetal acceleration"),
+    )
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        added = np.zeros(signals.twists.shape)
+        added[:, :2] = values["k"] * _centripetal(signals.twists)
+        return added
+
+
+@effects.register("load_transfer")
+class LoadTransfer(MotionEffect):
+    """A wheel that is pressed down has a smaller radius: r (1 - k a.u_i), u_i the direction of the wheel's axle.
+
+    a is the whole acceleration of the body, in its own frame: dv/dt + w x v.
+    """
+
+    stage = "wheel"
+    physics = "Accelerating shifts the robot's weight from wheel to wheel, and a tread gives way under load."
+    source = f"{_PACEJKA} (effective rolling radius under load)"
+    shows_in = "acceleration"
+    fixed_parameters = (Parameter("k", "s2/m", 0.0, 0.3, "relative change of the radius per acceleration"),)
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        angles = np.array([wheel.outward for wheel in signals.robot.measured])
+        towards = np.stack([np.cos(angles), np.sin(angles)])
+        acceleration = signals.accelerations[:, :2] + _centripetal(signals.twists)
+        return -values["k"] * (acceleration @ towards) * signals.rates
+
+
+@effects.register("rotation_translation_coupling")
+class RotationTranslationCoupling(MotionEffect):
+    """The robot turns faster or slower the faster it drives: w (1 + k.v)."""
+
+    stage = "body"
+    physics = "Rollers that already slide along their axles give way more easily when the robot turns."
+    source = "first principles"
+    shows_in = "command"
+    fixed_parameters = (
+        Parameter("kx", "s/m", -0.3, 0.3, "relative change of the rate of turn per velocity forward"),
+        Parameter("ky", "s/m", -0.3, 0.3, "relative change of the rate of turn per velocity to the left"),
+    )
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        vx, vy, w = signals.twists.T
+        added = np.zeros(signals.twists.shape)
+        added[:, 2] = w * (values["kx"] * vx + values["ky"] * vy)
+        return added
+
+
+@effects.register("quadratic_rotation_slip")
+class QuadraticRotationSlip(MotionEffect):
+    """The faster the robot turns, the more of it is lost or gained: w - k w abs(w)."""
+
+    stage = "body"
+    physics = "The rollers' drag grows with the rate of turn, and the wheels slip against it."
+    source = "first principles"
+    shows_in = "command"
+    form_covariates = ("turning",)
+    fixed_parameters = (Parameter("k", "s/rad", -0.1, 0.1, "share of the rate of turn that is lost per rad/s"),)
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        rate_of_turn = signals.twists[:, 2]
+        added = np.zeros(signals.twists.shape)
+        added[:, 2] = -values["k"] * rate_of_turn * np.abs(rate_of_turn)
+        return added
+
+
+@effects.register("icr_shift")
+class IcrShift(MotionEffect):
+    """The faster a skid-steered robot turns, the farther ahead it has its centre of rotation: vy - x w abs(w).
+
+    What the rate of turn itself loses by wider tracks is quadratic_rotation_slip.
+    """
+
+    stage = "body"
+    physics = "The floor's friction across the wheels turns with their load, which turning shifts between the axles."
+    source = (
+        "A. Mandow et al., Experimental kinematics for wheeled skid-steer mobile robots, 2007; J. Pentzer, S. Brennan "
+        "and K. Reichard, Model-based prediction of skid-steer robot kinematics using online estimation of track "
+        "instantaneous centers of rotation, 2014"
+    )
+    shows_in = "command"
+    form_covariates = ("turning",)
+    only_for = "skid-steered robots"
+    fixed_parameters = (Parameter("x", "m s/rad", -0.1, 0.1, "way ahead of the centre of rotation per rate of turn"),)
+
+    def applies(self, robot: Robot) -> bool:
+        return robot.skid
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        rate_of_turn = signals.twists[:, 2]
+        added = np.zeros(signals.twists.shape)
+        added[:, 1] = -values["x"] * rate_of_turn * np.abs(rate_of_turn)
+        return added
+
+
+@effects.register("light_wheel")
+class LightWheel(MotionEffect):
+    """A wheel that stands lightly slips in proportion to the force that is asked of it: omega - k_i a.u_i / r.
+
+    u_i is the direction in which the wheel drives the robot, a the whole acceleration of the body in its own frame,
+    dv/dt + w x v.
+    """
+
+    stage = "wheel"
+    physics = "Four wheels or more share the weight as floor and frame will have it; grip goes with a wheel's share."
+    source = f"{_PACEJKA} (slip stiffness in proportion to the load)"
+    shows_in = "acceleration"
+    only_for = "robots on four measured wheels or more"
+
+    def applies(self, robot: Robot) -> bool:
+        return len(robot.wheel_names) >= _WOBBLES
+
+    def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
+        return one_for_each_wheel(robot, "k", "s", 0.0, 0.1, "rim speed that is lost per acceleration")
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        robot, acceleration = signals.robot, signals.accelerations[:, :2] + _centripetal(signals.twists)
+        lost = np.empty(signals.rates.shape)
+        for index, (wheel, pair) in enumerate(zip(robot.measured, robot.drive.pairs, strict=True)):
+            rollers = wheel.roller_angle
+            angles: Array = np.full(len(lost), wheel.rolling - rollers)
+            if pair >= 0:
+                assert signals.steering is not None  # the robot steers
+                angles = angles + signals.steering[:, pair]
+            driving = np.cos(angles) * acceleration[:, 0] + np.sin(angles) * acceleration[:, 1]
+            lost[:, index] = driving / (wheel.radius * np.cos(rollers))
+        return -of_wheels(robot, "k", values) * lost
+
+
+_KNEE = 0.05  # rad/s, half-width of the smoothed sign function; chosen
+
+
+def _smooth_sign(rates: Array) -> Array:
+    """Sign of wheel rates, smoothed near 0."""
+    return np.tanh(rates / _KNEE)
+
+
+@effects.register("wheel_dead_zone")
+class WheelDeadZone(MotionEffect):
+    """Every wheel that turns loses or gains a constant rate: omega + c sign(omega)."""
+
+    stage = "wheel"
+    physics = "Play in the drive and dry friction of the rollers take a constant rate off every wheel that turns."
+    source = "H. Olsson et al., Friction models and friction compensation, 1998"
+    shows_in = "wheel rate"
+    fixed_parameters = (Parameter("c", "rad/s", -0.02, 0.02, "rate that is gained in the direction of rotation"),)
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        return values["c"] * _smooth_sign(signals.rates)
+
+
+@effects.register("coulomb_creep")
+class CoulombCreep(MotionEffect):
+    """Every wheel that turns loses a rate in proportion to the robot's speed: omega + c sign(omega) abs(v) / r."""
+
+    stage = "wheel"
+    physics = "Rollers drag with a friction that does not depend on their speed, and the wheels creep against it."
+    source = "F. W. Carter, On the action of a locomotive driving wheel, 1926; H. Olsson et al., 1998 (friction)"
+    shows_in = "wheel rate"
+    form_covariates = ("wheel rate", "speed")
+    fixed_parameters = (Parameter("c", "1", -0.02, 0.02, "creep as a share of the robot's speed"),)
+    only_for = "robots with a wheel on rollers"
+
+    def applies(self, robot: Robot) -> bool:
+        return has_rollers(robot)
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        speed = np.hypot(signals.twists[:, 0], signals.twists[:, 1])
+        radii = signals.robot.radii
+        return values["c"] * _smooth_sign(signals.rates) * (speed[:, None] / radii)
+
+
+_CENSI = (
+    "A. Censi, A. Franchi, L. Marchionni and G. Oriolo, Simultaneous calibration of odometry and sensor parameters "
+    "for mobile robots, 2013"
+)
+
+
+def _about_the_start(poses: Array, start: Array, factor: complex) -> Array:
+    """Poses (K, 3) whose positions are turned and stretched about the start by a complex factor."""
+    path = ((poses[:, 0] - start[0]) + 1j * (poses[:, 1] - start[1])) * factor
+    return np.column_stack([start[0] + path.real, start[1] + path.imag, poses[:, 2]])
+
+
+@effects.register("lidar_lever_arm")
+class LidarLeverArm(ReferenceEffect):
+    """The reference tracks another point than the robot's centre: p + (R(theta) - R(theta_0)) l."""
+
+    physics = "The LIDAR stands somewhere else on the robot than its mounting says."
+    source = _CENSI
+    shows_in = "command"
+    measurement = "a ruler: how far forward and to the left of the robot's centre the LIDAR stands"
+    fixed_parameters = (
+        Parameter("x", "m", -0.05, 0.05, "where the tracked point stands, forward of the centre"),
+        Parameter("y", "m", -0.05, 0.05, "where the tracked point stands, to the left of the centre"),
+    )
+
+    def reported(self, poses: Array, start: Array, values: Values) -> Array:
+        return _shifted(poses, _arm(poses, start, values))
+
+    def corrected(self, poses: Array, start: Array, values: Values) -> Array:
+        return _shifted(poses, -_arm(poses, start, values))
+
+
+def _arm(poses: Array, start: Array, values: Values) -> Complex:
+    """Displacement of the tracked point by the arm's rotation since the start: x + iy (K,), m."""
+    arm: Complex = (np.exp(1j * poses[:, 2]) - np.exp(1j * start[2])) * complex(values["x"], values["y"])
+    return arm
+
+
+def _shifted(poses: Array, shift: Complex) -> Array:
+    """Poses (K, 3) with positions displaced by x + iy (K,), m."""
+    return np.column_stack([poses[:, 0] + shift.real, poses[:, 1] + shift.imag, poses[:, 2]])
+
+
+@effects.register("lidar_yaw")
+class LidarYaw(ReferenceEffect):
+    """The reference's forward is not the robot's: R(beta) v."""
+
+    physics = "The LIDAR is mounted at another angle than its mounting says."
+    source = _CENSI
+    shows_in = "command"
+    measurement = "a wall: drive along it and see by which angle the scan of it is turned"
+    fixed_parameters = (Parameter("beta", "rad", -0.035, 0.035, "by how much the reported path is turned"),)
+
+    def reported(self, poses: Array, start: Array, values: Values) -> Array:
+        return _about_the_start(poses, start, complex(np.exp(1j * values["beta"])))
+
+    def corrected(self, poses: Array, start: Array, values: Values) -> Array:
+        return _about_the_start(poses, start, complex(np.exp(-1j * values["beta"])))
+
+
+@effects.register("reference_scale")
+class ReferenceScale(ReferenceEffect):
+    """The reference's metre is not a metre: p (1 + s), from the start on."""
+
+    physics = "The LIDAR's range is off by a factor, and the map with it."
+    source = "first principles"
+    shows_in = "command"
+    measurement = "a tape: the length of a wall or of a driven way against the map's"
+    fixed_parameters = (Parameter("s", "1", -0.01, 0.01, "by how much lengths are reported too long"),)
+
+    def reported(self, poses: Array, start: Array, values: Values) -> Array:
+        return _about_the_start(poses, start, 1 + values["s"])
+
+    def corrected(self, poses: Array, start: Array, values: Values) -> Array:
+        return _about_the_start(poses, start, 1 / (1 + values["s"]))
+
+
+@effects.register("sample_period_scale")
+class SamplePeriodScale(MotionEffect):
+    """Wheel rates are wrong by a factor while their stamps are right: omega (1 + s)."""
+
+    stage = "clock"
+    physics = "The controller divides encoder counts by a sample period that it does not keep."
+    source = "first principles"
+    shows_in = "command"
+    measurement = "a time stamp of every sample: their mean distance against the nominal period"
+    fixed_parameters = (Parameter("s", "1", -0.01, 0.01, "by how much the true rates are higher"),)
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        return values["s"] * signals.rates
+
+
+@effects.register("wheel_radius")
+class WheelRadius(MotionEffect):
+    """Wheels are larger or smaller than stated: omega (1 + k_i)."""
+
+    stage = "wheel"
+    physics = "Treads are worn, pumped up or pressed flat, and no two wheels are alike."
+    source = (
+        "J. Borenstein and L. Feng, Measurement and correction of systematic odometry errors in mobile robots, 1996 "
+        "(unequal wheel diameters)"
+    )
+    shows_in = "command"
+    measurement = "a tape: the way that each wheel rolls in ten turns under load"
+    only_for = "differential and skid-steered robots, tricycles and swerve drives"
+
+    def applies(self, robot: Robot) -> bool:
+        return class_of(robot) in ("differential", "skid", "tricycle", "swerve")
+
+    def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
+        return one_for_each_wheel(robot, "k", "1", -0.05, 0.05, "by how much the radius is larger")
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        return of_wheels(signals.robot, "k", values) * signals.rates
+
+
+@effects.register("wheel_position")
+class WheelPosition(MotionEffect):
+    """Fixed wheels stand farther out than stated: omega + y_i w / r to the left, in the direction of rolling ahead."""
+
+    stage = "wheel"
+    physics = "The track is not the one of the drawing: wheels touch the floor at another place of their width."
+    source = (
+        "J. Borenstein and L. Feng, Measurement and correction of systematic odometry errors in mobile robots, 1996 "
+        "(uncertainty about the effective wheelbase)"
+    )
+    shows_in = "command"
+    measurement = "a ruler from wheel to wheel, or better: ten turns on the spot against a mark on the floor"
+    only_for = "differential and skid-steered robots"
+
+    def applies(self, robot: Robot) -> bool:
+        return class_of(robot) in ("differential", "skid")
+
+    def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
+        return one_for_each_wheel(robot, "y", "m", -0.02, 0.02, "by how much farther to the left it stands")
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        robot = signals.robot
+        along = np.cos([wheel.rolling for wheel in robot.measured])
+        return of_wheels(robot, "y", values) * along / robot.radii * signals.twists[:, 2:]
+
+
+@effects.register("driven_steering_offset")
+class DrivenSteeringOffset(MotionEffect):
+    """Driven wheels that steer do not point straight ahead where the measured angle is 0: phi + c_i, for small c_i."""
+
+    stage = "steering"
+    physics = "The zero of each angle's encoder was set by eye or by a switch."
+    source = "twist = K u: an offset turns the pair omega cos phi, omega sin phi of signals"
+    shows_in = "command"
+    measurement = "a straight edge along each wheel's side at a measured angle of 0"
+    only_for = "robots with a driven wheel that steers"
+
+    def applies(self, robot: Robot) -> bool:
+        return any(pair >= 0 for pair in robot.drive.pairs)
+
+    def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
+        return tuple(
+            Parameter(f"c_{name}", "rad", -0.05, 0.05, f"true angle where 0 is measured, wheel {name}")
+            for name in _driven_and_steered(robot)
+        )
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        assert signals.steering is not None  # the robot steers
+        offsets = [values.get(f"c_{name}", 0.0) for name in signals.robot.drive.steered]
+        return np.tile(offsets, (len(signals.steering), 1))
+
+
+def _driven_and_steered(robot: Robot) -> tuple[str, ...]:
+    """Names of the wheels of which both rate and steering angle are measured."""
+    return tuple(robot.drive.steered[pair] for pair in robot.drive.pairs if pair >= 0)

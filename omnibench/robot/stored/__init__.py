@@ -1,1 +1,0 @@
-"""Odometry of runs whose samples are read where they are used."""

@@ -1,0 +1,204 @@
+"""Odometry of runs whose samples are read where they are used: as OdometryBatch, without holding them."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import islice
+from typing import Any, TypeVar
+
+import numpy as np
+
+from omnibench.jobs.gathering import gathered
+from omnibench.jobs.job import Backend
+from omnibench.progress import Reporter
+from omnibench.robot.compiled import path_sums
+from omnibench.robot.kinematics import Array
+from omnibench.robot.odometry import Complex, Integration, OdometryBatch, RunSamples, WheelLog
+
+# Samples up to which an OdometryBatch holds them, in 0.1 kB each of three wheels (chosen: beyond, reading them anew and
+# summing in compiled code takes a tenth of the time, too).
+_HELD = 1_000_000
+Sampled = TypeVar("Sampled", bound=Any)  # a log, or a run
+_TOGETHER = 500_000  # samples that are read together (chosen: as many as a block of a stored table)
+_PARTS_OF_A_JOB = 4  # read together one after another: some 0.1 s of work (chosen)
+_MATRICES = 3  # whose poses are kept: a descent goes on from one of the last (chosen)
+
+
+def odometry_of(logs: Sequence[WheelLog], integration: Integration) -> OdometryBatch:
+    """The odometry of logs, which holds their samples where these are few."""
+    return (StoredOdometry if are_many(logs) else OdometryBatch)(logs, integration)
+
+
+def are_many(logs: Sequence[WheelLog]) -> bool:
+    """True if logs have so many samples that odometry should not hold them."""
+    return sum(len(log.times) for log in logs) > _HELD
+
+
+def together(logs: Iterable[Sampled], samples: int | None = None) -> Iterator[list[Sampled]]:
+    """Logs, or runs, in parts of about so many samples, as many as are read at a time by default.
+
+    Each log counts as the longest of its part, as long as it is in an array of them all.
+    """
+    part, longest = list[Sampled](), 0
+    for log in logs:
+        longest = max(longest, len(log.times))
+        if part and (len(part) + 1) * longest > (samples or _TOGETHER):
+            yield part
+            part, longest = [], len(log.times)
+        part.append(log)
+    if part:
+        yield part
+
+
+@dataclass(frozen=True, eq=False)
+class AtStamps:
+    """Sums at the stamps for one matrix, see path_sums. slopes (2, S, 2 M): real and imaginary parts of row_12 and of
+    row_3 by turns; None where they were not asked for.
+    """
+
+    moved: Array
+    driven: Array
+    slopes: Array | None
+
+
+_WORKERS: ContextVar[Backend | None] = ContextVar("workers", default=None)
+
+
+def workers() -> Backend | None:
+    """The backend whose workers read many logs; None: this process does."""
+    return _WORKERS.get()
+
+
+@contextmanager
+def read_by(backend: Backend | None) -> Iterator[None]:
+    """Let the workers of a backend read and sum the samples of many logs, which gives the same to the bit."""
+    before = _WORKERS.set(backend)
+    try:
+        yield
+    finally:
+        _WORKERS.reset(before)
+
+
+class StoredOdometry(OdometryBatch):
+    """Poses of many logs, whose samples are read anew for every matrix.
+
+    The poses of the last few matrices are kept, and their derivatives once some were asked for: who descends by
+    derivatives needs them wherever a pose was good.
+    """
+
+    def __init__(self, logs: Sequence[WheelLog], integration: Integration) -> None:
+        self.integration = integration
+        self._logs = logs
+        self.trajectory = np.repeat(np.arange(len(logs)), [len(log.stamps) for log in logs])
+        starts = np.array([log.start for log in logs])[self.trajectory]
+        self._start, self._turn = starts, np.exp(1j * starts[:, 2])
+        self._signals = logs[0].signals.shape[1]
+        self._kept: OrderedDict[bytes, AtStamps] = OrderedDict()
+        self._descends = False
+
+    @cached_property
+    def driven(self) -> Array:
+        """Integrals (S, M) of the signals up to each stamp, rad."""
+        kept = next(iter(self._kept.values()), None) or self._of_all([np.zeros((3, self._signals))], slopes=False)[0]
+        return kept.driven
+
+    def poses(self, matrices: Array) -> Array:
+        """Poses (P, S, 3) of candidate matrices (P, 3, M), see OdometryBatch."""
+        found = [self._of(matrices[0], self._descends)] if len(matrices) == 1 else self._of_all(matrices, slopes=False)
+        result = np.empty((len(matrices), *self._start.shape))
+        for poses, matrix, sums in zip(result, matrices, found, strict=True):
+            path = (sums.moved[:, 0] + 1j * sums.moved[:, 1]) * self._turn
+            poses[:, 0], poses[:, 1] = self._start[:, 0] + path.real, self._start[:, 1] + path.imag
+            poses[:, 2] = self._start[:, 2] + sums.driven @ matrix[2]
+        return result
+
+    def jacobian(self, matrix: Array) -> Array:
+        """Derivatives (S, 3, 3, M) of the poses by the elements of one matrix, see OdometryBatch."""
+        self._descends = True
+        sums = self._of(matrix, slopes=True)
+        assert sums.slopes is not None  # they were asked for
+        row_12, row_3 = np.ascontiguousarray(sums.slopes).view(complex)
+        return self._as_jacobian(row_12, row_3, sums.driven)
+
+    def position_design(self, headings: Iterable[Array]) -> Complex:
+        """Regressors (S, M) of positions for given headings, see OdometryBatch."""
+        rest = iter(headings)
+        return np.concatenate(
+            [
+                OdometryBatch(part, self.integration).position_design(list(islice(rest, len(part))))
+                for part in together(self._logs)
+            ]
+        )
+
+    def _of(self, matrix: Array, slopes: bool) -> AtStamps:
+        key = np.ascontiguousarray(matrix, dtype=float).tobytes()
+        kept = self._kept.pop(key, None)
+        if kept is None or (slopes and kept.slopes is None):
+            while len(self._kept) >= _MATRICES:
+                self._kept.popitem(last=False)
+            (kept,) = self._of_all([matrix], slopes)
+        self._kept[key] = kept
+        return kept
+
+    def _of_all(self, matrices: Sequence[Array] | Array, slopes: bool) -> list[AtStamps]:
+        """The sums for some matrices, by one reading of the samples."""
+        tasks = [(part, list(matrices), self.integration, slopes) for part in together(self._logs, self._of_a_job)]
+        parts = gathered(workers(), sums_of_logs, tasks)
+        return _of_each(parts)
+
+    @property
+    def _of_a_job(self) -> int:
+        """Samples that are summed in a job, or at a time here."""
+        return _TOGETHER if workers() is None else _PARTS_OF_A_JOB * _TOGETHER
+
+
+def sums_of_logs(task: tuple[Sequence[WheelLog], Sequence[Array], Integration, bool], _: Reporter) -> list[AtStamps]:
+    """The sums of some logs for some matrices. The task: logs, matrices, integration, and whether slopes are wanted."""
+    logs, matrices, integration, slopes = task
+    parts = [[_sums(part, matrix, integration, slopes) for matrix in matrices] for part in _read(logs)]
+    return _of_each(parts)
+
+
+@dataclass(frozen=True, eq=False)
+class _Read:
+    """Samples, signals (F, M) and stamps of some logs."""
+
+    samples: RunSamples
+    signals: Array
+    stamps: list[Array]
+
+
+def _read(logs: Sequence[WheelLog]) -> Iterator[_Read]:
+    """The logs, some at a time."""
+    for part in together(logs):
+        samples = RunSamples.of([np.asarray(log.times) for log in part])
+        signals = np.ascontiguousarray(np.concatenate([np.asarray(log.signals) for log in part]))
+        yield _Read(samples, signals, [log.stamps for log in part])
+
+
+def _sums(part: _Read, matrix: Array, integration: Integration, slopes: bool) -> AtStamps:
+    edges = np.cumsum([0, *map(len, part.stamps)])
+    count, size = int(edges[-1]), part.signals.shape[1]
+    moved, driven = np.empty((count, 2)), np.empty((count, size))
+    rows = np.empty((2, count if slopes else 1, size), dtype=complex)
+    path_sums(
+        part.samples.times, part.signals, part.samples.edges, np.concatenate(part.stamps), edges,
+        np.ascontiguousarray(matrix), integration == "arc", slopes, moved, rows[0], rows[1], driven,
+    )  # fmt: skip
+    return AtStamps(moved, driven, rows.view(float) if slopes else None)
+
+
+def _of_each(parts: Sequence[Sequence[AtStamps]]) -> list[AtStamps]:
+    """The sums for each matrix over all parts, each of which has its sums by matrix. They have ``driven`` in common."""
+    driven = np.concatenate([part[0].driven for part in parts])
+    joined = []
+    for of_matrix in zip(*parts, strict=True):
+        slopes = [part.slopes for part in of_matrix if part.slopes is not None]
+        moved = np.concatenate([part.moved for part in of_matrix])
+        joined.append(AtStamps(moved, driven, np.concatenate(slopes, axis=1) if slopes else None))
+    return joined

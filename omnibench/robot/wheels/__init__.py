@@ -1,1 +1,0 @@
-"""Wheels of a robot, and the drive signals that they measure."""
