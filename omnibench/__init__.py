@@ -12,8 +12,8 @@ _PUBLIC = {
     "Dataset": "data.dataset",
     "LiveNode": "live.node",
     "OmnibenchError": "errors",
-    "Reference": "data.references.run_references",
-    "References": "data.references.run_references",
+    "Reference": "data.references",
+    "References": "data.references",
     "Robot": "robot.kinematics",
     "Trajectory": "data.dataset",
     "Wheel": "robot.kinematics",
@@ -31,7 +31,7 @@ _PUBLIC = {
     "make_dataset": "data.tables.dataset_tables",
     "odometry": "robot.dead_reckoning",
     "read_calibration": "robot.calibration",
-    "read_compare_config": "compare.read_config",
+    "read_compare_config": "compare.config",
     "read_live_config": "live.config",
     "read_simulation": "simulate.source",
     "read_tum": "data.importers.tum",
@@ -49,14 +49,14 @@ __version__: str  # of the installed package, "unknown" in a folder of source fi
 if TYPE_CHECKING:  # imports for type checkers; tests/ground/test_package.py holds them equal to the list
     from typing import Any
 
-    from omnibench.compare.read_config import read_compare_config as read_compare_config
+    from omnibench.compare.config import read_compare_config as read_compare_config
     from omnibench.compare.run import run_comparison as run_comparison
     from omnibench.data.dataset import Dataset as Dataset
     from omnibench.data.dataset import Trajectory as Trajectory
     from omnibench.data.importers.tum import read_tum as read_tum
     from omnibench.data.importers.tum import write_tum as write_tum
-    from omnibench.data.references.run_references import Reference as Reference
-    from omnibench.data.references.run_references import References as References
+    from omnibench.data.references import Reference as Reference
+    from omnibench.data.references import References as References
     from omnibench.data.storage import load_dataset as load_dataset
     from omnibench.data.storage import save_dataset as save_dataset
     from omnibench.data.tables.dataset_tables import make_dataset as make_dataset

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from commands import RECORDINGS
 
-from omnibench.cli.fetch.catalogue import find_recording
+from omnibench.cli.fetch import find_recording
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.slam.import_dataset import import_dataset
 

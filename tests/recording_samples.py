@@ -14,8 +14,8 @@ from omnibench.data.scans import ScansInMemory
 from omnibench.data.true_poses import TruePath
 from omnibench.robot.kinematics import Array, wheel_equations
 from omnibench.robot.odometry import Path
-from omnibench.simulate.chain.floor_plan import FloorPlan, RoomPlan, make_plan
-from omnibench.simulate.chain.lidar import Lidar, measure_scans, scan_stamps
+from omnibench.simulate.floor_plan import FloorPlan, RoomPlan, make_plan
+from omnibench.simulate.lidar import Lidar, measure_scans, scan_stamps
 
 COMMANDS = {"straight": (0.2, 0.0), "left": (0.2, 0.35), "right": (0.2, -0.35), "spot": (0.0, 0.35)}
 TICK = 0.2  # rad/s, of the measured rates

@@ -69,7 +69,7 @@ def compare(
     names robots is a study: every method on several robots and kinds of path. Run again with the same -o, it goes on
     where it was stopped.
     """
-    from omnibench.cli.terminal.comparisons.comparison_tables import print_comparison_ending, print_result
+    from omnibench.cli.terminal.comparison_tables import print_comparison_ending, print_result
     from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.compare.report.comparison_report import comparison_document
     from omnibench.compare.run import run_comparison
@@ -120,7 +120,7 @@ def _study(
     force: bool,
 ) -> None:
     """Run a study and print its answer. The exit code is 1 if a recording cannot be read, or no method answered."""
-    from omnibench.cli.terminal.comparisons.study_tables import print_study, print_study_ending
+    from omnibench.cli.terminal.comparison_tables import print_study, print_study_ending
     from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.progress import Progress
     from omnibench.study.report.study_report import study_document
@@ -143,9 +143,9 @@ def _study(
 
 def _asked_comparison(given: Sequence[Path], data: list[str] | None, plugins: Sequence[Path]) -> "CompareConfig":
     """The config that is given, or one for the data set that is: its folders, or a glob."""
-    from omnibench.compare.read_config import read_compare_config
+    from omnibench.compare.config import read_compare_config
     from omnibench.compare.recording_config import config_in_words, recording_config
-    from omnibench.data.stored.dataset_folders import is_glob
+    from omnibench.data.tables.table import is_glob
 
     first = given[0]
     of_recordings = all(place.is_dir() or is_glob(place) for place in given)

@@ -11,7 +11,7 @@ from omnibench.cli.terminal.console import make_console, print_ending, say, warn
 from omnibench.words import plural
 
 if TYPE_CHECKING:
-    from omnibench.cli.fetch.fetch_recording import Fetched
+    from omnibench.cli.fetch import Fetched
 
 fetch_app = typer.Typer()
 
@@ -38,7 +38,7 @@ def fetch(
 
     Your git clones it into ./clones; a clone that is there is used again. Without NAME: the list of known recordings.
     """
-    from omnibench.cli.fetch.fetch_recording import fetch_recording
+    from omnibench.cli.fetch import fetch_recording
     from omnibench.cli.terminal.progress_display import ProgressDisplay
 
     if name is None:
@@ -81,7 +81,7 @@ def _say_what_next(fetched: "Fetched") -> None:
 
 def _list_recordings() -> None:
     """Every data set of the catalogue, with its robot, its runs and its licence."""
-    from omnibench.cli.fetch.catalogue import RECORDINGS
+    from omnibench.cli.fetch import RECORDINGS
 
     width = make_console().width
     for recording in RECORDINGS:

@@ -15,8 +15,7 @@ from omnibench.cli.terminal.console import warn
 from omnibench.errors import ConfigError, PluginError
 
 if TYPE_CHECKING:
-    from omnibench.jobs.job import Backend
-    from omnibench.jobs.scheduler_tls import TlsFiles
+    from omnibench.jobs.job import Backend, TlsFiles
     from omnibench.progress import Reporter
     from omnibench.registry import PluginFailure
     from omnibench.report.blocks import Document
@@ -93,7 +92,7 @@ def tls_files(ca: Path | None, cert: Path | None, key: Path | None) -> TlsFiles 
         return None
     if ca is None or cert is None or key is None:
         raise ConfigError("TLS needs three files: --tls-ca, --tls-cert and --tls-key")
-    from omnibench.jobs.scheduler_tls import TlsFiles
+    from omnibench.jobs.job import TlsFiles
 
     return TlsFiles(ca=ca.resolve(), cert=cert.resolve(), key=key.resolve())
 

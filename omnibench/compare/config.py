@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, Field, field_validator
+from pydantic import AfterValidator, BaseModel, Field, field_validator
 
-from omnibench.config import Model, Positive, RelativePath, printable
+from omnibench.config import Model, Positive, RelativePath, printable, read_model, validate
 from omnibench.data.dataset import Split
+from omnibench.errors import ConfigError, OmnibenchError, PluginError, UnknownNameError
+from omnibench.fit.calibrator import unloadable
 from omnibench.fit.geometry import GeometryLimits
 from omnibench.fit.loss import LossName
 from omnibench.fit.parameterisation import Box, ParameterisationName
@@ -16,7 +21,8 @@ from omnibench.fit.problem import Budget
 from omnibench.fit.ratio_intervals import Bootstrap
 from omnibench.fit.span import Unidentified
 from omnibench.jobs.backend_choice import name_flaw
-from omnibench.jobs.scheduler_tls import TlsFiles
+from omnibench.jobs.job import TlsFiles
+from omnibench.registry import PluginFailure, calibrators, costs, load_plugins, plugin_text
 from omnibench.robot.odometry import Integration
 from omnibench.simulate.dataset_source import DatasetSource
 
@@ -163,3 +169,71 @@ class CompareConfig(Model):
         if not all(0 <= seed < 2**63 for seed in seeds):
             raise ValueError("seeds must not be negative, and below 2^63")
         return seeds
+
+
+def load_calibrators(plugins: Iterable[Path], names: Iterable[str]) -> list[PluginFailure]:
+    """Load a config's plug-ins. The runs of one that cannot be imported fail with its error, the others run.
+
+    names: the calibrators that the config names.
+    """
+    failures = load_plugins(plugins)
+    missing = set(names) - {entry.name for entry in calibrators.entries()}
+    for failure in failures:
+        for name in missing & _names_in(Path(failure.origin)):
+            calibrators.register(name)(unloadable(failure))
+            missing.remove(name)
+    return failures
+
+
+def _names_in(plugin: Path) -> set[str]:
+    """Calibrators that a plug-in file would register: the file's name, and names in its text."""
+    text = plugin_text(plugin)
+    return {plugin.stem, *re.findall(r"""calibrators\s*\.\s*register\(\s*["']([^"']+)["']""", text)}
+
+
+def effective_config(config: CompareConfig) -> CompareConfig:
+    """The config with every default of every option written out. Refuses unknown names and options."""
+    cost = effective_cost(config.cost, f"config {config.name}")
+    entries = []
+    for index, entry in enumerate(config.calibrators):
+        place = f"config {config.name}: calibrators.{index}"
+        options = effective_options(entry.name, entry.options, place)
+        entries.append(entry.model_copy(update={"options": options.model_dump(mode="json")}))
+    return config.model_copy(update={"calibrators": tuple(entries), "cost": cost})
+
+
+def effective_cost(choice: CostChoice, place: str) -> CostChoice:
+    """A cost with every default of its options. Errors begin with ``place``: an unknown name or option."""
+    options = costs.create(choice.name, choice.options, place).options
+    return choice.model_copy(update={"options": options.model_dump(mode="json")})
+
+
+def effective_options(name: str, given: Mapping[str, Any], place: str) -> BaseModel:
+    """The options of a calibrator with every default. ConfigError begins with ``place``: an unknown name or option."""
+    calibrator = calibrators.entry(name, place)
+    options = validate(calibrator.options, given, f"{place}: calibrator {name!r}")
+    try:
+        calibrators.create(name, given)  # a constructor may check its options further
+    except PluginError:
+        pass  # reported as the outcome of its run
+    except OmnibenchError as error:
+        raise ConfigError(f"{place}: {error}") from None
+    return options
+
+
+def read_compare_config(path: Path | str, data: Mapping[str, Path] | None = None) -> CompareConfig:
+    """Read a config; paths in it are relative to its folder and come back absolute.
+
+    ``data`` replaces the sources of data sets by name; the name "" stands for the only one. ConfigError in one line.
+    """
+    path = Path(path)
+    config = read_model(CompareConfig, path)
+    sources = dict(config.datasets)
+    for name, location in (data or {}).items():
+        if not name and len(sources) > 1:
+            raise ConfigError(f"--data: {path} has several data sets; say which: --data NAME={location}")
+        name = name or next(iter(sources))
+        if name not in sources:
+            raise UnknownNameError("data set", name, sources, str(path))
+        sources[name] = sources[name].at(location.resolve())
+    return config.model_copy(update={"datasets": sources})

@@ -9,14 +9,13 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from omnibench.compare.effective_config import load_calibrators
+from omnibench.compare.config import load_calibrators
 from omnibench.compare.plan import PlannedRun, RunTask
 from omnibench.errors import DataError, Interrupted
 from omnibench.fit.calibrator import Outcome, RunResult, Timing, describe_error, run_calibrator
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.fit.shrinkage import shrunk
-from omnibench.jobs.job import Backend, BackendError, Failure, Job, JobWatch, run_jobs
-from omnibench.jobs.result_store import ResultStore
+from omnibench.jobs.job import Backend, BackendError, Failure, Job, JobWatch, ResultStore, run_jobs
 from omnibench.processes import interrupts_not_in_callbacks
 from omnibench.progress import Progress, Reporter
 from omnibench.registry import calibrators

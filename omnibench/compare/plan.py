@@ -19,7 +19,7 @@ from omnibench.fit.geometry import GeometryLimits
 from omnibench.fit.loss import with_loss
 from omnibench.fit.parameterisation import Box, ParameterisationName
 from omnibench.fit.problem import CalibrationProblem, make_parameterisation
-from omnibench.jobs.result_store import code_digest, content_key
+from omnibench.jobs.job import code_digest, content_key
 from omnibench.progress import Reporter, no_progress
 from omnibench.registry import calibrators, costs
 from omnibench.robot.kinematics import Robot

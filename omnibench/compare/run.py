@@ -13,8 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from omnibench.compare.config import CompareConfig
-from omnibench.compare.effective_config import effective_config, load_calibrators
+from omnibench.compare.config import CompareConfig, effective_config, load_calibrators
 from omnibench.compare.execute import PRELOAD, execute, resumable
 from omnibench.compare.output import check_output, prepare_output, write_results
 from omnibench.compare.plan import UNBOUNDED, PlannedRun, load_datasets, make_plan
@@ -38,14 +37,14 @@ from omnibench.fit.cost import SumOfNorms
 from omnibench.fit.identifiability import warnings_of_calibration
 from omnibench.fit.uncertainty import NoCovarianceError, Uncertainty, uncertainty_of
 from omnibench.jobs.backend_choice import BackendChoice, open_backend
-from omnibench.jobs.result_store import ResultStore
+from omnibench.jobs.job import ResultStore
 from omnibench.processes import one_thread_processes
 from omnibench.progress import Reporter, no_progress
 from omnibench.registry import PluginFailure
 from omnibench.report.render import write_document
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import OdometryBatch
-from omnibench.simulate.chain.robot_config import RobotConfig
+from omnibench.simulate.robot_config import RobotConfig
 from omnibench.slam.slam_options import PRELOAD as SLAM_PRELOAD
 
 

@@ -14,14 +14,10 @@ from omnibench.data.checks.finding import findings_of
 from omnibench.data.checks.implausible import implausible
 from omnibench.data.header import Imported
 from omnibench.data.headings import unwrap
-from omnibench.data.references.reference_flaws import reference_flaw
-from omnibench.data.references.reference_headings import with_whole_turns
-from omnibench.data.references.reference_units import odd_references
-from omnibench.data.references.run_references import References
+from omnibench.data.references import References, odd_references, reference_flaw, with_whole_turns
 from omnibench.data.run_checks import check_sample_period, pose_times_flaw, reach_flaw, values_flaw, wheel_times_flaw
 from omnibench.data.scans import Scans
-from omnibench.data.stored.periods import median_period, period_of
-from omnibench.data.stored.stored_rows import in_file, noted
+from omnibench.data.stored_rows import in_file, median_period, noted, period_of
 from omnibench.errors import DataError, nearest, require_type
 from omnibench.robot.kinematics import Array, Drive, Robot, in_the_middle, interpolated
 from omnibench.robot.odometry import WheelLog, kept_with_samples

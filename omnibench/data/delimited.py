@@ -250,7 +250,7 @@ def _read_parquet(file: Path) -> CellTable:
     """The columns of a Parquet file; dates become seconds since 1970, durations seconds."""
     import polars as pl
 
-    from omnibench.data.stored.stored_rows import read_parquet
+    from omnibench.data.stored_rows import read_parquet
 
     frame = read_parquet(file)
     if frame.is_empty():

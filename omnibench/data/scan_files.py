@@ -14,7 +14,7 @@ from polars.io.plugins import register_io_source
 
 from omnibench.data.delimited import missing_column, not_increasing
 from omnibench.data.scans import Ranges, Scanner, Scans, TrajectoryScans
-from omnibench.data.stored.stored_rows import count_rows, file_state, readable
+from omnibench.data.stored_rows import count_rows, file_state, readable
 from omnibench.data.tables.table import Table
 from omnibench.errors import DataError, nearest
 from omnibench.files import TableFormat, check_file, quoted_formulas, unquoted_formulas

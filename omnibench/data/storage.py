@@ -11,18 +11,15 @@ from pathlib import Path
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.header import Header, read_header
-from omnibench.data.joining import SCANS_LEFT_OUT, check_fits, distinct_runs
-from omnibench.data.references.reference_table import REFERENCE_COLUMNS, TABLE
+from omnibench.data.reference_table import REFERENCE_COLUMNS, TABLE
 from omnibench.data.run_checks import stored_pose_times_flaw
 from omnibench.data.scan_files import ScansOnDisk, write_scans
 from omnibench.data.scans import Scans
-from omnibench.data.splits import complete
-from omnibench.data.stored.dataset_folders import dataset_folders
-from omnibench.data.stored.stored_rows import MOST_IN_MEMORY, count_rows
-from omnibench.data.stored.stored_wheels import StoredWheels, WholeTableError
+from omnibench.data.splits import SCANS_LEFT_OUT, check_fits, complete, distinct_runs
+from omnibench.data.stored_rows import MOST_IN_MEMORY, count_rows
+from omnibench.data.stored_wheels import StoredWheels, WholeTableError
 from omnibench.data.tables.dataset_tables import COMMAND_COLUMNS, POSE_COLUMNS, DatasetTables, tables_of
-from omnibench.data.tables.table import Table, read_table, table_file
-from omnibench.data.tables.wheel_table import WheelTable
+from omnibench.data.tables.table import Table, WheelTable, dataset_folders, read_table, table_file
 from omnibench.errors import DataError, require_type
 from omnibench.files import (
     FileContent,

@@ -21,11 +21,10 @@ from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
-from omnibench.simulate.chain.robot_config import RobotConfig
+from omnibench.simulate.commands import TimedCommand
 from omnibench.simulate.config import FlowerConfig
-from omnibench.simulate.driving.designed_run import run_as_designed
-from omnibench.simulate.driving.timed_command import TimedCommand
-from omnibench.simulate.flower import planned_commands
+from omnibench.simulate.flower import planned_commands, run_as_designed
+from omnibench.simulate.robot_config import RobotConfig
 from omnibench.simulate.source import ComparedData
 from omnibench.words import noun_for, plural
 

@@ -8,15 +8,13 @@ from typing import Annotated, Any, Literal
 from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 
 from omnibench.config import Model, Positive
-from omnibench.data.importers.robot_option import RobotOption
+from omnibench.data.importers.recording_options import RobotOption
 from omnibench.errors import UnknownNameError
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Robot
 from omnibench.robot.odometry import Integration
-from omnibench.simulate.command import beyond_steering, within_steering
+from omnibench.simulate.commands import MotionGrid, SingleCommand, TimedCommand, beyond_steering, within_steering
 from omnibench.simulate.config import SteeringLimit
-from omnibench.simulate.driving.command_config import MotionGrid, SingleCommand
-from omnibench.simulate.driving.timed_command import TimedCommand
 from omnibench.words import plural
 
 # They guard memory against slips of the pen and decide nothing else: so many samples of four wheels take 640 MB.

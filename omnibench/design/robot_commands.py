@@ -11,13 +11,13 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from omnibench.config import Model, Positive, validate
-from omnibench.data.importers.robot_option import RobotOption
+from omnibench.data.importers.recording_options import RobotOption
 from omnibench.design.candidates import CandidatePool, checked_pool, driven_as_designed, refuse_choice
 from omnibench.errors import ConfigError
 from omnibench.robot.calibration import Noise
 from omnibench.robot.odometry import Integration
-from omnibench.simulate.command import Command, default_directions, steering_limit, wheels_of
-from omnibench.simulate.driving.drivable_commands import LONGEST, SHORTEST, DrivableCommands, Shapes
+from omnibench.simulate.commands import Command, default_directions, steering_limit, wheels_of
+from omnibench.simulate.drivable_commands import LONGEST, SHORTEST, DrivableCommands, Shapes
 from omnibench.words import plural
 
 # What follows offers shapes of runs; more of them change a design little, because it is a choice of few (chosen).

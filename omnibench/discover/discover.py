@@ -14,28 +14,27 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from omnibench.data.dataset import Dataset
-from omnibench.discover.calibrations import Request
-from omnibench.discover.conclude import Findings, conclude
+from omnibench.discover.conclude import Findings, conclude, lacks_a_name, verdict_of
 from omnibench.discover.covariate_dependence import covariate_dependences, without_smooth_term
-from omnibench.discover.experiments.experiments import experiments_for
-from omnibench.discover.fitting.extend import Extended, extend, fit_matrix, without_effects
-from omnibench.discover.fitting.model_fit import Fit
-from omnibench.discover.fitting.windows import in_windows
-from omnibench.discover.held_out.cross_validation import (
+from omnibench.discover.experiments import experiments_for
+from omnibench.discover.fitting import Extended, Fit, extend, fit_matrix, in_windows, without_effects
+from omnibench.discover.held_out import (
+    compare_held_out,
     compare_with_validation,
     eq6_with_changes,
+    noise_runs,
     random_folds_of_repetitions,
+    validation_runs,
+    waterfall_steps,
 )
-from omnibench.discover.held_out.gaps import compare_held_out
-from omnibench.discover.held_out.validation_runs import noise_runs, validation_runs
-from omnibench.discover.held_out.waterfall import waterfall_steps
+from omnibench.discover.output import Request
 from omnibench.discover.regressors.fine_structure import fine_structure
 from omnibench.discover.regressors.significance import Significance, together
 from omnibench.discover.result import Discovery
 from omnibench.discover.selection.averaged_model import averaged
-from omnibench.discover.selection.candidate_groups import check_names
 from omnibench.discover.selection.competing_models import competing_models, with_fitted_forms
 from omnibench.discover.selection.detectability import detectability_of
+from omnibench.discover.selection.evidence import check_names
 from omnibench.discover.selection.extrapolation import extrapolations_of, faded
 from omnibench.discover.selection.model_selection import Selection, select_effects
 from omnibench.discover.selection.motor_effects import select_motor_effects
@@ -48,7 +47,6 @@ from omnibench.discover.selection.screening import (
     significance_left,
 )
 from omnibench.discover.selection.unknown_term import add_smooth_terms
-from omnibench.discover.verdict import lacks_a_name, verdict_of
 from omnibench.errors import DataError, computable, require_type
 from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.progress import Reporter, Stages, no_progress

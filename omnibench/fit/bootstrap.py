@@ -27,8 +27,7 @@ from omnibench.fit.information import INTERVAL, depending
 from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.fit.ratio_intervals import BOOTSTRAPPED, FEWEST, Units, units_of
-from omnibench.jobs.gathering import gathered
-from omnibench.jobs.job import Backend
+from omnibench.jobs.job import Backend, gathered
 from omnibench.progress import Reporter
 from omnibench.robot.kinematics import Array
 

@@ -17,7 +17,7 @@ from omnibench.fit.parameterisation import ParameterisationName
 from omnibench.fit.prior import MountChoice
 from omnibench.fit.problem import BudgetSpent, CalibrationProblem, Improvement
 from omnibench.fit.span import Unidentified
-from omnibench.jobs.memory import memory_limit
+from omnibench.jobs.job_process import memory_limit
 from omnibench.registry import AnyOptions, Options, PluginFailure, calibrators
 from omnibench.robot.calibration import ModelExtension, Noise, extended_model, matrix_flaw
 from omnibench.robot.kinematics import Array, JsonArray, Robot

@@ -121,8 +121,7 @@ from omnibench.fit.cost import SumOfNorms
 from omnibench.fit.evaluator import ElementBox, Path, cut, impulses, make_path, quadrature
 from omnibench.fit.parameterisation import Box, BoxName, ExplicitBox, MatrixElements
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
-from omnibench.jobs.gathering import gathered
-from omnibench.jobs.job import Backend
+from omnibench.jobs.job import Backend, gathered
 from omnibench.processes import one_thread
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.registry import calibrators, costs

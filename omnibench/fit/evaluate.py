@@ -13,8 +13,8 @@ from pydantic import Field
 from omnibench.config import Model
 from omnibench.data.dataset import SPLITS, WHEEL_DIGITS, Dataset, Trajectory
 from omnibench.data.domain_check import extrapolation_warning, share_outside
-from omnibench.data.references.run_references import UNITS, ReferenceKind
-from omnibench.data.stored.drawn_runs import drawn_runs, in_memory
+from omnibench.data.references import UNITS, ReferenceKind
+from omnibench.data.stored_rows import drawn_runs, in_memory
 from omnibench.errors import computable, require_type
 from omnibench.fit.check.missing_motions import command_names
 from omnibench.fit.cost import NO_ERROR

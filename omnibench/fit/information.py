@@ -14,7 +14,7 @@ from omnibench.data.dataset import Trajectory
 from omnibench.fit.loss import LossName, make_loss
 from omnibench.fit.noise import NoiseEstimate, Whitener, differences_between_repetitions, estimate_noise
 from omnibench.fit.trajectory_fit import with_poses
-from omnibench.jobs.gathering import gathered
+from omnibench.jobs.job import gathered
 from omnibench.progress import Reporter, no_progress
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array

@@ -8,7 +8,7 @@ import numpy as np
 
 from omnibench.config import Model
 from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory
-from omnibench.data.references.run_references import KINDS, ReferenceKind
+from omnibench.data.references import KINDS, ReferenceKind
 from omnibench.data.scans import Scans
 from omnibench.errors import require_type
 from omnibench.fit.identifiability import Identifiability, identifiability

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
-from omnibench.data.references.run_references import UNITS
+from omnibench.data.references import UNITS
 from omnibench.fit.parameterisation import MatrixElements, Parameterisation
 from omnibench.fit.prior import default_mount
 from omnibench.fit.reference_rows import ReferenceBatch, reference_rows

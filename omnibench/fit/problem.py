@@ -13,7 +13,7 @@ from pydantic import Field
 
 from omnibench.config import Model
 from omnibench.data.dataset import Trajectory
-from omnibench.data.stored.periods import median_period
+from omnibench.data.stored_rows import median_period
 from omnibench.errors import DataError
 from omnibench.fit.cost import Cost
 from omnibench.fit.evaluator import (

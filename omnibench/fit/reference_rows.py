@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
-from omnibench.data.references.run_references import KINDS, UNITS, ReferenceKind, References
+from omnibench.data.references import KINDS, UNITS, ReferenceKind, References
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel

@@ -10,9 +10,8 @@ from urllib.parse import urlsplit
 
 from omnibench.config import Model
 from omnibench.errors import ConfigError, nearest
-from omnibench.jobs.job import Backend
+from omnibench.jobs.job import Backend, TlsFiles
 from omnibench.jobs.local_backends import Processes
-from omnibench.jobs.scheduler_tls import TlsFiles
 from omnibench.progress import Progress, Reporter, no_progress
 
 _NAMES = ("processes", "dask")

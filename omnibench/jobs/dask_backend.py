@@ -25,10 +25,8 @@ from distributed.client import FutureCancelledError
 from omnibench.errors import DataError, OmnibenchError, one_line
 from omnibench.jobs.dask_cluster import WAIT, ClusterLostError, count_slots, lost, lost_if_closed
 from omnibench.jobs.dask_worker import JobEvent, JobOutcome, Order, Parcel, carry_out, content, read_events
-from omnibench.jobs.job import TRIES, BackendError, Ended, Failure, Job, JobWatch
-from omnibench.jobs.job_process import JobEnd
-from omnibench.jobs.packing import Packer, run_packed
-from omnibench.jobs.result_store import Store
+from omnibench.jobs.job import TRIES, BackendError, Ended, Failure, Job, JobWatch, Store
+from omnibench.jobs.job_process import JobEnd, Packer, run_packed
 from omnibench.progress import Progress, Reporter, no_progress
 
 T = TypeVar("T")

@@ -21,8 +21,7 @@ from distributed.core import send_recv
 
 from omnibench.errors import ConfigError, one_line
 from omnibench.jobs.dask_worker import Requirements, UnfitWorkerError, prepare, software
-from omnibench.jobs.job import BackendError
-from omnibench.jobs.scheduler_tls import TlsFiles
+from omnibench.jobs.job import BackendError, TlsFiles
 from omnibench.processes import interrupts_blocked, main_module_hidden
 from omnibench.progress import Progress, Reporter
 from omnibench.registry import loaded_plugin_files, plugin_text

@@ -30,10 +30,8 @@ from pydantic import TypeAdapter
 from omnibench.config import NonNegative
 from omnibench.errors import DataError
 from omnibench.files import write_text
-from omnibench.jobs.job import BackendError, Job
-from omnibench.jobs.job_process import PRELOAD, JobEnd, JobProcess, process_for
-from omnibench.jobs.packing import PackedJob
-from omnibench.jobs.result_store import Store, code_digest
+from omnibench.jobs.job import BackendError, Job, Store, code_digest
+from omnibench.jobs.job_process import PRELOAD, JobEnd, JobProcess, PackedJob, process_for
 from omnibench.processes import one_thread_processes
 from omnibench.progress import Progress, Reporter
 from omnibench.registry import REGISTRIES, PluginFailure, import_copies

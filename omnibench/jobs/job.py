@@ -7,15 +7,134 @@ worker that dies after writing has done its work. A backend only runs jobs and s
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+import hashlib
+import json
+import pickle
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any, Generic, NamedTuple, Protocol, Self, TypeVar
 
-from omnibench.errors import OmnibenchError
-from omnibench.jobs.result_store import Store
-from omnibench.progress import Progress, Reporter
+from pydantic import BaseModel, TypeAdapter
+
+from omnibench.config import Model, RelativePath
+from omnibench.errors import DataError, OmnibenchError
+from omnibench.files import remove, write_text
+from omnibench.progress import Progress, Reporter, expect_reading, no_progress, tell_reading
 
 T = TypeVar("T")
+
+
+class TlsFiles(Model):
+    """Files in PEM for a scheduler at tls://: the authority's certificate, and this client's with its key."""
+
+    ca: RelativePath
+    cert: RelativePath
+    key: RelativePath
+
+
+def content_key(facts: Mapping[str, Any]) -> str:
+    """The key (20 hexadecimal digits) of all that a result depends on: values, documents, dataclasses and arrays."""
+    return hashlib.sha256(json.dumps(facts, sort_keys=True, default=_plain).encode()).hexdigest()[:20]
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json")
+    if is_dataclass(value):
+        return {field.name: getattr(value, field.name) for field in fields(value)}
+    return [value.dtype.str, value.shape, hashlib.sha256(value.tobytes()).hexdigest()]  # an array
+
+
+def code_digest(package: Path, files: Iterable[Path]) -> str:
+    """Hash of code: paths of the files in ``package`` and their contents."""
+    digest = hashlib.sha256()
+    for file in sorted(files):
+        digest.update(file.relative_to(package).as_posix().encode())
+        digest.update(hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest()
+
+
+class Store(Protocol[T]):
+    """Where results of jobs are kept, by key."""
+
+    def anchored(self) -> Self:
+        """The store, to be found by a job that changes its working folder, too."""
+
+    def get(self, key: str) -> T | None:
+        """The stored result; None where there is none."""
+
+    def keep(self, key: str, result: T) -> Any:
+        """Keep a result where it was made; what this returns, if anything, is then given to ``put_content`` at home."""
+
+    def content(self, key: str, result: T) -> Any:
+        """The result as ``put_content`` takes it from a machine that does not reach the store."""
+
+    def put(self, key: str, result: T) -> None:
+        """Store a result."""
+
+    def put_content(self, key: str, content: Any) -> None:
+        """Store a result that another process made the content of."""
+
+    def file(self, key: str) -> Path:
+        """Where the result stands, in words of a message."""
+
+
+@dataclass(frozen=True)
+class ResultStore(Generic[T]):
+    """Results by key, each in a JSON file in ``folder``.
+
+    kind: their class, a dataclass or a document whose fields pydantic can write and read (arrays: ``JsonArray``).
+    """
+
+    folder: Path
+    kind: type[T]
+
+    def anchored(self) -> Self:
+        """The store by its folder's absolute path."""
+        return replace(self, folder=self.folder.absolute())
+
+    def get(self, key: str) -> T | None:
+        """The stored result; None where there is none, or its file is damaged."""
+        try:
+            return _adapter(self).validate_json(self.file(key).read_bytes())
+        except (OSError, ValueError):  # ValueError: pydantic's and Unicode's errors, too
+            return None
+
+    def put(self, key: str, result: T) -> None:
+        """Store a result, whole or not at all. DataError when it cannot be written, ValueError for a wrong type."""
+        self.put_content(key, self.content(key, result))
+
+    def keep(self, key: str, result: T) -> None:
+        """Store a result, as ``put``: a job whose file is there has done its work, whatever becomes of its parent."""
+        self.put(key, result)
+
+    def content(self, key: str, result: T) -> str:  # noqa: ARG002 (as ``put``)
+        """What the result's file will hold. ValueError for a wrong type."""
+        return json.dumps(_adapter(self).dump_python(result, mode="json", warnings="error"))
+
+    def put_content(self, key: str, content: str) -> None:
+        """Store a result that another process made the content of. DataError when it cannot be written."""
+        write_text(self.file(key), content)
+
+    def file(self, key: str) -> Path:
+        """The result's file."""
+        return self.folder / f"{key}.json"
+
+    def remove(self) -> None:
+        """Remove all results, half-written ones too, and the folder if it is then empty. DataError: disk refuses."""
+        for file in (*self.folder.glob("*.json"), *self.folder.glob(".*.json.*.partial")):
+            remove(file)
+        with suppress(OSError):
+            self.folder.rmdir()
+
+
+@cache
+def _adapter(store: ResultStore[T]) -> TypeAdapter[T]:
+    return TypeAdapter(store.kind)
+
 
 TRIES = 3  # how often a job whose worker is killed is begun: two chances that memory is free again; chosen
 
@@ -133,3 +252,70 @@ def _not_stored(jobs: Iterable[Job[T]], store: Store[T], watch: JobWatch[T]) -> 
 
 def _after(failure: Failure, tries: int) -> Failure:
     return failure if tries == 1 else replace(failure, reason=f"{failure.reason} in each of {tries} tries")
+
+
+def gathered(
+    backend: Backend | None,
+    function: Callable[[Any, Reporter], T],
+    arguments: Sequence[Any],
+    shared: tuple[Any, ...] = (),
+) -> list[T]:
+    """Results of ``function`` (from the top of a module) for every argument, in their order; None: without jobs.
+
+    Its results are not None. shared: see Job. DataError, or what the function raised: one of them has no result.
+    """
+    if backend is None:
+        return [function(argument, no_progress) for argument in arguments]
+    results: _Results[T] = _Results()
+    expect_reading(len(arguments), "part")
+    jobs = (Job(str(number), function, argument, shared=shared, own=True) for number, argument in enumerate(arguments))
+    run_jobs(jobs, _InMemory[T](), backend, results)
+    return [results.found[number] for number in range(len(arguments))]
+
+
+class _InMemory(Generic[T]):
+    """Results in memory, pickled until they are asked for, which is once."""
+
+    def __init__(self) -> None:
+        self._contents: dict[str, bytes] = {}
+
+    def __reduce__(self) -> tuple[type[Self], tuple[()]]:
+        return type(self), ()  # where results are made nobody needs the others
+
+    def anchored(self) -> Self:
+        return self
+
+    def get(self, key: str) -> T | None:
+        content = self._contents.pop(key, None)
+        return pickle.loads(content) if isinstance(content, bytes) else None  # no text, which events may bring
+
+    def keep(self, key: str, result: T) -> bytes:
+        return self.content(key, result)
+
+    def content(self, _: str, result: T) -> bytes:
+        return pickle.dumps(result, pickle.HIGHEST_PROTOCOL)
+
+    def put(self, key: str, result: T) -> None:
+        self.put_content(key, self.content(key, result))
+
+    def put_content(self, key: str, content: bytes) -> None:
+        self._contents[key] = content
+
+    def file(self, key: str) -> Path:
+        return Path(key)
+
+
+class _Results(JobWatch[T]):
+    """The results, by number. The first failure ends the work."""
+
+    def __init__(self) -> None:
+        self.found: dict[int, T] = {}
+
+    def ended(self, number: int, ending: T | Failure, reused: bool) -> None:  # noqa: ARG002
+        if not isinstance(ending, Failure):
+            self.found[number] = ending
+            tell_reading(1, "part")
+        elif ending.error is not None:
+            raise ending.error
+        else:
+            raise DataError(f"one of many jobs has no result: {ending.reason}; run again")

@@ -2,26 +2,149 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import pickle
+import resource
 import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from io import BytesIO
 from itertools import islice
 from multiprocessing.connection import Connection
+from pathlib import Path
 from signal import SIG_DFL, SIG_IGN, SIGABRT, SIGHUP, SIGINT, SIGKILL, SIGSEGV, SIGTERM, Signals
 from typing import Any
 
 from omnibench.errors import one_line
 from omnibench.jobs.job import Failure, Job
-from omnibench.jobs.memory import limited_memory, oom_kills
-from omnibench.jobs.packing import PackedJob
 from omnibench.processes import end_with_parent, interrupts_deferred, main_module_hidden, one_thread
-from omnibench.progress import Progress
+from omnibench.progress import Progress, Reporter
+from omnibench.registry import import_copies
+
+_MEGABYTE = 1_000_000  # bytes
+
+
+@contextmanager
+def limited_memory(megabytes: float | None) -> Iterator[None]:
+    """Limit the process's private memory, beyond which allocations raise MemoryError; None: no limit.
+
+    RLIMIT_DATA counts memory that can be written to (anonymous mappings, since Linux 4.7). RLIMIT_AS also counts
+    address space that is only reserved: with 700 MB of it before a run begins, Numba and polars then cannot be loaded.
+    """
+    if megabytes is None:
+        yield
+        return
+    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    limit = int(megabytes * _MEGABYTE)
+    resource.setrlimit(resource.RLIMIT_DATA, (limit if hard == resource.RLIM_INFINITY else min(limit, hard), hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))  # there is room for reporting the error
+
+
+def memory_limit() -> float | None:
+    """The limit of this process's private memory in 10^6 bytes; None without one."""
+    soft, _ = resource.getrlimit(resource.RLIMIT_DATA)
+    return None if soft == resource.RLIM_INFINITY else soft / _MEGABYTE
+
+
+def oom_kills() -> int:
+    """Number of processes that the system has killed for lack of memory; 0 where it does not say (not Linux)."""
+    try:
+        counts = Path("/proc/vmstat").read_text(encoding="ascii").splitlines()
+    except OSError:
+        return 0
+    return sum(int(line.split()[1]) for line in counts if line.startswith("oom_kill "))
+
+
+class Packer:
+    """Pickles jobs. Objects that they share are kept, so that each is pickled once."""
+
+    def __init__(self) -> None:
+        self._known: dict[int, tuple[Any, str, bytes]] = {}
+
+    def pack(self, job: Job[Any]) -> tuple[bytes, dict[str, bytes]]:
+        """The job's function and argument without what it shares, and that by the hash of its content."""
+        shared = {id(value): self._content(value) for value in job.shared}
+        stream = BytesIO()
+        _Pickler(stream, {key: name for key, (_, name, _) in shared.items()}).dump((job.function, job.argument))
+        return stream.getvalue(), {name: content for _, name, content in shared.values()}
+
+    def packed(self, job: Job[Any]) -> Job[Any]:
+        """A job of our own code packed for a process of this machine, to which what jobs share goes once; any other."""
+        if not (job.own and job.shared):
+            return job
+        content, shared = self.pack(job)
+        return replace(job, function=run_packed, argument=PackedJob(content, shared, {}, kept=True), shared=())
+
+    def _content(self, value: Any) -> tuple[Any, str, bytes]:
+        if id(value) not in self._known:
+            content = pickle.dumps(value, pickle.HIGHEST_PROTOCOL)
+            self._known[id(value)] = value, hashlib.sha256(content).hexdigest()[:20], content
+        return self._known[id(value)]
+
+
+class _Pickler(pickle.Pickler):
+    """names: of the objects that are left out, by their ids."""
+
+    def __init__(self, stream: BytesIO, names: Mapping[int, str]) -> None:
+        super().__init__(stream, pickle.HIGHEST_PROTOCOL)
+        self._names = names
+
+    def persistent_id(self, value: Any) -> str | None:
+        return self._names.get(id(value))
+
+
+class _Unpickler(pickle.Unpickler):
+    """shared: the objects that were left out, by their names."""
+
+    def __init__(self, content: bytes, shared: Mapping[str, Any]) -> None:
+        super().__init__(BytesIO(content))
+        self._shared = shared
+
+    def persistent_load(self, name: str) -> Any:
+        return self._shared[name]
+
+
+@dataclass(frozen=True)
+class PackedJob:
+    """A job's function and argument as bytes. plugins: copies of plug-in files here, by their paths at home.
+
+    kept: what the job shares with others, its ``names``, is kept in its process for the next job.
+    """
+
+    content: bytes
+    shared: Mapping[str, bytes]
+    plugins: Mapping[Path, Path]
+    kept: bool = False
+    names: tuple[str, ...] = ()
+
+    def without(self, sent: Collection[str]) -> PackedJob:
+        """The job for a process that has kept what was sent, by its names."""
+        left = {name: value for name, value in self.shared.items() if name not in sent}
+        return replace(self, shared=left, names=tuple(self.shared))
+
+
+_KEPT: dict[str, Any] = {}  # objects that the last job of this process shared, by their names
+
+
+def run_packed(packed: PackedJob, report: Reporter) -> Any:
+    """Unpack a job in its process and run it."""
+    import_copies(packed.plugins)
+    shared = {name: pickle.loads(content) for name, content in packed.shared.items()}
+    if packed.kept:
+        shared |= {name: _KEPT[name] for name in packed.names if name not in shared}
+        _KEPT.clear()
+        _KEPT.update(shared)
+    function, argument = _Unpickler(packed.content, shared).load()
+    return function(argument, report)
+
 
 # s after its start in which a process takes further jobs: to start one costs 20 ms (tests/studies/job_overhead.py),
 # 2 % of that; what jobs leave behind in it (memory, caches) is that of a second.

@@ -9,10 +9,8 @@ from functools import partial
 from multiprocessing.connection import wait
 from typing import Any, TypeVar
 
-from omnibench.jobs.job import Backend, Ended, Job, JobWatch
-from omnibench.jobs.job_process import PRELOAD, JobEnd, JobProcess, in_job, process_for, raised
-from omnibench.jobs.packing import Packer
-from omnibench.jobs.result_store import Store
+from omnibench.jobs.job import Backend, Ended, Job, JobWatch, Store
+from omnibench.jobs.job_process import PRELOAD, JobEnd, JobProcess, Packer, in_job, process_for, raised
 from omnibench.processes import one_thread, one_thread_processes
 
 T = TypeVar("T")

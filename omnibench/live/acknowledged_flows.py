@@ -13,7 +13,7 @@ from typing import Final
 
 import zenoh
 
-from omnibench.live.wire.attachment import Flow
+from omnibench.live.wire.messages import Flow
 
 _ACKNOWLEDGEMENT: Final = struct.Struct("<Q?")
 _MOST_FLOWS: Final = 16  # of one robot at once; another one takes the oldest one's place; chosen

@@ -10,11 +10,11 @@ from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 
 from omnibench.config import Model, Positive, RelativePath, read_model, read_yaml, validate
 from omnibench.errors import ConfigError, UnknownNameError
-from omnibench.live.frames import Frames
 from omnibench.live.fusion.pose_fusion import FusionSettings
 from omnibench.live.network.session_config import SessionConfig
 from omnibench.live.replay.arrivals import ReplayConfig
 from omnibench.live.wheels.wheel_input import WheelSettings
+from omnibench.live.wire.outputs import Frames
 from omnibench.live.wire.topics import Profile
 
 

@@ -24,11 +24,10 @@ from omnibench.live.control.query_server import QueryServer
 from omnibench.live.estimation.health import Health
 from omnibench.live.estimation.saved_state import RobotMemory
 from omnibench.live.estimation.tracker import RobotTracker
-from omnibench.live.network.callbacks import RateLimiter
 from omnibench.live.network.presence import Claim
 from omnibench.live.network.session import close_session, open_session
 from omnibench.live.robot_service import Intake, RobotService
-from omnibench.live.stopping import Closing, Stop
+from omnibench.live.stopping import Closing, RateLimiter, Stop
 from omnibench.live.wire.foxglove import PORT, FoxgloveServer
 from omnibench.live.wire.recorder import Recorder, free_path
 from omnibench.live.wire.topics import TOPICS, GraphNode, KeySpace

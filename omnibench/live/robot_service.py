@@ -19,10 +19,8 @@ from omnibench.live.acknowledged_flows import AcknowledgedFlows
 from omnibench.live.estimation.counts import anomalies_in_words
 from omnibench.live.estimation.health import Health, diagnostic
 from omnibench.live.estimation.tracker import RobotTracker
-from omnibench.live.network.callbacks import RateLimiter
-from omnibench.live.stopping import Closing
-from omnibench.live.wire.attachment import MissedMessages, flow_of
-from omnibench.live.wire.messages import Diagnostics
+from omnibench.live.stopping import Closing, RateLimiter
+from omnibench.live.wire.messages import Diagnostics, MissedMessages, flow_of
 from omnibench.live.wire.outputs import OUTPUTS, Update
 from omnibench.live.wire.topics import GraphNode
 

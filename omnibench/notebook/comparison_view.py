@@ -9,7 +9,7 @@ import plotly.graph_objects as go
 import polars as pl
 
 from omnibench.compare.output import result_table
-from omnibench.compare.report.entry_chart import entry_chart
+from omnibench.compare.report.headline import entry_chart
 from omnibench.compare.report.view import views
 from omnibench.compare.result import ComparisonResult
 from omnibench.errors import DataError, UnknownNameError

@@ -11,13 +11,13 @@ import plotly.graph_objects as go
 import polars as pl
 
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.data.references.reference_table import reference_frame
-from omnibench.data.references.run_references import References
+from omnibench.data.reference_table import reference_frame
+from omnibench.data.references import References
 from omnibench.data.tables.dataset_tables import tables_of
 from omnibench.notebook.single_figure import drawn
 from omnibench.report.blocks import Figure, FigureGrid
+from omnibench.report.recording.driven import REFERENCE_ITEM
 from omnibench.report.recording.room_figures import all_runs
-from omnibench.report.recording.scan_points import REFERENCE_ITEM
 from omnibench.report.style import plan
 from omnibench.report.traces import START, marks, path
 from omnibench.views import View

@@ -13,8 +13,7 @@ from omnibench.data.dataset import Trajectory
 from omnibench.fit.evaluate import final_errors
 from omnibench.report.blocks import Figure, FigureGrid, LegendItem
 from omnibench.report.numbers import fixed, listing
-from omnibench.report.recording.runs import ON_THE_SPOT, kinds_of, motion_titles, spread
-from omnibench.report.recording.scan_points import REFERENCE_ITEM, evenly
+from omnibench.report.recording.driven import ON_THE_SPOT, REFERENCE_ITEM, evenly, kinds_of, motion_titles, spread
 from omnibench.report.style import INK, THEORETICAL, plan, text
 from omnibench.report.traces import START, marks, path
 from omnibench.robot.kinematics import Array, rotated

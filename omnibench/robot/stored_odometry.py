@@ -13,8 +13,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from omnibench.jobs.gathering import gathered
-from omnibench.jobs.job import Backend
+from omnibench.jobs.job import Backend, gathered
 from omnibench.progress import Reporter
 from omnibench.robot.compiled import path_sums
 from omnibench.robot.kinematics import Array

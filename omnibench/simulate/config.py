@@ -14,12 +14,7 @@ from omnibench.errors import UnknownNameError
 from omnibench.robot.calibration import EffectTerm, Noise
 from omnibench.robot.kinematics import PUBLISHED, Robot
 from omnibench.robot.odometry import Integration
-from omnibench.simulate.command import (
-    Command,
-    beyond_steering,
-    within_steering,
-)
-from omnibench.simulate.driving.command_config import Commands, MotionGrid
+from omnibench.simulate.commands import Command, Commands, MotionGrid, beyond_steering, within_steering
 from omnibench.words import plural
 
 _MOST_NOISE = 1e4  # rad/s, or a factor; chosen: a hundred thousand turns a minute

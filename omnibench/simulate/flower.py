@@ -12,12 +12,11 @@ import numpy as np
 from omnibench.data.dataset import Split, Trajectory, make_dataset
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.robot.kinematics import Array, Robot
-from omnibench.simulate.command import Command, straight_and_pivot, wheels_of
+from omnibench.robot.model import OdometryModel
+from omnibench.simulate.commands import STEADY, Command, TimedCommand, Variation, straight_and_pivot, wheels_of
 from omnibench.simulate.config import FlowerConfig, Session
-from omnibench.simulate.driving.timed_command import TimedCommand
 from omnibench.simulate.simulation import Simulation
 from omnibench.simulate.truth import TrueRobot, reference_noise, true_record
-from omnibench.simulate.variation import STEADY, Variation
 from omnibench.words import plural
 
 _MANY = 1000  # runs whose checks and tables take more than about a second; chosen
@@ -228,3 +227,33 @@ def stamps_of_run(duration: float, sample_period: float, pose_period: float) -> 
     times: Array = sample_period * np.arange(1, samples + 1)
     between = pose_period * np.arange(1, math.ceil(times[-1] / pose_period))
     return times, np.concatenate([[0.0], between[between < times[-1] - 1e-9], times[-1:]])
+
+
+def run_as_designed(model: OdometryModel, timed: TimedCommand, periods: tuple[float, float], name: str) -> Trajectory:
+    """The run of a command with wheel rates by the design values, and poses by a model, from the origin on.
+
+    periods: of the wheel samples and of the reference poses, s.
+    """
+    robot, command = model.robot, timed.command
+    times, pose_times = stamps_of_run(timed.duration, *periods)
+    still = Trajectory(
+        name,
+        "train",
+        times,
+        commanded_rates(robot, command, times, timed.ramp, timed.variation),
+        pose_times,
+        np.zeros((len(pose_times), 3)),
+        steering=commanded_steering(robot, command, times, timed.variation),
+        drive=None if robot.drive.direct else robot.drive,
+    )
+    (poses,) = model.poses([still.log(pose_times)])
+    return replace(
+        still,
+        poses=poses,
+        command=name,
+        v=command.speed,
+        alpha=command.direction,
+        omega=command.turn_rate,
+        duration=float(times[-1]),
+        distance=command.speed * (float(times[-1]) - timed.ramp),
+    )

@@ -10,9 +10,9 @@ from pydantic import Discriminator, Tag
 from omnibench.config import CHOSEN
 from omnibench.errors import require_type
 from omnibench.progress import Reporter, no_progress
-from omnibench.simulate.chain.robot_config import RobotConfig
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.flower import simulate_flower
+from omnibench.simulate.robot_config import RobotConfig
 from omnibench.simulate.simulation import Simulation
 
 _FLOWER, _ROBOT = CHOSEN + FlowerConfig.__name__, CHOSEN + RobotConfig.__name__
@@ -46,6 +46,6 @@ def simulate_dataset(
     if isinstance(config, FlowerConfig):
         return simulate_flower(config, name, description, watch)
     require_type(config, RobotConfig, "read_simulation(...).config")
-    from omnibench.simulate.chain.robot_simulator import simulate_robot  # loads for a second (numba)
+    from omnibench.simulate.robot_simulator import simulate_robot  # loads for a second (numba)
 
     return simulate_robot(config, name, description, watch)

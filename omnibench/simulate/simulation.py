@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from omnibench.data.dataset import Dataset
 from omnibench.data.true_poses import TruePath
 from omnibench.robot.kinematics import Array
-from omnibench.simulate.chain.floor_plan import FloorPlan
+from omnibench.simulate.floor_plan import FloorPlan
 from omnibench.simulate.truth import TruthRecord
 from omnibench.views import Brief
 

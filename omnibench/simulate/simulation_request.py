@@ -25,7 +25,7 @@ from omnibench.robot.kinematics import Array
 from omnibench.simulate.simulation import Simulation
 from omnibench.simulate.source import SimulationSource, check_effect_options, read_simulation
 from omnibench.simulate.truth import reference_noise
-from omnibench.slam.accuracy import SlamAccuracy, slam_accuracy
+from omnibench.slam.summary import SlamAccuracy, slam_accuracy
 
 
 def simulate_like(dataset: Dataset, calibration: Calibration, noise_seed: int | None = None) -> Dataset:

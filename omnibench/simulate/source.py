@@ -15,9 +15,9 @@ from omnibench.progress import Reporter, no_progress
 from omnibench.registry import effects
 from omnibench.robot.calibration import EffectTerm
 from omnibench.robot.odometry import Integration
-from omnibench.simulate.chain.robot_config import RobotConfig
 from omnibench.simulate.config import FlowerConfig, Truth
 from omnibench.simulate.dataset_source import DatasetSource
+from omnibench.simulate.robot_config import RobotConfig
 from omnibench.simulate.simulate import simulate_dataset
 from omnibench.simulate.simulation import Simulation
 from omnibench.views import Brief

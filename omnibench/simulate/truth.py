@@ -27,6 +27,7 @@ from omnibench.robot.kinematics import (
 from omnibench.robot.model import OdometryModel, reported_poses
 from omnibench.robot.odometry import Integration, WheelLog
 from omnibench.robot.signals import of_centre, signals_of
+from omnibench.simulate.commands import Variation
 from omnibench.simulate.config import EncoderNoise, Tolerances, Truth
 from omnibench.simulate.mechanics import (
     BODY,
@@ -34,14 +35,13 @@ from omnibench.simulate.mechanics import (
     LIGHT_WHEEL,
     MECHANICS,
     STEERING,
+    TrueMotion,
+    WheelContacts,
     body_truth,
     lost_by_light_wheels,
     steering_truth,
     turned_by_steering,
 )
-from omnibench.simulate.true_motion import TrueMotion
-from omnibench.simulate.variation import Variation
-from omnibench.simulate.wheel_contacts import WheelContacts
 
 
 def reference_noise(noise: Noise, times: Array, rng: np.random.Generator) -> Array:

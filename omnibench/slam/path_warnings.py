@@ -9,8 +9,8 @@ from itertools import pairwise
 import numpy as np
 
 from omnibench.robot.kinematics import Array, relative
-from omnibench.slam.matching.scan_matching import LOST, Match
 from omnibench.slam.motion_prior import length
+from omnibench.slam.scan_matching import LOST, Match
 from omnibench.slam.slam_options import SlamOptions
 
 # The study tests/studies/constants_slam.py varies these numbers by 0.5 and 2. In three rooms, in round ones, with a

@@ -34,7 +34,7 @@ from __future__ import annotations
 import numpy as np
 
 from omnibench.robot.kinematics import Array, rotation
-from omnibench.slam.matching.scan_matching import Match
+from omnibench.slam.scan_matching import Match
 
 # m^2, m^2, rad^2: least covariance that is stated, for a start pose that is exact by definition. A hundredth of the
 # variances that poses of SLAM have (tests/studies/slam_study.py), so that a covariance can be inverted. Half of it

@@ -15,9 +15,8 @@ import numpy as np
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.scans import Scanner, TrajectoryScans
 from omnibench.errors import DataError, OmnibenchError
-from omnibench.jobs.job import Failure, Job, JobWatch, run_jobs
+from omnibench.jobs.job import Failure, Job, JobWatch, ResultStore, code_digest, content_key, run_jobs
 from omnibench.jobs.local_backends import local_backend
-from omnibench.jobs.result_store import ResultStore, code_digest, content_key
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.robot.kinematics import Array, relative
 from omnibench.robot.model import OdometryModel

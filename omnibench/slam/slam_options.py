@@ -11,7 +11,7 @@ from omnibench.config import Model, Positive
 from omnibench.robot.kinematics import Array
 
 # Modules that the processes of SLAM share; the second loads compiled code.
-PRELOAD = ("omnibench.slam.slam_dataset", "omnibench.slam.matching.line_growth")
+PRELOAD = ("omnibench.slam.slam_dataset", "omnibench.slam.line_growth")
 
 
 class SlamOptions(Model):

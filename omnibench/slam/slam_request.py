@@ -12,15 +12,14 @@ from omnibench.data.storage import check_dataset_folder, load_whole, save_datase
 from omnibench.data.true_poses import TruePath, read_true_poses, robot_of_truth
 from omnibench.errors import ConfigError, DataError, Interrupted
 from omnibench.files import TableFormat, refuse_existing, resolved
-from omnibench.jobs.result_store import ResultStore
+from omnibench.jobs.job import ResultStore
 from omnibench.progress import Reporter, no_progress
 from omnibench.robot.calibration import read_calibration
 from omnibench.robot.model import OdometryModel
-from omnibench.slam.accuracy import SlamAccuracy, slam_accuracy
 from omnibench.slam.slam_dataset import slam_paths, with_paths
 from omnibench.slam.slam_options import SlamOptions
 from omnibench.slam.slam_run import SlamPath
-from omnibench.slam.summary import SlamSummary, summarise
+from omnibench.slam.summary import SlamAccuracy, SlamSummary, slam_accuracy, summarise
 
 _WORKERS = 2  # processes at a time: results do not depend on their number
 

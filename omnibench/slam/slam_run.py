@@ -10,13 +10,11 @@ import numpy as np
 from omnibench.data.scans import Ranges, Scanner, TrajectoryScans
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array, JsonArray
-from omnibench.slam.matching.map import ScanMap
-from omnibench.slam.matching.points import ScanPoints, noise_factor, scan_points
-from omnibench.slam.matching.scan_matching import Match, refine, search
-from omnibench.slam.motion_prior import LastPosePrior, MotionPrior, OdometryPrior
-from omnibench.slam.motion_within_scan import MotionWithinScan
+from omnibench.slam.map import ScanMap
+from omnibench.slam.motion_prior import LastPosePrior, MotionPrior, MotionWithinScan, OdometryPrior
 from omnibench.slam.path_warnings import PathWarning, path_warnings
 from omnibench.slam.pose_errors import PoseErrors
+from omnibench.slam.scan_matching import Match, ScanPoints, noise_factor, refine, scan_points, search
 from omnibench.slam.slam_options import SlamOptions
 
 # The study tests/studies/constants_slam.py varies these numbers by 0.5 and 2. In three rooms _SKEWED moves poses by

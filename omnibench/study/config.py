@@ -15,7 +15,7 @@ from omnibench.fit.parameterisation import Box
 from omnibench.fit.prior import MountChoice
 from omnibench.fit.problem import Budget
 from omnibench.fit.span import Unidentified
-from omnibench.jobs.scheduler_tls import TlsFiles
+from omnibench.jobs.job import TlsFiles
 from omnibench.robot.odometry import Integration
 from omnibench.simulate.dataset_source import DatasetSource
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import polars as pl
 
-from omnibench.compare.effective_config import effective_cost, effective_options, load_calibrators
+from omnibench.compare.config import effective_cost, effective_options, load_calibrators
 from omnibench.compare.execute import PRELOAD, execute, resumable
 from omnibench.config import read_model, read_yaml, to_json, to_yaml
 from omnibench.environment import environment
@@ -30,17 +30,15 @@ from omnibench.files import (
 )
 from omnibench.fit.calibrator import RunResult
 from omnibench.jobs.backend_choice import BackendChoice, open_backend
-from omnibench.jobs.result_store import ResultStore
+from omnibench.jobs.job import ResultStore
 from omnibench.processes import one_thread_processes
 from omnibench.progress import Reporter, no_progress
 from omnibench.registry import PluginFailure
 from omnibench.report.render import write_document
-from omnibench.study.cell_intervals import CellRatio
-from omnibench.study.cells import MethodInCell, StudyCell, make_cells
+from omnibench.study.cells import CellRatio, MethodInCell, StudyCell, make_cells
 from omnibench.study.config import StudyConfig
-from omnibench.study.judging import judge_fits
 from omnibench.study.report.study_report import study_document
-from omnibench.study.study_plan import load_robots, plan_fits
+from omnibench.study.study_plan import judge_fits, load_robots, plan_fits
 from omnibench.study.study_result import StudyResult
 
 

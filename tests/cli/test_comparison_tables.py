@@ -17,7 +17,7 @@ from commands import COMMAND, ENVIRONMENT, compared, compared_here, flower, sear
 from rich.console import Console
 from timing import PATIENCE
 
-from omnibench.cli.terminal.comparisons.comparison_tables import print_result
+from omnibench.cli.terminal.comparison_tables import print_result
 from omnibench.compare.result import ComparisonResult
 
 # Texts that Rich would take for markup or an emoji.

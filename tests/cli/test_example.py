@@ -11,7 +11,7 @@ from typed_commands import parse
 
 from omnibench.cli import examples
 from omnibench.cli.examples import EXAMPLES, Example, find_example, write_example
-from omnibench.compare.read_config import read_compare_config
+from omnibench.compare.config import read_compare_config
 from omnibench.config import read_model
 from omnibench.study.config import StudyConfig
 

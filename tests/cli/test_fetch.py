@@ -16,10 +16,10 @@ from newcomer import PAGES, lines_of
 from real_recordings import OMNI3, ROBOTINO
 from timing import PATIENCE
 
+from omnibench.cli import fetch
 from omnibench.cli.examples import EXAMPLES
-from omnibench.cli.fetch import catalogue
-from omnibench.cli.fetch.catalogue import RECORDINGS as KNOWN
-from omnibench.cli.fetch.catalogue import find_recording
+from omnibench.cli.fetch import RECORDINGS as KNOWN
+from omnibench.cli.fetch import find_recording
 from omnibench.cli.handbook_topics import find_topic
 from omnibench.data.storage import load_dataset
 
@@ -77,7 +77,7 @@ class GitHub:
     def tested(self, **commits: str) -> None:
         """Commits that stand in the catalogue, by the recordings' names."""
         known = [each.model_copy(update={"commit": commits.get(each.name, each.commit)}) for each in KNOWN]
-        self.monkeypatch.setattr(catalogue, "RECORDINGS", tuple(known))
+        self.monkeypatch.setattr(fetch, "RECORDINGS", tuple(known))
 
 
 @pytest.fixture

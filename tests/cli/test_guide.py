@@ -16,7 +16,7 @@ from typed_commands import commands_in, parse
 import omnibench
 from omnibench.cli.handbook_topics import HANDBOOK, topics
 from omnibench.compare.config import CompareConfig
-from omnibench.data.importers.robot_option import RobotOption
+from omnibench.data.importers.recording_options import RobotOption
 from omnibench.study.config import StudyConfig
 
 PAGES = [ROOT / "README.md", *sorted(HANDBOOK.rglob("*.md"))]

@@ -21,8 +21,7 @@ from timing import PATIENCE
 
 from omnibench.cli.terminal.robot_table import describe, listen, plain_line, view
 from omnibench.errors import ConfigError, DataError
-from omnibench.live.robot_monitor import RobotMonitor
-from omnibench.live.robot_status import HealthSummary, OdometryStatus, RobotStatus
+from omnibench.live.robot_monitor import HealthSummary, OdometryStatus, RobotMonitor, RobotStatus
 from omnibench.live.wire.messages import Odometry
 from omnibench.live.wire.topics import KeySpace
 

@@ -25,8 +25,8 @@ from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.data.true_poses import TruePath, write_true_poses
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
-from omnibench.simulate.chain.floor_plan import RoomPlan, make_plan
-from omnibench.simulate.chain.lidar import Lidar, measure_scans, scan_stamps
+from omnibench.simulate.floor_plan import RoomPlan, make_plan
+from omnibench.simulate.lidar import Lidar, measure_scans, scan_stamps
 from omnibench.slam.summary import distances
 from omnibench.testing.synthetic import PERIOD, synthetic_robot, synthetic_trajectories, true_robot
 

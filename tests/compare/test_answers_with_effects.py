@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from commands import compared_here, small, write_plugin
 
-from omnibench.compare.config import CompareConfig
-from omnibench.compare.effective_config import effective_config
+from omnibench.compare.config import CompareConfig, effective_config
 from omnibench.compare.plan import load_datasets, make_plan
 from omnibench.compare.scoring import SplitScorer, score
 from omnibench.fit.calibrator import Outcome, run_calibrator

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 from commands import CONFIGS, compared_here, registries_restored, small, summary, without_seconds
 
-from omnibench.cli.terminal.comparisons.comparison_tables import print_result
+from omnibench.cli.terminal.comparison_tables import print_result
 from omnibench.cli.terminal.console import make_console
-from omnibench.compare.config import CompareConfig
+from omnibench.compare.config import CompareConfig, read_compare_config
 from omnibench.compare.plan import load_datasets
-from omnibench.compare.read_config import read_compare_config
 from omnibench.compare.result import ComparisonResult
 from omnibench.compare.run import run_comparison
 from omnibench.data.dataset import Dataset

@@ -8,7 +8,7 @@ import pytest
 from commands import compared_here, search, small
 from report_samples import config, page, run
 
-from omnibench.cli.terminal.comparisons.comparison_tables import print_result
+from omnibench.cli.terminal.comparison_tables import print_result
 from omnibench.cli.terminal.console import make_console
 from omnibench.compare.config import CompareConfig
 from omnibench.compare.result import ComparisonResult

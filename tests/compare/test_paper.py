@@ -13,15 +13,14 @@ import yaml
 from commands import CONFIGS
 
 from omnibench.cli.handbook_topics import find_topic
-from omnibench.compare.config import CompareConfig, PublishedResult
-from omnibench.compare.read_config import read_compare_config
+from omnibench.compare.config import CompareConfig, PublishedResult, read_compare_config
 from omnibench.data.importers.table1 import APR_02
 from omnibench.fit.identifiability import geometry_of
 from omnibench.fit.parameterisation import make_bounds
 from omnibench.robot.calibration import read_calibration
 from omnibench.robot.kinematics import Array, published_matrix, relative_deviations
-from omnibench.simulate.chain.lidar import Lidar
-from omnibench.simulate.chain.robot_config import RobotConfig
+from omnibench.simulate.lidar import Lidar
+from omnibench.simulate.robot_config import RobotConfig
 
 EQ_8 = """
 -0.0892930568372762 -0.0005606566978203 0.0867466159313470

@@ -11,10 +11,8 @@ import pytest
 import yaml
 from commands import CONFIGS, ROOT, flower, omnibench, small, write_config
 
-from omnibench.compare.config import CompareConfig
-from omnibench.compare.effective_config import effective_config, load_calibrators
+from omnibench.compare.config import CompareConfig, effective_config, load_calibrators, read_compare_config
 from omnibench.compare.plan import PlannedRun, load_datasets, make_plan
-from omnibench.compare.read_config import read_compare_config
 from omnibench.config import to_yaml
 from omnibench.errors import OmnibenchError
 

@@ -24,11 +24,9 @@ from commands import (
     write_config,
 )
 
-from omnibench.compare.config import CompareConfig
-from omnibench.compare.effective_config import effective_config
+from omnibench.compare.config import CompareConfig, effective_config, read_compare_config
 from omnibench.compare.output import prepare_output
 from omnibench.compare.plan import load_datasets, make_plan
-from omnibench.compare.read_config import read_compare_config
 from omnibench.compare.run import run_comparison
 from omnibench.errors import DataError
 from omnibench.fit.evaluate import evaluate

@@ -11,8 +11,7 @@ import pytest
 from commands import flower, search, small, write_plugin
 
 import omnibench
-from omnibench.compare.config import CompareConfig
-from omnibench.compare.effective_config import effective_config, load_calibrators
+from omnibench.compare.config import CompareConfig, effective_config, load_calibrators
 from omnibench.compare.plan import load_datasets, make_plan, shared_code
 
 PACKAGE = Path(omnibench.__file__).parent

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from omnibench.errors import DataError
 from omnibench.fit.calibrator import Outcome, RunResult
 from omnibench.fit.problem import Improvement
-from omnibench.jobs.result_store import ResultStore
+from omnibench.jobs.job import ResultStore
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
 WORDS = st.text(st.characters(codec="utf-8", exclude_categories=("Cs",)), max_size=20)

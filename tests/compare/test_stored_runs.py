@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 from commands import files_of, flower, registries_restored, search, small, summary, without_seconds, write_plugin
 
-from omnibench.compare.config import CompareConfig
-from omnibench.compare.effective_config import effective_config
+from omnibench.compare.config import CompareConfig, effective_config
 from omnibench.compare.plan import load_datasets, make_plan
 from omnibench.compare.run import run_comparison
 from omnibench.progress import Progress

@@ -15,9 +15,8 @@ import pytest
 from commands import COMMAND, ENVIRONMENT, compared_here, rows, search, small, summary, write_config, write_plugin
 from timing import PATIENCE
 
-from omnibench.compare.config import CompareConfig
+from omnibench.compare.config import CompareConfig, read_compare_config
 from omnibench.compare.plan import load_datasets
-from omnibench.compare.read_config import read_compare_config
 from omnibench.compare.run import run_comparison
 from omnibench.data.storage import save_dataset
 from omnibench.progress import Progress

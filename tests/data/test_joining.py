@@ -9,7 +9,7 @@ import pytest
 from drive_samples import DIFF, PERIOD, dataset, drive, trajectory
 
 from omnibench.data.dataset import Dataset, make_dataset
-from omnibench.data.joining import joined
+from omnibench.data.splits import joined
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Robot

@@ -13,7 +13,7 @@ from sample_robots import APR_02
 from storage_samples import FORMATS, Format, a_trajectory, everything_known
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.data.references.run_references import Reference, References
+from omnibench.data.references import Reference, References
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Robot

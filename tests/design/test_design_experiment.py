@@ -20,7 +20,7 @@ from omnibench.data.storage import save_dataset
 from omnibench.design.candidates import candidates_of_dataset, read_candidates
 from omnibench.design.config import DesignConfig
 from omnibench.design.design import design_experiment
-from omnibench.design.report.design_wording import equal_in_words
+from omnibench.design.report.design_figures import equal_in_words
 from omnibench.design.result import Design, SetDesign
 from omnibench.errors import ConfigError, DataError, OmnibenchError
 from omnibench.fit.information import information_of_runs

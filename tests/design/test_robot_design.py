@@ -15,7 +15,7 @@ from omnibench.config import validate
 from omnibench.design.candidates import CandidatePool, candidates_of_config
 from omnibench.design.config import DesignConfig
 from omnibench.design.design import design_experiment
-from omnibench.design.report.design_wording import plan_in_words
+from omnibench.design.report.design_figures import plan_in_words
 from omnibench.design.robot_commands import RobotCommands, RobotOptions, design_source
 from omnibench.errors import ConfigError
 

@@ -9,8 +9,7 @@ import numpy as np
 from discovery_samples import APR02
 
 from omnibench.data.dataset import Split, Trajectory
-from omnibench.discover.fitting.extend import Extended
-from omnibench.discover.fitting.model_fit import Fit
+from omnibench.discover.fitting import Extended, Fit
 from omnibench.fit.information import EstimatedCovariance
 from omnibench.fit.noise import NoiseEstimate
 from omnibench.fit.trajectory_fit import Nuisances

@@ -11,10 +11,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from omnibench.discover.regressors.column_group import Group
-from omnibench.discover.regressors.column_store import ColumnStore
+from omnibench.discover.regressors.columns import ColumnStore, Group
 from omnibench.discover.regressors.covariate_bases import Basis
-from omnibench.discover.selection.candidate_groups import Groups
+from omnibench.discover.selection.evidence import Groups
 from omnibench.discover.selection.screening import Screening
 from omnibench.fit.trajectory_fit import Whitened
 from omnibench.registry import effects

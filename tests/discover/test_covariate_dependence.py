@@ -10,7 +10,7 @@ import pytest
 from screening_samples import FIRST, SECOND, THIRD, screening
 
 from omnibench.discover.covariate_dependence import Dependences, covariate_dependences, weights_of_covariates
-from omnibench.discover.regressors.column_group import Group
+from omnibench.discover.regressors.columns import Group
 from omnibench.discover.regressors.covariate_bases import Basis
 from omnibench.discover.regressors.significance import Family, Significance, together
 from omnibench.discover.selection.model_selection import select_effects

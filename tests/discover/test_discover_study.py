@@ -12,7 +12,7 @@ from hidden.forms import FORMS
 from hidden.judging import Judgement, Name, ParameterError
 from hidden.tasks import GROUPS, Group, Result, Task, tasks
 
-from omnibench.jobs.result_store import ResultStore
+from omnibench.jobs.job import ResultStore
 
 TRUE, OTHER = "heading_drift", "floor_drift"
 

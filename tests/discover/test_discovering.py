@@ -11,7 +11,7 @@ from discovery_samples import COUPLING, lagging, nameless, nothing, repeated, si
 from page_figures import assert_printed, discovery_figures, plan_lines, printed_plan
 
 from omnibench.data.dataset import Dataset
-from omnibench.data.joining import joined
+from omnibench.data.splits import joined
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.result import Discovery
 from omnibench.errors import UnknownNameError

@@ -10,7 +10,7 @@ from discovery_samples import DELAY, named, repeated, shorn, simulated
 
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.discover.discover import discover_effects
-from omnibench.discover.fitting.extend import fit_matrix
+from omnibench.discover.fitting import fit_matrix
 from omnibench.errors import DataError
 from omnibench.fit.evaluate import evaluate
 from omnibench.fit.trajectory_fit import usable_runs

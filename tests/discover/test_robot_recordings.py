@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.discover.discover import discover_effects
-from omnibench.discover.selection.encoder_quantisation import quantisation_steps
+from omnibench.discover.selection.screening import quantisation_steps
 from omnibench.simulate.simulate import simulate_dataset
 
 FEW: dict[str, Any] = {

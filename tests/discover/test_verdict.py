@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
+from omnibench.discover.conclude import headline_of, lacks_a_name, verdict_of
 from omnibench.discover.result import CovariateDependence, NamedEffect, Verdict
-from omnibench.discover.verdict import headline_of, lacks_a_name, verdict_of
 from omnibench.robot.effects.effect import Stage
 
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from omnibench.data.dataset import Trajectory
-from omnibench.discover.fitting.windows import in_windows
+from omnibench.discover.fitting import in_windows
 from omnibench.robot.model import OdometryModel
 
 ROBOT_MODEL = simulated(()).robot

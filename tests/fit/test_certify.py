@@ -16,7 +16,7 @@ from rich.console import Console
 from scipy.optimize import minimize
 
 from omnibench.cli.terminal.calibration_tables import print_certificate
-from omnibench.compare.read_config import read_compare_config
+from omnibench.compare.config import read_compare_config
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.errors import ConfigError, DataError
 from omnibench.fit.calibrate import calibrate

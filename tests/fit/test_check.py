@@ -21,9 +21,9 @@ from hypothesis import strategies as st
 from omnibench import check, save_dataset
 from omnibench.cli.handbook_topics import HANDBOOK
 from omnibench.config import parse_settings, to_yaml
-from omnibench.data.checks.option_words import as_yaml
+from omnibench.data.checks.misreading import as_yaml
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.data.references.run_references import Reference, References
+from omnibench.data.references import Reference, References
 from omnibench.fit.check.checking import CheckReport
 from omnibench.fit.check.missing_motions import command_names
 from omnibench.robot.odometry import Path as Driven

@@ -13,8 +13,7 @@ from typing import Any
 
 from timing import PATIENCE
 
-from omnibench.jobs.job import Backend, Failure, Job, JobWatch, run_jobs
-from omnibench.jobs.result_store import ResultStore
+from omnibench.jobs.job import Backend, Failure, Job, JobWatch, ResultStore, run_jobs
 from omnibench.progress import Progress, Reporter
 
 

@@ -34,10 +34,8 @@ from test_jobs import (
 from omnibench.errors import DataError
 from omnibench.jobs.backend_choice import BackendChoice, open_backend
 from omnibench.jobs.dask_backend import DaskBackend
-from omnibench.jobs.gathering import gathered
-from omnibench.jobs.job import Failure, Job, run_jobs
-from omnibench.jobs.packing import Packer
-from omnibench.jobs.result_store import ResultStore
+from omnibench.jobs.job import Failure, Job, ResultStore, gathered, run_jobs
+from omnibench.jobs.job_process import Packer
 from omnibench.progress import Progress, Reporter
 
 

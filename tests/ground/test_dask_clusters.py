@@ -30,9 +30,7 @@ import omnibench.jobs.dask_backend as dask_backend
 import omnibench.jobs.dask_cluster as dask_cluster
 from omnibench.errors import ConfigError, OmnibenchError
 from omnibench.jobs.backend_choice import BackendChoice, check_backend, open_backend
-from omnibench.jobs.job import BackendError, JobWatch, run_jobs
-from omnibench.jobs.result_store import ResultStore
-from omnibench.jobs.scheduler_tls import TlsFiles
+from omnibench.jobs.job import BackendError, JobWatch, ResultStore, TlsFiles, run_jobs
 from omnibench.progress import Progress, Reporter
 
 PACKAGE = Path(package.__file__).parent
@@ -190,7 +188,7 @@ MOVES = """
 import sys
 from pathlib import Path
 import omnibench
-from omnibench.compare.read_config import read_compare_config
+from omnibench.compare.config import read_compare_config
 
 config = read_compare_config(sys.argv[1]).model_copy(update={"backend": sys.argv[3]})
 
@@ -226,7 +224,7 @@ from job_samples import Answer, Notes, jobs_of
 from test_dask_clusters import sleeping
 from omnibench.jobs.backend_choice import BackendChoice, open_backend
 from omnibench.jobs.job import BackendError, run_jobs
-from omnibench.jobs.result_store import ResultStore
+from omnibench.jobs.job import ResultStore
 try:
     with open_backend(BackendChoice(name=sys.argv[1])) as backend:
         folder = Path(sys.argv[2])

@@ -14,12 +14,10 @@ import psutil
 import pytest
 from job_samples import wait_for
 
-import omnibench.jobs.packing as packing
+import omnibench.jobs.job_process as packing
 from omnibench.errors import DataError
 from omnibench.jobs.backend_choice import BackendChoice, open_backend
-from omnibench.jobs.gathering import gathered
-from omnibench.jobs.job import Backend, Failure, Job, JobWatch, run_jobs
-from omnibench.jobs.result_store import ResultStore
+from omnibench.jobs.job import Backend, Failure, Job, JobWatch, ResultStore, gathered, run_jobs
 from omnibench.progress import Progress, Reporter
 
 

@@ -18,9 +18,8 @@ from job_samples import Answer, Notes, jobs_of, run, squared, tried
 from timing import PATIENCE
 
 from omnibench.errors import DataError
-from omnibench.jobs.job import Backend, Failure, Job, run_jobs
+from omnibench.jobs.job import Backend, Failure, Job, ResultStore, run_jobs
 from omnibench.jobs.local_backends import InPlace, Processes, local_backend
-from omnibench.jobs.result_store import ResultStore
 from omnibench.progress import Progress, Reporter
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from job_samples import Answer
 
-from omnibench.jobs.result_store import ResultStore, content_key
+from omnibench.jobs.job import ResultStore, content_key
 from omnibench.robot.kinematics import JsonArray
 
 

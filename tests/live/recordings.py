@@ -13,8 +13,8 @@ from omnibench.robot.calibration import EffectTerm
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
+from omnibench.simulate.commands import Commands
 from omnibench.simulate.config import EncoderNoise, FlowerConfig, Session, Tolerances, Truth
-from omnibench.simulate.driving.command_config import Commands
 from omnibench.simulate.simulate import simulate_dataset
 from omnibench.testing import synthetic_robot
 

@@ -10,7 +10,7 @@ from drives import NOISE, ORIGIN, PERIOD, SECOND
 
 from omnibench.data.dataset import Trajectory, make_dataset
 from omnibench.live.replay.concatenated_drive import Recording
-from omnibench.live.wheels.joints import joints_of
+from omnibench.live.wheels.wheel_input import joints_of
 from omnibench.live.wire.messages import JOINT_STATE, JointState
 from omnibench.robot.calibration import Calibration, covariance_rows, matrix_rows
 from omnibench.robot.kinematics import Array, Robot

@@ -13,8 +13,7 @@ from received_messages import ReceivedMessages
 from sessions import until
 
 from omnibench.live.estimation.health import Health
-from omnibench.live.wire.attachment import packed
-from omnibench.live.wire.messages import JOINT_STATE, ODOMETRY, Odometry
+from omnibench.live.wire.messages import JOINT_STATE, ODOMETRY, Odometry, packed
 
 SAMPLES = 60
 

@@ -15,8 +15,7 @@ from announced_robot import AnnouncedRobot
 from samples import odometry
 from sessions import Loopback, until
 
-from omnibench.live.robot_monitor import RobotMonitor
-from omnibench.live.robot_status import HealthSummary, RobotStatus
+from omnibench.live.robot_monitor import HealthSummary, RobotMonitor, RobotStatus
 from omnibench.live.wire.messages import Diagnostic, Diagnostics
 from omnibench.live.wire.topics import GraphNode, KeySpace, Profile
 

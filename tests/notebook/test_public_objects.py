@@ -17,7 +17,7 @@ from wheeled_samples import CAR, DIFF, SWERVE, TRICYCLE
 
 import omnibench
 from omnibench.data.dataset import Dataset, Split, Trajectory, make_dataset
-from omnibench.data.references.run_references import Reference, References
+from omnibench.data.references import Reference, References
 from omnibench.robot.kinematics import Robot
 from omnibench.views import Shown, brief
 

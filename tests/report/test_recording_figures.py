@@ -13,15 +13,14 @@ from recording_samples import COMMANDS, NOISE, TICK, Sample, sample
 from wheeled_samples import ROBOTS, driven
 
 from omnibench.data.scans import Mount, Scanner, ScansInMemory, TrajectoryScans
+from omnibench.report.recording.driven import ODOMETRY_ITEM, representative_runs, scan_points, thinned
 from omnibench.report.recording.player import player
 from omnibench.report.recording.room_figures import all_runs
-from omnibench.report.recording.runs import representative_runs
-from omnibench.report.recording.scan_points import ODOMETRY_ITEM, scan_points, thinned
 from omnibench.report.recording.wheel_figures import rate_step, wheel_rates
 from omnibench.report.robot_figures import is_placed
 from omnibench.robot.kinematics import Robot, Wheel
 from omnibench.robot.model import OdometryModel
-from omnibench.slam.accuracy import run_errors
+from omnibench.slam.summary import run_errors
 
 
 @pytest.fixture(scope="module")

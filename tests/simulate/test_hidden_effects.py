@@ -21,9 +21,8 @@ from omnibench.robot.calibration import EffectTerm
 from omnibench.robot.kinematics import Array, moved_to, published_matrix, wheel_equations
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
-from omnibench.simulate.command import Command
+from omnibench.simulate.commands import Command, Commands
 from omnibench.simulate.config import EncoderNoise, FlowerConfig
-from omnibench.simulate.driving.command_config import Commands
 from omnibench.simulate.flower import commanded_rates
 from omnibench.simulate.simulate import simulate_dataset
 

@@ -16,12 +16,11 @@ from omnibench.errors import ConfigError, DataError
 from omnibench.fit.evaluate import ModelErrors
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
-from omnibench.simulate.command import Command
+from omnibench.simulate.commands import Command, Variation
 from omnibench.simulate.flower import true_steering
 from omnibench.simulate.mechanics import body_truth, lost_by_light_wheels, steering_truth, turned_by_steering
 from omnibench.simulate.simulate import simulate_dataset
 from omnibench.simulate.simulation import Simulation
-from omnibench.simulate.variation import Variation
 
 WEAVE = {"weave": 0.2, "period": 3.0}
 # An effect on a robot with a variation of its commands, how small its model's errors are to be, as a share of those of

@@ -13,8 +13,7 @@ from sample_robots import APR_02
 
 from omnibench.robot.kinematics import Mount, Robot, Wheel
 from omnibench.robot.odometry import Path
-from omnibench.simulate.true_motion import TrueMotion
-from omnibench.simulate.wheel_contacts import WheelContacts
+from omnibench.simulate.mechanics import TrueMotion, WheelContacts
 
 REAR = Robot(
     name="behind its centre, and rolling to its side",

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from omnibench.robot.kinematics import Array, compose, relative
 from omnibench.robot.odometry import advance
-from omnibench.slam.motion_prior import LastPosePrior, OdometryPrior
-from omnibench.slam.motion_within_scan import smoothed
+from omnibench.slam.motion_prior import LastPosePrior, OdometryPrior, smoothed
 from omnibench.slam.slam_options import SlamOptions
 
 TIMES = np.array([1.0, 1.25, 1.5])

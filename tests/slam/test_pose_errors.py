@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from omnibench.robot.kinematics import Array
-from omnibench.slam.matching.scan_matching import Match
 from omnibench.slam.pose_errors import FLOOR, PoseErrors
+from omnibench.slam.scan_matching import Match
 
 NONE: Array = np.zeros((3, 3))
 

@@ -17,12 +17,12 @@ from omnibench.errors import DataError
 from omnibench.progress import Progress
 from omnibench.robot.kinematics import published_matrix
 from omnibench.robot.model import OdometryModel
-from omnibench.simulate.chain.floor_plan import RoomPlan, make_plan
-from omnibench.simulate.chain.lidar import Lidar
-from omnibench.slam.accuracy import run_errors, slam_accuracy
+from omnibench.simulate.floor_plan import RoomPlan, make_plan
+from omnibench.simulate.lidar import Lidar
 from omnibench.slam.pose_errors import FLOOR
 from omnibench.slam.slam_dataset import slam_dataset
 from omnibench.slam.slam_options import SlamOptions
+from omnibench.slam.summary import run_errors, slam_accuracy
 
 LIDAR = Lidar()
 START = np.array([1.0, 2.0, 0.5])

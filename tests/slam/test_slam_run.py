@@ -15,9 +15,9 @@ from omnibench.config import validate
 from omnibench.data.scans import Ranges, TrajectoryScans
 from omnibench.errors import ConfigError, DataError
 from omnibench.robot.kinematics import Array
-from omnibench.simulate.chain.floor_plan import FloorPlan, RoomPlan, make_plan
-from omnibench.simulate.chain.lidar import Lidar, LidarMount
-from omnibench.simulate.command import Command
+from omnibench.simulate.commands import Command
+from omnibench.simulate.floor_plan import FloorPlan, RoomPlan, make_plan
+from omnibench.simulate.lidar import Lidar, LidarMount
 from omnibench.slam.slam_options import SlamOptions
 from omnibench.slam.slam_run import SlamPath, run_slam
 

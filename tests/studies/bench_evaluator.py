@@ -19,7 +19,7 @@ import pytest
 from sample_robots import CAR, DIFFERENTIAL, MECANUM, SWERVE
 from wheeled_recordings import recorded
 
-from omnibench.compare.read_config import read_compare_config
+from omnibench.compare.config import read_compare_config
 from omnibench.data.dataset import make_dataset
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
 from omnibench.registry import costs

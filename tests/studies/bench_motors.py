@@ -20,10 +20,9 @@ import numpy as np
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from omnibench.robot.kinematics import Array, Robot, Wheel
-from omnibench.simulate.chain.motion_commands import CommandLink, MotionProfile, command_motion, target_rates
-from omnibench.simulate.chain.motors import Controller, Encoder, Motor
-from omnibench.simulate.chain.wheel_drive import DrivenRun, drive_session
-from omnibench.simulate.command import Command
+from omnibench.simulate.commands import Command
+from omnibench.simulate.motion_commands import CommandLink, MotionProfile, command_motion, target_rates
+from omnibench.simulate.motors import Controller, DrivenRun, Encoder, Motor, drive_session
 
 PERIOD = 0.01
 APR_02 = Robot(

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import binom
 
-from omnibench.compare.read_config import read_compare_config
+from omnibench.compare.config import read_compare_config
 from omnibench.fit.bootstrap import bootstrap_intervals
 from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from omnibench.compare.read_config import read_compare_config
+from omnibench.compare.config import read_compare_config
 from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.problem import CalibrationProblem, make_parameterisation
 from omnibench.registry import calibrators, costs

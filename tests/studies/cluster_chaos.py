@@ -26,8 +26,7 @@ import psutil
 from busy_jobs import Drawn, draw
 
 from omnibench.jobs.backend_choice import BackendChoice, open_backend
-from omnibench.jobs.job import BackendError, Failure, Job, JobWatch, run_jobs
-from omnibench.jobs.result_store import ResultStore
+from omnibench.jobs.job import BackendError, Failure, Job, JobWatch, ResultStore, run_jobs
 
 _HERE = Path(__file__).parent  # workers import the jobs from here
 

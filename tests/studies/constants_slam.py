@@ -17,9 +17,9 @@ from constant_study import Answer, Part, Value, carry_out, estimates, stated, wo
 from slam_study import Run, drive, flower_command
 
 from omnibench.data.scans import TrajectoryScans
-from omnibench.simulate.chain.floor_plan import RoomPlan, make_plan
-from omnibench.simulate.chain.lidar import Lidar
-from omnibench.simulate.command import Command
+from omnibench.simulate.commands import Command
+from omnibench.simulate.floor_plan import RoomPlan, make_plan
+from omnibench.simulate.lidar import Lidar
 from omnibench.slam.slam_options import SlamOptions
 from omnibench.slam.slam_run import run_slam
 

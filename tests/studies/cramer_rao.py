@@ -24,8 +24,8 @@ from omnibench.registry import calibrators, costs
 from omnibench.robot.kinematics import Array, Robot, Wheel, wheel_equations
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
+from omnibench.simulate.commands import Commands
 from omnibench.simulate.config import EncoderNoise, FlowerConfig, Session, Truth
-from omnibench.simulate.driving.command_config import Commands
 from omnibench.simulate.simulate import simulate_dataset
 from omnibench.simulate.truth import true_matrix
 

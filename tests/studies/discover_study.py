@@ -20,8 +20,7 @@ from hidden.tasks import GROUPS, Result, Task, carry_out, tasks
 
 import omnibench
 from omnibench.jobs.backend_choice import BackendChoice, open_backend
-from omnibench.jobs.job import Failure, Job, JobWatch, run_jobs
-from omnibench.jobs.result_store import ResultStore, code_digest, content_key
+from omnibench.jobs.job import Failure, Job, JobWatch, ResultStore, code_digest, content_key, run_jobs
 
 ROOMS = ("data", "discover", "fit", "robot")  # the code that a result depends on, beside the makers of sets
 

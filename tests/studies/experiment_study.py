@@ -27,7 +27,7 @@ from scipy.stats import binomtest
 import omnibench.discover.discover as discovering
 from omnibench.config import Model, parse_yaml
 from omnibench.data.dataset import Dataset
-from omnibench.data.joining import joined as joined_datasets
+from omnibench.data.splits import joined as joined_datasets
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.result import Discovery, NamedEffect
 from omnibench.discover.selection.competing_models import CompetingModels

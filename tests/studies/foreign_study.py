@@ -18,8 +18,7 @@ from foreign_judging import Result, carry_out
 from scipy.stats import binomtest
 
 from omnibench.jobs.backend_choice import BackendChoice, open_backend
-from omnibench.jobs.job import Failure, Job, JobWatch, run_jobs
-from omnibench.jobs.result_store import ResultStore, content_key
+from omnibench.jobs.job import Failure, Job, JobWatch, ResultStore, content_key, run_jobs
 
 KINDS = ("cross_wheel_coupling", "slippery_patch", "belt_ripple", "swinging_payload", "tether_pull")
 

@@ -41,8 +41,8 @@ import numpy as np
 from scipy.stats import binomtest
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.discover.fitting.extend import extend, fit_matrix
-from omnibench.discover.regressors.column_group import Group
+from omnibench.discover.fitting import extend, fit_matrix
+from omnibench.discover.regressors.columns import Group
 from omnibench.fit import sandwich
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.problem import Budget

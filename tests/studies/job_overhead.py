@@ -18,9 +18,8 @@ from pathlib import Path
 from busy_jobs import Done, busy
 
 from omnibench.jobs.backend_choice import BackendChoice, open_backend
-from omnibench.jobs.job import Job, JobWatch, run_jobs
-from omnibench.jobs.packing import Packer
-from omnibench.jobs.result_store import ResultStore
+from omnibench.jobs.job import Job, JobWatch, ResultStore, run_jobs
+from omnibench.jobs.job_process import Packer
 
 
 def main() -> None:

@@ -19,7 +19,7 @@ from hidden.sets import make_set
 
 from omnibench.discover import covariate_dependence
 from omnibench.discover.covariate_dependence import weights_of_covariates
-from omnibench.discover.fitting.extend import fit_matrix
+from omnibench.discover.fitting import fit_matrix
 from omnibench.discover.regressors.significance import Significance, significance_of
 from omnibench.discover.selection.model_selection import CHANCE
 from omnibench.discover.selection.screening import screen_plain

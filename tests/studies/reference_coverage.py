@@ -28,7 +28,7 @@ import numpy as np
 from scipy.stats import norm
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.data.references.run_references import Reference, References
+from omnibench.data.references import Reference, References
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.open_combinations import WORST
 from omnibench.fit.prior import prior_root, tolerance_of

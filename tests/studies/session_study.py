@@ -22,8 +22,8 @@ from hidden.disturbances import NULL_KINDS
 from hidden.session_sets import session_set
 
 from omnibench.data.dataset import Dataset
-from omnibench.discover.fitting.extend import extend, fit_matrix
-from omnibench.discover.regressors.column_group import Group
+from omnibench.discover.fitting import extend, fit_matrix
+from omnibench.discover.regressors.columns import Group
 from omnibench.fit.sessions import SessionComparison, compare_sessions
 from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.processes import one_thread

@@ -25,10 +25,10 @@ from omnibench.processes import one_thread
 from omnibench.robot.kinematics import Array, Robot, Wheel, published_matrix
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
-from omnibench.simulate.chain.floor_plan import FloorPlan, RoomPlan, make_plan
-from omnibench.simulate.chain.lidar import Lidar, measure_scans, scan_stamps
-from omnibench.simulate.chain.motion_commands import CommandLink, MotionProfile, command_motion, target_rates
-from omnibench.simulate.command import Command
+from omnibench.simulate.commands import Command
+from omnibench.simulate.floor_plan import FloorPlan, RoomPlan, make_plan
+from omnibench.simulate.lidar import Lidar, measure_scans, scan_stamps
+from omnibench.simulate.motion_commands import CommandLink, MotionProfile, command_motion, target_rates
 from omnibench.slam.slam_options import SlamOptions
 from omnibench.slam.slam_run import SlamPath, run_slam
 

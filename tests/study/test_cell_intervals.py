@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from omnibench.study.cell_intervals import Pairs, cell_ratio
+from omnibench.study.cells import Pairs, cell_ratio
 
 
 def pairs(sessions: int, runs_each: int, folds: int = 1, trained: bool = False) -> Pairs:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from omnibench.study.cell_intervals import Pairs
-from omnibench.study.cells import MEASURES, CellKey, MethodInCell, StudyCell
-from omnibench.study.ranks import profiles, ranking
+from omnibench.study.cells import MEASURES, CellKey, MethodInCell, Pairs, StudyCell
+from omnibench.study.study_result import profiles, ranking
 
 
 def cell(**errors: float | None) -> StudyCell:

@@ -9,7 +9,7 @@ from studied import robot_dataset
 
 from omnibench.data.dataset import Trajectory
 from omnibench.study.config import RegimeChoice
-from omnibench.study.regimes import in_regime
+from omnibench.study.trainings import in_regime
 
 
 @pytest.fixture(scope="module")

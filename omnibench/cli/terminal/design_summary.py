@@ -5,7 +5,7 @@ from __future__ import annotations
 from rich.console import Console
 
 from omnibench.cli.terminal.tables import print_table
-from omnibench.design.report.design_wording import (
+from omnibench.design.report.design_figures import (
     USE_IN_WORDS,
     choice_in_words,
     motions_in_words,

@@ -8,7 +8,7 @@ from rich.console import Console
 
 from omnibench.cli.terminal.tables import print_table
 from omnibench.fit.inspect import Inspection, ScansContent
-from omnibench.report.recording.inspection_tables import driven_by, identifiability_table, split_table
+from omnibench.report.recording.inspection_report import driven_by, identifiability_table, split_table
 from omnibench.words import plural
 
 

@@ -16,8 +16,7 @@ from rich.text import Text
 
 from omnibench.cli.terminal.tables import render_table
 from omnibench.errors import one_line
-from omnibench.live.robot_monitor import RobotMonitor
-from omnibench.live.robot_status import OdometryStatus, RobotStatus, json_document
+from omnibench.live.robot_monitor import OdometryStatus, RobotMonitor, RobotStatus, json_document
 from omnibench.live.stopping import ticks
 from omnibench.live.wire.topics import KeySpace
 from omnibench.report.blocks import Column, Row, RowRole, Table

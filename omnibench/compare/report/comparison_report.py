@@ -12,12 +12,18 @@ import numpy as np
 from omnibench.compare.report.cost_tables import cost_section
 from omnibench.compare.report.error_figures import error_section
 from omnibench.compare.report.headline import answer_of, path_picture
-from omnibench.compare.report.matrices import matrix_section
-from omnibench.compare.report.outcome_tables import outcome_section
+from omnibench.compare.report.outcome_tables import matrix_section, outcome_section
 from omnibench.compare.report.path_figures import path_section
 from omnibench.compare.report.search_figures import search_section
-from omnibench.compare.report.view import SPLIT_NAMES, DatasetView, views
-from omnibench.compare.report.wording import cost_decimals, cost_in_words, improvement_in_words, rivals_in_words
+from omnibench.compare.report.view import (
+    SPLIT_NAMES,
+    DatasetView,
+    cost_decimals,
+    cost_in_words,
+    improvement_in_words,
+    rivals_in_words,
+    views,
+)
 from omnibench.compare.result import ComparisonResult
 from omnibench.data.dataset import SPLITS, Trajectory
 from omnibench.errors import DataError
@@ -40,9 +46,8 @@ from omnibench.report.blocks import (
     answer_section,
     simulated_badge,
 )
-from omnibench.report.motions import MOST_MOTIONS, motion_items, motion_of
-from omnibench.report.numbers import NOTHING, count, fixed, listing, significant
-from omnibench.report.recording.scan_points import evenly
+from omnibench.report.numbers import MOST_MOTIONS, NOTHING, count, fixed, listing, motion_items, motion_of, significant
+from omnibench.report.recording.driven import evenly
 from omnibench.report.recording.section import has_recording, recording_section
 from omnibench.report.reproduction import reproduction_section
 from omnibench.report.robot_figures import DESIGN, is_drawn, motion_system, parameters

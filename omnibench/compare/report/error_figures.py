@@ -8,8 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 import plotly.graph_objects as go
 
-from omnibench.compare.report.view import SPLIT_NAMES, THEORETICAL_STYLE, DatasetView
-from omnibench.compare.report.wording import entry_cell, mean_and_worst, position_unit
+from omnibench.compare.report.view import (
+    SPLIT_NAMES,
+    THEORETICAL_STYLE,
+    DatasetView,
+    entry_cell,
+    mean_and_worst,
+    position_unit,
+)
 from omnibench.compare.result import EntryStatistics, ScoredRun
 from omnibench.data.dataset import Split, Trajectory
 from omnibench.fit.evaluate import positions_and_headings
@@ -25,8 +31,7 @@ from omnibench.report.blocks import (
     Section,
     Table,
 )
-from omnibench.report.motions import MOST_MOTIONS, Motion, direction_of, motion_items, motion_of, moves
-from omnibench.report.numbers import fixed
+from omnibench.report.numbers import MOST_MOTIONS, Motion, direction_of, fixed, motion_items, motion_of, moves
 from omnibench.report.style import INK, plot, text, wrapped
 from omnibench.report.traces import coordinates
 from omnibench.robot.kinematics import Array

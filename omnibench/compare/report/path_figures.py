@@ -13,8 +13,7 @@ from omnibench.compare.report.view import REFERENCE_STYLE, SPLIT_NAMES, THEORETI
 from omnibench.data.dataset import Trajectory
 from omnibench.report.blocks import Figure, FigureGrid, LegendItem, Section
 from omnibench.report.numbers import listing
-from omnibench.report.recording.runs import describe
-from omnibench.report.recording.scan_points import evenly
+from omnibench.report.recording.driven import describe, evenly
 from omnibench.report.style import plan, text
 from omnibench.report.traces import START, line, marks, path
 from omnibench.robot.kinematics import Array

@@ -16,8 +16,7 @@ import numpy as np
 import plotly.graph_objects as go
 
 from omnibench.compare.plan import SearchSpace
-from omnibench.compare.report.view import DatasetView
-from omnibench.compare.report.wording import cost_in_words
+from omnibench.compare.report.view import DatasetView, cost_in_words
 from omnibench.compare.result import ScoredRun
 from omnibench.fit.calibrators.genetic import GeneticOptions
 from omnibench.fit.problem import Improvement

@@ -11,8 +11,8 @@ from omnibench.data.checks.finding import Finding, Severity
 from omnibench.data.checks.stream_faults import runs_in_words
 from omnibench.data.clock_matching import ROUNDS, SEARCH, ClockMatch, Streams, Windows, fitted_together, match_clocks
 from omnibench.data.dataset import Trajectory
-from omnibench.data.stored.drawn_runs import MOST_DRAWN, drawn_runs
-from omnibench.jobs.gathering import gathered
+from omnibench.data.stored_rows import MOST_DRAWN, drawn_runs
+from omnibench.jobs.job import gathered
 from omnibench.progress import Reporter
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.stored_odometry import together, workers

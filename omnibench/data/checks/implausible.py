@@ -14,21 +14,23 @@ from itertools import product
 
 import numpy as np
 
-from omnibench.data.checks.design_distance import beyond_twists
 from omnibench.data.checks.finding import Finding
-from omnibench.data.checks.misfit import EXPLAINED, Explanation, Recording
+from omnibench.data.checks.misread_search import beyond_twists
 from omnibench.data.checks.misreading import (
+    EXPLAINED,
     POSITION_UNITS,
     RATE_UNITS,
+    Explanation,
     Misreading,
     Reading,
+    Recording,
     arrangements,
     headings_in_degrees,
     positions_in,
     scaled,
+    warning_of,
     wrong_unit,
 )
-from omnibench.data.checks.option_words import warning_of
 from omnibench.data.checks.steering_readings import (
     DEGREE,
     another_zero,

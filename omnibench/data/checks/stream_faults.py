@@ -12,8 +12,8 @@ from omnibench.data.checks.misreading import wheels_in_words
 from omnibench.data.checks.reference_jumps import reference_jumps
 from omnibench.data.checks.steering_readings import frozen_steering
 from omnibench.data.dataset import Trajectory
-from omnibench.data.stored.periods import median_period
-from omnibench.jobs.gathering import gathered
+from omnibench.data.stored_rows import median_period
+from omnibench.jobs.job import gathered
 from omnibench.progress import Reporter
 from omnibench.robot.kinematics import Array, Robot, wheel_equations
 from omnibench.robot.model import OdometryModel

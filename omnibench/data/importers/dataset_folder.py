@@ -12,11 +12,10 @@ from pydantic import Field, model_validator
 from omnibench.data.dataset import Dataset
 from omnibench.data.importer import Importer
 from omnibench.data.importers.copied_reference import follows_the_wheels
-from omnibench.data.importers.encoder_options import EncoderOptions, Signs
 from omnibench.data.importers.runs.reference_options import RADIANS, SECONDS, HeadingUnit, TimeUnit
 from omnibench.data.importers.runs.reread_runs import Columns, in_seconds, reread_runs, scans_of
-from omnibench.data.joining import joined
-from omnibench.data.splits import Names, complete
+from omnibench.data.importers.wheel_samples import EncoderOptions, Signs
+from omnibench.data.splits import Names, complete, joined
 from omnibench.data.storage import load_whole, read_recorded
 from omnibench.errors import DataError
 from omnibench.registry import importers

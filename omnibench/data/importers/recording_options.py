@@ -2,18 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
-from typing import ClassVar
+from collections.abc import Hashable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
-from omnibench.config import Positive
+from omnibench.config import Positive, read_yaml, validate
 from omnibench.data.alignment import median_period
 from omnibench.data.dataset import Dataset, Split, Trajectory, make_dataset
-from omnibench.data.importers.robot_option import RobotOption
 from omnibench.data.scans import Scans
 from omnibench.data.splits import Names, divided, remaining
 from omnibench.registry import Options
+from omnibench.robot.kinematics import Robot
+
+
+def _load(value: Any) -> Any:
+    if value in (None, ""):
+        raise ValueError("nothing is given; name the robot's YAML file, as robot=robot.yaml")
+    if not isinstance(value, str | Path):
+        return value
+    content = read_yaml(Path(value))
+    # A dataset.yaml and a calibration file hold the robot among other things.
+    return validate(Robot, content.get("robot", content) if isinstance(content, Mapping) else content, str(value))
+
+
+RobotOption = Annotated[Robot, BeforeValidator(_load)]
+"""A robot as in dataset.yaml, or the path of a YAML file that holds one: by itself, or under the key ``robot`` as a
+dataset.yaml or a calibration file does."""
 
 
 class RecordingOptions(Options):

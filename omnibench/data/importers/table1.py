@@ -15,8 +15,7 @@ from omnibench.data.alignment import align
 from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory
 from omnibench.data.delimited import NumberTable, read_numbers
 from omnibench.data.importer import Importer
-from omnibench.data.importers.recording_options import RecordingOptions
-from omnibench.data.importers.robot_option import RobotOption
+from omnibench.data.importers.recording_options import RecordingOptions, RobotOption
 from omnibench.data.scans import Scanner, ScansInMemory, TrajectoryScans
 from omnibench.data.splits import complete
 from omnibench.errors import DataError

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from omnibench.data.delimited import read_numbers
-from omnibench.data.importers.orientation import planar_headings
+from omnibench.data.importers.rosbag.message_streams import planar_headings
 from omnibench.errors import DataError
 from omnibench.files import write_text
 from omnibench.robot.arrays import Array, finite_array

@@ -14,15 +14,22 @@ import polars as pl
 from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory
 from omnibench.data.dataset import make_dataset as of_trajectories
 from omnibench.data.delimited import not_increasing
-from omnibench.data.references.reference_table import REFERENCE_COLUMNS, TABLE, read_references, reference_frame
-from omnibench.data.references.run_references import References
+from omnibench.data.reference_table import REFERENCE_COLUMNS, TABLE, read_references, reference_frame
+from omnibench.data.references import References
 from omnibench.data.run_checks import pose_times_flaw, stored_pose_times_flaw
 from omnibench.data.scans import Scans
 from omnibench.data.splits import every_second
-from omnibench.data.stored.periods import median_period
-from omnibench.data.tables.rows_of_runs import Rows, check_times, rows_by_trajectory
-from omnibench.data.tables.table import Table, checked_table
-from omnibench.data.tables.wheel_table import WheelArrays, WheelSource, WheelTable
+from omnibench.data.stored_rows import median_period
+from omnibench.data.tables.table import (
+    Rows,
+    Table,
+    WheelArrays,
+    WheelSource,
+    WheelTable,
+    check_times,
+    checked_table,
+    rows_by_trajectory,
+)
 from omnibench.errors import DataError, nearest, require_type
 from omnibench.robot.kinematics import Array, Robot
 

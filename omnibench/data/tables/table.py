@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import glob
+import os
+import shlex
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import polars as pl
@@ -11,11 +16,11 @@ from numpy.typing import NDArray
 
 from omnibench.config import LONGEST_NAME
 from omnibench.data.delimited import missing_column
-from omnibench.data.run_checks import LARGEST
-from omnibench.data.stored.stored_rows import read_parquet, readable
-from omnibench.errors import DataError
+from omnibench.data.run_checks import LARGEST, Flaw, wheel_times_flaw
+from omnibench.data.stored_rows import read_parquet, readable
+from omnibench.errors import DataError, nearest
 from omnibench.files import MOST_TEXT, check_file, unquoted_formulas
-from omnibench.robot.kinematics import Array
+from omnibench.robot.kinematics import Array, Robot
 
 # Names may consist of digits: 007 is not 7.
 _TEXTS = dict.fromkeys(("trajectory", "command", "split", "session"), pl.String)
@@ -129,3 +134,158 @@ def table_file(folder: Path, name: str) -> Path | None:
     if len(files) > 1:
         raise DataError(f"{folder}: both {name}.parquet and {name}.csv are there; remove the one that is not meant")
     return files[0] if files else None
+
+
+_MAGIC = "*?["
+
+
+def dataset_folders(places: Path | str | Sequence[Path | str]) -> list[Path]:
+    """The folders that places name: each a data set folder or a glob, whose folders come in the order of their names.
+
+    A folder that is named twice counts once. DataError: a glob matches no data set folder, or one without dataset.yaml
+    that has wheel samples; or nothing is named.
+    """
+    if isinstance(places, Path | str):
+        places = [places]
+    folders = {folder.resolve(): folder for place in places for folder in _named(Path(place))}
+    if not folders:
+        raise DataError("no data set folder is named")
+    return list(folders.values())
+
+
+def is_glob(place: Path) -> bool:
+    """True for a pattern, which no file or folder has as its name."""
+    return any(sign in str(place) for sign in _MAGIC) and not place.exists()
+
+
+def in_few_words(folders: Sequence[Path]) -> str:
+    """The folders as words of a shell: a glob that names just these, where there is one, else one by one."""
+    begin = os.path.commonprefix([str(folder) for folder in folders])  # noqa: RUF071 (a glob's begin is no path)
+    in_one_folder = len(folders) > 2 and begin.startswith(f"{folders[0].parent}/")
+    if in_one_folder and _found(f"{glob.escape(begin)}*") == list(folders):
+        return f"{shlex.quote(begin)}*"
+    return shlex.join(map(str, folders))
+
+
+def _named(place: Path) -> list[Path]:
+    if not is_glob(place):
+        return [place]
+    pattern = str(place)
+    if not (folders := _found(pattern)):
+        matching = sorted(glob.glob(pattern, recursive=True))
+        seen = f"; {matching[0]} has no dataset.yaml" if matching else ""
+        raise DataError(f"{place}: no data set folder matches{seen}")
+    return folders
+
+
+def _found(pattern: str) -> list[Path]:
+    matching = [Path(match) for match in sorted(glob.glob(pattern, recursive=True))]
+    for match in matching:
+        if table_file(match, "wheels") is not None and not (match / "dataset.yaml").is_file():
+            raise DataError(f"{match}: it has wheel samples, but no dataset.yaml; write one there, or name the others")
+    return [match for match in matching if (match / "dataset.yaml").is_file()]
+
+
+Rows = np.ndarray[Any, np.dtype[np.intp]]  # indices of rows of a table
+
+
+def rows_by_trajectory(runs: Table, table: Table, others: Collection[str] = ()) -> list[Rows]:
+    """The rows of ``table`` that belong to each run, in the file's order; a run among the others may have none."""
+    ids = runs.frame["trajectory"].to_list()
+    number = {identity: index for index, identity in enumerate(ids)}
+    codes = np.array([number.get(identity, -1) for identity in table.frame["trajectory"]])
+    refuse_unknown(runs, table, codes < 0)
+    order = np.argsort(codes, kind="stable")
+    counts = np.bincount(codes, minlength=len(ids))
+    for index, count in enumerate(counts):
+        if count == 0 and ids[index] not in others:
+            raise no_rows(table, runs, index)
+    return np.split(order, np.cumsum(counts)[:-1])
+
+
+def refuse_unknown(runs: Table, table: Table, unknown: NDArray[np.bool_] | pl.Series) -> None:
+    """DataError for the first row of ``table`` whose run is ``unknown`` (rows,): not in the table of runs."""
+    names = table.frame["trajectory"]
+    table.refuse(unknown, lambda row: f"trajectory {names[row]} is not in {runs.file.name}")
+
+
+def no_rows(table: Table, runs: Table, index: int) -> DataError:
+    """The error of a run, by its row in the table of runs, that has no rows in another table."""
+    what = "wheel samples" if table.file.stem == "wheels" else "reference poses"
+    run = runs.frame["trajectory"][index]
+    return DataError(f"{table.file}: trajectory {run} ({runs.file.name}, row {index + 1}) has no {what}")
+
+
+def check_times(table: Table, groups: Sequence[Rows], find_flaw: Callable[[Array, str], Flaw | None]) -> None:
+    """DataError for the first run whose times in ``table`` have a flaw. groups: the rows of each run."""
+    times = table.numbers("t")
+    for rows in groups:
+        if (flaw := find_flaw(times[rows], table.frame["trajectory"][int(rows[0])])) is not None:
+            raise table.fail(int(rows[flaw[0]]), flaw[1])
+
+
+class WheelArrays(NamedTuple):
+    """A run's wheel samples, as in Trajectory."""
+
+    times: Array
+    rates: Array
+    steering: Array | None = None
+    angles: Array | None = None
+    targets: Array | None = None
+    odometry: Array | None = None
+
+
+class WheelSource(Protocol):
+    """A table of wheel samples, in memory or in its file."""
+
+    def of_runs(self, runs: Table, robot: Robot) -> list[WheelArrays]:
+        """The samples of each of the runs. DataError names the table, the row and what is wrong."""
+
+
+def wheel_columns(robot: Robot) -> dict[str, list[str]]:
+    """The columns of each of the arrays of WheelArrays; those of no length are not there."""
+    wheels, steered = robot.wheel_names, robot.drive.steered
+    columns = {
+        "times": ["t"],
+        "rates": [f"omega_{wheel}" for wheel in wheels],
+        "steering": [f"steer_{wheel}" for wheel in steered],
+        "angles": [f"phi_{wheel}" for wheel in wheels],
+        "targets": [f"target_{wheel}" for wheel in wheels],
+        "odometry": ["odom_x", "odom_y", "odom_theta"],
+    }
+    return {name: names for name, names in columns.items() if names}
+
+
+def check_steering(file: Path, columns: Sequence[str], robot: Robot) -> None:
+    """DataError: there is no column with the steering angles of a wheel."""
+    for wheel in robot.drive.steered:
+        if (column := f"steer_{wheel}") not in columns:
+            hint = nearest(column, [name for name in columns if not name.startswith("omega_")])
+            raise DataError(
+                f"{file}: column {column!r}, the steering angle of wheel {wheel} (rad, counter-clockwise, at "
+                f"the sample's end), is missing; {hint}found: {', '.join(columns)}"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class WheelTable:
+    """A table of wheel samples in memory."""
+
+    table: Table
+
+    def of_runs(self, runs: Table, robot: Robot) -> list[WheelArrays]:
+        """The samples of each of the runs, see WheelSource."""
+        table = self.table
+        check_steering(table.file, table.frame.columns, robot)
+        rows_of_runs = rows_by_trajectory(runs, table)
+        check_times(table, rows_of_runs, wheel_times_flaw)
+        times = table.numbers("t")
+        stacked = {
+            name: values
+            for name, columns in wheel_columns(robot).items()
+            if name != "times" and (values := table.stack(columns)) is not None
+        }
+        return [
+            WheelArrays(times[rows], **{name: values[rows] for name, values in stacked.items()})
+            for rows in rows_of_runs
+        ]

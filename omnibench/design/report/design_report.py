@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from omnibench.design.report.design_figures import efficiency_figure, path_figures, precision_figures
-from omnibench.design.report.design_wording import (
+from omnibench.design.report.design_figures import (
     USE_IN_WORDS,
     baseline_runs,
     choice_in_words,
     duration_in_words,
+    efficiency_figure,
     equal_in_words,
     headline,
     motions_in_words,
     origin_in_words,
+    path_figures,
     plan_in_words,
+    precision_figures,
 )
 from omnibench.design.report.tables import candidate_table, chosen_table, equal_table, promise_table
 from omnibench.design.result import Design

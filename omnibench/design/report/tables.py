@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from omnibench.design.report.design_wording import (
+from omnibench.design.report.design_figures import (
     UNIT_OF_COST,
     USE_IN_WORDS,
     command_in_words,

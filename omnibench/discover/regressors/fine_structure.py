@@ -30,8 +30,8 @@ from itertools import pairwise, product
 import numpy as np
 from numpy.typing import NDArray
 
-from omnibench.discover.fitting.model_fit import Fit, paths_of
-from omnibench.discover.regressors.column_group import Group
+from omnibench.discover.fitting import Fit, paths_of
+from omnibench.discover.regressors.columns import Group
 from omnibench.discover.regressors.covariate_bases import Basis, area_of
 from omnibench.discover.regressors.paths import Paths
 from omnibench.discover.regressors.significance import Significance, significance_of_scores, together

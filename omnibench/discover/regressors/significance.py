@@ -38,7 +38,7 @@ from functools import cached_property
 import numpy as np
 from scipy.special import chdtrc
 
-from omnibench.discover.regressors.column_group import Group, best_shapes
+from omnibench.discover.regressors.columns import Group, best_shapes
 from omnibench.fit.trajectory_fit import Given, Whitened, given
 from omnibench.robot.kinematics import Array
 

@@ -11,8 +11,16 @@ import plotly.graph_objects as go
 from omnibench.discover.report.before_after import BAND, NOISE, ModelStyle, legend
 from omnibench.discover.report.residuals import CIRCLE_95, NORMAL_95, CommandResidual, Residuals
 from omnibench.report.blocks import Block, Figure, FigureGrid, LegendItem, Paragraph
-from omnibench.report.motions import MOST_MOTIONS, direction_of, motion_in_words, motion_items, motion_of, moves
-from omnibench.report.numbers import fixed, round_down
+from omnibench.report.numbers import (
+    MOST_MOTIONS,
+    direction_of,
+    fixed,
+    motion_in_words,
+    motion_items,
+    motion_of,
+    moves,
+    round_down,
+)
 from omnibench.report.style import INK, QUIET, plan, plot, text, wrapped
 from omnibench.report.traces import ORIGIN, area, arrows, coordinates, joined, line, marks
 from omnibench.robot.kinematics import Array

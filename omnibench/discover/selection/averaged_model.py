@@ -26,10 +26,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from omnibench.discover.fitting.extend import Extended, columns_of, terms_of
-from omnibench.discover.fitting.model_fit import at_model, model_with
-from omnibench.discover.held_out.cross_validation import folds_of_commands, held_out_residuals
-from omnibench.discover.regressors.column_group import Group
+from omnibench.discover.fitting import Extended, at_model, columns_of, model_with, terms_of
+from omnibench.discover.held_out import folds_of_commands, held_out_residuals
+from omnibench.discover.regressors.columns import Group
 from omnibench.fit.information import EstimatedCovariance
 from omnibench.robot.kinematics import Array
 

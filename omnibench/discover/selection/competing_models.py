@@ -11,10 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from omnibench.discover.fitting.extend import Extended, extend
-from omnibench.discover.fitting.model_fit import Fit
-from omnibench.discover.held_out.cross_validation import folds_of_commands, held_out_residuals, is_gain
-from omnibench.discover.regressors.column_group import Group
+from omnibench.discover.fitting import Extended, Fit, extend
+from omnibench.discover.held_out import folds_of_commands, held_out_residuals, is_gain
+from omnibench.discover.regressors.columns import Group
 from omnibench.discover.selection.model_selection import Selection
 from omnibench.discover.selection.screening import Screening
 from omnibench.fit.trajectory_fit import given

@@ -27,9 +27,9 @@ from itertools import combinations
 
 import numpy as np
 
-from omnibench.discover.regressors.column_group import Group, best_shapes
+from omnibench.discover.regressors.columns import Group, best_shapes
 from omnibench.discover.result import Absorbed, Hidden
-from omnibench.discover.selection.candidate_groups import Missing
+from omnibench.discover.selection.evidence import Missing
 from omnibench.discover.selection.model_selection import ABSORBED, Selection
 from omnibench.discover.selection.screening import Screening
 from omnibench.fit.trajectory_fit import Given, given

@@ -20,8 +20,8 @@ from dataclasses import replace
 import numpy as np
 
 from omnibench.data.dataset import Trajectory
-from omnibench.discover.fitting.extend import Extended, columns_at
-from omnibench.discover.held_out.cross_validation import folds_of_commands, held_out_residuals
+from omnibench.discover.fitting import Extended, columns_at
+from omnibench.discover.held_out import folds_of_commands, held_out_residuals
 from omnibench.discover.result import Extrapolation
 from omnibench.fit.noise import grouped
 from omnibench.robot.corrections import Fade, extrapolated_share, motions_of, representatives

@@ -15,14 +15,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from omnibench.discover.regressors.column_group import Group, best_shapes
+from omnibench.discover.regressors.columns import Group, best_shapes
 from omnibench.discover.regressors.significance import Significance, significance_of
 from omnibench.discover.selection.evidence import (
     DISCREPANCY,
     credibility_of,
     effect_sets,
+    form_columns,
     form_evidence,
-    forms_of,
     indices_of,
     log_evidence,
     names_of,
@@ -114,7 +114,7 @@ def _search(screening: Screening, candidates: Sequence[Group], rng: np.random.Ge
     left = significance_of(data, fitted, bases, rng)
     if not chosen:
         return _Search((), (), pool, steps, left, 0.0, 1.0, DISCREPANCY)
-    beyond = significance_of(data, [*fitted, *forms_of(chosen)], bases, rng)
+    beyond = significance_of(data, [*fitted, *form_columns(chosen)], bases, rng)
     sets = effect_sets(start, pool, len(chosen))
     alike = _look_alikes(start, pool, chosen)
     credibility = credibility_of(sets, start, chosen, left, beyond, alike)  # Eq. (9)
@@ -147,7 +147,7 @@ def _forward_selection(
         others = [group for group in tellable if group.name not in names_of(chosen)]
         if not others or start.scores.shape[0] == 0:
             break
-        step = significance_of(screening.data, [*screening.index_with(chosen), *forms_of(chosen)], others, rng)
+        step = significance_of(screening.data, [*screening.index_with(chosen), *form_columns(chosen)], others, rng)
         steps.append(step)
         pool += [step.groups[index] for index in step.best_shapes if step.groups[index] not in pool]
         if step.p_value(step.best) > CHANCE:
@@ -217,7 +217,7 @@ def _probabilities(
 ) -> list[tuple[Group, float]]:
     """Effects that could stand at one position among the chosen ones, the others given, with their probabilities."""
     others = [group for index, group in enumerate(chosen) if index != position]
-    now = start.given([*indices_of(others), *forms_of(others)])
+    now = start.given([*indices_of(others), *form_columns(others)])
     further = [group for group in pool if group.name not in names_of(chosen)]
     best = best_shapes(further, [now.chi_square(group.index) for group in further])
     groups = [chosen[position], *(further[index] for index in best)]

@@ -17,11 +17,10 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from omnibench.data.dataset import Trajectory
-from omnibench.discover.held_out.cross_validation import folds_of_repetitions
-from omnibench.discover.regressors.column_group import Group
-from omnibench.discover.regressors.column_store import ColumnStore
+from omnibench.discover.held_out import folds_of_repetitions
+from omnibench.discover.regressors.columns import ColumnStore, Group
 from omnibench.discover.regressors.covariate_bases import Basis
-from omnibench.discover.selection.candidate_groups import Groups
+from omnibench.discover.selection.evidence import Groups
 from omnibench.discover.selection.model_selection import Selection, select_effects
 from omnibench.discover.selection.screening import Screening
 from omnibench.fit.information import EstimatedCovariance

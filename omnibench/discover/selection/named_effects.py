@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from omnibench.discover.regressors.column_group import Group
+from omnibench.discover.regressors.columns import Group
 from omnibench.discover.regressors.significance import Significance
 from omnibench.discover.result import Candidate, EstimatedParameter, NamedEffect
 from omnibench.discover.selection.competing_models import CompetingModels

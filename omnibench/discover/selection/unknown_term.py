@@ -26,10 +26,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.discover.covariate_dependence import weights_of_covariates
-from omnibench.discover.fitting.extend import Extended, columns_of, extend
-from omnibench.discover.fitting.model_fit import Fit
-from omnibench.discover.held_out.cross_validation import folds_of_kinds, is_gain, without_runs
-from omnibench.discover.regressors.column_group import Group, best_shapes
+from omnibench.discover.fitting import Extended, Fit, columns_of, extend
+from omnibench.discover.held_out import folds_of_kinds, is_gain, without_runs
+from omnibench.discover.regressors.columns import Group, best_shapes
 from omnibench.discover.regressors.covariate_bases import Basis
 from omnibench.discover.regressors.significance import Significance
 from omnibench.discover.selection.competing_models import CompetingModels

@@ -18,14 +18,13 @@ from xxhash import xxh3_64_intdigest
 from omnibench.config import Model
 from omnibench.data.checks.clock_findings import clock_findings, clocks_of
 from omnibench.data.checks.finding import Finding, FindingWarning, findings_of
-from omnibench.data.checks.misread_search import UNRELATED, Explained, Recorded, search
-from omnibench.data.checks.motion_fit import Windows, continuous
+from omnibench.data.checks.misread_search import UNRELATED, Explained, Recorded, Windows, continuous, search
 from omnibench.data.checks.stream_faults import runs_in_words, stream_faults
 from omnibench.data.clock_matching import ClockMatch
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.importers.copied_reference import follows_the_wheels
-from omnibench.data.references.reference_units import odd_references
-from omnibench.data.stored.drawn_runs import count_drawn, drawn_runs
+from omnibench.data.references import odd_references
+from omnibench.data.stored_rows import count_drawn, drawn_runs
 from omnibench.errors import computable
 from omnibench.fit.check.fixes import (
     CannotBeTypedError,

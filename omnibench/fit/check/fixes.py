@@ -13,12 +13,12 @@ import numpy as np
 
 from omnibench.data.checks.finding import Finding
 from omnibench.data.checks.misread_search import Recorded
-from omnibench.data.checks.option_words import as_yaml
+from omnibench.data.checks.misreading import as_yaml
 from omnibench.data.dataset import Dataset
 from omnibench.data.importer import Importer
 from omnibench.data.storage import load_dataset
-from omnibench.data.stored.dataset_folders import dataset_folders, in_few_words
-from omnibench.data.stored.periods import median_period
+from omnibench.data.stored_rows import median_period
+from omnibench.data.tables.table import dataset_folders, in_few_words
 from omnibench.errors import ConfigError, DataError
 from omnibench.files import check_source
 from omnibench.registry import importers

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.checks.finding import Finding
-from omnibench.data.checks.motion_fit import Windows
+from omnibench.data.checks.misread_search import Windows
 from omnibench.data.dataset import Trajectory
 from omnibench.fit.span import driven_span
 from omnibench.robot.kinematics import Array, Robot

@@ -15,11 +15,19 @@ import zenoh
 
 from omnibench.config import Model, to_json
 from omnibench.errors import ConfigError, DataError, OmnibenchError, one_line
-from omnibench.live.control.orders import LONGEST, read_pose, read_sent_calibration, read_time
-from omnibench.live.control.request_queue import MOST_WAITING, Request, RequestQueue, client_of
+from omnibench.live.control.request_queue import (
+    LONGEST,
+    MOST_WAITING,
+    Request,
+    RequestQueue,
+    client_of,
+    read_pose,
+    read_sent_calibration,
+    read_time,
+)
 from omnibench.live.estimation.saved_state import RobotMemory
 from omnibench.live.estimation.tracker import RobotTracker
-from omnibench.live.network.callbacks import RateLimiter, direct
+from omnibench.live.stopping import RateLimiter, direct
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
 

@@ -9,8 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from omnibench.errors import DataError
 from omnibench.files import read_bytes
-from omnibench.live.control.orders import LONGEST, read_sent_calibration
-from omnibench.live.control.request_queue import source_of
+from omnibench.live.control.request_queue import LONGEST, read_sent_calibration, source_of
 from omnibench.live.network.presence import alive_robots, checked_robot, nothing_received
 
 _LONGEST_TEXT = 2000  # characters; names have some 400, reasons are one line

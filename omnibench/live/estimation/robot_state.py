@@ -17,9 +17,7 @@ from omnibench.live.estimation.live_odometry import LiveOdometry
 from omnibench.live.fusion.pose_fusion import Fusion, FusionSettings
 from omnibench.live.fusion.reference_correction import ReferenceCorrection
 from omnibench.live.fusion.timeline import Timeline
-from omnibench.live.wheels.joints import joints_of
-from omnibench.live.wheels.steering_input import SteeringInput
-from omnibench.live.wheels.wheel_input import WheelInput, WheelSettings
+from omnibench.live.wheels.wheel_input import SteeringInput, WheelInput, WheelSettings, joints_of
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.joint_choice import JointChoice
 from omnibench.robot.kinematics import CarDrive

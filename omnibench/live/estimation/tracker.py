@@ -26,16 +26,13 @@ from omnibench.live.estimation.health import Health, SwapRecord
 from omnibench.live.estimation.health_report import HealthReporter
 from omnibench.live.estimation.live_odometry import Motion
 from omnibench.live.estimation.robot_state import RobotState, new_state, wheel_angle_effects
-from omnibench.live.estimation.saved_state import RobotMemory, SavedState
-from omnibench.live.estimation.state_writer import StateWriter, resume_state
-from omnibench.live.frames import Frames
+from omnibench.live.estimation.saved_state import RobotMemory, SavedState, StateWriter, resume_state
 from omnibench.live.fusion.pose_fusion import Fusion, FusionSettings, Outcome
 from omnibench.live.fusion.pose_input import PoseInput
 from omnibench.live.fusion.timeline import Entry
 from omnibench.live.wheels.wheel_input import WheelSettings, WheelStep
 from omnibench.live.wire.messages import JointState, MessageError, arrival_stamp
-from omnibench.live.wire.outputs import Update
-from omnibench.live.wire.robot_messages import JointStateDecoder
+from omnibench.live.wire.outputs import Frames, JointStateDecoder, Update
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
 from omnibench.robot.signals import of_centre

@@ -22,7 +22,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from omnibench.errors import ConfigError
 from omnibench.files import read_text, replacing
-from omnibench.live.network.tls_files import read_certificate, read_key
+from omnibench.live.network.session_config import read_certificate, read_key
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 _RESERVED: Final = ("ca", "users")

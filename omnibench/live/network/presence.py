@@ -17,7 +17,7 @@ from typing import Final
 import zenoh
 
 from omnibench.errors import ConfigError, nearest
-from omnibench.live.network.callbacks import answers, direct
+from omnibench.live.stopping import answers, direct
 
 _ALIVE: Final = "omnibench/*/alive"
 _CLAIMS: Final = "omnibench/*/claim-$*"

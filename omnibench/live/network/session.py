@@ -23,8 +23,7 @@ import zenoh
 from omnibench.errors import ConfigError, DataError, nearest
 from omnibench.files import read_text
 from omnibench.live.network.access import access_control
-from omnibench.live.network.session_config import Access, SessionConfig, Tls, User, address_of
-from omnibench.live.network.tls_files import check_files, common_name
+from omnibench.live.network.session_config import Access, SessionConfig, Tls, User, address_of, check_files, common_name
 from omnibench.live.stopping import Stop, wait_until
 
 _TIMEOUT: Final = 2.0  # s to wait for a TCP connection, and for a word of TLS; chosen

@@ -21,9 +21,8 @@ import zenoh
 
 from omnibench.errors import OmnibenchError
 from omnibench.live.acknowledged_flows import acknowledgement_key, read_acknowledgement
-from omnibench.live.network.callbacks import direct
 from omnibench.live.network.session import is_connected
-from omnibench.live.stopping import Closing
+from omnibench.live.stopping import Closing, direct
 from omnibench.live.wire.topics import Publisher
 
 WINDOW: Final = 256  # messages under way at most, some 90 kB: less than Zenoh's queue holds; chosen

@@ -26,7 +26,7 @@ from omnibench.live.replay.concatenated_drive import (
 from omnibench.live.replay.delivery import WINDOW, DeliveryError
 from omnibench.live.replay.replay_player import Player, PlayReport
 from omnibench.live.stopping import wait_until
-from omnibench.live.wheels.joints import joints_of
+from omnibench.live.wheels.wheel_input import joints_of
 from omnibench.live.wire.messages import Odometry
 from omnibench.live.wire.subscriber import Subscription, subscribe
 from omnibench.live.wire.topics import GraphNode

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from omnibench.errors import ConfigError, OmnibenchError
 from omnibench.live.control.request_queue import source_of
 from omnibench.live.estimation.counts import anomalies_among
-from omnibench.live.network.callbacks import answers
 from omnibench.live.network.presence import alive_robots, checked_robot
 from omnibench.live.replay.arrivals import (
     TOPICS_PLAYED,
@@ -29,8 +28,8 @@ from omnibench.live.replay.arrivals import (
 )
 from omnibench.live.replay.concatenated_drive import ConcatenatedDrive
 from omnibench.live.replay.delivery import AcknowledgedDelivery, Delivery, DeliveryError, UnconfirmedDelivery
-from omnibench.live.stopping import wait_until
-from omnibench.live.wheels.joints import check_joints, joints_of
+from omnibench.live.stopping import answers, wait_until
+from omnibench.live.wheels.wheel_input import check_joints, joints_of
 from omnibench.live.wire.messages import JointState, PoseEstimate
 from omnibench.live.wire.topics import GraphNode
 from omnibench.progress import Progress, Reporter, no_progress

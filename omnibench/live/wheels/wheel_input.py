@@ -5,21 +5,194 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from omnibench.config import Model, Positive
+from omnibench.errors import ConfigError
 from omnibench.live.estimation.counts import Counts
-from omnibench.live.wheels.steering_input import REORDERED, SteeringInput
-from omnibench.live.wheels.wheel_angles import WheelAngles
 from omnibench.live.wire.messages import JointState, MessageError
 from omnibench.robot.joint_choice import JointChoice
-from omnibench.robot.kinematics import FASTEST, FASTEST_RIM, Array, fastest_rates
+from omnibench.robot.kinematics import FASTEST, FASTEST_RIM, Array, Robot, fastest_rates
 
+_TURN = 2 * math.pi
+_WITHIN_A_TURN = _TURN + 1e-6  # rad, a turn and rounding
+# Share of its last reading below which a counter has restarted; chosen: a robot seldom drives back so near its start.
+_RESTARTED = 0.05
+_JITTER = 0.01  # s, by which stamps may be too close together; chosen
+_FASTER = 1.5  # times the fastest rate so far is the fastest that is believed of a silence; chosen
+
+
+class WheelAngles:
+    """The counters of one robot's wheels.
+
+    wrap: the angle after which counters start again, rad; None: a counter that stays within one turn is taken to wrap
+    there. max_rate: of any wheel, rad/s. known (N,): the last reading, rad; None before the first.
+    """
+
+    def __init__(self, wheels: int, wrap: float | None, max_rate: float, counts: Counts) -> None:
+        self._wrap = wrap
+        self._max_rate = max_rate
+        self._counts = counts
+        self._fastest = 0.0  # rad/s, of any wheel so far
+        self._beyond_a_turn = np.zeros(wheels, dtype=bool)  # counters that have been there do not wrap at a turn
+        self._wraps = wrap is not None
+        self.known: Array | None = None
+
+    def begin(self, positions: Array | None) -> None:
+        """Count from these angles (N,) rad; None: from the next reading."""
+        self.known = positions
+        if positions is not None:
+            self._beyond_a_turn |= np.abs(positions) > _WITHIN_A_TURN
+
+    def drive(self, angles: Array) -> None:
+        """Add a turn by ``angles`` (N,) rad that comes from rates and not from the counters."""
+        if self.known is not None:
+            self.known = self.known + angles
+
+    def turned(self, positions: Array, rates: Array, elapsed: float) -> tuple[Array, bool]:
+        """Angles (N,) rad since the last reading, and True if they hold the whole motion.
+
+        rates (N,): expected, rad/s; they stand in for a counter that restarted. elapsed: s since the last reading.
+        """
+        assert self.known is not None
+        expected = rates * elapsed
+        angles = self._unwrapped(positions, expected)
+        self.begin(positions)
+        farthest, span = max(map(abs, angles.tolist())), max(elapsed, _JITTER)
+        if farthest <= self._max_rate * span:
+            self._fastest = max(self._fastest, farthest / span)
+            return angles, True
+        self._counts.counter_restarts += 1
+        return np.where(np.abs(angles) > self._max_rate * span, expected, angles), False
+
+    def turned_unseen(self, positions: Array, elapsed: float) -> tuple[Array, bool]:
+        """Angles and flag of ``turned`` after a silence of ``elapsed`` s: turns may be lost, counters restarted."""
+        assert self.known is not None
+        before = self.known
+        # counters that wrap do not tell how far the wheels went: the shortest way is taken
+        angles = self._unwrapped(positions, np.zeros(len(positions))) if self._wraps else positions - before
+        self.begin(positions)
+        fastest = (_FASTER * self._fastest or self._max_rate) * elapsed + math.pi
+        far = np.abs(before) > math.pi
+        restarted = bool(far.any()) and bool((np.abs(positions) < _RESTARTED * np.abs(before))[far].all())
+        if restarted or (np.abs(angles) > fastest).any():
+            self._counts.counter_restarts += 1
+            return np.zeros(len(angles)), False
+        turns_may_be_lost = self._wrap is not None or not self._beyond_a_turn.all()
+        length = self._wrap or _TURN
+        return angles, not (turns_may_be_lost and fastest > length / 2 + math.pi)
+
+    def _unwrapped(self, positions: Array, expected: Array) -> Array:
+        """Differences (N,) rad from the last reading, with the wraps that bring them nearest to those expected."""
+        assert self.known is not None
+        angles: Array = positions - self.known
+        length = self._wrap or _TURN
+        if max(map(abs, (angles - expected).tolist())) <= length / 2:
+            return angles
+        wraps = np.round((angles - expected) / length)
+        if self._wrap is None:  # a continuous joint of ROS 2 may wrap at a turn
+            wraps[self._beyond_a_turn | (np.abs(positions) > _WITHIN_A_TURN)] = 0.0
+        if wraps.any():
+            self._counts.wraps += 1
+            self._wraps = True
+        return angles - length * wraps
+
+
+REORDERED: Final = 0.2  # s; a message that is late by less is out of order, or the clock was set back a little; chosen
 _SECOND = 1e9  # ns
+_MOST_SENDERS = 16  # lists of names that are remembered, so that a sender of ever new ones cannot fill the memory
+
+
+class SteeringInput:
+    """Takes the positions of a robot's steering joints, in messages of their own or beside those of the wheels.
+
+    joints (S,): their names. choice: finds them where a message calls them otherwise. limit: beyond it, rad, no angle
+    is believed. An angle that a message does not tell, or tells as NaN, as ros2_control does of joints without a
+    position, is held.
+    """
+
+    def __init__(self, joints: Sequence[str], choice: JointChoice, limit: float, counts: Counts) -> None:
+        self._joints = tuple(joints)
+        self._choice = choice
+        self._limit = limit
+        self._counts = counts
+        self._angles = [math.nan] * len(self._joints)
+        self._stamps = [0] * len(self._joints)  # ns, of each angle
+        self._places: dict[tuple[str, ...], list[tuple[int, int]]] = {}  # joints and their places in a message
+
+    def tells(self, names: tuple[str, ...]) -> bool:
+        """True if a message with these names has a steering joint."""
+        return bool(self._found(names))
+
+    def take(self, message: JointState) -> str:
+        """Take the angles that a message tells, but those that are older than the known ones; why one is refused."""
+        refusal = ""
+        if message.positions is None:
+            return refusal
+        for joint, place in self._found(message.names):
+            angle, known = float(message.positions[place]), self._angles[joint]
+            if not math.isfinite(angle):
+                continue
+            if abs(angle) > self._limit:
+                self._counts.bad_steering += 1
+                refusal = _too_far(self._joints[joint], angle)
+                continue
+            if math.isnan(known):
+                known = angle
+            elif -REORDERED * _SECOND <= message.stamp - self._stamps[joint] < 0:
+                continue
+            # a joint may wrap at a turn: the angle between two readings lies on the shorter way
+            self._angles[joint] = angle + _TURN * round((known - angle) / _TURN)
+            self._stamps[joint] = message.stamp
+        return refusal
+
+    def known(self, message: JointState) -> Array:
+        """The angles (S,) at a message, rad. MessageError: one was never told, nor is it by this message."""
+        for joint, angle in zip(self._joints, self._angles, strict=True):
+            if math.isnan(angle):
+                self._counts.no_steering += 1
+                raise MessageError(f"no steering angle yet: {self._why_missing(joint, message)}")
+        return np.array(self._angles)
+
+    def age(self, stamp: int) -> float:
+        """Time at a stamp (ns) since the oldest angle was told, s."""
+        return max(abs(stamp - each) for each in self._stamps) / _SECOND
+
+    def resume(self, stamp: int, angles: Array | None) -> None:
+        """Continue from the angles (S,), rad, that another process knew at a stamp, ns."""
+        if angles is not None:
+            self._angles, self._stamps = angles.tolist(), [stamp] * len(self._joints)
+
+    def _why_missing(self, joint: str, message: JointState) -> str:
+        place = dict(self._found(message.names)).get(self._joints.index(joint))
+        if place is None:
+            return f"no joint {joint!r} among {', '.join(message.names[:12])}; set wheels.steering_joints"
+        if message.positions is None or math.isnan(angle := message.positions[place]):
+            return f"joint {joint!r} tells no position"
+        return _too_far(joint, angle)
+
+    def _found(self, names: tuple[str, ...]) -> list[tuple[int, int]]:
+        found = self._places.get(names)
+        if found is None:
+            if len(self._places) >= _MOST_SENDERS:
+                self._places.clear()
+            found = []
+            for index, (joint, wheel) in enumerate(zip(self._joints, self._choice.wheels, strict=True)):
+                matching = [] if self._choice.asked else self._choice.matching(wheel, names)
+                if joint in names or len(matching) == 1:
+                    found.append((index, names.index(joint) if joint in names else matching[0]))
+            self._places[names] = found
+        return found
+
+
+def _too_far(joint: str, angle: float) -> str:
+    return f"joint {joint!r} says {angle:g} rad, so far such a wheel does not steer; is it in degrees?"
+
+
 _CONFIRMATION = 3  # stamps in a row that confirm a new time of the sender's clock (chosen, as all here)
 _SET_BACK = 3  # late samples in a row; so many are of a clock that was set back, and not out of order
 _SLACK = 0.1  # s, by which arrivals may scatter
@@ -397,3 +570,40 @@ class WheelInput:
 def _told(values: Array, others: Array) -> Array | None:
     """Values (N,) of the wheels; None if none is told, and the ``others`` (N,) are."""
     return None if math.isnan(values[0]) and np.isnan(values).all() and not np.isnan(others).any() else values
+
+
+@dataclass(frozen=True)
+class Joints:
+    """Names of the joints of wheels with a measured rate (N) and of those that steer (S)."""
+
+    wheels: tuple[str, ...]
+    steering: tuple[str, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All, wheels first."""
+        return self.wheels + self.steering
+
+
+def joints_of(robot: Robot, settings: WheelSettings | None = None, where: str = "wheels") -> Joints:
+    """A robot's joints. ConfigError that begins with ``where``: they are not one, and a different one, for each wheel.
+
+    By default a wheel has its own name, and its steering joint that name with _steering at the end.
+    """
+    rated, steered, settings = robot.wheel_names, robot.drive.steered, settings or WheelSettings()
+    joints = Joints(
+        rated if settings.joints is None else settings.joints,
+        tuple(f"{name}_steering" for name in steered) if settings.steering_joints is None else settings.steering_joints,
+    )
+    check_joints(joints.wheels, rated, f"{where}.joints")
+    check_joints(joints.steering, steered, f"{where}.steering_joints", "steered wheels")
+    if both := set(joints.wheels) & set(joints.steering):
+        raise ConfigError(f"{where}.steering_joints: {min(both)} is the joint of a wheel, too; name its steering joint")
+    return joints
+
+
+def check_joints(joints: Sequence[str], wheels: Sequence[str], where: str, what: str = "wheels") -> None:
+    """ConfigError that begins with ``where``: the joints are not one, and a different one, for each wheel."""
+    if len(joints) != len(wheels) or len(set(joints)) < len(joints):
+        reason = f"name one joint, and a different one, for each of the {what} {', '.join(wheels)}"
+        raise ConfigError(f"{where}: {', '.join(joints) or 'none'}; {reason if wheels else 'no wheel steers'}")

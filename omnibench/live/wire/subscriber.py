@@ -14,13 +14,11 @@ from zenoh.handlers import FifoChannel, RingChannel
 
 from omnibench.config import validate
 from omnibench.errors import ConfigError, require_choice
-from omnibench.live.network.callbacks import RateLimiter
 from omnibench.live.network.presence import checked_robot
 from omnibench.live.network.session import close_session, open_session
 from omnibench.live.network.session_config import SessionConfig
-from omnibench.live.stopping import Closing
-from omnibench.live.wire.attachment import MissedMessages
-from omnibench.live.wire.messages import ODOMETRY, MessageError, Odometry
+from omnibench.live.stopping import Closing, RateLimiter
+from omnibench.live.wire.messages import ODOMETRY, MessageError, MissedMessages, Odometry
 from omnibench.live.wire.topics import TOPICS, KeySpace, Profile
 from omnibench.words import plural
 

@@ -11,9 +11,9 @@ from threading import Lock
 import zenoh
 
 from omnibench.errors import UnknownNameError
-from omnibench.live.network.callbacks import direct
 from omnibench.live.network.presence import checked_robot
-from omnibench.live.wire.attachment import MissedMessages
+from omnibench.live.stopping import direct
+from omnibench.live.wire.messages import MissedMessages
 from omnibench.live.wire.topics import TOPICS, KeySpace, topic_name
 
 

@@ -14,9 +14,8 @@ from typing import Any, Final, Generic, Literal, TypeVar
 import xxhash
 import zenoh
 
-from omnibench.live.network.callbacks import direct
-from omnibench.live.wire.attachment import Flow, packed
-from omnibench.live.wire.messages import DIAGNOSTICS, JOINT_STATE, POSE_ESTIMATE, MessageType
+from omnibench.live.stopping import direct
+from omnibench.live.wire.messages import DIAGNOSTICS, JOINT_STATE, POSE_ESTIMATE, Flow, MessageType, packed
 from omnibench.live.wire.outputs import OUTPUTS
 
 Profile = Literal["plain", "rmw", "humble"]

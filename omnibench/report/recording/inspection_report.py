@@ -5,6 +5,7 @@ Motions of a recording: speeds, directions and rates of turn, how long each was 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,7 +13,7 @@ import numpy as np
 
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.fit.check.missing_motions import SHARE, motion_kinds, turning
-from omnibench.fit.identifiability import UNTOLD
+from omnibench.fit.identifiability import ROWS, UNTOLD
 from omnibench.fit.inspect import Inspection
 from omnibench.report.blocks import (
     Callout,
@@ -30,15 +31,84 @@ from omnibench.report.blocks import (
     answer_section,
     simulated_badge,
 )
-from omnibench.report.numbers import NOTHING, count, fixed, listing, percent, significant
-from omnibench.report.recording.contents import contents_table
-from omnibench.report.recording.inspection_tables import identifiability_table, parameter_table, split_table
-from omnibench.report.recording.scan_points import evenly
-from omnibench.report.recording.section import about_table, path_overview, pictures
+from omnibench.report.numbers import NOTHING, count, fixed, listing, percent, significant, with_unit
+from omnibench.report.recording.driven import evenly
+from omnibench.report.recording.section import about_table, contents_table, path_overview, pictures
 from omnibench.report.style import INK, PALETTE, plot
 from omnibench.report.traces import marks
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.words import plural
+
+
+def driven_by(inspection: Inspection) -> str:
+    """What the columns of the matrix are: wheel rates, or drive signals."""
+    return "wheel rates" if len(inspection.driven_shares) == len(inspection.wheels) else "drive signals"
+
+
+def split_table(inspection: Inspection) -> Table:
+    """The content of each split: runs, commands, repetitions, sessions, time, distance, turns."""
+    rows = []
+    for name, split in inspection.splits.items():
+        repetitions = f"{split.repetitions_min}"
+        if split.repetitions_max != split.repetitions_min:
+            repetitions += f" to {split.repetitions_max}"
+        counts = (str(split.trajectories), str(split.commands), repetitions, str(split.sessions))
+        amounts = (f"{split.duration_s:.0f}", f"{split.distance_m:.1f}", f"{math.degrees(split.turned_rad):.0f}")
+        rows.append(Row.of(name, *counts, *amounts))
+    columns = (
+        Column("split", numeric=False),
+        Column("runs"),
+        Column("commands"),
+        Column("repetitions", priority=1),
+        Column("sessions"),
+        *(Column(*quantity) for quantity in (("duration", "s"), ("distance", "m"), ("turned", "°"))),
+    )
+    return Table("", columns, tuple(rows))
+
+
+def identifiability_table(inspection: Inspection) -> Table:
+    """The precision of a calibration along each direction of wheel rates."""
+    what, identifiability = driven_by(inspection), inspection.identifiability
+    rows = []
+    for direction in identifiability.directions:
+        deviations = ["open"] * len(ROWS)
+        if direction.state == "driven" and direction.deviations is not None:
+            deviations = ["open" if value > UNTOLD else f"{100 * value:.2g} %" for value in direction.deviations]
+        motion = direction.motion or "slip of the wheels"
+        rows.append(Row.of(direction.direction, motion, f"{100 * direction.share:.3g} %", *deviations))
+    columns = (
+        Column(f"{what} along", numeric=False),
+        Column("motion", numeric=False),
+        Column("driven"),
+        *(Column(f"row {row}") for row in ROWS),
+    )
+    caption = "Precision of a calibration from these data, ± % of the row's largest element"
+    return Table(caption, columns, tuple(rows))
+
+
+def parameter_table(inspection: Inspection) -> Table:
+    """How precisely the runs tell each physical parameter."""
+    rows = []
+    for parameter in inspection.identifiability.parameters:
+        factor, unit, digits = (math.degrees(1.0), "°", 2) if parameter.unit == "rad" else (1e3, "mm", 1)
+        kind, _, wheel = parameter.name.partition("_")
+        known = (
+            NOTHING
+            if parameter.deviation is None
+            else f"± {with_unit(significant(factor * parameter.deviation, 2), unit)}"
+        )
+        design = with_unit(fixed(factor * parameter.design, digits), unit)
+        known_now = "determined" if parameter.told else "not determined"
+        rows.append(Row.of(f"{kind} of {wheel}" if wheel else kind, design, known, known_now))
+    columns = (
+        Column("Parameter", numeric=False),
+        Column("Design"),
+        Column("Could be known to"),
+        Column("By these runs", numeric=False),
+    )
+    note = "One standard deviation of the best that any calibration from these runs could do (the Cramér-Rao bound)."
+    return Table("Wheels, as these runs determine them", columns, tuple(rows), note)
+
 
 _BLOCK = 0.5  # s: motions are means over so long, which smooths encoder ticks (chosen)
 _RESTS = 0.05  # share of the fastest motion below which the robot stands (chosen)

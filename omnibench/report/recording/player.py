@@ -12,7 +12,7 @@ from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.true_poses import TruePath
 from omnibench.report.blocks import LegendItem, Player
 from omnibench.report.numbers import listing
-from omnibench.report.recording.scan_points import (
+from omnibench.report.recording.driven import (
     ODOMETRY_ITEM,
     PLAN_ITEM,
     REFERENCE_ITEM,

@@ -12,7 +12,7 @@ from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.true_poses import TruePath
 from omnibench.report.blocks import Figure, FigureGrid, LegendItem
 from omnibench.report.numbers import count, round_down
-from omnibench.report.recording.scan_points import (
+from omnibench.report.recording.driven import (
     COVARIANCE_ITEM,
     ODOMETRY_ITEM,
     PLAN_ITEM,

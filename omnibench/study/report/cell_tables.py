@@ -3,29 +3,69 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import plotly.graph_objects as go
 
-from omnibench.report.blocks import (
-    Block,
-    Cell,
-    Choice,
-    Column,
-    Figure,
-    FigureGrid,
-    Row,
-    Section,
-    Table,
-)
+from omnibench.report.blocks import Block, Cell, Choice, Column, Figure, FigureGrid, LegendItem, Row, Section, Table
 from omnibench.report.numbers import NOTHING, fixed, seconds
-from omnibench.report.style import INK, plot, text, wrapped
+from omnibench.report.style import INK, THEORETICAL, colours, plot, text, wrapped
 from omnibench.robot.kinematics import Robot
-from omnibench.study.cell_intervals import CellRatio
-from omnibench.study.cells import MethodInCell, StudyCell
-from omnibench.study.report.study_view import StudyView, cell_words
+from omnibench.study.cells import CellRatio, MethodInCell, StudyCell
+from omnibench.study.study_result import StudyResult
+from omnibench.study.trainings import AS_RECORDED
 from omnibench.words import plural
+
+_FAMILIES = {"ours": "omnibench", "published": "published", "baseline": "baseline", "other": ""}
+
+
+@dataclass(frozen=True, eq=False)
+class StudyView:
+    """styles: of each method, the same in the whole report. methods: their names, in the config's order."""
+
+    result: StudyResult
+    methods: tuple[str, ...]
+    styles: Mapping[str, LegendItem]
+
+    @property
+    def robots(self) -> tuple[str, ...]:
+        """Names of the robots that were read."""
+        return tuple(robot.name for robot in self.result.robots)
+
+    def design(self, name: str) -> Robot:
+        """The robot called ``name`` as it was drawn."""
+        return next(robot.dataset.robot for robot in self.result.robots if robot.name == name)
+
+    def judged(self, robot: str | None = None) -> tuple[StudyCell, ...]:
+        """The cells that verdicts rest on, of one robot or of all."""
+        return tuple(cell for cell in self.result.judged_cells if robot in (None, cell.key.robot))
+
+    def plain(self, robot: str) -> tuple[StudyCell, ...]:
+        """The cells of a robot as recorded: judged ones, then training errors."""
+        keys = [(cell, cell.key) for cell in self.result.cells]
+        mine = [cell for cell, key in keys if key.robot == robot and key.regime == AS_RECORDED]
+        return tuple(sorted(mine, key=lambda cell: cell.key.fitted))
+
+    def family(self, method: str) -> str:
+        """A method's family in a word."""
+        families = {choice.shown: choice.family for choice in self.result.config.methods}
+        return _FAMILIES[families[method]]
+
+
+def study_view(result: StudyResult) -> StudyView:
+    """The view of a result."""
+    wanted = {choice.shown: THEORETICAL if choice.name == "theoretical" else None for choice in result.config.methods}
+    drawn = colours(wanted)
+    styles = {name: LegendItem(f"method-{i}", name, *drawn[name]) for i, name in enumerate(wanted)}
+    return StudyView(result, tuple(wanted), styles)
+
+
+def cell_words(cell: StudyCell) -> str:
+    """A cell within its robot: ``circular → square``."""
+    return f"{cell.key.training} → {cell.key.judged}"
+
 
 _COLUMNS = (
     Column("Method", numeric=False),

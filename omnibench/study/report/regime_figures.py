@@ -13,9 +13,9 @@ from omnibench.report.numbers import NOTHING, fixed
 from omnibench.report.style import logarithmic, plot
 from omnibench.report.traces import line, marks
 from omnibench.study.cells import StudyCell
-from omnibench.study.regimes import AS_RECORDED
-from omnibench.study.report.study_view import StudyView, cell_words
+from omnibench.study.report.cell_tables import StudyView, cell_words
 from omnibench.study.study_result import mean_ratio
+from omnibench.study.trainings import AS_RECORDED
 from omnibench.words import plural
 
 _CURVE = re.compile(r"^(?P<kind>.+), (?P<count>\d+) runs? a command$")

@@ -36,11 +36,9 @@ from omnibench.report.reproduction import reproduction_section
 from omnibench.report.style import INK, PALETTE, QUIET, logarithmic, plot, text
 from omnibench.report.traces import joined, line, marks
 from omnibench.study.cells import StudyCell
-from omnibench.study.ranks import Ranking, profiles, ranking
-from omnibench.study.report.cell_tables import robot_cells
+from omnibench.study.report.cell_tables import StudyView, cell_words, robot_cells, study_view
 from omnibench.study.report.regime_figures import curve_section, regime_section
-from omnibench.study.report.study_view import StudyView, cell_words, study_view
-from omnibench.study.study_result import AgainstBest, StudyResult
+from omnibench.study.study_result import AgainstBest, Ranking, StudyResult, profiles, ranking
 from omnibench.words import plural
 
 _VERDICTS = ("better", "undecided", "worse")

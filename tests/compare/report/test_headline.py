@@ -14,7 +14,7 @@ from report_samples import APR02, config, flower, page, run, statistics, usual
 from omnibench.compare.plan import load_datasets
 from omnibench.compare.result import ComparisonResult
 from omnibench.data.dataset import Trajectory, make_dataset
-from omnibench.data.references.run_references import Reference, References
+from omnibench.data.references import Reference, References
 from omnibench.fit.ratio_intervals import Interval
 from omnibench.robot.kinematics import Robot
 

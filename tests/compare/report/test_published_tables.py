@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from report_samples import config, flower, run, statistics, usual
 
-from omnibench.compare.report.cost_tables import cost_table
-from omnibench.compare.report.published_tables import ComparedFigure, compared_figures, published_blocks
+from omnibench.compare.report.cost_tables import ComparedFigure, compared_figures, cost_table, published_blocks
 from omnibench.compare.report.view import DatasetView, views
 from omnibench.compare.result import ComparisonResult
 from omnibench.report.blocks import Callout, Row, Table

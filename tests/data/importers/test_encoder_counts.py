@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from omnibench.data.importers.encoder_counts import (
+from omnibench.data.importers.wheel_samples import (
     POWERS_OF_TWO,
     about_zero,
     counted_on,

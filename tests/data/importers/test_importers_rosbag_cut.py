@@ -33,7 +33,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from omnibench.data.importers.rosbag.bag_recording import between_rests
-from omnibench.data.importers.runs.run_spans import find_rests
+from omnibench.data.importers.runs.recording_runs import find_rests
 from omnibench.robot.kinematics import Array
 
 

@@ -26,7 +26,7 @@ from bag_samples import (
 )
 
 from omnibench.data.dataset import Trajectory
-from omnibench.data.importers.rosbag.sensors.sensor_references import east_north
+from omnibench.data.importers.rosbag.sensor_references import east_north
 from omnibench.errors import ConfigError, DataError
 from omnibench.fit.calibrate import calibrate
 from omnibench.robot.kinematics import Array

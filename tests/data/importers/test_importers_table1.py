@@ -16,7 +16,7 @@ from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import ConfigError, DataError
 from omnibench.robot.kinematics import wheel_equations
 from omnibench.robot.model import OdometryModel
-from omnibench.simulate.chain.lidar import Lidar, LidarMount
+from omnibench.simulate.lidar import Lidar, LidarMount
 from omnibench.slam.import_dataset import import_dataset
 
 RPM = 2 * math.pi / 60

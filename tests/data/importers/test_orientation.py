@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from omnibench.data.importers.orientation import planar_headings
+from omnibench.data.importers.rosbag.message_streams import planar_headings
 
 
 @given(heading=st.floats(-math.pi + 1e-9, math.pi - 1e-9), length=st.floats(0.991, 1.009))

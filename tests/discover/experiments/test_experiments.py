@@ -10,13 +10,10 @@ import pytest
 from discovery_samples import DEAD_ZONE, Effects, look_alike, simulated
 from wheeled_samples import DIFF, SWERVE, TRICYCLE, driven
 
-from omnibench.data.joining import joined
+from omnibench.data.splits import joined
 from omnibench.discover.discover import discover_effects
-from omnibench.discover.experiments.candidate_runs import candidate_runs
-from omnibench.discover.experiments.experiments import description_of
-from omnibench.discover.experiments.run_choice import Choice
-from omnibench.discover.fitting.extend import fit_matrix
-from omnibench.discover.fitting.model_fit import Fit
+from omnibench.discover.experiments import Choice, candidate_runs, description_of
+from omnibench.discover.fitting import Fit, fit_matrix
 from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.registry import effects
 from omnibench.robot.kinematics import Robot

@@ -7,8 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from omnibench.discover.experiments.run_choice import choose_runs
-from omnibench.discover.experiments.separation import Members, Separation
+from omnibench.discover.experiments import Members, Separation, choose_runs
 from omnibench.discover.selection.evidence import DISCREPANCY, log_evidence
 from omnibench.fit.trajectory_fit import Whitened
 from omnibench.robot.kinematics import Array

@@ -12,10 +12,8 @@ from outlier_study import EFFECT, TRUTH
 from outlier_study import simulated as with_directions
 
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.discover.fitting.extend import Extended, extend, fit_matrix
-from omnibench.discover.fitting.model_fit import Fit, with_noise
-from omnibench.discover.fitting.outliers import InlierWhitener, inliers_of
-from omnibench.discover.regressors.column_group import Group
+from omnibench.discover.fitting import Extended, Fit, InlierWhitener, extend, fit_matrix, inliers_of, with_noise
+from omnibench.discover.regressors.columns import Group
 from omnibench.fit.noise import Whitener
 from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.registry import effects

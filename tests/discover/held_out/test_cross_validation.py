@@ -10,7 +10,7 @@ from extended_samples import FORWARD, SIDEWAYS, TURN, extended_of, run_of
 from screening_samples import FIRST, SECOND, screening
 
 from omnibench.data.dataset import Trajectory
-from omnibench.discover.held_out.cross_validation import (
+from omnibench.discover.held_out import (
     folds_of_commands,
     folds_of_kinds,
     folds_of_repetitions,

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from extended_samples import FORWARD, TURN, extended_of, run_of
 
-from omnibench.discover.held_out.gaps import (
+from omnibench.discover.held_out import (
+    ValidationRuns,
     compare_held_out,
     errors_of_repetitions,
     floor_of,
     gap_between,
     training_gap,
 )
-from omnibench.discover.held_out.validation_runs import ValidationRuns
 
 RUNS = [
     run_of(rates, name, f"{name} {number}") for name, rates in (("go", FORWARD), ("turn", TURN)) for number in (1, 2)

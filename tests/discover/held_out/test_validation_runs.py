@@ -7,8 +7,8 @@ from dataclasses import replace
 from discovery_samples import simulated
 
 from omnibench.data.dataset import Trajectory
-from omnibench.discover.fitting.extend import fit_matrix
-from omnibench.discover.held_out.validation_runs import validation_runs
+from omnibench.discover.fitting import fit_matrix
+from omnibench.discover.held_out import validation_runs
 from omnibench.fit.trajectory_fit import usable_runs
 
 

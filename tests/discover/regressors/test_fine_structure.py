@@ -10,8 +10,7 @@ from discovery_samples import APR02, shorn, simulated
 from hidden.sets import make_set
 
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.discover.fitting.extend import fit_matrix
-from omnibench.discover.fitting.model_fit import Fit, paths_of
+from omnibench.discover.fitting import Fit, fit_matrix, paths_of
 from omnibench.discover.regressors.fine_structure import fine_structure
 from omnibench.discover.regressors.significance import Significance
 from omnibench.fit.trajectory_fit import usable_runs

@@ -9,8 +9,7 @@ from config_robots import settings
 from discovery_samples import simulated
 
 from omnibench.config import validate
-from omnibench.discover.fitting.extend import fit_matrix
-from omnibench.discover.fitting.model_fit import Fit, paths_of
+from omnibench.discover.fitting import Fit, fit_matrix, paths_of
 from omnibench.discover.regressors.effect_slopes import slopes_by
 from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.registry import effects

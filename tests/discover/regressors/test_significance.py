@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import binomtest, chi2
 from screening_samples import FIRST, SECOND, THIRD, screening
 
-from omnibench.discover.regressors.column_group import Group
+from omnibench.discover.regressors.columns import Group
 from omnibench.discover.regressors.significance import Family, Significance, significance_of, together
 from omnibench.fit.trajectory_fit import Whitened
 

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from discovery_samples import COUPLING, simulated
 
-from omnibench.discover.fitting.extend import Extended, extend, fit_matrix
-from omnibench.discover.fitting.model_fit import Fit
-from omnibench.discover.regressors.column_group import Group
+from omnibench.discover.fitting import Extended, Fit, extend, fit_matrix
+from omnibench.discover.regressors.columns import Group
 from omnibench.discover.selection.averaged_model import averaged
 from omnibench.discover.selection.screening import screen_plain
 from omnibench.fit.trajectory_fit import usable_runs

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from discovery_samples import COUPLING, simulated
 
-from omnibench.discover.fitting.extend import extend, fit_matrix
-from omnibench.discover.fitting.model_fit import Fit
-from omnibench.discover.regressors.column_group import Group
+from omnibench.discover.fitting import Fit, extend, fit_matrix
+from omnibench.discover.regressors.columns import Group
 from omnibench.discover.selection.competing_models import CompetingModels, competing_models
 from omnibench.discover.selection.model_selection import Selection, select_effects
 from omnibench.discover.selection.screening import screen_plain

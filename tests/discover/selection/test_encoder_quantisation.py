@@ -10,7 +10,7 @@ import pytest
 from extended_samples import FORWARD, MATRIX, extended_of, run_of
 
 from omnibench.data.dataset import Trajectory
-from omnibench.discover.selection.encoder_quantisation import EncoderQuantisation, quantisation_steps
+from omnibench.discover.selection.screening import EncoderQuantisation, quantisation_steps
 
 ALONG = np.zeros((2, 3, 1))
 ALONG[:, 0] = 1.0  # both poses of a run, 1 m along x

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from discovery_samples import shorn, simulated
 
-from omnibench.discover.fitting.extend import Extended, extend, fit_matrix
-from omnibench.discover.fitting.model_fit import Fit
-from omnibench.discover.selection.candidate_groups import Missing
+from omnibench.discover.fitting import Extended, Fit, extend, fit_matrix
 from omnibench.discover.selection.detectability import detectability_of
+from omnibench.discover.selection.evidence import Missing
 from omnibench.discover.selection.model_selection import select_effects
 from omnibench.discover.selection.screening import Screening, screen_again, screen_extended, screen_plain
 from omnibench.fit.trajectory_fit import usable_runs

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from discovery_samples import simulated
 
-from omnibench.discover.fitting.extend import fit_matrix
+from omnibench.discover.fitting import fit_matrix
 from omnibench.errors import DataError
 from omnibench.fit.trajectory_fit import log_of, usable_runs
 

@@ -12,7 +12,7 @@ from sample_robots import APR_02
 
 import omnibench.robot.stored_odometry as odometry_of_stored
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.data.references.run_references import Reference, References
+from omnibench.data.references import Reference, References
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import ConfigError, DataError
 from omnibench.fit.calibrate import calibrate

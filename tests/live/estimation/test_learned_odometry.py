@@ -8,7 +8,7 @@ from drives import calibration as plain
 from learned_samples import a_learned_calibration
 
 from omnibench.config import to_yaml
-from omnibench.live.control.orders import LONGEST
+from omnibench.live.control.request_queue import LONGEST
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.wire.outputs import Update
 from omnibench.robot.calibration import Calibration, parse_calibration

@@ -14,8 +14,7 @@ from cryptography.hazmat.primitives.serialization import Encoding
 
 from omnibench.errors import ConfigError
 from omnibench.live.network.keys import make_keys
-from omnibench.live.network.session_config import Tls
-from omnibench.live.network.tls_files import check_files, read_certificate, read_key
+from omnibench.live.network.session_config import Tls, check_files, read_certificate, read_key
 
 
 def tls(folder: Path, name: str, key: str | None = None) -> Tls:

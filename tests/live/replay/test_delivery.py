@@ -26,8 +26,7 @@ from omnibench.data.storage import save_dataset
 from omnibench.live.replay.concatenated_drive import ConcatenatedDrive, concatenate_runs
 from omnibench.live.replay.delivery import WINDOW, DeliveryError
 from omnibench.live.replay.replay_player import Player
-from omnibench.live.wire.attachment import packed
-from omnibench.live.wire.messages import JOINT_STATE
+from omnibench.live.wire.messages import JOINT_STATE, packed
 from omnibench.live.wire.topics import GraphNode, KeySpace
 from omnibench.robot.kinematics import relative
 

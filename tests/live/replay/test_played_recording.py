@@ -13,8 +13,8 @@ from omnibench.config import to_yaml
 from omnibench.data.storage import save_dataset
 from omnibench.errors import OmnibenchError
 from omnibench.live.replay.concatenated_drive import load_recording
+from omnibench.simulate.commands import Commands
 from omnibench.simulate.config import FlowerConfig, Session, Truth
-from omnibench.simulate.driving.command_config import Commands
 from omnibench.simulate.simulate import simulate_dataset
 
 FLOWER = FlowerConfig(

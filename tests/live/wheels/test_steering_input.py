@@ -14,8 +14,7 @@ from steered import CAR, SWERVE, TRICYCLE, calibration, drive, only
 
 from omnibench.errors import ConfigError
 from omnibench.live.estimation.robot_state import new_state
-from omnibench.live.wheels.joints import joints_of
-from omnibench.live.wheels.wheel_input import WheelSettings, WheelStep
+from omnibench.live.wheels.wheel_input import WheelSettings, WheelStep, joints_of
 from omnibench.live.wire.messages import JointState
 from omnibench.robot.kinematics import Robot
 from omnibench.testing import synthetic_robot

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from omnibench.live.estimation.counts import Counts
-from omnibench.live.wheels.wheel_angles import WheelAngles
+from omnibench.live.wheels.wheel_input import WheelAngles
 
 
 @pytest.mark.parametrize(("turned", "believed"), [(2.0, True), (4.0, False)])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import zenoh
 
-from omnibench.live.wire.attachment import Flow, MissedMessages, flow_of, packed
+from omnibench.live.wire.messages import Flow, MissedMessages, flow_of, packed
 
 
 def numbered(number: int, publisher: bytes = bytes(16), flow: Flow | None = None) -> zenoh.ZBytes:

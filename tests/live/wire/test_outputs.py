@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from samples import COVARIANCE, STAMP
 
-from omnibench.live.frames import Frames
 from omnibench.live.wire.messages import ODOMETRY, TRANSFORMS
-from omnibench.live.wire.outputs import OUTPUTS, Output, Update, filtered_odometry, odometry, transforms
+from omnibench.live.wire.outputs import OUTPUTS, Frames, Output, Update, filtered_odometry, odometry, transforms
 from omnibench.live.wire.topics import TOPICS
 from omnibench.robot.odometry import advance
 

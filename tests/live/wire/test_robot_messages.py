@@ -18,7 +18,7 @@ from omnibench.live.wire.messages import (
     Odometry,
     Transform,
 )
-from omnibench.live.wire.robot_messages import JointStateDecoder, OdometryEncoder, TransformsEncoder
+from omnibench.live.wire.outputs import JointStateDecoder, OdometryEncoder, TransformsEncoder
 
 NUMBERS = st.floats(-1e6, 1e6)
 STAMPS = st.integers(0, 2**31 * 10**9 - 1)

@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 
 from omnibench.config import parse_yaml, validate
 from omnibench.errors import ConfigError, UnknownNameError
-from omnibench.simulate.chain import floor_plan
-from omnibench.simulate.chain.floor_plan import FloorPlan, RoomPlan, make_plan
-from omnibench.simulate.chain.floor_plans import PLANS
+from omnibench.simulate import floor_plan
+from omnibench.simulate.floor_plan import PLANS, FloorPlan, RoomPlan, make_plan
 
 WALLS = [[0, 0], [5, 0], [5, 4], [0, 4]]
 CUPBOARD = [[4, 3], [5, 3], [5, 4], [4, 4]]

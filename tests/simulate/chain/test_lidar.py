@@ -17,9 +17,9 @@ from omnibench.data.scans import Mount, TrajectoryScans
 from omnibench.data.true_poses import TruePath
 from omnibench.errors import ConfigError, DataError
 from omnibench.robot.kinematics import Array
-from omnibench.simulate.chain.floor_plan import FloorPlan, RoomPlan, make_plan
-from omnibench.simulate.chain.lidar import Lidar, LidarMount, measure_scans, scan_stamps
-from omnibench.simulate.chain.ray_casting import cast_rays
+from omnibench.simulate.floor_plan import FloorPlan, RoomPlan, make_plan
+from omnibench.simulate.lidar import Lidar, LidarMount, measure_scans, scan_stamps
+from omnibench.simulate.ray_casting import cast_rays
 
 EXACT = Lidar(rays=360, noise=0.0, far_noise=0.0, dropouts=0.0, resolution=1e-6)
 FLOAT32 = 2e-6  # m: steps of float32 below 16 m, and of the resolution

@@ -14,7 +14,8 @@ from sample_robots import APR_02
 from omnibench.config import validate
 from omnibench.errors import ConfigError
 from omnibench.robot.kinematics import Array
-from omnibench.simulate.chain.motion_commands import (
+from omnibench.simulate.commands import Command
+from omnibench.simulate.motion_commands import (
     CommandedMotion,
     CommandLink,
     MotionProfile,
@@ -24,7 +25,6 @@ from omnibench.simulate.chain.motion_commands import (
     command_motion,
     target_rates,
 )
-from omnibench.simulate.command import Command
 
 PERIOD, SETTLE, TURN = 0.01, 0.5, 6.0
 PETAL, WAY = Command(0.2, math.radians(30), 0.35), 1.116

@@ -13,9 +13,8 @@ from sample_robots import APR_02
 
 from omnibench.config import validate
 from omnibench.errors import ConfigError
-from omnibench.simulate.chain.motors import Controller, Encoder, Motor, check_reach
-from omnibench.simulate.chain.wheel_drive import drive_session
-from omnibench.simulate.command import Command
+from omnibench.simulate.commands import Command
+from omnibench.simulate.motors import Controller, Encoder, Motor, check_reach, drive_session
 
 
 @given(st.floats(0.05, 4), st.floats(-math.pi, math.pi), st.floats(-5, 5))

@@ -13,10 +13,9 @@ from sample_robots import APR_02
 from scipy.integrate import solve_ivp
 
 from omnibench.robot.kinematics import Array, wheel_equations
-from omnibench.simulate.chain.motion_commands import CommandLink, MotionProfile, command_motion, target_rates
-from omnibench.simulate.chain.motors import Controller, Encoder, Motor
-from omnibench.simulate.chain.wheel_drive import DrivenRun, drive_session
-from omnibench.simulate.command import Command
+from omnibench.simulate.commands import Command
+from omnibench.simulate.motion_commands import CommandLink, MotionProfile, command_motion, target_rates
+from omnibench.simulate.motors import Controller, DrivenRun, Encoder, Motor, drive_session
 
 PERIOD, STEP = 0.01, 0.001
 TICK = Encoder().tick

@@ -18,9 +18,9 @@ from omnibench.data.true_poses import read_true_poses
 from omnibench.fit.calibrate import calibrate
 from omnibench.robot.kinematics import wheel_equations
 from omnibench.robot.odometry import OdometryBatch
-from omnibench.simulate.chain.robot_config import RobotConfig
+from omnibench.simulate.commands import MotionGrid
 from omnibench.simulate.config import Truth
-from omnibench.simulate.driving.command_config import MotionGrid
+from omnibench.simulate.robot_config import RobotConfig
 from omnibench.simulate.simulate import simulate_dataset
 from omnibench.simulate.simulation import Simulation
 from omnibench.simulate.source import read_simulation

@@ -13,9 +13,9 @@ from config_robots import settings
 from omnibench.config import validate
 from omnibench.errors import ConfigError
 from omnibench.robot.model import OdometryModel
-from omnibench.simulate.chain.motors import Motor, check_reach
-from omnibench.simulate.chain.robot_config import RobotConfig
-from omnibench.simulate.command import Command
+from omnibench.simulate.commands import Command
+from omnibench.simulate.motors import Motor, check_reach
+from omnibench.simulate.robot_config import RobotConfig
 from omnibench.simulate.simulate import simulate_dataset
 from omnibench.simulate.simulation import Simulation
 

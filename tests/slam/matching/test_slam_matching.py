@@ -13,13 +13,12 @@ from hypothesis import strategies as st
 from omnibench.data.scans import Ranges
 from omnibench.data.true_poses import TruePath
 from omnibench.robot.kinematics import Array, compose, relative
-from omnibench.simulate.chain.floor_plan import RoomPlan, make_plan
-from omnibench.simulate.chain.lidar import Lidar, measure_scans
-from omnibench.slam.matching.map import ScanMap
-from omnibench.slam.matching.points import ScanPoints, noise_factor, scan_points
-from omnibench.slam.matching.scan_matching import Correspondences, Match, refine, search
-from omnibench.slam.motion_within_scan import MotionWithinScan
+from omnibench.simulate.floor_plan import RoomPlan, make_plan
+from omnibench.simulate.lidar import Lidar, measure_scans
+from omnibench.slam.map import ScanMap
+from omnibench.slam.motion_prior import MotionWithinScan
 from omnibench.slam.pose_errors import FLOOR, PoseErrors
+from omnibench.slam.scan_matching import Correspondences, Match, ScanPoints, noise_factor, refine, scan_points, search
 from omnibench.slam.slam_options import SlamOptions
 
 EXACT = Lidar(noise=0.0, far_noise=0.0, dropouts=0.0, resolution=1e-6)

@@ -16,12 +16,11 @@ from omnibench.data.dataset import Trajectory, make_dataset
 from omnibench.data.scans import Scanner, ScansInMemory, TrajectoryScans
 from omnibench.data.true_poses import TruePath
 from omnibench.robot.kinematics import Array
-from omnibench.simulate.chain.floor_plan import FloorPlan, RoomPlan, make_plan
-from omnibench.simulate.chain.lidar import Lidar, measure_scans
-from omnibench.slam.matching.map import ScanMap
-from omnibench.slam.matching.points import ScanPoints, scan_points
-from omnibench.slam.matching.scan_matching import Correspondences
-from omnibench.slam.motion_within_scan import MotionWithinScan
+from omnibench.simulate.floor_plan import FloorPlan, RoomPlan, make_plan
+from omnibench.simulate.lidar import Lidar, measure_scans
+from omnibench.slam.map import ScanMap
+from omnibench.slam.motion_prior import MotionWithinScan
+from omnibench.slam.scan_matching import Correspondences, ScanPoints, scan_points
 from omnibench.slam.slam_dataset import slam_dataset
 from omnibench.slam.slam_options import SlamOptions
 from omnibench.slam.slam_run import SlamPath, run_slam

@@ -18,8 +18,7 @@ from check_exam.motion import misfit
 from check_exam.recordings import DATA, NAMES, Recording, recording
 from check_exam.sitting import UNTOUCHED, Result, chosen_runs, generator, sit, sit_untouched
 from omnibench.jobs.backend_choice import BackendChoice, open_backend
-from omnibench.jobs.job import Failure, Job, JobWatch, run_jobs
-from omnibench.jobs.result_store import ResultStore
+from omnibench.jobs.job import Failure, Job, JobWatch, ResultStore, run_jobs
 from omnibench.progress import Reporter
 
 QUICK = (

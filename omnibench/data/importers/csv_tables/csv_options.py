@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from omnibench.config import Positive
-from omnibench.data.importers.encoder_options import EncoderOptions, Signs
+from omnibench.data.checks.misreading import as_yaml
+from omnibench.data.delimited import DECIMAL_COMMA, CellTable, ColumnError, missing_column
 from omnibench.data.importers.runs.reference_options import HeadingUnit, TimeUnit
+from omnibench.data.importers.wheel_samples import EncoderOptions, Signs
 from omnibench.data.splits import Names
 from omnibench.errors import nearest
 from omnibench.words import plural
@@ -122,3 +127,247 @@ class CsvOptions(EncoderOptions):
         wheels = [f"{self.prefix}{wheel}" for wheel in self.robot.wheel_names]
         steering = [f"steer_{wheel}" for wheel in self.robot.drive.steered]
         return ("t", *wheels, *self.robot.wheel_names, *steering, "pose_t", "x", "y", "theta", "run")
+
+
+_WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|°")
+TIME_UNITS = {"ms": "ms", "msec": "ms", "millis": "ms", "us": "us", "usec": "us", "micros": "us", "ns": "ns"}
+_LENGTHS = {"mm": "mm", "cm": "cm"}
+_ANGLES = {"deg": "deg", "degree": "deg", "degrees": "deg", "°": "deg"}
+_TICKS = dict.fromkeys(("tick", "ticks", "count", "counts", "pulses", "enc", "encoder"), "ticks")
+_WHEELS = {**_ANGLES, **_TICKS, **dict.fromkeys(("rev", "revs", "revolutions"), "rev"), "rpm": "rpm"}
+_PER_SECOND = ("s", "sec")  # behind a unit, of rates
+
+
+def words_of(name: str) -> list[str]:
+    """The words of a column's name in lower case: ``rpm``, ``fl`` of ``RPM_FL``."""
+    return [word.lower() for word in _WORDS.findall(name)] or [name.lower()]
+
+
+def unit_options(columns: Mapping[str, str], options: CsvOptions, *, shared: bool) -> dict[str, list[str]]:
+    """Units in the names of columns that differ from those read: what to set (``position_unit=mm``), and the columns.
+
+    columns: their names by the keys of the option ``columns``. shared: wheels and poses stand in the same rows. A unit
+    that the options say is never contradicted.
+    """
+    said: dict[str, list[str]] = {}
+    for key, name in columns.items():
+        for option, unit in _said(key, words_of(name)):
+            read = getattr(options, option) or (options.wheel_time_unit if shared else "s")
+            default = key.lower().endswith(name.lower())  # omega_left, or left: a wheel may be called as a unit
+            if option not in options.model_fields_set and unit != read and not default:
+                said.setdefault(f"{option}={unit}", []).append(name)
+    return said
+
+
+def typed_units(said: Mapping[str, list[str]]) -> list[str]:
+    """The settings of units, with what else ticks need."""
+    needs = {"wheel_unit=ticks": "ticks_per_turn=N", "steering_unit=ticks": "steering_ticks_per_turn=N"}
+    return [setting for unit in said for setting in filter(None, (unit, needs.get(unit)))]
+
+
+def check_units(file: object, columns: Mapping[str, str], options: CsvOptions, *, shared: bool) -> None:
+    """ColumnError: names of columns say other units than they are read in."""
+    said = unit_options(columns, options, shared=shared)
+    if not said:
+        return
+    names = list(dict.fromkeys(name for each in said.values() for name in each))
+    typed = " ".join(f"--set {setting}" for setting in typed_units(said))
+    option = next(iter(said)).partition("=")[0]
+    read = getattr(options, option) or "s"
+    raise ColumnError(
+        f"{file}: columns say another unit by their names than they are read in ({', '.join(names)}): {typed}; or say "
+        f"the unit that holds, as --set {option}={read}"
+    )
+
+
+def _said(key: str, words: list[str]) -> Iterator[tuple[str, str]]:
+    """The options and values that the words of a column's name say."""
+    if key in ("t", "pose_t"):
+        yield from _first("wheel_time_unit" if key == "t" else "pose_time_unit", words, TIME_UNITS)
+    elif key in ("x", "y"):
+        yield from _first("position_unit", words, _LENGTHS)
+    elif key == "theta":
+        yield from _first("heading_unit", words, _ANGLES)
+    elif key.startswith("steer_"):
+        yield from _first("steering_unit", words, {**_ANGLES, **_TICKS})
+    else:
+        yield from _first("wheel_unit", words, _WHEELS)
+
+
+def _first(option: str, words: list[str], units: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+    for word, after in zip(words, [*words[1:], ""], strict=True):
+        if word in units:
+            rate = option == "wheel_unit" and units[word] != "rpm" and after in _PER_SECOND
+            yield option, units[word] + ("/s" if rate else "")
+            return
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """A column that is wanted: its key in the option ``columns``, and the names that it may have, the first first."""
+
+    key: str
+    names: tuple[str, ...]
+
+    def found(self, table: CellTable) -> str | None:
+        """The name that it has in a table, in any case of letters; None if it is not there."""
+        for name in self.names:
+            if not table.missing([name]):
+                return name
+        lower = {name.lower(): name for name in reversed(table.names)}
+        return next((lower[name.lower()] for name in self.names if name.lower() in lower), None)
+
+
+@dataclass(frozen=True)
+class WantedColumns:
+    """The columns that a stream needs: its time, then its values. what: wheels or poses."""
+
+    what: str
+    time: Wanted
+    values: tuple[Wanted, ...]
+
+    @property
+    def all(self) -> tuple[Wanted, ...]:
+        """Time and values."""
+        return (self.time, *self.values)
+
+    def missing(self, table: CellTable) -> list[Wanted]:
+        """The columns that a table does not have."""
+        return [wanted for wanted in self.all if wanted.found(table) is None]
+
+    def names(self, table: CellTable) -> tuple[str, list[str]]:
+        """The names of time and values in a table that has them all."""
+        found = [wanted.found(table) or wanted.names[0] for wanted in self.all]
+        return found[0], found[1:]
+
+
+def wheel_columns(options: CsvOptions) -> WantedColumns:
+    """The columns of the wheels, and of the steering angles where the robot steers."""
+    wheels = _each(options, options.prefix, options.robot.wheel_names, options.wheel_columns, bare=True)
+    steering = _each(options, "steer_", options.robot.drive.steered, options.steering_columns, bare=False)
+    return WantedColumns("wheels", _time(options), (*wheels, *steering))
+
+
+def pose_columns(options: CsvOptions, *, shared: bool) -> WantedColumns:
+    """The columns of the poses. shared: wheels stand in the same table, whose time is theirs unless it is said."""
+    given = options.pose_time_column or options.columns.get("pose_t")
+    wheels = _time(options)
+    alike = tuple(dict.fromkeys((*wheels.names, *TIMES)))
+    time = Wanted("pose_t", (given,)) if given else wheels if shared else Wanted("pose_t", alike)
+    keys = ("x", "y", "theta")
+    values = []
+    for index, (key, names) in enumerate(zip(keys, (("x",), ("y",), HEADINGS), strict=True)):
+        said = options.columns.get(key) or (options.pose_columns[index] if options.pose_columns else None)
+        values.append(Wanted(key, (said,) if said else names))
+    return WantedColumns("poses", time, tuple(values))
+
+
+def run_column(options: CsvOptions, table: CellTable) -> str | None:
+    """The column that names the run of a row; None without one. DataError: it has not the one that the options name."""
+    given = options.run_column or options.columns.get("run")
+    found = Wanted("run", (given, *RUNS) if given else RUNS).found(table)
+    if given and found is None:
+        raise ColumnError(f"{missing_column(table.file, given, table.names)}; --set run_column=NAME")
+    return found
+
+
+def _time(options: CsvOptions) -> Wanted:
+    given = options.wheel_time_column or options.columns.get("t")
+    return Wanted("t", (given,) if given else TIMES)
+
+
+def _each(options: CsvOptions, prefix: str, wheels: Sequence[str], given: Sequence[str], *, bare: bool) -> list[Wanted]:
+    """The columns of some wheels. bare: wheels' names are some, too, and those of other units where one is said."""
+    others = tuple(other for other in PREFIXES if other != prefix) if bare else ()
+    wanted = []
+    for index, wheel in enumerate(wheels):
+        key = f"{prefix}{wheel}"
+        keys = (key, wheel, *(f"{other}{wheel}" for other in others)) if bare else (key,)
+        said = next((options.columns[each] for each in keys if each in options.columns), None)
+        said = said or (given[index] if given else None)
+        found = keys if "wheel_unit" in options.model_fields_set else keys[:2]
+        wanted.append(Wanted(key, (said,) if said else found))
+    return wanted
+
+
+_CLOSE = 0.75  # of difflib's ratio, from which on a name is taken for a misspelt one; chosen
+_KINDS = {
+    "t": ("t", "time", "stamp", "timestamp", "clock", "sec", "secs", "seconds", *TIME_UNITS),
+    "x": ("x", "px", "posx"),
+    "y": ("y", "py", "posy"),
+    "theta": ("theta", "heading", "yaw", "angle", "rotation", "orientation", "phi", "th"),
+}
+_STEERING = frozenset(("steer", "steering"))
+_SIDES = {"left": ("left", "l"), "right": ("right", "r"), "front": ("front", "f"), "rear": ("rear", "back", "b")}
+
+
+def missing_error(table: CellTable, missing: Sequence[Wanted], options: CsvOptions) -> ColumnError:
+    """The error that names what is missing, what was found, and what to type if that is meant."""
+    if not table.headed:
+        return _unnamed(table.file, missing, len(table.names))
+    names = [f"'{wanted.names[0]}'" for wanted in missing]
+    what = f"column {names[0]} is" if len(names) == 1 else f"columns {', '.join(names[:-1])} and {names[-1]} are"
+    found = ", ".join(filter(None, table.names))
+    if len(table.names) == 1:
+        way = "name what separates the fields: --set separator=blanks (or another character)"
+    else:
+        way = _way_out(table, missing, options)
+    return ColumnError(f"{table.file}: {what} missing; found: {found}; {way}")
+
+
+def _unnamed(file: Path, missing: Sequence[Wanted], count: int) -> ColumnError:
+    shown = ", ".join(f"{wanted.key}: 1" for wanted in missing[:1]) or "t: 1"
+    keys = ", ".join(wanted.key for wanted in missing)
+    return ColumnError(
+        f"{file}: it has no header and {count} columns; say by numbers, from 1, which of them are {keys}: "
+        f'--set "columns={{{shown}, ...}}"'
+    )
+
+
+def _way_out(table: CellTable, missing: Sequence[Wanted], options: CsvOptions) -> str:
+    """What to type to name the columns that are missing: by what looks like them, or by an example."""
+    streams = (wheel_columns(options), pose_columns(options, shared=False))
+    used = {wanted.found(table) for stream in streams for wanted in stream.all}
+    taken: dict[str, str] = {}
+    for wanted in missing:
+        free = [name for name in table.names if name and name not in taken.values() and name not in used]
+        if (likely := _likely(wanted, free, options)) is not None:
+            taken[wanted.key] = likely
+    units = typed_units(unit_options(taken, options, shared=True))
+    typed = "".join(f" --set {setting}" for setting in [*units, *_decimals(table, taken)])
+    shown = ", ".join(f"{wanted.key}: {_typed(taken.get(wanted.key, 'NAME'))}" for wanted in missing)
+    if len(taken) < len(missing):
+        return f'name {"it" if len(missing) == 1 else "them"}: --set "columns={{{shown}}}"{typed}'
+    return f'did you mean --set "columns={{{shown}}}"{typed}?'
+
+
+def _typed(name: str) -> str:
+    """A name as a value in a mapping of YAML that is typed between double quotes."""
+    return name if as_yaml(name) == name else "'" + name.replace("'", "''") + "'"
+
+
+def _decimals(table: CellTable, taken: Mapping[str, str]) -> list[str]:
+    """The option of decimal commas, where cells of the columns have them."""
+    commas = any(DECIMAL_COMMA.fullmatch(cell) for name in taken.values() for cell in table.texts(name))
+    return ["decimal=comma"] if commas else []
+
+
+def _likely(wanted: Wanted, names: Sequence[str], options: CsvOptions) -> str | None:
+    """The one of the columns whose name holds a word that says it; None if there is none, or several."""
+    kind = "t" if wanted.key == "pose_t" else wanted.key
+    steers = kind.startswith("steer_")
+    wheel = kind if kind in options.robot.wheel_names else kind.split("_", 1)[-1]
+    words = _KINDS.get(kind) or _SIDES.get(wheel.lower())
+    alike = [
+        name
+        for name in names
+        if steers == (not _STEERING.isdisjoint(said := words_of(name)))
+        and (not set(words).isdisjoint(said) if words else set(words_of(wheel)) <= set(said))
+    ]
+    if steers and not alike and len(options.robot.drive.steered) == 1:
+        alike = [name for name in names if not _STEERING.isdisjoint(words_of(name))]
+    exact = [name for name in alike if len(alike) == 1 or (words and words_of(name)[0] in words)]
+    if len(exact) == 1:
+        return exact[0]
+    close = get_close_matches(wanted.names[0], names, n=1, cutoff=_CLOSE)
+    return close[0] if close and not alike else None

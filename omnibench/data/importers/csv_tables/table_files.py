@@ -13,9 +13,12 @@ from omnibench.data.importers.csv_tables.csv_options import (
     REFERENCE_SUFFIXES,
     WHEEL_SUFFIXES,
     CsvOptions,
+    Wanted,
+    WantedColumns,
+    missing_error,
+    pose_columns,
+    wheel_columns,
 )
-from omnibench.data.importers.csv_tables.missing_columns import missing_error
-from omnibench.data.importers.csv_tables.wanted_columns import Wanted, WantedColumns, pose_columns, wheel_columns
 from omnibench.errors import DataError
 from omnibench.words import some
 

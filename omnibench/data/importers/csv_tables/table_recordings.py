@@ -16,21 +16,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.alignment import median_period
-from omnibench.data.checks.option_words import as_yaml
+from omnibench.data.checks.misreading import as_yaml
 from omnibench.data.delimited import CellTable, ColumnError, NumberTable
-from omnibench.data.importers.csv_tables.column_words import check_units
-from omnibench.data.importers.csv_tables.csv_options import CsvOptions
-from omnibench.data.importers.csv_tables.missing_columns import missing_error
+from omnibench.data.importers.csv_tables.csv_options import (
+    CsvOptions,
+    WantedColumns,
+    check_units,
+    missing_error,
+    pose_columns,
+    run_column,
+    wheel_columns,
+)
 from omnibench.data.importers.csv_tables.table_files import TablePair, load
-from omnibench.data.importers.csv_tables.wanted_columns import WantedColumns, pose_columns, run_column, wheel_columns
-from omnibench.data.importers.runs.recorded_streams import RecordedStreams
+from omnibench.data.importers.runs.recorded_streams import RecordedStreams, ReferenceStream
 from omnibench.data.importers.runs.reference_options import RADIANS, SECONDS
-from omnibench.data.importers.runs.reference_stream import ReferenceStream
 from omnibench.data.importers.tum import read_tum
 from omnibench.data.importers.wheel_samples import WheelReadings, WheelSamples, wheel_samples
-from omnibench.data.references.reference_columns import NUMBERS, references_of
-from omnibench.data.references.reference_flaws import measurement_flaw
-from omnibench.data.references.run_references import KINDS, References
+from omnibench.data.references import KINDS, NUMBERS, References, measurement_flaw, references_of
 from omnibench.errors import DataError, nearest
 from omnibench.robot.kinematics import Array
 from omnibench.words import plural, some

@@ -10,24 +10,25 @@ from pathlib import Path
 import numpy as np
 
 from omnibench.data.dataset import Trajectory
-from omnibench.data.importers.rosbag.bag import Bag, Topic, open_bag
-from omnibench.data.importers.rosbag.joint_streams import WheelStream, read_wheels
-from omnibench.data.importers.rosbag.message_streams import PoseStream, Stamps, header_stamp, read_poses
-from omnibench.data.importers.rosbag.rosbag_options import RosbagOptions
-from omnibench.data.importers.rosbag.scan_stream import RunScans, ScanStream, read_scans
-from omnibench.data.importers.rosbag.sensors.sensor_references import SensorReferences, read_sensors
-from omnibench.data.importers.rosbag.topic_choice import (
+from omnibench.data.importers.rosbag.bag import (
     TRANSFORMS,
+    Bag,
+    Topic,
     has_sensors,
     joint_topics,
+    open_bag,
     pose_topic,
     scan_topic,
     sensor_topics,
 )
+from omnibench.data.importers.rosbag.joint_streams import WheelStream, read_wheels
+from omnibench.data.importers.rosbag.message_streams import PoseStream, Stamps, header_stamp, read_poses
+from omnibench.data.importers.rosbag.rosbag_options import RosbagOptions
+from omnibench.data.importers.rosbag.scan_stream import RunScans, ScanStream, read_scans
+from omnibench.data.importers.rosbag.sensor_references import SensorReferences, read_sensors
 from omnibench.data.importers.rosbag.transform_poses import read_transforms
-from omnibench.data.importers.runs.cut_run import cut_run
-from omnibench.data.importers.runs.reference_stream import ReferenceStream
-from omnibench.data.importers.runs.run_spans import Span, breaks, departure, find_rests, from_rest, parted
+from omnibench.data.importers.runs.recorded_streams import ReferenceStream
+from omnibench.data.importers.runs.recording_runs import Span, breaks, cut_run, departure, find_rests, from_rest, parted
 from omnibench.data.importers.wheel_samples import Losses, WheelSamples, wheel_samples
 from omnibench.errors import DataError, one_line
 from omnibench.robot.kinematics import Array, interpolated

@@ -11,12 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from omnibench.data.importers.encoder_options import Quantity
-from omnibench.data.importers.rosbag.bag import Bag, Topic
+from omnibench.data.importers.rosbag.bag import Bag, JointTopics, Topic
 from omnibench.data.importers.rosbag.message_streams import MessageFilter, Stamps, possible
 from omnibench.data.importers.rosbag.rosbag_options import RosbagOptions, Use
-from omnibench.data.importers.rosbag.topic_choice import JointTopics
-from omnibench.data.importers.wheel_samples import WheelReadings
+from omnibench.data.importers.wheel_samples import Quantity, WheelReadings
 from omnibench.errors import DataError
 from omnibench.robot.joint_choice import JointChoice
 from omnibench.robot.kinematics import Array, interpolated

@@ -9,11 +9,10 @@ from pathlib import Path
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.importer import Importer
 from omnibench.data.importers.copied_reference import follows_the_wheels
-from omnibench.data.importers.rosbag.bag import find_bags
+from omnibench.data.importers.rosbag.bag import ODOMETRY, TRANSFORMS, find_bags
 from omnibench.data.importers.rosbag.bag_recording import cut_into_runs, read_recording
 from omnibench.data.importers.rosbag.rosbag_options import RosbagOptions
 from omnibench.data.importers.rosbag.scan_stream import RunScans, gather_scans
-from omnibench.data.importers.rosbag.topic_choice import ODOMETRY, TRANSFORMS
 from omnibench.data.importers.runs.recorded_streams import RecordedStreams, by_one_clock
 from omnibench.data.splits import complete
 from omnibench.errors import DataError

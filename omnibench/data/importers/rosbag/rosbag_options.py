@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import Field, model_validator
 
 from omnibench.config import NonNegative, Positive
-from omnibench.data.importers.encoder_options import EncoderOptions, Signs, WheelUnit
+from omnibench.data.importers.wheel_samples import EncoderOptions, Signs, WheelUnit
 from omnibench.data.scans import Mount
 from omnibench.data.splits import Names
 from omnibench.words import plural

@@ -10,7 +10,7 @@ import numpy as np
 
 from omnibench.data.importers.rosbag.bag import Bag, Topic
 from omnibench.data.importers.rosbag.message_streams import PoseStream, read_poses
-from omnibench.data.importers.rosbag.scanner_frames import fixed_transforms
+from omnibench.data.importers.rosbag.scan_stream import fixed_transforms
 from omnibench.errors import ConfigError, nearest
 from omnibench.robot.kinematics import Array, compose, interpolated
 

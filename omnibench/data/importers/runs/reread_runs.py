@@ -9,12 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
-from omnibench.data.importers.encoder_options import EncoderOptions
-from omnibench.data.importers.runs.recorded_streams import RecordedStreams, by_one_clock
+from omnibench.data.importers.runs.recorded_streams import RecordedStreams, ReferenceStream, by_one_clock
 from omnibench.data.importers.runs.recording_runs import recording_runs
 from omnibench.data.importers.runs.reference_options import ReferenceOptions
-from omnibench.data.importers.runs.reference_stream import ReferenceStream
-from omnibench.data.importers.wheel_samples import WheelSamples
+from omnibench.data.importers.wheel_samples import EncoderOptions, WheelSamples
 from omnibench.data.scans import Scans, ScansInMemory, TrajectoryScans
 from omnibench.errors import ConfigError, nearest
 from omnibench.robot.kinematics import Robot

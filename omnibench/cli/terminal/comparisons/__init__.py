@@ -1,1 +1,0 @@
-"""Comparisons and studies on a terminal."""

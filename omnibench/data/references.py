@@ -1,0 +1,356 @@
+"""What is known of a run's motion without motion capture: single measurements, each with its own uncertainty."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from types import MappingProxyType
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnibench.data.checks.finding import Kind
+from omnibench.data.checks.misreading import POSITION_UNITS, Misreading, warning_of
+from omnibench.data.run_checks import LARGEST, Flaw
+from omnibench.errors import nearest, require_type
+from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.model import OdometryModel
+from omnibench.robot.odometry import WheelLog
+from omnibench.views import Brief
+
+ReferenceKind = Literal["distance", "turn", "displacement", "position", "heading"]
+KINDS: tuple[ReferenceKind, ...] = get_args(ReferenceKind)
+PLANAR: frozenset[str] = frozenset({"displacement", "position"})  # kinds of two numbers, x and y
+AT_ONE_TIME: frozenset[str] = frozenset({"position", "heading"})  # kinds of an instant, t1, where t0 is not given
+UNITS: Mapping[str, Literal["m", "rad"]] = MappingProxyType(
+    {kind: "rad" if kind in ("turn", "heading") else "m" for kind in KINDS}
+)
+
+
+@dataclass(frozen=True)
+class Reference:
+    """One measurement of a run's motion.
+
+    kind: ``distance`` driven along the path from t0 to t1 (m), ``turn`` (rad, counter-clockwise), ``displacement``
+    (x, y, m, in the robot's frame at t0), ``position`` (x, y, m, in a fixed frame) or ``heading`` (rad) at t1.
+    value, sigma: one number, or x and y; one sigma counts for both. sigma: standard deviation, > 0. t1: s; None: the
+    run's end. t0: s; None: the run's start, and of a position or a heading none: it is that in the fixed frame. A
+    heading with t0 = 0 is a gyro's, counted from the run's start.
+    """
+
+    kind: ReferenceKind
+    value: float | tuple[float, float]
+    sigma: float | tuple[float, float]
+    t1: float | None = None
+    t0: float | None = None
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class References(Brief):
+    """The R measurements of one run.
+
+    kinds (R,): of KINDS. t0, t1 (R,): s; equal for what is measured at one time. values, sigmas (R, 2): the second of
+    kinds of one number is NaN. start_known: True if the run's start pose is known in the frame of positions and
+    headings; else it is a nuisance of the run. rate_sigma: standard deviation, rad/s, of a gyro's offset, which times
+    the span is in every turn and heading from the start, and is the same in all runs of a session. Before a recording
+    is cut into runs, -inf is the start of a run to come, and inf its end.
+    """
+
+    kinds: NDArray[np.str_]
+    t0: Array
+    t1: Array
+    values: Array
+    sigmas: Array
+    start_known: bool = False
+    rate_sigma: float = 0.0
+
+    @classmethod
+    def of(
+        cls, references: Iterable[Reference], end: float, *, start_known: bool = False, rate_sigma: float = 0.0
+    ) -> References:
+        """The measurements of a run that ends after ``end`` s, by their times. ConfigError: one is no Reference.
+
+        >>> tape = Reference("distance", 3.03, 0.003)  # m, driven from the run's start to its end
+        >>> len(References.of([tape], end=10.0))
+        1
+        """
+        given = list(references)
+        for each in given:
+            require_type(each, Reference, "Reference(kind, value, sigma)")
+        t1 = np.array([end if each.t1 is None else each.t1 for each in given], dtype=float)
+        t0 = np.array(
+            [
+                each.t0 if each.t0 is not None else until if each.kind in AT_ONE_TIME else 0.0
+                for each, until in zip(given, t1, strict=True)
+            ],
+            dtype=float,
+        )
+        values, sigmas = (
+            np.array([_pair(each.kind, pair) for each, pair in zip(given, pairs, strict=True)]).reshape(-1, 2)
+            for pairs in ([each.value for each in given], [each.sigma for each in given])
+        )
+        kinds = np.array([each.kind for each in given], dtype=str)
+        return cls(kinds, t0, t1, values, sigmas, start_known, rate_sigma).by_time()
+
+    def __len__(self) -> int:
+        return len(self.kinds)
+
+    @cached_property
+    def planar(self) -> NDArray[np.bool_]:
+        """True (R,) for measurements of two numbers, x and y."""
+        return np.isin(self.kinds, list(PLANAR))
+
+    @cached_property
+    def fixed_frame(self) -> NDArray[np.bool_]:
+        """True (R,) for positions, and for headings that are not counted from another time."""
+        return (self.kinds == "position") | ((self.kinds == "heading") & (self.t0 == self.t1))
+
+    @cached_property
+    def gyro(self) -> NDArray[np.bool_]:
+        """True (R,) for angles since another time, in which a gyro's offset adds up."""
+        return (self.kinds == "turn") | ((self.kinds == "heading") & (self.t0 < self.t1))
+
+    def by_time(self) -> References:
+        """These measurements in the order of t1, then t0."""
+        order = np.lexsort((self.t0, self.t1))
+        t0, t1, values, sigmas = (array[order] for array in (self.t0, self.t1, self.values, self.sigmas))
+        return replace(self, kinds=self.kinds[order], t0=t0, t1=t1, values=values, sigmas=sigmas)
+
+    def with_values(self, values: Array) -> References:
+        """These measurements with other values (R, 2)."""
+        return replace(self, values=values)
+
+    def of_run(self, zero: float, end: float, kept: NDArray[np.bool_] | slice = slice(None)) -> References:
+        """These measurements, or those kept (R,), by the time of a run that began at ``zero`` and lasted ``end`` s.
+
+        t0 = -inf becomes the run's start, and t1 = inf its end.
+        """
+        kinds, t0, t1 = self.kinds[kept], self.t0[kept] - zero, self.t1[kept] - zero
+        t0, t1 = np.where(np.isneginf(t0), 0.0, t0), np.where(np.isposinf(t1), end, t1)
+        t0 = np.where(np.isposinf(t0), t1, t0)
+        return replace(self, kinds=kinds, t0=t0, t1=t1, values=self.values[kept], sigmas=self.sigmas[kept])
+
+    def open_ended(self, end: float) -> References:
+        """These measurements of a run of ``end`` s, with -inf for its start and inf for its end: see ``of_run``."""
+        spans = self.t0 < self.t1
+        t0 = np.where(spans & (self.t0 == 0), -np.inf, self.t0)
+        t1 = np.where(spans & (self.t1 == end) & (self.kinds != "heading"), np.inf, self.t1)
+        return replace(self, t0=t0, t1=t1)
+
+    @property
+    def content(self) -> tuple[Hashable, ...]:
+        """All of it as plain values, for digests."""
+        arrays = (np.ascontiguousarray(array, dtype=float) for array in (self.t0, self.t1, self.values, self.sigmas))
+        # Left out where it says nothing, as tables leave it out.
+        offset = (self.rate_sigma,) * bool(self.rate_sigma > 0 and self.gyro.any())
+        return (tuple(self.kinds.tolist()), self.start_known, *(array.tobytes() for array in arrays), *offset)
+
+
+def _pair(kind: str, given: float | tuple[float, float]) -> tuple[float, float]:
+    """Two numbers; the second is NaN for kinds of one number, and the first again where one is given for both."""
+    first, *others = np.atleast_1d(np.asarray(given, dtype=float)).tolist()
+    if kind not in PLANAR:
+        return first, np.nan
+    return first, others[0] if others else first
+
+
+NUMBERS = ("t0", "t1", "value", "value_x", "value_y", "sigma", "sigma_x", "sigma_y", "sigma_rate")
+
+
+def references_of(kinds: NDArray[np.str_], numbers: Mapping[str, Array], *, start_known: bool = False) -> References:
+    """The references of rows with a kind (R,) and numbers (R,) by NUMBERS, NaN where a cell is empty.
+
+    An empty t1 becomes inf, the end of a run; an empty t0 -inf, its start, or t1 of what is measured at one time. The
+    largest sigma_rate is that of the run.
+    """
+    planar, instant = np.isin(kinds, list(PLANAR)), np.isin(kinds, list(AT_ONE_TIME))
+    t1 = np.where(np.isnan(numbers["t1"]), np.inf, numbers["t1"])
+    t0 = np.where(np.isnan(numbers["t0"]), np.where(instant, t1, -np.inf), numbers["t0"])
+    both = numbers["sigma"]
+    values = np.column_stack([np.where(planar, numbers["value_x"], numbers["value"]), numbers["value_y"]])
+    sigmas = np.column_stack(
+        [np.where(planar, _filled(numbers["sigma_x"], both), both), _filled(numbers["sigma_y"], both)]
+    )
+    values[~planar, 1] = sigmas[~planar, 1] = np.nan
+    rates = np.append(np.nan_to_num(numbers["sigma_rate"]), 0.0)
+    return References(kinds, t0, t1, values, sigmas, start_known, float(rates[np.abs(rates).argmax()]))
+
+
+def _filled(values: Array, others: Array) -> Array:
+    return np.where(np.isnan(values), others, values)
+
+
+_LATE = 0.5  # s after the last wheel sample: a later reference is not of this run
+
+
+def reference_flaw(references: References, times: Array) -> Flaw | None:
+    """The first flaw in a run's references, None if there is none. times (F,): ends of its wheel samples, s."""
+    for row, kind in enumerate(references.kinds.tolist()):
+        what = (
+            _kind_flaw(kind)
+            or _times_flaw(kind, float(references.t0[row]), float(references.t1[row]), float(times[-1]))
+            or _numbers_flaw(kind, references.values[row], references.sigmas[row])
+        )
+        if what:
+            return row, what
+    return _rate_flaw(references)
+
+
+def measurement_flaw(references: References) -> Flaw | None:
+    """The first flaw in kinds, values and standard deviations, whatever their times; None if there is none."""
+    for row, kind in enumerate(references.kinds.tolist()):
+        if what := _kind_flaw(kind) or _numbers_flaw(kind, references.values[row], references.sigmas[row]):
+            return row, what
+    return _rate_flaw(references)
+
+
+def _rate_flaw(references: References) -> Flaw | None:
+    if np.isfinite(references.rate_sigma) and 0 <= references.rate_sigma <= LARGEST:
+        return None
+    return 0, f"sigma_rate is {references.rate_sigma:g}; the standard deviation of a gyro's offset is >= 0, rad/s"
+
+
+def _kind_flaw(kind: str) -> str:
+    if kind in KINDS:
+        return ""
+    return f"kind is {kind!r}; {nearest(kind, KINDS)}it must be one of {', '.join(KINDS)}"
+
+
+def _times_flaw(kind: str, t0: float, t1: float, end: float) -> str:
+    """What is wrong with the times of a reference to a run of ``end`` s; empty if nothing is."""
+    for name, value in (("t0", t0), ("t1", t1)):
+        if not np.isfinite(value):
+            return f"{name} is {value}; remove or repair the row"
+        if value < 0:
+            return f"{name} is {value:g}; it must not be negative (s since the run's start)"
+    if t1 > end + _LATE:
+        return f"t1 is {t1:g}, after the run's last wheel sample at {end:g} s; check the clocks, or leave the row out"
+    if kind == "position" and t0 != t1:
+        return f"t0 is {t0:g} and t1 {t1:g}; a position is that at t1, leave t0 empty"
+    if kind == "heading" and t0 not in (0.0, t1):
+        return f"t0 is {t0:g}; leave it empty for a heading in a fixed frame, or take kind turn for one since t0"
+    if kind not in AT_ONE_TIME and t0 >= t1:
+        return f"t0 is {t0:g} and t1 {t1:g}; a {kind} needs t0 < t1"
+    return ""
+
+
+def _numbers_flaw(kind: str, values: Array, sigmas: Array) -> str:
+    """What is wrong with the values and standard deviations (2,) of a reference; empty if nothing is."""
+    names = ("x", "y") if kind in ("displacement", "position") else ("",)
+    for axis, name in enumerate(names):
+        value, sigma = (f"{word}_{name}" if name else word for word in ("value", "sigma"))
+        if np.isnan(values[axis]):
+            return f"{value} is missing; a {kind} needs {' and '.join(_named('value', names))}"
+        if np.isnan(sigmas[axis]):
+            return f"{sigma} is missing: how exactly the {kind} is known, a standard deviation"
+        if not np.isfinite(values[axis]) or abs(values[axis]) > LARGEST:
+            return f"{value} is {values[axis]:g}, which no robot can reach; check the units"
+        if not 0 < sigmas[axis] <= LARGEST:
+            return f"{sigma} is {sigmas[axis]:g}; a standard deviation is > 0 (how exactly the {kind} is known)"
+    if kind == "distance" and values[0] < 0:
+        return f"value is {values[0]:g}; a distance driven is not negative, backwards or not"
+    return ""
+
+
+def _named(word: str, names: tuple[str, ...]) -> list[str]:
+    return [f"{word}_{name}" if name else word for name in names]
+
+
+TURN = 2 * np.pi  # rad
+
+
+def with_whole_turns(robot: Robot, log: WheelLog, references: References) -> References:
+    """The references with the whole turns added to headings that bring each step closest to the design's odometry.
+
+    log: of the run, from its start pose. Turned angles stay as they are: three turns are 18.85 rad.
+    """
+    values = references.values.copy()
+    absolute = references.fixed_frame & (references.kinds == "heading")
+    counted = (references.kinds == "heading") & ~absolute
+    for chosen, known, first in ((absolute, references.start_known, log.start[2]), (counted, True, 0.0)):
+        if chosen.any():
+            stamps, headings = references.t1[chosen], values[chosen, 0]
+            driven = _turned(robot, log, stamps)
+            before = (first, 0.0) if known else (headings[0], driven[0])
+            steps = np.diff(headings, prepend=before[0])
+            turns = np.round((np.diff(driven, prepend=before[1]) - steps) / TURN)
+            values[chosen, 0] = headings + TURN * np.cumsum(turns)
+    return references.with_values(values)
+
+
+def _turned(robot: Robot, log: WheelLog, stamps: Array) -> Array:
+    """Angles (S,) that the design robot has turned by at stamps (S,), rad."""
+    wanted = WheelLog(log.times, log.rates, np.zeros(3), stamps, steering=log.steering, drive=log.drive)
+    (poses,) = OdometryModel.of_design(robot, "arc").poses([wanted])
+    turned: Array = poses[:, 2]
+    return turned
+
+
+# How many times too large references in another unit are, and that unit.
+_FACTORS = {"m": POSITION_UNITS, "rad": ((float(np.degrees(1)), "deg"),)}
+_NEAR = 1.5  # a ratio to the odometry within this factor of a unit's is that unit; chosen: designs are off by less
+_LEAST = {"m": 0.02, "rad": 0.05}  # m, rad: motions that are smaller tell nothing of a unit; chosen
+
+
+def odd_references(robot: Robot, runs: Iterable[tuple[WheelLog, References]]) -> list[str]:
+    """A warning for each kind of reference whose values are as large as in another unit, of some runs' references."""
+    ratios: dict[str, list[float]] = {kind: [] for kind in KINDS}
+    model = OdometryModel.of_design(robot, "arc")
+    for log, references in runs:
+        if not len(references):
+            continue
+        sizes, driven = _sizes(model, log, references)
+        for kind, size, expected in zip(references.kinds.tolist(), sizes, driven, strict=True):
+            if expected > _LEAST[UNITS[kind]] and np.isfinite(size):
+                ratios[kind].append(size / expected)
+    return [warning for kind in KINDS for warning in _warnings(robot, kind, ratios[kind])]
+
+
+def _warnings(robot: Robot, kind: ReferenceKind, ratios: Sequence[float]) -> list[str]:
+    if not ratios:
+        return []
+    ratio = float(np.median(ratios))
+    for factor, unit in _FACTORS[UNITS[kind]]:
+        if factor / _NEAR < ratio < factor * _NEAR:
+            what = (
+                f"references of kind {kind} are {ratio:.3g} times what the wheels say, as if they were in "
+                f"{'degrees' if unit == 'deg' else unit}: they must be in {UNITS[kind]}"
+            )
+            option: Kind = "heading_unit" if UNITS[kind] == "rad" else "position_unit"
+            found = Misreading(option, what, f"references of kind {kind}", {option: unit}).finding()
+            return [warning_of(robot, found, unit=True)]
+    return []
+
+
+def _sizes(model: OdometryModel, log: WheelLog, references: References) -> tuple[Array, Array]:
+    """Magnitudes (R,) of what was measured and of the same by a model; positions and compass headings since the first.
+
+    NaN for the first of those.
+    """
+    first, last = (_at(model, log, stamps) for stamps in (references.t0, references.t1))
+    values = references.values.copy()
+    for kind in ("position", "heading"):
+        chosen = references.fixed_frame & (references.kinds == kind)
+        if chosen.any():
+            values[chosen] -= values[chosen][0]
+            values[np.flatnonzero(chosen)[0]] = np.nan
+            first[0][chosen], first[1][chosen] = last[0][chosen][0], last[1][chosen][0]
+    size = np.where(references.planar, np.hypot(values[:, 0], values[:, 1]), np.abs(values[:, 0]))
+    moved = last[0] - first[0]
+    expected = np.select(
+        [references.kinds == "distance", references.planar],
+        [last[1] - first[1], np.hypot(moved[:, 0], moved[:, 1])],
+        np.abs(moved[:, 2]),
+    )
+    return size, expected
+
+
+def _at(model: OdometryModel, log: WheelLog, stamps: Array) -> tuple[Array, Array]:
+    """Poses (S, 3) and distances driven (S,) at stamps (S,), in any order."""
+    order = np.argsort(stamps)
+    wanted = replace(log, stamps=stamps[order])
+    poses, lengths = np.empty((len(stamps), 3)), np.empty(len(stamps))
+    poses[order], lengths[order] = model.poses([wanted])[0], model.lengths([wanted])[0]
+    return poses, lengths

@@ -1,1 +1,0 @@
-"""References other than poses: distances, turns, displacements, positions and headings of a run."""

@@ -1,1 +1,0 @@
-"""Runs that a model was not fitted to, and its errors on them: folds of the training runs, and the validation split."""

@@ -1,1 +1,0 @@
-"""A robot simulated from command to SLAM: motors, encoders, room, LIDAR."""

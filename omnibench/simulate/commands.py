@@ -1,0 +1,308 @@
+"""Motion commands: their twists, and the wheel rates and steering angles that drive them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, FiniteFloat, model_validator
+
+from omnibench.config import Model, NonNegative, Positive
+from omnibench.robot.kinematics import Array, Robot, class_of
+
+# Largest steering angles where none is given, deg (chosen): a tricycle's front wheel nearly reaches the turn on the
+# spot, a car's wheels 30 to 40 deg; any other module drives backward in the place of turning further than 90.
+_LIMITS, _LARGEST = {"tricycle": 80.0, "car": 35.0}, 90.0
+_DIGITS = 9  # of a pivot, m, and a direction, deg: the rest is rounding
+_SLACK = 1e-6  # rad, and relative to the signals: rounding of what lies on a limit
+_EVERY_WAY = tuple(float(degrees) for degrees in range(0, 360, 45))
+
+
+@dataclass(frozen=True)
+class Command:
+    """A motion command: speed (m/s), direction (rad, robot's frame), rate of turn (rad/s).
+
+    pivot: the point, m in the robot's frame, that stands still when the robot turns on the spot, and whose speed is
+    commanded: the centre, except for a robot whose fixed wheels have their axle elsewhere.
+    """
+
+    speed: float
+    direction: float
+    turn_rate: float
+    pivot: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def name(self) -> str:
+        return f"v{self.speed:g}_a{math.degrees(self.direction):g}_w{self.turn_rate:g}"
+
+    @property
+    def twist(self) -> Array:
+        """(vx, vy, w) of the robot's centre."""
+        x, y = self.speed * math.cos(self.direction), self.speed * math.sin(self.direction)
+        return np.array([x + self.turn_rate * self.pivot[1], y - self.turn_rate * self.pivot[0], self.turn_rate])
+
+
+def straight_and_pivot(robot: Robot) -> tuple[float, tuple[float, float]] | None:
+    """The direction, rad, in which a robot rolls that cannot go sideways, and its pivot; None for one that can."""
+    motions = robot.motions
+    if len(motions) == 3:
+        return None
+    line, turning = motions
+    straight = line / np.hypot(line[0], line[1]) * np.sign(max(line[:2], key=abs))
+    turning = turning / turning[2]
+    x, y = (round(float(value), _DIGITS) + 0.0 for value in (-turning[1], turning[0]))  # + 0.0: never -0.0
+    degrees = round(math.degrees(math.atan2(straight[1], straight[0])), _DIGITS) + 0.0
+    return math.radians(degrees), (x, y)
+
+
+def default_directions(robot: Robot) -> tuple[float, ...]:
+    """Directions, deg, where none are given: every 45 degrees; forward and backward for a robot that only rolls."""
+    rolls = straight_and_pivot(robot)
+    return (
+        _EVERY_WAY if rolls is None else tuple(round(math.degrees(rolls[0]) + back, _DIGITS) for back in (0.0, 180.0))
+    )
+
+
+def steering_limit(robot: Robot, degrees: float | None) -> float:
+    """The largest steering angle, rad: as given in degrees, or the default of the robot's type."""
+    if degrees is None:
+        degrees = _LIMITS.get(class_of(robot), _LARGEST)
+    return math.radians(degrees)
+
+
+def wheels_of(robot: Robot, twist: Array) -> tuple[Array, Array]:
+    """Wheel rates (N,), rad/s, and steering angles (S,), rad, that drive a twist by the design values.
+
+    A wheel that would have to steer by more than a quarter turn drives backward.
+    """
+    with np.errstate(divide="ignore"):  # a car's wheel at a right angle, which its limit refuses
+        rates, steering = (values[0] for values in robot.drive.commands((robot.signal_equations @ twist)[None]))
+    for wheel, pair in enumerate(robot.drive.pairs):
+        if pair >= 0 and abs(steering[pair]) > math.pi / 2 + _SLACK:
+            steering[pair] -= math.copysign(math.pi, steering[pair])
+            rates[wheel] = -rates[wheel]
+    return rates, steering
+
+
+def is_within(robot: Robot, command: Command, limit: float) -> bool:
+    """True if the robot can drive a command with steering angles up to a limit, rad."""
+    if robot.drive.direct:
+        return True
+    wanted = robot.signal_equations @ command.twist
+    rates, steering = wheels_of(robot, command.twist)
+    driven = robot.drive.signals(rates[None], steering[None])[0]
+    missed = np.abs(driven - wanted).max() > _SLACK * max(np.abs(wanted).max(), 1e-9)
+    return not missed and np.abs(steering).max() <= limit + _SLACK
+
+
+def sharpest_turn(robot: Robot, command: Command, limit: float) -> float:
+    """The fastest rate of turn, rad/s, that steering up to a limit, rad, allows at a command's speed and side."""
+    low, high = 0.0, 1.0
+    for _ in range(50):
+        middle = (low + high) / 2
+        turning = Command(command.speed, command.direction, middle * command.turn_rate, command.pivot)
+        low, high = (middle, high) if is_within(robot, turning, limit) else (low, middle)
+    return low * abs(command.turn_rate)
+
+
+def within_steering(
+    robot: Robot, commands: Sequence[Command], degrees: float | None
+) -> tuple[list[Command], list[Command]]:
+    """The commands that a robot can steer, and those that are beyond its limit, deg, or need it to turn on the spot."""
+    limit = steering_limit(robot, degrees)
+    kept = [command for command in commands if is_within(robot, command, limit)]
+    return kept, [command for command in commands if command not in kept]
+
+
+def beyond_steering(robot: Robot, left_out: Sequence[Command], degrees: float | None) -> str:
+    """The reason why commands cannot be driven, in words, by the example of the first, and what to give instead."""
+    first, limit = left_out[0], steering_limit(robot, degrees)
+    if not first.speed:
+        return f"{first.name} turns on the spot, which steering angles up to {math.degrees(limit):g} deg do not allow"
+    sharpest = sharpest_turn(robot, first, limit)
+    radius = f", a radius of {first.speed / sharpest:.3g} m" if sharpest else ""
+    return (
+        f"{first.name} needs more than steering_limit_deg {math.degrees(limit):g}; at {first.speed:g} m/s it turns by "
+        f"at most {sharpest:.3g} rad/s{radius}"
+    )
+
+
+class Variation(Model):
+    """Variation of every command within a run, by default none: what changes only then shows steering and casters."""
+
+    weave: NonNegative = Field(0.0, description="by which the rate of turn swings about the command's, rad/s")
+    period: Positive = Field(4.0, description="of the weave, s")
+    reversals: int = Field(0, ge=0, le=1000, description="of the speed within a run; the rate of turn goes on")
+
+    @property
+    def is_none(self) -> bool:
+        """True if a run holds its command throughout."""
+        return not self.weave and not self.reversals
+
+    def extremes(self, command: Command) -> tuple[Command, ...]:
+        """The command with the slowest and with the fastest rate of turn that it takes."""
+        if not self.weave:
+            return (command,)
+        return tuple(replace(command, turn_rate=command.turn_rate + side * self.weave) for side in (-1, 1))
+
+    def wheels(self, robot: Robot, command: Command, times: Array, *, ends: bool) -> tuple[Array, Array]:
+        """Wheel rates (F, N), rad/s, and steering angles (F, S), rad, by the design in samples that end at times (F,).
+
+        ends: at the samples' ends, else in their middles. Between two reversals steering angles are continuous; after
+        each a wheel that would steer by more than a quarter turn drives backward.
+        """
+        middles = times - np.diff(times, prepend=0.0) / 2
+        legs = np.floor(middles / times[-1] * (self.reversals + 1)).astype(int)
+        swing = self.weave * np.sin(2 * math.pi / self.period * (times if ends else middles))
+        straight = replace(command, turn_rate=0.0).twist
+        turning = replace(command, speed=0.0, turn_rate=1.0).twist
+        twists = (1 - 2 * (legs % 2))[:, None] * straight + (command.turn_rate + swing)[:, None] * turning
+        rates, steering = robot.drive.commands(twists @ robot.signal_equations.T)
+        for wheel, pair in enumerate(robot.drive.pairs):
+            if pair >= 0:
+                angles = _within_legs(steering[:, pair], legs)
+                rates[:, wheel] *= np.sign(np.cos(angles - steering[:, pair]))
+                steering[:, pair] = angles
+        return rates, steering
+
+
+STEADY = Variation()  # a run holds its command throughout
+
+
+def _within_legs(angles: Array, legs: NDArray[np.intp]) -> Array:
+    """Directions (F,) of rolling, rad, either way: continuous in each leg, which begins within a quarter turn."""
+    chosen = np.empty_like(angles)
+    for leg in np.unique(legs):
+        part = np.unwrap(angles[legs == leg], period=math.pi)
+        chosen[legs == leg] = part - math.pi * round(part[0] / math.pi)
+    return chosen
+
+
+@dataclass(frozen=True)
+class TimedCommand:
+    """A motion command with its duration, s.
+
+    ramp: time at its start and its end in which the speed changes, s. variation: of the command within the run.
+    """
+
+    command: Command
+    duration: float
+    ramp: float = 0.0
+    variation: Variation = STEADY
+
+
+_ASIDE = 1e-6  # sine of a direction off that of rolling, above which wheels would slide: rounding of degrees
+
+
+class MotionGrid(Model):
+    """Motion commands: every direction with every rate of turn, at each speed."""
+
+    speeds: tuple[NonNegative, ...] = Field((0.2,), min_length=1, description="m/s")
+    directions_deg: tuple[FiniteFloat, ...] | None = Field(
+        None, min_length=1, description="default: every 45; forward and backward for a robot that cannot go sideways"
+    )
+    turn_rates: tuple[FiniteFloat, ...] = Field(min_length=1, description="rad/s")
+    turn_duration: Positive = Field(6.0, description="duration of turns on the spot, s")
+
+    @property
+    def moves(self) -> bool:
+        """True if some command moves the robot."""
+        return any(self.speeds) or any(self.turn_rates)
+
+    def directions(self, robot: Robot) -> tuple[float, ...]:
+        """Directions, deg, for a robot. ValueError: its fixed wheels do not roll in one that is given."""
+        if self.directions_deg is None:
+            return default_directions(robot)
+        rolls = straight_and_pivot(robot)
+        for direction in self.directions_deg:
+            if rolls is not None and abs(math.sin(math.radians(direction) - rolls[0])) > _ASIDE:
+                forward, backward = default_directions(robot)
+                raise ValueError(
+                    f"directions_deg: this robot's fixed wheels would slide at {direction:g} deg; give {forward:g} and "
+                    f"{backward:g}, or leave directions_deg out"
+                )
+        return self.directions_deg
+
+    def extremes(self, command: Command) -> tuple[Command, ...]:
+        """The commands between which a run of this one varies."""
+        return (command,)
+
+    def grid(self, robot: Robot) -> list[Command]:
+        """Every direction with every rate of turn, at each speed; the direction of a turn on the spot is 0.
+
+        ValueError as for ``directions``.
+        """
+        rolls = straight_and_pivot(robot)
+        pivot = (0.0, 0.0) if rolls is None else rolls[1]
+        directions = self.directions(robot)
+        return [
+            Command(speed, math.radians(direction), turn_rate, pivot)
+            for speed, turn_rate in product(self.speeds, self.turn_rates)
+            for direction in (directions if speed > 0 else (0.0,))
+            if speed or turn_rate
+        ]
+
+
+class SingleCommand(Model):
+    """One command with its own duration."""
+
+    speed: NonNegative = Field(0.0, description="m/s")
+    direction_deg: FiniteFloat = Field(0.0, description="degrees, in the robot's frame")
+    turn_rate: FiniteFloat = Field(0.0, description="rad/s")
+    duration: Positive = Field(description="s")
+
+    @model_validator(mode="after")
+    def _moves(self) -> Self:
+        if not self.speed and not self.turn_rate:
+            raise ValueError("this command does not move the robot; give a speed or a turn_rate")
+        return self
+
+    def command(self, robot: Robot) -> Command:
+        """The motion command. ValueError: the robot's wheels do not roll in its direction."""
+        directions = (self.direction_deg,) if self.speed else None
+        grid = MotionGrid(speeds=(self.speed,), directions_deg=directions, turn_rates=(self.turn_rate,))
+        return grid.grid(robot)[0]
+
+    def commands(self, robot: Robot) -> Iterator[TimedCommand]:
+        """The one command, as a grid has many. ValueError as for ``command``."""
+        yield TimedCommand(self.command(robot), self.duration)
+
+
+class ListedCommand(SingleCommand):
+    """One command with its own duration, start and repetitions."""
+
+    duration: Positive = Field(description="with its ramps, s")
+    repetitions: int = Field(1, gt=0, le=1000)
+    heading_deg: FiniteFloat | None = Field(None, description="at the start, degrees; default: as start says")
+
+
+class Commands(MotionGrid):
+    """Motion commands, a grid or a list, and the ramps with which they are driven."""
+
+    turn_rates: tuple[FiniteFloat, ...] = Field((), description="rad/s")
+    listed: tuple[ListedCommand, ...] = Field((), description="commands one by one, in the place of the grid")
+    ramp: NonNegative = Field(0.0, description="time in which wheel rates rise and fall, which is added to the run, s")
+    variation: Variation = Field(STEADY, description="of the commands within a run")
+
+    @model_validator(mode="after")
+    def _are_given(self) -> Commands:
+        if not self.turn_rates and not self.listed:
+            raise ValueError("give turn_rates (rad/s) of a grid of commands, or listed commands")
+        return self
+
+    @property
+    def moves(self) -> bool:
+        return bool(self.listed) or super().moves
+
+    def extremes(self, command: Command) -> tuple[Command, ...]:
+        return self.variation.extremes(command)
+
+    def grid(self, robot: Robot) -> list[Command]:
+        if not self.listed:
+            return super().grid(robot)
+        return list(dict.fromkeys(each.command(robot) for each in self.listed))

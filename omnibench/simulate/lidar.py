@@ -1,0 +1,159 @@
+"""A simulated planar LIDAR: ranges from the robot's true poses, ray by ray as the mirror turns."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import shapely
+from pydantic import Field, FiniteFloat, model_validator
+
+from omnibench.config import Model, NonNegative, Positive
+from omnibench.data.scans import Mount, Scanner, TrajectoryScans
+from omnibench.data.true_poses import TruePath
+from omnibench.errors import DataError
+from omnibench.robot.kinematics import Array, compose
+from omnibench.simulate.floor_plan import FloorPlan
+
+_SHORTEST_PERIOD = 0.001  # s between scans; a shorter one is a mistake of units
+
+
+class LidarMount(Model):
+    """Pose of the LIDAR in the robot's frame, or in that of its tracked point where it has a ``mount``."""
+
+    x: FiniteFloat = Field(0.1, description="m, forward")
+    y: FiniteFloat = Field(0.0, description="m, left")
+    yaw_deg: FiniteFloat = Field(0.0, description="degrees, counter-clockwise")
+    pitch_deg: float = Field(0.0, ge=-60, le=60, description="degrees, tilted down ahead: rays may meet the floor")
+    height: Positive = Field(0.5, description="m above the floor; without effect on a horizontal scanner")
+
+    @property
+    def in_radians(self) -> Mount:
+        """The mount as data sets describe it; a horizontal scanner's height is left out."""
+        height = self.height if self.pitch_deg else 0.0
+        yaw, pitch = math.radians(self.yaw_deg), math.radians(self.pitch_deg)
+        return Mount(x=self.x, y=self.y, yaw=yaw, pitch=pitch, height=height)
+
+
+class Lidar(Model):
+    """A planar LIDAR; the defaults are those of the Hokuyo UTM-30LX of the paper's robot.
+
+    Its data sheet (Hokuyo Automatic, UTM-30LX specification): 0.1 to 30 m, 270 degrees in steps of 1/1440 of a turn,
+    25 ms a turn, sigma of a range below 10 mm up to 10 m and below 30 mm beyond; its protocol gives whole mm. It has
+    1081 ranges from -135 to 135 degrees; the paper's Table 1 keeps 1080.
+    """
+
+    name: str = "Hokuyo UTM-30LX"
+    rays: int = Field(1080, gt=0, le=100_000, description="ranges of a scan")
+    field_of_view_deg: float = Field(
+        270.0, gt=0, le=360, description="degrees, ahead in the middle; rays are field_of_view_deg / rays apart"
+    )
+    turn_time: float = Field(0.025, ge=0, le=10, description="s for a whole turn of the mirror")
+    range_min: NonNegative = Field(0.1, description="m; nearer walls are not seen")
+    range_max: Positive = Field(30.0, description="m; walls farther off are not seen")
+    noise: float = Field(0.01, ge=0, le=10, description="standard deviation of a range, m")
+    far_noise: float = Field(0.03, ge=0, le=10, description="standard deviation of ranges beyond far, m")
+    far: Positive = Field(10.0, description="m")
+    resolution: float = Field(0.001, ge=1e-6, le=1, description="step of the ranges, m")
+    mount: LidarMount = LidarMount()
+    period: tuple[float, float] = Field((0.2, 0.3), description="shortest and longest time between scans, s")
+    latency: float = Field(0.0, ge=0, le=1, description="from a scan's first ray to its stamp, s")
+    dropouts: float = Field(0.001, ge=0, lt=1, description="probability that a ray returns nothing")
+    distortion: bool = Field(
+        True, description="rays are measured one after another while the robot moves; false: all at once"
+    )
+
+    @model_validator(mode="after")
+    def _scans_follow_each_other(self) -> Lidar:
+        if self.range_min >= self.range_max:
+            raise ValueError(f"range_min {self.range_min:g} m is not below range_max {self.range_max:g} m")
+        low, high = self.period
+        if not (_SHORTEST_PERIOD <= low <= high < math.inf):
+            raise ValueError(
+                f"period: expected the shortest and the longest time between scans, from {_SHORTEST_PERIOD:g} s on "
+                f"(given: {low:g}, {high:g})"
+            )
+        if low < self.sweep:
+            raise ValueError(
+                f"period: {low:g} s; a scan alone takes {self.sweep:g} s, give more or a shorter turn_time"
+            )
+        return self
+
+    @property
+    def sweep(self) -> float:
+        """Duration of a scan, s."""
+        return self.turn_time * self.field_of_view_deg / 360 if self.distortion else 0.0
+
+    @property
+    def scanner(self) -> Scanner:
+        """Description of the scanner in the data set."""
+        increment = math.radians(self.field_of_view_deg) / self.rays
+        rounding = self.resolution / math.sqrt(12)
+        return Scanner(
+            name=self.name,
+            rays=self.rays,
+            angle_min=-math.radians(self.field_of_view_deg) / 2,
+            angle_increment=increment,
+            time_increment=self.sweep / self.rays,
+            range_min=self.range_min,
+            range_max=self.range_max,
+            noise=max(self.noise, rounding),
+            far_noise=max(self.far_noise, rounding),
+            far=self.far,
+            mount=self.mount.in_radians,
+        )
+
+
+def scan_stamps(lidar: Lidar, end: float, rng: np.random.Generator) -> Array:
+    """Stamps (S,) of scans, s, from 0 on at random intervals; the last scan is complete by ``end``.
+
+    DataError in one line: there is no time for a single scan.
+    """
+    last = end - max(lidar.sweep - lidar.latency, 0.0)
+    if last < 0:
+        raise DataError(
+            f"the run ends at {end:g} s, before the LIDAR's first scan is over; drive longer or let it rest"
+        )
+    low, high = lidar.period
+    between = rng.uniform(low, high, size=math.ceil(last / low))
+    stamps = np.concatenate([[0.0], np.cumsum(between)])
+    return stamps[stamps <= last]
+
+
+def measure_scans(
+    plan: FloorPlan, lidar: Lidar, track: TruePath, stamps: Array, rng: np.random.Generator
+) -> TrajectoryScans:
+    """Scans of a room at stamps (S,), s, which include the latency.
+
+    Each ray starts at the scanner's pose when it is measured. Walls and obstacles are as high as the rays of a tilted
+    scanner reach; its rays end on the floor where that is nearer. DataError in one line: the scanner is inside a wall,
+    or a scan sees nothing.
+    """
+    from omnibench.simulate.ray_casting import cast_rays  # numba takes half a second to load
+
+    scanner = lidar.scanner
+    measured = stamps - lidar.latency
+    _check_places(plan, scanner.mount, track, measured)
+    to_walls = cast_rays(plan.segments, scanner, track.times, track.poses, measured) / scanner.level_shares
+    true = np.minimum(to_walls, scanner.floor_ranges)
+    ranges = true + rng.standard_normal(true.shape) * np.where(true > lidar.far, lidar.far_noise, lidar.noise)
+    ranges = lidar.resolution * np.round(ranges / lidar.resolution)
+    seen = (true <= lidar.range_max) & (ranges <= lidar.range_max) & (ranges >= lidar.range_min)
+    seen &= rng.uniform(size=true.shape) >= lidar.dropouts
+    for row in np.flatnonzero(~seen.any(axis=1))[:1]:
+        x, y, _ = track.at(measured[row])
+        raise DataError(
+            f"the LIDAR sees nothing at {stamps[row]:g} s, the robot at ({x:.2f}, {y:.2f}) m: no wall from "
+            f"{lidar.range_min:g} to {lidar.range_max:g} m; choose a smaller room, or more range or fewer dropouts"
+        )
+    return TrajectoryScans(stamps, np.where(seen, ranges, np.inf).astype(np.float32))
+
+
+def _check_places(plan: FloorPlan, mount: Mount, track: TruePath, times: Array) -> None:
+    x, y, _ = compose(track.at(times), mount.pose).T
+    for row in np.flatnonzero(~shapely.contains_xy(plan.free, x, y))[:1]:
+        place = plan.place_of(np.array([x[row], y[row]]))
+        raise DataError(
+            f"the LIDAR at ({x[row]:.2f}, {y[row]:.2f}) m is {place} of the room {plan.name} at {times[row]:g} s; "
+            "check lidar.mount, the robot's radius and the way it drives"
+        )

@@ -1,1 +1,0 @@
-"""Scan matching: one scan against a growing map."""
