@@ -181,7 +181,7 @@ def _extension(problem: CalibrationProblem, shrunk: RunResult, network: Network,
     """The network, the motions it was trained on, and the matrix to which it fades beyond.
 
     The covariance of the matrix is that of its fit. The variance of the share is such that, by Eq. (3) and (4) of
-    fade.py, the network is gone at one width from the motions that it was trained on.
+    corrections.py, the network is gone at one width from the motions that it was trained on.
     """
     assert shrunk.matrix is not None  # there is an answer
     matrix, size = shrunk.matrix, shrunk.matrix.size

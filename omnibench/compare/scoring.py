@@ -55,7 +55,7 @@ class SplitScorer:
     def final_errors(self, matrix: Array) -> Array:
         """Odometry minus reference (Z, 3) at the last reference pose of every trajectory, m, m, rad.
 
-        Of one without poses: what ``with_mean_errors`` of reference_errors.py says.
+        Of one without poses: what ``with_mean_errors`` of reference_rows.py says.
         """
         errors = self._ends.poses(matrix[None])[0] - self._final
         return with_mean_errors(errors, matrix, self._trajectories, self._integration)

@@ -376,7 +376,7 @@ _LEAST_STEERING = math.radians(10.0)  # rad: limit of the steering where a robot
 _TURNING = 1.0  # rad/s: at most, where the robot never turned as fast (chosen)
 _WEAVE, _WEAVE_PERIOD = 0.3, 3.0  # rad/s and s, by which the rate of turn swings: gear play of a degree shows (chosen)
 _COARSE = 0.05  # s: shorter samples tell the same of constant commands
-_STAMPS = 80  # reference poses of a run that a fit uses, at most: see fit/least_squares/usable_runs.py
+_STAMPS = 80  # reference poses of a run that a fit uses, at most: see fit/trajectory_fit.py
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ robot does the same again: at one stamp of a command's repetitions, or of most r
 The plain matrix, and matrix and effects, fitted in turn with the noise and the nuisances that they leave.
 
 The covariance of matrix elements and parameters is that of every trajectory fit
-(fit/least_squares/trajectory_covariance.py).
+(fit/calibrators/trajectory_ml.py).
 """
 
 from __future__ import annotations

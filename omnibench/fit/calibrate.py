@@ -109,7 +109,7 @@ def calibrate(
     intervals: also draw resampled intervals about the optimum (closed_form only), unless there are fewer than three
     commands (runs, where none is repeated) or too few for a covariance, of which a warning tells.
     loss: of the cost's pose errors when they are fitted. squares: as the calibrator takes them; huber, student_t: poses
-    that are far off have a bounded influence (see loss/losses.py).
+    that are far off have a bounded influence (see fit/loss.py).
     unidentified: for motions that the data drive so little that slip alone may explain them, ``keep`` the design values
     or ``fit`` them (see make_parameterisation); ``shrink`` keeps them and shrinks what else is hardly known to the
     design, of the given tolerance (see shrinkage.py). The run's warnings name them. mount: ``known``, or ``fit`` where

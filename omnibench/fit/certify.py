@@ -1,7 +1,7 @@
 """Certificate of optimality: a proven bound on how much better than a calibration any matrix in a box could be.
 
 Branch and bound on the matrix elements (Horst and Tuy, Global Optimization, 1996, ch. IV): the parts P that the box is
-cut into have the bounds b(P) of bounds/lower_bound.py, and M is the best matrix that is known. At any time
+cut into have the bounds b(P) of fit/certify.py, and M is the best matrix that is known. At any time
 
     min over P of b(P)  <=  least cost in the box  <=  F(M)                                        (C1)
     gap = 1 - min b(P) / F(M).                                                                     (C2)
@@ -16,7 +16,7 @@ At row 3 = m3 + d, with the angles a_k that sample k drives and c_k before it al
     |d^2 S_sj / dd_l dd_m| <= sum_k |a_kj c_kl c_km|.                                              (S2)
 
 An Euler step is one sample k. An arc is an integral along the sample, taken by Gauss-Legendre quadrature with enough
-nodes that its error (impulses.py) sums up to q = 1e-9 m at most over a run, for every matrix of the box.
+nodes that its error (evaluator.py) sums up to q = 1e-9 m at most over a run, for every matrix of the box.
 
 Rounding: with u = 2^-53, n additions into one number are wrong by less than 1.01 n u of the largest magnitude that
 their partial sums have (Higham, Accuracy and Stability of Numerical Algorithms, 2002, sections 3.1 and 4.2). With L the
@@ -71,7 +71,7 @@ h_j = H_j + dH_j.delta there,
         + sum_j [min over D_1j of D_1j Re h_j + min over D_2j of -D_2j Im h_j]                   (B6)
     F >= L - 1/2 sum_lm rho_l rho_m (B_0lm + sum_j max|zeta_j| B_jlm) - w (q + e),               (B7)
 
-w the largest weight, q the error of the quadrature of arcs and e that of rounding (stamp_sums.py). u_s with heading
+w the largest weight, q the error of the quadrature of arcs and e that of rounding (certify.py). u_s with heading
 components alone have H = 0: they are taken where others prove nothing beyond the part that was cut, as in wide boxes.
 
 The part is cut where its width takes most from (B7), which is at most

@@ -5,7 +5,7 @@ For a given row 3 of the matrix positions are linear in rows 1 and 2 (odometry.p
     G_j(m3) = sum_i a_ij exp(i m3.c_i)
 
 are smooth functions of row 3 alone. Over a box they are expanded once in Chebyshev polynomials, of which a singular
-value decomposition leaves some hundred combinations (expansion_plan.py). The poses of a population then are two matrix
+value decomposition leaves some hundred combinations (evaluator.py). The poses of a population then are two matrix
 products, whatever the sampling rate. A recording whose heading the box turns too far for one expansion is cut into
 segments, each in the frame of its anchor, whose heading is linear in row 3 too; they are joined in the end.
 Runs that are read from files have an evaluator for each part of them.

@@ -2,7 +2,7 @@
 
 Minimum of a robust cost by reweighted Gauss-Newton steps within the box.
 
-At the weights w of fit/loss/losses.py, Eq. (5), of the present errors e_i, a step d minimises
+At the weights w of fit/loss.py, Eq. (5), of the present errors e_i, a step d minimises
 
     sum_i p_i w_i |e_i + J_i d|^2,                                                                        (1)
 

@@ -301,7 +301,7 @@ def _told(design: OdometryModel, run: Trajectory, end: int) -> Array:
 
 
 class RobustCost(Cost):
-    """The norms of a cost's pose errors under a loss with an estimated scale, Eq. (1) to (4) of losses.py.
+    """The norms of a cost's pose errors under a loss with an estimated scale, Eq. (1) to (4) of loss.py.
 
     base: the cost, whose stamps, norms and shares these are. Single poses that are far off have a bounded influence. A
     start that is off, or at costs of the final pose an end, spoils a run: its poses then are far off together.

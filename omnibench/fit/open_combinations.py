@@ -25,14 +25,14 @@ from omnibench.robot.odometry import Integration
 from omnibench.words import plural
 
 # Share of a row's largest element: a larger standard deviation tells less than the design does, whose wheels are known
-# to 2 % and their common errors to 5 % (shrinkage/prior.py), and two of them and a half reach the box of 25 %.
+# to 2 % and their common errors to 5 % (fit/prior.py), and two of them and a half reach the box of 25 %.
 WORST = 0.10
 # Standard deviation, m and rad, for which reference poses count beside the others: that of a first guess (noise.py).
 _OF_POSES = 0.01
 
 
 # Share, squared, of an element in the open directions from which on it counts as open: what 5 % of the design there
-# leave of it is then 0.2 % (as _UNIDENTIFIED of uncertainty/physical.py).
+# leave of it is then 0.2 % (as _UNIDENTIFIED of fit/identifiability.py).
 _SHARE = 1e-3
 
 

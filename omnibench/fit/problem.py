@@ -83,7 +83,7 @@ class CalibrationProblem:
     """Training trajectories, a start, a box, a budget and a cost to be minimised.
 
     trajectories: the training runs; a calibrator cannot reach the validation runs. ends_moved: names of those whose
-    start (or end) has jumped, and is taken from the poses beside it, as a robust loss does (loss/end_poses.py).
+    start (or end) has jumped, and is taken from the poses beside it, as a robust loss does (fit/loss.py).
     start (n,): the vector of the design values; lower, upper (n,): its box; names: of its n elements.
     free (n,): True for elements that may be searched; the others keep their start values.
     objective: the Cost. cost(candidates): its values, counted against the budget and recorded; a search calls this.

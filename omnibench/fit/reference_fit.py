@@ -5,7 +5,7 @@ which wanders by random walks w_p of position and w_h of heading (m and rad per 
 
     C = diag(s^2) + w_p^2 G_p + w_h^2 G_h,                                                                (1)
 
-with the G of wander.py. With the columns J of what is fitted, N of the run's start
+with the G of reference_fit.py. With the columns J of what is fitted, N of the run's start
 where it is not known, and P = C^-1 - C^-1 N (N'C^-1 N)^-1 N'C^-1, the walks maximise the restricted likelihood
 
     -2 ln L = sum_z (ln |C| + ln |N'C^-1 N| + r'P r) + ln |A| - b'A^-1 b,   A = sum J'P J,   b = sum J'P r   (2)

@@ -44,7 +44,7 @@ the term E_k, by the s of its session's repetitions, or of all where it has none
 
 Sessions that differ, and by what: the radii of the wheels, one of them, or more than radii.
 
-The tests are those of session_contrast.py. Looked for are a common change of all radii (d = 1), one of each (d = N) and
+The tests are those of sessions.py. Looked for are a common change of all radii (d = 1), one of each (d = N) and
 any change of the matrix (d = 3N); the least chance counts, times three and times the number of sessions that are tested
 (Bonferroni). The session that differs most is taken out, and the others are tested again.
 
@@ -88,7 +88,7 @@ from omnibench.words import plural
 # Share of a command's median duration that a run must last: a shorter one would cut all others (chosen).
 _WHOLE = 0.5
 # Share of the largest singular value below which a direction is rounding, and of the noise model's variance below which
-# the scatter is: repetitions that agree exactly (trajectory_covariance.py).
+# the scatter is: repetitions that agree exactly (trajectory_ml.py).
 _ROUNDING = 1e-6
 
 
@@ -302,7 +302,7 @@ def _total_variance(covariance: Array) -> float:
 # Chance at which sessions are said to differ that do not, over all that is tested: strict, as one such answer in a
 # hundred is too many, and enough to see 0.5 % of one radius in 60 + 60 runs (tests/studies/session_study.py).
 CHANCE = 0.001
-# Level of the tests for nuisances, that of discover (discover/fitting/model_fit.py).
+# Level of the tests for nuisances, that of discover (discover/fitting.py).
 _NUISANCES = 1e-4
 # Chance of what is left from which on a change of radii counts as all that differs: chosen; words alone hang on it.
 _ALL = 0.01

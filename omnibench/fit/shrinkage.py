@@ -47,7 +47,7 @@ def shrunk(problem: CalibrationProblem, result: RunResult, *, fitted: bool = Tru
     """A calibrator's result, shrunk to the design where the problem ``shrinks``; otherwise, or unanswered, as it is.
 
     fitted: False for an answer that was not fitted to the runs, which is not shrunk; neither is one with effects beside
-    the matrix, whose calibrator shrinks the matrix before it fits these (shrunk_matrix.py). Covariance and degrees of
+    the matrix, whose calibrator shrinks the matrix before it fits these (shrinkage.py). Covariance and degrees of
     freedom of the result are the posterior's; an answer without its own that runs without a start heading mislead has
     none. Elements that lay on a bound before are said to, since it bent the others.
     """

@@ -6,8 +6,8 @@ step (d, e) minimises over all runs
 
     |W (r - J d - N e)|^2 + |(eta + e) / S|^2.                                                            (1)
 
-Whatever d is, the nuisances eta + e of a run are those of nuisances.py, Eq. (1), for the residuals r + N eta - J d.
-Eliminated, they leave plain least squares in d, whose columns whitened.py makes.
+Whatever d is, the nuisances eta + e of a run are those of Eq. (1) for the residuals r + N eta - J d. Eliminated, they
+leave plain least squares in d.
 
 Nuisances of each run: its start heading, and the offset and slope of the reference's clock.
 

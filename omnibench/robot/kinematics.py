@@ -3,7 +3,7 @@
 A wheel that rolls in one direction, or on rollers, has the equation ``omega = row . (vx, vy, w)`` with the row
 ``(-sin d + tan g cos d, cos d + tan g sin d, R) / r``: d is the direction of the wheel's axle, g the angle of its
 rollers (0: none), R the lever arm of the driving force about the robot's centre, r the radius. A steered wheel at
-(x, y) whose rate is measured has two, for its signals omega cos phi and omega sin phi (drive.py):
+(x, y) whose rate is measured has two, for its signals omega cos phi and omega sin phi (kinematics.py):
 
     (omega cos phi, omega sin phi) = (vx - y w, vy + x w) / r.                                        (1)
 

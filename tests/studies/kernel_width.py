@@ -1,4 +1,4 @@
-"""Study of the kernel of fit/uncertainty/sandwich.py: the stated deviation of a median, divided by the true one.
+"""Study of the kernel of fit/sandwich.py: the stated deviation of a median, divided by the true one.
 
     python tests/studies/kernel_width.py [--draws 1000]
 

@@ -7,7 +7,7 @@ One line of JSON a set, added as it comes: run again with the same file, and it 
 
 The simulation shares nothing with the package: wheel equations stand here, and every run is one exact arc. Each set is
 a robot of its own. About its drawing its true geometry spreads by what data sheets and the literature say, and not by
-the prior that shrinkage assumes (fit/shrinkage/prior.py). Standard deviations, if not said otherwise:
+the prior that shrinkage assumes (fit/prior.py). Standard deviations, if not said otherwise:
 
 - all: the radius of a wheel 0.5 %, of all wheels together 1 % (load, pressure);
 - differential: the track 1 %;

@@ -23,7 +23,7 @@ any direction, residuals scatter with variance 1 + delta^2 N beside it, and chi-
 The discrepancy is estimated from the data: delta^2 is the share of N that generic bases still find beside the chosen
 effects in all their forms, within bounds.
 
-Families. An effect is a family of forms (robot/effects/forms.py). Let z be the m scores of the form columns of a set
+Families. An effect is a family of forms (robot/effects/effect.py). Let z be the m scores of the form columns of a set
 beyond X, independent and divided by the square root of 1 + delta^2 N, their values normal with the variance v beyond
 chance. With the likeliest v the forms raise the evidence, and the more so the less they have to explain:
 

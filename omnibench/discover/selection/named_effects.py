@@ -1,6 +1,6 @@
 """Named effects: those that were selected, with 95 % intervals, probabilities and doubts; and all that were tried.
 
-The intervals are those of the fit's covariance by Student's t, fit/uncertainty/intervals.py.
+The intervals are those of the fit's covariance by Student's t, fit/information.py.
 """
 
 from __future__ import annotations

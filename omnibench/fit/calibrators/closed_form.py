@@ -6,7 +6,7 @@ linearised about the present matrix, which makes the minimisation of a sum of no
 steps are so small that a few programs converge, to a local minimum: that no other is lower is proven afterwards, and
 only to a gap (certify.py).
 
-A robust loss has no cone program: its minimum is found by reweighted least squares (least_squares/reweighted.py), from
+A robust loss has no cone program: its minimum is found by reweighted least squares (fit/gauss_newton.py), from
 the linear fit to Huber's loss and, where that is asked for, from there to Student's t.
 """
 

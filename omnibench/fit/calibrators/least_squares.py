@@ -12,7 +12,7 @@ and the matrix is the minimiser over the box of the quadratic program
 with the shares p_s and the weights W of the cost, whose norms |W e_s| it squares. Two things set it apart from the
 minimum of the cost: squares give the worst runs more weight, and positions are not charged for errors of row 3.
 
-With a robust loss the squares of Eq. (2) get the weights of fit/loss/losses.py, Eq. (5), at the errors of the matrix
+With a robust loss the squares of Eq. (2) get the weights of fit/loss.py, Eq. (5), at the errors of the matrix
 before, until it stays (iteratively reweighted least squares; Holland and Welsch, Comm. Stat. A 6:813, 1977): Huber's
 from the least squares on, since its minimum is the only one, and Student's t from Huber's. Headings of poses that come
 out far off are left out of G_s, and the rest is done again.

@@ -1,6 +1,6 @@
 """Most probable matrix and lost wheel rate, by the whole paths and by what is known of the robot's design.
 
-The unknowns are x = (z, d): the matrix K = K0 + L z with a root L of the prior's covariance (physical_prior.py), and
+The unknowns are x = (z, d): the matrix K = K0 + L z with a root L of the prior's covariance (prior.py), and
 the rate d that every turning wheel gains or loses (effect ``wheel_dead_zone``), of standard deviation s. A run's path
 is cut into eight stretches and its end. With the medians r = (x, y, heading) of the odometry's errors at the reference
 poses of each stretch, which single poses that have jumped do not move,

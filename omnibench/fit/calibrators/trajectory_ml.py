@@ -1,6 +1,6 @@
 """Maximum likelihood over whole trajectories: every reference pose, weighted by the noise that repetitions show.
 
-The reference errors of a run are white noise, a random walk and a bias (least_squares/noise.py), whose variances are
+The reference errors of a run are white noise, a random walk and a bias (fit/noise.py), whose variances are
 estimated from the differences between repetitions of a command. Generalised least squares with these variances is
 statistically efficient as long as the model is right. Nuisances of each run:
 
@@ -13,16 +13,16 @@ statistically efficient as long as the model is right. Nuisances of each run:
 Where the runs scatter more than their noise explains, no matrix is right, and the best one depends on its purpose: the
 squared pose errors at the stamps of the problem's cost are then minimised, with starts and clocks kept as the
 likelihood found them. The covariance is that of the noise model, or the sandwich of the scatter
-(uncertainty/sandwich.py), also where no repetition shows the noise.
+(fit/sandwich.py), also where no repetition shows the noise.
 
-With a robust loss poses and starts that are off have less weight (least_squares/robust_noise.py), and the noise is that
+With a robust loss poses and starts that are off have less weight, and the noise is that
 of the others.
 
 Noise with heavy tails: single poses, and starts of runs, that are off by more than the noise explains.
 
 An error of a pose is compared with what the other poses of its run say of it. With u its difference from that and V
 the variance of u under the noise, diagonal over the coordinates, and s the scale of all poses by Eq. (2) or (4) of
-fit/loss/losses.py, at least 1, its weight w (Eq. 5 there, 1 for no error) gives the pose the variance
+fit/loss.py, at least 1, its weight w (Eq. 5 there, 1 for no error) gives the pose the variance
 
     V / w,   w = w(x / s),   x^2 = u' V^-1 u,                                                              (1)
 
@@ -223,7 +223,7 @@ class FitCovariance:
     """Covariances of the numbers (n,) of a whitened fit, from its noise model and from the scatter of its runs.
 
     by_model: inverse of the information, zero along undetermined directions. scatter: the sandwich of
-    uncertainty/sandwich.py, None if there are too few runs. Both are zero in rows and columns whose ``unit`` (n,) is 0;
+    fit/sandwich.py, None if there are too few runs. Both are zero in rows and columns whose ``unit`` (n,) is 0;
     others are the units of the numbers in which directions are judged as undetermined. curvature: of a robust loss, as
     a share of the information of its weights. freedom_of: degrees of freedom (n,) of a covariance (n, n) at most.
     """

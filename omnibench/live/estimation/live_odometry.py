@@ -6,7 +6,7 @@ The covariance P of the pose (x, y, heading) has these parts, P = W + J C J^T + 
   the derivative of the pose after the step with respect to the pose before it.                                 (L2)
 - C is the covariance of the matrix's elements, J the derivative of the pose with respect to them. The matrix errs in
   the same way all the time, so that J adds up along the way.                                                   (L3)
-- E are the deviations of the pose by those of motions that effects extrapolate, Eq. (3) of robot/domain/fade.py; these
+- E are the deviations of the pose by those of motions that effects extrapolate, Eq. (3) of robot/corrections.py; these
   are the same all the time, too, and add up as J does.                                                         (L4)
 
 The matrix moves the tracked point. Where that is mounted off the robot's centre, W and J are of its pose, and what is

@@ -71,7 +71,7 @@ class Effect(ABC):
     run_nuisance: True if it has one value for each run, which is estimated and reported but is no answer of
     ``discover``. measurement: how to measure it, for an effect that a change of the matrix can absorb. only_for: the
     robots to which it applies, in words, where these are not all; then override ``applies``. form_covariates: with what
-    its size may vary (forms.py), by default what follows from shows_in. fixed_parameters: parameters that are the same
+    its size may vary (effect.py), by default what follows from shows_in. fixed_parameters: parameters that are the same
     for every robot; otherwise override ``parameters``. in_catalogue: False for a smooth
     function without physics, which ``discover`` never names. weighted: True if it has weights beside its parameters,
     many numbers that only training finds; then override ``with_weights`` and ``trial_weights``.

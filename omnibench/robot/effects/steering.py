@@ -1,7 +1,7 @@
 """Steering: angles that are measured with a wrong gain, play, lag or zero, and gears that turn the wheel along.
 
 A driven wheel whose rate is measured and that steers has two signals, in which an offset of its angle is a change of
-the matrix (absorbed.py). The wheels of a car that only steer have one, in which an offset is none beyond small angles.
+the matrix (wheels.py). The wheels of a car that only steer have one, in which an offset is none beyond small angles.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Export of a calibration as a self-contained C99 header: the matrix and one step of the odometry.
 
-Drive signals of robots with steered wheels are computed as in wheels/drive.py.
+Drive signals of robots with steered wheels are computed as in robot/kinematics.py.
 """
 
 from __future__ import annotations
