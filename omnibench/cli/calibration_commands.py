@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
+from omnibench.cli.fit_options import FitCommand, chosen_settings
 from omnibench.cli.options import (
     BackendName,
     CalibrationFile,
@@ -29,65 +30,13 @@ from omnibench.cli.terminal.console import make_console, print_ending, print_jso
 calibration_app = typer.Typer()
 
 
-@calibration_app.command()
+@calibration_app.command(cls=FitCommand)
 def calibrate(
+    context: typer.Context,
     dataset: DatasetFolders,
     output: Annotated[
         Path | None, output_option("Calibration file to write. Default: it is only shown.", metavar="FILE.yaml")
     ] = None,
-    calibrator: Annotated[
-        str | None,
-        typer.Option(
-            help="How to search; omnibench list names all. Default: closed_form; trajectory_ml, of runs without poses."
-        ),
-    ] = None,
-    cost: Annotated[
-        str | None,
-        typer.Option(help="What to minimise (see omnibench list). Default: final_pose; trajectory, of few runs."),
-    ] = None,
-    loss: Annotated[
-        Literal["squares", "huber", "student_t"],
-        typer.Option(help="huber, student_t: bound the influence of reference poses that are far off."),
-    ] = "squares",
-    parameterisation: Annotated[
-        Literal["matrix", "geometry"] | None,
-        typer.Option(help="Search the matrix elements, or the wheels' geometry. Default: the calibrator's own."),
-    ] = None,
-    box: Annotated[
-        Literal["paper", "row"],
-        typer.Option(help="Search range. paper: +-10 % of each element; row: +-25 % of the row's largest element."),
-    ] = "row",
-    integration: Annotated[
-        Literal["euler", "arc"],
-        typer.Option(help="Path within a sample. arc: exact for constant rates; euler: the paper's straight step."),
-    ] = "arc",
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the random numbers.")] = 1,
-    evaluations: Annotated[int, typer.Option(min=1, help="Budget: most evaluations of the cost.")] = 60_000,
-    seconds: Annotated[float, typer.Option(min=0.001, help="Budget: longest time, in s.")] = 600.0,
-    intervals: Annotated[
-        bool,
-        typer.Option("--intervals", help="Also draw 95 % intervals of the matrix by resampling (closed_form only)."),
-    ] = False,
-    unidentified: Annotated[
-        Literal["keep", "fit", "shrink"] | None,
-        typer.Option(
-            help="What the data hardly tell: keep the design where motions are hardly driven, fit it all the same, or "
-            "shrink all to the design in proportion to what is known. Default: shrink where wheels say a type but omni."
-        ),
-    ] = None,
-    tolerance: Annotated[
-        float | None,
-        typer.Option(
-            min=1e-6, help="Of the design, for shrink: share of each row's largest element. Default: by class."
-        ),
-    ] = None,
-    mount: Annotated[
-        Literal["known", "fit"] | None,
-        typer.Option(help="Tracked point of a robot that cannot slide. Default: fit for tricycles and cars."),
-    ] = None,
-    steering: Annotated[
-        Literal["known", "fit"], typer.Option(help="fit: first find its gain, play and coupling, and a car's zero.")
-    ] = "known",
     backend: BackendName = None,
     workers: Workers = None,
     tls_ca: TlsAuthority = None,
@@ -108,14 +57,9 @@ def calibrate(
     from omnibench.data.storage import load_dataset
     from omnibench.files import refuse_existing, write_text
     from omnibench.fit.calibrate import calibrate as fit
-    from omnibench.fit.problem import Budget
-    from omnibench.registry import calibrators, costs
 
     load_given_plugins(plugins)
-    if calibrator is not None:
-        calibrators.entry(calibrator, "--calibrator")
-    if cost is not None:
-        costs.entry(cost, "--cost")
+    chosen = chosen_settings(context, parse_settings(settings))
     refuse_existing(output, force=force)
     tls, preload = tls_files(tls_ca, tls_cert, tls_key), ("omnibench.fit.bootstrap",)
     with (
@@ -124,34 +68,16 @@ def calibrate(
         asked_backend(backend, workers, tls, preload, watch) as jobs,
     ):
         recordings = load_dataset(dataset)
-        run = fit(
-            recordings,
-            calibrator,
-            options=parse_settings(settings),
-            cost=cost,
-            loss=loss,
-            parameterisation=parameterisation,
-            box=box,
-            integration=integration,
-            budget=Budget(evaluations=evaluations, seconds=seconds),
-            seed=seed,
-            intervals=intervals,
-            unidentified=unidentified,
-            tolerance=tolerance,
-            mount=mount,
-            steering=steering,
-            watch=watch,
-            backend=jobs,
-        )
+        run = fit(recordings, chosen, watch=watch, backend=jobs)
     calibration, result = run.calibration, run.result
     if output is not None:
         write_text(output, to_yaml(calibration))
     warn([*recordings.warnings, *run.warnings])
     if result.at_bounds:
         when = "" if result.shrinkage is None else " before the answer was shrunk to the design"
-        warn([f"on a bound of the box {box!r}{when}: {', '.join(result.at_bounds)}; a wider box may fit better"])
+        warn([f"on a bound of the box {chosen.box!r}{when}: {', '.join(result.at_bounds)}; a wider box may fit better"])
     if run.untouched:
-        warn([f"not fitted, kept at the start value by the box {box!r} or the cost: {', '.join(run.untouched)}"])
+        warn([f"not fitted, kept at the start value by the box {chosen.box!r} or the cost: {', '.join(run.untouched)}"])
     if as_json:
         return print_json(calibration)
     print_calibration(make_console(), run)

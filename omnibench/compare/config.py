@@ -12,13 +12,13 @@ from pydantic import AfterValidator, BaseModel, Field, field_validator
 from omnibench.config import Model, Positive, RelativePath, printable, read_model, validate
 from omnibench.data.dataset import Split
 from omnibench.errors import ConfigError, OmnibenchError, PluginError, UnknownNameError
-from omnibench.fit.calibrator import unloadable
+from omnibench.fit.calibrator import as_answered, unloadable
 from omnibench.fit.geometry import GeometryLimits
 from omnibench.fit.loss import LossName
 from omnibench.fit.parameterisation import Box, ParameterisationName
 from omnibench.fit.prior import MountChoice
-from omnibench.fit.problem import Budget
 from omnibench.fit.ratio_intervals import Bootstrap
+from omnibench.fit.settings import Budget, CostChoice, FitSettings
 from omnibench.fit.span import Unidentified
 from omnibench.jobs.backend_choice import name_flaw
 from omnibench.jobs.job import TlsFiles
@@ -41,13 +41,6 @@ def _is_squares(loss: object) -> bool:
     return loss == "squares"
 
 
-class CostChoice(Model):
-    """The cost that every calibrator minimises."""
-
-    name: str = Field("final_pose", description="a cost, see omnibench list")
-    options: dict[str, Any] = {}
-
-
 class CalibratorEntry(Model):
     """One entry of the comparison: a calibrator with its options."""
 
@@ -59,6 +52,22 @@ class CalibratorEntry(Model):
     parameterisation: ParameterisationName | None = Field(None, description="default: the calibrator's own")
     box: Box | None = Field(None, description="default: the config's box")
     limits: GeometryLimits | None = Field(None, description="limits of the geometry parameterisation; default: its own")
+
+    def settings(self, common: FitSettings) -> FitSettings:
+        """The settings of the entry's fit: those common to a comparison, with its own and its calibrator's."""
+        calibrator = calibrators.entry(self.name).cls
+        assert common.unidentified is not None  # a comparison says it
+        unidentified, mount = as_answered(calibrator, common.unidentified, common.mount)
+        own = {
+            "calibrator": self.name,
+            "options": self.options,
+            "parameterisation": self.parameterisation or calibrator.parameterisation,
+            "box": self.box or common.box,
+            "limits": self.limits,
+            "unidentified": unidentified,
+            "mount": mount,
+        }
+        return common.model_copy(update=own)
 
 
 class CertificateChoice(Model):
@@ -147,7 +156,12 @@ class CompareConfig(Model):
     @property
     def objective(self) -> str:
         """The names of the cost and of its loss, if it has a robust one."""
-        return self.cost.name if self.loss == "squares" else f"{self.cost.name}, loss {self.loss}"
+        return FitSettings(cost=self.cost, loss=self.loss).objective
+
+    def settings(self, entry: CalibratorEntry, seed: int) -> FitSettings:
+        """The settings of an entry's fit."""
+        names = ("cost", "loss", "box", "integration", "budget", "unidentified", "tolerance", "mount")
+        return entry.settings(FitSettings(seed=seed, **{name: getattr(self, name) for name in names}))
 
     @field_validator("calibrators", mode="before", json_schema_input_type=tuple[str | CalibratorEntry, ...])
     @classmethod

@@ -13,7 +13,7 @@ from omnibench.compare.config import load_calibrators
 from omnibench.compare.plan import PlannedRun, RunTask
 from omnibench.errors import DataError, Interrupted
 from omnibench.fit.calibrator import Outcome, RunResult, Timing, describe_error, run_calibrator
-from omnibench.fit.problem import CalibrationProblem
+from omnibench.fit.problem import CalibrationProblem, make_problem
 from omnibench.fit.shrinkage import shrunk
 from omnibench.jobs.job import Backend, BackendError, Failure, Job, JobWatch, ResultStore, run_jobs
 from omnibench.processes import interrupts_not_in_callbacks
@@ -61,7 +61,7 @@ def _job(run: PlannedRun) -> Job[RunResult]:
         run.key,
         _solve,
         run.task,
-        seconds=run.config.budget.seconds + _GRACE,
+        seconds=run.settings.budget.seconds + _GRACE,
         memory_mb=run.config.memory_mb,
         timed=run.config.timing,
         shared=(run.training,),
@@ -75,11 +75,12 @@ class _RunFailed(Exception):  # noqa: N818 (not an error: the outcome of a run t
 def _solve(task: RunTask, report: Reporter) -> RunResult:
     """Solve one run's problem in a worker process."""
     try:
-        load_calibrators(task.config.plugins, [task.entry.name])
-        calibrator = calibrators.create(task.entry.name, task.entry.options)
-        problem = task.problem(report)
+        assert task.settings.calibrator is not None  # the settings are complete
+        load_calibrators(task.plugins, [task.settings.calibrator])
+        calibrator = calibrators.create(task.settings.calibrator, task.settings.options)
+        problem = make_problem(task.settings, task.robot, task.trajectories, report)
         result = shrunk(problem, run_calibrator(calibrator, problem), fitted=calibrator.fitted)
-        if task.config.timing and result.matrix is not None:
+        if task.timing and result.matrix is not None:
             result = replace(result, timing=Timing(_reference_seconds(problem), platform.node()))
     except BaseException as error:  # whatever a plug-in raises, wherever, is this run's outcome
         result = _without_answer(Outcome.FAILED, describe_error(error))
@@ -142,7 +143,7 @@ class _Runs(JobWatch[RunResult]):
         self, number: int, evaluations: int = 0, best: float | None = None, result: str | None = None
     ) -> None:
         run = self._plan[number]
-        budget = run.config.budget.evaluations
+        budget = run.settings.budget.evaluations
         self._report(Progress(run.title, evaluations, budget, "evaluation", best, result=result))
 
     def _result(self, number: int, failure: Failure) -> RunResult:
@@ -157,7 +158,7 @@ class _Runs(JobWatch[RunResult]):
         if not failure.over_time:
             return _without_answer(Outcome.FAILED, failure.reason, *spent)
         run = self._plan[number]
-        reason = f"ended by force: {run.config.budget.seconds:g} s spent without an answer"
+        reason = f"ended by force: {run.settings.budget.seconds:g} s spent without an answer"
         result = _without_answer(Outcome.TIME, reason, *spent)
         self._store.put(run.key, result)  # it would spend them again
         return result

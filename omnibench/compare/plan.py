@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import hashlib
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Protocol
 
 from omnibench.compare.config import CalibratorEntry, CompareConfig
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.splits import training_split
 from omnibench.errors import ConfigError
-from omnibench.fit.calibrator import as_answered
 from omnibench.fit.geometry import GeometryLimits
-from omnibench.fit.loss import with_loss
 from omnibench.fit.parameterisation import Box, ParameterisationName
-from omnibench.fit.problem import CalibrationProblem, make_parameterisation
+from omnibench.fit.problem import CalibrationProblem, make_parameterisation, make_problem
+from omnibench.fit.settings import FitSettings
 from omnibench.jobs.job import code_digest, content_key
 from omnibench.progress import Reporter, no_progress
 from omnibench.registry import calibrators, costs
@@ -30,37 +30,24 @@ _SHARED = (
     "robot/**/*.py",
     "fit/**/*.py",
     "data/dataset.py",
-    "data/references/*.py",
-    "data/stored/*.py",
+    "data/references.py",
+    "data/stored_rows.py",
+    "data/stored_wheels.py",
     "compare/plan.py",
 )
 _CALIBRATORS = "fit/calibrators/*.py"
 _NO_PART = "fit/check/*.py"  # judges recordings before they are fitted
 
 
-def run_key(config: CompareConfig, dataset: Dataset, entry: CalibratorEntry, seed: int) -> str:
-    """The key of one entry's run on one data set with one seed: it changes with all that the result depends on.
+def run_key(settings: FitSettings, dataset: Dataset) -> str:
+    """The key of one run on one data set: it changes with all that the result depends on.
 
     The code behind a run is what all runs share (``robot/``, ``fit/``, trajectories, the problem that a run is given)
     and the files of the calibrators and the cost that it names. Files in ``fit/calibrators/`` that it does not name are
     left out, so that a new calibrator does not discard the stored runs of the others; none of them imports another.
     """
-    return content_key(
-        {
-            "data": dataset.hash,
-            "cost": config.cost,
-            **({} if config.loss == "squares" else {"loss": config.loss}),
-            "integration": config.integration,
-            "unidentified": config.unidentified,
-            "mount": config.mount,
-            "tolerance": config.tolerance,
-            "calibrator": entry.model_dump(mode="json", exclude={"label"}),
-            "box": config.box,
-            "budget": config.budget,
-            "seed": seed,
-            "code": named_code(entry, config.cost.name) + _shared_code(),
-        }
-    )
+    code = named_code(settings) + _shared_code()
+    return content_key({"data": dataset.hash, "settings": settings, "code": code})
 
 
 def shared_code(package: Path) -> str:
@@ -77,10 +64,12 @@ def _shared_code() -> str:
     return shared_code(_PACKAGE)
 
 
-def named_code(entry: CalibratorEntry, cost: str) -> str:
+def named_code(settings: FitSettings) -> str:
     """Hash of the code of the calibrator, of the calibrators that its options name, of the cost, and of their bases."""
-    named = {entry.name, *(value for value in entry.options.values() if isinstance(value, str))}
-    classes = [known.cls for known in calibrators.entries() if known.name in named] + [costs.entry(cost).cls]
+    assert settings.cost is not None  # the settings are complete
+    named = {settings.calibrator, *(value for value in settings.options.values() if isinstance(value, str))}
+    classes = [known.cls for known in calibrators.entries() if known.name in named]
+    classes.append(costs.entry(settings.cost.name).cls)
     modules = {sys.modules.get(base.__module__) for cls in classes for base in cls.__mro__}
     digest = hashlib.sha256()
     for name in sorted({name for cls in classes for name in getattr(cls, "uses", ())}):
@@ -120,97 +109,81 @@ class SearchSpace:
     bounded: bool
 
 
+class RunConfig(Protocol):
+    """The part of a comparison's or a study's config that says how runs are made."""
+
+    @property
+    def plugins(self) -> tuple[Path, ...]: ...
+    @property
+    def timing(self) -> bool: ...
+    @property
+    def memory_mb(self) -> float | None: ...
+
+
 @dataclass(frozen=True)
 class RunTask:
-    """The part of a run that its worker process is sent: the training data, and nothing of the validation data."""
+    """The part of a run that its worker process is sent: the training data, and nothing of the validation data.
 
-    config: CompareConfig
+    plugins: folders of plug-ins to load first. timing: True if the machine's speed is to be measured beside the run.
+    """
+
+    settings: FitSettings
     robot: Robot
     trajectories: tuple[Trajectory, ...]
-    entry: CalibratorEntry
-    parameterisation: ParameterisationName
-    box: Box
-    seed: int
-
-    def problem(self, watch: Reporter = no_progress) -> CalibrationProblem:
-        """The calibration problem; ``watch`` is told the evaluations so far and the best cost."""
-        calibrator = calibrators.entry(self.entry.name).cls
-        unidentified, mount = as_answered(calibrator, self.config.unidentified, self.config.mount)
-        return CalibrationProblem(
-            self.robot,
-            self.trajectories,
-            with_loss(costs.create(self.config.cost.name, self.config.cost.options), self.config.loss),
-            make_parameterisation(
-                self.parameterisation,
-                self.robot,
-                self.trajectories,
-                box=self.box,
-                limits=self.entry.limits,
-                unidentified=unidentified,
-                mount=mount,
-                tolerance=self.config.tolerance,
-            ),
-            integration=self.config.integration,
-            budget=self.config.budget,
-            seed=self.seed,
-            shrinks=unidentified == "shrink",
-            watch=watch,
-        )
+    plugins: tuple[Path, ...]
+    timing: bool
 
 
 @dataclass(frozen=True)
 class PlannedRun:
     """One run: an entry of the config on one data set with one seed.
 
-    training: the data set's training runs, the same object for all runs on it. box: the entry's box of matrix elements,
-    or else the config's; a geometry does not use it. box_name: the name of the bounds that are searched, or
-    ``UNBOUNDED``.
+    config: where the run's plug-ins, timing and memory are from. training: the data set's training runs, the same
+    object for all runs on it. settings: complete; a geometry does not use their box. box_name: the name of the bounds
+    that are searched, or ``UNBOUNDED``.
     """
 
-    config: CompareConfig
+    config: RunConfig
     dataset_name: str
     dataset: Dataset
     training: tuple[Trajectory, ...]
-    entry: CalibratorEntry
+    settings: FitSettings
     label: str
-    parameterisation: ParameterisationName
-    box: Box
     box_name: str
-    seed: int
 
     @property
     def title(self) -> str:
         """Data set, entry and seed."""
-        return f"{self.dataset_name} {self.label} seed {self.seed}"
+        return f"{self.dataset_name} {self.label} seed {self.settings.seed}"
 
     @property
     def element_box(self) -> Box | None:
         """The box of matrix elements that is searched; None for a geometry, or an answer without a box."""
-        return None if self.parameterisation == "geometry" or self.box_name == UNBOUNDED else self.box
+        searched = self.settings.parameterisation != "geometry" and self.box_name != UNBOUNDED
+        return self.settings.box if searched else None
 
     @property
     def search_space(self) -> SearchSpace:
         """The set of matrices that the run chooses from."""
-        limits = (self.entry.limits or GeometryLimits()) if self.parameterisation == "geometry" else self.box
-        return SearchSpace(self.parameterisation, limits, self.box_name != UNBOUNDED)
+        settings = self.settings
+        assert settings.parameterisation is not None  # the settings are complete
+        limits = (settings.limits or GeometryLimits()) if settings.parameterisation == "geometry" else settings.box
+        return SearchSpace(settings.parameterisation, limits, self.box_name != UNBOUNDED)
 
     @property
     def task(self) -> RunTask:
         """The run as its worker process sees it."""
-        return RunTask(
-            config=self.config.model_copy(update={"datasets": {}}),
-            robot=self.dataset.robot,
-            trajectories=self.training,
-            entry=self.entry,
-            parameterisation=self.parameterisation,
-            box=self.box,
-            seed=self.seed,
-        )
+        config = self.config
+        return RunTask(self.settings, self.dataset.robot, self.training, config.plugins, config.timing)
+
+    def problem(self) -> CalibrationProblem:
+        """The run's calibration problem."""
+        return make_problem(self.settings, self.dataset.robot, self.training)
 
     @cached_property
     def key(self) -> str:
         """The key of the run's stored result."""
-        return run_key(self.config, self.dataset, self.entry, self.seed)
+        return run_key(self.settings, self.dataset)
 
 
 def load_datasets(config: CompareConfig, progress: Reporter = no_progress) -> dict[str, Dataset]:
@@ -229,40 +202,36 @@ def make_plan(config: CompareConfig, datasets: Mapping[str, Dataset]) -> list[Pl
         labels: set[str] = set()
         training = dataset.split("train")
         for entry in config.calibrators:
-            cls = calibrators.entry(entry.name).cls
-            parameterisation = entry.parameterisation or cls.parameterisation
-            box = entry.box or config.box
-            box_name = _box_name(config, entry, dataset, parameterisation, box)
-            label = _label(config, entry, parameterisation, box_name, labels)
-            seeds = config.seeds if cls.stochastic else config.seeds[:1]
+            settings = config.settings(entry, config.seeds[0])
+            try:
+                box_name = name_of_bounds(settings, dataset.robot, training)
+            except ConfigError as error:
+                raise ConfigError(f"config {config.name}: calibrator {entry.name!r}: {error}") from None
+            label = _label(config, entry, settings, box_name, labels)
+            seeds = config.seeds if calibrators.entry(entry.name).cls.stochastic else config.seeds[:1]
             plan += [
-                PlannedRun(config, name, dataset, training, entry, label, parameterisation, box, box_name, seed)
+                PlannedRun(config, name, dataset, training, settings.model_copy(update={"seed": seed}), label, box_name)
                 for seed in seeds
             ]
     return plan
 
 
-def _box_name(
-    config: CompareConfig, entry: CalibratorEntry, dataset: Dataset, parameterisation: ParameterisationName, box: Box
-) -> str:
-    if not calibrators.entry(entry.name).cls.bounded:
+def name_of_bounds(settings: FitSettings, robot: Robot, training: Sequence[Trajectory]) -> str:
+    """The name of the bounds that a fit searches, or ``UNBOUNDED``. ConfigError: the robot has no such parameters."""
+    assert settings.calibrator is not None and settings.parameterisation is not None  # noqa: PT018 (complete)
+    if not calibrators.entry(settings.calibrator).cls.bounded:
         return UNBOUNDED
-    try:
-        searched = make_parameterisation(
-            parameterisation, dataset.robot, dataset.split("train"), box=box, limits=entry.limits
-        )
-        return searched.bounds.name
-    except ConfigError as error:
-        raise ConfigError(f"config {config.name}: calibrator {entry.name!r}: {error}") from None
+    box, limits = settings.box, settings.limits
+    return make_parameterisation(settings.parameterisation, robot, training, box=box, limits=limits).bounds.name
 
 
-def _label(config: CompareConfig, entry: CalibratorEntry, parameterisation: str, box: str, taken: set[str]) -> str:
+def _label(config: CompareConfig, entry: CalibratorEntry, settings: FitSettings, box: str, taken: set[str]) -> str:
     """The entry's label, by default its name with the parameterisation or box that is not the usual one."""
     cls = calibrators.entry(entry.name).cls
     label = entry.label or entry.name
     if not entry.label:
-        if parameterisation != cls.parameterisation:
-            label += f" ({parameterisation})"
+        if settings.parameterisation != cls.parameterisation:
+            label += f" ({settings.parameterisation})"
         elif entry.box is not None and entry.box != config.box:
             label += f" ({box} box)"
     if label in taken:

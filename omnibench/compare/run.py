@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from omnibench.compare.config import CompareConfig, effective_config, load_calibrators
+from omnibench.compare.config import CertificateChoice, CompareConfig, effective_config, load_calibrators
 from omnibench.compare.execute import PRELOAD, execute, resumable
 from omnibench.compare.output import check_output, prepare_output, write_results
 from omnibench.compare.plan import UNBOUNDED, PlannedRun, load_datasets, make_plan
@@ -35,6 +35,7 @@ from omnibench.fit.calibrator import RunResult
 from omnibench.fit.certify import prove, proven_gap
 from omnibench.fit.cost import SumOfNorms
 from omnibench.fit.identifiability import warnings_of_calibration
+from omnibench.fit.span import driven_span
 from omnibench.fit.uncertainty import NoCovarianceError, Uncertainty, uncertainty_of
 from omnibench.jobs.backend_choice import BackendChoice, open_backend
 from omnibench.jobs.job import ResultStore
@@ -49,7 +50,7 @@ from omnibench.slam.slam_options import PRELOAD as SLAM_PRELOAD
 
 
 def certify(
-    plan: Sequence[PlannedRun], scored: Sequence[ScoredRun]
+    choice: CertificateChoice | None, plan: Sequence[PlannedRun], scored: Sequence[ScoredRun]
 ) -> tuple[tuple[ScoredRun, ...], tuple[BoxCertificate, ...]]:
     """The runs with their proven gaps, and one proof for each box of matrix elements in which a run gave an answer.
 
@@ -58,14 +59,14 @@ def certify(
     """
     proofs: list[tuple[PlannedRun, BoxCertificate]] = []
     for run, done in zip(plan, scored, strict=True):
-        wanted = run.config.certificate is not None and run.element_box is not None and done.matrix is not None
-        if wanted and not any(_same_box(run, owner) for owner, _ in proofs):
+        wanted = run.element_box is not None and done.matrix is not None
+        if choice and wanted and not any(_same_box(run, owner) for owner, _ in proofs):
             answers = [
                 other.matrix.ravel()
                 for planned, other in zip(plan, scored, strict=True)
                 if other.matrix is not None and planned.dataset_name == run.dataset_name
             ]
-            proofs += [(run, proof) for proof in _proof(run, answers)]
+            proofs += [(run, proof) for proof in _proof(choice, run, answers)]
     return (
         tuple(_with_proven_gap(run, done, proofs) for run, done in zip(plan, scored, strict=True)),
         tuple(proof for _, proof in proofs),
@@ -76,12 +77,11 @@ def _same_box(run: PlannedRun, other: PlannedRun) -> bool:
     return run.dataset_name == other.dataset_name and run.element_box == other.element_box
 
 
-def _proof(run: PlannedRun, answers: Sequence[Array]) -> list[BoxCertificate]:
+def _proof(choice: CertificateChoice, run: PlannedRun, answers: Sequence[Array]) -> list[BoxCertificate]:
     """The lower bound over a run's box, if its cost has one. Good answers (3N,) that are known make it faster."""
-    choice = run.config.certificate
-    problem = run.task.problem()
+    problem = run.problem()
     posed = isinstance(problem.odometry, OdometryBatch)
-    if choice is None or not posed or not isinstance(problem.objective, SumOfNorms):
+    if not posed or not isinstance(problem.objective, SumOfNorms):
         return []
     known = np.stack([problem.start, *answers])
     inside = known[problem.inside(known)]
@@ -127,7 +127,7 @@ def typical_uncertainties(
         if run.box_name == UNBOUNDED or not any(done is one for one in typical):
             continue
         try:
-            uncertainties[run.dataset_name, run.label] = uncertainty_of(run.task.problem(), result)
+            uncertainties[run.dataset_name, run.label] = uncertainty_of(run.problem(), result)
         except NoCovarianceError:
             continue
     return uncertainties
@@ -165,8 +165,8 @@ def run_comparison(
                 with resumable(plan, store, folder), opened.pop_all():  # Ctrl-C while they close is resumable, too
                     results = execute(plan, store, progress, backend)
         with resumable(plan, store, folder):
-            scored = score(plan, results, datasets)
-            runs, certificates = certify(plan, scored)
+            scored = score(config, plan, results, datasets)
+            runs, certificates = certify(config.certificate, plan, scored)
             statistics = entry_statistics(runs, config.bootstrap)
             uncertainties = typical_uncertainties(plan, results, runs, statistics)
             result = ComparisonResult(
@@ -218,16 +218,17 @@ def _warnings(
     for name, dataset in datasets.items():
         yield from (f"data set {name}: {warning}" for warning in dataset.warnings)
     fitted = [run for run in plan if run.box_name != UNBOUNDED]
-    for name, parameterisation in dict.fromkeys((run.dataset_name, run.parameterisation) for run in fitted):
+    for name, parameterisation in dict.fromkeys(
+        (run.dataset_name, run.search_space.parameterisation) for run in fitted
+    ):
         dataset = datasets[name]
-        undetermined = warnings_of_calibration(
-            dataset.robot, dataset.split("train"), parameterisation, fitted[0].config.unidentified
-        )
+        span = driven_span(dataset.split("train"))
+        undetermined = warnings_of_calibration(dataset.robot, span, parameterisation, config.unidentified)
         yield from (f"data set {name}, fit of the {parameterisation}: {warning}" for warning in undetermined)
     if config.loss != "squares":
         first = {run.dataset_name: run for run in reversed(plan)}
         for name, run in first.items():
-            yield from (f"data set {name}: {sentence}" for sentence in run.task.problem().moved_ends)
+            yield from (f"data set {name}: {sentence}" for sentence in run.problem().moved_ends)
     if not all(is_mean(run) for run in runs):
         yield "the cost is no mean over trajectories: intervals and differences are of the mean of their own costs"
 

@@ -89,7 +89,10 @@ class SplitScorer:
 
 
 def score(
-    plan: Sequence[PlannedRun], results: Sequence[RunResult], datasets: Mapping[str, Dataset]
+    config: CompareConfig,
+    plan: Sequence[PlannedRun],
+    results: Sequence[RunResult],
+    datasets: Mapping[str, Dataset],
 ) -> tuple[ScoredRun, ...]:
     """Every run with its costs and errors, and its gap above closed_form where that converged in the same box."""
     scorers: dict[str, dict[Split, SplitScorer]] = {}
@@ -97,7 +100,7 @@ def score(
     for run in plan:
         if run.dataset_name not in scorers:
             dataset = datasets[run.dataset_name]
-            scorers[run.dataset_name] = _scorers(run.config, dataset)
+            scorers[run.dataset_name] = _scorers(config, dataset)
             design[run.dataset_name] = _scores(scorers[run.dataset_name], dataset.robot.inverse_kinematic_matrix)
     scored = []
     for run, result in zip(plan, results, strict=True):
@@ -138,7 +141,7 @@ def _scores_of(run: PlannedRun, result: RunResult, scorers: Mapping[Split, Split
         return _scores(scorers, result.matrix)
     dataset = run.dataset
     model = extended_model(
-        dataset.robot, result.matrix, run.config.integration, dataset.sample_period, result.extension, run.label
+        dataset.robot, result.matrix, run.settings.integration, dataset.sample_period, result.extension, run.label
     )
     return {split: scorer.score_of_model(model) for split, scorer in scorers.items()}
 
@@ -159,14 +162,16 @@ def _scored(
     scores: Mapping[Split, SplitScore],
     design: Mapping[Split, SplitScore],
 ) -> ScoredRun:
+    settings = run.settings
+    assert settings.calibrator is not None and settings.parameterisation is not None  # noqa: PT018 (they are complete)
     record = RunRecord(
         dataset=run.dataset_name,
         label=run.label,
-        calibrator=run.entry.name,
-        parameterisation=run.parameterisation,
+        calibrator=settings.calibrator,
+        parameterisation=settings.parameterisation,
         box=run.box_name,
-        seed=run.seed,
-        options=run.entry.options,
+        seed=settings.seed,
+        options=settings.options,
         outcome=result.outcome,
         reason=result.reason,
         **_columns("train", scores, design),
@@ -205,15 +210,15 @@ def _improvement(score: SplitScore | None, theoretical: SplitScore | None) -> fl
 
 
 def _parameters(run: PlannedRun, result: RunResult) -> tuple[FittedParameter, ...] | None:
-    if run.parameterisation != "geometry" or result.vector is None:
+    if run.settings.parameterisation != "geometry" or result.vector is None:
         return None
-    geometry = WheelGeometry(run.dataset.robot, fitted_mount=run.config.mount == "fit")
+    geometry = WheelGeometry(run.dataset.robot, fitted_mount=run.settings.mount == "fit")
     return fitted_parameters(geometry, result.vector)
 
 
 def _is_exact(run: PlannedRun, scored: ScoredRun) -> bool:
     """True if a run converged to what should be the optimum in its box of matrix elements, with a cost to divide by."""
-    plain = run.config.loss == "squares"  # under a robust loss no run minimises the cost by which it is scored
+    plain = run.settings.loss == "squares"  # under a robust loss no run minimises the cost by which it is scored
     exact = calibrators.entry(scored.record.calibrator).cls.exact and run.element_box is not None and plain
     score = scored.scores.get("train")
     return exact and scored.record.outcome is Outcome.CONVERGED and score is not None and score.cost > score.rounding
@@ -244,5 +249,5 @@ def is_comparable(run: PlannedRun, matrix: Array, other: PlannedRun) -> bool:
         return False
     if run.element_box is not None:
         return run.element_box == other.element_box
-    bounds = make_bounds(other.dataset.robot, other.box)
+    bounds = make_bounds(other.dataset.robot, other.settings.box)
     return bool(((matrix.ravel() >= bounds.lower) & (matrix.ravel() <= bounds.upper)).all())

@@ -204,25 +204,22 @@ def _advice(motion: str) -> str:
 
 
 def kept_motions(
-    robot: Robot, trajectories: Sequence[Trajectory], parameterisation: ParameterisationName, unidentified: Unidentified
+    robot: Robot, span: DrivenSpan, parameterisation: ParameterisationName, unidentified: Unidentified
 ) -> tuple[WheelDirection, ...]:
-    """Motions of which a calibration on these runs keeps the design values, so that no interval tells of them."""
+    """Motions that runs with this span do not identify, of which a calibration keeps the design values."""
     if parameterisation == "geometry":
         return ()
-    directions = wheel_directions(robot, driven_span(trajectories))
+    directions = wheel_directions(robot, span)
     open_ones = (each for each in directions if not each.identified and each.motion)
     return tuple(each for each in open_ones if not (each.state == "weak" and unidentified == "fit"))
 
 
 def warnings_of_calibration(
-    robot: Robot,
-    trajectories: Sequence[Trajectory],
-    parameterisation: ParameterisationName,
-    unidentified: Unidentified,
+    robot: Robot, span: DrivenSpan, parameterisation: ParameterisationName, unidentified: Unidentified
 ) -> tuple[str, ...]:
-    """Warnings of a calibration on these runs: a sentence for every unidentified direction, and how it was treated."""
+    """A sentence for every direction that runs with this span do not identify, and how a calibration treats it."""
     sentences = []
-    for each in wheel_directions(robot, driven_span(trajectories)):
+    for each in wheel_directions(robot, span):
         if each.identified or not each.motion:  # where the wheels only slip, no motion of the robot depends on it
             continue
         subject = f"{each.words} ({each.motion}) do"
@@ -326,7 +323,7 @@ def identifiability(
         noise_source=estimate.description,
         sentences=(
             *open_directions(every),
-            *open_sentences(robot, trajectories),
+            *open_sentences(robot, trajectories, span=span),
             *_rough_rows(directions),
             *_open_parameters(robot, parameters),
         ),

@@ -19,7 +19,7 @@ from omnibench.data.references import UNITS
 from omnibench.fit.parameterisation import MatrixElements, Parameterisation
 from omnibench.fit.prior import default_mount
 from omnibench.fit.reference_rows import ReferenceBatch, reference_rows
-from omnibench.fit.span import Unidentified, directions_kept, driven_span
+from omnibench.fit.span import DrivenSpan, Unidentified, directions_kept, driven_span
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import Integration
 from omnibench.words import plural
@@ -79,11 +79,17 @@ def open_directions(searched: MatrixElements, information: Array) -> Array:
 _MOST = 0.9  # share, squared, of a motion's part in the open combinations from which on it is called open; chosen
 
 
-def open_sentences(robot: Robot, runs: Sequence[Trajectory], unidentified: Unidentified = "keep") -> tuple[str, ...]:
+def open_sentences(
+    robot: Robot,
+    runs: Sequence[Trajectory],
+    unidentified: Unidentified = "keep",
+    *,
+    span: DrivenSpan | None = None,
+) -> tuple[str, ...]:
     """A sentence for each part of the matrix that the runs' references leave open; none where all runs have poses."""
     if all(run.references is None for run in runs):
         return ()
-    kept = directions_kept(robot, driven_span(runs), unidentified)
+    kept = directions_kept(robot, span or driven_span(runs), unidentified)
     searched = MatrixElements(robot, "row", kept, default_mount(robot) == "known")
     searched = with_open_combinations(searched, runs)
     end = "keeps the design values" if unidentified != "shrink" else "rests on the design and its tolerance"

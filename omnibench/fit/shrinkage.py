@@ -24,7 +24,6 @@ from omnibench.fit.noise import GIVEN
 from omnibench.fit.open_combinations import information_of_references
 from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.problem import CalibrationProblem
-from omnibench.fit.span import driven_span, unidentified_directions
 from omnibench.fit.uncertainty import NoCovarianceError, covariance_of_answer, runs_without_heading
 from omnibench.registry import calibrators
 from omnibench.robot.calibration import Noise
@@ -88,9 +87,8 @@ def _knowledge(problem: CalibrationProblem, result: RunResult) -> _Knowledge:
     assert result.matrix is not None  # there is an answer
     assert result.vector is not None
     robot = problem.robot
-    kept = unidentified_directions(robot, driven_span(problem.trajectories))
     unit = np.repeat(robot.row_scales, len(robot.drive.names))
-    driven = MatrixElements(robot, "row", kept, known_mount=False).projection
+    driven = MatrixElements(robot, "row", problem.unidentified, known_mount=False).projection
     slopes = driven @ problem.parameterisation.slopes(result.vector) / unit[:, None]
     if not result.at_bounds:
         try:

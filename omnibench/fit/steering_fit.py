@@ -16,7 +16,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import count
-from typing import Literal
 
 import numpy as np
 from scipy.optimize import minimize
@@ -24,20 +23,15 @@ from scipy.optimize import minimize
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import run_calibrator
-from omnibench.fit.cost import Cost
 from omnibench.fit.loss import RobustCost, norms_of, with_ends_from_others, with_loss
-from omnibench.fit.parameterisation import Box
-from omnibench.fit.prior import MountChoice
-from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
+from omnibench.fit.problem import Budget, make_problem
+from omnibench.fit.settings import FitSettings
 from omnibench.progress import Progress, Reporter, no_progress
-from omnibench.registry import calibrators, effects
+from omnibench.registry import calibrators, costs, effects
 from omnibench.robot.corrections import corrected, needs_of
 from omnibench.robot.effects.effect import Parameter, Term
 from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.odometry import Integration
 from omnibench.robot.signals import signals_of
-
-SteeringChoice = Literal["known", "fit"]
 
 _GAIN = "steering_gain"
 FITTED = (_GAIN, "steering_play", "steering_offset", "steering_coupling")
@@ -86,18 +80,34 @@ def _numbers_of(robot: Robot) -> list[_Number]:
     ]
 
 
+def fit_steering(
+    settings: FitSettings, robot: Robot, runs: Sequence[Trajectory], sample_period: float, watch: Reporter = no_progress
+) -> tuple[Term, ...]:
+    """The effects of a robot's steering that fit runs best, by complete settings; sample_period: nominal, s.
+
+    ConfigError: the robot has no steering, the cost is no sum of norms, or no matrix can be fitted.
+    """
+    loss = "huber" if settings.loss == "squares" else settings.loss
+    smooth = settings.model_copy(
+        update={
+            "parameterisation": "matrix",
+            "unidentified": "keep",
+            "tolerance": None,
+            "loss": loss,
+            "budget": Budget(),
+        }
+    )
+    return SteeringFit(robot, tuple(runs), sample_period, smooth, watch).terms()
+
+
 @dataclass(frozen=True, eq=False)
 class SteeringFit:
-    """The search for the steering's parameters on some runs, with one cost."""
+    """The search for the steering's parameters on some runs, with a robust cost."""
 
     robot: Robot
     runs: tuple[Trajectory, ...]
     sample_period: float
-    objective: Cost
-    box: Box
-    mount: MountChoice | None
-    integration: Integration
-    seed: int
+    settings: FitSettings
     watch: Reporter = no_progress
 
     def terms(self) -> tuple[Term, ...]:
@@ -142,9 +152,11 @@ class SteeringFit:
     @cached_property
     def _smooth(self) -> RobustCost:
         """The cost that is minimised. ConfigError: the one that was asked for is no sum of norms."""
-        if norms_of(self.objective) is None:
-            raise ConfigError(f"steering: fit needs a cost that is a sum of norms, which {self.objective.name} is not")
-        smooth = self.objective if isinstance(self.objective, RobustCost) else with_loss(self.objective, "huber")
+        assert self.settings.cost is not None  # the settings are complete
+        cost = costs.create(self.settings.cost.name, self.settings.cost.options)
+        if norms_of(cost) is None:
+            raise ConfigError(f"steering: fit needs a cost that is a sum of norms, which {cost.name} is not")
+        smooth = with_loss(cost, self.settings.loss)
         assert isinstance(smooth, RobustCost)  # it is one of norms
         return smooth
 
@@ -164,10 +176,8 @@ class SteeringFit:
 
     def _best_matrix(self, runs: Sequence[Trajectory]) -> tuple[Array, float]:
         """The matrix (3, M) of least cost, and that cost."""
-        searched = make_parameterisation("matrix", self.robot, runs, box=self.box, mount=self.mount)
-        problem = CalibrationProblem(
-            self.robot, runs, self._smooth, searched, integration=self.integration, budget=Budget(), seed=self.seed
-        )
+        assert self._smooth  # refuses what is no sum of norms
+        problem = make_problem(self.settings, self.robot, runs)
         result = run_calibrator(calibrators.create("closed_form", {"tolerance": _TOLERANCE}), problem)
         if result.matrix is None or result.cost is None:
             raise ConfigError(f"steering: no matrix could be fitted ({result.outcome}): {result.reason}")
@@ -178,17 +188,16 @@ class SteeringFit:
 
         Starts and ends that have jumped follow from the vector, too, as in the problem whose cost this is.
         """
-        slopes = np.empty(len(vector))
+        slopes, integration = np.empty(len(vector)), self.settings.integration
         for index in range(len(vector)):
             values = []
             for step in (-_STEP, _STEP):
                 moved = vector.copy()
                 moved[index] += step
                 runs = corrected_runs(self.robot, self.runs, self._as_terms(moved), self.sample_period)
-                runs, _ = with_ends_from_others(
-                    runs, self.robot, self.integration, self._smooth.of_poses, last=self._smooth.stamps == "final"
-                )
-                batch = self._smooth.batch(runs, self.integration)
+                last = self._smooth.stamps == "final"
+                runs, _ = with_ends_from_others(runs, self.robot, integration, self._smooth.of_poses, last=last)
+                batch = self._smooth.batch(runs, integration)
                 errors = batch.poses(matrix[None]) - self._smooth.reference(runs)
                 values.append(float(self._smooth.combine(errors, batch.trajectory)[0]))
             slopes[index] = (values[1] - values[0]) / (2 * _STEP)

@@ -33,12 +33,10 @@ from omnibench.fit.identifiability import ParameterEstimate, geometry_of, identi
 from omnibench.fit.information import EstimatedCovariance, depending, noise_of_matrix
 from omnibench.fit.loss import RobustCost, loss_of, norms_of
 from omnibench.fit.noise import GIVEN, covariance_of_sums, roots_of
-from omnibench.fit.open_combinations import elements_open, with_open_combinations
-from omnibench.fit.parameterisation import MatrixElements
+from omnibench.fit.open_combinations import elements_open
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.fit.reference_rows import ReferenceBatch
 from omnibench.fit.sandwich import Sandwich, Scores, covariance_of_rows, sandwich, scores_of_references, scores_of_runs
-from omnibench.fit.span import driven_span, unidentified_directions
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import OdometryBatch
@@ -338,11 +336,10 @@ def _parameters(
             return None
     else:
         return None
-    kept = unidentified_directions(robot, driven_span(problem.trajectories))
-    known = with_open_combinations(MatrixElements(robot, "row", kept, known_mount=False), problem.trajectories)
+    identified = identified_parameters(geometry, problem.unidentified, problem.left_open)
     untold = [
-        "no interval" if touching else "" if identified else "not identified by these data"
-        for identified, touching in zip(identified_parameters(geometry, kept, known.open), bounded, strict=True)
+        "no interval" if touching else "" if told else "not identified by these data"
+        for told, touching in zip(identified, bounded, strict=True)
     ]
     return tuple(
         ParameterEstimate(

@@ -35,11 +35,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from omnibench.compare.plan import PlannedRun
-from omnibench.fit.calibrator import Calibrator, as_answered
 from omnibench.fit.information import INTERVAL
 from omnibench.fit.ratio_intervals import FEWEST, Interval
-from omnibench.registry import calibrators
 from omnibench.robot.kinematics import Array
 from omnibench.study.study_plan import JudgedFit, StudiedRobot
 from omnibench.study.trainings import AS_RECORDED, Fold, Training
@@ -317,18 +314,10 @@ def _method(
         seconds=float(np.median(seconds)) if seconds else None,
         numbers=answered[0].reason if answered else "",
         answers=len(answered),
-        cost=", ".join(dict.fromkeys(run.config.objective for run in runs)),
-        unidentified=", ".join(
-            dict.fromkeys(as_answered(_class(run), run.config.unidentified, None)[0] for run in runs)
-        ),
+        cost=", ".join(dict.fromkeys(run.settings.objective for run in runs)),
+        unidentified=", ".join(dict.fromkeys(run.settings.unidentified or "" for run in runs)),
         matrix=next((each.result.matrix for each in answered if each.result is not None), None),
     )
-
-
-def _class(run: PlannedRun) -> type[Calibrator]:
-    """The class of a run's calibrator."""
-    found: type[Calibrator] = calibrators.entry(run.entry.name).cls
-    return found
 
 
 def _measured(errors: Array, pairs: Pairs) -> dict[Measure, Array]:

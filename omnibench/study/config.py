@@ -7,15 +7,16 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, ConfigDict, Field, field_validator, model_validator
 
-from omnibench.compare.config import LEAST_MEMORY, CalibratorEntry, CostChoice, known_backend
+from omnibench.compare.config import LEAST_MEMORY, CalibratorEntry, known_backend
 from omnibench.config import Model, NonNegative, Positive, RelativePath, printable
 from omnibench.data.splits import Names
 from omnibench.fit.loss import LossName
 from omnibench.fit.parameterisation import Box
-from omnibench.fit.prior import MountChoice
-from omnibench.fit.problem import Budget
+from omnibench.fit.prior import MountChoice, default_cost, default_unidentified
+from omnibench.fit.settings import Budget, CostChoice, FitSettings
 from omnibench.fit.span import Unidentified
 from omnibench.jobs.job import TlsFiles
+from omnibench.robot.kinematics import Robot
 from omnibench.robot.odometry import Integration
 from omnibench.simulate.dataset_source import DatasetSource
 
@@ -148,11 +149,6 @@ class MethodChoice(CalibratorEntry):
         """Its name in tables."""
         return self.label or self.name
 
-    @property
-    def entry(self) -> CalibratorEntry:
-        """The calibrator with its options alone."""
-        return CalibratorEntry(**{name: getattr(self, name) for name in CalibratorEntry.model_fields})
-
     @field_validator("cost", mode="before", json_schema_input_type=str | CostChoice | None)
     @classmethod
     def _name_stands_for_cost(cls, cost: Any) -> Any:
@@ -183,6 +179,21 @@ class StudyConfig(Model):
     tls: TlsFiles | None = None
     timing: bool = Field(True, description="no: the runs' seconds are not compared")
     memory_mb: Annotated[float, Field(ge=LEAST_MEMORY)] | None = Field(None, description="as for a comparison")
+
+    def settings_of(self, method: MethodChoice, robot: Robot, runs: int, seed: int) -> FitSettings:
+        """The settings of a method's fit to so many runs of a robot; what it leaves open is as usual for these."""
+        common = FitSettings(
+            cost=method.cost or CostChoice(name=default_cost(robot, runs)),
+            loss=method.loss,
+            box=self.box,
+            integration=self.integration,
+            seed=seed,
+            budget=self.budget,
+            unidentified=method.unidentified or default_unidentified(robot),
+            tolerance=method.tolerance,
+            mount=method.mount,
+        )
+        return method.settings(common)
 
     @field_validator("methods", mode="before", json_schema_input_type=tuple[str | MethodChoice, ...])
     @classmethod

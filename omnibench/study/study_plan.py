@@ -9,14 +9,11 @@ from fnmatch import fnmatchcase
 
 import numpy as np
 
-from omnibench.compare.config import CompareConfig, CostChoice
-from omnibench.compare.plan import UNBOUNDED, PlannedRun
-from omnibench.data.dataset import Dataset, Trajectory
+from omnibench.compare.plan import PlannedRun, name_of_bounds
+from omnibench.data.dataset import Dataset
 from omnibench.errors import ConfigError, OmnibenchError, PluginError, nearest
 from omnibench.fit.calibrator import Outcome, RunResult, refusal_of
 from omnibench.fit.evaluate import final_errors
-from omnibench.fit.prior import default_cost, default_unidentified
-from omnibench.fit.problem import make_parameterisation
 from omnibench.fit.reference_rows import with_mean_errors
 from omnibench.progress import Progress, Reporter
 from omnibench.registry import calibrators
@@ -125,53 +122,19 @@ def _planned(
     config: StudyConfig, robot: StudiedRobot, method: MethodChoice, dataset: Dataset, seed: int, what: str
 ) -> tuple[PlannedRun | None, str]:
     """A fit as a run of a comparison, or why the method cannot be asked."""
-    calibrator = calibrators.entry(method.name).cls
     if not dataset.trajectories:
         return None, "no training run is left"
     with suppress(PluginError):  # a constructor that raises is the outcome of the fit
         made = calibrators.create(method.name, method.options)
         if refusal := refusal_of(made, dataset.robot, dataset.trajectories):
             return None, refusal
-    settings = comparison_of(config, robot, method, dataset.trajectories)
-    parameterisation = method.parameterisation or calibrator.parameterisation
-    box, box_name = method.box or config.box, UNBOUNDED
-    if calibrator.bounded:
-        try:
-            searched = make_parameterisation(
-                parameterisation, dataset.robot, dataset.trajectories, box=box, limits=method.limits
-            )
-            box_name = searched.bounds.name
-        except ConfigError as error:  # the robot has no such parameters
-            return None, str(error)
-    entry, training = settings.calibrators[0], dataset.trajectories
+    settings = config.settings_of(method, dataset.robot, len(dataset.trajectories), seed)
+    try:
+        box_name = name_of_bounds(settings, dataset.robot, dataset.trajectories)
+    except ConfigError as error:  # the robot has no such parameters
+        return None, str(error)
     label = f"{what.strip()}, {method.shown}"
-    run = PlannedRun(settings, robot.name, dataset, training, entry, label, parameterisation, box, box_name, seed)
-    return run, ""
-
-
-def comparison_of(
-    config: StudyConfig, robot: StudiedRobot, method: MethodChoice, training: tuple[Trajectory, ...]
-) -> CompareConfig:
-    """The config of a comparison of one method on one training set; cost and treatment of the undriven by default."""
-    design = robot.dataset.robot
-    choice = config.robots[robot.name]
-    return CompareConfig(
-        name=config.name,
-        datasets={robot.name: choice.source(config.data, robot.name)},
-        cost=method.cost or CostChoice(name=default_cost(design, len(training))),
-        loss=method.loss,
-        integration=config.integration,
-        box=config.box,
-        unidentified=method.unidentified or default_unidentified(design),
-        mount=method.mount,
-        tolerance=method.tolerance,
-        budget=config.budget,
-        seeds=config.seeds,
-        calibrators=(method.entry,),
-        plugins=config.plugins,
-        timing=config.timing,
-        memory_mb=config.memory_mb,
-    )
+    return PlannedRun(config, robot.name, dataset, dataset.trajectories, settings, label, box_name), ""
 
 
 _TOGETHER = 64  # matrices that are judged at once (chosen: 164 runs of 1,200 samples take 0.1 GB)
