@@ -72,6 +72,7 @@ def _parameters(model: type[BaseModel]) -> Iterator[inspect.Parameter]:
             continue
         annotation: Any = Literal[tuple(said["enum"])] if "enum" in said else _TYPES[said["type"]]
         least = said.get("minimum", said.get("exclusiveMinimum"))
+        least = least + 1 if annotation is int and "exclusiveMinimum" in said else least
         flag = [f"--{name}"] if annotation is bool else []
         option = typer.Option(*flag, help=field.description, min=least)
         annotation = annotation | None if field.default is None else annotation

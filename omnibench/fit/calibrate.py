@@ -148,10 +148,7 @@ def calibrate(
         intervals=drawn,
         parameters=fitted_parameters(searched, result.vector) if isinstance(searched, WheelGeometry) else None,
         uncertainty=uncertainty,
-        warnings=(
-            *filter(None, [without_covariance]),
-            *_warnings(settings, calibrator, problem, runs, terms, units),
-        ),
+        warnings=tuple(_warnings(settings, calibrator, problem, runs, terms, units, without_covariance)),
         kept=kept_motions(robot, problem.span, searched.name, settings.unidentified),
         units=units,
     )
@@ -268,8 +265,9 @@ def _warnings(
     runs: Sequence[Trajectory],
     terms: Sequence[Term],
     units: Units,
+    without_covariance: str,
 ) -> Iterator[str]:
-    """Sentences on what the data leave open, or a fit rests on."""
+    """Sentences on what the data leave open, or a fit rests on; without_covariance: why it has none, if so."""
     assert settings.unidentified is not None  # the settings are complete
     robot, searched = problem.robot, problem.parameterisation
     yield from warnings_of_calibration(robot, problem.span, searched.name, settings.unidentified)
@@ -277,6 +275,8 @@ def _warnings(
     if isinstance(searched, WheelGeometry) and calibrator.fitted:
         yield from inseparable_in_words(searched, problem.unidentified, problem.left_open)
     yield from problem.moved_ends
+    if without_covariance:
+        yield without_covariance
     if terms:
         yield (
             f"the steering was fitted first ({words_of(terms)}); the matrix's intervals take these numbers for exact, "

@@ -23,7 +23,7 @@ SteeringChoice = Literal["known", "fit"]
 class Budget(Model):
     """Limits of one run of a calibrator."""
 
-    evaluations: int = Field(60_000, ge=1, description="Budget: most evaluations of the cost.")
+    evaluations: int = Field(60_000, gt=0, description="Budget: most evaluations of the cost.")
     seconds: float = Field(600.0, gt=0, description="Budget: longest time, in s.")
 
 
