@@ -28,7 +28,7 @@ _PUBLIC = {
     "inspect_dataset": "fit.inspect",
     "load_dataset": "data.storage",
     "load_plugins": "registry",
-    "make_dataset": "data.tables.dataset_tables",
+    "make_dataset": "data.tables",
     "odometry": "robot.dead_reckoning",
     "read_calibration": "robot.calibration",
     "read_compare_config": "compare.config",
@@ -59,7 +59,7 @@ if TYPE_CHECKING:  # imports for type checkers; tests/ground/test_package.py hol
     from omnibench.data.references import References as References
     from omnibench.data.storage import load_dataset as load_dataset
     from omnibench.data.storage import save_dataset as save_dataset
-    from omnibench.data.tables.dataset_tables import make_dataset as make_dataset
+    from omnibench.data.tables import make_dataset as make_dataset
     from omnibench.design.design import design_experiment as design_experiment
     from omnibench.discover.discover import discover_effects as discover_effects
     from omnibench.errors import OmnibenchError as OmnibenchError

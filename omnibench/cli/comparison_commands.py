@@ -145,7 +145,7 @@ def _asked_comparison(given: Sequence[Path], data: list[str] | None, plugins: Se
     """The config that is given, or one for the data set that is: its folders, or a glob."""
     from omnibench.compare.config import read_compare_config
     from omnibench.compare.recording_config import config_in_words, recording_config
-    from omnibench.data.tables.table import is_glob
+    from omnibench.data.tables import is_glob
 
     first = given[0]
     of_recordings = all(place.is_dir() or is_glob(place) for place in given)

@@ -87,7 +87,7 @@ def import_(
     scans but without reference poses get these by SLAM.
     """
     from omnibench.config import parse_settings
-    from omnibench.data.header import Imported
+    from omnibench.data.dataset import Imported
     from omnibench.data.splits import division_in_words
     from omnibench.data.storage import check_dataset_folder, save_dataset
     from omnibench.files import refuse_existing, resolved

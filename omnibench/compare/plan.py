@@ -32,7 +32,7 @@ _SHARED = (
     "data/dataset.py",
     "data/references.py",
     "data/stored_rows.py",
-    "data/stored_wheels.py",
+    "data/tables.py",
     "compare/plan.py",
 )
 _CALIBRATORS = "fit/calibrators/*.py"

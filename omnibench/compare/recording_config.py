@@ -13,7 +13,7 @@ from omnibench.config import validate
 from omnibench.data.dataset import Dataset
 from omnibench.data.splits import training_split
 from omnibench.data.storage import load_dataset
-from omnibench.data.tables.table import dataset_folders, in_few_words
+from omnibench.data.tables import dataset_folders, in_few_words
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import Calibrator
 from omnibench.fit.prior import default_cost, default_unidentified

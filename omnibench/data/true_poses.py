@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 
 from omnibench.config import read_yaml, validate
-from omnibench.data.tables.table import read_table
+from omnibench.data.tables import read_table
 from omnibench.errors import DataError
 from omnibench.files import write_table
 from omnibench.robot.kinematics import Array, Robot, interpolated

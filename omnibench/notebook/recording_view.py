@@ -11,9 +11,8 @@ import plotly.graph_objects as go
 import polars as pl
 
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.data.reference_table import reference_frame
 from omnibench.data.references import References
-from omnibench.data.tables.dataset_tables import tables_of
+from omnibench.data.tables import reference_frame, tables_of
 from omnibench.notebook.single_figure import drawn
 from omnibench.report.blocks import Figure, FigureGrid
 from omnibench.report.recording.driven import REFERENCE_ITEM

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from omnibench.config import validate
-from omnibench.data.dataset import Dataset
-from omnibench.data.header import Imported
+from omnibench.data.dataset import Dataset, Imported
 from omnibench.data.importer import Importer
 from omnibench.files import check_source
 from omnibench.registry import importers

@@ -20,9 +20,8 @@ from storage_samples import FORMATS, Format, everything_known, read_frame, table
 from timing import PATIENCE
 
 from omnibench.data.dataset import Dataset
-from omnibench.data.scan_files import ScansOnDisk
 from omnibench.data.scans import Mount, Scanner, ScansInMemory, TrajectoryScans
-from omnibench.data.storage import load_dataset, save_dataset
+from omnibench.data.storage import ScansOnDisk, load_dataset, save_dataset
 from omnibench.errors import DataError, OmnibenchError
 
 SCANNER = Scanner(

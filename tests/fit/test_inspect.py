@@ -10,7 +10,7 @@ from fit_samples import noisy_trajectories
 from sample_robots import WHEELED
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.data.tables.dataset_tables import make_dataset as dataset_of_tables
+from omnibench.data.tables import make_dataset as dataset_of_tables
 from omnibench.fit.inspect import Inspection, inspect_dataset
 from omnibench.robot.kinematics import Robot
 from omnibench.testing.synthetic import synthetic_robot

@@ -18,7 +18,7 @@ from omnibench.data.dataset import Dataset
 from omnibench.data.importer import Importer
 from omnibench.data.storage import load_dataset
 from omnibench.data.stored_rows import median_period
-from omnibench.data.tables.table import dataset_folders, in_few_words
+from omnibench.data.tables import dataset_folders, in_few_words
 from omnibench.errors import ConfigError, DataError
 from omnibench.files import check_source
 from omnibench.registry import importers

@@ -17,12 +17,12 @@ from sample_robots import APR_02, MECANUM
 from wheeled_samples import CAR, DIFF, SWERVE, driven
 
 import omnibench.data.stored_rows as periods
-import omnibench.data.stored_wheels as stored_wheels
+import omnibench.data.tables as stored_wheels
 import omnibench.robot.stored_odometry as odometry_of_stored
 from omnibench.data.dataset import Dataset
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.data.stored_rows import StoredRows, drawn_runs, in_memory, median_period
-from omnibench.data.tables.table import in_few_words
+from omnibench.data.tables import in_few_words
 from omnibench.errors import DataError
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.certify import LowerBounds, certify_optimum

@@ -1,1 +1,0 @@
-"""Tables of data sets: read, checked, made of runs and turned into runs."""
