@@ -10,14 +10,11 @@ import typer
 from typer.core import TyperGroup
 
 from omnibench.cli.calibration_commands import calibration_app
-from omnibench.cli.check_command import check_app
 from omnibench.cli.comparison_commands import comparison_app
 from omnibench.cli.discovery_commands import discovery_app
-from omnibench.cli.fetch_command import fetch_app
-from omnibench.cli.guide_commands import guide_app
-from omnibench.cli.import_command import import_app
+from omnibench.cli.guide_commands import guide_app, plugin_app
+from omnibench.cli.import_commands import check_app, fetch_app, import_app
 from omnibench.cli.live_commands import live_app
-from omnibench.cli.plugin_commands import plugin_app
 from omnibench.cli.recording_commands import recording_app
 
 # Headings of the help and the families under them, in the order in which a newcomer needs them.

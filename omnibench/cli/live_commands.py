@@ -132,7 +132,7 @@ def listen(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document a line, once a second.")] = False,
 ) -> None:
     """Show a robot's odometry live: pose, rate, age, health."""
-    from omnibench.cli.terminal.robot_table import listen as show
+    from omnibench.cli.terminal.live_tables import listen as show
     from omnibench.live.stopping import stop_on_signals
 
     with _client(config, connect, profile, "listen") as (session, keys), stop_on_signals() as stop:
@@ -182,7 +182,7 @@ def record(
     force: Force = False,
 ) -> None:
     """Record live topics into MCAP, for Foxglove and rosbags."""
-    from omnibench.cli.terminal.recording_status import record as write
+    from omnibench.cli.terminal.live_tables import record as write
     from omnibench.files import refuse_existing, remove
     from omnibench.live.config import read_live_config
     from omnibench.live.stopping import stop_on_signals

@@ -24,7 +24,7 @@ from omnibench.jobs.backend_choice import name_flaw
 from omnibench.jobs.job import TlsFiles
 from omnibench.registry import PluginFailure, calibrators, costs, load_plugins, plugin_text
 from omnibench.robot.odometry import Integration
-from omnibench.simulate.dataset_source import DatasetSource
+from omnibench.simulate.source import DatasetSource
 
 LEAST_MEMORY = 256.0  # 10^6 bytes; a worker process has 200 MB before its run begins (measured, RLIMIT_DATA)
 

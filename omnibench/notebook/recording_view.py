@@ -15,10 +15,9 @@ from omnibench.data.references import References
 from omnibench.data.tables import reference_frame, tables_of
 from omnibench.notebook.single_figure import drawn
 from omnibench.report.blocks import Figure, FigureGrid
-from omnibench.report.recording.driven import REFERENCE_ITEM
-from omnibench.report.recording.room_figures import all_runs
+from omnibench.report.figures import START, marks, path
+from omnibench.report.recording.recording_figures import REFERENCE_ITEM, all_runs
 from omnibench.report.style import plan
-from omnibench.report.traces import START, marks, path
 from omnibench.views import View
 from omnibench.words import plural
 

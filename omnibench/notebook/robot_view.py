@@ -10,7 +10,7 @@ import polars as pl
 from omnibench.errors import DataError
 from omnibench.notebook.single_figure import drawn
 from omnibench.report.blocks import FigureGrid
-from omnibench.report.robot_figures import is_drawn, motion_system
+from omnibench.report.figures import is_drawn, motion_system
 from omnibench.robot.kinematics import Robot
 from omnibench.views import View
 

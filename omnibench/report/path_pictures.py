@@ -12,10 +12,17 @@ import plotly.graph_objects as go
 from omnibench.data.dataset import Trajectory
 from omnibench.fit.evaluate import final_errors
 from omnibench.report.blocks import Figure, FigureGrid, LegendItem
+from omnibench.report.figures import START, marks, path
 from omnibench.report.numbers import fixed, listing
-from omnibench.report.recording.driven import ON_THE_SPOT, REFERENCE_ITEM, evenly, kinds_of, motion_titles, spread
+from omnibench.report.recording.recording_figures import (
+    ON_THE_SPOT,
+    REFERENCE_ITEM,
+    evenly,
+    kinds_of,
+    motion_titles,
+    spread,
+)
 from omnibench.report.style import INK, THEORETICAL, plan, text
-from omnibench.report.traces import START, marks, path
 from omnibench.robot.kinematics import Array, rotated
 from omnibench.robot.model import OdometryModel
 from omnibench.words import plural

@@ -15,8 +15,7 @@ from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.simulate.commands import STEADY, Command, TimedCommand, Variation, straight_and_pivot, wheels_of
 from omnibench.simulate.config import FlowerConfig, Session
-from omnibench.simulate.simulation import Simulation
-from omnibench.simulate.truth import TrueRobot, reference_noise, true_record
+from omnibench.simulate.truth import Simulation, TrueRobot, reference_noise, true_record
 from omnibench.words import plural
 
 _MANY = 1000  # runs whose checks and tables take more than about a second; chosen

@@ -24,8 +24,7 @@ from omnibench.simulate.lidar import measure_scans, scan_stamps
 from omnibench.simulate.motion_commands import CommandedMotion, command_motion, target_rates
 from omnibench.simulate.motors import TRUE_STEP, DrivenRun, check_reach, drive_session
 from omnibench.simulate.robot_config import Placement, RobotConfig
-from omnibench.simulate.simulation import Simulation
-from omnibench.simulate.truth import TrueRobot, true_record
+from omnibench.simulate.truth import Simulation, TrueRobot, true_record
 from omnibench.slam.slam_dataset import slam_dataset
 
 _FOLLOWED = 0.1  # relative difference of wheel angle from target above which a warning is given (chosen)

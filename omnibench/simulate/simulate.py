@@ -13,7 +13,7 @@ from omnibench.progress import Reporter, no_progress
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.flower import simulate_flower
 from omnibench.simulate.robot_config import RobotConfig
-from omnibench.simulate.simulation import Simulation
+from omnibench.simulate.truth import Simulation
 
 _FLOWER, _ROBOT = CHOSEN + FlowerConfig.__name__, CHOSEN + RobotConfig.__name__
 

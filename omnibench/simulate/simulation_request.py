@@ -22,10 +22,9 @@ from omnibench.files import TableFormat, refuse_existing, remove, resolved, writ
 from omnibench.progress import Reporter, no_progress
 from omnibench.robot.calibration import Calibration, read_calibration
 from omnibench.robot.kinematics import Array
-from omnibench.simulate.simulation import Simulation
 from omnibench.simulate.source import SimulationSource, check_effect_options, read_simulation
-from omnibench.simulate.truth import reference_noise
-from omnibench.slam.summary import SlamAccuracy, slam_accuracy
+from omnibench.simulate.truth import Simulation, reference_noise
+from omnibench.slam.slam_request import SlamAccuracy, slam_accuracy
 
 
 def simulate_like(dataset: Dataset, calibration: Calibration, noise_seed: int | None = None) -> Dataset:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from pydantic import Field
 
 from omnibench.config import Model
+from omnibench.data.dataset import Dataset
+from omnibench.data.true_poses import TruePath
 from omnibench.errors import UnknownNameError
 from omnibench.registry import effects
 from omnibench.robot.calibration import EffectTerm, Noise, Row, matrix_rows
@@ -29,6 +31,7 @@ from omnibench.robot.odometry import Integration, WheelLog
 from omnibench.robot.signals import of_centre, signals_of
 from omnibench.simulate.commands import Variation
 from omnibench.simulate.config import EncoderNoise, Tolerances, Truth
+from omnibench.simulate.floor_plan import FloorPlan
 from omnibench.simulate.mechanics import (
     BODY,
     COUPLING,
@@ -42,6 +45,7 @@ from omnibench.simulate.mechanics import (
     steering_truth,
     turned_by_steering,
 )
+from omnibench.views import Brief
 
 
 def reference_noise(noise: Noise, times: Array, rng: np.random.Generator) -> Array:
@@ -343,3 +347,18 @@ def _complete(term: EffectTerm, robot: Robot, sessions: tuple[str, ...], where: 
 
 def _place(dataset: str) -> str:
     return f"data set {dataset}: truth.effects"
+
+
+@dataclass(frozen=True, repr=False)
+class Simulation(Brief):
+    """A simulated data set and, apart from it, the truth behind it.
+
+    The robot simulator also gives paths: the true path of each run. plan: the room. starts: the true start pose (3,) in
+    the room of each run, m, m, rad.
+    """
+
+    dataset: Dataset
+    truth: TruthRecord
+    paths: Mapping[str, TruePath] = field(default_factory=dict)
+    plan: FloorPlan | None = None
+    starts: Mapping[str, Array] = field(default_factory=dict)

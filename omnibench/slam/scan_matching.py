@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from omnibench.data.scans import Ranges, Scanner
 from omnibench.robot.kinematics import Array, rotated, rotation
-from omnibench.slam.lines import Lines, fit_lines
-from omnibench.slam.map import ScanMap
+from omnibench.slam.map import Lines, ScanMap, fit_lines
 from omnibench.slam.motion_prior import MotionWithinScan
 from omnibench.slam.slam_options import SlamOptions
 

@@ -21,8 +21,7 @@ from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.robot.kinematics import Array, relative
 from omnibench.robot.model import OdometryModel
 from omnibench.slam.motion_prior import length, odometry_deviations
-from omnibench.slam.path_warnings import PathWarning, merged_warning
-from omnibench.slam.pose_errors import FLOOR
+from omnibench.slam.pose_errors import FLOOR, PathWarning, merged_warning
 from omnibench.slam.slam_options import PRELOAD, SlamOptions
 from omnibench.slam.slam_run import SlamPath, run_slam
 

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from omnibench.data.dataset import Dataset
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from omnibench.config import Model
+from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.storage import check_dataset_folder, load_whole, save_dataset
 from omnibench.data.true_poses import TruePath, read_true_poses, robot_of_truth
 from omnibench.errors import ConfigError, DataError, Interrupted
@@ -15,11 +20,239 @@ from omnibench.files import TableFormat, refuse_existing, resolved
 from omnibench.jobs.job import ResultStore
 from omnibench.progress import Reporter, no_progress
 from omnibench.robot.calibration import read_calibration
+from omnibench.robot.kinematics import Array, interpolated, moved_to, rotated
 from omnibench.robot.model import OdometryModel
 from omnibench.slam.slam_dataset import slam_paths, with_paths
 from omnibench.slam.slam_options import SlamOptions
 from omnibench.slam.slam_run import SlamPath
-from omnibench.slam.summary import SlamAccuracy, SlamSummary, slam_accuracy, summarise
+
+# Share of the largest variance below which a covariance counts as singular: rounding of its eigenvalues.
+_SINGULAR = 1e-14
+
+
+class ErrorSummary(Model):
+    """Errors of poses. The bias is the mean error along the robot's axes, the systematic part of the error."""
+
+    poses: int
+    position_mean_m: float
+    position_p95_m: float
+    position_max_m: float
+    heading_mean_rad: float
+    heading_p95_rad: float
+    heading_max_rad: float
+    bias_forward_m: float
+    bias_left_m: float
+    bias_heading_rad: float
+    nees_mean: float | None = Field(
+        description="mean of error' covariance^-1 error; 3 for honest covariances; singular ones are left out"
+    )
+
+
+class SlamAccuracy(Model):
+    """Errors of the last pose of every run, and of all poses but the start poses."""
+
+    runs: int
+    distance_m: float = Field(description="driven in all")
+    final: ErrorSummary
+    every: ErrorSummary
+    drift_position: float = Field(description="growth of the position's error, m per m driven")
+    drift_heading: float = Field(description="growth of the heading's error, rad per m driven")
+
+
+def slam_accuracy(poses: Dataset, truth: Mapping[str, TruePath]) -> SlamAccuracy:
+    """Errors of a data set's reference poses against the true paths.
+
+    DataError in one line: a run is not in the truth, or has no pose after its start.
+    """
+    runs = []
+    for trajectory in poses.trajectories:
+        if trajectory.id not in truth:
+            raise DataError(
+                f"data set {poses.name}: trajectory {trajectory.id} is not in the truth; name that of this data set"
+            )
+        if len(trajectory.pose_times) < 2:
+            raise DataError(f"data set {poses.name}: trajectory {trajectory.id} has no pose after its start")
+        runs.append(run_errors(trajectory, truth[trajectory.id]))
+    return SlamAccuracy(
+        runs=len(runs),
+        distance_m=sum(float(run.driven[-1]) for run in runs),
+        final=_summary([run.of(slice(-1, None)) for run in runs]),
+        every=_summary(runs),
+        drift_position=_growth(runs, [run.position for run in runs]),
+        drift_heading=_growth(runs, [run.heading for run in runs]),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class RunErrors:
+    """Errors of a run's reference poses after the first.
+
+    times (K,): times of the poses, s. driven (K,): true distance driven until then, m. in_robot (K, 3): errors along
+    the robot's axes, m, m, rad. nees (K,): error' covariance^-1 error, NaN where the covariance is singular; None
+    without covariances.
+    """
+
+    times: Array
+    driven: Array
+    in_robot: Array
+    nees: Array | None
+
+    @property
+    def position(self) -> Array:
+        """Magnitudes (K,) of the position's errors, m."""
+        return np.hypot(self.in_robot[:, 0], self.in_robot[:, 1])
+
+    @property
+    def heading(self) -> Array:
+        """Magnitudes (K,) of the heading's errors, rad."""
+        return np.abs(self.in_robot[:, 2])
+
+    def of(self, poses: slice | NDArray[np.bool_]) -> RunErrors:
+        """The errors of some of the poses."""
+        nees = None if self.nees is None else self.nees[poses]
+        return RunErrors(self.times[poses], self.driven[poses], self.in_robot[poses], nees)
+
+
+def run_errors(trajectory: Trajectory, truth: TruePath) -> RunErrors:
+    """Errors of a run's reference poses after the first, at their stamps; the true path begins at the run's start."""
+    times = trajectory.pose_times[1:]
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(truth.poses[:, :2], axis=0).T))])
+    true = TruePath(truth.times, moved_to(trajectory.start, truth.poses)).at(times)
+    errors = trajectory.poses[1:] - true
+    covariances = trajectory.pose_covariances
+    nees = None if covariances is None else _nees(errors, covariances[1:])
+    in_robot = np.column_stack([rotated(errors, -true[:, 2]), errors[:, 2]])
+    return RunErrors(times, np.interp(times, truth.times, way), in_robot, nees)
+
+
+def _nees(errors: Array, covariances: Array) -> Array:
+    """Normalised squared errors e' C^-1 e (K,); NaN where the covariance C is singular."""
+    values, directions = np.linalg.eigh(covariances)
+    regular = values[:, 0] > _SINGULAR * values[:, -1]
+    along = np.einsum("kij,ki->kj", directions[regular], errors[regular])
+    nees = np.full(len(errors), np.nan)
+    nees[regular] = (along**2 / values[regular]).sum(axis=1)
+    return nees
+
+
+def _summary(runs: list[RunErrors]) -> ErrorSummary:
+    errors = np.concatenate([run.in_robot for run in runs])
+    position, heading = np.hypot(errors[:, 0], errors[:, 1]), np.abs(errors[:, 2])
+    nees = np.concatenate([run.nees for run in runs if run.nees is not None] or [np.zeros(0)])
+    nees = nees[np.isfinite(nees)]
+    forward, left, turned = errors.mean(axis=0).tolist()
+    return ErrorSummary(
+        poses=len(errors),
+        position_mean_m=float(position.mean()),
+        position_p95_m=float(np.quantile(position, 0.95)),
+        position_max_m=float(position.max()),
+        heading_mean_rad=float(heading.mean()),
+        heading_p95_rad=float(np.quantile(heading, 0.95)),
+        heading_max_rad=float(heading.max()),
+        bias_forward_m=forward,
+        bias_left_m=left,
+        bias_heading_rad=turned,
+        nees_mean=float(nees.mean()) if len(nees) else None,
+    )
+
+
+def _growth(runs: list[RunErrors], sizes: list[Array]) -> float:
+    """Slope k of error^2 = noise^2 + (k distance)^2 by least squares; 0 where errors do not grow."""
+    squares = np.concatenate(sizes) ** 2
+    ways = np.concatenate([run.driven for run in runs]) ** 2
+    ways -= ways.mean()
+    spread = float(ways @ ways)
+    return float(np.sqrt(max(0.0, ways @ squares / spread))) if spread > 0 else 0.0
+
+
+_SAME_TIME = 1e-6  # s: rounding of stamps; poses that are nearer in time are of the same time
+
+
+class Distances(Model):
+    """Distances between two sets of poses of the same runs and times, without the start poses."""
+
+    poses: int
+    position_mean_m: float
+    position_p95_m: float
+    heading_mean_rad: float
+    heading_p95_rad: float
+
+
+class SlamSummary(Model):
+    """SLAM of a data set. Deviations are the standard deviations that SLAM states for the runs' last poses."""
+
+    dataset: str
+    simulated: bool
+    runs: int
+    scans: int
+    matched_mean: float = Field(description="share of a scan's points that lie on the map, mean over all scans")
+    matched_min: float = Field(description="matched share of the worst scan")
+    position_deviation_mean_m: float = Field(description="along the least certain direction; mean over runs")
+    position_deviation_max_m: float = Field(description="along the least certain direction; worst run")
+    heading_deviation_mean_rad: float
+    heading_deviation_max_rad: float
+    recorded: Distances | None = Field(
+        description="distance from the poses that the data set held before; None: not comparable"
+    )
+    accuracy: SlamAccuracy | None = Field(description="against the truth of a simulation, if that is known")
+    warnings: tuple[str, ...]
+
+
+def summarise(
+    before: Dataset, after: Dataset, paths: Sequence[SlamPath], accuracy: SlamAccuracy | None = None
+) -> SlamSummary:
+    """Summary of SLAM. before: the data set with its recorded poses. after: with the poses of ``paths``."""
+    matched = np.concatenate([path.matched for path in paths])
+    last = np.array([path.covariances[-1] for path in paths])
+    position = np.sqrt(np.linalg.eigvalsh(last[:, :2, :2])[:, -1])
+    heading = np.sqrt(last[:, 2, 2])
+    return SlamSummary(
+        dataset=after.name,
+        simulated=after.simulated,
+        runs=len(paths),
+        scans=sum(len(before.scans.times(run.id)) for run in before.trajectories) if before.scans else 0,
+        matched_mean=float(matched.mean()),
+        matched_min=float(matched.min()),
+        position_deviation_mean_m=float(position.mean()),
+        position_deviation_max_m=float(position.max()),
+        heading_deviation_mean_rad=float(heading.mean()),
+        heading_deviation_max_rad=float(heading.max()),
+        recorded=distances(before, after),
+        accuracy=accuracy,
+        warnings=after.warnings,
+    )
+
+
+def distances(one: Dataset, other: Dataset) -> Distances | None:
+    """Distances between the reference poses of two data sets of the same runs; None when they have no common times.
+
+    Compared at the stamps of the data set with fewer poses; the other's poses are interpolated by straight lines.
+    """
+    differences = [
+        _apart((mine.pose_times, mine.poses), (theirs.pose_times, theirs.poses))
+        for mine, theirs in zip(one.trajectories, other.trajectories, strict=True)
+    ]
+    errors = np.concatenate(differences)
+    if not len(errors):
+        return None
+    position = np.hypot(errors[:, 0], errors[:, 1])
+    heading = np.abs(errors[:, 2])
+    return Distances(
+        poses=len(errors),
+        position_mean_m=float(position.mean()),
+        position_p95_m=float(np.quantile(position, 0.95)),
+        heading_mean_rad=float(heading.mean()),
+        heading_p95_rad=float(np.quantile(heading, 0.95)),
+    )
+
+
+def _apart(one: tuple[Array, Array], other: tuple[Array, Array]) -> Array:
+    """Differences (K, 3) at the common times after the start; only whole turns at the start are taken away."""
+    (times, poses), (dense_times, dense) = sorted((one, other), key=lambda path: len(path[0]))
+    common = (times > _SAME_TIME) & (times >= dense_times[0] - _SAME_TIME) & (times <= dense_times[-1] + _SAME_TIME)
+    turns = np.round((poses[0, 2] - dense[0, 2]) / (2 * np.pi))
+    return poses[common] - interpolated(times[common], dense_times, dense) - [0.0, 0.0, 2 * np.pi * turns]
+
 
 _WORKERS = 2  # processes at a time: results do not depend on their number
 

@@ -12,8 +12,7 @@ from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array, JsonArray
 from omnibench.slam.map import ScanMap
 from omnibench.slam.motion_prior import LastPosePrior, MotionPrior, MotionWithinScan, OdometryPrior
-from omnibench.slam.path_warnings import PathWarning, path_warnings
-from omnibench.slam.pose_errors import PoseErrors
+from omnibench.slam.pose_errors import PathWarning, PoseErrors, path_warnings
 from omnibench.slam.scan_matching import Match, ScanPoints, noise_factor, refine, scan_points, search
 from omnibench.slam.slam_options import SlamOptions
 

@@ -18,7 +18,7 @@ from omnibench.fit.span import Unidentified
 from omnibench.jobs.job import TlsFiles
 from omnibench.robot.kinematics import Robot
 from omnibench.robot.odometry import Integration
-from omnibench.simulate.dataset_source import DatasetSource
+from omnibench.simulate.source import DatasetSource
 
 Label = Annotated[str, Field(min_length=1, max_length=60), AfterValidator(printable)]
 TrainingRule = Literal["split", "kind", "session"]

@@ -21,7 +21,7 @@ from samples import sample
 from sessions import Loopback, until
 from timing import PATIENCE
 
-from omnibench.cli.terminal.recording_status import record
+from omnibench.cli.terminal.live_tables import record
 from omnibench.errors import DataError
 from omnibench.live.wire.topics import KeySpace
 
@@ -83,7 +83,7 @@ RECORDING_PROCESS = """
 import sys
 from pathlib import Path
 from rich.console import Console
-from omnibench.cli.terminal.recording_status import record
+from omnibench.cli.terminal.live_tables import record
 from omnibench.live.stopping import stop_on_signals
 from omnibench.live.wire.topics import KeySpace
 from sessions import raw_session

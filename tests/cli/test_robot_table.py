@@ -19,7 +19,7 @@ from samples import odometry
 from sessions import Loopback
 from timing import PATIENCE
 
-from omnibench.cli.terminal.robot_table import describe, listen, plain_line, view
+from omnibench.cli.terminal.live_tables import describe, listen, plain_line, view
 from omnibench.errors import ConfigError, DataError
 from omnibench.live.robot_monitor import HealthSummary, OdometryStatus, RobotMonitor, RobotStatus
 from omnibench.live.wire.messages import Odometry

@@ -27,7 +27,7 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.simulate.floor_plan import RoomPlan, make_plan
 from omnibench.simulate.lidar import Lidar, measure_scans, scan_stamps
-from omnibench.slam.summary import distances
+from omnibench.slam.slam_request import distances
 from omnibench.testing.synthetic import PERIOD, synthetic_robot, synthetic_trajectories, true_robot
 
 ROBOT = synthetic_robot()

@@ -12,11 +12,10 @@ from commands import Command
 from config_robots import NAMES, robot, settings
 
 from omnibench.config import validate
-from omnibench.design.candidates import CandidatePool, candidates_of_config
+from omnibench.design.candidates import CandidatePool, RobotCommands, RobotOptions, candidates_of_config, design_source
 from omnibench.design.config import DesignConfig
 from omnibench.design.design import design_experiment
 from omnibench.design.report.design_figures import plan_in_words
-from omnibench.design.robot_commands import RobotCommands, RobotOptions, design_source
 from omnibench.errors import ConfigError
 
 AREA = (4.5, 3.5)

@@ -18,7 +18,7 @@ from omnibench.data.dataset import Dataset
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.output import DiscoverOptions, write_discovery
 from omnibench.discover.report.discovery_report import discovery_report
-from omnibench.discover.report.wording import VERDICTS, verdict_in_words
+from omnibench.discover.report.tables import VERDICTS, verdict_in_words
 from omnibench.discover.result import Discovery, discovery_document
 from omnibench.report.render import render
 

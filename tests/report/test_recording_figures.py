@@ -13,14 +13,20 @@ from recording_samples import COMMANDS, NOISE, TICK, Sample, sample
 from wheeled_samples import ROBOTS, driven
 
 from omnibench.data.scans import Mount, Scanner, ScansInMemory, TrajectoryScans
-from omnibench.report.recording.driven import ODOMETRY_ITEM, representative_runs, scan_points, thinned
+from omnibench.report.figures import is_placed
 from omnibench.report.recording.player import player
-from omnibench.report.recording.room_figures import all_runs
-from omnibench.report.recording.wheel_figures import rate_step, wheel_rates
-from omnibench.report.robot_figures import is_placed
+from omnibench.report.recording.recording_figures import (
+    ODOMETRY_ITEM,
+    all_runs,
+    rate_step,
+    representative_runs,
+    scan_points,
+    thinned,
+    wheel_rates,
+)
 from omnibench.robot.kinematics import Robot, Wheel
 from omnibench.robot.model import OdometryModel
-from omnibench.slam.summary import run_errors
+from omnibench.slam.slam_request import run_errors
 
 
 @pytest.fixture(scope="module")

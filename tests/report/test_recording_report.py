@@ -19,10 +19,10 @@ from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.scans import ScansInMemory
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import DataError
-from omnibench.report.recording.driven import representative_runs
+from omnibench.report.recording.recording_figures import representative_runs
 from omnibench.report.recording.section import has_recording, recording_document, recording_section
 from omnibench.report.render import write_document
-from omnibench.slam.summary import run_errors, slam_accuracy
+from omnibench.slam.slam_request import run_errors, slam_accuracy
 
 CONTENTS = "What was recorded"
 PLOTLY = 4.9e6  # bytes, at most

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from omnibench.report.blocks import LegendItem
+from omnibench.report.figures import path
 from omnibench.report.style import PALETTE, REFERENCE, THEORETICAL, colours, logarithmic, plan, plot, text, wrapped
-from omnibench.report.traces import path
 
 
 def test_an_entry_gets_the_colour_that_it_wants() -> None:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from omnibench.report.blocks import LegendItem
-from omnibench.report.traces import area, arrows, coordinates, joined, line, marks
+from omnibench.report.figures import area, arrows, coordinates, joined, line, marks
 
 ITEM = LegendItem("key", "a <name>", "#0072b2", "dot", "square-open")
 

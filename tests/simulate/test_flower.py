@@ -23,8 +23,7 @@ from omnibench.robot.kinematics import Array, published_matrix
 from omnibench.robot.model import OdometryModel
 from omnibench.simulate.config import EncoderNoise, FlowerConfig
 from omnibench.simulate.simulate import simulate_dataset
-from omnibench.simulate.simulation import Simulation
-from omnibench.simulate.truth import true_matrix
+from omnibench.simulate.truth import Simulation, true_matrix
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 QUIET = dict.fromkeys(EncoderNoise.model_fields, 0.0)

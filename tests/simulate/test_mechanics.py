@@ -20,7 +20,7 @@ from omnibench.simulate.commands import Command, Variation
 from omnibench.simulate.flower import true_steering
 from omnibench.simulate.mechanics import body_truth, lost_by_light_wheels, steering_truth, turned_by_steering
 from omnibench.simulate.simulate import simulate_dataset
-from omnibench.simulate.simulation import Simulation
+from omnibench.simulate.truth import Simulation
 
 WEAVE = {"weave": 0.2, "period": 3.0}
 # An effect on a robot with a variation of its commands, how small its model's errors are to be, as a share of those of

@@ -22,7 +22,7 @@ from omnibench.simulate.lidar import Lidar
 from omnibench.slam.pose_errors import FLOOR
 from omnibench.slam.slam_dataset import slam_dataset
 from omnibench.slam.slam_options import SlamOptions
-from omnibench.slam.summary import run_errors, slam_accuracy
+from omnibench.slam.slam_request import run_errors, slam_accuracy
 
 LIDAR = Lidar()
 START = np.array([1.0, 2.0, 0.5])

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from omnibench.data.dataset import Dataset
-from omnibench.slam.summary import distances
+from omnibench.slam.slam_request import distances
 from omnibench.testing.synthetic import synthetic_dataset
 
 DATA = synthetic_dataset()

@@ -11,17 +11,15 @@ from rich.console import Console
 from omnibench.cli.terminal.console import print_ending
 from omnibench.cli.terminal.tables import in_brief, print_table
 from omnibench.discover.report.tables import (
+    chance,
+    data_in_words,
     dependence_table,
     experiment_table,
+    extrapolations_in_words,
     gap_table,
     held_out_table,
     hidden_table,
     parameter_table,
-)
-from omnibench.discover.report.wording import (
-    chance,
-    data_in_words,
-    extrapolations_in_words,
     verdict_in_words,
     worst_of_each,
 )

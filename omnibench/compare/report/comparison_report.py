@@ -10,10 +10,9 @@ from dataclasses import replace
 import numpy as np
 
 from omnibench.compare.report.cost_tables import cost_section
-from omnibench.compare.report.error_figures import error_section
+from omnibench.compare.report.error_figures import error_section, path_section
 from omnibench.compare.report.headline import answer_of, path_picture
 from omnibench.compare.report.outcome_tables import matrix_section, outcome_section
-from omnibench.compare.report.path_figures import path_section
 from omnibench.compare.report.search_figures import search_section
 from omnibench.compare.report.view import (
     SPLIT_NAMES,
@@ -46,13 +45,12 @@ from omnibench.report.blocks import (
     answer_section,
     simulated_badge,
 )
+from omnibench.report.figures import DESIGN, START, is_drawn, joined, line, marks, motion_system, parameters
 from omnibench.report.numbers import MOST_MOTIONS, NOTHING, count, fixed, listing, motion_items, motion_of, significant
-from omnibench.report.recording.driven import evenly
+from omnibench.report.recording.recording_figures import evenly
 from omnibench.report.recording.section import has_recording, recording_section
 from omnibench.report.reproduction import reproduction_section
-from omnibench.report.robot_figures import DESIGN, is_drawn, motion_system, parameters
 from omnibench.report.style import INK, PALETTE, plan
-from omnibench.report.traces import START, joined, line, marks
 from omnibench.robot.kinematics import Array, Robot, Wheel, seen_from
 from omnibench.words import plural
 

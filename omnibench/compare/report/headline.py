@@ -39,10 +39,10 @@ from omnibench.report.blocks import (
     Section,
     answer_section,
 )
+from omnibench.report.figures import joined, line, marks
 from omnibench.report.numbers import fixed, listing, percent, significant, span, typeset, with_unit
 from omnibench.report.path_pictures import CALIBRATED, paths_before_after
 from omnibench.report.style import INK, PALETTE, QUIET, plot, text, wrapped
-from omnibench.report.traces import joined, line, marks
 from omnibench.words import plural
 
 _ROW, _LINE = 11, 14  # px of an entry, and of each line of its label

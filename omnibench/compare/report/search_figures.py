@@ -21,9 +21,9 @@ from omnibench.compare.result import ScoredRun
 from omnibench.fit.calibrators.genetic import GeneticOptions
 from omnibench.fit.problem import Improvement
 from omnibench.report.blocks import Figure, FigureGrid, LegendItem, Paragraph, Section
+from omnibench.report.figures import joined, line, marks
 from omnibench.report.numbers import count, listing, percent, significant
 from omnibench.report.style import AXIS, INK, logarithmic, plot, text
-from omnibench.report.traces import joined, line, marks
 from omnibench.robot.kinematics import Array
 from omnibench.words import plural
 

@@ -13,9 +13,9 @@ import plotly.graph_objects as go
 from omnibench.design.config import Per, Use
 from omnibench.design.result import Candidate, Design, Effort, Precision, SetDesign, Step
 from omnibench.report.blocks import Dash, Figure, FigureGrid, LegendItem
+from omnibench.report.figures import ORIGIN, line, marks
 from omnibench.report.numbers import count, fixed, listing, motion_in_words, percent, significant
 from omnibench.report.style import INK, PALETTE, QUIET, logarithmic, plan, plot, text
-from omnibench.report.traces import ORIGIN, line, marks
 from omnibench.robot.kinematics import Array
 from omnibench.words import noun_for, plural
 

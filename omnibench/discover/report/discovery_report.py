@@ -6,36 +6,34 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 
-from omnibench.discover.report.before_after import ALONE, EXTENDED, PLAIN
 from omnibench.discover.report.evidence_figures import CANDIDATES, GAPS, drawn, hidden_grid
+from omnibench.discover.report.residuals import ALONE, EXTENDED, PLAIN
 from omnibench.discover.report.tables import (
+    STAGES,
     absorbed_table,
+    answer_in_words,
+    closed_in_words,
+    decisive,
     dependence_table,
+    effect_in_words,
     experiment_table,
     extrapolation_table,
+    extrapolations_in_words,
+    final_errors_in_words,
+    gap_decimals,
+    gap_in_words,
     gap_table,
+    held_out_in_words,
     held_out_table,
     hidden_table,
     not_looked_for_table,
     parameter_table,
     step_table,
-)
-from omnibench.discover.report.where_section import where_section
-from omnibench.discover.report.wording import (
-    STAGES,
-    answer_in_words,
-    closed_in_words,
-    decisive,
-    effect_in_words,
-    extrapolations_in_words,
-    final_errors_in_words,
-    gap_decimals,
-    gap_in_words,
-    held_out_in_words,
     verdict_at_length,
     verdict_in_words,
     weight_in_words,
 )
+from omnibench.discover.report.where_section import where_section
 from omnibench.discover.result import Discovery, Experiment, Gap, NamedEffect, experiment_file
 from omnibench.environment import package_versions
 from omnibench.report.blocks import (

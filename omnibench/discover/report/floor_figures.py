@@ -10,13 +10,12 @@ import numpy as np
 import plotly.graph_objects as go
 from numpy.typing import NDArray
 
-from omnibench.discover.report.before_after import Curve, ModelStyle
 from omnibench.discover.report.motion_figures import MODES, CovariateFigure, motion_panels
-from omnibench.discover.report.residuals import CIRCLE_95, NORMAL_95, Residuals
+from omnibench.discover.report.residuals import CIRCLE_95, NORMAL_95, Curve, ModelStyle, Residuals
 from omnibench.report.blocks import Figure, FigureGrid, LegendItem
+from omnibench.report.figures import arrows, coordinates
 from omnibench.report.numbers import round_down
 from omnibench.report.style import plan
-from omnibench.report.traces import arrows, coordinates
 from omnibench.robot.kinematics import Array
 from omnibench.words import plural
 

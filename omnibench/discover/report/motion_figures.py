@@ -10,8 +10,18 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from omnibench.discover.report.before_after import Curve, ModelStyle, Panel, drawn, legend
-from omnibench.discover.report.residuals import CIRCLE_95, NORMAL_95, Fitted, Residuals, shares
+from omnibench.discover.report.residuals import (
+    CIRCLE_95,
+    NORMAL_95,
+    Curve,
+    Fitted,
+    ModelStyle,
+    Panel,
+    Residuals,
+    drawn,
+    legend,
+    shares,
+)
 from omnibench.report.blocks import Figure, FigureGrid
 from omnibench.report.numbers import listing
 from omnibench.robot.kinematics import Array

@@ -10,9 +10,8 @@ import numpy as np
 
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.regressors.paths import Paths
-from omnibench.discover.report.before_after import Curve, ModelStyle, Panel
 from omnibench.discover.report.motion_figures import CovariateFigure, fitted_curves, fitted_panels, grid, motion_panels
-from omnibench.discover.report.residuals import NORMAL_95, Residuals
+from omnibench.discover.report.residuals import NORMAL_95, Curve, ModelStyle, Panel, Residuals
 from omnibench.report.blocks import FigureGrid
 from omnibench.report.numbers import fixed
 from omnibench.robot.kinematics import Array, interpolated, rotated

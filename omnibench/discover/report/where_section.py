@@ -11,10 +11,21 @@ import numpy as np
 
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.report import floor_figures, motion_figures, time_figures
-from omnibench.discover.report.before_after import AFTER, ALONE, BEFORE, EXTENDED, PLAIN, Curve, ModelStyle, Panel
-from omnibench.discover.report.command_figures import command_blocks
+from omnibench.discover.report.evidence_figures import command_blocks
 from omnibench.discover.report.motion_figures import grid
-from omnibench.discover.report.residuals import NORMAL_95, Residuals, shares
+from omnibench.discover.report.residuals import (
+    AFTER,
+    ALONE,
+    BEFORE,
+    EXTENDED,
+    NORMAL_95,
+    PLAIN,
+    Curve,
+    ModelStyle,
+    Panel,
+    Residuals,
+    shares,
+)
 from omnibench.discover.report.tables import dependence_table
 from omnibench.discover.result import Discovery, NamedEffect
 from omnibench.registry import effects

@@ -15,8 +15,7 @@ from omnibench.live.estimation.extrapolation_monitor import ExtrapolationMonitor
 from omnibench.live.estimation.health import SwapRecord
 from omnibench.live.estimation.live_odometry import LiveOdometry
 from omnibench.live.fusion.pose_fusion import Fusion, FusionSettings
-from omnibench.live.fusion.reference_correction import ReferenceCorrection
-from omnibench.live.fusion.timeline import Timeline
+from omnibench.live.fusion.timeline import ReferenceCorrection, Timeline
 from omnibench.live.wheels.wheel_input import SteeringInput, WheelInput, WheelSettings, joints_of
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.joint_choice import JointChoice

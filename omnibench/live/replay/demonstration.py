@@ -13,7 +13,7 @@ import zenoh
 
 from omnibench.live.config import LiveConfig, client_session, robot_called
 from omnibench.live.estimation.health import Health
-from omnibench.live.estimation.robot_centre import RobotCentre
+from omnibench.live.estimation.live_odometry import RobotCentre
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.network.session import close_session, open_session
 from omnibench.live.node import LiveNode, load_effects

@@ -23,10 +23,10 @@ from omnibench.report.blocks import (
     answer_section,
     simulated_badge,
 )
+from omnibench.report.figures import line
 from omnibench.report.numbers import fixed, typeset
 from omnibench.report.recording.section import path_overview
 from omnibench.report.style import PALETTE, REFERENCE, plot
-from omnibench.report.traces import line
 from omnibench.robot.kinematics import Array, Robot
 
 _WHEELS = LegendItem("wheels", "by the wheels, at the design", PALETTE[0])

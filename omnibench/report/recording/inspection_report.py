@@ -31,11 +31,11 @@ from omnibench.report.blocks import (
     answer_section,
     simulated_badge,
 )
+from omnibench.report.figures import marks
 from omnibench.report.numbers import NOTHING, count, fixed, listing, percent, significant, with_unit
-from omnibench.report.recording.driven import evenly
+from omnibench.report.recording.recording_figures import evenly
 from omnibench.report.recording.section import about_table, contents_table, path_overview, pictures
 from omnibench.report.style import INK, PALETTE, plot
-from omnibench.report.traces import marks
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.words import plural
 

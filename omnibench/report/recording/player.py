@@ -11,8 +11,9 @@ import numpy as np
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.true_poses import TruePath
 from omnibench.report.blocks import LegendItem, Player
+from omnibench.report.figures import is_placed
 from omnibench.report.numbers import listing
-from omnibench.report.recording.driven import (
+from omnibench.report.recording.recording_figures import (
     ODOMETRY_ITEM,
     PLAN_ITEM,
     REFERENCE_ITEM,
@@ -23,7 +24,6 @@ from omnibench.report.recording.driven import (
     poses_at,
     scan_points,
 )
-from omnibench.report.robot_figures import is_placed
 from omnibench.report.style import INK
 from omnibench.robot.kinematics import Array, Robot, compose, interpolated, placed
 from omnibench.robot.model import OdometryModel

@@ -33,17 +33,22 @@ from omnibench.report.blocks import (
     answer_section,
     simulated_badge,
 )
+from omnibench.report.figures import coordinates, joined, line
 from omnibench.report.numbers import NOTHING, count, fixed, significant
-from omnibench.report.recording.driven import evenly, representative_runs
 from omnibench.report.recording.player import player
-from omnibench.report.recording.room_figures import all_runs, one_run
+from omnibench.report.recording.recording_figures import (
+    all_runs,
+    evenly,
+    one_run,
+    rate_step,
+    representative_runs,
+    wheel_rates,
+)
 from omnibench.report.recording.slam_tables import accuracy_tiles, bias_table, error_table, errors_in_words
-from omnibench.report.recording.wheel_figures import rate_step, wheel_rates
 from omnibench.report.style import INK, PALETTE, QUIET, plot
-from omnibench.report.traces import coordinates, joined, line
 from omnibench.robot.kinematics import Array, placed, seen_from
 from omnibench.robot.model import OdometryModel
-from omnibench.slam.summary import RunErrors, SlamAccuracy, run_errors, slam_accuracy
+from omnibench.slam.slam_request import RunErrors, SlamAccuracy, run_errors, slam_accuracy
 from omnibench.words import plural
 
 

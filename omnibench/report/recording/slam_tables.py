@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from omnibench.report.blocks import Cell, Column, Fact, Row, Table
 from omnibench.report.numbers import NOTHING, significant
-from omnibench.slam.summary import ErrorSummary, SlamAccuracy, SlamSummary
+from omnibench.slam.slam_request import ErrorSummary, SlamAccuracy, SlamSummary
 from omnibench.words import plural
 
 

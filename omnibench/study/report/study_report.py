@@ -31,13 +31,19 @@ from omnibench.report.blocks import (
     answer_section,
     simulated_badge,
 )
+from omnibench.report.figures import joined, line, marks
 from omnibench.report.numbers import count, fixed, listing, seconds, significant
 from omnibench.report.reproduction import reproduction_section
 from omnibench.report.style import INK, PALETTE, QUIET, logarithmic, plot, text
-from omnibench.report.traces import joined, line, marks
 from omnibench.study.cells import StudyCell
-from omnibench.study.report.cell_tables import StudyView, cell_words, robot_cells, study_view
-from omnibench.study.report.regime_figures import curve_section, regime_section
+from omnibench.study.report.cell_tables import (
+    StudyView,
+    cell_words,
+    curve_section,
+    regime_section,
+    robot_cells,
+    study_view,
+)
 from omnibench.study.study_result import AgainstBest, Ranking, StudyResult, profiles, ranking
 from omnibench.words import plural
 

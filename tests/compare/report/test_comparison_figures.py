@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from report_samples import APR02, config, flower, run, usual
 
-from omnibench.compare.report.path_figures import chosen_trajectories
+from omnibench.compare.report.error_figures import chosen_trajectories
 from omnibench.compare.report.search_figures import TARGETS, courses, targets_reached, thinned
 from omnibench.compare.report.view import views
-from omnibench.report.recording.driven import describe
+from omnibench.report.recording.recording_figures import describe
 from omnibench.robot.kinematics import Robot, published_matrix, relative_deviations
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.simulate import simulate_dataset

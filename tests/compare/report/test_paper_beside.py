@@ -7,8 +7,8 @@ import pytest
 from report_samples import config, flower, run
 
 from omnibench.compare.report.cost_tables import published_blocks
+from omnibench.compare.report.error_figures import chosen_trajectories, drawn_models
 from omnibench.compare.report.outcome_tables import matrix_section
-from omnibench.compare.report.path_figures import chosen_trajectories, drawn_models
 from omnibench.compare.report.search_figures import search_diagram
 from omnibench.compare.report.view import DatasetView, views
 from omnibench.report.blocks import Callout, Table

@@ -17,7 +17,7 @@ from omnibench.compare.report.view import DatasetView, views
 from omnibench.data.importers.table1 import APR_02
 from omnibench.fit.identifiability import geometry_of
 from omnibench.report.blocks import Facts, Figure, FigureGrid
-from omnibench.report.robot_figures import motion_system, parameters
+from omnibench.report.figures import motion_system, parameters
 from omnibench.robot.kinematics import Array, Robot, wheel_equations
 
 

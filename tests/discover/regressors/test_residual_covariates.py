@@ -11,8 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from omnibench.discover.discover import discover_effects
-from omnibench.discover.report.before_after import EXTENDED, PLAIN, Panel
-from omnibench.discover.report.residuals import NORMAL_95, Residuals, shares
+from omnibench.discover.report.residuals import EXTENDED, NORMAL_95, PLAIN, Panel, Residuals, shares
 from omnibench.discover.report.where_section import motor_grid
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from omnibench.discover.report.before_after import PLAIN, Curve, Panel, drawn
+from omnibench.discover.report.residuals import PLAIN, Curve, Panel, drawn
 
 
 def scale_of(values: list[float], half_width: list[float]) -> float:

@@ -29,12 +29,11 @@ from discovery_samples import (
 from report_page import Page
 
 from omnibench.discover.discover import discover_effects
-from omnibench.discover.report.before_after import ALONE, EXTENDED, PLAIN, Curve, Panel
-from omnibench.discover.report.command_figures import command_blocks
 from omnibench.discover.report.discovery_report import discovery_report, sure_blocks, what_blocks
+from omnibench.discover.report.evidence_figures import command_blocks
 from omnibench.discover.report.motion_figures import grid
-from omnibench.discover.report.residuals import Residuals
-from omnibench.discover.report.wording import decisive
+from omnibench.discover.report.residuals import ALONE, EXTENDED, PLAIN, Curve, Panel, Residuals
+from omnibench.discover.report.tables import decisive
 from omnibench.discover.result import Absorbed, Discovery, EstimatedParameter
 from omnibench.report.blocks import Document, FigureGrid, Section
 from omnibench.report.render import render

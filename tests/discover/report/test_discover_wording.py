@@ -7,12 +7,12 @@ from dataclasses import replace
 import pytest
 from discovery_samples import held_out, named
 
-from omnibench.discover.report.tables import extrapolation_table
-from omnibench.discover.report.wording import (
+from omnibench.discover.report.tables import (
     added,
     answer_in_words,
     chance,
     closed_in_words,
+    extrapolation_table,
     extrapolations_in_words,
     floor_in_words,
     gap_in_words,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from drives import motion
 
-from omnibench.live.fusion.pose_filter import PoseFilter, innovation_of
+from omnibench.live.fusion.pose_fusion import PoseFilter, innovation_of
 from omnibench.robot.odometry import advance
 
 COVARIANCE = np.array([[0.04, 0.01, -0.02], [0.01, 0.09, 0.03], [-0.02, 0.03, 0.05]])

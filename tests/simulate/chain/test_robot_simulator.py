@@ -22,9 +22,8 @@ from omnibench.simulate.commands import MotionGrid
 from omnibench.simulate.config import Truth
 from omnibench.simulate.robot_config import RobotConfig
 from omnibench.simulate.simulate import simulate_dataset
-from omnibench.simulate.simulation import Simulation
 from omnibench.simulate.source import read_simulation
-from omnibench.simulate.truth import true_matrix
+from omnibench.simulate.truth import Simulation, true_matrix
 
 TOLERANCES = {"tolerances": {"radius": 0.02, "distance": 0.05, "angle_deg": 1.0, "seed": 249}}
 BLIND = {"plan": "corridor"}

@@ -17,7 +17,7 @@ from omnibench.simulate.commands import Command
 from omnibench.simulate.motors import Motor, check_reach
 from omnibench.simulate.robot_config import RobotConfig
 from omnibench.simulate.simulate import simulate_dataset
-from omnibench.simulate.simulation import Simulation
+from omnibench.simulate.truth import Simulation
 
 
 def made(name: str, **changes: Any) -> Simulation:

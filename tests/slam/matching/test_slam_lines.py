@@ -11,7 +11,7 @@ from omnibench.data.true_poses import TruePath
 from omnibench.robot.kinematics import Array
 from omnibench.simulate.floor_plan import RoomPlan, make_plan
 from omnibench.simulate.lidar import Lidar, measure_scans
-from omnibench.slam.lines import Lines, fit_lines
+from omnibench.slam.map import Lines, fit_lines
 
 INCREMENT = np.radians(0.25)
 

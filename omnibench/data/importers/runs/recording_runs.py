@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.alignment import align
-from omnibench.data.checks.reference_jumps import reference_jumps
+from omnibench.data.checks.stream_faults import reference_jumps
 from omnibench.data.dataset import Trajectory
 from omnibench.data.importers.runs.recorded_streams import ReferenceStream
 from omnibench.data.importers.runs.reference_options import ReferenceOptions

@@ -1,4 +1,4 @@
-"""The robot seen from above, its front upwards: wheels, frame and parameters, after Fig. 2 and 3 of the paper."""
+"""The traces that figures are made of: lines, marks, arrows and areas, in the style of an item of the legend."""
 
 from __future__ import annotations
 
@@ -12,8 +12,93 @@ import plotly.graph_objects as go
 from omnibench.report.blocks import Figure, LegendItem
 from omnibench.report.numbers import fixed, plain
 from omnibench.report.style import INK, PALETTE, QUIET, THEORETICAL, plan, text
-from omnibench.report.traces import arrows, joined, line
 from omnibench.robot.kinematics import Array, Robot, Wheel
+
+Values = Sequence[float] | Sequence[str] | Array  # numbers, or the names of categories
+START = LegendItem("", "start", INK, symbol="circle-open")
+ORIGIN = LegendItem("", "start", INK)  # where several paths start
+_DIGITS = 5  # significant digits of coordinates: below a pixel in a figure magnified ten times
+
+
+def line(
+    item: LegendItem, width: float, x: Values, y: Values, *, hover: str = "", words: Sequence[str] = (), **more: Any
+) -> go.Scatter:
+    """A line through points, broken at NaN.
+
+    width: px. hover: Plotly's template of what a point shows, in which ``%{text}`` is its own of ``words``; empty: it
+    shows nothing. more: further properties of the trace, in place of these where they have the same name.
+    """
+    looks = {"mode": "lines", "line": {"color": item.colour, "width": width, "dash": item.dash}}
+    return _trace(item, x, y, hover, words, looks | more)
+
+
+def marks(
+    item: LegendItem, size: float, x: Values, y: Values, *, hover: str = "", words: Sequence[str] = (), **more: Any
+) -> go.Scatter:
+    """Points with the item's symbol, ``size`` px, if it is open with a line of 2 px; the rest as for :func:`line`."""
+    marker = {"color": item.colour, "size": size, "symbol": item.symbol}
+    marker |= {"line": {"width": 2}} if item.symbol.endswith("-open") else {}
+    return _trace(item, x, y, hover, words, {"mode": "markers", "marker": marker} | more)
+
+
+def arrows(item: LegendItem, starts: Array, tips: Array, words: Sequence[str]) -> list[go.Scatter]:
+    """Arrows from ``starts`` (n, 2) to ``tips`` (n, 2), with words that are shown at the tips."""
+    shafts = joined([np.array(ends) for ends in zip(starts, tips, strict=True)])
+    clockwise_from_up = 90.0 - np.degrees(np.arctan2(*(tips - starts).T[::-1]))
+    heads: dict[str, Any] = {"marker_symbol": "triangle-up", "marker_angle": coordinates(clockwise_from_up)}
+    return [line(item, 2.0, *shafts.T), marks(item, 9, *tips.T, hover="%{text}", words=words, **heads)]
+
+
+def area(key: str, colour: str, x: Values, y: Values) -> go.Scatter:
+    """A filled outline, or several that NaN separates. key: of its item in the legend."""
+    looks = {"mode": "none", "fill": "toself", "fillcolor": colour}
+    return _trace(LegendItem(key, "", colour), x, y, "", (), looks)
+
+
+def path(item: LegendItem, poses: Array, width: float, **more: Any) -> go.Scatter:
+    """A path over the ground; poses (K, 2 or 3), m."""
+    hover = f"{text(item.label)}<br>x %{{x:.3f}} m, y %{{y:.3f}} m"
+    return line(item, width, poses[:, 0], poses[:, 1], hover=hover, **more)
+
+
+def joined(paths: Sequence[Array]) -> Array:
+    """Paths (K, n) joined into one array, with a row of NaN between them, at which a plotted line breaks."""
+    if not paths:
+        return np.empty((0, 2))
+    gap = np.full((1, paths[0].shape[1]), np.nan)
+    return np.vstack([part for each in paths for part in (each, gap)][:-1])
+
+
+def coordinates(values: Values) -> list[float | None]:
+    """Values to five significant digits, of their range where that is smaller; NaN becomes None.
+
+    So a path is as fine far from the origin of its map as near it, and small values stay on logarithmic axes.
+    """
+    numbers = np.asarray(values, float)
+    finite = numbers[np.isfinite(numbers)]
+    span = float(np.ptp(finite)) if finite.size else 0.0
+    if not 0 < span < np.inf:
+        return [None if math.isnan(value) else value for value in numbers.tolist()]
+    decimals = _DIGITS - math.floor(math.log10(span))
+    return [None if math.isnan(value) else _rounded(value, span, decimals) for value in numbers.tolist()]
+
+
+def _rounded(value: float, span: float, decimals: int) -> float:
+    return round(value, decimals) if abs(value) > span else float(f"{value:.{_DIGITS}g}")
+
+
+def _trace(
+    item: LegendItem, x: Values, y: Values, hover: str, words: Sequence[str], looks: dict[str, Any]
+) -> go.Scatter:
+    shown: dict[str, Any] = {"hovertemplate": f"{hover}<extra></extra>"} if hover else {"hoverinfo": "skip"}
+    shown |= {"text": [text(each) for each in words]} if words else {}
+    return go.Scatter(**shown | {"x": _along(x), "y": _along(y), "legendgroup": item.key or None} | looks)
+
+
+def _along(values: Values) -> list[Any]:
+    names = [text(value) for value in values if isinstance(value, str)]
+    return names or coordinates(values)
+
 
 _WIDTH = 0.15  # of a drawn wheel, as a share of its radius (chosen: the data do not hold it)
 _REACH = 1.95  # half of the picture, in distances from the centre to the farthest wheel
@@ -40,12 +125,12 @@ def motion_system(robot: Robot) -> tuple[Figure, list[LegendItem]]:
     traces = [_outlines(DESIGN, robot)]
     traces += arrows(_FRAME, np.zeros((2, 2)), _up(0.55 * size * np.eye(2)), ["X_R, front", "Y_R, left"])
     middles = np.array([wheel.position for wheel in robot.measured])
-    ways = np.array([_along(wheel.rolling) for wheel in robot.measured])
-    starts = middles + 0.22 * size * np.array([_along(wheel.outward) for wheel in robot.measured])
+    ways = np.array([_unit_vector(wheel.rolling) for wheel in robot.measured])
+    starts = middles + 0.22 * size * np.array([_unit_vector(wheel.outward) for wheel in robot.measured])
     words = [f"V_{wheel.name}: rate times radius" for wheel in robot.measured]
     traces += arrows(_ROLLING, _up(starts - 0.18 * size * ways), _up(starts + 0.18 * size * ways), words)
     direction = math.radians(_DIRECTION)
-    tip = 0.62 * size * _along(direction)[None]
+    tip = 0.62 * size * _unit_vector(direction)[None]
     traces += arrows(_COMMAND, np.zeros((1, 2)), _up(tip), [f"α = {_DIRECTION}°"])
     turning = _arc(0.3 * size, direction, direction + math.radians(80))
     traces.append(line(_COMMAND, 1.6, *_up(turning).T))
@@ -59,7 +144,9 @@ def motion_system(robot: Robot) -> tuple[Figure, list[LegendItem]]:
     for wheel, start, way in zip(robot.measured, starts, ways, strict=True):
         labels.append(_label(start + 0.36 * size * way, f"V<sub>{text(wheel.name)}</sub>", _ROLLING.colour))
     for wheel in robot.wheels:
-        behind = (wheel.radius + 0.1 * size) * _along(wheel.rolling)  # beside the rectangle, which names would cross
+        behind = (wheel.radius + 0.1 * size) * _unit_vector(
+            wheel.rolling
+        )  # beside the rectangle, which names would cross
         labels.append(_label(np.array(wheel.position) - behind, text(wheel.name), INK))
     figure = _seen_from_above(traces, labels, size)
     names = ", ".join(wheel.name for wheel in robot.wheels)
@@ -80,8 +167,8 @@ def parameters(robot: Robot, fitted: Sequence[tuple[LegendItem, Robot]] = ()) ->
             angle = wheel.axle % (2 * math.pi)
             reach, before = (0.2 + 0.1 * number) * size, angle - 0.35  # rad before the arc's end: beside that line
             traces.append(line(_FRAME, 1.0, *_up(_arc(reach, 0.0, angle)).T))
-            labels.append(_label((reach + 0.08 * size) * _along(before), f"δ<sub>{name}</sub>", QUIET))
-            labels.append(_label(0.6 * place + 0.1 * size * _along(wheel.rolling), f"R<sub>{name}</sub>", INK))
+            labels.append(_label((reach + 0.08 * size) * _unit_vector(before), f"δ<sub>{name}</sub>", QUIET))
+            labels.append(_label(0.6 * place + 0.1 * size * _unit_vector(wheel.rolling), f"R<sub>{name}</sub>", INK))
             values, apart = (
                 f"r {wheel.radius:g} m<br>R {wheel.distance:g} m<br>δ {fixed(math.degrees(angle), 1)}°",
                 0.65,
@@ -89,12 +176,14 @@ def parameters(robot: Robot, fitted: Sequence[tuple[LegendItem, Robot]] = ()) ->
         else:
             x, y = map(plain, wheel.position)
             values, apart = f"r {wheel.radius:g} m<br>x {x} m<br>y {y} m", 0.5  # wheels to the sides: within the plot
-        labels.append(_label(place + apart * size * _along(wheel.outward), f"<b>{name}</b> {values}", DESIGN.colour))
+        labels.append(
+            _label(place + apart * size * _unit_vector(wheel.outward), f"<b>{name}</b> {values}", DESIGN.colour)
+        )
     description = f"Radius and place of each wheel of {robot.name}"
     return Figure("Its parameters", _seen_from_above(traces, labels, size), description, 460)
 
 
-def _along(angle: float) -> Array:
+def _unit_vector(angle: float) -> Array:
     """Unit vector at an angle from the front, rad."""
     return np.array([math.cos(angle), math.sin(angle)])
 
@@ -109,7 +198,7 @@ def _outlines(item: LegendItem, robot: Robot, filled: bool = False) -> go.Scatte
     corners = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1], [1, 1]])
     rectangles = []
     for wheel in robot.wheels:
-        sides = wheel.radius * np.array([_along(wheel.rolling), _WIDTH * _along(wheel.axle)])
+        sides = wheel.radius * np.array([_unit_vector(wheel.rolling), _WIDTH * _unit_vector(wheel.axle)])
         rectangles.append(_up(np.array(wheel.position) + corners @ sides))
     looks: dict[str, Any] = {"fill": "toself", "fillcolor": "rgba(0,135,95,0.12)"} if filled else {}
     return line(item, 2.0, *joined(rectangles).T, **looks)

@@ -3,27 +3,41 @@
 import shlex
 from dataclasses import replace
 from pathlib import Path
+from textwrap import fill
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from typer.core import TyperCommand
 
 from omnibench.cli.options import (
+    BackendName,
+    Figures,
     Force,
+    Json,
     PluginFiles,
     Plugins,
     Settings,
     TableFormat,
+    TlsAuthority,
+    TlsCertificate,
+    TlsKey,
+    Workers,
+    asked_backend,
     load_given_plugins,
     output_option,
+    refuse_figures_without_browser,
+    tls_files,
+    write_asked_figures,
 )
-from omnibench.cli.terminal.console import make_console, print_ending, warn
+from omnibench.cli.terminal.console import make_console, print_ending, say, warn
 from omnibench.errors import ConfigError, DataError
 from omnibench.words import plural
 
 if TYPE_CHECKING:
+    from omnibench.cli.fetch import Fetched
     from omnibench.fit.check.checking import CheckReport
     from omnibench.fit.check.fixes import RecordingSource
+
 
 import_app = typer.Typer()
 
@@ -200,3 +214,155 @@ def _write_template(
         "put your robot and your samples into them, and import them",
         *("omnibench", "import", "csv", folder, "-o", f"data/{folder.resolve().name}"),
     )
+
+
+check_app = typer.Typer()
+
+
+@check_app.command()
+def check(
+    source: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Data set folder, or several; folder or file of CSV tables, or a bag.", metavar="SOURCE..."
+        ),
+    ],
+    importer: Annotated[
+        str | None,
+        typer.Option("--format", metavar="NAME", help="Importer of the source. Default: by its files."),
+    ] = None,
+    robot: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="robot.yaml, where the source does not say the robot.")
+    ] = None,
+    settings: Settings = None,
+    report: Annotated[
+        Path | None, typer.Option(metavar="FILE.html", help="Write a page with figures of clocks and findings.")
+    ] = None,
+    figures: Figures = None,
+    plugin: Annotated[
+        list[Path] | None, typer.Option("--plugin", metavar="FILE", help="A plug-in with an importer; may be repeated.")
+    ] = None,
+    backend: BackendName = None,
+    workers: Workers = None,
+    tls_ca: TlsAuthority = None,
+    tls_cert: TlsCertificate = None,
+    tls_key: TlsKey = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Say what is wrong with a recording, and what to type.
+
+    Nothing is changed. Exit 0 whatever the verdict; 2 where the source cannot be read.
+    """
+    from omnibench.cli.terminal.check_summary import print_check
+    from omnibench.cli.terminal.console import make_console, print_json
+    from omnibench.cli.terminal.progress_display import ProgressDisplay
+    from omnibench.config import parse_settings
+    from omnibench.errors import PluginError
+    from omnibench.files import refuse_existing
+    from omnibench.fit.check.checking import check_recording
+    from omnibench.fit.check.fixes import next_command, read_source
+    from omnibench.registry import load_plugin_file, load_plugins
+
+    refuse_existing(report, force=force)
+    refuse_figures_without_browser(figures)
+    load_plugins()
+    for file in plugin or ():
+        if (failure := load_plugin_file(file)) is not None:
+            raise PluginError(f"plug-in {failure.origin} cannot be imported: {failure.error}")
+    tls = tls_files(tls_ca, tls_cert, tls_key)
+    with ProgressDisplay() as watch, asked_backend(backend, workers, tls, (), watch):
+        read = read_source(source, importer, parse_settings(settings), robot)
+        checked = check_recording(read)
+    if report is not None or figures is not None:
+        from omnibench.report.recording.check_document import check_document
+        from omnibench.report.render import write_document
+
+        document = check_document(read.dataset, checked)
+        if report is not None:
+            write_document(document, report)
+            typer.echo(f"report: {report}", err=True)
+        write_asked_figures(document, figures)
+    if as_json:
+        print_json(checked.model_dump(mode="json", include={"verdict", "needed", "findings"}))
+        return
+    print_check(make_console(), checked, next_command(read))
+
+
+fetch_app = typer.Typer()
+
+_NAMES = 12  # columns of the list's names, with the spaces around them
+
+
+@fetch_app.command()
+def fetch(
+    name: Annotated[
+        str | None,
+        typer.Argument(help="One of the list that is shown without it, or any OWNER/REPO on GitHub."),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        output_option("Data set folder to write; of several data sets, the folder above. Default: data/NAME."),
+    ] = None,
+    commit: Annotated[
+        str | None,
+        typer.Option(metavar="SHA", help="Commit to take; HEAD: the newest. Default: the one that was tested."),
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Clone a public recording from GitHub and import it.
+
+    Your git clones it into ./clones; a clone that is there is used again. Without NAME: the list of known recordings.
+    """
+    from omnibench.cli.fetch import fetch_recording
+    from omnibench.cli.terminal.progress_display import ProgressDisplay
+
+    if name is None:
+        return _list_recordings()
+    with ProgressDisplay() as watch:
+        fetched = fetch_recording(name, output, commit=commit, force=force, report=watch)
+    for folder, dataset in fetched.datasets.items():
+        warn(f"{folder}: {each}" if len(fetched.datasets) > 1 else each for each in dataset.warnings)
+    for folder, dataset in fetched.datasets.items():
+        typer.echo(f"{plural(len(dataset.trajectories), 'trajectory')}: {folder}")
+    say(f"source: {fetched.source}, in {fetched.clone.folder}")
+    say(f"licence: {_licence(fetched)}")
+    say(f"cite: {fetched.cite}")
+    return _say_what_next(fetched)
+
+
+def _licence(fetched: "Fetched") -> str:
+    """The licence in words, with the file that holds its text."""
+    if fetched.licence_file is None:
+        return fetched.licence or "the repository states none; ask its authors before you use it"
+    folder = next(iter(fetched.datasets), fetched.clone.folder)
+    return f"{fetched.licence or 'see'} ({folder / fetched.licence_file.name})"
+
+
+def _say_what_next(fetched: "Fetched") -> None:
+    """The last sentence: what there is now, and what to type."""
+    clone = fetched.clone
+    if fetched.datasets:
+        folder, dataset = next(iter(fetched.datasets.items()))
+        count = plural(len(dataset.trajectories), "run")
+        rest = f" and {plural(len(fetched.datasets) - 1, 'more folder')}" if len(fetched.datasets) > 1 else ""
+        holds = f"{folder} holds {count} of {dataset.robot.name}" if not rest else f"{folder}{rest} hold the recordings"
+        return print_ending(holds, "see whether they are fit for calibration", "omnibench", "check", folder)
+    make_console(error=True).print(f"not imported: {fetched.refusal}", soft_wrap=True)
+    if not fetched.importer:
+        return print_ending(f"{clone.folder} holds {clone.repository}", "see what can be imported", "omnibench", "list")
+    command = ("omnibench", "import", fetched.importer, "--help")
+    return print_ending(f"{clone.folder} holds {clone.repository}", "see what its import needs", *command)
+
+
+def _list_recordings() -> None:
+    """Every data set of the catalogue, with its robot, its runs and its licence."""
+    from omnibench.cli.fetch import RECORDINGS
+
+    width = make_console().width
+    for recording in RECORDINGS:
+        typer.echo(f"{recording.repository} ({recording.licence}); reference: {recording.reference}")
+        for dataset in recording.datasets:
+            text = f"{dataset.robot}: {dataset.runs}"
+            typer.echo(fill(text, width, initial_indent=f"  {dataset.name:10}", subsequent_indent=" " * _NAMES))
+    print_ending("these are the public recordings that are known", "fetch one", "omnibench", "fetch", "omni3")
