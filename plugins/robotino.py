@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from omnibench.data.alignment import median_period
+from omnibench.data.clock_matching import median_period
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.delimited import read_numbers
 from omnibench.data.importer import Importer

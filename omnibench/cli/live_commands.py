@@ -96,8 +96,7 @@ def replay(
     from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.config import parse_settings, validate
     from omnibench.live.network.presence import checked_robot
-    from omnibench.live.replay.arrivals import ReplayConfig
-    from omnibench.live.replay.concatenated_drive import concatenate_recording, load_recording
+    from omnibench.live.replay.concatenated_drive import ReplayConfig, concatenate_recording, load_recording
     from omnibench.live.replay.replay_player import Player
     from omnibench.live.stopping import stop_on_signals
     from omnibench.live.wire.topics import GraphNode
@@ -256,8 +255,7 @@ def _replay_to_node(
     from omnibench.cli.terminal.live_tables import node_log, print_demonstration
     from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.config import validate
-    from omnibench.live.replay.arrivals import ReplayConfig
-    from omnibench.live.replay.concatenated_drive import load_recording
+    from omnibench.live.replay.concatenated_drive import ReplayConfig, load_recording
     from omnibench.live.replay.demonstration import demonstrate
     from omnibench.live.stopping import stop_on_signals
 

@@ -31,8 +31,7 @@ from omnibench.discover.output import Request
 from omnibench.discover.regressors.fine_structure import fine_structure
 from omnibench.discover.regressors.significance import Significance, together
 from omnibench.discover.result import Discovery
-from omnibench.discover.selection.averaged_model import averaged
-from omnibench.discover.selection.competing_models import competing_models, with_fitted_forms
+from omnibench.discover.selection.competing_models import averaged, competing_models, with_fitted_forms
 from omnibench.discover.selection.detectability import detectability_of
 from omnibench.discover.selection.evidence import check_names
 from omnibench.discover.selection.extrapolation import extrapolations_of, faded

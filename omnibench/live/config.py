@@ -12,7 +12,7 @@ from omnibench.config import Model, Positive, RelativePath, read_model, read_yam
 from omnibench.errors import ConfigError, UnknownNameError
 from omnibench.live.fusion.pose_fusion import FusionSettings
 from omnibench.live.network.session_config import SessionConfig
-from omnibench.live.replay.arrivals import ReplayConfig
+from omnibench.live.replay.concatenated_drive import ReplayConfig
 from omnibench.live.wheels.wheel_input import WheelSettings
 from omnibench.live.wire.outputs import Frames
 from omnibench.live.wire.topics import Profile

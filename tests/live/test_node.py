@@ -20,8 +20,7 @@ from sessions import until
 from omnibench.errors import ConfigError, DataError
 from omnibench.live.config import LiveConfig, read_live_config
 from omnibench.live.node import LiveNode
-from omnibench.live.replay.arrivals import ReplayConfig
-from omnibench.live.replay.concatenated_drive import concatenate_runs
+from omnibench.live.replay.concatenated_drive import ReplayConfig, concatenate_runs
 from omnibench.live.replay.replay_player import Player
 from omnibench.live.stopping import RateLimiter
 from omnibench.live.wire.messages import DIAGNOSTICS, ODOMETRY, TRANSFORMS, Odometry

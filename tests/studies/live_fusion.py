@@ -16,9 +16,9 @@ import numpy as np
 
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.fusion.pose_fusion import FusionSettings
-from omnibench.live.replay.arrivals import ReplayConfig
 from omnibench.live.replay.concatenated_drive import (
     ConcatenatedDrive,
+    ReplayConfig,
     concatenate_recording,
     concatenated_truth,
     load_recording,

@@ -12,8 +12,8 @@ from pydantic import Field, model_validator
 from omnibench.data.dataset import Dataset
 from omnibench.data.importer import Importer
 from omnibench.data.importers.copied_reference import follows_the_wheels
-from omnibench.data.importers.runs.reference_options import RADIANS, SECONDS, HeadingUnit, TimeUnit
-from omnibench.data.importers.runs.reread_runs import Columns, in_seconds, reread_runs, scans_of
+from omnibench.data.importers.recording_options import RADIANS, SECONDS, HeadingUnit, TimeUnit
+from omnibench.data.importers.runs.recording_runs import Columns, in_seconds, reread_runs, scans_of
 from omnibench.data.importers.wheel_samples import EncoderOptions, Signs
 from omnibench.data.splits import Names, complete, joined
 from omnibench.data.storage import load_whole, read_recorded

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from omnibench.data.alignment import median_period
+from omnibench.data.clock_matching import median_period
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.delimited import NumberTable, read_numbers
 from omnibench.data.importer import Importer

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from omnibench.data.alignment import align
+from omnibench.data.clock_matching import align
 from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory
 from omnibench.data.delimited import NumberTable, read_numbers
 from omnibench.data.importer import Importer

@@ -16,7 +16,7 @@ from pydantic import BeforeValidator, Field, FiniteFloat, model_validator
 
 from omnibench.config import Positive
 from omnibench.data.checks.finding import FindingWarning
-from omnibench.data.importers.runs.reference_options import ReferenceOptions
+from omnibench.data.importers.recording_options import ReferenceOptions
 from omnibench.errors import DataError, nearest
 from omnibench.robot.kinematics import Array, fastest_rates
 from omnibench.words import plural

@@ -18,15 +18,15 @@ from omnibench.errors import ConfigError, OmnibenchError
 from omnibench.live.control.request_queue import source_of
 from omnibench.live.estimation.counts import anomalies_among
 from omnibench.live.network.presence import alive_robots, checked_robot
-from omnibench.live.replay.arrivals import (
+from omnibench.live.replay.concatenated_drive import (
     TOPICS_PLAYED,
     WHEELS,
+    ConcatenatedDrive,
     PoseDeviation,
     ReplayConfig,
     SlamChannel,
     make_schedule,
 )
-from omnibench.live.replay.concatenated_drive import ConcatenatedDrive
 from omnibench.live.replay.delivery import AcknowledgedDelivery, Delivery, DeliveryError, UnconfirmedDelivery
 from omnibench.live.stopping import answers, wait_until
 from omnibench.live.wheels.wheel_input import check_joints, joints_of

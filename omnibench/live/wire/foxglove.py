@@ -12,8 +12,7 @@ import zenoh
 
 from omnibench.errors import ConfigError
 from omnibench.live.stopping import Closing
-from omnibench.live.wire.topic_listener import Arrival, TopicListener
-from omnibench.live.wire.topics import TOPICS, KeySpace
+from omnibench.live.wire.topics import TOPICS, Arrival, KeySpace, TopicListener
 
 if TYPE_CHECKING:
     from foxglove import Channel

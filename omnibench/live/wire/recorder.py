@@ -27,8 +27,7 @@ from mcap.writer import MCAP0_MAGIC, Writer
 
 from omnibench.errors import DataError
 from omnibench.live.wire.messages import MessageError, MessageType
-from omnibench.live.wire.topic_listener import Arrival, TopicListener
-from omnibench.live.wire.topics import TOPICS, KeySpace
+from omnibench.live.wire.topics import TOPICS, Arrival, KeySpace, TopicListener
 
 
 class McapFile:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from omnibench.data.alignment import align, median_period
+from omnibench.data.clock_matching import align, median_period
 
 WHEELS = 0.01 * np.arange(1, 101)
 

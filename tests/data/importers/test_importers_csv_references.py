@@ -14,7 +14,7 @@ from omnibench.data.importers.csv_tables.csv import Csv
 from omnibench.data.importers.csv_tables.csv_options import CsvOptions
 from omnibench.data.importers.csv_tables.csv_template import write_template
 from omnibench.data.importers.dataset_folder import DatasetFolder, DatasetOptions
-from omnibench.data.importers.runs.reread_runs import in_seconds
+from omnibench.data.importers.runs.recording_runs import in_seconds
 from omnibench.data.storage import save_dataset
 from omnibench.errors import DataError
 

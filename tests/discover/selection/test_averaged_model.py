@@ -10,7 +10,7 @@ from discovery_samples import COUPLING, simulated
 
 from omnibench.discover.fitting import Extended, Fit, extend, fit_matrix
 from omnibench.discover.regressors.columns import Group
-from omnibench.discover.selection.averaged_model import averaged
+from omnibench.discover.selection.competing_models import averaged
 from omnibench.discover.selection.screening import screen_plain
 from omnibench.fit.trajectory_fit import usable_runs
 

@@ -25,8 +25,12 @@ from omnibench.live.estimation.live_odometry import LiveOdometry
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.fusion.pose_fusion import FusionSettings
 from omnibench.live.node import LiveNode
-from omnibench.live.replay.arrivals import ReplayConfig
-from omnibench.live.replay.concatenated_drive import concatenate_recording, concatenate_runs, concatenated_truth
+from omnibench.live.replay.concatenated_drive import (
+    ReplayConfig,
+    concatenate_recording,
+    concatenate_runs,
+    concatenated_truth,
+)
 from omnibench.live.replay.replay_player import events
 from omnibench.live.wheels.wheel_input import WheelStep
 from omnibench.live.wire.messages import JOINT_STATE, JointState

@@ -11,8 +11,7 @@ from pydantic import ValidationError
 from routers import RouterProcess, member, works
 from sessions import until
 
-from omnibench.live.network.access import Right, rights_of
-from omnibench.live.network.session import open_session
+from omnibench.live.network.session import Right, open_session, rights_of
 from omnibench.live.network.session_config import Access
 
 

@@ -18,8 +18,7 @@ from sessions import free_port, until
 from omnibench.cli.handbook_topics import find_topic
 from omnibench.live.network.session import open_session
 from omnibench.live.network.session_config import SessionConfig, Tls
-from omnibench.live.replay.arrivals import ReplayConfig
-from omnibench.live.replay.concatenated_drive import concatenate_runs
+from omnibench.live.replay.concatenated_drive import ReplayConfig, concatenate_runs
 from omnibench.live.replay.replay_player import Player
 from omnibench.live.wire.topics import GraphNode, KeySpace
 

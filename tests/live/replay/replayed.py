@@ -9,8 +9,7 @@ import numpy as np
 from recordings import random_dataset
 
 from omnibench.config import validate
-from omnibench.live.replay.arrivals import ReplayConfig
-from omnibench.live.replay.concatenated_drive import ConcatenatedDrive, concatenate_runs
+from omnibench.live.replay.concatenated_drive import ConcatenatedDrive, ReplayConfig, concatenate_runs
 from omnibench.live.replay.replay_player import Event, events
 from omnibench.live.wire.messages import JointState, PoseEstimate
 from omnibench.robot.calibration import Noise

@@ -17,8 +17,7 @@ from replayed import DRIVE, arrivals, config, of, played, same, taken
 
 from omnibench.config import parse_yaml, to_yaml, validate
 from omnibench.errors import ConfigError
-from omnibench.live.replay.arrivals import ReplayConfig
-from omnibench.live.replay.concatenated_drive import ConcatenatedDrive
+from omnibench.live.replay.concatenated_drive import ConcatenatedDrive, ReplayConfig
 from omnibench.live.replay.replay_player import events
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array

@@ -12,8 +12,7 @@ from steered import CAR, SWERVE, TRICYCLE, calibration, recording
 
 from omnibench.config import validate
 from omnibench.live.estimation.tracker import RobotTracker
-from omnibench.live.replay.arrivals import ReplayConfig
-from omnibench.live.replay.concatenated_drive import ConcatenatedDrive, concatenate_recording
+from omnibench.live.replay.concatenated_drive import ConcatenatedDrive, ReplayConfig, concatenate_recording
 from omnibench.live.replay.replay_player import events
 from omnibench.live.wheels.wheel_input import WheelSettings
 from omnibench.live.wire.messages import JOINT_STATE, JointState

@@ -18,8 +18,13 @@ from omnibench.data.delimited import row_error
 from omnibench.data.importer import Importer
 from omnibench.data.importers.copied_reference import follows_the_wheels
 from omnibench.data.importers.csv_tables.csv_options import CsvOptions, run_column
-from omnibench.data.importers.csv_tables.table_files import RUN_TABLES, file_called, find_tables, load
-from omnibench.data.importers.csv_tables.table_recordings import read_recordings
+from omnibench.data.importers.csv_tables.table_recordings import (
+    RUN_TABLES,
+    file_called,
+    find_tables,
+    load,
+    read_recordings,
+)
 from omnibench.data.importers.runs.recorded_streams import RecordedStreams, by_one_clock
 from omnibench.data.importers.runs.recording_runs import recording_runs
 from omnibench.errors import DataError, nearest

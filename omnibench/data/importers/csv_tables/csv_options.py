@@ -14,7 +14,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from omnibench.config import Positive
 from omnibench.data.checks.misreading import as_yaml
 from omnibench.data.delimited import DECIMAL_COMMA, CellTable, ColumnError, missing_column
-from omnibench.data.importers.runs.reference_options import HeadingUnit, TimeUnit
+from omnibench.data.importers.recording_options import HeadingUnit, TimeUnit
 from omnibench.data.importers.wheel_samples import EncoderOptions, Signs
 from omnibench.data.splits import Names
 from omnibench.errors import nearest

@@ -24,9 +24,8 @@ from omnibench.data.importers.rosbag.bag import (
 from omnibench.data.importers.rosbag.joint_streams import WheelStream, read_wheels
 from omnibench.data.importers.rosbag.message_streams import PoseStream, Stamps, header_stamp, read_poses
 from omnibench.data.importers.rosbag.rosbag_options import RosbagOptions
-from omnibench.data.importers.rosbag.scan_stream import RunScans, ScanStream, read_scans
+from omnibench.data.importers.rosbag.scan_stream import RunScans, ScanStream, read_scans, read_transforms
 from omnibench.data.importers.rosbag.sensor_references import SensorReferences, read_sensors
-from omnibench.data.importers.rosbag.transform_poses import read_transforms
 from omnibench.data.importers.runs.recorded_streams import ReferenceStream
 from omnibench.data.importers.runs.recording_runs import Span, breaks, cut_run, departure, find_rests, from_rest, parted
 from omnibench.data.importers.wheel_samples import Losses, WheelSamples, wheel_samples

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,10 @@ import numpy as np
 
 from omnibench.config import validate
 from omnibench.data.importers.rosbag.bag import Bag, Topic, open_bag
-from omnibench.data.importers.rosbag.message_streams import MessageFilter, Stamps, stamp_of
+from omnibench.data.importers.rosbag.message_streams import MessageFilter, PoseStream, Stamps, read_poses, stamp_of
 from omnibench.data.scans import Mount, Ranges, Scanner, Scans, TrajectoryScans
-from omnibench.errors import ConfigError, DataError
-from omnibench.robot.kinematics import Array
+from omnibench.errors import ConfigError, DataError, nearest
+from omnibench.robot.kinematics import Array, compose, interpolated
 from omnibench.words import plural
 
 _BASES = ("base_link", "base_footprint", "base")  # REP-105; with or without the robot's namespace
@@ -302,3 +303,66 @@ def _scanner(shape: _Shape, increment: float, mounting: ScannerMounting, topic: 
         )
     except ConfigError as error:
         raise DataError(f"{error}; {_WAY_OUT}") from None
+
+
+def read_transforms(bag: Bag, topic: Topic, frames: Sequence[str], warnings: list[str]) -> PoseStream:
+    """Poses of the second of two frames in the first, at the stamps of the rarest transform between them.
+
+    Transforms between are composed in the plane. ConfigError: no frames are given, or nothing leads from one to the
+    other. DataError as for ``read_poses``.
+    """
+    moving = _parents(bag, topic)
+    fixed = fixed_transforms(bag)
+    parents = moving | {child: parent for child, (parent, _) in fixed.items()}
+    shown = ", ".join(f"{parent} > {child}" for child, parent in parents.items()) or "none"
+    place = f"{bag.path}: topic {topic.name}"
+    if not frames:
+        raise ConfigError(f"{place}: set pose_frames=[world, robot] to the frames of the reference; found: {shown}")
+    world, child = (frame.strip("/") for frame in frames)
+    links: list[str] = []
+    while child != world:
+        if child not in parents or child in links:
+            known = {*parents, *parents.values()}
+            hint = nearest(child if links else frames[1], known) if child not in known else ""
+            raise ConfigError(
+                f"{place}: pose_frames: no transforms lead from {world} to {frames[1]}; {hint}found: {shown}"
+            )
+        links.append(child)
+        child = parents[child]
+    streams = {link: read_poses(bag, topic, warnings, partial(_transform, link)) for link in links if link in moving}
+    if not streams:
+        raise ConfigError(f"{place}: pose_frames: {frames[1]} does not move in {world}; found: {shown}")
+    stamps = min(streams.values(), key=lambda stream: len(stream.stamps)).stamps
+    begin, end = max(each.stamps[0] for each in streams.values()), min(each.stamps[-1] for each in streams.values())
+    stamps = stamps[(stamps >= begin) & (stamps <= end)]
+    poses: Array = np.zeros((len(stamps), 3))
+    for link in reversed(links):
+        poses = compose(
+            poses,
+            _at(streams[link], stamps) if link in streams else np.broadcast_to(_in_plane(fixed[link][1]), poses.shape),
+        )
+    return PoseStream(stamps, poses, None)
+
+
+def _parents(bag: Bag, topic: Topic) -> dict[str, str]:
+    """The parent of every frame that moves."""
+    return {
+        stamped.child_frame_id.strip("/"): stamped.header.frame_id.strip("/")
+        for record in bag.records(topic)
+        for stamped in getattr(record.message, "transforms", ())
+    }
+
+
+def _transform(child: str, message: Any) -> Any:
+    """The transform of a frame in a message of transforms; None if it is not in it."""
+    return next((each for each in message.transforms if each.child_frame_id.strip("/") == child), None)
+
+
+def _at(stream: PoseStream, stamps: Any) -> Array:
+    """Poses (K, 3) at stamps (K,), by straight lines between those of a stream."""
+    poses = np.column_stack([stream.poses[:, :2], np.unwrap(stream.poses[:, 2])])
+    return interpolated((stamps - stream.stamps[0]) / 1e9, (stream.stamps - stream.stamps[0]) / 1e9, poses)
+
+
+def _in_plane(transform: Array) -> Array:
+    return np.array([*transform[:2, 3], np.arctan2(transform[1, 0], transform[0, 0])])

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from omnibench.data.clock_matching import Streams, match_clocks
-from omnibench.data.importers.runs.reference_options import ReferenceOptions, units_of
+from omnibench.data.importers.recording_options import ReferenceOptions, units_of
 from omnibench.data.importers.wheel_samples import WheelSamples
 from omnibench.data.references import KINDS, UNITS, References
 from omnibench.robot.kinematics import Array, Robot, in_the_middle
