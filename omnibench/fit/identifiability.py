@@ -36,6 +36,16 @@ from omnibench.robot.stored_odometry import odometry_of
 _UNIDENTIFIED = 1e-3  # share of a parameter's axis in the unidentified space from which on it is not identified
 _NO_CHANGE = 1e-6  # share of the largest singular value below which a change of the geometry leaves the matrix as it is
 _ROUNDING = 1e-12  # strength of a change, in units of its scale, that is none: nothing of the matrix may be known
+# Share of the strongest direction: one that is driven less is mentioned, since slip counts five times as much along it.
+# Half of it and twice say the same of three recordings (tests/studies/constants_fit.py).
+_LITTLE_SHARE = 0.2
+ROWS = ("x", "y", "heading")
+# Standard deviation, as a share of a row's largest element, above which the row counts as rough along a direction:
+# calibrations change rows by a few per cent, and the box about the design is +-25 % wide. Half of it and twice say the
+# same of three recordings (tests/studies/constants_fit.py).
+LARGEST_DEVIATION = 0.10
+UNTOLD = 10.0  # the same share from which on references other than poses tell nothing, as other sentences say
+_OPEN = 1e-14  # share of the largest eigenvalue of the information: less is rounding, and the direction is open
 
 
 @dataclass(frozen=True)
@@ -125,18 +135,17 @@ def inseparable_parameters(
     return tuple(groups)
 
 
-def inseparable_in_words(geometry: WheelGeometry, kept: Array, left_open: Array | None = None) -> tuple[str, ...]:
+def inseparable_in_words(geometry: WheelGeometry, kept: Array, left_open: Array | None = None) -> Iterator[str]:
     """A sentence for each group of a geometry's numbers that cannot be told apart."""
-    return tuple(map(_group_in_words, inseparable_parameters(geometry, kept, left_open)))
-
-
-def _group_in_words(group: tuple[str, ...]) -> str:
-    if len(group) == 1:
-        return f"these data say nothing of {group[0]}: it stays where the search left it"
-    return (
-        f"these data cannot tell {', '.join(group[:-1])} and {group[-1]} apart: a change of one is made up for by the "
-        "others, so that no such number is known by itself, only what they do together in the motions that were driven"
-    )
+    for group in inseparable_parameters(geometry, kept, left_open):
+        if len(group) == 1:
+            yield f"these data say nothing of {group[0]}: it stays where the search left it"
+        else:
+            yield (
+                f"these data cannot tell {', '.join(group[:-1])} and {group[-1]} apart: a change of one is made up for "
+                "by the others, so that no such number is known by itself, only what they do together in the motions "
+                "that were driven"
+            )
 
 
 def _unseen_changes(geometry: WheelGeometry, kept: Array, left_open: Array | None) -> Array:
@@ -152,16 +161,12 @@ def _unseen_changes(geometry: WheelGeometry, kept: Array, left_open: Array | Non
     return projection
 
 
-# Share of the strongest direction: one that is driven less is mentioned, since slip counts five times as much along it.
-# Half of it and twice say the same of three recordings (tests/studies/constants_fit.py).
-_LITTLE_SHARE = 0.2
-
-
 def open_directions(directions: Sequence[WheelDirection]) -> Iterator[str]:
     """A sentence for every direction that the runs drive little or not at all."""
     kept = "calibration keeps the design values there"
     for each in directions:
         words, motion, share = each.words, each.motion, each.share_in_words
+        verb = "turn the robot" if motion == "turning on the spot" else motion.replace("moving", "move the robot", 1)
         if each.identified:
             continue
         if each.state == "undriven" and motion:
@@ -175,7 +180,7 @@ def open_directions(directions: Sequence[WheelDirection]) -> Iterator[str]:
             yield f"no run drives the wheels along {words}{expected}: the matrix is not determined along it, and {kept}"
         elif motion:
             yield (
-                f"these recordings hardly {_verb(motion)}: they drive the wheels along {words} ({motion}) with "
+                f"these recordings hardly {verb}: they drive the wheels along {words} ({motion}) with "
                 f"{share}, which slip alone can do; what row 3 (heading) says of it cannot be identified, nor what "
                 f"rows 1 (x) and 2 (y) say; {kept}, unless it is told to fit them; {_advice(motion)}"
             )
@@ -187,13 +192,6 @@ def open_directions(directions: Sequence[WheelDirection]) -> Iterator[str]:
                 f"the runs drive the wheels along {each.words}{f' ({each.motion})' if each.motion else ''} with only "
                 f"{each.share_in_words}: slip counts {1 / each.share:.0f} times as much there"
             )
-
-
-def _verb(motion: str) -> str:
-    """The motion as an imperative, like ``turn the robot``."""
-    if motion == "turning on the spot":
-        return "turn the robot"
-    return motion.replace("moving", "move the robot", 1)
 
 
 def _advice(motion: str) -> str:
@@ -233,15 +231,6 @@ def warnings_of_calibration(
             end = "kept at the design values"
         sentences.append(f"these data do not identify what wheel rates along {subject}; {end}")
     return tuple(sentences)
-
-
-ROWS = ("x", "y", "heading")
-# Standard deviation, as a share of a row's largest element, above which the row counts as rough along a direction:
-# calibrations change rows by a few per cent, and the box about the design is +-25 % wide. Half of it and twice say the
-# same of three recordings (tests/studies/constants_fit.py).
-LARGEST_DEVIATION = 0.10
-UNTOLD = 10.0  # the same share from which on references other than poses tell nothing, as other sentences say
-_OPEN = 1e-14  # share of the largest eigenvalue of the information: less is rounding, and the direction is open
 
 
 class DirectionIdentifiability(Model):
@@ -312,10 +301,18 @@ def identifiability(
         )
         for each in every
     )
-    left_open = with_open_combinations(
-        MatrixElements(robot, "row", unidentified_directions(robot, span), known_mount=False), trajectories
-    ).open
-    parameters = _parameters(robot, span, information, left_open)
+    # The physical parameters, the matrix being unknown along unidentified directions and open combinations.
+    kept, geometry = unidentified_directions(robot, span), _geometry(robot)
+    left_open = with_open_combinations(MatrixElements(robot, "row", kept, known_mount=False), trajectories).open
+    told = identified_parameters(geometry, kept, left_open)
+    slopes = known_slopes(geometry, kept, left_open)
+    of_parameters = geometry.scale * np.linalg.norm(roots_of(slopes.T @ information @ slopes), axis=1)
+    parameters = tuple(
+        ParameterIdentifiability(
+            name=name, unit=unit_of(name), design=float(value), told=told, deviation=float(deviation) if told else None
+        )
+        for name, value, told, deviation in zip(geometry.names, geometry.start, told, of_parameters, strict=True)
+    )
     return Identifiability(
         directions=directions,
         parameters=parameters,
@@ -396,26 +393,3 @@ def _inverse(information: Array) -> Array:
 def _geometry(robot: Robot) -> WheelGeometry:
     """The geometry that is fitted by default."""
     return WheelGeometry(robot, fitted_mount=default_mount(robot) == "fit")
-
-
-def _parameters(
-    robot: Robot, span: DrivenSpan, information: Array, left_open: Array | None
-) -> tuple[ParameterIdentifiability, ...]:
-    """Identifiability of the physical parameters if the matrix is unknown along unidentified directions.
-
-    left_open (q, 3M): combinations of elements that references leave open, and that are unknown, too.
-    """
-    kept, geometry = unidentified_directions(robot, span), _geometry(robot)
-    identified = identified_parameters(geometry, kept, left_open)
-    slopes = known_slopes(geometry, kept, left_open)
-    deviations = geometry.scale * np.linalg.norm(roots_of(slopes.T @ information @ slopes), axis=1)
-    return tuple(
-        ParameterIdentifiability(
-            name=name,
-            unit=unit_of(name),
-            design=float(value),
-            told=told,
-            deviation=float(deviation) if told else None,
-        )
-        for name, value, told, deviation in zip(geometry.names, geometry.start, identified, deviations, strict=True)
-    )

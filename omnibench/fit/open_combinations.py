@@ -29,11 +29,10 @@ from omnibench.words import plural
 WORST = 0.10
 # Standard deviation, m and rad, for which reference poses count beside the others: that of a first guess (noise.py).
 _OF_POSES = 0.01
-
-
 # Share, squared, of an element in the open directions from which on it counts as open: what 5 % of the design there
 # leave of it is then 0.2 % (as _UNIDENTIFIED of fit/identifiability.py).
 _SHARE = 1e-3
+_MOST = 0.9  # share, squared, of a motion's part in the open combinations from which on it is called open; chosen
 
 
 def with_open_combinations(searched: MatrixElements, runs: Sequence[Trajectory]) -> MatrixElements:
@@ -74,9 +73,6 @@ def open_directions(searched: MatrixElements, information: Array) -> Array:
     values, vectors = np.linalg.eigh(columns.T @ information @ columns)
     directions: Array = (allowed @ vectors[:, values < WORST**-2.0]).T
     return directions
-
-
-_MOST = 0.9  # share, squared, of a motion's part in the open combinations from which on it is called open; chosen
 
 
 def open_sentences(

@@ -13,7 +13,7 @@ without shrinkage: S tells of the scatter of the runs, and slip may be the same 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -32,16 +32,6 @@ from omnibench.robot.kinematics import Array
 _ROUNDING = 1e-10  # share of the largest variance: a smaller one is rounding of a direction that was not fitted
 
 
-@dataclass(frozen=True, eq=False)
-class _Knowledge:
-    """What the data say: information S^+ (n, n), degrees of freedom (n,) of its estimate, noise, source in words."""
-
-    information: Array
-    degrees_of_freedom: Array
-    noise: Noise | None
-    words: str
-
-
 def shrunk(problem: CalibrationProblem, result: RunResult, *, fitted: bool = True) -> RunResult:
     """A calibrator's result, shrunk to the design where the problem ``shrinks``; otherwise, or unanswered, as it is.
 
@@ -52,14 +42,22 @@ def shrunk(problem: CalibrationProblem, result: RunResult, *, fitted: bool = Tru
     """
     if not (problem.shrinks and fitted) or result.extension or result.vector is None or result.cost is None:
         return result
-    known = _knowledge(problem, result)
+    information, known_freedom, noise, words = _knowledge(problem, result)
     root = problem.parameterisation.prior_root * problem.free[:, None]
     # eigh bears information of any size: data without noise have so much that 1 + S is singular to rounding
-    strengths, directions = np.linalg.eigh(root.T @ known.information @ root)
+    strengths, directions = np.linalg.eigh(root.T @ information @ root)
     posterior = root @ directions @ np.diag(1 / (1 + np.maximum(strengths, 0.0))) @ directions.T @ root.T
     deviation = problem.parameterisation.projection @ (result.vector - problem.start)
-    vector = problem.settled(problem.start + posterior @ known.information @ deviation)
+    vector = problem.settled(problem.start + posterior @ information @ deviation)
     cost = float(problem.values(vector[None])[0])
+    # The change of the cost: as a share of it, or in its unit where it is rounding alone.
+    change = f"{cost - result.cost:+.2g}"
+    if result.cost > problem.objective.rounding:
+        change = f"{100 * (cost / result.cost - 1):+.2g} %"
+    # The posterior variances are C S^+ C from the data and else from the prior, whose part is exact: their degrees of
+    # freedom are those of the data over the square of its share (Satterthwaite 1946).
+    shares = np.diag(posterior @ information @ posterior) / np.maximum(np.diag(posterior), 1e-300)
+    freedom: Array = np.minimum(known_freedom / np.square(np.clip(shares, 1e-9, 1.0)), MANY)
     misled = result.covariance is None and bool(runs_without_heading(problem))
     return replace(
         result,
@@ -67,26 +65,21 @@ def shrunk(problem: CalibrationProblem, result: RunResult, *, fitted: bool = Tru
         matrix=problem.matrix(vector),
         cost=cost,
         covariance=None if misled else posterior,
-        degrees_of_freedom=_freedom(posterior, known),
-        noise=known.noise,
-        shrinkage=Shrinkage(result.cost, f"the design's tolerance and {known.words}"),
-        reason=f"{result.reason}; shrunk to the design, which changes the cost by {_added(problem, result.cost, cost)}",
+        degrees_of_freedom=freedom,
+        noise=noise,
+        shrinkage=Shrinkage(result.cost, f"the design's tolerance and {words}"),
+        reason=f"{result.reason}; shrunk to the design, which changes the cost by {change}",
     )
 
 
-def _added(problem: CalibrationProblem, before: float, after: float) -> str:
-    """Change of a cost in words: as a share of it, or in its unit where it is rounding alone."""
-    return f"{100 * (after / before - 1):+.2g} %" if before > problem.objective.rounding else f"{after - before:+.2g}"
+def _knowledge(problem: CalibrationProblem, result: RunResult) -> tuple[Array, Array, Noise | None, str]:
+    """The data's information S^+ (n, n), the degrees of freedom (n,) of its estimate, the noise, and its source.
 
-
-def _knowledge(problem: CalibrationProblem, result: RunResult) -> _Knowledge:
-    """Information by the answer's covariance; where it has none, or lies on a bound, by the noise of the poses.
-
-    Both are of the part of the matrix that the data drive, in units of its rows' largest elements.
+    The information is that of the answer's covariance, or of the noise of the poses where the answer has none or lies
+    on a bound. Both are of the part of the matrix that the data drive, in units of its rows' largest elements.
     """
-    assert result.matrix is not None  # there is an answer
-    assert result.vector is not None
-    robot = problem.robot
+    assert result.matrix is not None and result.vector is not None  # noqa: PT018 (there is an answer)
+    robot, matrix = problem.robot, result.matrix
     unit = np.repeat(robot.row_scales, len(robot.drive.names))
     driven = MatrixElements(robot, "row", problem.unidentified, known_mount=False).projection
     slopes = driven @ problem.parameterisation.slopes(result.vector) / unit[:, None]
@@ -96,39 +89,21 @@ def _knowledge(problem: CalibrationProblem, result: RunResult) -> _Knowledge:
         except NoCovarianceError:
             pass
         else:
-            told = slopes @ answer.steadied @ slopes.T
-            information = slopes.T @ np.linalg.pinv(told, rcond=_ROUNDING, hermitian=True) @ slopes
+            covariance = slopes @ answer.steadied @ slopes.T
+            information = slopes.T @ np.linalg.pinv(covariance, rcond=_ROUNDING, hermitian=True) @ slopes
             freedom = np.broadcast_to(answer.of_vector.degrees_of_freedom, problem.size)
-            return _Knowledge(information, np.array(freedom), answer.noise, answer.source)
-    every, noise, words = _information(problem, result.matrix)
-    columns = unit[:, None] * slopes
-    return _Knowledge(columns.T @ every @ columns, np.full(problem.size, MANY), noise, words)
-
-
-def _information(problem: CalibrationProblem, matrix: Array) -> tuple[Array, Noise | None, str]:
-    """Information (3M, 3M) about the elements by the noise of poses and references, that noise, and both in words."""
-    posed = [run for run in problem.trajectories if run.has_poses]
-    measured = [run for run in problem.trajectories if run.references is not None]
+            return information, np.array(freedom), answer.noise, answer.source
+    # Information (3M, 3M) about the elements by the noise of poses and references.
     total: Array = np.zeros((matrix.size, matrix.size))
     noise, words = None, GIVEN.description
-    if posed:
+    if posed := [run for run in problem.trajectories if run.has_poses]:
         estimate = noise_of_matrix(posed, matrix, problem.integration, loss_of(problem.objective))
         total = information_of_runs(posed, matrix, problem.integration, estimate.noise).sum(axis=0)
         noise, words = estimate.noise, f"the poses' noise ({estimate.description})"
-    if measured:
-        total = total + information_of_references(problem.robot, measured, problem.integration, poses=False)
-    return total, noise, words
-
-
-def _freedom(posterior: Array, known: _Knowledge) -> Array:
-    """Degrees of freedom (n,) of the posterior variances, which are C S^+ C from the data and else from the prior.
-
-    The prior's part is exact, so that they are those of the data over the square of its share (Satterthwaite 1946).
-    """
-    parts, whole = np.diag(posterior @ known.information @ posterior), np.maximum(np.diag(posterior), 1e-300)
-    shares = np.clip(parts / whole, 1e-9, 1.0)
-    freedom: Array = np.minimum(known.degrees_of_freedom / np.square(shares), MANY)
-    return freedom
+    if measured := [run for run in problem.trajectories if run.references is not None]:
+        total = total + information_of_references(robot, measured, problem.integration, poses=False)
+    columns = unit[:, None] * slopes
+    return columns.T @ total @ columns, np.full(problem.size, MANY), noise, words
 
 
 def closed_form_result(problem: CalibrationProblem) -> RunResult:

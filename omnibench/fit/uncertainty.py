@@ -43,6 +43,18 @@ from omnibench.robot.odometry import OdometryBatch
 from omnibench.views import Brief
 from omnibench.words import plural
 
+# The check that an answer is a minimum says the same with half of _MOST_STEPS and _NO_GAIN and with twice
+# (tests/studies/constants_fit.py).
+_MOST_STEPS = 20  # steps
+_NO_GAIN = 1e-4  # relative decrease of the cost that ends the steps
+# Least share 1 - p/n of the errors' numbers beyond those fitted by which the curvature is corrected: first order in p/n
+# says nothing below it. Four runs, the fewest for the nine elements of three wheels, leave just as much. With half of
+# it nothing changes; with twice, deviations from four runs are 29 % smaller, and of the 95 % intervals from four and
+# five runs 99.5 % hold the truth in the place of 99.8 %, in 60 sets each (tests/studies/constants_fit.py).
+_LEAST_LEFT = 0.25
+
+Basis = Literal["likelihood", "scatter", "posterior"]
+
 
 def robust_scores(
     objective: RobustCost,
@@ -93,20 +105,6 @@ def _correction(curvatures: Array, shares: Array, numbers: int, hessians: Array)
     mean = float(curvatures @ shares)
     spread = float(np.square(curvatures - mean) @ shares)
     return 1 + float(fitted) / numbers * spread / mean**2 if mean > 0 else 1.0
-
-
-# The check that an answer is a minimum says the same with half of _MOST_STEPS and _NO_GAIN and with twice
-# (tests/studies/constants_fit.py).
-_MOST_STEPS = 20  # steps
-_NO_GAIN = 1e-4  # relative decrease of the cost that ends the steps
-# Least share 1 - p/n of the errors' numbers beyond those fitted by which the curvature is corrected: first order in p/n
-# says nothing below it. Four runs, the fewest for the nine elements of three wheels, leave just as much. With half of
-# it nothing changes; with twice, deviations from four runs are 29 % smaller, and of the 95 % intervals from four and
-# five runs 99.5 % hold the truth in the place of 99.8 %, in 60 sets each (tests/studies/constants_fit.py).
-_LEAST_LEFT = 0.25
-
-
-Basis = Literal["likelihood", "scatter", "posterior"]
 
 
 class NoCovarianceError(DataError):
@@ -210,7 +208,12 @@ def _by_scatter(problem: CalibrationProblem, result: RunResult, noise: Noise) ->
     base = norms_of(objective)
     if base is None:
         raise NoCovarianceError(f"no covariance: the cost {objective.name} is no sum of norms")
-    _check_starts(problem)
+    if runs := runs_without_heading(problem):
+        shown = ", ".join(runs[:3]) + ", ..." * (len(runs) > 3)
+        raise NoCovarianceError(
+            f"no covariance: the positions of {plural(len(runs), 'run')} ({shown}) do not tell which way the robot "
+            "looked at the start, and the cost counts them all the same; trajectory_ml does not, and has intervals"
+        )
     free = problem.free & ~np.isin(problem.names, result.at_bounds)
     if not problem.parameterisation.slopes(result.vector)[:, free].any():
         raise NoCovarianceError(
@@ -222,9 +225,15 @@ def _by_scatter(problem: CalibrationProblem, result: RunResult, noise: Noise) ->
         )
     try:
         scores = _scores(problem, result.vector, free, noise)
-        numbers = len(problem.trajectories) * sum(map(bool, base.weights))
-        expected = isinstance(objective, RobustCost) or isinstance(problem.odometry, ReferenceBatch)
-        answer = sandwich(scores if expected else _less_curved(scores, numbers))
+        curved = scores
+        if not isinstance(objective, RobustCost) and not isinstance(problem.odometry, ReferenceBatch):
+            # A fit of p numbers to n errors shortens them by sqrt(1 - p/n), and the curvature of a norm is the
+            # reciprocal of its length: the correction of M-estimates for small samples (Huber 1981, section 7.6), to
+            # first order in p/n.
+            numbers = len(problem.trajectories) * sum(map(bool, base.weights))
+            fitted = np.linalg.matrix_rank(scores.hessians.sum(axis=0), hermitian=True)
+            curved = replace(scores, hessians=np.sqrt(max(1 - fitted / numbers, _LEAST_LEFT)) * scores.hessians)
+        answer = sandwich(curved)
         _check_minimum(problem, result.vector, free, scores, noise)
     except NoCovarianceError:
         raise
@@ -250,16 +259,6 @@ def runs_without_heading(problem: CalibrationProblem) -> list[str]:
     return sorted({rows.runs[index].id for index in rows.trajectory[rows.tells_no_heading].tolist()})
 
 
-def _check_starts(problem: CalibrationProblem) -> None:
-    """NoCovarianceError: positions do not tell the start heading of a run."""
-    if runs := runs_without_heading(problem):
-        shown = ", ".join(runs[:3]) + ", ..." * (len(runs) > 3)
-        raise NoCovarianceError(
-            f"no covariance: the positions of {plural(len(runs), 'run')} ({shown}) do not tell which way the robot "
-            "looked at the start, and the cost counts them all the same; trajectory_ml does not, and has intervals"
-        )
-
-
 def _scores(problem: CalibrationProblem, vector: Array, free: NDArray[np.bool_], noise: Noise) -> Scores:
     """Score vectors of the runs in the free numbers, at a vector (n,)."""
     objective = problem.objective
@@ -274,16 +273,6 @@ def _scores(problem: CalibrationProblem, vector: Array, free: NDArray[np.bool_],
     if isinstance(odometry, ReferenceBatch):
         return scores_of_references(objective, odometry, errors, jacobian, problem.trajectories, noise)
     return scores_of_runs(objective, odometry, errors, jacobian, problem.trajectories, noise)
-
-
-def _less_curved(scores: Scores, numbers: int) -> Scores:
-    """Score vectors with the curvature that the errors of the true matrix would have.
-
-    A fit of p numbers to n errors shortens them by sqrt(1 - p/n), and the curvature of a norm is the reciprocal of its
-    length: the correction of M-estimates for small samples (Huber 1981, section 7.6), to first order in p/n.
-    """
-    fitted = np.linalg.matrix_rank(scores.hessians.sum(axis=0), hermitian=True)
-    return replace(scores, hessians=np.sqrt(max(1 - fitted / numbers, _LEAST_LEFT)) * scores.hessians)
 
 
 def _check_minimum(
