@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import sys
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -23,17 +22,11 @@ from omnibench.data.scans import Ranges, Scanner, Scans, TrajectoryScans
 from omnibench.data.splits import SCANS_LEFT_OUT, check_fits, complete, distinct_runs
 from omnibench.data.stored_rows import MOST_IN_MEMORY, count_rows, file_state, readable
 from omnibench.data.tables import (
-    COMMAND_COLUMNS,
-    POSE_COLUMNS,
-    REFERENCE_COLUMNS,
     TABLE,
-    DatasetTables,
-    StoredWheels,
     Table,
-    WheelTable,
-    WholeTableError,
     dataset_folders,
-    read_table,
+    read_trajectories,
+    stored_samples,
     table_file,
     tables_of,
 )
@@ -252,7 +245,7 @@ def load_dataset(path: Path | str | Sequence[Path | str], *, most_in_memory: int
     DataError names the file, the row (1 is the first after the header) and what is wrong.
     """
     folders = dataset_folders(path)
-    samples = sum(_stored_samples(folder) for folder in folders)
+    samples = sum(stored_samples(folder) for folder in folders)
     left = samples > most_in_memory
     if left:
         expect_reading(samples, "sample")
@@ -306,31 +299,16 @@ def read_recorded(folder: Path, *, left_in_files: bool = False) -> RecordedDatas
     left_in_files: the wheel samples of a Parquet file stay there, if its rows allow to read it run by run.
     """
     header = read_header(folder)
-    runs = read_table(folder, "trajectories", ("trajectory", "split"))
-    poses = _poses(folder)
-    references = None if table_file(folder, TABLE) is None else read_table(folder, TABLE, REFERENCE_COLUMNS)
-    commands = None if table_file(folder, "commands") is None else read_table(folder, "commands", COMMAND_COLUMNS)
-    whole = partial(read_table, folder, "wheels", ("trajectory", "t", *(f"omega_{wheel}" for wheel in header.wheels)))
-    trajectories = None
-    if left_in_files and (file := _parquet_of_wheels(folder)) is not None:
-        with suppress(WholeTableError):
-            tables = DatasetTables(runs, StoredWheels(file), poses, references, commands)
-            trajectories = tables.trajectories(header.robot)
-    if trajectories is None:
-        tables = DatasetTables(runs, WheelTable(whole()), poses, references, commands)
-        trajectories = tables.trajectories(header.robot)
-    return RecordedDataset(header, trajectories, _scans(folder, header, [trajectory.id for trajectory in trajectories]))
-
-
-def _stored_samples(folder: Path) -> int:
-    """The number of wheel samples that a folder has in a Parquet file."""
-    file = _parquet_of_wheels(folder)
-    return 0 if file is None else count_rows(file)
-
-
-def _parquet_of_wheels(folder: Path) -> Path | None:
-    file = table_file(folder, "wheels")
-    return file if file is not None and file.suffix == ".parquet" else None
+    trajectories = read_trajectories(folder, header, left_in_files=left_in_files)
+    scans = None
+    if (file := table_file(folder, "scans")) is not None:
+        if header.scanner is None:
+            raise DataError(
+                f"{folder / 'dataset.yaml'}: scanner is missing, which {file.name} needs: rays, angle_min, "
+                "angle_increment, range_max (rad, m)"
+            )
+        scans = ScansOnDisk(file, header.scanner, [trajectory.id for trajectory in trajectories])
+    return RecordedDataset(header, trajectories, scans)
 
 
 def save_dataset(
@@ -425,22 +403,3 @@ def _recorded_scans(dataset: Dataset) -> Scans | None:
         return None
     recorded = set(dataset.scans.trajectories)
     return dataset.scans if any(trajectory.id in recorded for trajectory in dataset.trajectories) else None
-
-
-def _scans(folder: Path, header: Header, trajectories: Sequence[str]) -> ScansOnDisk | None:
-    file = table_file(folder, "scans")
-    if file is None:
-        return None
-    if header.scanner is None:
-        raise DataError(
-            f"{folder / 'dataset.yaml'}: scanner is missing, which {file.name} needs: rays, angle_min, "
-            "angle_increment, range_max (rad, m)"
-        )
-    return ScansOnDisk(file, header.scanner, trajectories)
-
-
-def _poses(folder: Path) -> Table | None:
-    """The table of poses; None where there is none, and references in its place."""
-    if table_file(folder, "poses") is None and table_file(folder, TABLE) is not None:
-        return None
-    return read_table(folder, "poses", POSE_COLUMNS)

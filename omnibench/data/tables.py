@@ -13,6 +13,7 @@ import glob
 import os
 import shlex
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from numbers import Real
 from pathlib import Path
@@ -23,7 +24,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from omnibench.config import LONGEST_NAME
-from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory
+from omnibench.data.dataset import SPLITS, Dataset, Header, Split, Trajectory
 from omnibench.data.dataset import make_dataset as of_trajectories
 from omnibench.data.delimited import missing_column, not_increasing
 from omnibench.data.references import AT_ONE_TIME, NUMBERS, PLANAR, References, reference_flaw, references_of
@@ -34,6 +35,7 @@ from omnibench.data.stored_rows import (
     BLOCK_ROWS,
     BlockFile,
     StoredRows,
+    count_rows,
     file_state,
     median_period,
     read_parquet,
@@ -654,6 +656,36 @@ class DatasetTables:
             _trajectory(row, samples[index], reference, pose_rows[index], references.get(row["trajectory"]), commands)
             for index, (row, commands) in enumerate(zip(runs.frame.iter_rows(named=True), sent, strict=True))
         ]
+
+
+def read_trajectories(folder: Path, header: Header, *, left_in_files: bool) -> list[Trajectory]:
+    """The trajectories of a data set's folder, its tables checked. DataError as for ``load_dataset``.
+
+    left_in_files: the wheel samples of a Parquet file stay there, if its rows allow to read it run by run.
+    """
+    runs = read_table(folder, "trajectories", ("trajectory", "split"))
+    references = None if table_file(folder, TABLE) is None else read_table(folder, TABLE, REFERENCE_COLUMNS)
+    poses = None  # where there are none, references must be in their place
+    if references is None or table_file(folder, "poses") is not None:
+        poses = read_table(folder, "poses", POSE_COLUMNS)
+    commands = None if table_file(folder, "commands") is None else read_table(folder, "commands", COMMAND_COLUMNS)
+    if left_in_files and (file := _parquet_of_wheels(folder)) is not None:
+        with suppress(WholeTableError):
+            return DatasetTables(runs, StoredWheels(file), poses, references, commands).trajectories(header.robot)
+    columns = ("trajectory", "t", *(f"omega_{wheel}" for wheel in header.wheels))
+    wheels = WheelTable(read_table(folder, "wheels", columns))
+    return DatasetTables(runs, wheels, poses, references, commands).trajectories(header.robot)
+
+
+def stored_samples(folder: Path) -> int:
+    """The number of wheel samples that a folder has in a Parquet file."""
+    file = _parquet_of_wheels(folder)
+    return 0 if file is None else count_rows(file)
+
+
+def _parquet_of_wheels(folder: Path) -> Path | None:
+    file = table_file(folder, "wheels")
+    return file if file is not None and file.suffix == ".parquet" else None
 
 
 def tables_of(dataset: Dataset) -> dict[str, pl.DataFrame]:
