@@ -1,8 +1,7 @@
-"""Catalogue of public recordings, and the names by which a user asks for one.
+"""Fetching of a public recording: a clone of its GitHub repository, imported as data sets.
 
-Fetching of a public recording: a clone of its GitHub repository, imported as data sets.
-
-Clones of public GitHub repositories, made by the user's git: a clone is whole, or it is not there.
+The catalogue holds the names by which a user asks for one. Clones of public GitHub repositories, made by the user's
+git: a clone is whole, or it is not there.
 """
 
 from __future__ import annotations

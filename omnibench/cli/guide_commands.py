@@ -1,4 +1,4 @@
-"""The commands for whoever begins: the handbook, and examples to run."""
+"""The commands for whoever begins or extends: the handbook, examples to run, and plug-ins."""
 
 import shlex
 import sys

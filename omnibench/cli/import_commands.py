@@ -1,4 +1,4 @@
-"""``import``: recordings into a data set, the options of every importer, and tables to fill in."""
+"""``import``, ``check`` and ``fetch``: from a recording, or a public one's name, to a checked data set."""
 
 import shlex
 from dataclasses import replace

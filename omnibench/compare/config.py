@@ -1,4 +1,4 @@
-"""The config of a comparison, as its YAML file says it."""
+"""The config of a comparison, as its YAML file says it, and as it is once every default is written out."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Trajectory and Dataset: a robot's recordings in memory, SI units throughout."""
+"""Trajectory and Dataset: a robot's recordings in memory, SI units throughout; and the header of their folder."""
 
 from __future__ import annotations
 

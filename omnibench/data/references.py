@@ -1,4 +1,4 @@
-"""What is known of a run's motion without motion capture: single measurements, each with its own uncertainty."""
+"""References: single measurements of a run's motion without motion capture, each with its own uncertainty."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Division of imported runs into training and validation, and what they have in common."""
+"""Division of runs into training and validation, and the joining of several recordings of one robot."""
 
 from __future__ import annotations
 

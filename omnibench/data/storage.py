@@ -1,4 +1,4 @@
-"""Data sets on disk, ``omnibench-dataset/1``: a folder with dataset.yaml and Parquet or CSV tables."""
+"""Data sets on disk, ``omnibench-dataset/1``: a folder with dataset.yaml, Parquet or CSV tables, and scans."""
 
 from __future__ import annotations
 

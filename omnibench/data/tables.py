@@ -1,10 +1,9 @@
-"""A table of a data set, Parquet or CSV; every flaw is reported with its file and row.
+"""Tables of a data set, Parquet or CSV: runs, wheels, poses and references; every flaw is told with its file and row.
 
-The table references.parquet (or .csv) of a data set: a row for each measurement of a run's motion.
-
-Columns: trajectory, kind, value and sigma of kinds of one number, value_x, value_y, sigma_x and sigma_y of those of two
-(sigma stands for both where these are empty), t0 and t1, which may be missing or empty: the run's start and end;
-sigma_rate (rad/s) of a gyro's offset, which the turns of a session share.
+The table references.parquet (or .csv) has a row for each measurement of a run's motion. Columns: trajectory, kind,
+value and sigma of kinds of one number, value_x, value_y, sigma_x and sigma_y of those of two (sigma stands for both
+where these are empty), t0 and t1, which may be missing or empty: the run's start and end; sigma_rate (rad/s) of a
+gyro's offset, which the turns of a session share.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Candidate runs for a design: the commands of recordings, of a simulated data set, or of a design config."""
+"""Candidate runs for a design: the commands of recordings, of a data set or config, or those that suit a robot."""
 
 from __future__ import annotations
 

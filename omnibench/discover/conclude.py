@@ -1,4 +1,4 @@
-"""The conclusion: what the steps of a discovery returned, put into one result, with headline and notes."""
+"""The conclusion: the verdict of a discovery, and what its steps returned, put into one result."""
 
 from __future__ import annotations
 

@@ -1,18 +1,14 @@
 """Experiments that tell the members of a class of effects apart: the cheapest runs, chosen for this robot.
 
-The plan of an experiment: in words that a person can drive by, and as a config that can be simulated.
+An experiment is said in words that a person can drive by, and as a config that can be simulated. It is chosen so that
+it tells the effects apart in the least time: runs of one command after another are added, each time those that raise
+the mean margins of all pairs most for their seconds, until every name would be sure; then runs that turned out to be
+dispensable are taken away, and commands are exchanged for others that take less time. What results is a local optimum.
 
-Choice of the runs that tell competing effects apart in the least time.
-
-Runs of one command after another are added, each time those that raise the mean margins of all pairs most for their
-seconds, until every name would be sure; then runs that turned out to be dispensable are taken away, and commands are
-exchanged for others that take less time. What results is a local optimum.
-
-Separation of competing effects by further runs: expected log odds of their names, and the chance that one is sure.
-
-Let I0 and s0 be information and scores of all columns in the recorded runs: those of the base (matrix, and effects that
-are chosen beside the class) and those of the class's members; and D the information of the further runs. If member i
-is right, with the values b of base and member (0 elsewhere), the further runs add in expectation
+Further runs separate effects by the expected log odds of their names. Let I0 and s0 be information and scores of all
+columns in the recorded runs: those of the base (matrix, and effects that are chosen beside the class) and those of the
+class's members; and D the information of the further runs. If member i is right, with the values b of base and member
+(0 elsewhere), the further runs add in expectation
 
     I = I0 + D,    s = s0 + D b.                                                                                    (1)
 

@@ -1,17 +1,15 @@
-"""Windows of long drives: a drive or few, cut into parts that serve as runs, each from its own reference pose.
+"""Fits of a discovery: the plain matrix, and matrix and effects, with the noise and the nuisances that they leave.
 
-Outliers: reference poses that contradict the other poses of their run, where nothing like it recurs.
-
-Let r be the residuals of a run along one axis, normal with the inverse covariance P. Given all others, residual i is
-normal with the mean r_i - (P r)_i / P_ii and the variance 1 / P_ii (Rasmussen and Williams, Gaussian processes for
-machine learning, 2006, Eq. 5.12), so that it lies so many standard deviations from what the others predict:
+Long drives are cut into windows that serve as runs, each from its own reference pose. Outliers are reference poses that
+contradict the other poses of their run, where nothing like it recurs. Let r be the residuals of a run along one axis,
+normal with the inverse covariance P. Given all others, residual i is normal with the mean r_i - (P r)_i / P_ii and the
+variance 1 / P_ii (Rasmussen and Williams, Gaussian processes for machine learning, 2006, Eq. 5.12), so that it lies so
+many standard deviations from what the others predict:
 
     |(P r)_i| / sqrt(P_ii).                                                                                         (1)
 
 The score of a pose is the largest of those in x, y and heading. What a model lacks raises scores, too, but wherever the
 robot does the same again: at one stamp of a command's repetitions, or of most runs. An outlier stands out of these.
-
-The plain matrix, and matrix and effects, fitted in turn with the noise and the nuisances that they leave.
 
 The covariance of matrix elements and parameters is that of every trajectory fit
 (fit/calibrators/trajectory_ml.py).

@@ -1,9 +1,8 @@
-"""The runs of the validation split that a model can predict, and warnings about them.
+"""Held-out runs: cross-validation of a fit, errors of the validation split, and the gap that a model leaves.
 
-Cross-validation: runs of a fit predicted from the runs of the other folds.
-
-With I the information X'X and s the scores X'e of whitened columns X against whitened residuals e, summed over all
-runs, and I_f, s_f those over the runs of fold f, least squares of all runs but these give the values
+Cross-validation predicts runs of a fit from the runs of the other folds. With I the information X'X and s the scores
+X'e of whitened columns X against whitened residuals e, summed over all runs, and I_f, s_f those over the runs of fold
+f, least squares of all runs but these give the values
 
     b_f = (I - I_f)^+ (s - s_f),                                                                                    (1)
 
@@ -19,12 +18,11 @@ Sessions of training and validation runs are compared by the discovery's model. 
 tyre_wear is an effect of the catalogue as any other. Where one is held out, the change that explains its deviation is
 fitted here, beside the model.
 
-Errors of plain and extended model on held-out runs, and the gap between them and what repetitions allow.
+The gap is what a model errs beyond what repetitions allow. Let b_z and a_z be the errors of Z runs by the plain and by
+the extended model, and f_i those that D differences between repetitions of a command leave to any model, the floor. The
+gap, its standard error and the share that is closed are
 
-Let b_z and a_z be the errors of Z runs by the plain and by the extended model, and f_i those that D differences between
-repetitions of a command leave to any model, the floor. The gap, its standard error and the share that is closed are
-
-    G = mean b - mean f,    sigma = sqrt(var b / Z + var f / D),    (mean b - mean a) / G.                          (1)
+    G = mean b - mean f,    sigma = sqrt(var b / Z + var f / D),    (mean b - mean a) / G.                          (4)
 
 Where G is within two standard errors of nothing, no share is closed. Where a model errs less than the differences
 scatter, by chance or because the repetitions were no repetitions, their mean is no floor, and all of a gap is closed.
@@ -403,7 +401,7 @@ def gap_between(metric: Literal["eq6", "chi2"], before: Array, after: Array, flo
         return Gap(metric, first, last, None, None, scatter)
     error, least = float(np.sqrt(before.var() / len(before) + floor.var() / len(floor))), float(floor.mean())
     gap = first - least
-    closed = min((first - last) / gap, 1.0) if gap > STANDARD_ERRORS * error else None  # Eq. (1)
+    closed = min((first - last) / gap, 1.0) if gap > STANDARD_ERRORS * error else None  # Eq. (4)
     return Gap(metric, first, last, least if least <= min(first, last) else None, closed, error)
 
 

@@ -1,4 +1,4 @@
-"""Listening to robots: newest odometry, its rate and age, presence and health of each, from their messages."""
+"""Listening to robots: the status of each, its newest odometry, rate, age, presence and health, from its messages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stopping a command that runs until a signal, a time limit or an event."""
+"""Stopping a command that runs until a signal, a time limit or an event, and callbacks of threads meanwhile."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The traces that figures are made of: lines, marks, arrows and areas, in the style of an item of the legend."""
+"""The traces that figures are made of, in the style of an item of the legend; and the drawing of a robot."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Motion commands: their twists, and the wheel rates and steering angles that drive them."""
+"""Motion commands of a config: their twists, their times, and the wheel rates and steering angles that drive them."""
 
 from __future__ import annotations
 

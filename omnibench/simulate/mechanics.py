@@ -9,12 +9,11 @@ along by its pivot:
 beta being the direction from where the caster's wheel touches the floor to its pivot, relative to the robot, gamma that
 of the pivot's velocity V, w the robot's rate of turn, and L the trail.
 
-True kinematics of a simulated robot: the twist that its wheels give it by how they touch the floor.
+The twist that the wheels give a robot by how they touch the floor is derived from the velocities of the points of
+contact and shares nothing with the matrices that are fitted (robot/kinematics.py). A robot with the twist (vx, vy, w)
+moves over the contact of a wheel at (x, y) with the velocity
 
-This is derived from the velocities of the points of contact and shares nothing with the matrices that are fitted
-(robot/kinematics.py). A robot with the twist (vx, vy, w) moves over the contact of a wheel at (x, y) with the velocity
-
-    V = (vx - y w, vy + x w).                                                                         (1)
+    V = (vx - y w, vy + x w).                                                                         (2)
 
 A fixed wheel of radius r that turns at omega slides by V.e - r omega along its direction of rolling e, and by V.n along
 its axle n; a driven steered wheel by V - r omega e, with e its true direction; omni and mecanum wheels slide along the
@@ -24,11 +23,10 @@ skid-steered robot counts by its lateral friction. A car is driven through a dif
 meet in its instantaneous centre of rotation as nearly as they can, its speed is such that the mean rate of its rear
 wheels is as driven, and each rear wheel then turns as it rolls.
 
-True motion of a simulated robot: constant twists integrated about their centres of rotation, on code of its own.
+A constant twist turns the robot about its centre of rotation: with the twist (vx, vy, w) in the frame of a pose (p,
+theta), positions as complex numbers, a robot is after a time s at
 
-With the twist (vx, vy, w) in the frame of a pose (p, theta), positions as complex numbers, a robot is after a time s at
-
-    p + exp(i theta) (vx + i vy) (exp(i w s) - 1) / (i w).                                            (1)
+    p + exp(i theta) (vx + i vy) (exp(i w s) - 1) / (i w).                                            (3)
 """
 
 from __future__ import annotations
@@ -158,7 +156,7 @@ class WheelContacts:
 
 
 def _contact(wheel: Wheel) -> Array:
-    """The matrix (2, 3) from a twist to the velocity of the robot over a wheel's contact, Eq. (1)."""
+    """The matrix (2, 3) from a twist to the velocity of the robot over a wheel's contact, Eq. (2)."""
     x, y = wheel.position
     return np.array([[1.0, 0.0, -y], [0.0, 1.0, x]])
 
@@ -299,7 +297,7 @@ COUPLING, LIGHT_WHEEL = "steering_coupling", "light_wheel"
 MECHANICS = STEERING | BODY | {COUPLING, LIGHT_WHEEL}
 
 
-_SMALL = 1e-4  # rad: below it the series of Eq. (1) is exact to rounding
+_SMALL = 1e-4  # rad: below it the series of Eq. (3) is exact to rounding
 
 
 class TrueMotion:
@@ -331,7 +329,7 @@ class TrueMotion:
         return np.column_stack([position.real, position.imag, heading])
 
     def _travel(self, sample: NDArray[np.intp], seconds: Array) -> Complex:
-        """Displacements (K,) within samples (K,) after some seconds (K,) of each, Eq. (1)."""
+        """Displacements (K,) within samples (K,) after some seconds (K,) of each, Eq. (3)."""
         vx, vy, turn = self._twists[sample].T
         velocity: Complex = (vx + 1j * vy) * np.exp(1j * self._headings[sample])
         angle = 1j * turn * seconds

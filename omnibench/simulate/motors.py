@@ -1,6 +1,4 @@
-"""Parameters of a wheel's drive (brushed DC motor, PID controller, encoder), and which commands it can follow.
-
-Wheels driven by motors under PID control: true motion of the wheels, and what their encoders measure.
+"""Wheels driven by motors under PID control: their true motion, what encoders measure, which commands they can follow.
 
 Each motor moves its own share of the robot's inertia, independently of the other wheels. Wheel angles are continuous
 within a session; between its runs the robot stands.

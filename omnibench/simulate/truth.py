@@ -1,4 +1,4 @@
-"""The truth behind simulated recordings: the true robot, its record in the truth folder, and the noise of its poses."""
+"""The truth behind a simulation: the true robot, its record in the truth folder, and the noise of its poses."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Matching of one scan against the map: its pose, and how well the scan determines it.
 
-Correspondences of a scan's points with surfaces of the map: the algebra of one step of scan matching.
+One step is linear in the correspondences of the scan's points with surfaces of the map.
 """
 
 from __future__ import annotations

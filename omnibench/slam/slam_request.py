@@ -1,4 +1,4 @@
-"""The job of ``omnibench slam``: reference poses of a recording from its scans, and how good they are."""
+"""The job of ``omnibench slam``: reference poses of a recording from its scans, their accuracy and summary."""
 
 from __future__ import annotations
 

@@ -1,9 +1,8 @@
 """Cells of a study: robot, training, regime and judged kind, with the errors of every method in each.
 
-Intervals of a ratio of mean errors between two methods in one cell of a study, by sessions and by runs.
-
-A cell has pairs (f, z): the calibration of training set f judged on run z. With the errors a and b of two methods and
-sums over all pairs, the ratio is
+The ratio of two methods' mean errors in a cell has intervals by sessions and by runs. A cell has pairs (f, z): the
+calibration of training set f judged on run z. With the errors a and b of two methods and sums over all pairs, the ratio
+is
 
     R = sum a_fz / sum b_fz.                                                                       (S1)
 

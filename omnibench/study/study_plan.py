@@ -1,4 +1,4 @@
-"""The fits of a study: robots x trainings x regimes x folds x methods x seeds, as runs of a comparison."""
+"""The fits of a study: robots x trainings x regimes x folds x methods x seeds, and the errors of their answers."""
 
 from __future__ import annotations
 

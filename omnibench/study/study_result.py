@@ -1,7 +1,5 @@
 """The result of a study: its cells, the answer to whether the reference method beats the best published one.
 
-Ranks of methods over cells with their critical difference, and performance profiles.
-
 Ranks: Friedman's test asks whether k methods that were all judged in N cells differ at all; two whose mean ranks are
 closer than the critical difference of Nemenyi's test are not told apart (Demsar, J. Mach. Learn. Res. 7:1, 2006):
 

@@ -1,4 +1,4 @@
-"""A comparison's results on a terminal: the tables of its report on costs, errors and outcomes."""
+"""Results of a comparison and of a study on a terminal: the tables of their reports."""
 
 from __future__ import annotations
 

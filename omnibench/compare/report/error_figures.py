@@ -1,4 +1,4 @@
-"""The section on final errors: a table, and errors before and after by command: polar plots or box plots."""
+"""The sections on final errors and on paths: errors before and after by command, and paths with what was driven."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The section on outcomes: entries over their seeds, proven bounds, every run."""
+"""The sections on matrices and on outcomes: elements, entries over their seeds, proven bounds, every run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The report's view of one data set: its results, how entries are drawn, errors of the design values."""
+"""The report's view of one data set: its results, how entries are drawn, and how its numbers are said."""
 
 from __future__ import annotations
 

@@ -9,21 +9,19 @@ headings of another sign or in degrees, and steering angles. Every reading has t
 d^2 being the distance from the design; the residual of the fit tells readings by which the windows contradict each
 other, and the share of the signals that no motion gives those by which the wheels do.
 
-A robot's matrix as the recording itself has it, by linear least squares, whatever its design says.
+The matrix is fitted freely, by linear least squares, whatever the design says. Between reference poses at t_i and t_j
+about a second apart, with C (M) the integrals of the drive signals, p = x + iy and theta the reference's position and
+heading,
 
-Between reference poses at t_i and t_j about a second apart, with C (M) the integrals of the drive signals, p = x + iy
-and theta the reference's position and heading,
-
-    theta_j - theta_i = k3 . (C_j - C_i),                                                           (1)
-    exp(-i theta_i) (p_j - p_i) = (k1 + i k2) . sum over samples of exp(i (theta - theta_i)) dC.    (2)
+    theta_j - theta_i = k3 . (C_j - C_i),                                                           (2)
+    exp(-i theta_i) (p_j - p_i) = (k1 + i k2) . sum over samples of exp(i (theta - theta_i)) dC.    (3)
 
 Both are linear in the matrix with rows k1, k2, k3. Headings between two poses lie on straight lines.
 
-How far a matrix that was fitted freely lies from a robot's design, in what designs, tyres and floors may be off.
+Its distance from the design is counted in what designs, tyres and floors may be off. With k the elements of a fitted
+matrix K (3, M) and k0 the design's, the distance is
 
-With k the elements of a fitted matrix K (3, M) and k0 the design's, the distance is
-
-    d^2 = (k - k0)^T (V + S)^-1 (k - k0),                                                        (1)
+    d^2 = (k - k0)^T (V + S)^-1 (k - k0),                                                        (4)
 
 V being the covariance of the fit and S that of real robots about their designs: a radius and a gain of every row, the
 yaw and place of the tracked point, and small errors of all elements. Directions that are not driven have a huge V and
@@ -88,7 +86,7 @@ class FreeFit:
 
 @dataclass(frozen=True, eq=False)
 class Windows:
-    """Windows of all runs together: driven (W, M), bent (W, M) as in Eq. (2), turned (W,), rad, moved (W,), m.
+    """Windows of all runs together: driven (W, M), bent (W, M) as in Eq. (3), turned (W,), rad, moved (W,), m.
 
     run (W,): index of the run. times (W, 2): stamps of both poses, s.
     """
@@ -235,7 +233,7 @@ _PLACE = 0.1  # of the tracked point, in robot sizes; chosen
 
 
 class DesignDistance:
-    """Distances of fits from the design of one robot, Eq. (1)."""
+    """Distances of fits from the design of one robot, Eq. (4)."""
 
     def __init__(self, robot: Robot) -> None:
         self.design = robot.inverse_kinematic_matrix

@@ -1,9 +1,8 @@
 """Faults of the streams of runs: missing samples and poses, a standing reference, dead wheels, restarted counters.
 
-Jumps of a reference: steps from pose to pose that neither the wheels nor its usual scatter explain.
-
-A SLAM that closes a loop moves its poses at once, and motion capture that takes one marker for another turns or shifts
-them. The odometry of the design model is wrong by a share of each step, in every step alike; a jump stands out.
+A reference jumps where steps from pose to pose are explained neither by the wheels nor by its usual scatter. A SLAM
+that closes a loop moves its poses at once, and motion capture that takes one marker for another turns or shifts them.
+The odometry of the design model is wrong by a share of each step, in every step alike; a jump stands out.
 """
 
 from __future__ import annotations

@@ -1,9 +1,5 @@
 """Importer of the OptiOdom recordings: four robots with encoders and motion capture.
 
-The robot's own log of one OptiOdom session.
-
-The robots of the OptiOdom recordings: what their files hold, and how omnibench has them.
-
 Kinematics of the authors with wheel angles d (m): diff v = (dR + dL)/2, w = (dR - dL)/L; tricyc v = d cos phi,
 w = d sin phi / L; omni3 vx = (-d0 + d1)/sqrt(3), vy = (-d0 - d1 + 2 d2)/3, w = -(d0 + d1 + d2)/(3 L); omni4
 v = (d0 - d1 + d2 - d3)/4, vn = (-d0 - d1 + d2 + d3)/4, w = -(d0 + d1 + d2 + d3)/(2 (L1 + L2)).

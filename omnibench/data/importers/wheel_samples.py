@@ -1,4 +1,4 @@
-"""Wheel samples of a recording: mean rates between readings of the encoders, in stretches without missing samples."""
+"""Wheel samples of a recording: what encoders count, and mean rates in stretches without missing samples."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables of a design, for its report and for the terminal: what to drive, how precise it is, the baseline's equals."""
+"""The report of a design and its tables: what to drive, how precise it is, the baseline's equals."""
 
 from __future__ import annotations
 

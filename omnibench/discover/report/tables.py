@@ -1,4 +1,4 @@
-"""Tables of a discovery's report."""
+"""Tables of a discovery's report, and how its effects, errors and chances are said."""
 
 from __future__ import annotations
 

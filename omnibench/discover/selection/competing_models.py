@@ -3,11 +3,10 @@
 Where several effects explain the same residuals, each in its place makes a model of its own. The one that best predicts
 commands that its fit did not see, in the paper's cost, is used; what the models disagree on is not known.
 
-The average of competing models, weighed by all that is known of them.
-
-Member c of a class has the name's probability p_c, parameters b_ci of which s_ci is the largest plausible size, and
-errs by e_cz in the final pose of run z of Z when the run's command is held out. With the plausible size as the standard
-deviation of a parameter about 0, and errors that are normal with an unknown variance, its weight is in proportion to
+Their average is weighed by all that is known of them. Member c of a class has the name's probability p_c, parameters
+b_ci of which s_ci is the largest plausible size, and errs by e_cz in the final pose of run z of Z when the run's
+command is held out. With the plausible size as the standard deviation of a parameter about 0, and errors that are
+normal with an unknown variance, its weight is in proportion to
 
     p_c exp(-1/2 sum over i of (b_ci / s_ci)^2) (sum over z of |e_cz|^2)^(-3 Z / 2)                                 (1)
 

@@ -1,8 +1,7 @@
 """Screening: all that could explain what the plain matrix leaves, as whitened columns against its residuals.
 
-Encoder quantisation: what a wheel turns between the last tick and standstill is not measured.
-
-No effect explains it, and it may look like one where a controller stops the wheels at the same place each time. A
+Encoder quantisation is what a wheel turns between the last tick and standstill, which is not measured. No effect
+explains it, and it may look like one where a controller stops the wheels at the same place each time. A
 wheel's true angle is then off the measured one by the same part of a tick in all repetitions of a command, uniform
 within half a tick: a quarter in the mean. With q the changes of the poses by such a quarter, of each wheel at its start
 and at its rest, whitened, and R the roots of the information of columns X beyond others (R'X'XR = I), columns lower the

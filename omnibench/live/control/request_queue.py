@@ -1,4 +1,4 @@
-"""Fair queue of requests: every client has a lane of its own, and the lanes are served in turn."""
+"""Requests to a node, and their fair queue: every client has a lane of its own, and the lanes are served in turn."""
 
 from __future__ import annotations
 

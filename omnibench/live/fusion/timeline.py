@@ -1,4 +1,4 @@
-"""Timeline: the motions of a robot's last seconds, the poses after them, and the poses measured in between."""
+"""Timeline, and the correction of measured poses: the motions of a robot's last seconds, the poses after them, and the poses measured in between."""
 
 from __future__ import annotations
 

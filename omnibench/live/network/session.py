@@ -2,8 +2,7 @@
 
 Zenoh only reports that it could not connect: the reason, in one line, is found by trying each step.
 
-Zenoh's access control from a config's access rules: rights by key, message and peer; all else is refused.
-
+Zenoh's access control is made of a config's access rules: rights by key, message and peer; all else is refused.
 Messages from a peer (ingress) are checked. Messages to a peer (egress) are not: a peer only receives what it was
 allowed to subscribe to or to query.
 """

@@ -2,10 +2,9 @@
 
 To add an output, write its function and its row in OUTPUTS; a message type that is new goes to messages.py.
 
-Fast CDR for one robot's messages, in which only stamps and numbers change.
-
-rosbags encodes or decodes the first message; for the later ones only the bytes of its stamps and numbers are exchanged,
-which is several times as fast.
+One robot's messages, in which only stamps and numbers change, have a fast CDR of their own. rosbags encodes or decodes
+the first message; for the later ones only the bytes of its stamps and numbers are exchanged, which is several times as
+fast.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The report of an inspection: paths, motions driven, what can be identified, wheel rates, and runs step by step.
 
-Motions of a recording: speeds, directions and rates of turn, how long each was driven, and which are missing.
+Its tables are the terminal's, too.
 """
 
 from __future__ import annotations

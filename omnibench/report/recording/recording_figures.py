@@ -1,4 +1,4 @@
-"""The choice of runs that a report shows, and their names."""
+"""Figures of a recording: the runs that are shown, the room with its paths and scans, and the wheels' rates."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every cell of a study: a picture of all ratios to the design values, and a table for each cell."""
+"""Every cell of a study: a picture of all ratios to the design values, a table for each, and figures by regime."""
 
 from __future__ import annotations
 

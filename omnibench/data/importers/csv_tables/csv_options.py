@@ -1,4 +1,4 @@
-"""Options of the importer of CSV tables."""
+"""Options of the importer of CSV tables, and the columns that they name or that are guessed from headings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recordings in tables: wheels and poses of every run, found, split by run and read.
+"""Recordings in tables: the files of wheels, poses and references, split by run and read.
 
 Distances, turns, positions and the like stand in a table of their own: a row for each, with its kind, value and
 standard deviation.

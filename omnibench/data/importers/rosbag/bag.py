@@ -1,4 +1,4 @@
-"""Reading of bags (MCAP, rosbag2 and ROS 1) with the library rosbags; every fault is one line."""
+"""Reading of bags (MCAP, rosbag2 and ROS 1) with rosbags, and the choice of their topics; every fault is one line."""
 
 from __future__ import annotations
 

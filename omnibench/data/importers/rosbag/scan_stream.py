@@ -1,4 +1,4 @@
-"""Scans of a bag: the scanner, the usable scans, and the reading of a run's scans on demand."""
+"""Scans of a bag, read on demand, and the frames that its transforms place: the scanner's and the robot's."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """The runs of one recording: of its unbroken stretches, windows, and what gaps, jumps and rests leave of them.
 
-Distances, turns, positions and the like of a recording, given to the runs that it is cut into.
+Distances, turns, positions and the like are given to the runs that the recording is cut into. A data set's runs can be
+read anew by other options.
 """
 
 from __future__ import annotations
