@@ -1,6 +1,6 @@
 """Fetching of a public recording: a clone of its GitHub repository, imported as data sets.
 
-The catalogue holds the names by which a user asks for one. Clones of public GitHub repositories, made by the user's
+The catalogue holds the names by which a user asks for one. Clones are made by the user's
 git: a clone is whole, or it is not there.
 """
 

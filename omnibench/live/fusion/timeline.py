@@ -1,4 +1,4 @@
-"""Timeline, and the correction of measured poses: the motions of a robot's last seconds, the poses after them, and the poses measured in between."""
+"""Timeline of a robot's last seconds: its motions, the poses after them, and poses measured in between, corrected."""
 
 from __future__ import annotations
 
