@@ -36,7 +36,7 @@ from omnibench.robot.signals import signals_of
 _GAIN = "steering_gain"
 FITTED = (_GAIN, "steering_play", "steering_offset", "steering_coupling")
 # Factors on the measured angle from which the search begins: gears between an encoder and its wheel are seldom known
-# worse than this, and between two of them the cost has one minimum (tests/fit/test_steering_fit.py).
+# worse than this, and between two of them the cost has one minimum (tests/fit/test_wheeled_fits.py).
 _FACTORS = (0.5, 1.0, 2.0, 4.0, 8.0)
 _GAINS = (-0.95, 15.0)  # bounds of the gain, which counts from 0
 _WIDER = 3.0  # times the plausible range, of play and zero

@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import re
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -17,6 +18,7 @@ from commands import omnibench as command
 from config_robots import experiment
 from hypothesis import example, given
 from hypothesis import strategies as st
+from wheeled_samples import TRICYCLE, driven
 
 from omnibench import check, save_dataset
 from omnibench.cli.handbook_topics import HANDBOOK
@@ -26,10 +28,17 @@ from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.references import Reference, References
 from omnibench.fit.check.checking import CheckReport
 from omnibench.fit.check.missing_motions import command_names
+from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Path as Driven
+from omnibench.robot.odometry import WheelLog
 from omnibench.simulate.simulate import simulate_dataset
 
 Change = Callable[[Trajectory], Trajectory]
+
+
+@pytest.fixture(autouse=True)
+def in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
 
 
 @cache
@@ -89,6 +98,13 @@ def kinds(report: CheckReport) -> set[str]:
     return {finding.kind for finding in report.findings}
 
 
+def typed(words: str) -> None:
+    """Run a command as the check prints it."""
+    program, *arguments = shlex.split(words)
+    assert program == "omnibench"
+    assert command(*arguments).returncode == 0
+
+
 def in_the_faq(report: CheckReport, kind: str) -> bool:
     """True if a heading of the handbook's FAQ quotes the findings of a kind, in whatever numbers and wheels it is."""
 
@@ -107,7 +123,7 @@ def test_a_sound_recording_is_ready_and_its_calibration_is_needed() -> None:
     assert report.needed is True
 
 
-TYPED = {
+TYPED: dict[str, tuple[Change, str]] = {
     "wheel_dropout": (without(6.0, 8.0, wheels=True), "run1"),
     "reference_dropout": (without(6.0, 8.5, wheels=False), "run1"),
     "reference_jump": (jumped, "run1"),
@@ -117,20 +133,24 @@ TYPED = {
     "wheel_scale": (lambda run: replace(run, rates=run.rates * 4), ""),
 }
 
+IN_THE_SLOW_LANE = (
+    *("wheel_dropout", "reference_dropout", "reference_jump", "reference_frozen", "wheel_scale"),
+    *("wheels_swapped", "position_unit"),
+)
 
-@pytest.mark.parametrize("kind", TYPED)
-def test_a_fault_is_found_and_what_is_typed_for_it_mends_it(
-    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+
+def lanes(cases: Iterable[str]) -> list[Any]:
+    return [pytest.param(case, marks=pytest.mark.slow) if case in IN_THE_SLOW_LANE else case for case in cases]
+
+
+@pytest.mark.parametrize("kind", lanes(TYPED))
+def test_a_fault_is_found_and_what_is_typed_for_it_mends_it(kind: str) -> None:
     save_dataset(changed(*TYPED[kind]), "log")
     report = check("log")
     assert report.verdict == "fix"
     assert in_the_faq(report, kind) == (kind in ("wheel_negated", "wheel_scale"))
     (fix,) = {finding.fix for finding in report.findings if finding.kind == kind}
-    program, *words = shlex.split(fix)
-    assert program == "omnibench"
-    assert command(*words).returncode == 0
+    typed(fix)
     assert kind not in kinds(check("log_mended"))
 
 
@@ -149,7 +169,6 @@ def taped(run: Trajectory) -> Trajectory:
 
 
 def in_mm(run: Trajectory) -> Trajectory:
-    assert run.references is not None
     lengths = np.where(run.references.kinds == "displacement", 1000.0, 1.0)[:, None]
     measured = replace(run.references, values=run.references.values * lengths, sigmas=run.references.sigmas * lengths)
     return replace(run, references=measured)
@@ -163,56 +182,46 @@ SPARSE: dict[str, Change] = {
 
 
 @pytest.mark.parametrize("change", [ends, taped])
-def test_sparse_references_that_are_right_are_not_to_be_mended_and_tell_that_a_calibration_is_needed(
-    change: Change,
-) -> None:
+def test_sparse_references_that_are_right_tell_that_a_calibration_is_needed(change: Change) -> None:
     report = check(changed(change))
-    assert report.command == ""
-    assert report.needed is True
+    assert (report.command, report.needed) == ("", True)
     assert report.gain.startswith("cross-validated (8 runs): ")
 
 
-@pytest.mark.parametrize("kind", SPARSE)
-def test_a_misreading_that_few_references_show_is_found_and_mended_as_typed(
-    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+@pytest.mark.parametrize("kind", lanes(SPARSE))
+def test_a_misreading_that_few_references_show_is_found_and_mended_as_typed(kind: str) -> None:
     save_dataset(changed(SPARSE[kind]), "log")
     report = check("log")
     assert (report.verdict, kind in kinds(report)) == ("fix", True)
-    assert command(*shlex.split(report.command)[1:]).returncode == 0
+    typed(report.command)
     assert "warning" not in command("inspect", "log_mended").stderr
     assert check("log_mended").command == ""
 
 
-def test_a_data_set_in_ms_is_told_and_mended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_a_data_set_in_ms_is_told_and_mended() -> None:
     save_dataset(recording(), "log")
-    for table in ("wheels", "poses"):
-        file = tmp_path / "log" / f"{table}.parquet"
+    for file in (Path("log/wheels.parquet"), Path("log/poses.parquet")):
         frame = pl.read_parquet(file)
         frame.with_columns(t=frame["t"] * 1000).write_parquet(file)
     (finding,) = check("log").findings
     assert finding.kind == "time_unit"
-    assert command(*shlex.split(finding.fix)[1:]).returncode == 0
+    typed(finding.fix)
     assert check("log_mended").verdict == "ready"
 
 
-def test_a_log_in_ms_whose_wheels_hold_positions_is_mended_in_both(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+@pytest.mark.slow
+def test_a_log_in_ms_whose_wheels_hold_positions_is_mended_in_both() -> None:
     columns = [f"w_{name}" for name in recording().robot.wheel_names]
+    Path("log").mkdir()
     for run in recording().trajectories:
         turned = dict(zip(columns, np.cumsum(run.rates * 0.04, axis=0).T, strict=True))
         poses = dict(zip(("x", "y", "theta"), run.poses.T, strict=True))
         rows = [pl.DataFrame({"t": run.times * 1000, **turned}), pl.DataFrame({"t": run.pose_times * 1000, **poses})]
-        (tmp_path / "log").mkdir(exist_ok=True)
         pl.concat(rows, how="diagonal").sort("t").write_csv(f"log/{run.command}_{run.id}.csv")
-    (tmp_path / "log" / "robot.yaml").write_text(to_yaml(recording().robot))
+    Path("log/robot.yaml").write_text(to_yaml(recording().robot))
     report = check("log", options={"wheel_columns": columns})
     assert kinds(report) == {"time_unit", "wheel_unit"}
-    assert command(*shlex.split(report.command)[1:]).returncode == 0
+    typed(report.command)
     assert check("data/log").verdict == "ready"
 
 
@@ -224,10 +233,9 @@ def test_a_gain_that_clocks_hide_is_not_told_in_figures() -> None:
     runs = [off(run) for run in recording().trajectories if run.command in ("c0", "c1")]
     report = check(make_dataset("base", recording().robot, 0.04, runs))
     assert "clock_offset" in kinds(report)
-    assert (report.needed, report.gain) == (
-        None,
-        "whether a calibration is needed can be told once the clocks are matched",
-    )
+    assert report.needed is None
+    assert "clocks" in report.gain
+    assert not re.search(r"\d", report.gain)
 
 
 def test_a_wheel_that_never_turns_is_dead() -> None:
@@ -248,7 +256,7 @@ def test_poses_of_other_runs_are_not_what_the_wheels_drove() -> None:
 def test_poses_that_end_long_before_the_wheels_are_told() -> None:
     report = check(changed(lambda run: replace(run, pose_times=run.pose_times / 100)))
     assert "reference_foreign" in kinds(report)
-    assert "end long before the wheels, as after 0.24 s of 24 s" in report.sentence
+    assert "0.24 s of 24 s" in report.sentence
 
 
 @pytest.mark.parametrize("driven", [24.0, 3.0])
@@ -294,22 +302,17 @@ def test_a_recording_without_turns_lacks_them_in_words() -> None:
     ]
 
 
-def test_json_holds_verdict_need_and_findings_alone(tmp_path: Path) -> None:
-    save_dataset(changed(jumped, "run1"), tmp_path / "log")
-    document = json.loads(command("check", str(tmp_path / "log"), "--json").stdout)
+def test_json_holds_verdict_need_and_findings_alone() -> None:
+    save_dataset(changed(jumped, "run1"), "log")
+    document = json.loads(command("check", "log", "--json").stdout)
     assert set(document) == {"verdict", "needed", "findings"}
     assert set(document["findings"][0]) == {"kind", "what", "where", "severity", "fix"}
 
 
-def test_a_source_that_is_not_there_ends_in_one_line(tmp_path: Path) -> None:
-    done = command("check", str(tmp_path / "nothing"))
-    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
-
-
-def test_the_report_shows_stamps_before_and_after(tmp_path: Path) -> None:
-    save_dataset(changed(late), tmp_path / "log")
-    assert command("check", str(tmp_path / "log"), "--report", str(tmp_path / "check.html")).returncode == 0
-    page = (tmp_path / "check.html").read_text()
+def test_the_report_shows_stamps_before_and_after() -> None:
+    save_dataset(changed(late), "log")
+    assert command("check", "log", "--report", "check.html").returncode == 0
+    page = Path("check.html").read_text()
     assert "With matched stamps" in page
     assert "--set clocks=match" in page
 
@@ -320,17 +323,10 @@ def test_values_are_typed_so_that_they_are_read_as_they_are(names: list[str]) ->
     assert parse_settings([f"leave_out={as_yaml(names)}"]) == {"leave_out": names}
 
 
-def test_a_data_set_in_memory_is_to_be_saved_before_its_fix_is_typed() -> None:
-    swapped = changed(lambda run: replace(run, rates=run.rates[:, ::-1]))
-    assert check(swapped).command.endswith("# after save_dataset(dataset, 'base')")
-
-
-def test_a_data_set_in_memory_is_none_of_the_folder_that_has_its_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_data_set_in_memory_is_to_be_saved_before_its_fix_is_typed_whatever_folder_has_its_name() -> None:
     swapped = changed(lambda run: replace(run, rates=run.rates[:, ::-1]))
     alone = check(swapped)
-    monkeypatch.chdir(tmp_path)
+    assert alone.command.endswith("# after save_dataset(dataset, 'base')")
     save_dataset(recording(), "base")
     assert check(swapped) == alone
 
@@ -365,10 +361,43 @@ def test_a_tape_in_mm_is_told_beside_poses_in_m() -> None:
     report = check(changed(lambda run: run if run.id in ("run0", "run4") else in_mm(taped(run))))
     (finding,) = [each for each in report.findings if each.kind == "position_unit"]
     assert finding.where == "references of kind displacement"
-    assert finding.fix == "write these references in m and rad, as the poses are, and import again"
+    assert "import again" in finding.fix
 
 
 def test_runs_without_a_command_share_a_name_where_their_wheels_turn_alike() -> None:
     runs = [replace(run, command=run.command if run.id == "run3" else None) for run in recording().trajectories]
     names = ["like run0", "like run1", "like run2", "c3"]
     assert command_names(runs) == [*names[:3], "c3", *names[:3], "like run7"]
+
+
+def test_two_units_that_are_wrong_at_once_are_both_typed() -> None:
+    sound = driven(TRICYCLE, 8, 200)
+    runs = [
+        replace(run, steering=np.degrees(run.steering), poses=run.poses * (1, 1, 180 / np.pi))
+        for run in sound.trajectories
+    ]
+    save_dataset(make_dataset("trike", TRICYCLE, sound.sample_period, runs), "log")
+    assert {"steering_unit=deg", "heading_unit=deg"} <= set(shlex.split(check("log").command))
+
+
+def steered_runs(duration: float, reported: bool, noise: float, held: dict[str, tuple[float, float]]) -> Dataset:
+    """Runs of a tricycle, each at a wheel rate, rad/s, and a steering angle, rad; its steering reports 0 if it is not
+    ``reported``."""
+    count = round(duration / 0.05)
+    times, stamps = 0.05 * np.arange(1, count + 1), np.arange(0.0, duration, 0.1)
+    runs = []
+    for name, (rate, angle) in held.items():
+        rates, angles = np.full((count, 1), rate), np.full((count, 1), angle)
+        log = WheelLog(times, rates, np.zeros(3), stamps, steering=angles, drive=TRICYCLE.drive)
+        (poses,) = OdometryModel.of_design(TRICYCLE, "arc").poses([log])
+        scattered = poses + np.random.default_rng(len(runs)).normal(0, noise, poses.shape)
+        runs.append(Trajectory(name, "train", times, rates, stamps, scattered, steering=angles * reported))
+    return make_dataset("held", TRICYCLE, 0.05, runs)
+
+
+def test_a_steering_that_is_held_is_frozen_only_if_it_counts_nothing() -> None:
+    """Held forward and backward, its turns differ in sign by the way the wheels roll, and by nothing else."""
+    held = {"f1": (6.0, 0.4), "b1": (-6.0, 0.4), "f2": (5.0, 0.4), "b2": (-5.0, 0.4)}
+    assert "steering_frozen" not in kinds(check(steered_runs(10.0, True, 0.001, held)))
+    circle_and_line = {"circle": (6.0, 0.15), "line": (6.0, 0.0)}
+    assert "steering_frozen" in kinds(check(steered_runs(20.0, False, 0.003, circle_and_line)))

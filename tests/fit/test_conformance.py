@@ -25,10 +25,17 @@ SOLVED = {
 }
 
 
+SLOW = ("isres", "parametric")  # relatives of crs
+
+
 def cases(registry: Registry[Any], base: type[Conformance]) -> list[Any]:
     methods = [name for cls in base.__mro__ for name in vars(cls) if name.startswith("test_")]
     names = [entry.name for entry in registry.entries() if entry.origin == "built in"]
-    return [pytest.param(name, method, id=f"{name}-{method[5:]}") for name in names for method in methods]
+    return [
+        pytest.param(name, method, id=f"{name}-{method[5:]}", marks=[pytest.mark.slow] * (name in SLOW))
+        for name in names
+        for method in methods
+    ]
 
 
 class Short(CalibratorConformance):

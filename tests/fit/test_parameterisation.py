@@ -1,8 +1,9 @@
-"""What is searched and in which box: matrix elements and wheel geometry."""
+"""What is searched and in which box: matrix elements, and the wheel geometry of every kind of robot."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,13 +11,14 @@ import pytest
 from fit_samples import box_between, make_problem
 from hypothesis import given
 from hypothesis import strategies as st
-from sample_robots import APR_02, DIFFERENTIAL, SKID
+from sample_robots import APR_02, CAR, DIFFERENTIAL, MECANUM, SKID, SWERVE, TRICYCLE, WHEELED
 
 from omnibench.config import validate
 from omnibench.errors import ConfigError
 from omnibench.fit.geometry import GeometryLimits, WheelGeometry
+from omnibench.fit.identifiability import identified_parameters
 from omnibench.fit.parameterisation import Box, MatrixElements, make_bounds
-from omnibench.robot.kinematics import Array, Robot, inverse_kinematic_matrix, published_matrix
+from omnibench.robot.kinematics import Array, Mount, Robot, inverse_kinematic_matrix, published_matrix
 from omnibench.testing.synthetic import synthetic_robot
 
 DESIGN = APR_02.inverse_kinematic_matrix
@@ -32,41 +34,20 @@ def bounds(box: Box) -> tuple[Array, Array]:
     return found.lower.reshape(3, 3), found.upper.reshape(3, 3)
 
 
-class TestPaperBox:
-    """+-10 % of each start element."""
-
-    def test_every_element_has_ten_per_cent_of_itself_on_either_side(self) -> None:
-        lower, upper = bounds("paper")
-        np.testing.assert_allclose(upper - DESIGN, 0.1 * np.abs(DESIGN), rtol=1e-12, atol=0)
-        np.testing.assert_allclose(DESIGN - lower, 0.1 * np.abs(DESIGN), rtol=1e-12, atol=0)
-
-    def test_m12_has_no_width(self) -> None:
-        lower, upper = bounds("paper")
-        assert lower[0, 1] == upper[0, 1] == 0.0
-
-    def test_it_holds_eq_9_but_not_eq_8(self) -> None:
-        lower, upper = bounds("paper")
-        inside = [
-            ((published_matrix(name) >= lower) & (published_matrix(name) <= upper)).all()
-            for name in ("palacin2023_eq9", "palacin2023_eq8")
-        ]
-        assert inside == [True, False]
+def test_the_papers_box_has_ten_per_cent_of_every_element_on_either_side() -> None:
+    lower, upper = bounds("paper")
+    np.testing.assert_allclose(upper - DESIGN, 0.1 * np.abs(DESIGN), rtol=1e-12, atol=0)
+    np.testing.assert_allclose(DESIGN - lower, 0.1 * np.abs(DESIGN), rtol=1e-12, atol=0)
+    assert lower[0, 1] == upper[0, 1] == 0.0
+    published = [published_matrix(name) for name in ("palacin2023_eq9", "palacin2023_eq8")]
+    assert [bool(((matrix >= lower) & (matrix <= upper)).all()) for matrix in published] == [True, False]
 
 
-class TestRowBox:
-    """+-25 % of the row's largest element."""
-
-    def test_every_element_has_a_quarter_of_the_rows_largest_on_either_side(self) -> None:
-        lower, upper = bounds("row")
-        for row in range(3):
-            width = 0.25 * max(abs(element) for element in DESIGN[row])
-            np.testing.assert_allclose(upper[row] - DESIGN[row], width, rtol=1e-12)
-            np.testing.assert_allclose(DESIGN[row] - lower[row], width, rtol=1e-12)
-
-    def test_m12_is_free(self) -> None:
-        lower, upper = bounds("row")
-        assert lower[0, 1] == pytest.approx(-0.25 * DESIGN[0, 2])
-        assert upper[0, 1] == pytest.approx(0.25 * DESIGN[0, 2])
+def test_the_row_box_has_a_quarter_of_the_rows_largest_element_on_either_side() -> None:
+    lower, upper = bounds("row")
+    width = np.tile(0.25 * np.abs(DESIGN).max(axis=1, keepdims=True), 3)
+    np.testing.assert_allclose(upper - DESIGN, width, rtol=1e-12)
+    np.testing.assert_allclose(DESIGN - lower, width, rtol=1e-12)
 
 
 def test_an_explicit_box_is_taken_as_it_is() -> None:
@@ -77,45 +58,30 @@ def test_an_explicit_box_is_taken_as_it_is() -> None:
     np.testing.assert_array_equal(found.upper, upper.ravel())
 
 
-def changed(matrix: Array, row: int, column: int, value: float) -> Array:
-    matrix = matrix.copy()
-    matrix[row, column] = value
+def with_m11(value: float) -> Array:
+    matrix = DESIGN.copy()
+    matrix[0, 0] = value
     return matrix
 
 
-def test_a_box_that_excludes_the_start_is_refused_in_one_line() -> None:
-    box = box_between(changed(DESIGN - 0.1, 1, 2, 0.06), DESIGN + 0.1)
+@pytest.mark.parametrize(
+    ("lower", "upper", "named"),
+    [
+        (with_m11(0.06), with_m11(0.09), "of m11 is outside [0.06, "),
+        (with_m11(0.5), with_m11(-0.5), "m11"),
+        (np.full((3, 2), -1.0), np.full((3, 2), 1.0), "3 rows of 3 values"),
+        (np.full((2, 3), -1.0), np.full((2, 3), 1.0), "3 rows of 3 values"),
+    ],
+)
+def test_a_box_that_cannot_be_is_refused_by_its_element_or_shape(lower: Array, upper: Array, named: str) -> None:
     with pytest.raises(ConfigError) as refusal:
-        make_problem(box=box_for_synthetic(box))
-    assert str(refusal.value).startswith("box: start value ")
-    assert "of m23 is outside [0.06, " in str(refusal.value)
-    assert str(refusal.value).endswith("]; widen the box")
+        make_problem(box=box_between(lower, upper))  # the robot of the samples has the design of the APR-02
+    assert str(refusal.value).startswith("box: ")
+    assert named in str(refusal.value)
 
 
-def box_for_synthetic(box: Box) -> Box:
-    """The same box; the robot of the samples has the design of the APR-02."""
-    np.testing.assert_allclose(synthetic_robot().inverse_kinematic_matrix, DESIGN, atol=1e-15)
-    return box
-
-
-def test_an_inverted_box_is_refused_in_one_line() -> None:
-    box = box_between(changed(DESIGN - 0.1, 0, 0, 0.5), changed(DESIGN + 0.1, 0, 0, -0.5))
-    with pytest.raises(ConfigError, match=r"^box: lower bound 0\.5 of m11 is above its upper bound -0\.5$"):
-        assert elements(box).bounds
-
-
-@pytest.mark.parametrize("shape", [(3, 2), (2, 3), (3, 4)])
-def test_a_box_of_another_shape_is_refused_in_one_line(shape: tuple[int, int]) -> None:
-    box = box_between(np.full(shape, -1.0), np.full(shape, 1.0))
-    with pytest.raises(ConfigError, match=r"^box: lower and upper must have 3 rows of 3 values$"):
-        make_bounds(APR_02, box)
-
-
-def test_elements_are_named_by_row_and_column() -> None:
+def test_elements_are_named_by_row_and_column_and_start_at_the_design() -> None:
     assert elements("row").names == ("m11", "m12", "m13", "m21", "m22", "m23", "m31", "m32", "m33")
-
-
-def test_the_start_is_the_matrix_of_the_design_row_by_row() -> None:
     np.testing.assert_array_equal(elements("row").start, DESIGN.ravel())
 
 
@@ -140,21 +106,27 @@ def test_along_undriven_directions_the_design_is_kept(seed: int) -> None:
 class TestGeometry:
     """Radius, distance and angle of every wheel within physical limits."""
 
-    def test_by_default_radii_have_10_distances_20_per_cent_and_angles_3_degrees(self) -> None:
-        box = WheelGeometry(APR_02).bounds
-        lower, upper = box.lower.reshape(3, 3), box.upper.reshape(3, 3)
-        angles = np.radians([60, 180, 300])
-        np.testing.assert_allclose(lower[:2], [[0.9 * 0.148] * 3, [0.8 * 0.195] * 3], rtol=1e-12)
-        np.testing.assert_allclose(lower[2], angles - math.radians(3), rtol=1e-12)
-        np.testing.assert_allclose(upper[:2], [[1.1 * 0.148] * 3, [1.2 * 0.195] * 3], rtol=1e-12)
-        np.testing.assert_allclose(upper[2], angles + math.radians(3), rtol=1e-12)
-
-    def test_limits_may_be_one_sided(self) -> None:
-        limits = GeometryLimits(radius=(-0.02, 0.05), distance=(0.0, 0.3), angle_deg=(-1.0, 0.5))
-        box = WheelGeometry(APR_02, limits).bounds
-        lower, upper = box.lower.reshape(3, 3)[:, 1], box.upper.reshape(3, 3)[:, 1]
-        np.testing.assert_allclose(lower, [0.98 * 0.148, 0.195, math.pi - math.radians(1)], rtol=1e-12)
-        np.testing.assert_allclose(upper, [1.05 * 0.148, 1.3 * 0.195, math.pi + math.radians(0.5)], rtol=1e-12)
+    @pytest.mark.parametrize(
+        ("limits", "radius", "distance", "angle_deg"),
+        [
+            (GeometryLimits(), (0.9, 1.1), (0.8, 1.2), (-3.0, 3.0)),
+            (
+                GeometryLimits(radius=(-0.02, 0.05), distance=(0.0, 0.3), angle_deg=(-1.0, 0.5)),
+                (0.98, 1.05),
+                (1.0, 1.3),
+                (-1.0, 0.5),
+            ),
+        ],
+    )
+    def test_limits_are_shares_of_radius_and_distance_and_degrees(
+        self, limits: GeometryLimits, radius: Any, distance: Any, angle_deg: Any
+    ) -> None:
+        geometry = WheelGeometry(APR_02, limits)
+        ends = (geometry.bounds.lower, geometry.bounds.upper)
+        for end, of_radius, of_distance, degrees in zip(ends, radius, distance, angle_deg, strict=True):
+            found = end.reshape(3, 3)
+            np.testing.assert_allclose(found[:2], [[of_radius * 0.148] * 3, [of_distance * 0.195] * 3], rtol=1e-12)
+            np.testing.assert_allclose(found[2], np.radians(np.array([60, 180, 300]) + degrees), rtol=1e-12)
 
     def test_parameters_are_named_by_wheel(self) -> None:
         assert WheelGeometry(APR_02).names == (
@@ -162,12 +134,6 @@ class TestGeometry:
             *("distance_a", "distance_b", "distance_c"),
             *("angle_a", "angle_b", "angle_c"),
         )
-
-    @pytest.mark.parametrize("wheels", [3, 4])
-    def test_the_start_means_the_matrix_of_the_design(self, wheels: Any) -> None:
-        geometry = WheelGeometry(synthetic_robot(wheels))
-        matrix = geometry.matrices(geometry.start[None])[0]
-        np.testing.assert_allclose(matrix, synthetic_robot(wheels).inverse_kinematic_matrix, rtol=1e-14, atol=1e-17)
 
     @pytest.mark.parametrize("wheels", [3, 4])
     def test_vectors_mean_the_matrix_of_a_robot_built_like_that(self, wheels: Any) -> None:
@@ -182,13 +148,11 @@ class TestGeometry:
             )
             np.testing.assert_allclose(matrix, inverse_kinematic_matrix(built), rtol=1e-12, atol=1e-16)
 
-    def test_limits_that_exclude_the_design_are_refused_in_one_line(self) -> None:
-        with pytest.raises(ConfigError, match=r"box: start value 0\.148 of radius_a is outside \[0\.14948, "):
-            make_problem(parameterisation="geometry", limits=GeometryLimits(radius=(0.01, 0.1)))
-
-    def test_limits_the_wrong_way_round_are_refused_in_one_line(self) -> None:
-        with pytest.raises(ConfigError, match="of distance_a is above its upper bound"):
-            make_problem(parameterisation="geometry", limits=GeometryLimits(distance=(0.1, -0.1)))
+    @pytest.mark.parametrize("limits", [{"radius": (0.01, 0.1)}, {"distance": (0.1, -0.1)}])
+    def test_limits_that_exclude_the_design_or_are_the_wrong_way_round_are_refused_by_name(self, limits: Any) -> None:
+        (name,) = limits
+        with pytest.raises(ConfigError, match=f"of {name}_a is "):
+            make_problem(parameterisation="geometry", limits=GeometryLimits(**limits))
 
     @pytest.mark.parametrize(
         "limits", [{"radius": 1.5}, {"distance": [-1.0, 0.2]}, {"radius": math.nan}, {"radii": 0.1}]
@@ -223,3 +187,84 @@ def test_a_robot_that_turns_by_half_of_its_track_is_in_the_box_where_it_skids_an
         matrix = robot.inverse_kinematic_matrix * [[1.0], [1.0], [0.5]]
         box = make_bounds(robot, "row")
         assert bool(((matrix.ravel() >= box.lower) & (matrix.ravel() <= box.upper)).all()) is turns_by_half
+
+
+def with_wheels(robot: Robot, change: Callable[[Any], dict[str, float]]) -> Robot:
+    """A robot with other design values of its measured wheels."""
+    return robot.model_copy(
+        update={
+            "wheels": tuple(
+                wheel.model_copy(update=change(wheel)) if wheel in robot.measured else wheel for wheel in robot.wheels
+            )
+        }
+    )
+
+
+@pytest.mark.parametrize("robot", [pytest.param(robot, id=robot.name) for robot in (APR_02, *WHEELED)])
+@pytest.mark.parametrize("fitted_mount", [False, True])
+def test_the_design_values_have_the_design_matrix(robot: Robot, fitted_mount: bool) -> None:
+    mounted = robot.model_copy(update={"mount": Mount(x=0.3, y=0.1, yaw=0.2)})
+    geometry = WheelGeometry(mounted, fitted_mount=fitted_mount)
+    found = geometry.matrices(geometry.start[None])[0]
+    np.testing.assert_allclose(found, mounted.inverse_kinematic_matrix, rtol=0, atol=1e-15)
+    assert ("mount_x" in geometry.names) == (fitted_mount and not robot.slides)
+
+
+@pytest.mark.parametrize(
+    ("robot", "kind", "change"),
+    [
+        (DIFFERENTIAL, "radius", lambda wheel: {"radius": 1.1 * wheel.radius}),
+        (DIFFERENTIAL, "distance", lambda wheel: {"y": 1.2 * wheel.y}),
+        (SKID, "distance", lambda wheel: {"y": 1.2 * wheel.y}),
+        (TRICYCLE, "x", lambda wheel: {"x": wheel.x + 0.1}),
+        (TRICYCLE, "y", lambda wheel: {"y": wheel.y + 0.1}),
+        (SWERVE, "radius", lambda wheel: {"radius": 1.1 * wheel.radius}),
+        (SWERVE, "x", lambda wheel: {"x": wheel.x + 0.1}),
+    ],
+)
+def test_a_changed_number_has_the_matrix_of_a_robot_that_is_changed_so(
+    robot: Robot, kind: str, change: Callable[[Any], dict[str, float]]
+) -> None:
+    changed = with_wheels(robot, change)
+    vector = WheelGeometry(changed).start
+    others = [index for index, name in enumerate(WheelGeometry(robot).names) if not name.startswith(kind)]
+    np.testing.assert_array_equal(vector[others], WheelGeometry(robot).start[others])
+    found = WheelGeometry(robot).matrices(vector[None])[0]
+    np.testing.assert_allclose(found, changed.inverse_kinematic_matrix, rtol=0, atol=1e-15)
+
+
+def test_an_offset_turns_the_signals_of_its_wheel() -> None:
+    geometry = WheelGeometry(TRICYCLE)
+    vector = geometry.start.copy()
+    vector[geometry.names.index("offset_front")] = 0.1
+    measured, true = np.array([[0.3]]), np.array([[0.4]])
+    found = geometry.matrices(vector[None])[0] @ TRICYCLE.drive.signals(np.array([[2.0]]), measured)[0]
+    expected = TRICYCLE.inverse_kinematic_matrix @ TRICYCLE.drive.signals(np.array([[2.0]]), true)[0]
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-15)
+
+
+def test_a_longer_wheelbase_turns_a_car_less() -> None:
+    geometry = WheelGeometry(CAR)
+    longer = geometry.matrices((geometry.start * [1.0, 1.25])[None])[0]
+    np.testing.assert_allclose(longer, CAR.inverse_kinematic_matrix * [[1.0], [1.0], [0.8]], rtol=0, atol=1e-15)
+
+
+def none_kept(robot: Robot) -> Array:
+    return np.zeros((0, len(robot.drive.names)))
+
+
+@pytest.mark.parametrize("robot", [DIFFERENTIAL, CAR], ids=lambda robot: robot.name)
+def test_a_matrix_tells_the_geometry_of_a_robot_whose_tracked_point_is_known(robot: Robot) -> None:
+    assert all(identified_parameters(WheelGeometry(robot), none_kept(robot)))
+
+
+def test_the_side_of_a_tracked_point_is_not_told_apart_from_that_of_the_wheels() -> None:
+    geometry = WheelGeometry(TRICYCLE, fitted_mount=True)
+    told = dict(zip(geometry.names, identified_parameters(geometry, none_kept(TRICYCLE)), strict=True))
+    assert [name for name, known in told.items() if not known] == ["y_front", "mount_y"]
+
+
+def test_the_limits_of_a_mecanum_geometry_hold_its_design() -> None:
+    bounds = WheelGeometry(MECANUM).bounds
+    assert (bounds.lower < WheelGeometry(MECANUM).start).all()
+    assert (bounds.upper > WheelGeometry(MECANUM).start).all()

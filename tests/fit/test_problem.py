@@ -32,50 +32,31 @@ def population(problem: CalibrationProblem, count: int, seed: int = 0) -> Array:
     return problem.from_unit(rng.uniform(size=(count, int(problem.free.sum()))))
 
 
-def test_every_candidate_counts() -> None:
+def test_every_candidate_counts_but_those_that_are_only_valued() -> None:
     problem = make_problem()
+    problem.values(population(problem, 7))
+    assert (problem.evaluations, problem.best_cost) == (0, np.inf)
     problem.cost(problem.start)
     problem.cost(population(problem, 7))
     assert (problem.evaluations, problem.remaining) == (8, 60_000 - 8)
 
 
-def test_values_for_the_verdict_do_not_count() -> None:
-    problem = make_problem()
-    problem.values(population(problem, 7))
-    assert problem.evaluations == 0
-    assert problem.best_cost == np.inf
-
-
 def test_a_population_is_cut_at_the_budget_and_what_was_evaluated_is_kept() -> None:
     problem, unlimited = make_problem(evaluations=5), make_problem()
     candidates = population(problem, 9)
-    with pytest.raises(BudgetSpent, match="budget of 5 evaluations spent"):
-        problem.cost(candidates)
-    assert problem.evaluations == 5
+    for _ in range(2):  # nothing is evaluated beyond it
+        with pytest.raises(BudgetSpent, match="5 evaluations") as spent:
+            problem.cost(candidates)
+        assert (spent.value.kind, problem.evaluations) == ("budget", 5)
     assert problem.best_cost == pytest.approx(unlimited.cost(candidates)[:5].min(), rel=1e-12)
-
-
-def test_a_population_that_fits_exactly_is_answered() -> None:
-    problem = make_problem(evaluations=5)
-    assert problem.cost(population(problem, 5)).shape == (5,)
-
-
-def test_nothing_is_evaluated_when_the_budget_is_spent() -> None:
-    problem = make_problem(evaluations=1)
-    problem.cost(problem.start)
-    for _ in range(2):
-        with pytest.raises(BudgetSpent) as spent:
-            problem.cost(problem.start)
-        assert spent.value.kind == "budget"
-    assert problem.evaluations == 1
+    assert make_problem(evaluations=5).cost(candidates[:5]).shape == (5,)
 
 
 def test_nothing_is_evaluated_when_the_time_is_spent() -> None:
     problem = make_problem(seconds=1e-9)
-    with pytest.raises(BudgetSpent, match="time budget of 1e-09 s spent") as spent:
+    with pytest.raises(BudgetSpent, match="1e-09 s") as spent:
         problem.cost(problem.start)
-    assert spent.value.kind == "time"
-    assert problem.evaluations == 0
+    assert (spent.value.kind, problem.evaluations) == ("time", 0)
 
 
 @pytest.mark.parametrize("wheels", [3, 4])
@@ -110,7 +91,7 @@ def test_a_candidate_outside_the_box_costs_but_is_never_the_best() -> None:
 
 def test_candidates_of_another_shape_are_a_programming_error() -> None:
     problem = make_problem()
-    with pytest.raises(ValueError, match=r"candidates have shape \(2, 8\), expected \(P, 9\)"):
+    with pytest.raises(ValueError, match=r"\(2, 8\)"):
         problem.cost(np.zeros((2, 8)))
     assert problem.evaluations == 0
 
@@ -127,18 +108,17 @@ def test_candidates_are_left_unchanged_and_answers_do_not_depend_on_them_later()
 
 
 @given(sizes=st.lists(st.integers(1, 6), min_size=1, max_size=8), seed=st.integers(0, 2**16))
-def test_evaluations_and_costs_of_the_history_only_move_one_way(sizes: list[int], seed: int) -> None:
+def test_the_best_of_all_batches_is_kept_and_the_history_says_when_it_was_found(sizes: list[int], seed: int) -> None:
     problem = make_problem(RUNS)
-    for index, size in enumerate(sizes):
-        problem.cost(population(problem, size, seed + index))
-    evaluations = [step.evaluations for step in problem.history]
-    seconds = [step.seconds for step in problem.history]
+    batches = [population(problem, size, seed + index) for index, size in enumerate(sizes)]
+    values = np.concatenate([problem.cost(batch) for batch in batches])
     costs = [step.cost for step in problem.history]
-    assert evaluations == sorted(set(evaluations))
+    seconds = [step.seconds for step in problem.history]
+    assert [values[step.evaluations - 1] for step in problem.history] == costs == sorted(set(costs), reverse=True)
     assert seconds == sorted(seconds)
-    assert costs == sorted(set(costs), reverse=True)
-    assert costs[-1] == problem.best_cost
-    assert evaluations[-1] <= problem.evaluations == sum(sizes)
+    assert costs[-1] == problem.best_cost == values.min()
+    np.testing.assert_array_equal(problem.best_vector, np.concatenate(batches)[values.argmin()])
+    assert problem.evaluations == sum(sizes)
 
 
 RUNS = noisy_trajectories()
@@ -158,26 +138,23 @@ def test_progress_is_shown_while_candidates_are_evaluated() -> None:
 
 
 @pytest.mark.parametrize("name", ["start", "lower", "upper", "free", "reference", "best_vector"])
-def test_what_a_calibrator_is_given_cannot_be_overwritten(name: str) -> None:
+@pytest.mark.parametrize("evaluated", [0, 4])
+def test_what_a_calibrator_is_given_cannot_be_overwritten(name: str, evaluated: int) -> None:
+    problem = make_problem(RUNS)
+    problem.cost(population(problem, evaluated))
+    assert (problem.best_cost < np.inf) == (evaluated > 0)
     with pytest.raises(ValueError, match="read-only"):
-        getattr(make_problem(), name)[0] = 0
-
-
-def test_the_best_candidate_cannot_be_overwritten_either() -> None:
-    problem = make_problem()
-    problem.cost(population(problem, 4))
-    assert problem.best_cost < np.inf
-    with pytest.raises(ValueError, match="read-only"):
-        problem.best_vector[0] = 0
+        getattr(problem, name)[0] = 0
 
 
 class TestUnitCube:
     """Searches work in the unit cube of the elements that are free."""
 
-    def test_its_corners_are_the_box(self) -> None:
-        problem = make_problem()
+    def test_its_corners_are_the_box_and_what_is_outside_comes_to_its_surface(self) -> None:
+        problem = make_problem(RUNS)
         np.testing.assert_allclose(problem.from_unit(np.zeros(9))[0], problem.lower, rtol=1e-15)
         np.testing.assert_allclose(problem.from_unit(np.ones(9))[0], problem.upper, rtol=1e-15)
+        np.testing.assert_array_equal(problem.to_unit(problem.upper + 1.0)[0], np.ones(9))
 
     @given(seed=st.integers(0, 2**16), box=st.sampled_from(["row", "paper"]))
     def test_points_come_back(self, seed: int, box: Any) -> None:
@@ -190,10 +167,6 @@ class TestUnitCube:
         problem = make_problem(RUNS)
         vectors = problem.from_unit(np.array(points))
         assert ((vectors >= problem.lower) & (vectors <= problem.upper)).all()
-
-    def test_points_of_vectors_outside_are_on_its_surface(self) -> None:
-        problem = make_problem()
-        np.testing.assert_array_equal(problem.to_unit(problem.upper + 1.0)[0], np.ones(9))
 
     def test_frozen_elements_keep_their_start(self) -> None:
         problem = make_problem(box="paper")
@@ -212,44 +185,32 @@ class TestUnitCube:
 class TestBox:
     """Inside, and on the surface."""
 
-    def test_its_corners_are_inside(self) -> None:
-        problem = make_problem(box="paper")
+    def test_its_corners_are_inside_and_rounding_is_forgiven_and_no_more(self) -> None:
+        problem = make_problem(RUNS)
         assert problem.inside(np.array([problem.lower, problem.upper, problem.start])).all()
-
-    def test_rounding_is_forgiven_and_no_more(self) -> None:
-        problem = make_problem()
         assert problem.inside(problem.upper * (1 + 1e-14 * np.sign(problem.upper)))
         beyond = problem.upper.copy()
         beyond[4] += 1e-9
-        assert not problem.inside(beyond)
+        outside = [beyond, np.full(9, np.nan), np.full(9, np.inf)]
+        assert not problem.inside(np.array(outside)).any()
 
-    @pytest.mark.parametrize("value", [np.nan, np.inf])
-    def test_what_is_not_finite_is_outside(self, value: float) -> None:
-        assert not make_problem().inside(np.full(9, value))
-
-    def test_elements_on_a_bound_are_named(self) -> None:
-        problem = make_problem()
+    def test_elements_on_a_bound_are_named_but_not_frozen_ones(self) -> None:
+        problem = make_problem(RUNS)
         vector = problem.start.copy()
         vector[[1, 8]] = problem.upper[1], problem.lower[8]
         assert problem.at_bounds(vector) == ("m12", "m33")
-
-    def test_frozen_elements_are_not_said_to_be_on_a_bound(self) -> None:
-        problem = make_problem(box="paper")
-        assert problem.at_bounds(problem.start) == ()
+        frozen = make_problem(RUNS, box="paper")
+        assert frozen.at_bounds(frozen.start) == ()
 
 
 def test_limits_of_the_geometry_are_its_box() -> None:
-    problem = make_problem(parameterisation="geometry", limits=GeometryLimits(angle_deg=0.0))
-    assert problem.box == "limits"
-    assert [name for name, free in zip(problem.names, problem.free, strict=True) if not free] == [
-        "angle_a",
-        "angle_b",
-        "angle_c",
-    ]
+    problem = make_problem(RUNS, parameterisation="geometry", limits=GeometryLimits(angle_deg=0.0))
+    frozen = [name for name, free in zip(problem.names, problem.free, strict=True) if not free]
+    assert (problem.box, frozen) == ("limits", ["angle_a", "angle_b", "angle_c"])
 
 
 def test_no_trajectories_are_refused() -> None:
-    with pytest.raises(DataError, match="no trajectories; nothing can be calibrated"):
+    with pytest.raises(DataError, match="no trajectories"):
         make_problem(())
 
 
@@ -313,31 +274,23 @@ class TestValidationData:
         calibrate(dataset, "spy")
         return problems[0], dataset.split("train"), dataset.split("validation")
 
-    def test_no_array_of_a_validation_run_is_reachable(self, seen: Any) -> None:
-        problem, _, validation = seen
-        arrays = [item for item in reachable(problem) if isinstance(item, np.ndarray)]
+    def test_training_runs_are_reachable_and_no_array_of_a_validation_run_is(self, seen: Any) -> None:
+        problem, training, validation = seen
+        items = list(reachable(problem))
+        arrays = [item for item in items if isinstance(item, np.ndarray)]
         for hidden in arrays_of(validation):
             assert not any(np.shares_memory(array, hidden) or holds(array, hidden) for array in arrays)
-
-    def test_the_search_does_find_the_training_runs(self, seen: Any) -> None:
-        problem, training, _ = seen
-        arrays = [item for item in reachable(problem) if isinstance(item, np.ndarray)]
         for shown in arrays_of(training):
             assert any(holds(array, shown) for array in arrays)
-
-    def test_every_trajectory_that_is_reachable_is_a_training_run(self, seen: Any) -> None:
-        problem, training, _ = seen
-        runs = [item for item in reachable(problem) if isinstance(item, Trajectory)]
-        assert {run.id for run in runs} == {run.id for run in training}
+        assert {run.id for run in items if isinstance(run, Trajectory)} == {run.id for run in training}
 
     def test_a_pickled_problem_does_not_hold_a_validation_run(self, seen: Any) -> None:
         problem, training, validation = seen
         content = pickle.dumps(problem)
         assert all(np.ascontiguousarray(run.poses).tobytes() in content for run in training)
         for run in validation:
-            assert np.ascontiguousarray(run.poses).tobytes() not in content
-            assert np.ascontiguousarray(run.rates).tobytes() not in content
-            assert run.id.encode() not in content
+            for hidden in (run.id.encode(), *(np.ascontiguousarray(each).tobytes() for each in (run.poses, run.rates))):
+                assert hidden not in content
 
 
 def test_elements_that_the_cost_does_not_see_keep_their_start_values() -> None:

@@ -43,7 +43,6 @@ def raising(error: BaseException) -> Callable[[CalibrationProblem], Solution]:
 def test_an_answer_by_the_calibrators_own_rule_has_converged() -> None:
     result = run(answering(lambda problem: problem.start * 1.01))
     assert (result.outcome, result.reason) == (Outcome.CONVERGED, "done")
-    assert result.vector is not None
     problem = make_problem(RUNS)
     assert result.cost == problem.values(result.vector[None])[0]
     np.testing.assert_array_equal(result.matrix, problem.matrix(result.vector))
@@ -51,21 +50,17 @@ def test_an_answer_by_the_calibrators_own_rule_has_converged() -> None:
 
 def test_one_number_of_degrees_of_freedom_is_that_of_every_variance() -> None:
     result = run(lambda problem: Solution(problem.start, "done", covariance=np.eye(problem.size), degrees_of_freedom=7))
-    np.testing.assert_array_equal(result.degrees_of_freedom, np.full(make_problem(RUNS).size, 7.0))
+    np.testing.assert_array_equal(result.degrees_of_freedom, np.full(9, 7.0))
 
 
-def test_degrees_of_freedom_of_another_size_fail_the_run() -> None:
-    result = run(lambda problem: Solution(problem.start, "done", degrees_of_freedom=np.ones(problem.size + 1)))
-    assert result.outcome is Outcome.FAILED
-    assert result.vector is None
-
-
-@pytest.mark.parametrize("freedom", [np.nan, 0.0, -3.0])
-def test_variances_without_degrees_of_freedom_make_an_answer_invalid(freedom: float) -> None:
+@pytest.mark.parametrize(
+    ("freedom", "outcome"),
+    [(np.ones(10), Outcome.FAILED), *((value, Outcome.INVALID) for value in (np.nan, 0.0, -3.0))],
+)
+def test_degrees_of_freedom_of_another_size_or_not_above_0_are_no_answer(freedom: Any, outcome: Outcome) -> None:
     result = run(lambda problem: Solution(problem.start, "done", degrees_of_freedom=freedom))
-    assert result.outcome is Outcome.INVALID
-    assert result.reason == f"degrees_of_freedom of the answer's variances must be above 0, found {freedom:g}"
-    assert (result.vector, result.degrees_of_freedom) == (None, None)
+    assert (result.outcome, result.vector, result.degrees_of_freedom) == (outcome, None, None)
+    assert "degrees_of_freedom" in result.reason or outcome is Outcome.FAILED
 
 
 def test_an_answer_at_a_limit_of_the_calibrators_own_has_not_converged() -> None:
@@ -74,49 +69,45 @@ def test_an_answer_at_a_limit_of_the_calibrators_own_has_not_converged() -> None
     assert result.cost is not None
 
 
-def test_a_spent_budget_gives_the_best_candidate_so_far() -> None:
-    result = run(for_ever, evaluations=40)
-    assert (result.outcome, result.reason) == (Outcome.BUDGET, "budget of 40 evaluations spent")
-    assert result.evaluations == 40
+@pytest.mark.parametrize(
+    ("limit", "outcome"), [({"evaluations": 40}, Outcome.BUDGET), ({"seconds": 0.05}, Outcome.TIME)]
+)
+def test_a_spent_budget_gives_the_best_candidate_so_far(limit: dict[str, Any], outcome: Outcome) -> None:
+    result = run(for_ever, **limit)
+    assert result.outcome is outcome
+    assert "spent" in result.reason
+    assert result.evaluations == 40 or 0.05 <= result.seconds < 5
     assert result.cost == pytest.approx(result.history[-1].cost, rel=1e-12)
     assert result.matrix is not None
 
 
-def test_spent_time_gives_the_best_candidate_so_far() -> None:
-    result = run(for_ever, seconds=0.05)
-    assert (result.outcome, result.reason) == (Outcome.TIME, "time budget of 0.05 s spent")
-    assert 0.05 <= result.seconds < 5
-    assert result.cost == pytest.approx(result.history[-1].cost, rel=1e-12)
-
-
-def test_a_budget_spent_without_a_finite_cost_is_invalid() -> None:
-    def only_nan(problem: CalibrationProblem) -> Solution:
-        while True:
-            problem.cost(np.full((5, 9), np.nan))
-
-    result = run(only_nan, evaluations=20)
-    assert (result.outcome, result.vector, result.cost) == (Outcome.INVALID, None, None)
-    assert result.reason == "budget of 20 evaluations spent, and no candidate in the box had a finite cost"
-
-
-def test_a_budget_spent_outside_the_box_is_invalid() -> None:
+@pytest.mark.parametrize("candidate", [np.nan, 1e-3])
+def test_a_budget_spent_without_a_finite_cost_in_the_box_is_invalid(candidate: float) -> None:
     def outside(problem: CalibrationProblem) -> Solution:
         while True:
-            problem.cost(problem.upper + 1e-3)
+            problem.cost(np.tile(problem.upper + candidate, (5, 1)))
 
-    assert run(outside, evaluations=20).outcome is Outcome.INVALID
+    result = run(outside, evaluations=20)
+    assert (result.outcome, result.vector, result.cost) == (Outcome.INVALID, None, None)
+    assert "no candidate" in result.reason
+
+
+class NastyError(Exception):
+    """An error whose own text raises."""
+
+    def __str__(self) -> str:
+        raise RuntimeError("not even this works")
 
 
 @pytest.mark.parametrize(
     ("error", "reason"),
     [
         (ValueError("a bad\nday"), "ValueError: a bad day"),
-        (ZeroDivisionError("division by zero"), "ZeroDivisionError: division by zero"),
         (ConfigError("cannot be solved this way"), "cannot be solved this way"),
         (SystemExit(3), "SystemExit: 3"),
         (MemoryError(), "MemoryError"),
-        (RecursionError("too deep"), "RecursionError: too deep"),
         (np.linalg.LinAlgError("singular"), "LinAlgError: singular"),
+        (NastyError(), "NastyError"),
     ],
 )
 def test_whatever_a_calibrator_raises_its_run_has_failed_with_the_reason(error: BaseException, reason: str) -> None:
@@ -126,35 +117,20 @@ def test_whatever_a_calibrator_raises_its_run_has_failed_with_the_reason(error: 
     assert result.evaluations == 1
 
 
-def test_an_error_whose_own_text_raises_is_still_told() -> None:
-    class NastyError(Exception):
-        def __str__(self) -> str:
-            raise RuntimeError("not even this works")
-
-    assert run(raising(NastyError())).reason == "NastyError"
-
-
 def test_ctrl_c_is_not_taken_for_a_failure() -> None:
     with pytest.raises(KeyboardInterrupt):
         run(raising(KeyboardInterrupt()))
 
 
 INVALID: dict[str, tuple[Callable[[CalibrationProblem], Any], str]] = {
-    "NaN": (lambda problem: problem.start * np.nan, "the answer holds NaN or infinity"),
-    "infinity": (lambda _: np.full(9, np.inf), "the answer holds NaN or infinity"),
-    "one NaN": (lambda problem: np.append(problem.start[:8], np.nan), "the answer holds NaN or infinity"),
-    "too short": (lambda problem: problem.start[:8], "the answer has shape (8,), expected (9,)"),
-    "a matrix": (lambda problem: problem.start.reshape(3, 3), "the answer has shape (3, 3), expected (9,)"),
-    "a population": (lambda problem: problem.start[None], "the answer has shape (1, 9), expected (9,)"),
-    "a number": (lambda _: 1.0, "the answer has shape (), expected (9,)"),
-    "nothing": (lambda _: None, "the answer has shape (), expected (9,)"),
-    "text": (lambda _: "none found", "the answer is not a vector of numbers"),
-    "a mapping": (lambda _: {"m11": 1.0}, "the answer is not a vector of numbers"),
-    "ragged": (lambda _: [[1.0], [1.0, 2.0]], "the answer is not a vector of numbers"),
-    "outside": (
-        lambda problem: problem.start + np.isin(problem.names, ["m21", "m33"]),
-        "the answer is outside the box (m21, m33)",
-    ),
+    "infinity": (lambda _: np.full(9, np.inf), "NaN or infinity"),
+    "one NaN": (lambda problem: np.append(problem.start[:8], np.nan), "NaN or infinity"),
+    "too short": (lambda problem: problem.start[:8], "shape (8,)"),
+    "a population": (lambda problem: problem.start[None], "shape (1, 9)"),
+    "nothing": (lambda _: None, "shape ()"),
+    "text": (lambda _: "none found", "not a vector of numbers"),
+    "ragged": (lambda _: [[1.0], [1.0, 2.0]], "not a vector of numbers"),
+    "outside": (lambda problem: problem.start + np.isin(problem.names, ["m21", "m33"]), "(m21, m33)"),
 }
 
 
@@ -162,30 +138,36 @@ INVALID: dict[str, tuple[Callable[[CalibrationProblem], Any], str]] = {
 def test_an_answer_that_is_no_calibration_is_invalid(case: str) -> None:
     answer, reason = INVALID[case]
     result = run(answering(answer))
-    assert (result.outcome, result.reason) == (Outcome.INVALID, reason)
-    assert (result.vector, result.matrix, result.cost) == (None, None, None)
+    assert (result.outcome, result.vector, result.matrix, result.cost) == (Outcome.INVALID, None, None, None)
+    assert reason in result.reason
 
 
 def test_an_answer_in_a_box_without_width_must_match_it() -> None:
     result = run(answering(lambda problem: problem.start + 1e-9 * np.isin(problem.names, ["m12"])), box="paper")
-    assert (result.outcome, result.reason) == (Outcome.INVALID, "the answer is outside the box (m12)")
-
-
-def test_a_matrix_that_moves_no_robot_is_invalid() -> None:
-    class Unbounded(Scripted):
-        bounded = False
-
-    result = run_calibrator(Unbounded(answering(lambda problem: 0 * problem.start)), make_problem(RUNS))
     assert result.outcome is Outcome.INVALID
-    assert result.reason == "the answer's matrix holds zeros only: no wheel would move the robot"
+    assert "(m12)" in result.reason
 
 
-def test_rounding_on_the_boxs_surface_is_forgiven() -> None:
-    result = run(answering(lambda problem: problem.upper * (1 + 1e-15 * np.sign(problem.upper))))
-    assert result.outcome is Outcome.CONVERGED
+class Unbounded(Scripted):
+    bounded = False
 
 
-def test_an_answer_whose_cost_is_not_finite_is_invalid() -> None:
+def test_a_calibrator_without_bounds_may_answer_outside_the_box_but_not_with_a_matrix_of_zeros() -> None:
+    beyond = run_calibrator(Unbounded(answering(lambda problem: problem.upper + 1e-3)), make_problem(RUNS))
+    assert (beyond.outcome, beyond.at_bounds) == (Outcome.CONVERGED, ())
+    zeros = run_calibrator(Unbounded(answering(lambda problem: 0 * problem.start)), make_problem(RUNS))
+    assert zeros.outcome is Outcome.INVALID
+    assert "zeros" in zeros.reason
+
+
+def test_rounding_on_the_boxs_surface_is_forgiven_and_an_answer_on_a_bound_is_flagged() -> None:
+    rounded = run(answering(lambda problem: problem.upper * (1 + 1e-15 * np.sign(problem.upper))))
+    assert rounded.outcome is Outcome.CONVERGED
+    result = run(answering(lambda problem: np.append(problem.start[:8], problem.lower[8])))
+    assert result.at_bounds == ("m33",)
+
+
+def test_an_answer_whose_cost_is_not_finite_is_invalid_and_a_cost_that_raises_fails_the_run() -> None:
     @costs.register("undefined")
     class Undefined(Cost):
         """NaN everywhere."""
@@ -193,11 +175,6 @@ def test_an_answer_whose_cost_is_not_finite_is_invalid() -> None:
         def combine(self, errors: Array, trajectory: Any) -> Array:  # noqa: ARG002
             return np.full(len(errors), np.nan)
 
-    result = run(answering(lambda problem: problem.start), cost="undefined")
-    assert (result.outcome, result.reason, result.cost) == (Outcome.INVALID, "the answer's cost is not finite", None)
-
-
-def test_a_cost_that_raises_fails_the_run_even_of_a_calibrator_that_never_asked() -> None:
     @costs.register("broken")
     class Broken(Cost):
         """Raises."""
@@ -205,32 +182,18 @@ def test_a_cost_that_raises_fails_the_run_even_of_a_calibrator_that_never_asked(
         def combine(self, errors: Array, trajectory: Any) -> Array:  # noqa: ARG002
             raise RuntimeError("no cost today")
 
+    result = run(answering(lambda problem: problem.start), cost="undefined")
+    assert (result.outcome, result.cost) == (Outcome.INVALID, None)
     for script in (answering(lambda problem: problem.start), for_ever):
         result = run(script, cost="broken")
-        assert result.outcome is Outcome.FAILED
-        assert result.reason == "RuntimeError: no cost today"
+        assert (result.outcome, result.reason) == (Outcome.FAILED, "RuntimeError: no cost today")
 
 
 @pytest.mark.parametrize("answer", [None, np.zeros(9), (1, 2)])
 def test_something_else_than_a_solution_is_a_failure_that_says_what_it_was(answer: Any) -> None:
     result = run(lambda _: answer)
     assert result.outcome is Outcome.FAILED
-    assert result.reason == f"calibrate returned {type(answer).__name__}, expected a Solution"
-
-
-def test_a_calibrator_without_bounds_may_answer_outside_the_box() -> None:
-    class Free(Scripted):
-        bounded = False
-
-    problem = make_problem(RUNS)
-    result = run_calibrator(Free(answering(lambda given: given.upper + 1e-3)), problem)
-    assert result.outcome is Outcome.CONVERGED
-    assert result.at_bounds == ()
-
-
-def test_an_answer_on_a_bound_is_flagged() -> None:
-    result = run(answering(lambda problem: np.append(problem.start[:8], problem.lower[8])))
-    assert result.at_bounds == ("m33",)
+    assert type(answer).__name__ in result.reason
 
 
 def test_the_answer_is_a_copy() -> None:
@@ -248,24 +211,17 @@ def test_the_answer_is_a_copy() -> None:
 
 def test_the_history_shows_every_improvement() -> None:
     problem = make_problem(RUNS)
-    better = problem.start + 0.3 * (closed_form_vector() - problem.start)
+    optimum = run_calibrator(calibrators.create("closed_form"), make_problem(RUNS)).vector
 
     def script(given: CalibrationProblem) -> Solution:
-        for candidate in (given.start, given.start, better, given.start, closed_form_vector()):
-            given.cost(candidate)
+        for share in (0.0, 0.0, 0.3, 0.0, 1.0):
+            given.cost(given.start + share * (optimum - given.start))
         return Solution(given.best_vector, "done")
 
     result = run_calibrator(Scripted(script), problem)
     assert [step.evaluations for step in result.history] == [1, 3, 5]
     assert result.evaluations == 5
     assert result.history[-1].cost == pytest.approx(result.cost, rel=1e-12)
-
-
-def closed_form_vector() -> Array:
-    """The optimum of the problem."""
-    vector = run_calibrator(calibrators.create("closed_form"), make_problem(RUNS)).vector
-    assert vector is not None
-    return vector
 
 
 def test_a_reason_of_several_lines_becomes_one() -> None:
@@ -276,4 +232,5 @@ def test_a_plugin_that_cannot_be_imported_fails_with_its_error() -> None:
     stand_in: type[Calibrator] = unloadable(PluginFailure("plugins/mine.py", "SyntaxError: invalid syntax"))
     result = run_calibrator(stand_in(stand_in.Options(anything=1)), make_problem(RUNS))
     assert result.outcome is Outcome.FAILED
-    assert result.reason == "plugins/mine.py cannot be imported: SyntaxError: invalid syntax"
+    assert "plugins/mine.py" in result.reason
+    assert "SyntaxError" in result.reason

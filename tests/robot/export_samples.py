@@ -13,6 +13,15 @@ from omnibench.robot.export.formats import Export
 from omnibench.robot.kinematics import Array, Mount, Robot, Wheel
 
 MOUNT = Mount(x=0.12, y=-0.03, yaw=0.2)
+ORIGIN: dict[str, Any] = {  # of a provenance
+    "dataset": "flower",
+    "dataset_hash": "0",
+    "calibrator": "genetic",
+    "seed": 1,
+    "cost": "final_pose",
+    "box": "row",
+    "outcome": "converged",
+}
 NOISE = Noise(pose_position=0.004, walk_position=0.006, walk_heading=0.01, bias_heading=0.02)
 
 

@@ -103,30 +103,18 @@ def test_everything_in_a_calibration_comes_back(tmp_path: Path) -> None:
 
 
 def test_a_robot_that_steers_names_the_columns_of_its_matrix(tmp_path: Path) -> None:
-    write_calibration(calibration(TRICYCLE), tmp_path / "tricycle.yaml")
-    assert "\nsignals: [front_cos, front_sin]\n" in (tmp_path / "tricycle.yaml").read_text()
-    assert read_calibration(tmp_path / "tricycle.yaml").signals == ("front_cos", "front_sin")
-    write_calibration(a_calibration(), tmp_path / "omni.yaml")
-    assert "signals" not in (tmp_path / "omni.yaml").read_text()
-
-
-def test_columns_of_other_signals_are_refused(tmp_path: Path) -> None:
-    file = tmp_path / "calibration.yaml"
+    file, line = tmp_path / "tricycle.yaml", "signals: [front_cos, front_sin]\n"
     write_calibration(calibration(TRICYCLE), file)
-    file.write_text(file.read_text().replace("[front_cos, front_sin]", "[front_sin, front_cos]"))
-    with pytest.raises(
-        DataError, match=r"signals are front_sin, front_cos, but the columns .* are front_cos, front_sin"
-    ):
+    text, written = file.read_text(), read_calibration(file)
+    assert line in text
+    assert written.signals == ("front_cos", "front_sin")
+    file.write_text(text.replace(line, ""))
+    assert read_calibration(file) == written
+    file.write_text(text.replace(line, "signals: [front_sin, front_cos]\n"))
+    with pytest.raises(DataError, match="front_sin, front_cos"):
         read_calibration(file)
-
-
-def test_the_signals_of_a_file_without_them_are_the_robots(tmp_path: Path) -> None:
-    file = tmp_path / "calibration.yaml"
-    write_calibration(calibration(TRICYCLE), file)
-    file.write_text(file.read_text().replace("signals: [front_cos, front_sin]\n", ""))
-    assert read_calibration(file) == calibration(TRICYCLE).model_copy(
-        update={"created": read_calibration(file).created}
-    )
+    write_calibration(a_calibration(), file)
+    assert "signals" not in file.read_text()
 
 
 TERMS = (
@@ -140,76 +128,55 @@ TERMS = (
 )
 
 
-def test_effects_come_back_with_their_parameters_in_their_order(tmp_path: Path) -> None:
+def test_effects_come_back_with_their_parameters_in_their_order_and_the_same_poses(tmp_path: Path) -> None:
     size = 9 + 6 + 7 + 1 + 1
     covariance = np.random.default_rng(0).normal(size=(size, size))
     written = a_calibration(
         effects=TERMS, covariance=tuple(tuple(values) for values in (covariance @ covariance.T).tolist())
     )
     write_calibration(written, tmp_path / "calibration.yaml")
-    found = read_calibration(tmp_path / "calibration.yaml")
+    found, log = read_calibration(tmp_path / "calibration.yaml"), a_drive(1)
     assert found == written
     assert [list(term.parameters) for term in found.effects] == [list(term.parameters) for term in TERMS]
-
-
-def test_the_covariance_has_the_parameters_of_the_effects_after_the_matrix() -> None:
+    np.testing.assert_array_equal(found.model.reported([log])[0], written.model.reported([log])[0])
     content = a_calibration(effects=TERMS).model_dump(mode="json") | {"covariance": np.eye(9).tolist()}
-    with pytest.raises(ConfigError, match="covariance is not 24 x 24"):
+    with pytest.raises(ConfigError, match="24 x 24"):  # of the matrix, then of the effects
         validate(Calibration, content, "calibration.yaml")
 
 
 def test_the_fingerprints_of_hundreds_of_fitted_runs_are_few_lines_of_the_file(tmp_path: Path) -> None:
-    fitted = tuple(f"{run:016x}" for run in range(360))
+    file, fitted = tmp_path / "calibration.yaml", tuple(f"{run:016x}" for run in range(360))
     provenance = PROVENANCE.model_copy(update={"fitted": fitted})
-    write_calibration(a_calibration(provenance=provenance), tmp_path / "calibration.yaml")
-    assert read_calibration(tmp_path / "calibration.yaml").provenance == provenance
-    assert len((tmp_path / "calibration.yaml").read_text().splitlines()) < 150
-
-
-def test_a_fingerprint_that_cannot_be_one_is_refused(tmp_path: Path) -> None:
-    write_calibration(a_calibration(provenance=PROVENANCE), tmp_path / "calibration.yaml")
-    text = (tmp_path / "calibration.yaml").read_text().replace("89abcdef01234567", "run1")
-    (tmp_path / "calibration.yaml").write_text(text)
+    write_calibration(a_calibration(provenance=provenance), file)
+    assert read_calibration(file).provenance == provenance
+    assert len(file.read_text().splitlines()) < 150
+    file.write_text(file.read_text().replace(fitted[7], "run1"))
     with pytest.raises(DataError, match="fitted"):
-        read_calibration(tmp_path / "calibration.yaml")
+        read_calibration(file)
 
 
-def test_the_model_of_a_calibration_has_its_effects() -> None:
-    model = a_calibration(effects=TERMS).model
+def test_the_model_of_a_calibration_has_its_matrix_integration_and_effects() -> None:
+    model = a_calibration(effects=TERMS, integration="arc").model
     assert [(term.name, dict(term.values)) for term in model.terms] == [(each.name, each.parameters) for each in TERMS]
-    assert model.sample_period == 0.01
+    assert (model.sample_period, model.integration) == (0.01, "arc")
     assert [term.name for term in model.reference_terms] == ["reference_time_offset"]
-
-
-def test_the_model_of_a_file_gives_the_same_poses_to_the_last_bit(tmp_path: Path) -> None:
-    written, log = a_calibration(effects=TERMS), a_drive(1)
-    write_calibration(written, tmp_path / "calibration.yaml")
-    again = read_calibration(tmp_path / "calibration.yaml").model
-    np.testing.assert_array_equal(again.reported([log])[0], written.model.reported([log])[0])
+    np.testing.assert_array_equal(model.matrix, published_matrix("palacin2023_eq8"))
 
 
 def test_a_file_with_the_plain_matrix_comes_back_and_its_effects_fade(tmp_path: Path) -> None:
     slip = EffectTerm(name="centripetal_slip", parameters={"k": 0.05})
     covariance = tuple(map(tuple, np.diag([1e-9] * 9 + [0.1**2]).tolist()))
-    fading = a_calibration(
-        effects=(slip,), covariance=covariance, driven=((0.01, 0.0, 0.0),), plain=matrix_rows(1.1 * APR_MATRIX)
-    )
+    shared = {"effects": (slip,), "covariance": covariance, "driven": ((0.01, 0.0, 0.0),)}
+    fading, before = a_calibration(**shared, plain=matrix_rows(1.1 * APR_MATRIX)), a_calibration(**shared)
     write_calibration(fading, tmp_path / "calibration.yaml")
     again, log = read_calibration(tmp_path / "calibration.yaml"), a_drive(1)
     assert again == fading
     (poses,), (plain,) = again.model.poses([log]), a_calibration(matrix=fading.plain).model.poses([log])
     (whole,) = a_calibration(effects=(slip,)).model.poses([log])
     assert np.abs(poses - plain).max() < 0.1 * np.abs(whole - plain).max()
-
-
-def test_a_file_without_it_stays_as_it_was(tmp_path: Path) -> None:
-    slip = EffectTerm(name="centripetal_slip", parameters={"k": 0.05})
-    covariance = tuple(map(tuple, np.diag([1e-9] * 9 + [0.1**2]).tolist()))
-    before = a_calibration(effects=(slip,), covariance=covariance, driven=((0.01, 0.0, 0.0),))
-    write_calibration(before, tmp_path / "calibration.yaml")
-    assert "plain" not in yaml.safe_load((tmp_path / "calibration.yaml").read_text())
-    log, whole = a_drive(1), a_calibration(effects=(slip,))
-    np.testing.assert_array_equal(before.model.poses([log])[0], whole.model.poses([log])[0])
+    write_calibration(before, tmp_path / "before.yaml")  # without it all stays as it was
+    assert "plain" not in yaml.safe_load((tmp_path / "before.yaml").read_text())
+    np.testing.assert_array_equal(before.model.poses([log])[0], whole)
 
 
 def test_an_effect_of_a_plug_in_is_run(tmp_path: Path) -> None:
@@ -241,12 +208,6 @@ def test_the_file_holds_what_the_design_says(tmp_path: Path) -> None:
     ]
 
 
-def test_the_model_of_a_calibration_has_its_matrix_and_integration() -> None:
-    model = a_calibration(integration="arc").model
-    assert model.integration == "arc"
-    np.testing.assert_array_equal(model.matrix, published_matrix("palacin2023_eq8"))
-
-
 def test_a_calibration_that_cannot_be_written_leaves_the_old_one(tmp_path: Path) -> None:
     file = tmp_path / "calibration.yaml"
     write_calibration(a_calibration(), file)
@@ -266,46 +227,44 @@ def rows(*lengths: int) -> list[list[float]]:
     return [[0.1] * length for length in lengths]
 
 
+def effect(name: str, **parameters: float) -> Callable[[dict[str, Any]], object]:
+    return put("effects", [{"name": name, "parameters": parameters}])
+
+
 REFUSED: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
-    "an unknown key": (put("matrixx", 1), "unknown key 'matrixx'; did you mean 'matrix'?"),
+    "an unknown key": (put("matrixx", 1), "'matrixx'; did you mean 'matrix'?"),
     "an unknown key within": (
         lambda content: content["robot"]["wheels"][1].update(radios=1),
-        "unknown key 'robot.wheels.1.radios'; did you mean 'radius'?",
+        "'robot.wheels.1.radios'",
     ),
-    "another format": (put("format", "omnibench-dataset/1"), "format is 'omnibench-dataset/1', expected"),
-    "no format": (lambda content: content.pop("format"), "format is None, expected 'omnibench-calibration/1'"),
-    "a missing key": (lambda content: content.pop("integration"), "key 'integration' is missing"),
-    "a row too short": (put("matrix", rows(3, 2, 3)), "row 2 of the matrix has 2 values, the robot has 3 wheels"),
-    "a row too few": (put("matrix", rows(3, 3)), "key 'matrix.2' is missing"),
+    "another format": (put("format", "omnibench-dataset/1"), "'omnibench-dataset/1'"),
+    "no format": (lambda content: content.pop("format"), "'omnibench-calibration/1'"),
+    "a missing key": (lambda content: content.pop("integration"), "'integration'"),
+    "a row too short": (put("matrix", rows(3, 2, 3)), "row 2 of the matrix"),
+    "a row too few": (put("matrix", rows(3, 3)), "'matrix.2'"),
     "a row too many": (put("matrix", rows(3, 3, 3, 3)), "matrix: "),
-    "NaN in the matrix": (put("matrix", [[math.nan] * 3] * 3), "matrix.0.0: Input should be a finite number"),
-    "infinity in the matrix": (put("matrix", [[math.inf] * 3] * 3), "matrix.0.0: Input should be a finite number"),
-    "an element that no wheel has": (put("matrix", [[1e6] * 3] * 3), "matrix holds 1e+06, which no wheel can drive"),
+    "NaN in the matrix": (put("matrix", [[math.nan] * 3] * 3), "matrix.0.0: "),
+    "infinity in the matrix": (put("matrix", [[math.inf] * 3] * 3), "matrix.0.0: "),
+    "an element that no wheel has": (put("matrix", [[1e6] * 3] * 3), "1e+06"),
     "text in the matrix": (put("matrix", [["x"] * 3] * 3), "matrix.0.0: "),
-    "a plain matrix of another shape": (put("plain", rows(3, 3, 4)), "row 3 of the plain matrix has 4 values"),
-    "a plain matrix without a covariance": (put("plain", rows(3, 3, 3)), "covariance and driven are needed"),
-    "a covariance of another shape": (put("covariance", rows(*[3] * 3)), "covariance is not 9 x 9"),
+    "a matrix of zeros": (put("matrix", [[0.0] * 3] * 3), "zeros"),
+    "a plain matrix of another shape": (put("plain", rows(3, 3, 4)), "row 3 of the plain matrix"),
+    "a plain matrix without a covariance": (put("plain", rows(3, 3, 3)), "covariance and driven"),
+    "a covariance of another shape": (put("covariance", rows(*[3] * 3)), "9 x 9"),
+    "a covariance that is negative": (put("covariance", (-np.eye(9)).tolist()), "semi-definite"),
+    "a covariance that is not symmetric": (put("covariance", np.triu(np.ones((9, 9))).tolist()), "symmetric"),
     "NaN in the noise": (put("noise", {"pose_position": math.nan}), "noise.pose_position: "),
     "negative noise": (put("noise", {"walk_heading": -0.1}), "noise.walk_heading: "),
+    "noise of kilometres": (put("noise", {"walk_position": 1e200}), "noise.walk_position: "),
     "a period of zero": (put("sample_period", 0), "sample_period: "),
     "an infinite period": (put("sample_period", math.inf), "sample_period: "),
     "a period of hardly anything": (put("sample_period", 1e-300), "sample_period: "),
     "a period of centuries": (put("sample_period", 1e10), "sample_period: "),
-    "a matrix of zeros": (put("matrix", [[0.0] * 3] * 3), "matrix holds zeros only: no wheel would move the robot"),
     "an unknown integration": (put("integration", "runge_kutta"), "integration: "),
-    "an unknown effect": (put("effects", [{"name": "sllip"}]), "unknown effect 'sllip'; "),
-    "an infinite parameter of an effect": (
-        put("effects", [{"name": "centripetal_slip", "parameters": {"k": math.inf}}]),
-        "effects.0.parameters.k: ",
-    ),
-    "an unknown parameter of an effect": (
-        put("effects", [{"name": "heading_drift", "parameters": {"b": 0.001, "bias": 0.1}}]),
-        "effect 'heading_drift': unknown parameter 'bias'; known: b",
-    ),
-    "a missing parameter of an effect": (
-        put("effects", [{"name": "heading_drift"}]),
-        "effect 'heading_drift': parameter 'b' (rad/s) is missing; ",
-    ),
+    "an unknown effect": (effect("centripetal_slipp"), "did you mean 'centripetal_slip'"),
+    "an infinite parameter of an effect": (effect("centripetal_slip", k=math.inf), "effects.0.parameters.k: "),
+    "an unknown parameter of an effect": (effect("heading_drift", b=0.001, bias=0.1), "unknown parameter 'bias'"),
+    "a missing parameter of an effect": (effect("heading_drift"), "parameter 'b' (rad/s)"),
 }
 
 
@@ -320,50 +279,23 @@ def test_a_file_that_is_wrong_is_refused_in_one_line_that_names_it(tmp_path: Pat
     assert "\n" not in str(refusal.value)
 
 
-def test_an_unknown_effect_is_answered_with_the_nearest_one(tmp_path: Path) -> None:
-    file = broken(tmp_path, put("effects", [{"name": "centripetal_slipp"}]))
-    with pytest.raises(OmnibenchError, match="did you mean 'centripetal_slip'"):
-        read_calibration(file)
-
-
-@pytest.mark.parametrize("content", ["", "- a\n- b\n", "just text", "a: [1"])
-def test_a_file_that_is_no_mapping_is_refused_in_one_line_that_names_it(tmp_path: Path, content: str) -> None:
+@pytest.mark.parametrize("content", [None, b"", b"- a\n- b\n", b"just text", b"a: [1", b"\x89PNG\xff\xfe\x00\x01"])
+def test_a_file_that_is_no_mapping_or_not_there_is_refused_in_one_line(tmp_path: Path, content: bytes | None) -> None:
     file = tmp_path / "calibration.yaml"
-    file.write_text(content)
+    if content is not None:
+        file.write_bytes(content)
     with pytest.raises(DataError) as refusal:
         read_calibration(file)
     assert str(file) in str(refusal.value)
     assert "\n" not in str(refusal.value)
 
 
-def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"missing\.yaml: no such file"):
-        read_calibration(tmp_path / "missing.yaml")
-
-
-def test_binary_content_is_refused_in_one_line_that_names_the_file(tmp_path: Path) -> None:
-    file = tmp_path / "calibration.yaml"
-    file.write_bytes(b"\x89PNG\xff\xfe\x00\x01")
-    with pytest.raises(DataError, match=r"calibration\.yaml: cannot be read"):
-        read_calibration(file)
-
-
-@pytest.mark.parametrize(
-    ("changes", "reason"),
-    [
-        ({"covariance": (-np.eye(9)).tolist()}, "covariance is not positive semi-definite"),
-        ({"covariance": np.triu(np.ones((9, 9))).tolist()}, "covariance is not symmetric"),
-        ({"noise": {"walk_position": 1e200}}, "noise.walk_position: Input should be less than or equal to 1000"),
-        ({"name": "\ud800"}, "name: Input should be a valid string"),
-    ],
-)
-def test_what_no_calibration_can_be_is_refused(changes: dict[str, object], reason: str) -> None:
-    content = a_calibration().model_dump(mode="json") | changes
-    with pytest.raises(ConfigError, match=reason):
-        validate(Calibration, content, "calibration.yaml")
+def test_a_name_that_is_no_text_is_refused() -> None:
+    with pytest.raises(ConfigError, match="name"):
+        validate(Calibration, a_calibration().model_dump(mode="json") | {"name": "\ud800"}, "calibration.yaml")
 
 
 def test_a_calibration_whose_effects_cannot_be_run_says_so_by_its_name() -> None:
     chosen = a_calibration().model_copy(update={"effects": (EffectTerm(name="heading_drift", parameters={"k": 0.1}),)})
-    with pytest.raises(OmnibenchError, match=r"^calibration 'flower closed_form': effect 'heading_drift': unknown par"):
+    with pytest.raises(OmnibenchError, match="calibration 'flower closed_form': effect 'heading_drift'"):
         _ = chosen.model

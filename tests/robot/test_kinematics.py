@@ -1,27 +1,41 @@
-"""From wheel geometry to the inverse kinematic matrix: Eq. (3) and (7), mecanum, any number of wheels."""
+"""From wheels of any kind to the inverse kinematic matrix and drive signals, and robots that cannot be."""
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
+import config_robots
 import numpy as np
 import pytest
+import yaml
+from commands import Command
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from sample_robots import APR_02
+from sample_robots import APR_02, CAR, DIFFERENTIAL, SKID, SWERVE, TRICYCLE, WHEELED
 
-from omnibench.config import validate
+from omnibench.config import to_yaml, validate
+from omnibench.data.storage import save_dataset
 from omnibench.errors import ConfigError
+from omnibench.fit.calibrate import calibrate
+from omnibench.fit.geometry import WheelGeometry
+from omnibench.robot.export.formats import export_calibration
 from omnibench.robot.kinematics import (
     Array,
+    Mount,
     Robot,
     Wheel,
+    class_of,
     inverse_kinematic_matrices,
     inverse_kinematic_matrix,
     published_matrix,
     wheel_equations,
 )
+from omnibench.robot.model import OdometryModel
+from omnibench.robot.odometry import Integration, WheelLog
+from omnibench.simulate.config import FlowerConfig
+from omnibench.simulate.simulate import simulate_dataset
 
 # Eq. (7) of the article, as printed.
 EQ_7 = np.array(
@@ -64,31 +78,19 @@ def condition(equations: Array) -> float:
     return float(np.linalg.cond(equations))
 
 
-@pytest.mark.parametrize("row", [0, 1, 2])
-@pytest.mark.parametrize("column", [0, 1, 2])
-def test_the_design_values_give_every_element_of_eq_7(row: int, column: int) -> None:
-    assert abs(inverse_kinematic_matrix(APR_02.wheels)[row, column] - EQ_7[row, column]) <= 1e-15
-
-
-def test_m12_of_the_design_is_exactly_zero_so_that_the_papers_box_freezes_it() -> None:
-    assert inverse_kinematic_matrix(APR_02.wheels)[0, 1] == 0.0
+def test_the_design_values_give_every_element_of_eq_7_and_m12_is_exactly_zero() -> None:
+    matrix = inverse_kinematic_matrix(APR_02.wheels)
+    np.testing.assert_allclose(matrix, EQ_7, rtol=0, atol=1e-15)
+    assert matrix[0, 1] == 0.0  # so that the paper's box freezes it
 
 
 @given(wheels=three_omni_wheels)
-def test_eq_3_is_the_inverse_of_the_wheel_equations(wheels: tuple[Wheel, ...]) -> None:
+def test_eq_3_is_the_inverse_and_the_pseudo_inverse_of_the_wheel_equations(wheels: tuple[Wheel, ...]) -> None:
     equations = wheel_equations(wheels)
     assume(condition(equations) < 1e4)
-    product = inverse_kinematic_matrix(wheels) @ equations
-    np.testing.assert_allclose(product, np.eye(3), atol=1e-14 * condition(equations))
-
-
-@given(wheels=three_omni_wheels)
-def test_eq_3_is_the_pseudo_inverse_of_the_wheel_equations(wheels: tuple[Wheel, ...]) -> None:
-    equations = wheel_equations(wheels)
-    assume(condition(equations) < 1e4)
-    expected = np.linalg.pinv(equations)
-    error = np.abs(inverse_kinematic_matrix(wheels) - expected).max() / np.abs(expected).max()
-    assert error < 1e-14 * condition(equations)
+    matrix, expected = inverse_kinematic_matrix(wheels), np.linalg.pinv(equations)
+    np.testing.assert_allclose(matrix @ equations, np.eye(3), atol=1e-14 * condition(equations))
+    assert np.abs(matrix - expected).max() / np.abs(expected).max() < 1e-14 * condition(equations)
 
 
 @given(wheels=many_wheels)
@@ -171,15 +173,11 @@ def test_a_geometry_without_a_matrix_spoils_no_other(wheels: int, value: float) 
     assert np.isfinite(good).all()
 
 
-def test_eq_8_inverted_is_the_geometry_that_is_known() -> None:
+def test_eq_8_inverted_is_the_geometry_that_is_known_and_gives_eq_8_back() -> None:
     radius, distance, angle = geometry_of(published_matrix("palacin2023_eq8"))
     np.testing.assert_allclose(100 * (radius / 0.148 - 1), [3.4, 3.6, 3.3], atol=0.05)
     np.testing.assert_allclose(100 * (distance / 0.195 - 1), [7.6, 14.6, 11.5], atol=0.05)
     np.testing.assert_allclose(100 * (np.degrees(angle) / [60, 180, 300] - 1), [0.98, 0.26, -0.02], atol=0.005)
-
-
-def test_the_geometry_of_eq_8_gives_eq_8_back() -> None:
-    radius, distance, angle = geometry_of(published_matrix("palacin2023_eq8"))
     matrix = inverse_kinematic_matrices(radius[None], distance[None], angle[None])[0]
     np.testing.assert_allclose(matrix, published_matrix("palacin2023_eq8"), atol=1e-15)
 
@@ -221,3 +219,246 @@ def test_a_robot_that_cannot_be_is_refused_in_one_line(case: str) -> None:
     assert str(refusal.value).startswith("robot.yaml: ")
     assert words in str(refusal.value)
     assert "\n" not in str(refusal.value)
+
+
+PLACES = {"fl": (0.2, 0.15), "fr": (0.2, -0.15), "rl": (-0.2, 0.15), "rr": (-0.2, -0.15)}
+BY_PLACES = Robot(
+    name="mecanum", wheels=[Wheel(name=n, type="mecanum", radius=0.05, x=x, y=y) for n, (x, y) in PLACES.items()]
+)
+
+
+def test_it_is_the_robot_that_lever_arms_and_angles_describe_and_its_file_says_its_rollers() -> None:
+    by_angles = config_robots.robot("mecanum").inverse_kinematic_matrix
+    # By angles a positive rate turns the robot counter-clockwise, by x and y it drives forward.
+    np.testing.assert_allclose(BY_PLACES.inverse_kinematic_matrix, by_angles * [-1, 1, -1, 1], atol=1e-12)
+    written = yaml.safe_load(yaml.safe_dump(BY_PLACES.model_dump(mode="json")))
+    assert [wheel["roller_angle"] > 0 for wheel in written["wheels"]] == [True, False, False, True]
+    assert Robot.model_validate(written) == BY_PLACES
+
+
+def test_rollers_that_are_given_stay_and_a_wheel_on_an_axis_has_to_say_them() -> None:
+    wheel = Wheel(name="fl", type="mecanum", radius=0.05, x=0.2, y=0.15, roller_angle=-math.pi / 4)
+    assert wheel.roller_angle == -math.pi / 4
+    assert Wheel(name="a", radius=0.05, x=0.2, y=0.15, angle=0.3).kind == "omni"
+    with pytest.raises(ConfigError, match="roller_angle"):
+        Wheel(name="ahead", type="mecanum", radius=0.05, x=0.2, y=0.0)
+
+
+@pytest.mark.slow
+def test_such_a_robot_is_simulated_calibrated_designed_for_and_exported(command: Command, tmp_path: Path) -> None:
+    content = config_robots.settings("mecanum") | {"robot": BY_PLACES.model_dump(mode="json")}
+    truth = {"truth": {"tolerances": {"radius": 0.01, "position": 0.003, "angle_deg": 0.3, "seed": 7}}}
+    dataset = simulate_dataset(validate(FlowerConfig, content | truth, "mecanum"), "mecanum").dataset
+    run = calibrate(dataset)
+    assert run.calibration.provenance.held_out.verdict == "better"
+    exported = export_calibration(run.calibration, "ros2_controllers").text
+    (line,) = [line for line in exported.splitlines() if line.strip().startswith("sum_of_robot")]
+    assert float(line.split(":")[1].split("#")[0]) == pytest.approx(0.35, rel=0.03)
+    assert export_calibration(run.calibration, "c_header").text
+    assert WheelGeometry(BY_PLACES).names[:4] == ("radius_fl", "radius_fr", "radius_rl", "radius_rr")
+    save_dataset(dataset, tmp_path / "data")
+    assert command("inspect", tmp_path / "data").returncode == 0
+    wheels = [{"name": n, "type": "mecanum", "radius": 0.05, "x": x, "y": y} for n, (x, y) in PLACES.items()]
+    Path("robot.yaml").write_text(yaml.safe_dump({"robot": {"name": "m", "wheels": wheels}}))
+    designed = command("design", "--robot", "robot.yaml")
+    assert designed.returncode == 0, designed.stderr
+
+
+EVERY = [pytest.param(robot, id=robot.name) for robot in (APR_02, *WHEELED)]
+STEERED = [pytest.param(robot, id=robot.name) for robot in (TRICYCLE, CAR, SWERVE)]
+SPEEDS = st.floats(-2.0, 2.0)
+
+
+def a_robot(*wheels: dict[str, Any], **more: Any) -> Robot:
+    """A robot by its document, as files give it. ConfigError in one line."""
+    return validate(Robot, {"name": "r", "wheels": wheels, **more}, "robot.yaml")
+
+
+def fixed(name: str, x: float, y: float, **more: Any) -> dict[str, Any]:
+    return {"name": name, "type": "fixed", "radius": 0.05, "x": x, "y": y, **more}
+
+
+def steered(name: str, x: float, y: float, **more: Any) -> dict[str, Any]:
+    return {"name": name, "type": "steered", "radius": 0.05, "x": x, "y": y, **more}
+
+
+def velocity(twist: Array, x: float, y: float) -> Array:
+    """Velocity (2,) of a point of a rigid body."""
+    return np.array([twist[0] - twist[2] * y, twist[1] + twist[2] * x])
+
+
+@pytest.mark.parametrize("robot", EVERY)
+@given(amounts=st.tuples(SPEEDS, SPEEDS, SPEEDS))
+def test_signals_of_a_motion_without_sliding_give_it_back(robot: Robot, amounts: tuple[float, float, float]) -> None:
+    twist = np.array(amounts[: len(robot.motions)]) @ robot.motions
+    back = robot.inverse_kinematic_matrix @ robot.signal_equations @ twist
+    np.testing.assert_allclose(back, twist, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("robot", STEERED)
+@given(amounts=st.tuples(SPEEDS, SPEEDS, SPEEDS))
+def test_wheels_that_are_steered_as_commanded_do_not_slide(robot: Robot, amounts: tuple[float, float, float]) -> None:
+    twist = np.array(amounts[: len(robot.motions)]) @ robot.motions
+    if robot is CAR:  # it needs speed to turn
+        twist[0] = math.copysign(max(abs(twist[0]), 0.3 + 0.5 * abs(twist[2])), twist[0])
+    rates, steering = robot.drive.commands((robot.signal_equations @ twist)[None])
+    angles = dict(zip(robot.drive.steered, steering[0], strict=True))
+    of_wheels = dict(zip(robot.wheel_names, rates[0], strict=True))
+    for wheel in robot.wheels:
+        at_wheel = velocity(twist, *wheel.position)
+        angle = angles.get(wheel.name, 0.0)
+        along, across = np.array([math.cos(angle), math.sin(angle)]), np.array([-math.sin(angle), math.cos(angle)])
+        assert across @ at_wheel == pytest.approx(0.0, abs=1e-12)
+        if wheel.name in of_wheels and robot is not CAR:
+            assert along @ at_wheel == pytest.approx(wheel.radius * of_wheels[wheel.name], abs=1e-12)
+
+
+@pytest.mark.parametrize("robot", EVERY)
+def test_commands_give_the_signals_that_were_asked_for(robot: Robot) -> None:
+    rates, steering = robot.drive.commands((robot.motions @ robot.signal_equations.T + 1.0)[:1])
+    again = robot.drive.signals(rates, steering)
+    np.testing.assert_allclose(again, (robot.motions @ robot.signal_equations.T + 1.0)[:1], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("robot", STEERED)
+def test_slopes_of_signals_are_their_derivatives(robot: Robot) -> None:
+    rng, step = np.random.default_rng(3), 1e-6
+    rates = rng.normal(0.0, 5.0, (4, len(robot.wheel_names)))
+    steering = rng.normal(0.0, 0.4, (4, len(robot.drive.steered)))
+    by_rate, by_angle = robot.drive.slopes(rates, steering)
+    for slopes, moved in ((by_rate, 0), (by_angle, 1)):
+        for column in range(slopes.shape[2]):
+            change = np.zeros(slopes.shape[2])
+            change[column] = step
+            up, down = ([rates, steering], [rates, steering])
+            up[moved], down[moved] = up[moved] + change, down[moved] - change
+            found = (robot.drive.signals(*up) - robot.drive.signals(*down)) / (2 * step)
+            np.testing.assert_allclose(slopes[..., column], found, rtol=0, atol=1e-8)
+
+
+TRACK, RADIUS = 0.3, 0.05  # m
+TEXTBOOK = [
+    (DIFFERENTIAL, [[RADIUS / 2] * 2, [0] * 2, [-RADIUS / TRACK, RADIUS / TRACK]], ("left", "right")),
+    (SKID, [[RADIUS / 4] * 4, [0] * 4, [sign * RADIUS / (2 * TRACK) for sign in (-1, 1, -1, 1)]], SKID.wheel_names),
+    (TRICYCLE, [[RADIUS, 0], [0, 0], [0, RADIUS / 0.5]], ("front_cos", "front_sin")),
+    (CAR, [[RADIUS, 0, 0], [0, 0, 0], [0, RADIUS / 0.5, 0]], ("mean", "mean_tan", "difference")),
+]
+
+
+@pytest.mark.parametrize(("robot", "expected", "signals"), TEXTBOOK, ids=lambda value: getattr(value, "name", ""))
+def test_a_robot_has_the_textbook_matrix(robot: Robot, expected: Any, signals: tuple[str, ...]) -> None:
+    """A skid base turns by its track on paper, and the difference of a car's rear rates counts for nothing."""
+    np.testing.assert_allclose(robot.inverse_kinematic_matrix, expected, rtol=0, atol=1e-15)
+    assert tuple(robot.drive.names) == tuple(signals)
+
+
+def test_a_matrix_is_that_of_the_tracked_point() -> None:
+    mount = {"x": 0.4, "y": -0.1, "yaw": 0.3}
+    turned = TRICYCLE.model_copy(update={"mount": Mount.model_validate(mount)})
+    twist = np.array([0.5, 0.0, 0.7])
+    moved = velocity(twist, 0.4, -0.1)
+    seen = turned.inverse_kinematic_matrix @ turned.signal_equations @ twist
+    cosine, sine = math.cos(0.3), math.sin(0.3)
+    expected = [cosine * moved[0] + sine * moved[1], -sine * moved[0] + cosine * moved[1], 0.7]
+    np.testing.assert_allclose(seen, expected, rtol=0, atol=1e-12)
+
+
+def test_the_class_of_a_robot_is_that_of_its_measured_wheels() -> None:
+    found = [class_of(robot) for robot in (APR_02, *WHEELED)]
+    assert found == ["omni", "differential", "skid", "mecanum", "tricycle", "car", "swerve"]
+
+
+@pytest.mark.parametrize("robot", EVERY)
+def test_a_document_of_a_robot_is_read_back(robot: Robot, tmp_path: Any) -> None:
+    from omnibench.config import read_model
+
+    (tmp_path / "robot.yaml").write_text(to_yaml(robot))
+    assert read_model(Robot, tmp_path / "robot.yaml") == robot
+
+
+def test_the_document_of_omni_wheels_is_what_it_was_before_there_were_others() -> None:
+    assert [list(wheel) for wheel in APR_02.model_dump()["wheels"]] == [
+        ["name", "radius", "distance", "angle", "roller_angle"]
+    ] * 3
+    assert list(APR_02.model_dump()) == ["name", "wheels"]
+
+
+def test_degrees_may_be_given_under_keys_that_say_so() -> None:
+    wheels = [
+        {"name": name, "radius": 0.1, "distance": 0.2, "angle_deg": angle}
+        for name, angle in zip("abc", (60, 180, 300), strict=True)
+    ]
+    assert a_robot(*wheels).wheels[1].angle == pytest.approx(math.pi)
+
+
+FOUR = [fixed("a", 0.2, 0.2), fixed("b", 0.2, -0.2), fixed("c", -0.2, 0.2), fixed("d", -0.2, -0.2)]
+
+
+LEFT, RIGHT = fixed("a", 0, 0.1), fixed("b", 0, -0.1)
+CANNOT_BE: list[tuple[list[dict[str, Any]], str]] = [
+    ([LEFT], "measured: a"),
+    (FOUR, "fixed wheels a, b, c, d would have to slide"),
+    ([LEFT, RIGHT, fixed("c", -0.2, 0, measured=False)], "fixed wheel c would have to slide"),
+    ([LEFT, fixed("b", 0, -0.1, angle=0.3)], "fixed wheels a, b would have to slide"),
+    ([LEFT, fixed("b", 0, 0.1)], "signals a, b do not determine"),
+    ([LEFT, {"name": "b", "type": "fixed", "radius": 0.1, "x": 0}], "y of a fixed wheel"),
+    ([steered("a", 0.5, 0, angle=1.0)], "angle"),
+    ([fixed("a", 0, 0.1, roller_angle=0.7)], "rollers"),
+    ([fixed("a", 0, 0.1, distance=0.1)], "distance"),
+    ([{"name": "a", "type": "mecanum", "radius": 0.1, "x": 0, "y": 1}], "roller_angle"),
+    ([{"name": "a", "radius": 0.1, "x": 0.1, "angle": 0}], "y is missing"),
+    ([{"name": "a", "radius": 0.1, "distance": 0.1, "x": 0.1, "angle": 0}], "distance and x, y"),
+    ([{"name": "a", "radius": 0.1, "distance": 0.1, "angle": 0, "angle_deg": 0}], "angle and angle_deg"),
+    ([fixed("a", 0, 0.1, angle=90)], "is it in degrees?"),
+    ([fixed("a", 0, 0.1, typ="fixed")], "'type'"),
+    ([LEFT, RIGHT, steered("c", 0.0, 0, driven=False)], "steered wheel c"),
+    ([LEFT, steered("b", 0.3, 0.1), steered("c", 0.3, -0.1, driven=False)], "measured: false for c"),
+]
+
+
+@pytest.mark.parametrize(("wheels", "words"), CANNOT_BE, ids=[words for _, words in CANNOT_BE])
+def test_a_robot_that_cannot_be_is_refused_by_name(wheels: list[dict[str, Any]], words: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        a_robot(*wheels)
+    assert words in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_skid_steering_is_said_of_fixed_wheels_only() -> None:
+    a_robot(*FOUR, skid=True)
+    with pytest.raises(ConfigError, match="skid: true is for fixed wheels; this robot has none"):
+        a_robot(*(steered(name, x, 0.1) for name, x in (("a", 0.2), ("b", -0.2))), skid=True)
+
+
+def test_a_robot_whose_wheels_roll_sideways_moves_along_y() -> None:
+    robot = a_robot(*(fixed(name, x, 0.0, angle_deg=90) for name, x in (("a", 0.15), ("b", -0.15))))
+    np.testing.assert_allclose(robot.motions, [[0, 1, 0], [0, 0, 1]], rtol=0, atol=1e-12)
+
+
+def test_a_swerve_base_averages_its_modules() -> None:
+    matrix = SWERVE.inverse_kinematic_matrix
+    np.testing.assert_allclose(matrix[0, ::2], 0.05 / 4, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(matrix[1, 1::2], 0.05 / 4, rtol=0, atol=1e-15)
+    assert len(SWERVE.drive.names) == 8
+
+
+@pytest.mark.parametrize("robot", EVERY)
+@given(seed=st.integers(0, 2**32 - 1), integration=st.sampled_from(["euler", "arc"]))
+def test_a_stream_drives_as_a_batch(robot: Robot, seed: int, integration: Integration) -> None:
+    rng = np.random.default_rng(seed)
+    times = np.cumsum(rng.uniform(0.01, 0.1, 40))
+    rates = rng.normal(0.0, 5.0, (40, len(robot.wheel_names)))
+    steering = rng.normal(0.0, 0.4, (40, len(robot.drive.steered))) if robot.drive.steered else None
+    model = OdometryModel.of_design(robot, integration)
+    log = WheelLog(times, rates, np.array([1.0, -2.0, 0.5]), times, steering=steering, drive=robot.drive)
+    stream = model.stream(log.start)
+    for sample, duration in enumerate(np.diff(times, prepend=0.0)):
+        stream.drive(rates[sample] * duration, steering=None if steering is None else steering[sample])
+    np.testing.assert_allclose(stream.pose, model.poses([log])[0][-1], rtol=0, atol=1e-12)
+
+
+def test_a_row_of_zeros_has_the_scale_of_the_other_direction_of_driving() -> None:
+    """Of a differential drive, radius r and track 2 b: r / 2 ahead and aside, r / 2b for turning."""
+    sideways = DIFFERENTIAL.model_copy(update={"mount": Mount(yaw=math.pi / 2)})  # zeros to rounding in row 1 then
+    for robot in (DIFFERENTIAL, sideways):
+        np.testing.assert_allclose(robot.row_scales, [0.05 / 2, 0.05 / 2, 0.05 / 0.3], rtol=1e-12)

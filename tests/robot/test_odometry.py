@@ -1,19 +1,34 @@
-"""Odometry: Eq. (1) and (2), exact arcs, batches, streams and derivatives."""
+"""Odometry: Eq. (1) and (2), exact arcs, batches, streams, derivatives, of arrays, and poses of the plane."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from sample_robots import APR_02
+from wheeled_samples import DIFF, TRICYCLE, driven
 
-from omnibench.robot.kinematics import Array, published_matrix
+import omnibench
+from omnibench.errors import OmnibenchError
+from omnibench.robot.kinematics import (
+    Array,
+    compose,
+    correction,
+    interpolated,
+    moved_to,
+    published_matrix,
+    relative,
+    unit_twist,
+    wrapped,
+)
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.odometry import Integration, OdometryBatch, OdometryStream, WheelLog
+from omnibench.robot.odometry import Integration, OdometryBatch, OdometryStream, WheelLog, advance
 
 BOTH: tuple[Integration, ...] = ("euler", "arc")
 MATRIX = published_matrix("palacin2023_eq8")
@@ -81,11 +96,17 @@ def test_euler_is_eq_1_and_2_as_written() -> None:
 
 
 @pytest.mark.parametrize("integration", BOTH)
-@given(seed=st.integers(0, 2**32 - 1), samples=st.integers(1, 60), stamps=st.integers(2, 12))
-def test_a_batch_equals_a_stream(integration: Integration, seed: int, samples: int, stamps: int) -> None:
-    log = a_log(seed, samples, stamps)
-    poses = OdometryBatch([log], integration).poses(MATRIX[None])[0]
-    np.testing.assert_allclose(poses, streamed(log, MATRIX, integration), rtol=0, atol=1e-12)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    samples=st.integers(1, 60),
+    stamps=st.integers(2, 12),
+    wheels=st.sampled_from([3, 4, 6]),
+)
+def test_a_batch_equals_a_stream(integration: Integration, seed: int, samples: int, stamps: int, wheels: int) -> None:
+    log = a_log(seed, samples, stamps, wheels)
+    matrix = MATRIX if wheels == 3 else np.random.default_rng(5).normal(0, 0.1, (3, wheels))
+    poses = OdometryBatch([log], integration).poses(matrix[None])[0]
+    np.testing.assert_allclose(poses, streamed(log, matrix, integration), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("integration", BOTH)
@@ -95,23 +116,6 @@ def test_one_stamp_within_the_last_sample_equals_a_stream(integration: Integrati
     log = replace(log, stamps=log.times[-2:-1] + share * np.diff(log.times[-2:]))
     poses = OdometryBatch([log], integration).poses(MATRIX[None])[0]
     np.testing.assert_allclose(poses, streamed(log, MATRIX, integration), rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("integration", BOTH)
-def test_a_final_stamp_gives_the_same_pose_alone_and_among_others(integration: Integration) -> None:
-    log = a_log(2)
-    among_others = OdometryBatch([log], integration).poses(MATRIX[None])[0, -1]
-    alone = OdometryBatch([at_the_end(log)], integration).poses(MATRIX[None])[0, 0]
-    np.testing.assert_allclose(alone, among_others, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("integration", BOTH)
-@pytest.mark.parametrize("wheels", [3, 4, 6])
-def test_any_number_of_wheels_streams_as_in_a_batch(integration: Integration, wheels: int) -> None:
-    matrix = np.random.default_rng(5).normal(0, 0.1, (3, wheels))
-    log = a_log(3, wheels=wheels)
-    poses = OdometryBatch([log], integration).poses(matrix[None])[0]
-    np.testing.assert_allclose(poses, streamed(log, matrix, integration), rtol=0, atol=1e-12)
 
 
 @given(
@@ -207,9 +211,12 @@ def test_a_stamp_after_the_last_sample_has_the_pose_at_its_end(integration: Inte
     np.testing.assert_allclose(pose, streamed(at_the_end(log), MATRIX, integration)[0], rtol=0, atol=1e-12)
 
 
-def test_a_stamp_at_zero_has_the_start_pose() -> None:
+def test_a_stamp_at_zero_has_the_start_pose_and_driven_angles_add_up_to_each_stamp() -> None:
     log = a_log(7)
-    np.testing.assert_array_equal(OdometryBatch([log], "arc").poses(MATRIX[None])[0, 0], log.start)
+    batch = OdometryBatch([log], "arc")
+    np.testing.assert_array_equal(batch.poses(MATRIX[None])[0, 0], log.start)
+    within = np.clip(log.stamps[:, None] - np.append(0.0, log.times[:-1]), 0.0, np.diff(log.times, prepend=0.0))
+    np.testing.assert_allclose(batch.driven, within @ log.rates, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("integration", BOTH)
@@ -217,12 +224,6 @@ def test_headings_are_not_wrapped(integration: Integration) -> None:
     times = np.arange(0.1, 60.05, 0.1)
     log = constant_twist(np.array([0.0, 0.0, 1.0]), times, times[-1:])
     assert OdometryBatch([log], integration).poses(MATRIX[None])[0, 0, 2] == pytest.approx(60.0, abs=1e-9)
-
-
-def test_driven_angles_add_up_to_each_stamp() -> None:
-    log = a_log(8)
-    within = np.clip(log.stamps[:, None] - np.append(0.0, log.times[:-1]), 0.0, np.diff(log.times, prepend=0.0))
-    np.testing.assert_allclose(OdometryBatch([log], "arc").driven, within @ log.rates, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("integration", BOTH)
@@ -272,13 +273,113 @@ def test_a_model_gives_the_poses_of_each_log_by_itself() -> None:
         np.testing.assert_allclose(poses, streamed(log, MATRIX, "arc"), rtol=0, atol=1e-12)
 
 
-def test_a_models_stream_starts_at_the_origin_unless_told() -> None:
-    model = OdometryModel.of_design(APR_02, "arc")
+def test_a_models_stream_starts_at_the_origin_unless_told_and_does_not_change_the_start() -> None:
+    model, start = OdometryModel.of_design(APR_02, "arc"), np.array([1.0, 2.0, 3.0])
     np.testing.assert_array_equal(model.stream().pose, np.zeros(3))
-    np.testing.assert_array_equal(model.stream(np.array([1.0, 2.0, 3.0])).pose, [1.0, 2.0, 3.0])
+    stream = model.stream(start)
+    np.testing.assert_array_equal(stream.pose, [1.0, 2.0, 3.0])
+    stream.drive(np.ones(3))
+    np.testing.assert_array_equal(start, [1.0, 2.0, 3.0])
 
 
-def test_a_stream_does_not_change_the_start_it_was_given() -> None:
-    start = np.zeros(3)
-    OdometryStream(MATRIX, "arc", start).drive(np.ones(3))
-    np.testing.assert_array_equal(start, np.zeros(3))
+T = np.arange(1, 51) * 0.02
+
+
+@given(forward=st.floats(-10, 10), turn=st.floats(-10, 10))
+def test_the_end_of_an_arc_is_where_its_radius_says(forward: float, turn: float) -> None:
+    rates = np.tile([forward + turn, forward - turn], (50, 1))  # right, left
+    x, y, heading = omnibench.odometry(DIFF, T, rates)[-1]
+    way, angle = 0.042 * forward, 0.042 * turn / 0.1
+    chord = np.sinc(angle / 2 / np.pi) * way  # over 1 s
+    np.testing.assert_allclose(
+        [x, y, heading], [chord * np.cos(angle / 2), chord * np.sin(angle / 2), angle], atol=1e-9
+    )
+
+
+def test_it_is_the_odometry_of_data_sets() -> None:
+    dataset = driven(TRICYCLE)
+    run = dataset.trajectories[0]
+    (wanted,) = OdometryModel.of_design(TRICYCLE, "arc").poses([run.log(run.pose_times)])
+    given_arrays = {"steering": run.steering, "start": run.start, "stamps": run.pose_times}
+    assert run.steering is not None
+    np.testing.assert_array_equal(omnibench.odometry(TRICYCLE, run.times, run.rates, **given_arrays), wanted)
+
+
+def test_a_calibration_brings_its_matrix_and_integration() -> None:
+    run = driven(DIFF).trajectories[0]
+    calibration = omnibench.calibrate(driven(DIFF), integration="euler").calibration
+    (wanted,) = calibration.model.poses([run.log(run.times)])
+    np.testing.assert_array_equal(omnibench.odometry(calibration, run.times, run.rates, start=run.start), wanted)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"rates": np.ones((50, 3))}, r"rates .*\(50, 2\): .*right, left"),
+        ({"rates": np.ones(50)}, r"rates .*\(50,\)"),
+        ({"rates": [["fast"] * 2] * 50}, "rates"),
+        ({"rates": np.r_[np.ones((3, 2)), np.full((47, 2), np.nan)]}, "rates, row 4"),
+        ({"times": T - 0.02}, "times, row 1"),
+        ({"times": T[::-1]}, "times, row 2"),
+        ({"stamps": [-1.0]}, "stamps, row 1"),
+        ({"start": [0, 0]}, r"start .*\(2,\)"),
+        ({"robot": "robot.yaml"}, "'robot.yaml'"),
+        ({"robot": TRICYCLE, "rates": np.ones((50, 1))}, "steering .*front"),
+    ],
+)
+def test_what_does_not_fit_is_named(given: dict[str, Any], message: str) -> None:
+    call: dict[str, Any] = {"robot": DIFF, "times": T, "rates": np.ones((50, 2))} | given
+    with pytest.raises(OmnibenchError, match=message):
+        omnibench.odometry(**call)
+
+
+POSES = arrays(float, 3, elements=st.floats(-10, 10))
+
+
+@given(POSES, POSES)
+def test_the_relative_pose_leads_from_the_first_to_the_second(first: np.ndarray, second: np.ndarray) -> None:
+    np.testing.assert_allclose(compose(first, relative(first, second)), second, atol=1e-9)
+
+
+@given(POSES, POSES, POSES)
+def test_composing_is_associative(first: np.ndarray, second: np.ndarray, third: np.ndarray) -> None:
+    np.testing.assert_allclose(
+        compose(compose(first, second), third), compose(first, compose(second, third)), atol=1e-9
+    )
+
+
+@given(POSES, POSES)
+def test_the_correction_takes_odom_to_the_map(in_map: np.ndarray, in_odom: np.ndarray) -> None:
+    np.testing.assert_allclose(compose(correction(in_map, in_odom), in_odom), in_map, atol=1e-9)
+
+
+@given(POSES, arrays(float, (4, 3), elements=st.floats(-10, 10)))
+def test_a_path_that_is_moved_begins_there_and_keeps_its_shape(start: np.ndarray, path: np.ndarray) -> None:
+    moved = moved_to(start, path)
+    np.testing.assert_allclose(moved[0], start, atol=1e-9)
+    for before, after in ((0, 1), (1, 3)):
+        np.testing.assert_allclose(
+            relative(moved[before], moved[after]), relative(path[before], path[after]), atol=1e-9
+        )
+
+
+@given(st.floats(-2, 2), st.floats(-2, 2), st.floats(-np.pi, np.pi))
+def test_the_twist_of_a_motion_makes_it_along_an_arc(x: float, y: float, turn: float) -> None:
+    motion = np.array([x, y, turn])
+    np.testing.assert_allclose(advance(np.zeros(3), unit_twist(motion), "arc"), motion, atol=1e-12)
+    np.testing.assert_allclose(unit_twist(np.stack([motion, motion]))[1], unit_twist(motion), atol=1e-12)
+
+
+@given(st.floats(-20, 20))
+def test_the_twist_of_whole_turns_is_finite(turn: float) -> None:
+    assert np.isfinite(unit_twist(np.array([1.0, -1.0, turn]))).all()
+
+
+def test_rows_are_interpolated_by_straight_lines_and_held_beyond_their_stamps() -> None:
+    rows = np.array([[0.0, 1.0, 0.0], [2.0, 1.0, -4.0]])
+    found = interpolated(np.array([-1.0, 1.5, 9.0]), np.array([1.0, 2.0]), rows)
+    np.testing.assert_array_equal(found, [[0.0, 1.0, 0.0], [1.0, 1.0, -2.0], [2.0, 1.0, -4.0]])
+
+
+def test_wrapped_angles_differ_by_whole_turns() -> None:
+    np.testing.assert_allclose(wrapped(np.array([0.1, np.pi, -np.pi, 7.0])), [0.1, -np.pi, -np.pi, 7.0 - 2 * np.pi])

@@ -1,16 +1,19 @@
-"""Motions that a model was fitted to, and which others are far from all of them."""
+"""Motions that a model was fitted to, which others are far from all of them, and corrections that fade there."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from effect_samples import ROBOTS
+from effect_samples import EVERY, ROBOTS, a_drive, at_every_sample, mixture, model, streamed, term
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from sample_robots import APR_02
 
 from omnibench.robot.corrections import (
+    Fade,
     TrainingDomain,
     extrapolated_share,
     extrapolation_consequence,
@@ -19,6 +22,8 @@ from omnibench.robot.corrections import (
     representatives,
 )
 from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.model import OdometryModel
+from omnibench.robot.odometry import WheelLog
 
 DISTANCE = 0.195  # m, of the APR-02's wheels
 FORWARDS = np.array([0.2, 0.0, 0.0])
@@ -128,16 +133,86 @@ def test_motions_of_a_run_are_its_twists_smoothed() -> None:
     found = motions_of(matrix, times, rates)
     assert len(found) > 10
     assert np.abs(found - twist).max() < 0.05 * np.abs(rates @ matrix.T - twist).max()
-
-
-def test_a_run_shorter_than_the_smoothing_has_one_motion() -> None:
-    matrix, twist = APR_02.inverse_kinematic_matrix, np.array([0.1, -0.2, 0.3])
-    rates = np.tile(np.linalg.solve(matrix, twist), (5, 1))
-    np.testing.assert_allclose(motions_of(matrix, 0.01 * np.arange(1, 6), rates), twist[None], atol=1e-12)
+    shorter = np.tile(np.linalg.solve(matrix, twist), (5, 1))  # than the smoothing
+    np.testing.assert_allclose(motions_of(matrix, times[:5], shorter), twist[None], atol=1e-12)
 
 
 def test_it_is_told_what_is_not_known() -> None:
-    assert extrapolation_consequence(["a"]) == "a is not known to hold there, and errors may be larger than stated"
-    assert extrapolation_consequence(["a", "b", "a"], fading=True) == (
-        "a, b are not known to hold there, fade to the plain matrix where unsure, and errors may be larger than stated"
-    )
+    assert extrapolation_consequence(["a"]).startswith("a is not known")
+    assert "a, b are not known to hold there, fade" in extrapolation_consequence(["a", "b", "a"], fading=True)
+
+
+FORWARDS, SIDEWAYS = np.array([0.2, 0.0, 0.0]), np.array([0.0, 0.2, 0.0])
+GROWN = term("speed_dependent_radius", k=0.01)
+PLAIN = 0.9 * APR_02.inverse_kinematic_matrix
+
+
+def unsure(deviation: float) -> OdometryModel:
+    """A model with a radius that grows with the rate, fitted to driving forwards; deviation of its k, s/rad."""
+    matrix, covariance = APR_02.inverse_kinematic_matrix, np.zeros((10, 10))
+    covariance[9, 9] = deviation**2
+    return replace(model(GROWN), fade=Fade(APR_02, matrix - PLAIN, FORWARDS[None], [GROWN], covariance))
+
+
+def log_of(twist: Array) -> WheelLog:
+    """Two seconds of a twist by the design values."""
+    times = 0.1 * np.arange(1, 21)
+    rates = np.tile(np.linalg.solve(APR_02.inverse_kinematic_matrix, twist), (20, 1))
+    return WheelLog(times, rates, np.zeros(3), times)
+
+
+def moved(chosen: OdometryModel, twist: Array) -> Array:
+    return chosen.poses([log_of(twist)])[0][-1]
+
+
+def by_plain_matrix(twist: Array) -> Array:
+    return moved(OdometryModel(APR_02, PLAIN, "arc"), twist)
+
+
+@given(seed=st.integers(0, 2**32 - 1), robot=st.sampled_from(sorted(EVERY)), samples=st.integers(2, 60))
+def test_a_stream_fades_as_a_batch_does(seed: int, robot: str, samples: int) -> None:
+    log, rng = at_every_sample(a_drive(seed, samples, EVERY[robot])), np.random.default_rng(seed)
+    terms = mixture(seed, EVERY[robot])
+    whole = model(*terms, robot=EVERY[robot])
+    shapes = [{each.name for each in one.effect.parameters(EVERY[robot]) if each.choices} for one in terms]
+    values = [0.0 if name in of_term else value for one, of_term in zip(terms, shapes, strict=True)
+              for name, value in one.values.items()]  # fmt: skip
+    deviations = np.append(np.full(whole.matrix.size, 1e-4), 0.2 * np.abs(values))
+    root = deviations[:, None] * rng.normal(size=(len(deviations), 3))
+    driven = representatives(EVERY[robot], motions_of(whole.matrix, log.times, log.signals)[:1])
+    change = 1e-3 * rng.normal(size=whole.matrix.shape)
+    chosen = replace(whole, fade=Fade(EVERY[robot], change, driven, terms, root @ root.T))
+    stream = chosen.stream(log.start, log.session, log.started_at or 0.0)
+    np.testing.assert_allclose(streamed(stream, log), chosen.poses([log])[0], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("deviation", [0.001, 0.1])
+def test_corrections_are_whole_where_the_robot_was_driven(deviation: float) -> None:
+    np.testing.assert_array_equal(moved(unsure(deviation), FORWARDS), moved(model(GROWN), FORWARDS))
+
+
+def test_never_driven_motions_keep_what_is_known_well_and_are_left_the_plain_matrix_elsewhere() -> None:
+    np.testing.assert_allclose(moved(unsure(1e-6), SIDEWAYS), moved(model(GROWN), SIDEWAYS), rtol=1e-6)
+    np.testing.assert_allclose(moved(unsure(0.1), SIDEWAYS), by_plain_matrix(SIDEWAYS), atol=1e-12)
+
+
+def test_between_these_a_correction_fades_the_farther_it_is_from_what_was_driven() -> None:
+    angles, shares = np.radians([0, 10, 20, 30, 40]), []
+    for angle in angles:
+        twist = 0.2 * np.array([np.cos(angle), np.sin(angle), 0.0])
+        part, whole, none = moved(unsure(0.02), twist), moved(model(GROWN), twist), by_plain_matrix(twist)
+        shares.append(np.linalg.norm(part - none) / np.linalg.norm(whole - none))
+    assert shares[0] == pytest.approx(1.0)
+    assert (np.diff(shares[1:]) < 0).all()
+    assert shares[-1] > 0
+
+
+def test_the_matrix_errs_along_with_the_parameters_that_it_was_fitted_with() -> None:
+    """A parameter that a change of the matrix undoes says nothing wrong, however little it is known."""
+    scale = term("sample_period_scale", s=0.02)  # every motion is 2 % longer
+    matrix, covariance = APR_02.inverse_kinematic_matrix, np.zeros((10, 10))
+    along = np.append(-matrix.ravel() / 1.02, 1.0)  # what leaves the motion as it is
+    covariance[:] = 0.1**2 * np.outer(along, along)
+    fade = Fade(APR_02, matrix - PLAIN, FORWARDS[None], [scale], covariance)
+    kept = moved(replace(model(scale), fade=fade), SIDEWAYS)
+    np.testing.assert_allclose(kept, moved(model(scale), SIDEWAYS), rtol=1e-2)

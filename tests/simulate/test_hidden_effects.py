@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,14 +15,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from omnibench.config import validate
-from omnibench.data.dataset import Dataset, Trajectory
+from omnibench.data.dataset import Trajectory
 from omnibench.errors import ConfigError, DataError, OmnibenchError
 from omnibench.fit.evaluate import final_errors
 from omnibench.robot.calibration import EffectTerm
 from omnibench.robot.kinematics import Array, moved_to, published_matrix, wheel_equations
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
-from omnibench.simulate.commands import Command, Commands
+from omnibench.simulate.commands import Command
 from omnibench.simulate.config import EncoderNoise, FlowerConfig
 from omnibench.simulate.flower import commanded_rates
 from omnibench.simulate.simulate import simulate_dataset
@@ -90,7 +91,6 @@ def test_the_benchmark_stays_what_it_was_to_the_bit() -> None:
     assert len(expected) == len(dataset.trajectories) == 360
     for run, (rates, angles, poses) in zip(dataset.trajectories, expected, strict=True):
         assert np.array_equal(run.rates, rates)
-        assert run.angles is not None
         assert np.array_equal(run.angles, angles)
         # headings are unwrapped on loading: whole turns, of which there are none here, and rounding
         assert np.array_equal(run.poses[:, :2], poses[:, :2])
@@ -98,19 +98,8 @@ def test_the_benchmark_stays_what_it_was_to_the_bit() -> None:
 
 
 class TestEffects:
-    def test_a_heading_drift_turns_every_run_by_as_much_more(self) -> None:
-        for drifting, plain in zip(runs({"heading_drift": {"b": 0.01}}), runs(), strict=True):
-            np.testing.assert_allclose(drifting.poses[:, 2] - plain.poses[:, 2], 0.01 * plain.pose_times, atol=1e-9)
-
-    def test_a_late_reference_reports_where_the_robot_was(self) -> None:
-        late, plain = (runs(each, pose_period=0.05) for each in ({"reference_time_offset": {"tau": 0.1}}, None))
-        for delayed, run in zip(late, plain, strict=True):
-            np.testing.assert_allclose(delayed.poses[3:-1], run.poses[1:-3], atol=1e-9)
-            np.testing.assert_array_equal(delayed.poses[:3], 0.0)
-
     def test_motors_with_a_wrong_gain_turn_wheels_by_as_much_faster(self) -> None:
         for run in runs({"motor_gain": {"g": 0.04}}):
-            assert run.targets is not None
             np.testing.assert_allclose(run.rates, 1.04 * run.targets, rtol=1e-12)
 
     def test_what_motors_lag_behind_is_seen_by_encoders_and_reference(self) -> None:
@@ -120,26 +109,6 @@ class TestEffects:
             turned = published_matrix(PUBLISHED)[2] @ missing
             assert plain.poses[-1, 2] - lagging.poses[-1, 2] == pytest.approx(turned, rel=1e-6)
 
-    def test_a_thermal_drift_grows_from_run_to_run(self) -> None:
-        for drifting, plain in zip(runs({"thermal_radius_drift": {"k": 2e-5}}), runs(), strict=True):
-            assert plain.started_at is not None
-            growth = drifting.poses[-1, 2] / plain.poses[-1, 2] - 1
-            assert growth == pytest.approx(2e-5 * (plain.started_at + plain.times[-1] / 2), rel=1e-6)
-
-    def test_worn_tyres_change_their_session_alone(self) -> None:
-        sessions = {"validation": {"seed": 2, "distance": 0.6}}
-        worn, plain = (runs(each, **sessions) for each in ({"tyre_wear": {"radius_validation": -0.01}}, None))
-        for run, same in zip(worn, plain, strict=True):
-            growth = -0.01 if run.split == "validation" else 0.0
-            np.testing.assert_allclose(run.poses[:, 2], (1 + growth) * same.poses[:, 2], atol=1e-12)
-
-    def test_an_eccentric_wheel_follows_its_angle_through_the_session(self) -> None:
-        (first, *_), plain = runs({"wheel_eccentricity": {"a_b": 0.02}}), runs()[0]
-        assert plain.angles is not None
-        angle = np.append(0.0, plain.angles[:, 1])
-        turned = published_matrix(PUBLISHED)[2, 1] * 0.02 * np.sin(angle[-1])  # the integral of cos over the angle
-        assert first.poses[-1, 2] - plain.poses[-1, 2] == pytest.approx(turned, rel=1e-3)
-
     @pytest.mark.parametrize(
         "effects",
         [
@@ -148,6 +117,7 @@ class TestEffects:
             {"floor_drift": {"dx": 0.02, "dy": -0.01}, "thermal_radius_drift": {"k": 1e-5}},
             {"start_transient": {"k": 0.2, "length": 0.1}, "lidar_lever_arm": {"x": 0.05, "y": 0.02}},
             {"motor_lag": {"tau": 0.1}, "tyre_wear": {"radius_validation": 0.01}},
+            {"heading_drift": {"b": 0.01}, "reference_time_offset": {"tau": 0.1}},
         ],
     )
     def test_without_noise_the_recording_is_what_the_true_model_reports(self, effects: dict[str, Any]) -> None:
@@ -177,58 +147,52 @@ class TestEffects:
 
 
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
-    "an unknown effect": (
-        {"heading_drft": {"b": 0.1}},
-        "data set flower: truth.effects: unknown effect 'heading_drft'; did you mean 'heading_drift'?",
-    ),
-    "an unknown parameter": (
-        {"heading_drift": {"bb": 0.1}},
-        "data set flower: truth.effects: effect 'heading_drift': unknown parameter 'bb'; did you mean 'b'?",
-    ),
-    "a wheel that is not there": ({"wheel_eccentricity": {"a_d": 0.1}}, "unknown parameter 'a_d'; did you mean 'a_"),
-    "a session that is not driven": (
-        {"tyre_wear": {"radius_validation": 0.01}},
-        "effect 'tyre_wear': unknown parameter 'radius_validation'; known: none",
-    ),
-    "no parameter": ({"heading_drift": {}}, "effect 'heading_drift': parameter 'b' (rad/s) is missing"),
-    "no shape": ({"start_transient": {"k": 0.1}}, "effect 'start_transient': parameter 'length' (m) is missing"),
-    "a shape out of range": ({"start_transient": {"k": 0.1, "length": 99}}, "parameter 'length' is 99"),
+    "an unknown effect": ({"heading_drft": {"b": 0.1}}, "'heading_drift'"),
+    "an unknown parameter": ({"heading_drift": {"bb": 0.1}}, "'bb'"),
+    "a wheel that is not there": ({"wheel_eccentricity": {"a_d": 0.1}}, "'a_d'"),
+    "a session that is not driven": ({"tyre_wear": {"radius_validation": 0.01}}, "'radius_validation'"),
+    "no parameter": ({"heading_drift": {}}, "'b' (rad/s)"),
+    "no shape": ({"start_transient": {"k": 0.1}}, "'length' (m)"),
+    "a shape out of range": ({"start_transient": {"k": 0.1, "length": 99}}, "'length' is 99"),
 }
 
 
 @pytest.mark.parametrize("case", REFUSED)
 def test_an_effect_that_cannot_be_hidden_is_refused_in_one_line(case: str) -> None:
     effects, words = REFUSED[case]
-    with pytest.raises(OmnibenchError) as refusal:
+    with pytest.raises(OmnibenchError, match=f"truth.effects: .*{re.escape(words)}") as refusal:
         simulate_dataset(few(effects))
-    assert words in str(refusal.value)
     assert "\n" not in str(refusal.value)
 
 
-def test_an_effect_that_is_given_twice_is_refused() -> None:
-    term = {"name": "heading_drift", "parameters": {"b": 0.1}}
-    with pytest.raises(ConfigError, match=r"truth: effects: heading_drift is given twice"):
-        few(truth={"published": PUBLISHED, "effects": [term, term]})
+TERM = {"name": "heading_drift", "parameters": {"b": 0.1}}
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"truth": {"published": PUBLISHED, "effects": [TERM, TERM]}}, "heading_drift"),
+        ({"commands": {"ramp": 3.5}}, "commands.ramp: 3.5 s; .* 3 s"),
+        ({"commands": {"ramp": 1.5, "speeds": [0.0, 0.2], "turn_duration": 1.0}}, "1 s"),
+        ({"commands": {"ramp": -1}}, "commands.ramp"),
+        ({"start": "anywhere"}, "start"),
+        ({"start": "random", "start_area": 0}, "start"),
+    ],
+)
+def test_effects_given_twice_ramps_longer_than_a_run_and_unknown_starts_are_refused(changes: Any, named: str) -> None:
+    with pytest.raises(ConfigError, match=named):
+        few(**changes)
 
 
 class TestRamps:
-    def ramped(self, **changes: Any) -> Dataset:
-        return simulate_dataset(few(commands={"ramp": 0.5}, **changes)).dataset
-
-    def test_wheels_start_and_end_at_rest_and_have_their_speed_between(self) -> None:
-        for run, plain in zip(self.ramped().trajectories, runs(), strict=True):
+    def test_wheels_rise_linearly_to_their_speed_take_longer_and_keep_their_way(self) -> None:
+        for run, plain in zip(runs(commands={"ramp": 0.5}), runs(), strict=True):
             full = plain.rates[0]
             np.testing.assert_allclose(run.rates[0], 0.01 * full, rtol=1e-9)  # mean of the first of 50 samples
             np.testing.assert_allclose(run.rates[-1], 0.01 * full, rtol=1e-9)
             np.testing.assert_allclose(run.rates[50:-50], np.tile(full, (len(run.rates) - 100, 1)), rtol=1e-9)
-
-    def test_rates_rise_linearly(self) -> None:
-        for run in self.ramped().trajectories:
             steps = np.diff(run.rates[:50], axis=0)
             np.testing.assert_allclose(steps, np.tile(steps[0], (49, 1)), rtol=1e-6)
-
-    def test_a_run_takes_longer_and_its_way_stays(self) -> None:
-        for run, plain in zip(self.ramped().trajectories, runs(), strict=True):
             assert run.times[-1] == pytest.approx(plain.times[-1] + 0.5)
             np.testing.assert_allclose((run.rates * 0.01).sum(axis=0), (plain.rates * 0.01).sum(axis=0), rtol=1e-9)
             assert (run.distance, run.duration) == (pytest.approx(0.6), run.times[-1])
@@ -255,29 +219,13 @@ class TestRamps:
         driven = (rates * np.diff(times, prepend=0.0)[:, None]).sum(axis=0)
         np.testing.assert_allclose(driven, (full + ramp) * wheel_equations(robot.wheels) @ command.twist, rtol=1e-9)
 
-    def test_a_ramp_longer_than_the_shortest_run_is_refused(self) -> None:
-        with pytest.raises(ConfigError, match=r"commands.ramp: 3.5 s; .* give it less than 3 s"):
-            few(commands={"ramp": 3.5})
-        with pytest.raises(ConfigError, match=r"give it less than 1 s"):
-            few(commands={"ramp": 1.5, "speeds": [0.0, 0.2], "turn_duration": 1.0})
-
-    def test_a_negative_ramp_is_refused(self) -> None:
-        with pytest.raises(ConfigError, match=r"commands.ramp: "):
-            few(commands={"ramp": -1})
-
-    def test_there_is_none_unless_it_is_asked_for(self) -> None:
-        assert Commands(directions_deg=(0,), turn_rates=(0.1,)).ramp == 0.0
-
 
 class TestRandomStarts:
     def test_starts_lie_anywhere_in_the_square_with_any_heading(self) -> None:
         starts = np.array([run.start for run in runs(repetitions=60, start="random", start_area=3.0)])
         assert np.abs(starts[:, :2]).max() <= 1.5
         assert (np.abs(starts[:, :2]).max(axis=0) > 1.4).all()
-        assert (starts[:, 2].min(), starts[:, 2].max()) == (
-            pytest.approx(-math.pi, abs=0.1),
-            pytest.approx(3.1, abs=0.1),
-        )
+        assert [starts[:, 2].min(), starts[:, 2].max()] == pytest.approx([-math.pi, math.pi], abs=0.15)
 
     def test_a_run_is_the_same_from_wherever_it_starts(self) -> None:
         for moved, plain in zip(runs(start="random"), runs(), strict=True):
@@ -288,11 +236,6 @@ class TestRandomStarts:
             simulate_dataset(few(start="random", train={"seed": seed, "distance": 0.6})).dataset for seed in (1, 1, 2)
         ]
         assert again[0].hash == again[1].hash != again[2].hash
-
-    @pytest.mark.parametrize("changes", [{"start": "anywhere"}, {"start": "random", "start_area": 0}])
-    def test_a_start_that_cannot_be_is_refused(self, changes: dict[str, Any]) -> None:
-        with pytest.raises(ConfigError, match=r"start"):
-            few(**changes)
 
 
 def test_a_record_of_the_truth_says_what_it_lacks() -> None:

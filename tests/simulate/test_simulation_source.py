@@ -1,21 +1,26 @@
-"""Which simulated data set of a YAML is meant, and what may be added to it; the command that makes data sets."""
+"""Which simulated data set of a YAML is meant, what may be added to it, and recordings that a model drives again."""
 
 from __future__ import annotations
 
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 from commands import CONFIGS, Command, Prepared, assert_refused, flower, small
 
-from omnibench.data.storage import load_dataset
-from omnibench.errors import ConfigError, OmnibenchError
-from omnibench.robot.calibration import EffectTerm
-from omnibench.simulate.simulate import simulate_dataset
+from omnibench.data.dataset import Dataset, Trajectory, make_dataset
+from omnibench.data.storage import load_dataset, save_dataset
+from omnibench.errors import ConfigError, DataError, OmnibenchError
+from omnibench.robot.calibration import Calibration, EffectTerm, Noise, matrix_rows
+from omnibench.simulate.simulation_request import simulate_like
 from omnibench.simulate.source import read_simulation
+from omnibench.testing import synthetic_robot, synthetic_trajectories
 
 DRIFT = "heading_drift: {b: 0.01}"
+AGAIN = ("--like", "DATA", "--model", "CALIBRATION")
 PLUGIN = """
 import numpy as np
 from omnibench.registry import effects
@@ -89,17 +94,12 @@ class TestEffectsOfTheCommandLine:
         assert [term.name for term in source.config.truth.effects] == ["floor_drift", "heading_drift", "motor_gain"]
         assert source.simulate().truth.effects[1] == EffectTerm(name="heading_drift", parameters={"b": 0.01})
 
-    def test_without_any_nothing_changes(self, tmp_path: Path) -> None:
-        source = read_simulation(only(tmp_path))
-        assert source.with_effects([]) == source
-        assert source.simulate().dataset.hash == simulate_dataset(source.config).dataset.hash
-
     @pytest.mark.parametrize(
         ("given", "words"),
         [
-            ("heading_drift", "--effect heading_drift: expected 'name: {parameter: value}'"),
-            ("heading_drift: 0.1", "expected 'name: {parameter: value}'"),
-            ("{a: {b: 1}, c: {d: 1}}", "expected 'name: {parameter: value}'"),
+            ("heading_drift", "--effect heading_drift: "),
+            ("heading_drift: 0.1", "{parameter: value}"),
+            ("{a: {b: 1}, c: {d: 1}}", "{parameter: value}"),
             ("heading_drift: {b", "--effect heading_drift: {b: not valid YAML"),
             ("heading_drift: {b: fast}", "--effect heading_drift: {b: fast}: parameters.b: "),
             ("heading_drift: {b: .nan}", "parameters.b: "),
@@ -112,9 +112,11 @@ class TestEffectsOfTheCommandLine:
         assert words in str(refusal.value)
         assert "\n" not in str(refusal.value)
 
-    def test_one_given_twice_is_refused(self, tmp_path: Path) -> None:
-        with pytest.raises(ConfigError, match="--effect: effects: heading_drift is given twice"):
-            read_simulation(only(tmp_path)).with_effects([DRIFT, DRIFT])
+    def test_one_given_twice_is_refused_and_without_any_nothing_changes(self, tmp_path: Path) -> None:
+        source = read_simulation(only(tmp_path))
+        with pytest.raises(ConfigError, match=r"--effect: .*heading_drift"):
+            source.with_effects([DRIFT, DRIFT])
+        assert source.with_effects([]) == source
 
 
 class TestTheCommand:
@@ -152,22 +154,19 @@ class TestTheCommand:
     @pytest.mark.parametrize(
         ("arguments", "words"),
         [
-            ([], "name a CONFIG with a simulated data set, or a recording with --like DATASET --model CALIBRATION"),
-            (["--like", "DATA"], "say with --model CALIBRATION by which model"),
-            (["--model", "CALIBRATION"], "say with --like DATASET which recording it is to drive again"),
-            (["CONFIG", "--like", "DATA", "--model", "CALIBRATION"], "does not go with --like"),
-            (["--like", "DATA", "--model", "CALIBRATION", "--truth", "t"], "--truth: does not go with --like"),
-            (["--like", "DATA", "--model", "CALIBRATION", "--dataset", "t"], "--dataset: does not go with --like"),
-            (["--like", "DATA", "--model", "CALIBRATION", "--effect", DRIFT], "--effect: does not go with --like"),
-            (["--like", "DATA", "--model", "CALIBRATION", "--seed", "3"], "--seed: is for --noise"),
-            (["CONFIG", "--noise"], "--noise: is for --like; a config has its own noise and seeds; leave it out"),
-            (["CONFIG", "--seed", "1"], "--seed: is for --like"),
-            (["--like", "CONFIG", "--model", "CALIBRATION"], "a data set is a folder"),
-            (["--like", "DATA", "--model", "CONFIG"], "is this a calibration file?"),
-            (
-                ["CONFIG", "--effect", "heading_drft: {b: 1}"],
-                "--effect heading_drft: {b: 1}: unknown effect 'heading_drft'",
-            ),
+            ([], "CONFIG"),
+            (["--like", "DATA"], "--model CALIBRATION"),
+            (["--model", "CALIBRATION"], "--like DATASET"),
+            (["CONFIG", *AGAIN], "--like"),
+            ([*AGAIN, "--truth", "t"], "--truth: "),
+            ([*AGAIN, "--dataset", "t"], "--dataset: "),
+            ([*AGAIN, "--effect", DRIFT], "--effect: "),
+            ([*AGAIN, "--seed", "3"], "--seed: "),
+            (["CONFIG", "--noise"], "--noise: "),
+            (["CONFIG", "--seed", "1"], "--seed: "),
+            (["--like", "CONFIG", "--model", "CALIBRATION"], "folder"),
+            (["--like", "DATA", "--model", "CONFIG"], "calibration file"),
+            (["CONFIG", "--effect", "heading_drft: {b: 1}"], "unknown effect 'heading_drft'"),
         ],
     )
     def test_what_does_not_go_together_is_refused(
@@ -185,6 +184,7 @@ class TestTheCommand:
         assert load_dataset(prepared.data).hash == before
 
 
+@pytest.mark.slow
 def test_the_hidden_effect_of_the_readme_is_in_its_truth(command: Command, tmp_path: Path) -> None:
     config = CONFIGS / "hidden_effect.yaml"
     made = command("simulate", config, "-o", tmp_path / "data", "--truth", tmp_path / "truth")
@@ -192,3 +192,115 @@ def test_the_hidden_effect_of_the_readme_is_in_its_truth(command: Command, tmp_p
     truth = yaml.safe_load((tmp_path / "truth" / "truth.yaml").read_text())
     assert len(truth["effects"]) == 1
     assert truth["effects"][0]["name"] not in (tmp_path / "data" / "dataset.yaml").read_text()
+
+
+ROBOT = synthetic_robot()
+NOISE = Noise(pose_position=0.02, pose_heading=0.01, bias_position=0.03)
+
+
+def recording(**changes: Any) -> Dataset:
+    """Twelve runs with all that a recording may know of them."""
+    runs = []
+    for number, run in enumerate(synthetic_trajectories(ROBOT)):
+        known: dict[str, Any] = {
+            "split": "train" if number % 2 else "validation",
+            "command": f"c{number // 2}",
+            "repetition": number % 2,
+            "session": "morning",
+            "started_at": 20.0 * number,
+            "angles": np.cumsum(run.rates, axis=0) * 0.2,
+            "targets": run.rates,
+            "pose_covariances": np.tile(np.eye(3), (len(run.poses), 1, 1)),
+            "poses": run.poses + np.array([1.0, 2.0, 0.5]),
+        }
+        runs.append(replace(run, **(known | changes)))
+    return make_dataset("recorded", ROBOT, 0.2, runs, description="A robot drove.", source="here", licence="CC0")
+
+
+def calibration(*effects: EffectTerm, **changes: Any) -> Calibration:
+    matrix = 1.02 * ROBOT.inverse_kinematic_matrix
+    plain: dict[str, Any] = {"name": "mine", "robot": ROBOT, "sample_period": 0.2, "integration": "arc"}
+    return Calibration(**(plain | {"matrix": matrix_rows(matrix), "effects": effects} | changes))
+
+
+def eccentric() -> EffectTerm:
+    values = dict.fromkeys(("a_a", "b_a", "a_b", "b_b", "a_c", "b_c"), 0.01)
+    return EffectTerm(name="wheel_eccentricity", parameters=values)
+
+
+def test_everything_but_the_poses_is_as_recorded() -> None:
+    dataset = recording()
+    simulated = simulate_like(dataset, calibration())
+    for made, run in zip(simulated.trajectories, dataset.trajectories, strict=True):
+        assert made.pose_covariances is None
+        for item in {field.name for field in fields(Trajectory)} - {"poses", "pose_covariances"}:
+            assert np.array_equal(getattr(made, item), getattr(run, item)), item
+    assert (simulated.name, simulated.robot, simulated.sample_period) == ("recorded", ROBOT, 0.2)
+
+
+def test_poses_are_what_the_model_reports_from_the_recorded_starts() -> None:
+    dataset = recording()
+    terms = (eccentric(), EffectTerm(name="reference_time_offset", parameters={"tau": 0.1}))
+    given = calibration(*terms)
+    expected = given.model.reported([run.reference_log for run in dataset.trajectories])
+    simulated = simulate_like(dataset, given)
+    for made, run, poses in zip(simulated.trajectories, dataset.trajectories, expected, strict=True):
+        np.testing.assert_array_equal(made.start, run.start)
+        np.testing.assert_allclose(made.poses[1:], poses, atol=1e-12)
+
+
+def test_it_is_said_to_be_simulated_like_what_and_by_which_model() -> None:
+    simulated = simulate_like(recording(), calibration(eccentric()))
+    assert (simulated.simulated, simulated.licence) == (True, "CC0")
+    for part in ("like recorded", "calibration mine", "wheel_eccentricity", "without noise", "A robot drove."):
+        assert part in simulated.description
+    assert "recorded (here)" in simulated.source
+
+
+def test_the_model_of_what_was_simulated_explains_it_in_full(tmp_path: Path) -> None:
+    given = calibration(eccentric())
+    save_dataset(simulate_like(recording(), given), tmp_path / "like")
+    loaded = load_dataset(tmp_path / "like")
+    for run, poses in zip(
+        loaded.trajectories, given.model.reported([run.reference_log for run in loaded.trajectories]), strict=True
+    ):
+        np.testing.assert_allclose(run.poses[1:], poses, atol=1e-9)
+
+
+def test_a_run_with_its_start_pose_alone_keeps_it() -> None:
+    dataset = recording()
+    first, *others = dataset.trajectories
+    alone = replace(first, pose_times=first.pose_times[:1], poses=first.poses[:1], pose_covariances=None)
+    simulated = simulate_like(replace(dataset, trajectories=(alone, *others)), calibration())
+    np.testing.assert_array_equal(simulated.trajectories[0].poses, alone.poses)
+
+
+def test_noise_is_the_calibrations_and_the_seeds() -> None:
+    runs = synthetic_trajectories(ROBOT)
+    many = [replace(run, id=f"{run.id}-{copy}") for run in runs for copy in range(40)]
+    dataset, given = make_dataset("many", ROBOT, 0.2, many), calibration(noise=NOISE)
+    plain, noisy, again, other = (simulate_like(dataset, given, seed) for seed in (None, 7, 7, 8))
+    assert noisy.hash == again.hash != other.hash
+    pairs = zip(noisy.trajectories, plain.trajectories, strict=True)
+    errors = np.array([made.poses - run.poses for made, run in pairs])
+    np.testing.assert_array_equal(errors[:, 0], 0.0)
+    assert errors[:, 1:, :2].std() == pytest.approx(np.hypot(0.02, 0.03), rel=0.1)
+    assert errors[:, 1:, 2].std() == pytest.approx(0.01, rel=0.1)
+    assert "with its noise, seed 7" in noisy.description
+
+
+OTHER = synthetic_robot(4)
+REFUSED: list[tuple[dict[str, Any], Calibration, int | None, str]] = [
+    ({}, calibration(noise=None), 1, "--noise"),
+    ({}, calibration(noise=Noise()), 1, "--noise"),
+    ({}, calibration(robot=OTHER, matrix=matrix_rows(OTHER.inverse_kinematic_matrix)), None, "fl, fr, rl, rr"),
+    ({"angles": None}, calibration(eccentric()), None, r"'wheel_eccentricity' .*phi_"),
+]
+
+
+@pytest.mark.parametrize(("changes", "given", "seed", "named"), REFUSED)
+def test_noise_that_is_not_known_other_robots_and_recordings_without_what_an_effect_needs_are_refused(
+    changes: dict[str, Any], given: Calibration, seed: int | None, named: str
+) -> None:
+    with pytest.raises(DataError, match=named):
+        simulate_like(recording(**changes), given, seed)

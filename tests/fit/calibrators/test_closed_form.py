@@ -14,7 +14,7 @@ from fit_samples import box_between, make_problem, noisy_trajectories
 
 from omnibench.fit.calibrator import Outcome, RunResult, run_calibrator
 from omnibench.fit.cost import Cost
-from omnibench.fit.parameterisation import Box, MatrixElements
+from omnibench.fit.parameterisation import Box
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import calibrators, costs
 from omnibench.robot.kinematics import Array
@@ -53,40 +53,29 @@ BOXES: dict[str, Callable[[Any], Box]] = {
 
 @pytest.mark.parametrize("integration", BOTH)
 @pytest.mark.parametrize("cost", ["final_pose", "trajectory"])
-def test_three_wheels_without_noise_give_the_hidden_matrix(cost: str, integration: Any) -> None:
-    runs = synthetic_trajectories(synthetic_robot(3), integration)
-    result = closed_form(make_problem(runs, cost=cost, integration=integration))
-    assert result.outcome is Outcome.CONVERGED
-    assert result.matrix is not None
-    hidden = true_robot(synthetic_robot(3)).inverse_kinematic_matrix
-    np.testing.assert_allclose(result.matrix, hidden, rtol=0, atol=1e-10)
-
-
-@pytest.mark.parametrize("integration", BOTH)
-@pytest.mark.parametrize("cost", ["final_pose", "trajectory"])
-def test_four_wheels_without_noise_give_the_hidden_matrix_on_the_span_that_was_driven(
-    cost: str, integration: Any
+@pytest.mark.parametrize("wheels", [3, 4])
+def test_runs_without_noise_give_the_hidden_matrix_on_the_span_that_was_driven(
+    wheels: Any, cost: str, integration: Any
 ) -> None:
-    robot = synthetic_robot(4)
-    problem = make_problem(synthetic_trajectories(robot, integration), wheels=4, cost=cost, integration=integration)
+    robot = synthetic_robot(wheels)
+    problem = make_problem(
+        synthetic_trajectories(robot, integration), wheels=wheels, cost=cost, integration=integration
+    )
     result = closed_form(problem)
     assert result.outcome is Outcome.CONVERGED
-    assert result.matrix is not None
-    assert isinstance(problem.parameterisation, MatrixElements)
     null = problem.parameterisation.null
-    assert null.shape == (1, 4)
+    assert null.shape == (wheels - 3, wheels)
     error = result.matrix - true_robot(robot).inverse_kinematic_matrix
     np.testing.assert_allclose(error - error @ null.T @ null, 0, atol=1e-10)
     np.testing.assert_allclose(result.matrix @ null.T, robot.inverse_kinematic_matrix @ null.T, atol=1e-14)
+    np.testing.assert_allclose(result.vector, result.matrix.ravel(), atol=1e-15)
 
 
 def test_three_wheels_on_straight_runs_keep_the_design_along_what_was_not_driven() -> None:
     straight = [run for index, run in enumerate(noisy_trajectories(3, noise=1e-4)) if index % 3 == 1]
     problem = make_problem(straight)
-    assert isinstance(problem.parameterisation, MatrixElements)
     (null,) = problem.parameterisation.null
     result = closed_form(problem)
-    assert result.matrix is not None
     np.testing.assert_allclose(np.abs(null), np.sqrt(1 / 3), atol=0.02)
     np.testing.assert_allclose(result.matrix @ null, DESIGNS[3] @ null, atol=1e-14)
 
@@ -101,82 +90,38 @@ def local_rivals(problem: CalibrationProblem, vector: Array, count: int) -> Arra
     return np.clip(vector + steps, problem.lower, problem.upper)
 
 
+def assert_optimal(problem: CalibrationProblem, rivals: int) -> RunResult:
+    """The answer, which no change within the box improves."""
+    result = closed_form(problem)
+    assert result.outcome is Outcome.CONVERGED
+    assert problem.inside(result.vector)
+    assert problem.values(local_rivals(problem, result.vector, rivals)).min() > result.cost - 1e-9
+    return result
+
+
 @pytest.mark.parametrize("box", BOXES)
 @pytest.mark.parametrize("cost", ["final_pose", "final_position", "final_heading", "trajectory"])
 @pytest.mark.parametrize("wheels", [3, 4])
 def test_no_change_within_the_box_lowers_the_cost(wheels: Any, cost: str, box: str) -> None:
     problem = make_problem(wheels=wheels, cost=cost, box=BOXES[box](wheels))
-    result = closed_form(problem)
-    assert result.vector is not None
-    assert result.cost is not None
-    rivals = local_rivals(problem, result.vector, 400)
-    assert problem.values(rivals).min() > result.cost - 1e-9
+    result = assert_optimal(problem, 400)
+    assert result.at_bounds == problem.at_bounds(result.vector)
+    if cost == "final_pose":
+        assert (len(result.at_bounds) >= 2) == (box in ("tight", "lopsided"))
+    if box == "paper":
+        assert result.matrix[0, 1] == DESIGNS[wheels][0, 1] or wheels == 4
 
 
 @pytest.mark.parametrize("integration", BOTH)
 @pytest.mark.parametrize("seed", [11, 12, 13])
 def test_no_change_within_the_box_lowers_the_cost_of_other_noise(seed: int, integration: Any) -> None:
     runs = noisy_trajectories(noise=0.03, seed=seed, integration=integration)
-    problem = make_problem(runs, box="paper", integration=integration)
-    result = closed_form(problem)
-    assert result.vector is not None
-    assert result.cost is not None
-    assert problem.values(local_rivals(problem, result.vector, 2_000)).min() > result.cost - 1e-9
+    assert_optimal(make_problem(runs, box="paper", integration=integration), 2_000)
 
 
 def test_steps_that_overshoot_are_shortened() -> None:
     # Errors of two metres bend the paths so much that full steps lead nowhere.
-    problem = make_problem(noisy_trajectories(noise=2.0, seed=3)[:6], cost="final_position")
-    result = closed_form(problem)
-    assert result.outcome is Outcome.CONVERGED
-    assert result.vector is not None
-    assert result.cost is not None
-    assert problem.values(local_rivals(problem, result.vector, 2_000)).min() > result.cost - 1e-9
-
-
-@pytest.mark.parametrize(
-    ("wheels", "box", "seed"),
-    [(3, "paper", 1), (3, "row", 2), (3, "tight", 3), (4, "row", 4), (4, "tight", 5), (4, "lopsided", 6)],
-)
-def test_no_search_finds_a_lower_cost_in_the_same_box(wheels: Any, box: str, seed: int) -> None:
-    runs = noisy_trajectories(wheels, noise=0.02, seed=seed)
-    found = {}
-    for name in ("closed_form", "crs", "random_search"):
-        problem = make_problem(runs, wheels=wheels, box=BOXES[box](wheels), evaluations=6_000)
-        result = run_calibrator(calibrators.create(name), problem)
-        assert result.cost is not None
-        found[name] = result.cost
-    assert found["closed_form"] <= min(found.values()) + 1e-9
-    assert found["crs"] < 1.02 * found["closed_form"]  # the search did come near
-
-
-@pytest.mark.parametrize("wheels", [3, 4])
-def test_a_binding_box_is_kept_and_said(wheels: Any) -> None:
-    problem = make_problem(wheels=wheels, box=tight(wheels, 0.02))
-    result = closed_form(problem)
-    assert result.outcome is Outcome.CONVERGED
-    assert result.vector is not None
-    assert problem.inside(result.vector)
-    assert set(result.at_bounds) == set(problem.at_bounds(result.vector))
-    assert len(result.at_bounds) >= 2
-
-
-def test_an_optimum_inside_the_box_is_at_no_bound() -> None:
-    assert closed_form(make_problem()).at_bounds == ()
-
-
-@pytest.mark.parametrize("wheels", [3, 4])
-def test_the_answer_is_its_own_matrix(wheels: Any) -> None:
-    result = closed_form(make_problem(wheels=wheels))
-    assert result.vector is not None
-    assert result.matrix is not None
-    np.testing.assert_allclose(result.vector, result.matrix.ravel(), atol=1e-15)
-
-
-def test_elements_that_the_box_freezes_stay() -> None:
-    result = closed_form(make_problem(box="paper"))
-    assert result.matrix is not None
-    assert result.matrix[0, 1] == 0.0
+    assert_optimal(make_problem(noisy_trajectories(noise=2.0, seed=3)[:6], cost="final_position"), 2_000)
 
 
 def test_a_box_without_any_width_gives_the_design() -> None:
@@ -191,46 +136,35 @@ def test_one_run_is_enough_to_converge() -> None:
     assert result.cost == pytest.approx(0.0, abs=1e-9)
 
 
-def test_the_seed_makes_no_difference() -> None:
+def test_the_seed_makes_no_difference_and_few_evaluations_are_enough() -> None:
     first, second = (closed_form(make_problem(seed=seed)) for seed in (1, 2))
     np.testing.assert_array_equal(first.vector, second.vector)
-
-
-def test_few_evaluations_are_enough() -> None:
-    result = closed_form(make_problem())
-    assert result.evaluations < 20
-    assert "cone programs" in result.reason
+    assert first.evaluations < 20
+    assert "cone programs" in first.reason
 
 
 def test_the_reason_says_newton_steps_where_no_cone_program_was_solved() -> None:
     runs = noisy_trajectories()
     stamps = sum(len(run.pose_times) - 1 for run in runs)
     many = [replace(run, id=f"{run.id}-{copy}") for copy in range(-(-1000 // stamps)) for run in runs]
-    result = closed_form(make_problem(many, cost="trajectory"))
-    assert re.fullmatch(r"(step below 1e-09|no part of .* lowers the cost) after \d+ Newton steps", result.reason)
+    assert re.search(r"after \d+ Newton steps", closed_form(make_problem(many, cost="trajectory")).reason)
 
 
-def test_too_few_programs_are_not_called_converged() -> None:
+def test_too_few_programs_or_evaluations_are_not_called_converged() -> None:
     result = closed_form(make_problem(), programs=1)
     assert result.outcome is Outcome.BUDGET
-    assert result.reason.startswith("step still ")
-    assert result.reason.endswith(" after 1 cone program")
-
-
-def test_a_budget_of_one_evaluation_leaves_the_start() -> None:
+    assert "after 1 cone program" in result.reason
     problem = make_problem(evaluations=1)
     result = closed_form(problem)
     assert result.outcome is Outcome.BUDGET
     np.testing.assert_array_equal(result.vector, problem.start)
 
 
-def test_the_geometry_is_refused_in_words() -> None:
-    result = closed_form(make_problem(parameterisation="geometry"))
-    assert (result.outcome, result.vector) == (Outcome.FAILED, None)
-    assert "closed_form works on the matrix parameterisation" in result.reason
-
-
-def test_a_cost_that_is_no_sum_of_norms_is_refused_in_words() -> None:
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [({"parameterisation": "geometry"}, "matrix parameterisation"), ({"cost": "largest"}, "largest")],
+)
+def test_a_geometry_or_a_cost_that_is_no_sum_of_norms_is_refused_in_words(changes: Any, reason: str) -> None:
     @costs.register("largest")
     class Largest(Cost):
         """The largest error."""
@@ -238,9 +172,9 @@ def test_a_cost_that_is_no_sum_of_norms_is_refused_in_words() -> None:
         def combine(self, errors: Array, trajectory: Any) -> Array:  # noqa: ARG002
             return np.abs(errors).max(axis=(1, 2))
 
-    result = closed_form(make_problem(cost="largest"))
+    result = closed_form(make_problem(**changes))
     assert (result.outcome, result.vector) == (Outcome.FAILED, None)
-    assert result.reason == "closed_form needs a cost that is a sum of norms, which largest is not"
+    assert reason in result.reason
 
 
 def test_five_runs_that_hardly_scatter_have_an_answer_and_say_why_the_solver_stopped() -> None:

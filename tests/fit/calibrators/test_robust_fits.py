@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -21,6 +22,7 @@ from omnibench.errors import ConfigError, DataError
 from omnibench.fit.calibrate import CalibrationRun, calibrate
 from omnibench.fit.calibrator import Outcome, run_calibrator
 from omnibench.fit.certify import certify_optimum
+from omnibench.fit.cost import Cost
 from omnibench.fit.evaluate import evaluate, final_errors
 from omnibench.fit.loss import LossName, RobustCost, with_loss
 from omnibench.fit.problem import Budget
@@ -68,7 +70,7 @@ def on_clean(robot: Robot, calibrator: str, cost: str, seed: int = 1) -> float:
     [
         pytest.param("least_squares", "trajectory", TRICYCLE, id="least_squares", marks=pytest.mark.slow),
         pytest.param("trajectory_ml", "trajectory", DIFF, id="trajectory_ml of diff", marks=pytest.mark.slow),
-        pytest.param("trajectory_ml", "trajectory", TRICYCLE, id="trajectory_ml of tricycle"),
+        pytest.param("trajectory_ml", "trajectory", TRICYCLE, id="trajectory_ml of tricycle", marks=pytest.mark.slow),
         pytest.param("closed_form", "final_pose", TRICYCLE, id="closed_form"),
         pytest.param("crs", "trajectory", DIFF, id="crs", marks=pytest.mark.slow),
     ],
@@ -136,11 +138,9 @@ def test_closed_form_reaches_what_a_long_search_finds(loss: LossName) -> None:
 def test_intervals_of_a_robust_fit_are_about_as_wide_as_those_of_squares_on_normal_errors(loss: LossName) -> None:
     clean, jumping, _ = recording(DIFF)
     usual = calibrate(clean, "trajectory_ml", unidentified="keep").uncertainty
-    assert usual is not None
     for dataset in (clean, jumping):
         for calibrator in ("closed_form", "trajectory_ml"):
             run = calibrate(dataset, calibrator, cost="trajectory", loss=loss, unidentified="keep")
-            assert run.uncertainty is not None, run.warnings
             ratio = run.uncertainty.standard_deviations[[0, 2]] / usual.standard_deviations[[0, 2]]
             assert (ratio > 0.9).all()  # of the efficient estimate
             assert (ratio < 1.7).all()
@@ -148,26 +148,30 @@ def test_intervals_of_a_robust_fit_are_about_as_wide_as_those_of_squares_on_norm
 
 def test_starts_that_were_taken_from_other_poses_are_named() -> None:
     _, jumping, _ = recording(DIFF)
-    (warning,) = [
-        words
-        for words in calibrate(jumping, "least_squares", cost="trajectory", loss="huber").warnings
-        if "at the start is far" in words
-    ]
-    assert warning.startswith(("1 run of 36", "2 runs of 36", "3 runs of 36", "4 runs of 36"))
+    run = calibrate(jumping, "least_squares", cost="trajectory", loss="huber")
+    (warning,) = [words for words in run.warnings if "at the start is far" in words]
+    assert re.match("[1-4] runs? of 36", warning)
 
 
-def test_a_cost_that_is_no_sum_of_norms_has_no_robust_loss() -> None:
-    from omnibench.fit.cost import Cost
+class Odd(Cost):
+    """A cost that is no sum of norms."""
 
-    class Odd(Cost):
-        name = "odd"
+    name = "odd"
 
-        def combine(self, errors: Any, trajectory: Any) -> Any:  # noqa: ARG002
-            return errors[:, 0, 0]
+    def combine(self, errors: Any, trajectory: Any) -> Any:  # noqa: ARG002
+        return errors[:, 0, 0]
 
-    with pytest.raises(ConfigError, match="no sum of norms"):
+
+def test_what_does_not_go_with_a_robust_loss_is_refused() -> None:
+    with pytest.raises(ConfigError, match="sum of norms"):
         with_loss(Odd(None), "huber")
     assert isinstance(with_loss(costs.create("trajectory"), "huber"), RobustCost)
+    clean, _, _ = recording(DIFF)
+    with pytest.raises(ConfigError, match="huber"):
+        calibrate(clean, "closed_form", loss="huber", intervals=True, unidentified="keep")
+    calibration = calibrate(clean, "least_squares", loss="student_t").calibration
+    with pytest.raises(DataError, match="student_t"):
+        certify_optimum(calibration, clean, seconds=1.0)
 
 
 def test_only_a_robust_loss_is_in_the_calibration_file_and_what_evaluate_says(tmp_path: Path) -> None:
@@ -182,16 +186,3 @@ def test_only_a_robust_loss_is_in_the_calibration_file_and_what_evaluate_says(tm
     assert "loss" not in written["squares"]
     assert written["huber"]["loss"] == "huber"
     assert written["huber"]["training_cost"] == pytest.approx(written["squares"]["training_cost"], rel=0.05)
-
-
-def test_certify_refuses_what_was_fitted_with_a_robust_loss() -> None:
-    clean, _, _ = recording(DIFF)
-    calibration = calibrate(clean, "least_squares", loss="student_t").calibration
-    with pytest.raises(DataError, match=r"fitted with the loss student_t.*without --loss"):
-        certify_optimum(calibration, clean, seconds=1.0)
-
-
-def test_resampled_intervals_of_a_robust_fit_are_refused() -> None:
-    clean, _, _ = recording(DIFF)
-    with pytest.raises(ConfigError, match="leave out the loss huber"):
-        calibrate(clean, "closed_form", loss="huber", intervals=True, unidentified="keep")

@@ -53,13 +53,6 @@ def drawn(box: ElementBox, rng: np.random.Generator, count: int) -> Array:
     return np.concatenate([inside, box.lower[None], box.upper[None]])
 
 
-def built(logs: list[WheelLog], integration: Integration, box: ElementBox) -> PoseEvaluator:
-    """An evaluator that is there."""
-    evaluator = make_evaluator(OdometryBatch(logs, integration), logs, integration, box)
-    assert evaluator is not None
-    return evaluator
-
-
 def long_runs(wheels: int = 3) -> list[Trajectory]:
     """The noisy runs, sampled as densely as recordings are."""
     finer = 40
@@ -87,7 +80,7 @@ def test_poses_are_those_of_direct_integration_within_the_stated_bound(
     rng = np.random.default_rng(seed)
     logs = [random_log(rng, wheels, int(rng.integers(300, 600)), stamps) for _ in range(3)]
     box = design_box(wheels, width)
-    evaluator = built(logs, integration, box)
+    evaluator = make_evaluator(OdometryBatch(logs, integration), logs, integration, box)
     matrices = drawn(box, rng, 5)
     difference = np.abs(evaluator.poses(matrices) - OdometryBatch(logs, integration).poses(matrices)).max()
     assert evaluator.error_bound < 1e-10
@@ -100,7 +93,7 @@ def test_a_long_recording_is_cut_into_segments_and_agrees(integration: Integrati
     times = 0.01 * np.arange(1, 30_001)
     turning = WheelLog(times, 1.5 + 0.3 * rng.standard_normal((30_000, 3)), np.zeros(3), np.array([170.0, 300.0]))
     box = design_box(3, 0.25)
-    evaluator = built([turning], integration, box)
+    evaluator = make_evaluator(OdometryBatch([turning], integration), [turning], integration, box)
     matrices = drawn(box, rng, 3)
     assert evaluator.segments > 10
     direct = OdometryBatch([turning], integration).poses(matrices)
@@ -117,21 +110,15 @@ def test_costs_are_the_same_either_way(cost: str, integration: Integration, whee
     assert np.abs(problem.cost(candidates) - problem.values(candidates)).max() <= 1e-11
 
 
-def test_costs_are_the_same_either_way_for_wheel_geometries() -> None:
-    problem = make_problem(long_runs(), parameterisation="geometry", limits=GeometryLimits())
-    evaluator = problem.build_evaluator()
-    assert evaluator is not None
-    candidates = problem.from_unit(np.random.default_rng(1).uniform(size=(50, int(problem.free.sum()))))
-    assert evaluator.covers(problem.parameterisation.matrices(candidates)).mean() > 0.9
-    assert np.abs(problem.cost(candidates) - problem.values(candidates)).max() <= 1e-11
-
-
-def test_outside_the_box_direct_integration_answers() -> None:
+def test_costs_are_the_same_either_way_for_wheel_geometries_and_outside_the_box() -> None:
+    geometry = make_problem(long_runs(), parameterisation="geometry", limits=GeometryLimits())
+    candidates = geometry.from_unit(np.random.default_rng(1).uniform(size=(50, int(geometry.free.sum()))))
+    assert geometry.build_evaluator().covers(geometry.parameterisation.matrices(candidates)).mean() > 0.9
+    assert np.abs(geometry.cost(candidates) - geometry.values(candidates)).max() <= 1e-11
     problem = make_problem(long_runs())
-    evaluator = problem.build_evaluator()
-    assert evaluator is not None
     candidates = np.stack([problem.start, problem.start * 3, problem.upper * 1.5])
-    assert evaluator.covers(problem.parameterisation.matrices(candidates)).tolist() == [True, False, False]
+    covered = problem.build_evaluator().covers(problem.parameterisation.matrices(candidates))
+    assert covered.tolist() == [True, False, False]
     assert np.abs(problem.cost(candidates) - problem.values(candidates)).max() <= 1e-11
 
 
@@ -149,13 +136,9 @@ def test_a_search_builds_the_evaluator_and_few_evaluations_do_not(monkeypatch: p
     assert built_for == [many]
 
 
-def test_recordings_that_moments_would_slow_down_are_integrated_directly() -> None:
-    few_samples = noisy_trajectories()
-    sparse = [replace(run, times=run.times[::5], rates=run.rates[::5]) for run in few_samples]
+def test_recordings_that_moments_would_slow_down_or_do_not_express_are_integrated_directly() -> None:
+    sparse = [replace(run, times=run.times[::5], rates=run.rates[::5]) for run in noisy_trajectories()]
     assert make_problem(sparse, cost="trajectory").build_evaluator() is None
-
-
-def test_an_odometry_that_the_moments_do_not_express_is_left_to_itself() -> None:
     problem = make_problem(long_runs(), integration="arc")
     logs = problem.objective.logs(problem.trajectories)
     box = ElementBox.of(problem.parameterisation, problem.lower, problem.upper)
@@ -170,7 +153,7 @@ def test_nothing_that_is_kept_grows_with_the_sampling_rate() -> None:
         times = np.arange(1, samples + 1) * 4 / samples
         rates = np.array([1.0, -0.5, 0.2]) + np.sin(np.outer(times, [1.0, 2.0, 3.0]))
         logs = [WheelLog(times, rates * scale, np.zeros(3), times[-1:]) for scale in np.linspace(-1, 1, 20)]
-        sizes.append(built(logs, "euler", box).size)
+        sizes.append(make_evaluator(OdometryBatch(logs, "euler"), logs, "euler", box).size)
     assert sizes[1] < 1.2 * sizes[0]
 
 
@@ -184,7 +167,6 @@ def test_an_expanded_exponential_is_right_to_the_bound(
 ) -> None:
     z, d = np.array(angles), np.array(place)
     degree, left_out = degree_for(np.abs(z).sum(keepdims=True), np.ones(1), np.array([0]), tolerance, 3)
-    assert degree is not None
     basis = Basis.make(degree, np.ones(3, dtype=bool))
     terms = basis.coefficients(z[None])[:, 0] * basis.values(d[None])[:, 0]
     expanded = (terms * 1j**basis.quarter_turns).sum()
@@ -200,7 +182,6 @@ def test_arcs_by_quadrature_are_right_to_the_bound(seed: int, tolerance: float) 
     row = np.abs(box.centre[2]) + box.reach[2]
     path = make_path(log, "arc")
     nodes = quadrature([path], row, box.speed, tolerance, "arc")
-    assert nodes is not None
     (segment,) = cut(path, box.reach[2], np.inf)
     angles, about = impulses(path, segment, "arc", nodes)
     for matrix in drawn(box, rng, 2):

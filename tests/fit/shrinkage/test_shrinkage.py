@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -41,39 +40,30 @@ def distance(matrix: Array) -> float:
     return float(np.linalg.norm((matrix - DESIGN) / ROBOT.row_scales[:, None]))
 
 
-def test_a_design_that_may_be_anything_leaves_the_answer_as_it_is() -> None:
-    kept = calibrate(RECORDING, unidentified="keep").calibration.matrix_array
-    np.testing.assert_allclose(shrunk(1e3).calibration.matrix_array, kept, rtol=0, atol=1e-9)
-
-
-def test_a_design_that_is_exact_is_the_answer() -> None:
-    np.testing.assert_allclose(shrunk(1e-9).calibration.matrix_array, DESIGN, rtol=0, atol=1e-9)
-
-
 def test_the_better_the_design_is_known_the_closer_to_it_is_the_answer() -> None:
+    kept = calibrate(RECORDING, unidentified="keep").calibration.matrix_array
+    np.testing.assert_allclose(shrunk(1e3).calibration.matrix_array, kept, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(shrunk(1e-9).calibration.matrix_array, DESIGN, rtol=0, atol=1e-9)
     distances = [distance(shrunk(tolerance).calibration.matrix_array) for tolerance in (0.001, 0.003, 0.01, 0.03)]
     assert distances == sorted(distances)
+    assert shrunk(0.001, calibrator="theoretical").result.shrinkage is None  # which is not fitted
 
 
 def test_the_posterior_weighs_design_and_data_by_their_variances() -> None:
     """Where covariances commute, by the textbook: each direction by its own variances."""
     free = calibrate(RECORDING, unidentified="keep")
-    assert free.uncertainty is not None
     prior = np.diag(np.repeat(0.01 * ROBOT.row_scales, 3) ** 2)
     of_data = free.uncertainty.covariance
     gain = prior @ np.linalg.inv(prior + of_data)
     expected = DESIGN.ravel() + gain @ (free.calibration.matrix_array - DESIGN).ravel()
     run = shrunk(0.01)
     np.testing.assert_allclose(run.calibration.matrix_array.ravel(), expected, rtol=0, atol=1e-8)
-    assert run.uncertainty is not None
     np.testing.assert_allclose(run.uncertainty.covariance, prior - gain @ prior, rtol=1e-5, atol=1e-12)
 
 
 def test_a_posterior_variance_has_the_degrees_of_freedom_of_the_part_that_the_data_estimate() -> None:
     """Satterthwaite: 2 E^2 / Var of a sum of an exact part and one, w, whose variance is 2 w^2 / f."""
     free, shrunk_little, run = calibrate(RECORDING, unidentified="keep"), shrunk(1e3), shrunk(0.01)
-    assert free.uncertainty is not None
-    assert run.uncertainty is not None
     posterior = run.uncertainty.covariance
     of_data = np.diag(posterior @ np.linalg.solve(free.uncertainty.covariance, posterior))
     variance_of_estimate = 2 * of_data**2 / shrunk_little.result.degrees_of_freedom
@@ -82,17 +72,9 @@ def test_a_posterior_variance_has_the_degrees_of_freedom_of_the_part_that_the_da
     np.testing.assert_allclose(run.result.degrees_of_freedom, expected, rtol=1e-3)
 
 
-def test_an_answer_that_was_not_fitted_is_not_shrunk() -> None:
-    run = shrunk(0.001, calibrator="theoretical")
-    assert run.result.shrinkage is None
-
-
 def test_the_cost_of_shrinking_is_said_and_certified() -> None:
     run = shrunk(0.003)
     origin = run.calibration.provenance
-    assert origin is not None
-    assert origin.training_cost is not None
-    assert origin.unshrunk_cost is not None
     assert (origin.unidentified, origin.tolerance) == ("shrink", 0.003)
     certificate = certify_optimum(run.calibration, RECORDING, gap=0.01).certificate
     assert certificate.gap < 0.01
@@ -105,11 +87,7 @@ def test_a_fit_without_any_error_is_shrunk_and_certified_all_the_same() -> None:
     (run, *_) = recorded(TRICYCLE, TRICYCLE.inverse_kinematic_matrix, np.random.default_rng(3))
     dataset = make_dataset("tricycle", TRICYCLE, PERIOD, [run], simulated=True)
     calibration = calibrate(dataset, cost="final_pose", unidentified="shrink").calibration
-    assert calibration.provenance is not None
-    assert calibration.provenance.unshrunk_cost is not None
     assert calibration.provenance.unshrunk_cost < 1e-9
-    assert calibration.provenance.training_cost is not None
-    assert re.search(r"which changes the cost by \+0\.0", calibration.provenance.reason)
     certificate = certify_optimum(calibration, dataset, seconds=1.0).certificate
     assert certificate.cost == calibration.provenance.training_cost
     assert certificate.shrinking is None
@@ -123,23 +101,16 @@ def test_a_motion_that_is_not_driven_keeps_the_design() -> None:
     np.testing.assert_allclose(run.calibration.matrix_array @ turning, DESIGN @ turning, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_search_is_shrunk_like_the_optimum() -> None:
     searched = shrunk(0.01, calibrator="crs").calibration.matrix_array
     np.testing.assert_allclose(searched, shrunk(0.01).calibration.matrix_array, rtol=0, atol=1e-5)
 
 
-def test_resampled_intervals_of_a_shrunk_answer_are_refused() -> None:
-    with pytest.raises(ConfigError, match="set unidentified to keep"):
-        shrunk(intervals=True)
-
-
-def test_robots_whose_wheels_say_their_type_are_shrunk_by_default() -> None:
+def test_robots_whose_wheels_say_their_type_are_shrunk_and_a_tricycle_s_tracked_point_is_fitted_by_default() -> None:
     assert [default_unidentified(robot) for robot in (APR_02, MECANUM, DIFFERENTIAL)] == ["keep", "shrink", "shrink"]
     wheels = tuple(wheel.model_copy(update={"type": "omni"}) for wheel in APR_02.wheels)
     assert default_unidentified(APR_02.model_copy(update={"wheels": wheels})) == "keep"
-
-
-def test_the_tracked_point_of_a_tricycle_is_fitted_by_default() -> None:
     assert [default_mount(robot) for robot in (DIFFERENTIAL, TRICYCLE)] == ["known", "fit"]
 
 
@@ -154,6 +125,7 @@ def test_the_prior_has_the_stated_widths() -> None:
     np.testing.assert_allclose(deviations[2], np.hypot(elements, rows[2]), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_centre_of_turning_that_is_not_in_the_middle_leaves_a_skid_base_its_turn() -> None:
     """2 cm off, as the mass of a skid-steered base moves it; a prior that knew it to 1.5 mm bent the turn by 0.5 %."""
     turns = [[covered("skid", answer, seed, repetitions=1).errors[2] for answer in ANSWERS] for seed in range(1, 4)]
@@ -167,8 +139,9 @@ def test_intervals_of_shrunk_answers_hold_the_truth_of_skid_bases() -> None:
     assert np.mean(ratios <= 1) > 0.8
 
 
-def test_a_tolerance_is_refused_where_nothing_is_shrunk() -> None:
-    with pytest.raises(
-        ConfigError, match="tolerance is of the design, for unidentified: shrink, and unidentified is keep"
-    ):
-        calibrate(RECORDING, unidentified="keep", tolerance=0.01)
+@pytest.mark.parametrize(
+    "choices", [{"unidentified": "shrink", "intervals": True}, {"unidentified": "keep", "tolerance": 0.01}]
+)
+def test_resampled_intervals_of_shrunk_answers_and_a_tolerance_without_shrinkage_are_refused(choices: Any) -> None:
+    with pytest.raises(ConfigError, match="unidentified"):
+        calibrate(RECORDING, **choices)

@@ -1,17 +1,21 @@
-"""What recordings can tell before anything is fitted, and what they leave open."""
+"""What recordings can tell before anything is fitted, what they leave open, and what they cannot tell apart."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from fit_samples import make_problem
 from motions import FLOWER, RING, SPEED, TURNS, Twist, driven
+from wheeled_samples import CAR, DIFF
+from wheeled_samples import driven as curves
 
 from omnibench.data.dataset import Dataset
 from omnibench.errors import DataError
+from omnibench.fit.calibrate import calibrate
 from omnibench.fit.calibrators.closed_form import linear_start
 from omnibench.fit.geometry import WheelGeometry
 from omnibench.fit.identifiability import (
@@ -19,11 +23,15 @@ from omnibench.fit.identifiability import (
     deviations_along,
     identifiability,
     identified_parameters,
+    inseparable_in_words,
+    inseparable_parameters,
     known_slopes,
     warnings_of_calibration,
 )
 from omnibench.fit.inspect import inspect_dataset
+from omnibench.fit.problem import Budget
 from omnibench.fit.span import aligned, driven_span, unidentified_directions
+from omnibench.robot.kinematics import Robot
 from omnibench.testing.synthetic import synthetic_robot
 
 ROBOT = synthetic_robot()
@@ -114,57 +122,46 @@ class TestPrecision:
 class TestDirections:
     """Every direction of wheel rates, with its motion and how well it is told."""
 
-    def test_runs_that_turn_and_drive_tell_everything(self) -> None:
+    def test_runs_that_turn_and_drive_tell_everything_even_if_they_never_reverse(self) -> None:
         found = told_of(FLOWER)
         assert states(found) == dict.fromkeys(("turning on the spot", "moving along x", "moving along y"), "driven")
         assert (found.sentences, untold(found)) == ((), ())
-
-    def test_runs_that_never_reverse_are_fine(self) -> None:
-        forward = ((SPEED, 0.0, 0.4), (0.0, SPEED, 0.4), (SPEED, SPEED, 0.4))
-        assert told_of(forward).sentences == ()
+        assert told_of(((SPEED, 0.0, 0.4), (0.0, SPEED, 0.4), (SPEED, SPEED, 0.4))).sentences == ()
 
     @pytest.mark.parametrize("slip", [0.0, 0.02])
     def test_translation_alone_leaves_the_turn_and_the_distances(self, slip: float) -> None:
         found = told_of(RING, slip)
         assert states(found)["turning on the spot"] == ("weak" if slip else "undriven")
         assert untold(found) == DISTANCES
-        assert found.sentences[-1] == f"of the wheels' geometry these recordings do not tell {', '.join(DISTANCES)}"
+        assert ", ".join(DISTANCES) in found.sentences[-1]
 
-    def test_turns_alone_leave_both_translations_and_every_parameter(self) -> None:
-        found = told_of(TURNS, slip=0.02)
-        assert states(found)["turning on the spot"] == "driven"
-        assert {states(found)[f"moving along {axis}"] for axis in "xy"} <= {"weak", "undriven"}
-        assert len(untold(found)) == 9
-
-    def test_runs_along_x_leave_y_and_the_turn(self) -> None:
-        found = told_of(((SPEED, 0.0, 0.0), (-SPEED, 0.0, 0.0)), slip=0.002)
-        assert states(found) == {
-            "moving along x": "driven",
-            "moving along y": "undriven",
-            "turning on the spot": "undriven",
-        }
-
-    def test_one_command_is_one_direction(self) -> None:
-        found = told_of(((SPEED, 0.0, 0.3),))
-        assert [each.state for each in found.directions] == ["driven", "undriven", "undriven"]
-        assert found.directions[0].motion == "moving along x while turning"
+    @pytest.mark.parametrize(
+        ("twists", "slip", "motion"),
+        [
+            (TURNS, 0.02, "turning on the spot"),
+            (((SPEED, 0.0, 0.0), (-SPEED, 0.0, 0.0)), 0.002, "moving along x"),
+            (((SPEED, 0.0, 0.3),), 0.0, "moving along x while turning"),
+        ],
+    )
+    def test_turns_lines_or_one_command_alone_are_one_direction(
+        self, twists: tuple[Twist, ...], slip: float, motion: str
+    ) -> None:
+        found = told_of(twists, slip=slip)
+        assert [each.motion for each in found.directions if each.state == "driven"] == [motion]
+        assert {each.state for each in found.directions} <= {"driven", "weak", "undriven"}
+        assert len(untold(found)) >= 8
         assert all("record" in sentence for sentence in found.sentences[:2])
 
-    def test_four_wheels_name_the_slipping_direction_apart_from_the_turn(self) -> None:
-        found = identifiability(synthetic_robot(4), driven(RING, wheels=4))
-        assert [(each.direction, each.motion) for each in found.directions[2:]] == [
+    def test_four_wheels_name_the_slipping_direction_apart_from_the_turn_and_slip_is_no_motion(self) -> None:
+        still = identifiability(synthetic_robot(4), driven(RING, wheels=4))
+        assert [(each.direction, each.motion) for each in still.directions[2:]] == [
             ("fl + fr + rl + rr", "turning on the spot"),
             ("fl - fr - rl + rr", ""),
         ]
-
-    def test_slip_does_not_pass_for_a_motion(self) -> None:
         found = identifiability(synthetic_robot(4), driven(FLOWER, wheels=4, slip=0.02))
         assert [each.state for each in found.directions] == ["driven"] * 3 + ["weak"]
-        assert found.sentences == (
-            "the wheels go along fl - fr - rl + rr, which only slips, with "
-            f"{100 * found.directions[3].share:.1f} % of the strongest motion: slip cannot be identified, and "
-            "calibration keeps the design values there",
-        )
+        (sentence,) = found.sentences
+        assert f"fl - fr - rl + rr, which only slips, with {100 * found.directions[3].share:.1f} %" in sentence
 
 
 class TestPrediction:
@@ -178,7 +175,6 @@ class TestPrediction:
     def test_deviations_grow_with_the_noise_and_shrink_with_the_repetitions(self) -> None:
         once, noisy, often = told_of(FLOWER), told_of(FLOWER, noise=0.03), told_of(FLOWER, repetitions=12)
         for one, more, less in zip(once.directions, noisy.directions, often.directions, strict=True):
-            assert one.deviations is not None
             assert np.divide(more.deviations, one.deviations) == pytest.approx(10, rel=0.2)
             assert np.divide(less.deviations, one.deviations) == pytest.approx(0.5, rel=0.2)
 
@@ -188,6 +184,7 @@ class TestPrediction:
         assert "row 1 (x) to " in rough
         assert rough.endswith("record more or longer runs")
 
+    @pytest.mark.slow
     def test_the_calibrations_of_many_recordings_scatter_as_predicted(self) -> None:
         # The bound is of the best estimator; least squares at every pose is close to it under white noise.
         found = told_of(FLOWER)
@@ -198,7 +195,6 @@ class TestPrediction:
         turn = np.ones(3) / math.sqrt(3)
         seen = np.std(np.array(matrices) @ turn, axis=0) / np.abs(ROBOT.inverse_kinematic_matrix).max(axis=1)
         predicted = next(each.deviations for each in found.directions if each.motion == "turning on the spot")
-        assert predicted is not None
         # Of 25 values the standard deviation is uncertain by 14 %.
         assert (seen > 0.65 * np.array(predicted)).all()
         assert (seen < 1.8 * np.array(predicted)).all()
@@ -212,48 +208,69 @@ class TestPrediction:
 class TestWarnings:
     """What a calibration says of the directions it could not tell."""
 
-    def test_fine_data_give_none(self) -> None:
-        assert warnings_of_calibration(ROBOT, driven(FLOWER), "matrix", "keep") == ()
-
-    def test_what_slips_on_any_four_wheels_gives_none(self) -> None:
-        assert warnings_of_calibration(synthetic_robot(4), driven(FLOWER, wheels=4), "matrix", "keep") == ()
+    @pytest.mark.parametrize("wheels", [3, 4])
+    def test_fine_data_give_none(self, wheels: Any) -> None:
+        runs = driven(FLOWER, wheels=wheels)
+        assert warnings_of_calibration(synthetic_robot(wheels), driven_span(runs), "matrix", "keep") == ()
 
     @pytest.mark.parametrize(
         ("parameterisation", "unidentified", "end"),
         [
             ("matrix", "keep", "kept at the design values"),
             ("matrix", "fit", "what was fitted there rests on slip and noise"),
-            (
-                "geometry",
-                "keep",
-                "the geometry cannot keep design values there, so what was fitted to it rests on slip and noise",
-            ),
+            ("geometry", "keep", "what was fitted to it rests on slip and noise"),
         ],
     )
     def test_each_way_to_go_on_is_said(self, parameterisation: str, unidentified: str, end: str) -> None:
         runs = driven(RING, slip=0.02)
-        share = 100 * driven_span(runs).shares[2]
-        assert warnings_of_calibration(ROBOT, runs, parameterisation, unidentified) == (
-            "these data do not identify what wheel rates along a + b + c (turning on the spot) do: "
-            f"{share:.1f} % of the strongest motion, which slip alone can make; {end}",
-        )
+        (warning,) = warnings_of_calibration(ROBOT, driven_span(runs), parameterisation, unidentified)
+        assert "a + b + c (turning on the spot)" in warning
+        assert f"{100 * driven_span(runs).shares[2]:.1f} %" in warning
+        assert warning.endswith(end)
 
     def test_what_is_not_driven_at_all_is_kept_whatever_is_asked(self) -> None:
-        (warning,) = warnings_of_calibration(ROBOT, driven(RING), "matrix", "fit")
+        (warning,) = warnings_of_calibration(ROBOT, driven_span(driven(RING)), "matrix", "fit")
         assert warning.endswith("do; kept at the design values")
 
 
 class TestRecordings:
     """The Robotino's table recordings translate only; omni3 drives everything."""
 
-    def test_inspection_of_the_table_recordings_names_the_turn(self, robotino: Dataset) -> None:
+    def test_inspection_of_the_table_recordings_names_the_turn_and_omni3_leaves_nothing_open(
+        self, robotino: Dataset, omni3: Dataset
+    ) -> None:
         found = inspect_dataset(robotino)
         turning = found.findings[0]
         assert turning.startswith("these recordings hardly turn the robot: they drive the wheels along 1 + 2 + 3")
         assert "row 3 (heading)" in turning
-        assert turning.endswith("record turns, on the spot or while driving")
         assert states(found.identifiability)["turning on the spot"] == "weak"
         assert untold(found.identifiability) == ("distance_1", "distance_2", "distance_3")
+        assert warnings_of_calibration(omni3.robot, driven_span(omni3.split("train")), "matrix", "keep") == ()
 
-    def test_omni3_leaves_nothing_open(self, omni3: Dataset) -> None:
-        assert warnings_of_calibration(omni3.robot, omni3.split("train"), "matrix", "keep") == ()
+
+KNOWN = np.empty((0, 2))  # no direction of wheel rates is unknown
+
+
+def test_the_track_of_two_wheels_and_an_unknown_tracked_point_between_them_cannot_be_told_apart() -> None:
+    geometry = WheelGeometry(DIFF, fitted_mount=True)
+    assert inseparable_parameters(geometry, KNOWN) == (("distance_right", "distance_left", "mount_y"),)
+    assert inseparable_parameters(WheelGeometry(DIFF), KNOWN) == ()
+    of_the_right_wheel = np.array([[1.0, 0.0]])  # nothing is known of it
+    sentences = inseparable_in_words(WheelGeometry(DIFF), of_the_right_wheel)
+    assert any(sentence.startswith("these data say nothing of ") for sentence in sentences)
+
+
+@pytest.mark.parametrize("robot", [DIFF, CAR], ids=lambda robot: robot.name)
+@pytest.mark.parametrize("fitted_mount", [False, True])
+def test_the_groups_hold_the_numbers_that_are_not_identified(robot: Robot, fitted_mount: bool) -> None:
+    geometry = WheelGeometry(robot, fitted_mount=fitted_mount)
+    kept = np.empty((0, len(robot.drive.names)))
+    identified = dict(zip(geometry.names, identified_parameters(geometry, kept), strict=True))
+    grouped = {name for group in inseparable_parameters(geometry, kept) for name in group}
+    assert grouped == {name for name, known in identified.items() if not known}
+
+
+def test_calibrate_says_which_numbers_cannot_be_told_apart() -> None:
+    run = calibrate(curves(DIFF), "crs", parameterisation="geometry", mount="fit", budget=Budget(evaluations=300))
+    (warning,) = [each for each in run.warnings if "apart" in each]
+    assert "distance_right, distance_left and mount_y" in warning

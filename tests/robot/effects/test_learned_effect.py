@@ -13,7 +13,6 @@ from learned_samples import a_learned_calibration, a_network, a_weighted_term, a
 from sample_robots import APR_02
 
 from omnibench.errors import DataError
-from omnibench.registry import effects
 from omnibench.robot.calibration import EffectTerm, extended_model, read_calibration, write_calibration
 from omnibench.robot.effects.effect import MOST_BYTES, decode_weights, make_term
 from omnibench.robot.effects.learned import unpacked
@@ -109,16 +108,14 @@ def test_half_a_width_outside_half_of_the_network_is_left(share: float) -> None:
     assert (driven_to(model, twist)[2] - driven_to(plain, twist)[2]) / whole == pytest.approx(0.5, abs=1e-6)
 
 
-def test_a_file_holds_the_weights(tmp_path: Path) -> None:
+def test_a_file_holds_the_weights_and_a_c_header_says_that_they_are_left_out(tmp_path: Path) -> None:
     calibration = a_learned_calibration(APR_02, NEAR, PERIOD)
     write_calibration(calibration, tmp_path / "c.yaml")
     again = read_calibration(tmp_path / "c.yaml")
     assert again == calibration
     log = a_drive(4)
     np.testing.assert_array_equal(again.model.poses([log])[0], calibration.model.poses([log])[0])
-
-
-def test_a_file_without_weights_does_not_name_them() -> None:
+    assert f"learned (share 1, {len(PACKED)} weights)" in " ".join(c_header(calibration, "apr")[1])
     assert "weights" not in EffectTerm(name="heading_drift", parameters={"b": 0.0}).model_dump()
 
 
@@ -127,19 +124,21 @@ def as_text(numbers: Array) -> str:
 
 
 PACKED = a_network(APR_02).packed()
+
 REFUSED = {
-    "no base64": ("***", "weights are not base64"),
-    "empty": ("", "weights are 0 bytes, which is no whole number of float32"),
-    "half a number": (base64.b64encode(b"abc").decode(), "weights are 3 bytes, which is no whole number of float32"),
-    "too long": (as_text(np.zeros(MOST_BYTES // 4 + 1)), "weights are longer than 48 KiB"),
-    "NaN": (as_text(np.append(PACKED[:-1], np.nan)), "weights hold NaN or infinity"),
-    "infinity": (as_text(np.append(PACKED[:-1], np.inf)), "weights hold NaN or infinity"),
-    "another version": (as_text(np.append(2.0, PACKED[1:])), "do not begin as those of a network, version 1"),
-    "other wheels": (as_text(a_network(EVERY["four"]).packed()), "weights are for 4 drive signals, the robot has 3"),
-    "no layers": (as_text(np.array([1.0, 0, 0, 3])), "weights have no layers of a network"),
-    "a layer of no size": (as_text(np.array([1.0, 0, 1, 3, 0])), "weights have no layers of a network"),
-    "one too few": (as_text(PACKED[:-1]), f"weights are {len(PACKED) - 1} numbers, its layers need {len(PACKED)}"),
-    "a scale of 0": (as_text(np.where(np.arange(len(PACKED)) == 5, 0, PACKED)), "scales that are not above 0"),
+    "no base64": ("***", "base64"),
+    "empty": ("", "0 bytes"),
+    "half a number": (base64.b64encode(b"abc").decode(), "3 bytes"),
+    "too long": (as_text(np.zeros(MOST_BYTES // 4 + 1)), "48 KiB"),
+    "NaN": (as_text(np.append(PACKED[:-1], np.nan)), "NaN or infinity"),
+    "infinity": (as_text(np.append(PACKED[:-1], np.inf)), "NaN or infinity"),
+    "another version": (as_text(np.append(2.0, PACKED[1:])), "version 1"),
+    "other wheels": (as_text(a_network(EVERY["four"]).packed()), "4 drive signals"),
+    "no layers": (as_text(np.array([1.0, 0, 0, 3])), "no layers"),
+    "a layer of no size": (as_text(np.array([1.0, 0, 1, 3, 0])), "no layers"),
+    "one too few": (as_text(PACKED[:-1]), f"{len(PACKED) - 1} numbers"),
+    "a scale of 0": (as_text(np.where(np.arange(len(PACKED)) == 5, 0, PACKED)), "scales"),
+    "none": (None, "missing"),
 }
 
 
@@ -147,36 +146,18 @@ REFUSED = {
 def test_weights_that_are_none_are_refused_in_one_line(what: str) -> None:
     text, words = REFUSED[what]
     with pytest.raises(DataError, match=f"^c.yaml: effect 'learned'.*{words}") as refused:
-        make_term("learned", {"share": 1.0}, APR_02, "c.yaml", weights=text)
+        make_term("learned", {"share": 1.0}, APR_02, "c.yaml", **({} if text is None else {"weights": text}))
     assert "\n" not in str(refused.value)
 
 
-def test_the_largest_weights_are_read() -> None:
+def test_the_largest_weights_are_read_and_packed_ones_unpacked_as_they_were() -> None:
     assert len(decode_weights(as_text(np.zeros(MOST_BYTES // 4)))) == MOST_BYTES // 4
-
-
-def test_missing_weights_are_refused() -> None:
-    with pytest.raises(DataError, match="effect 'learned': weights are missing"):
-        make_term("learned", {"share": 1.0}, APR_02)
-
-
-def test_weights_of_an_effect_that_has_none_are_refused() -> None:
-    with pytest.raises(DataError, match="effect 'heading_drift' has no weights; leave them out"):
-        make_term("heading_drift", {"b": 0.0}, APR_02, weights=as_text(PACKED))
-
-
-def test_packed_weights_are_unpacked_as_they_were() -> None:
     network = a_network(APR_02, alone=True, sizes=(7, 3))
     again = unpacked(network.packed(), 3, "here")
     assert again.alone
     np.testing.assert_array_equal(again.packed(), network.packed())
 
 
-def test_the_effect_is_in_no_catalogue() -> None:
-    assert not effects.create("learned").in_catalogue
-
-
-def test_a_c_header_says_that_the_network_is_left_out() -> None:
-    calibration = a_learned_calibration(APR_02, NEAR, PERIOD)
-    _, warnings = c_header(calibration, "apr")
-    assert f"left out: learned (share 1, {len(PACKED)} weights)" in " ".join(warnings)
+def test_weights_of_an_effect_that_has_none_are_refused() -> None:
+    with pytest.raises(DataError, match="heading_drift"):
+        make_term("heading_drift", {"b": 0.0}, APR_02, weights=as_text(PACKED))

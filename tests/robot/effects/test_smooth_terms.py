@@ -15,7 +15,7 @@ from sample_robots import APR_02
 
 from omnibench.registry import effects
 from omnibench.robot.calibration import Calibration, EffectTerm, matrix_rows, read_calibration, write_calibration
-from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect, make_term
+from omnibench.robot.effects.effect import make_term
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, advance
 from omnibench.robot.signals import Signals, signals_of
@@ -23,14 +23,8 @@ from omnibench.robot.signals import Signals, signals_of
 MOTION = (
     *("smooth_elapsed_time", "smooth_heading", "smooth_course", "smooth_place", "smooth_patch", "smooth_command"),
     *("smooth_order_of_runs", "smooth_wheel_rate", "smooth_common_rate", "smooth_wheel_angle", "smooth_acceleration"),
-    *(
-        "smooth_heading_wave",
-        "smooth_place_wave",
-        "smooth_edge",
-        "smooth_joint",
-        "smooth_time_wave",
-        "smooth_session_wave",
-    ),
+    *("smooth_heading_wave", "smooth_place_wave", "smooth_time_wave", "smooth_session_wave"),
+    *("smooth_edge", "smooth_joint"),
 )
 REFERENCE = ("smooth_map", "smooth_map_patch", "smooth_stamps", "smooth_stamp_wave")
 seeds = st.integers(0, 2**32 - 1)
@@ -44,10 +38,7 @@ def signals(**changes: Array) -> Signals:
 
 def added(name: str, given_signals: Signals, **values: float) -> Array:
     """The correction of a sample; all that is not said is 0, or as usual if it shapes the function."""
-    effect = effects.create(name)
-    assert isinstance(effect, MotionEffect)
-    usual = {each.name: each.choices[0] if each.choices else 0.0 for each in effect.parameters(APR_02, SESSIONS)}
-    return effect.correction(given_signals, usual | values)[0]
+    return effects.create(name).correction(given_signals, usual(name) | values)[0]
 
 
 def driving(vx: float, vy: float, omega: float) -> Array:
@@ -58,17 +49,9 @@ def at(x: float, y: float, heading: float = 0.0) -> Array:
     return np.array([[x, y, heading]])
 
 
-@pytest.mark.parametrize("name", [*MOTION, *REFERENCE])
-def test_a_smooth_term_is_no_name(name: str) -> None:
-    assert not effects.create(name).in_catalogue
-
-
 def test_all_that_is_no_name_is_tested_here() -> None:
-    nameless = {
-        entry.name
-        for entry in effects.entries()
-        if not (entry.cls.in_catalogue or entry.cls.weighted)  # learned effects are tested elsewhere
-    }
+    """Learned effects, whose terms have weights, are tested elsewhere."""
+    nameless = {entry.name for entry in effects.entries() if not (entry.cls.in_catalogue or entry.cls.weighted)}
     assert nameless == {*MOTION, *REFERENCE}
 
 
@@ -88,7 +71,6 @@ def test_a_stream_equals_a_batch_with_every_smooth_term(
 def test_poses_are_those_of_the_uncorrected_path_in_the_middle_of_the_samples(seed: int, samples: int) -> None:
     log, pose = a_drive(seed, samples), np.zeros(3)
     found = signals_of(log, APR_02, APR_02.inverse_kinematic_matrix, PERIOD, {"poses"})
-    assert found.poses is not None
     pose = log.start
     for twist, duration, expected in zip(found.twists, found.durations, found.poses, strict=True):
         after = advance(pose, twist * duration, "arc")
@@ -157,23 +139,24 @@ def test_a_share_changes_the_motion_along_across_and_in_turning(mode: str, expec
     np.testing.assert_allclose(found, expected, atol=1e-15)
 
 
-def test_cosines_of_the_elapsed_time_end_with_the_longest_run_and_are_held() -> None:
-    def after(elapsed: float) -> float:
-        one = signals(elapsed=np.array([elapsed]), twists=driving(1.0, 0.0, 0.0))
-        return float(added("smooth_elapsed_time", one, along_3=0.1, duration=2.0)[0])
-
-    assert after(0.5) == pytest.approx(0.1 * math.cos(3 * math.pi / 4))
-    assert after(2.0) == pytest.approx(-0.1)
-    assert after(1000.0) == after(2.0)
-
-
-def test_polynomials_of_the_sessions_time_are_held_after_the_longest_session() -> None:
+@pytest.mark.parametrize(
+    ("name", "column", "number", "duration", "within", "expected"),
+    [
+        ("smooth_elapsed_time", "elapsed", {"along_3": 0.1}, 2.0, 0.5, 0.1 * math.cos(3 * math.pi / 4)),
+        ("smooth_elapsed_time", "elapsed", {"along_3": 0.1}, 2.0, 2.0, -0.1),
+        ("smooth_order_of_runs", "session_time", {"rotation_2": 0.1}, 100.0, 75.0, 0.1 * (2 * 0.5**2 - 1)),
+        ("smooth_order_of_runs", "session_time", {"rotation_2": 0.1}, 100.0, 100.0, 0.1),
+    ],
+)
+def test_functions_of_the_time_end_with_the_longest_run_or_session_and_are_held(
+    name: str, column: str, number: dict[str, float], duration: float, within: float, expected: float
+) -> None:
     def after(time: float) -> float:
-        one = signals(session_time=np.array([time]), twists=driving(0.0, 0.0, 1.0))
-        return float(added("smooth_order_of_runs", one, rotation_2=0.1, duration=100.0)[2])
+        one = signals(**{column: np.array([time])}, twists=driving(1.0, 0.0, 1.0))
+        return float(added(name, one, **number, duration=duration)[0 if "along_3" in number else 2])
 
-    assert after(75.0) == pytest.approx(0.1 * (2 * 0.5**2 - 1))
-    assert after(1e6) == after(100.0) == pytest.approx(0.1)
+    assert after(within) == pytest.approx(expected)
+    assert after(1e6) == after(duration)
 
 
 def test_polynomials_of_the_place_are_held_beyond_the_places_that_were_seen() -> None:
@@ -240,29 +223,34 @@ def test_changes_by_acceleration_end_with_the_largest_that_was_seen() -> None:
     np.testing.assert_allclose(added("smooth_acceleration", one, rotation=0.1, **seen), [0.0, 0.0, 1.0])
 
 
-def test_a_bent_map_agrees_at_the_start_and_is_held_beyond_the_places_that_were_seen() -> None:
-    effect = effects.create("smooth_map")
-    assert isinstance(effect, ReferenceEffect)
-    values = usual("smooth_map") | {"y_xx": 0.01, "centre_x": 0.0, "centre_y": 0.0, "reach": 2.0}
-    poses = np.array([[1.0, 0.0, 0.3], [2.0, 0.0, 0.4], [9.0, 0.0, 0.5]])
-    shift = effect.reported(poses, poses[0], values) - poses
-    np.testing.assert_allclose(shift, [[0, 0, 0], [0, 0.0075, 0], [0, 0.0075, 0]], atol=1e-15)
-
-
-def test_a_shifted_patch_of_the_map_fades_to_zero() -> None:
-    effect = effects.create("smooth_map_patch")
-    assert isinstance(effect, ReferenceEffect)
-    values = usual("smooth_map_patch") | {"x_bump": 0.01, "centre_x": 1.0, "centre_y": 0.0, "radius": 0.5}
-    poses = np.array([[9.0, 0.0, 0.0], [1.0, 0.0, 0.1], [1.5, 0.0, 0.2]])
-    shift = effect.reported(poses, poses[0], values) - poses
-    np.testing.assert_allclose(shift, [[0, 0, 0], [0.01, 0, 0], [0.01 / math.e, 0, 0]], atol=1e-15)
+@pytest.mark.parametrize(
+    ("name", "values", "poses", "expected"),
+    [
+        (
+            "smooth_map",
+            {"y_xx": 0.01, "centre_x": 0.0, "centre_y": 0.0, "reach": 2.0},
+            [[1.0, 0.0, 0.3], [2.0, 0.0, 0.4], [9.0, 0.0, 0.5]],
+            [[0, 0, 0], [0, 0.0075, 0], [0, 0.0075, 0]],
+        ),
+        (
+            "smooth_map_patch",
+            {"x_bump": 0.01, "centre_x": 1.0, "centre_y": 0.0, "radius": 0.5},
+            [[9.0, 0.0, 0.0], [1.0, 0.0, 0.1], [1.5, 0.0, 0.2]],
+            [[0, 0, 0], [0.01, 0, 0], [0.01 / math.e, 0, 0]],
+        ),
+    ],
+)
+def test_a_bent_map_agrees_at_the_start_is_held_beyond_what_was_seen_and_a_patch_fades(
+    name: str, values: dict[str, float], poses: list[list[float]], expected: list[list[float]]
+) -> None:
+    places = np.array(poses)
+    shift = effects.create(name).reported(places, places[0], usual(name) | values) - places
+    np.testing.assert_allclose(shift, expected, atol=1e-15)
 
 
 def test_delays_alternate_grow_and_swing_with_the_stamps() -> None:
     stamps = np.array([0.25, 0.5, 8.0])
     stamped, wave = effects.create("smooth_stamps"), effects.create("smooth_stamp_wave")
-    assert isinstance(stamped, ReferenceEffect)
-    assert isinstance(wave, ReferenceEffect)
     values = usual("smooth_stamps") | {
         "position_late": 0.1,
         "heading_alternating": 0.05,

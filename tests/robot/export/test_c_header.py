@@ -6,10 +6,11 @@ import math
 import shutil
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from export_samples import CAR, DIFF, SWERVE, TRICYCLE, calibration, disturbed, mounted
+from export_samples import CAR, DIFF, ORIGIN, SWERVE, TRICYCLE, calibration, disturbed, mounted
 from sample_robots import APR_02
 
 from omnibench.robot.calibration import Provenance, matrix_rows
@@ -46,7 +47,6 @@ int main(void)
 
 def run_header(export: Export, folder: Path, stem: str, samples: Array, wheels: int) -> Array:
     """Poses (F, 3) that a program with the header computes from rows of rates, steering angles and duration."""
-    assert COMPILER is not None
     steers = samples.shape[1] > wheels + 1
     text = PROGRAM.format(
         header=export.file_name,
@@ -86,62 +86,48 @@ def test_the_compiled_step_equals_the_stream(tmp_path: Path, integration: Integr
     np.testing.assert_allclose(poses, expected, rtol=0, atol=1e-12)
 
 
+STEERING = [
+    {"name": "steering_gain", "parameters": {"g": 4.8}},
+    {"name": "steering_offset", "parameters": {"c": 0.02}},
+]
+
+
 @needs_compiler
-@pytest.mark.parametrize("robot", [TRICYCLE, CAR, SWERVE], ids=lambda robot: robot.name)
+@pytest.mark.parametrize(
+    ("robot", "effects"), [(TRICYCLE, []), (CAR, []), (SWERVE, []), (CAR, STEERING)], ids=lambda value: str(value)[:16]
+)
 @pytest.mark.parametrize("integration", ["euler", "arc"])
-def test_steered_wheels_drive_as_in_the_stream(tmp_path: Path, robot: Robot, integration: Integration) -> None:
-    matrix, drive = disturbed(robot), robot.drive
-    rng = np.random.default_rng(2)
+def test_steered_wheels_drive_as_in_the_stream(
+    tmp_path: Path, robot: Robot, effects: list[dict[str, Any]], integration: Integration
+) -> None:
+    """A fitted gain and zero of the steering are in the header, too."""
+    document = calibration(robot, disturbed(robot), integration=integration, effects=effects)
+    rng, drive = np.random.default_rng(2), robot.drive
     rates = rng.normal(0, 4, (300, len(drive.wheels)))
-    steering = np.cumsum(rng.normal(0, 0.02, (300, len(drive.steered))), axis=0)
+    steering = np.cumsum(rng.normal(0, 0.02 / (1 + 5 * bool(effects)), (300, len(drive.steered))), axis=0)
     durations = rng.uniform(0.005, 0.05, 300)
-    export = export_calibration(calibration(robot, matrix, integration=integration), "c_header")
-    samples = np.column_stack([rates, steering, durations])
-    poses = run_header(export, tmp_path, robot.name, samples, len(drive.wheels))
-    stream = OdometryStream(matrix, integration, START, drive)
-    expected = [stream.drive(a * d, d, steering=s) for a, s, d in zip(rates, steering, durations, strict=True)]
-    np.testing.assert_allclose(poses, expected, rtol=0, atol=1e-12)
-    assert all(f"/* {name} */" in export.text for name in drive.names)
-
-
-@needs_compiler
-def test_a_fitted_gain_and_zero_of_the_steering_are_in_the_header(tmp_path: Path) -> None:
-    effects = [
-        {"name": "steering_gain", "parameters": {"g": 4.8}},
-        {"name": "steering_offset", "parameters": {"c": 0.02}},
-    ]
-    document = calibration(CAR, disturbed(CAR), effects=effects)
     export = export_calibration(document, "c_header")
-    rng = np.random.default_rng(2)
-    rates, steering = rng.normal(0, 4, (50, len(CAR.drive.wheels))), 0.01 * rng.normal(0, 1, (50, 2))
-    durations = np.full(50, 0.02)
-    poses = run_header(export, tmp_path, CAR.name, np.column_stack([rates, steering, durations]), 2)
+    poses = run_header(export, tmp_path, robot.name, np.column_stack([rates, steering, durations]), len(drive.wheels))
     stream = document.model.stream(START)
     expected = [stream.drive(a * d, d, steering=s) for a, s, d in zip(rates, steering, durations, strict=True)]
     np.testing.assert_allclose(poses, expected, rtol=0, atol=1e-12)
-    assert "left out" not in export.text
-    assert not any("left out" in warning for warning in export.warnings)
+    assert all(f"/* {name} */" in export.text for name in drive.names)
+    assert "left out" not in " ".join((export.text, *export.warnings))
 
 
-def test_signs_are_told_as_they_are() -> None:
-    assert (
-        "A positive rate drives the robot counter-clockwise" in export_calibration(calibration(APR_02), "c_header").text
-    )
-    assert "in the wheel's\n * direction of rolling" in export_calibration(calibration(DIFF), "c_header").text
+def test_signs_provenance_wheels_and_period_are_told() -> None:
+    origin = Provenance(**ORIGIN | {"dataset_hash": "f00", "training_cost": 0.0215}, simulated=True)
+    export = export_calibration(calibration(APR_02, provenance=origin), "c_header")
+    parts = ("flower (simulated)", "f00", "genetic", "seed 1", "training cost 0.0215", "converged", "counter-clockwise")
+    for part in (*parts, '#define APR_02_WHEEL_NAMES { "a", "b", "c" }', "#define APR_02_SAMPLE_PERIOD 0.02 /* s */"):
+        assert part in export.text
+    assert "direction of rolling" in export_calibration(calibration(DIFF), "c_header").text
 
 
 @needs_compiler
 def test_any_number_of_wheels_and_any_name_compiles(tmp_path: Path) -> None:
     mecanum = Robot(name="m", wheels=tuple(map(by_lever_arm, range(4))))
-    origin = Provenance(
-        dataset="a */ b",
-        dataset_hash="f00",
-        calibrator="crs",
-        seed=1,
-        cost="final_pose",
-        box="row",
-        outcome="budget",
-    )
+    origin = Provenance(**ORIGIN | {"dataset": "a */ b"})
     document = calibration(mecanum, name="4-wheeler: *Größe* */ #1", sample_period=1.0, provenance=origin)
     export = export_calibration(document, "c_header")
     assert export.file_name == "robot_4_wheeler_gr_e_1_odometry.h"
@@ -158,30 +144,13 @@ def test_the_matrix_reads_back_to_the_bit() -> None:
     assert read == matrix.tolist()
 
 
-def test_provenance_wheels_and_period_are_told() -> None:
-    origin = Provenance(
-        dataset="flower",
-        dataset_hash="f00",
-        simulated=True,
-        calibrator="closed_form",
-        seed=7,
-        cost="final_pose",
-        box="row",
-        training_cost=0.0215,
-        outcome="converged",
-    )
-    text = export_calibration(calibration(APR_02, provenance=origin), "c_header").text
-    for part in ("flower (simulated)", "f00", "closed_form", "seed 7", "training cost 0.0215", "converged"):
-        assert part in text
-    assert '#define APR_02_WHEEL_NAMES { "a", "b", "c" }' in text
-    assert "#define APR_02_SAMPLE_PERIOD 0.02 /* s */" in text
-
-
-def test_effects_are_warned_of() -> None:
-    document = calibration(APR_02, effects=[{"name": "slip", "parameters": {"k": 0.1}}])
-    export = export_calibration(document, "c_header")
+def test_what_a_header_cannot_hold_is_warned_of() -> None:
+    export = export_calibration(calibration(APR_02, effects=[{"name": "slip", "parameters": {"k": 0.1}}]), "c_header")
     assert "slip" in export.warnings[0]
     assert "left out: effects slip (k 0.1)" in export.text
+    tracked = export_calibration(calibration(mounted(DIFF)), "c_header")
+    assert all("tracked point" in text for text in (tracked.text, tracked.warnings[0]))
+    assert export_calibration(calibration(APR_02), "c_header").warnings == ()
 
 
 def test_without_its_effects_the_matrix_is_the_one_that_was_fitted_without_them() -> None:
@@ -192,13 +161,3 @@ def test_without_its_effects_the_matrix_is_the_one_that_was_fitted_without_them(
     table = of_plain.text[of_plain.text.index("_matrix[3]") : of_plain.text.index("};")]
     assert table in export.text
     assert "the matrix was fitted without them" in export.warnings[0]
-
-
-def test_a_tracked_point_off_the_centre_is_warned_of() -> None:
-    export = export_calibration(calibration(mounted(DIFF)), "c_header")
-    assert "that of the tracked point" in export.warnings[0]
-    assert "that of the tracked point" in export.text
-
-
-def test_a_bare_matrix_has_no_warnings() -> None:
-    assert export_calibration(calibration(APR_02), "c_header").warnings == ()

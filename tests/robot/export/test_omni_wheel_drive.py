@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
+from export_samples import calibration as calibration_of
+from export_samples import parameters as parameters_of
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 from omnibench.errors import ConfigError
-from omnibench.robot.calibration import Calibration, Noise, matrix_rows
+from omnibench.robot.calibration import Calibration, Noise
 from omnibench.robot.export.formats import EXPORT_FORMATS, Export, export_calibration
 from omnibench.robot.export.ros2_controllers import OmniWheelDrive, closest_omni_wheel_drive, remaining_error
 from omnibench.robot.kinematics import Array, Robot, Wheel, published_matrix
@@ -36,15 +37,11 @@ APR_02 = robot(60, 180, 300)
 
 
 def calibration(of: Robot = APR_02, matrix: Array | None = None, **fields: Any) -> Calibration:
-    chosen = of.inverse_kinematic_matrix if matrix is None else matrix
-    defaults: dict[str, Any] = {"name": "apr02", "sample_period": 0.01, "integration": "arc"}
-    return Calibration(robot=of, matrix=matrix_rows(chosen), **(defaults | fields))
+    return calibration_of(of, matrix, **({"name": "apr02"} | fields))
 
 
 def parameters(export: Export) -> dict[str, Any]:
-    content: dict[str, Any] = yaml.safe_load(export.text)
-    found: dict[str, Any] = content["omni_wheel_drive_controller"]["ros__parameters"]
-    return found
+    return parameters_of(export, "omni_wheel_drive_controller")
 
 
 def controller_twist(values: dict[str, Any], velocities: Array) -> Array:
@@ -162,8 +159,7 @@ class TestRos2Controllers:
 
 def test_an_unknown_format_is_refused_with_the_nearest_and_all() -> None:
     known = "c_header, robot_localization, ros2_controllers"
-    message = rf"unknown export format 'c_heder'; did you mean 'c_header'\? known: {known}"
-    with pytest.raises(ConfigError, match=message):
+    with pytest.raises(ConfigError, match=rf"'c_heder'; did you mean 'c_header'\? known: {known}"):
         export_calibration(calibration(), "c_heder")
 
 

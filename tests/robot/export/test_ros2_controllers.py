@@ -17,6 +17,7 @@ from export_samples import (
     MECANUM,
     MOUNT,
     ODD_DIFF,
+    ORIGIN,
     SKID,
     SWERVE,
     TRICYCLE,
@@ -263,8 +264,7 @@ def test_a_base_frame_at_the_stated_place_leaves_no_lever_arm() -> None:
     shifted = Mount(x=0.03, y=-0.04).twist @ held_matrix("diff")  # nobody said that the tracked point is there
     export = export_calibration(calibration(DIFF, shifted), "ros2_controllers")
     assert "0.00 deg a metre, 0.0 deg and 314.2 mm a full turn" in export.warnings[1]
-    place = "x -0.0300 m, y 0.0400 m of the robot's centre would leave none"
-    assert any(warning.endswith(f"a base_frame_id at {place}") for warning in export.warnings)
+    assert any("base_frame_id at x -0.0300 m, y 0.0400 m" in warning for warning in export.warnings)
 
 
 def test_a_steering_offset_is_told_with_the_parameters_that_go_with_it() -> None:
@@ -274,7 +274,6 @@ def test_a_steering_offset_is_told_with_the_parameters_that_go_with_it() -> None
     export = export_calibration(calibration(TRICYCLE, matrix), "ros2_controllers")
     note = next(warning for warning in export.warnings if "its zero in the driver" in warning)
     found = re.search(r"with (\S+) deg added .* wheelbase (\S+) and wheel_radius (\S+) would leave 0.0 mm", note)
-    assert found is not None
     degrees, wheelbase, radius = map(float, found.groups())
     rates, angles = TRICYCLE.drive.commands(signals)
     values = {"traction_joint_name": "t", "steering_joint_name": "s", "wheelbase": wheelbase, "wheel_radius": radius}
@@ -301,18 +300,14 @@ def test_what_a_robot_needs_beside_its_parameters_is_said() -> None:
     assert "covariance_diagonal" not in unknown.text
 
 
-def test_mecanum_wheels_whose_rollers_form_an_o_are_told_to_be_elsewhere() -> None:
+def test_rollers_that_form_an_o_and_wheels_that_the_controller_does_not_read_are_told() -> None:
     turned = [w.model_copy(update={"roller_angle": -w.roller_angle}) for w in MECANUM.wheels]
     export = export_calibration(calibration(Robot(name="o", wheels=tuple(turned))), "ros2_controllers")
     places = "front_left is fr, rear_left is rr, rear_right is rl, front_right is fl"
-    assert f"the rollers form an O seen from above, so that {places}" in export.warnings
-
-
-def test_wheels_that_the_controller_does_not_read_are_named() -> None:
-    odometer = fixed("odometer", 0, 0.0)
-    robot = Robot(name="r", wheels=(*DIFF.wheels, odometer.model_copy(update={"type": "omni", "angle": 0.0})))
-    warnings = export_calibration(calibration(robot), "ros2_controllers").warnings
-    assert "the controller does not read odometer" in warnings
+    assert places in " ".join(export.warnings)
+    odometer = fixed("odometer", 0, 0.0).model_copy(update={"type": "omni", "angle": 0.0})
+    robot = Robot(name="r", wheels=(*DIFF.wheels, odometer))
+    assert "odometer" in " ".join(export_calibration(calibration(robot), "ros2_controllers").warnings)
 
 
 TWO_LEFT = Robot(name="r", wheels=(*DIFF.wheels, fixed("second", 0, 0.1)))
@@ -328,41 +323,31 @@ ONE_REAR = Robot(name="r", wheels=CAR.wheels[1:])
 
 
 @pytest.mark.parametrize(
-    ("robot", "message"),
+    ("robot", "named"),
     [
-        (SWERVE, "no released controller .* drives by the steered wheels m0, m1, m2; c_header does"),
-        (TWO_LEFT, "as many measured wheels on the left as on the right, found 2 and 1; use c_header"),
-        (SIDEWAYS, "wheels that roll along x, and a, b do not; turn the robot's frame"),
-        (ONE_REAR, "no controller holds a car that steers by sl, sr and measures rr there"),
-        (TURNED_ROLLERS, "one mecanum wheel in each corner, with rollers that form an X or an O seen from above"),
+        (SWERVE, "m0, m1, m2"),
+        (TWO_LEFT, "found 2 and 1"),
+        (SIDEWAYS, "a, b"),
+        (ONE_REAR, "sl, sr .*rr"),
+        (TURNED_ROLLERS, "rollers"),
     ],
 )
-def test_a_robot_that_no_controller_holds_is_refused_in_one_line(robot: Robot, message: str) -> None:
-    with pytest.raises(ConfigError, match=f"^ros2_controllers: .*{message}"):
+def test_a_robot_that_no_controller_holds_is_refused(robot: Robot, named: str) -> None:
+    with pytest.raises(ConfigError, match=f"^ros2_controllers: .*{named}"):
         export_calibration(calibration(robot), "ros2_controllers")
 
 
 @pytest.mark.parametrize("name", ["diff", "mecanum", "tricycle", "car"])
 def test_a_matrix_that_drives_the_wrong_way_is_refused(name: str) -> None:
     robot = ROBOTS[name][0]
-    with pytest.raises(ConfigError, match=r"turn.* counter-clockwise; check .*sign"):
+    with pytest.raises(ConfigError, match="counter-clockwise"):
         export_calibration(calibration(robot, -robot.inverse_kinematic_matrix), "ros2_controllers")
 
 
 @pytest.mark.parametrize("form", EXPORT_FORMATS)
-def test_every_export_of_a_simulated_calibration_says_so(form: str) -> None:
-    origin = Provenance(
-        dataset="flower",
-        dataset_hash="0",
-        calibrator="genetic",
-        seed=1,
-        cost="final_pose",
-        box="row",
-        outcome="converged",
-    )
-    said = [
-        export_calibration(calibration(DIFF, provenance=origin.model_copy(update={"simulated": simulated})), form)
-        for simulated in (False, True)
-    ]
-    assert ["simulated" in export.text.splitlines()[0] for export in said] == [False, True]
-    assert ["simulated" in " ".join(export.warnings) for export in said] == [False, True]
+@pytest.mark.parametrize("simulated", [False, True])
+def test_every_export_of_a_simulated_calibration_says_so(form: str, simulated: bool) -> None:
+    origin = Provenance(**ORIGIN, simulated=simulated)
+    export = export_calibration(calibration(DIFF, provenance=origin), form)
+    assert ("simulated" in export.text.splitlines()[0]) == simulated
+    assert ("simulated" in " ".join(export.warnings)) == simulated

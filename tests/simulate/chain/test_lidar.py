@@ -1,4 +1,4 @@
-"""The LIDAR: exact geometry, motion within a scan, noise, and scans that cannot be."""
+"""The LIDAR and its rooms: exact geometry, motion within a scan, noise, plans, and what does not fit."""
 
 from __future__ import annotations
 
@@ -7,17 +7,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from shapely.geometry import LineString, Point
 
-from omnibench.config import validate
+from omnibench.config import parse_yaml, validate
 from omnibench.data.scans import Mount, TrajectoryScans
 from omnibench.data.true_poses import TruePath
-from omnibench.errors import ConfigError, DataError
+from omnibench.errors import ConfigError, DataError, UnknownNameError
 from omnibench.robot.kinematics import Array
-from omnibench.simulate.floor_plan import FloorPlan, RoomPlan, make_plan
+from omnibench.simulate import floor_plan
+from omnibench.simulate.floor_plan import PLANS, FloorPlan, RoomPlan, make_plan
 from omnibench.simulate.lidar import Lidar, LidarMount, measure_scans, scan_stamps
 from omnibench.simulate.ray_casting import cast_rays
 
@@ -169,11 +171,6 @@ def test_ahead_of_a_scanner_that_is_tilted_by_30_degrees_is_the_floor_and_beside
     assert not EXACT.scanner.on_floor(look(square(3), EXACT, standing(0, 0, 0)).ranges).any()
 
 
-def test_a_tilted_scanner_needs_its_height() -> None:
-    with pytest.raises(ConfigError, match="needs its height above the floor"):
-        validate(Mount, {"pitch": 0.1}, "mount")
-
-
 def test_without_distortion_all_rays_start_where_the_robot_is_at_the_stamp() -> None:
     times = np.arange(0, 1000) * 0.001
     track = TruePath(times, circling(0.5, 0.2, 2.0, times))
@@ -227,18 +224,14 @@ def test_what_is_too_near_or_too_far_is_not_seen() -> None:
     assert (lidar.scanner.valid(ranges) == seen).all()
 
 
-def test_rays_are_lost_by_chance() -> None:
-    lidar = Lidar(dropouts=0.02)
-    ranges = look(square(3), lidar, standing(0, 0, 0), np.arange(200) * 0.25).ranges
-    share = np.isposinf(ranges).mean()
-    assert share == pytest.approx(0.02, abs=5 * math.sqrt(0.02 / ranges.size))
-
-
-def test_the_same_seed_gives_the_same_scans() -> None:
-    plan, stamps = make_plan(RoomPlan(plan="furnished_room"), "room"), np.array([0.0, 0.25])
-    first = look(plan, Lidar(), standing(3, 3, 0), stamps, seed=1).ranges
-    assert (first == look(plan, Lidar(), standing(3, 3, 0), stamps, seed=1).ranges).all()
-    assert (first != look(plan, Lidar(), standing(3, 3, 0), stamps, seed=2).ranges).mean() > 0.5
+def test_rays_are_lost_by_chance_and_the_same_seed_gives_the_same_scans() -> None:
+    plan, stamps = square(3), np.arange(200) * 0.25
+    first, again, other = (
+        look(plan, Lidar(dropouts=0.02), standing(0, 0, 0), stamps, seed).ranges for seed in (1, 1, 2)
+    )
+    assert np.isposinf(first).mean() == pytest.approx(0.02, abs=5 * math.sqrt(0.02 / first.size))
+    assert (first == again).all()
+    assert (first != other).mean() > 0.5
 
 
 @given(low=st.floats(0.02, 1), longer=st.floats(0, 1), end=st.floats(0.02, 30), latency=st.floats(0, 0.1), seed=seeds)
@@ -262,14 +255,11 @@ def test_the_time_between_scans_jitters_all_over_its_bounds() -> None:
     assert between.mean() == pytest.approx(0.25, abs=0.005)
 
 
-def test_a_run_too_short_for_a_scan_is_refused() -> None:
-    with pytest.raises(DataError, match="before the LIDAR's first scan is over"):
+def test_a_run_too_short_for_a_scan_and_a_scan_that_sees_nothing_are_refused() -> None:
+    with pytest.raises(DataError, match="first scan"):
         scan_stamps(Lidar(), 0.01, np.random.default_rng(0))
-
-
-def test_a_scan_that_sees_nothing_is_refused_with_time_and_place() -> None:
     track = TruePath(np.array([0.0, 1.0]), np.array([[8.9, 0, 0], [0.0, 0, 0]]))
-    with pytest.raises(DataError, match=r"the LIDAR sees nothing at 0\.75 s, the robot at \(2\.2., 0\.00\) m: no wall"):
+    with pytest.raises(DataError, match=r"0\.75 s, the robot at \(2\.2., 0\.00\) m"):
         look(square(10), Lidar(range_max=5), track, np.array([0.0, 0.25, 0.75]))
 
 
@@ -281,21 +271,201 @@ def test_a_scanner_in_a_wall_is_refused(x: float, told: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("part", "given", "told"),
     [
-        ({"period": [0.3, 0.2]}, "period: expected the shortest and the longest"),
-        ({"period": [0.2, float("inf")]}, "period: expected the shortest and the longest"),
-        ({"period": [1e-9, 0.2], "turn_time": 0}, "from 0.001 s on"),
-        ({"period": [0.01, 0.2]}, "a scan alone takes 0.01875 s"),
-        ({"range_min": 40}, "range_min 40 m is not below range_max 30 m"),
-        ({"rays": 0}, "rays: .*greater than 0"),
-        ({"noise": -1}, "noise: .*greater than or equal to 0"),
-        ({"mount": {"yaw": 3}}, "did you mean 'yaw_deg'"),
-        ({"mount": {"pitch_deg": 80}}, "mount.pitch_deg: .*less than or equal to 60"),
-        ({"latency": float("nan")}, "latency"),
+        (Lidar, {"period": [0.3, 0.2]}, "period"),
+        (Lidar, {"period": [0.2, float("inf")]}, "period"),
+        (Lidar, {"period": [1e-9, 0.2], "turn_time": 0}, "0.001 s"),
+        (Lidar, {"period": [0.01, 0.2]}, "0.01875 s"),
+        (Lidar, {"range_min": 40}, "range_min 40 m"),
+        (Lidar, {"rays": 0}, "rays"),
+        (Lidar, {"noise": -1}, "noise"),
+        (Lidar, {"mount": {"yaw": 3}}, "'yaw_deg'"),
+        (Lidar, {"mount": {"pitch_deg": 80}}, "mount.pitch_deg"),
+        (Lidar, {"latency": float("nan")}, "latency"),
+        (Mount, {"pitch": 0.1}, "height"),
     ],
 )
-def test_a_lidar_that_cannot_be_is_refused_in_one_line(given: dict[str, Any], told: str) -> None:
+def test_a_lidar_that_cannot_be_is_refused_in_one_line(part: Any, given: dict[str, Any], told: str) -> None:
     with pytest.raises(ConfigError, match=told) as error:
-        validate(Lidar, given, "lidar")
+        validate(part, given, "lidar")
     assert "\n" not in str(error.value)
+
+
+WALLS = [[0, 0], [5, 0], [5, 4], [0, 4]]
+CUPBOARD = [[4, 3], [5, 3], [5, 4], [4, 4]]
+
+
+def room(**drawn: Any) -> RoomPlan:
+    return validate(RoomPlan, {"boundary": WALLS, "start": [2, 2, 90], **drawn}, "room")
+
+
+def refused(**drawn: Any) -> str:
+    with pytest.raises(ConfigError) as error:
+        make_plan(room(**drawn), "flower: room")
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+def drive(plan: FloorPlan, *places: tuple[float, float], radius: float = 0.25, steps: int = 2000) -> None:
+    """Along straight lines from place to place, a second each."""
+    times = np.linspace(0, len(places) - 1, steps)
+    corners = np.array(places, dtype=float)
+    positions = np.column_stack([np.interp(times, np.arange(len(places)), column) for column in corners.T])
+    plan.check_path(positions, times, radius, "run train-001")
+
+
+def test_a_drawn_room_has_its_walls_and_start() -> None:
+    plan = make_plan(room(obstacles=[CUPBOARD]), "room")
+    assert plan.start == pytest.approx([2, 2, math.pi / 2])
+    assert plan.free.area == pytest.approx(19)
+    assert plan.segments.shape == (8, 4)
+    assert plan.owners.tolist() == [-1, -1, -1, -1, 0, 0, 0, 0]
+    assert np.hypot(*(plan.segments[:, 2:] - plan.segments[:, :2]).T).sum() == pytest.approx(18 + 4)
+
+
+def test_the_yaml_in_the_documentation_is_a_room() -> None:
+    one, drawn = parse_yaml(floor_plan.__doc__.split("\n\n", 2)[2].replace("    room:", "- room:"), "documentation")
+    assert make_plan(validate(RoomPlan, one["room"], "room"), "room").name == "furnished_room"
+    assert len(make_plan(validate(RoomPlan, drawn["room"], "room"), "room").obstacles) == 2
+
+
+def test_corners_that_are_repeated_make_no_walls_and_obstacles_may_touch_each_other() -> None:
+    plan = make_plan(room(boundary=[[0, 0], [5, 0], [5, 0], [5, 4], [0, 4], [0, 0]]), "room")
+    assert len(plan.segments) == 4
+    plan = make_plan(room(obstacles=[CUPBOARD, [[3, 3], [4, 3], [4, 4], [3, 4]]]), "room")
+    assert plan.free.area == pytest.approx(18)
+
+
+@pytest.mark.parametrize("name", PLANS)
+def test_a_ready_made_plan_leaves_the_robot_room(name: str) -> None:
+    plan = make_plan(RoomPlan(plan=name), "room")
+    free = 0.9 if name == "corridor" else 1.9
+    turns = np.linspace(0, 2 * np.pi, 400)
+    circle = plan.start[:2] + (free - 0.25) * np.column_stack([np.cos(turns), np.sin(turns)])
+    plan.check_path(circle, turns, 0.25, "circle")
+
+
+def test_the_corridor_has_no_end_within_the_range_of_a_30_m_scanner() -> None:
+    plan = make_plan(RoomPlan(plan="corridor"), "room")
+    left, _, right, _ = plan.boundary.bounds
+    assert min(plan.start[0] - left, right - plan.start[0]) > 30 + 5
+
+
+def test_ready_made_plans_have_obstacles_apart_and_take_another_start() -> None:
+    for name in PLANS:
+        plan = make_plan(RoomPlan(plan=name), "room")
+        areas = sum(obstacle.area for obstacle in plan.obstacles)
+        assert plan.free.area == pytest.approx(plan.boundary.area - areas)
+    assert make_plan(RoomPlan(plan="hall", start=(5, 8, 180)), "room").start == pytest.approx([5, 8, math.pi])
+    with pytest.raises(UnknownNameError, match="'furnished_room'"):
+        make_plan(RoomPlan(plan="furnished_rom"), "room")
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({}, "neither"),
+        ({"plan": "hall", "boundary": WALLS}, "both"),
+        ({"plan": "hall", "obstacles": [CUPBOARD]}, "obstacles"),
+        ({"boundary": WALLS}, "start"),
+        ({"boundary": [[0, 0], [5, float("inf")], [5, 4]], "start": [1, 1, 0]}, "boundary.1.1"),
+        ({"boundry": WALLS}, "'boundary'"),
+    ],
+)
+def test_a_room_is_a_ready_made_plan_or_a_drawing(given: dict[str, Any], told: str) -> None:
+    with pytest.raises(ConfigError, match=told):
+        validate(RoomPlan, given, "room")
+
+
+@pytest.mark.parametrize(
+    ("part", "corners", "told"),
+    [
+        ("obstacles[1]", [[1, 1], [2, 2]], "2 of the 3"),
+        ("obstacles[1]", [[1, 1], [1, 1], [1, 1], [1, 1]], "1 of the 3"),
+        ("obstacles[1]", [[1, 1], [2, 2], [3, 3]], "no area"),
+        ("obstacles[1]", [[1, 1], [3, 2], [3, 1], [1, 2]], "(2.00, 1.50) m"),
+        ("obstacles[1]", [[6, 6], [7, 6], [7, 7]], "outside"),
+        ("obstacles[1]", [[4.5, 1], [6, 1], [6, 2]], "outside"),
+        ("obstacles[1]", WALLS, "whole room"),
+        ("obstacles[1]", [[-1, -1], [6, -1], [6, 6], [-1, 6]], "whole room"),
+        ("obstacles[1]", [[1000, 1000], [3000, 1000], [3000, 3000]], "2000 m"),
+        ("boundary", [[0, 0], [5, 0]], "2 of the 3"),
+        ("boundary", [[0, 0], [5, 4], [5, 0], [0, 4]], "(2.50, 2.00) m"),
+        ("boundary", [[0, 0], [5000, 0], [5000, 4000], [0, 4000]], "mm"),
+    ],
+)
+def test_a_degenerate_obstacle_or_boundary_is_named(part: str, corners: list[list[float]], told: str) -> None:
+    message = refused(boundary=corners) if part == "boundary" else refused(obstacles=[CUPBOARD, corners])
+    assert message.startswith(f"flower: room.{part}: ")
+    assert told in message
+
+
+def test_obstacles_that_fill_the_room_together_are_refused() -> None:
+    left, right = [[0, 0], [2.5, 0], [2.5, 4], [0, 4]], [[2.5, 0], [5, 0], [5, 4], [2.5, 4]]
+    assert "obstacles: they cover the whole room" in refused(obstacles=[left, right])
+
+
+@pytest.mark.parametrize(
+    ("start", "told"), [([4.5, 3.5, 0], "in obstacles[0]"), ([5, 7, 0], "outside the boundary"), ([0, 0, 0], "outside")]
+)
+def test_a_start_that_is_not_free_is_refused(start: list[float], told: str) -> None:
+    message = refused(obstacles=[CUPBOARD], start=start)
+    assert message.startswith("flower: room.start: (")
+    assert told in message
+
+
+@given(reach=st.floats(0.3, 1.9), radius=st.floats(0.05, 0.5), turn=st.floats(0, 2 * math.pi))
+def test_a_circle_fits_when_the_robot_keeps_off_the_walls(reach: float, radius: float, turn: float) -> None:
+    turns = turn + np.linspace(0, 2 * np.pi, 1500)
+    plan = make_plan(room(boundary=[[-2, -2], [2, -2], [2, 2], [-2, 2]], start=[0, 0, 0]), "room")
+    circle = reach * np.column_stack([np.cos(turns), np.sin(turns)])
+    if reach + radius <= 2:
+        plan.check_path(circle, turns, radius, "circle")
+    elif reach + radius > 2.01:
+        with pytest.raises(ConfigError, match=r"circle: at .* hits the boundary"):
+            plan.check_path(circle, turns, radius, "circle")
+
+
+def test_a_robot_that_hits_a_wall_is_told_with_run_time_and_place() -> None:
+    with pytest.raises(ConfigError) as error:
+        drive(make_plan(room(), "room"), (2, 2), (4.9, 2))
+    message = str(error.value)
+    assert message.startswith("run train-001: at 0.95 s the robot at (4.7")
+    assert "hits the boundary" in message
+    assert "larger room" in message
+
+
+def test_a_robot_that_hits_an_obstacle_is_told_which() -> None:
+    with pytest.raises(ConfigError, match=r"hits obstacles\[0\]"):
+        drive(make_plan(room(obstacles=[CUPBOARD]), "room"), (2, 2), (4.2, 2.8))
+    with pytest.raises(ConfigError, match=r"hits sofa of the room furnished_room"):
+        drive(make_plan(RoomPlan(plan="furnished_room"), "room"), (3.2, 3), (3.2, 5))
+
+
+def test_a_wall_that_is_touched_for_a_moment_or_lies_between_two_places_is_seen() -> None:
+    with pytest.raises(ConfigError, match="hits the boundary"):
+        drive(make_plan(room(), "room"), (2, 2), (4.761, 2), (2, 2), steps=14000)
+    post = [[2.4, 1.9], [2.5, 1.9], [2.5, 2.1], [2.4, 2.1]]
+    plan = make_plan(room(obstacles=[post], start=[1, 1, 0]), "room")
+    with pytest.raises(ConfigError, match=r"hits obstacles\[0\]"):
+        plan.check_path(np.array([[1.5, 2.0], [3.5, 2.0]]), np.array([0.0, 1.0]), 0.25, "run")
+
+
+@pytest.mark.parametrize(
+    ("place", "told"), [((9, 9), "is outside the boundary"), ((4.5, 3.5), r"is in obstacles\[0\]")]
+)
+def test_a_robot_that_is_far_from_the_free_area_is_told_where(place: tuple[float, float], told: str) -> None:
+    plan = make_plan(room(obstacles=[CUPBOARD]), "room")
+    with pytest.raises(ConfigError, match=told):
+        plan.check_path(np.array([place]), np.zeros(1), 0.1, "run")
+
+
+def test_the_free_area_is_the_boundary_without_the_obstacles() -> None:
+    plan = make_plan(RoomPlan(plan="furnished_room"), "room")
+    places = np.random.default_rng(0).uniform(-1, 9, size=(2000, 2))
+    inside = shapely.contains_xy(plan.boundary, places)
+    for obstacle in plan.obstacles:
+        inside &= ~shapely.intersects_xy(obstacle, places)
+    assert (shapely.contains_xy(plan.free, places) == inside).all()
+    assert [plan.place_of(place) is None for place in places[:200]] == inside[:200].tolist()

@@ -1,9 +1,11 @@
-"""Motors under PID with encoders: against closed forms, at rest, at their limits, and what the encoder makes of it."""
+"""Motors and encoders: against closed forms, at rest, at their limits, and what cannot be asked of them."""
 
 from __future__ import annotations
 
 import math
+import re
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,10 +14,12 @@ from hypothesis import strategies as st
 from sample_robots import APR_02
 from scipy.integrate import solve_ivp
 
+from omnibench.config import validate
+from omnibench.errors import ConfigError
 from omnibench.robot.kinematics import Array, wheel_equations
 from omnibench.simulate.commands import Command
 from omnibench.simulate.motion_commands import CommandLink, MotionProfile, command_motion, target_rates
-from omnibench.simulate.motors import Controller, DrivenRun, Encoder, Motor, drive_session
+from omnibench.simulate.motors import Controller, DrivenRun, Encoder, Motor, check_reach, drive_session
 
 PERIOD, STEP = 0.01, 0.001
 TICK = Encoder().tick
@@ -251,12 +255,14 @@ def test_wheel_angles_are_continuous_in_a_session(seed: int, start: float) -> No
         assert np.array_equal(before.wheel_angles[-1], after.wheel_angles[0])
 
 
-def test_every_run_starts_from_rest_whatever_came_before() -> None:
+def test_every_run_starts_from_rest_whatever_came_before_and_has_its_true_angles_at_every_millisecond() -> None:
     moving, told = np.full((50, 3), 2.0), petals(1)[0]
     _, after = session([moving, told], np.zeros(3))
     (alone,) = session([told], after.wheel_angles[0])
     assert np.array_equal(after.wheel_angles, alone.wheel_angles)
     assert np.array_equal(after.rates, alone.rates)
+    assert alone.wheel_angles.shape == (10 * len(told) + 1, 3)
+    assert alone.rates.shape == alone.angles.shape == alone.voltages.shape == told.shape
 
 
 def test_a_session_is_the_same_to_the_bit_when_driven_again() -> None:
@@ -266,8 +272,50 @@ def test_a_session_is_the_same_to_the_bit_when_driven_again() -> None:
         assert first.rates.tobytes() == second.rates.tobytes()
 
 
-def test_a_run_has_its_true_angles_at_every_millisecond() -> None:
-    told = petals(2)[0]
-    (run,) = session([told], np.zeros(3))
-    assert run.wheel_angles.shape == (10 * len(told) + 1, 3)
-    assert run.rates.shape == run.angles.shape == run.voltages.shape == told.shape
+@given(st.floats(0.05, 4), st.floats(-math.pi, math.pi), st.floats(-5, 5))
+def test_the_speed_that_is_proposed_fits_and_little_more_does_not(
+    speed: float, direction: float, turn_rate: float
+) -> None:
+    command = Command(speed, direction, turn_rate)
+    try:
+        check_reach(APR_02, [command], Motor())
+    except ConfigError as error:
+        (proposal,) = re.findall(r"give it a speed of at most ([\d.]+) m/s", str(error))
+        proposed = float(proposal)
+        check_reach(APR_02, [Command(proposed, direction, turn_rate)], Motor())
+        with pytest.raises(ConfigError):
+            check_reach(APR_02, [Command(proposed * 1.02, direction, turn_rate)], Motor())
+
+
+def test_a_command_faster_than_the_motors_is_refused_with_the_greatest_speed_or_rate() -> None:
+    fits = Command(0.2, 0.0, 0.35)
+    with pytest.raises(ConfigError) as caught:
+        check_reach(APR_02, [fits, Command(2.0, 0.0, 0.35)], Motor())
+    for part in ("command v2_a0_w0.35", "wheel c", "12.16 rad/s", "10.42 rad/s", "1.52 m/s"):
+        assert part in str(caught.value)
+    with pytest.raises(ConfigError, match=r"7.11 rad/s"):
+        check_reach(APR_02, [Command(0.0, 0.0, 8.0)], Motor())
+    check_reach(APR_02, [Command(0.0, 0.0, 7.11)], Motor())
+
+
+@pytest.mark.parametrize(
+    ("part", "settings", "named"),
+    [
+        (Motor, {"coulomb_friction": 2.0}, "coulomb_friction"),
+        (Motor, {"static_friction": 100.0}, "67.5 N m"),
+        (Motor, {"resistence": 1.0}, "'resistance'"),
+        (Motor, {"inductance": 0.0}, "inductance"),
+        (Controller, {"proportional": 0, "integral": 0}, "no wheel"),
+    ],
+)
+def test_a_motor_or_controller_that_cannot_be_is_refused(part: Any, settings: dict[str, float], named: str) -> None:
+    with pytest.raises(ConfigError, match=named):
+        validate(part, settings, "motor")
+
+
+@pytest.mark.parametrize(
+    ("motors", "period", "named"), [(Motor(), 0.0125, r"sample_period 0\.0125 s"), ([Motor()] * 2, 0.01, "2 motors")]
+)
+def test_broken_milliseconds_and_fewer_motors_than_wheels_are_refused(motors: Any, period: float, named: str) -> None:
+    with pytest.raises(ConfigError, match=named):
+        drive_session(motors, Controller(), Encoder(), [], period, np.zeros(3))

@@ -1,13 +1,15 @@
-"""Calibrations of runs that have references in the place of poses: derivatives, truth, intervals, what stays open."""
+"""Calibrations of runs that have references in the place of poses, and windows whose motion is compared."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import reference_coverage as study
 from sample_robots import APR_02
 
 import omnibench.robot.stored_odometry as odometry_of_stored
@@ -19,12 +21,11 @@ from omnibench.fit.calibrate import calibrate
 from omnibench.fit.certify import certify_optimum
 from omnibench.fit.evaluate import evaluate
 from omnibench.fit.inspect import inspect_dataset
+from omnibench.fit.motion_windows import MotionWindows, motions_in_windows
 from omnibench.fit.reference_fit import ReferenceFit
 from omnibench.fit.reference_rows import ReferenceBatch, reference_rows
 from omnibench.robot.odometry import Integration
-from omnibench.robot.stored_odometry import StoredOdometry
 
-STUDY = Path(__file__).parents[2] / "studies"
 TIMES = 0.1 * np.arange(1, 101)
 
 
@@ -65,7 +66,6 @@ def test_references_of_samples_that_stay_in_their_file_are_predicted_alike(
     np.testing.assert_allclose(
         batches[1].jacobian(matrices[1]), batches[0].jacobian(matrices[1]), rtol=1e-12, atol=1e-12
     )
-    assert isinstance(batches[1]._odometry, StoredOdometry)
 
 
 @pytest.mark.parametrize("integration", ["arc", "euler"])
@@ -94,20 +94,14 @@ def test_an_unknown_start_is_where_the_positions_fit_best() -> None:
     np.testing.assert_allclose(exact.poses(design)[0], exact.rows.observed, atol=1e-12)
 
 
-@pytest.fixture
-def study(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.syspath_prepend(str(STUDY))
-    import reference_coverage
-
-    return reference_coverage
-
-
-def a_set(*kinds: Sequence[Reference]) -> Dataset:
-    return make_dataset("tape", APR_02, 0.1, [a_run(seed, given) for seed, given in enumerate(kinds)])
+def reduced(robot: str, seed: int, kinds: str) -> Dataset:
+    """Simulated runs with references of some kinds in the place of their poses."""
+    exact, _ = study.simulated(robot, seed)
+    return study.reduced(exact, kinds, np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize("calibrator", ["trajectory_ml", "closed_form", "least_squares"])
-def test_exact_references_give_the_true_matrix(study, calibrator: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_exact_references_give_the_true_matrix(calibrator: str, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("TAPE", "ANGLE"):
         monkeypatch.setattr(study, name, 1e-7)
     exact, truth = study.simulated("omni", 1, encoder=0.0)
@@ -116,14 +110,17 @@ def test_exact_references_give_the_true_matrix(study, calibrator: str, monkeypat
     np.testing.assert_allclose(run.calibration.matrix_array, truth, atol=1e-6)
 
 
-@pytest.mark.parametrize("kind", ["distance", "turn", "displacement", "position"])
-def test_intervals_hold_the_truth(study, kind: str) -> None:
+@pytest.mark.parametrize(
+    "kind", ["displacement", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("distance", "turn", "position"))]
+)
+def test_intervals_hold_the_truth(kind: str) -> None:
     found = [study.covered(study.Case("diff", kind), seed) for seed in range(6)]
     errors = np.concatenate([each.combinations for each in found])
     assert (np.abs(errors) < 1).mean() > 0.75  # the study of 300 sets is tests/studies/reference_coverage.py
 
 
-def test_turns_that_share_the_offset_of_a_gyro_have_errors_within_their_intervals(study) -> None:
+@pytest.mark.slow
+def test_turns_that_share_the_offset_of_a_gyro_have_errors_within_their_intervals() -> None:
     offset_sigma = 0.01  # rad/s: ten times what the noise leaves of a turn of a second
 
     def of_gyro(run: Trajectory, offset: float, rng: np.random.Generator) -> Trajectory:
@@ -139,46 +136,38 @@ def test_turns_that_share_the_offset_of_a_gyro_have_errors_within_their_interval
         rng = np.random.default_rng(seed)
         runs = [of_gyro(run, offset_sigma * (-1.5) ** (seed % 2), rng) for run in exact.trajectories]
         fit = calibrate(make_dataset("gyro", exact.robot, exact.sample_period, runs))
-        assert fit.uncertainty is not None
         away.append((fit.calibration.matrix_array - truth)[2] / fit.uncertainty.standard_deviations[2])
     assert np.sqrt(np.mean(np.square(away))) < 2
 
 
-def test_only_trajectory_ml_has_intervals_where_positions_do_not_tell_how_runs_start(study) -> None:
-    exact, _ = study.simulated("diff", 6)
-    dataset = study.reduced(exact, "position", np.random.default_rng(6))
+def test_only_trajectory_ml_has_intervals_where_positions_do_not_tell_how_runs_start() -> None:
+    dataset = reduced("diff", 6, "position")
     assert calibrate(dataset).uncertainty is not None
     run = calibrate(dataset, "closed_form")
     assert run.uncertainty is None
     assert any("positions of 8 runs" in warning and "trajectory_ml" in warning for warning in run.warnings)
 
 
-def test_distances_alone_leave_turning_and_the_direction_of_x_open() -> None:
-    dataset = a_set(*[[Reference("distance", 1.0, 0.002)]] * 8)
-    said = " ".join(inspect_dataset(dataset).findings)
-    assert "no reference tells of turning" in said
-    assert "no reference tells which way the robot's x axis points" in said
+@pytest.mark.parametrize(
+    ("kind", "open_", "told"), [("distance", ["turning", "x axis"], "lengths"), ("turn", ["lengths"], "turning")]
+)
+def test_distances_alone_leave_turning_open_and_turns_alone_lengths(kind: str, open_: list[str], told: str) -> None:
+    runs = [a_run(seed, [Reference(kind, 1.0, 0.002)]) for seed in range(8)]
+    said = " ".join(inspect_dataset(make_dataset("tape", APR_02, 0.1, runs)).findings)
+    assert all(each in said for each in ("no reference tells", *open_))
+    assert f"of {told}" not in said
 
 
-def test_turns_alone_leave_lengths_open() -> None:
-    said = " ".join(inspect_dataset(a_set(*[[Reference("turn", 1.0, 0.002)]] * 8)).findings)
-    assert "no reference tells of lengths" in said
-    assert "of turning" not in said
-
-
-def test_what_is_left_open_keeps_the_design_and_has_no_interval(study) -> None:
-    exact, _ = study.simulated("omni", 2)
-    dataset = study.reduced(exact, "distance", np.random.default_rng(2))
+def test_what_is_left_open_keeps_the_design_and_has_no_interval() -> None:
+    dataset = reduced("omni", 2, "distance")
     run = calibrate(dataset)
-    assert run.uncertainty is not None
     assert np.isnan(run.uncertainty.intervals.low[2]).all()
     np.testing.assert_array_equal(run.calibration.matrix_array[2], dataset.robot.inverse_kinematic_matrix[2])
     assert any("no reference tells of turning" in warning for warning in run.warnings)
 
 
-def test_errors_are_told_by_kind_and_in_sigmas(study) -> None:
-    exact, _ = study.simulated("diff", 3)
-    dataset = study.reduced(exact, "distance and turn", np.random.default_rng(3))
+def test_errors_are_told_by_kind_and_in_sigmas() -> None:
+    dataset = reduced("diff", 3, "distance and turn")
     run = calibrate(dataset)
     by_kind = {each.kind: each for each in evaluate(run.calibration, dataset).splits["train"].references}
     assert set(by_kind) == {"distance", "turn"}
@@ -186,28 +175,23 @@ def test_errors_are_told_by_kind_and_in_sigmas(study) -> None:
     assert 0.5 < by_kind["distance"].in_sigmas < 1.6
 
 
-def test_a_mixed_set_uses_poses_and_references(study) -> None:
+def test_a_mixed_set_uses_poses_and_references() -> None:
     exact, truth = study.simulated("diff", 4)
     part = study.reduced(exact, "distance and turn", np.random.default_rng(4))
-    mixed = [
-        (whole if index % 2 else other)
-        for index, (whole, other) in enumerate(zip(exact.trajectories, part.trajectories, strict=True))
-    ]
+    mixed = [*exact.trajectories[::2], *part.trajectories[1::2]]
     dataset = make_dataset("mixed", exact.robot, exact.sample_period, mixed)
     for calibrator in ("trajectory_ml", "closed_form"):
         found = calibrate(dataset, calibrator).calibration.matrix_array
         np.testing.assert_allclose(found, truth, atol=2e-3 * np.abs(truth).max())
 
 
-def test_what_needs_poses_says_so_in_one_line(study) -> None:
-    exact, _ = study.simulated("diff", 5)
-    dataset = study.reduced(exact, "turn", np.random.default_rng(5))
-    calibration = calibrate(dataset).calibration
-    with pytest.raises(ConfigError, match="a lower bound is proven for reference poses alone"):
-        certify_optimum(calibration, dataset)
-    with pytest.raises(DataError, match="has no reference of its position, which the cost final_position needs"):
+def test_what_needs_poses_says_so() -> None:
+    dataset = reduced("diff", 5, "turn")
+    with pytest.raises(ConfigError, match="reference poses"):
+        certify_optimum(calibrate(dataset).calibration, dataset)
+    with pytest.raises(DataError, match="final_position"):
         calibrate(dataset, cost="final_position")
-    with pytest.raises(ConfigError, match="weighs references that are no poses by their own sigma"):
+    with pytest.raises(ConfigError, match="sigma"):
         calibrate(dataset, "trajectory_ml", loss="huber")
 
 
@@ -223,7 +207,6 @@ def test_a_compass_has_its_weight_beside_positions_that_tell_no_heading_of_the_s
         given = References.of(measured, 10.0)
         runs.append(Trajectory(f"spot-{seed}", "train", TIMES, rates, np.zeros(1), np.zeros((1, 3)), references=given))
     fit = ReferenceFit.of(runs, APR_02.inverse_kinematic_matrix, "arc")
-    assert fit is not None
     design = APR_02.inverse_kinematic_matrix
     _, columns = fit.whitened(design, np.eye(design.size))
     information = sum(of_run.T @ of_run for of_run in columns)[-1, -1]  # of the last wheel's share of turning
@@ -231,3 +214,36 @@ def test_a_compass_has_its_weight_beside_positions_that_tell_no_heading_of_the_s
     moments = np.arange(1, 9) + later
     turned = (0.3 / APR_02.inverse_kinematic_matrix[2].sum()) * (moments - moments.mean())
     assert information == pytest.approx(6 * np.square(turned).sum() / 0.05**2, rel=0.02)
+
+
+RADIUS, TURN = 2.0, 0.5  # m, rad/s
+
+
+def on_a_circle(seconds: float, name: str = "run") -> Trajectory:
+    """A run whose only wheel turns as fast as it drives, in m, on a circle to the left."""
+    times, stamps = 0.02 * np.arange(1, round(seconds / 0.02) + 1), np.append(np.arange(0.0, seconds, 0.1), seconds)
+    heading = 0.3 + TURN * stamps
+    poses = np.column_stack([RADIUS * np.sin(heading), -RADIUS * np.cos(heading), heading])
+    return Trajectory(name, "train", times, np.full((len(times), 1), RADIUS * TURN), stamps, poses)
+
+
+def test_motions_by_exact_arcs_are_the_references_own() -> None:
+    windows = MotionWindows.of([on_a_circle(5.0), on_a_circle(3.03, "b")], (2.0, math.inf), 0.25, 1000)
+    twists = windows.drive @ np.array([[1.0, 0.0, 1 / RADIUS]])
+    moved = motions_in_windows(twists, windows.durations, windows.windows)
+    np.testing.assert_allclose(moved, windows.motions, atol=1e-12)
+    angle = TURN * 5.0
+    whole = windows.motions[(windows.lengths == 1) & (windows.windows[:, 0] == 0)]
+    np.testing.assert_allclose(whole, [[RADIUS * math.sin(angle), RADIUS * (1 - math.cos(angle)), angle]], atol=1e-12)
+
+
+def test_windows_are_as_long_as_wanted_and_begin_every_half_of_it() -> None:
+    windows = MotionWindows.of([on_a_circle(5.0)], (2.0,), 0.1, 1000)
+    edges = np.append(0.0, np.cumsum(windows.durations[0]))
+    np.testing.assert_allclose(edges[windows.windows[:, 1]], [0, 1, 2, 3], atol=1e-9)
+    np.testing.assert_allclose(edges[windows.windows[:, 2]], [2, 3, 4, 5], atol=1e-9)
+
+
+@pytest.mark.parametrize(("step", "most", "count"), [(0.1, 1000, 50), (0.5, 1000, 10), (0.1, 10, 10)])
+def test_steps_are_as_long_as_wanted_or_as_few_as_allowed(step: float, most: int, count: int) -> None:
+    assert MotionWindows.of([on_a_circle(5.0)], (math.inf,), step, most).drive.shape == (1, count, 1)
