@@ -232,6 +232,6 @@ def prepare() -> Prepared:
     config = write_config(folder)
     data, truth, calibration = folder / "data", folder / "truth", folder / "calibration.yaml"
     for arguments in (("simulate", config, "-o", data, "--truth", truth), ("calibrate", data, "-o", calibration)):
-        run = omnibench(*arguments)
+        run = run_here(*arguments, cwd=folder)
         assert run.returncode == 0, run.stderr
     return Prepared(config, data, truth, calibration)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,7 +12,7 @@ import numpy as np
 import polars as pl
 import pytest
 import yaml
-from commands import RECORDINGS, ROOT
+from commands import RECORDINGS, ROOT, run_here
 from shared_results import made_once, shared_folder
 from tricycle_samples import TRICYCLE, tricycle_drive
 from typed_pages import shell_commands, terminal
@@ -99,6 +100,19 @@ def typed(page: Path, folder: Path, before: Callable[[str, Path], None] = prepar
             if line not in elsewhere:
                 typing.type(line)
         return typing.folder
+
+
+def typed_here(page: Path, folder: Path, left_out: str = "omnibench compare") -> Path:
+    """Type a page's commands in this process, without those that begin with ``left_out``; the reader's folder then."""
+    for command in (command for line in lines_of(page) for command in line.split(" && ")):
+        program, *arguments = shlex.split(command, comments=True)
+        if program == "cd":
+            folder = folder / arguments[0]
+        elif not command.startswith(left_out):
+            prepare(command, folder)
+            run = run_here(*arguments, cwd=folder)
+            assert run.returncode == 0, f"{command}\n{run.stderr}"
+    return folder
 
 
 def lines_of(page: Path) -> list[str]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import polars as pl
 import pytest
 import yaml
 from commands import (
@@ -41,13 +42,6 @@ def document(printed: Printed) -> Any:
     return json.loads(printed.stdout, parse_constant=no_constant)
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["compare", "--help"], ["plugin", "--help"]])
-def test_help_is_shown_on_standard_output(arguments: list[str], command: Command) -> None:
-    printed = command(*arguments)
-    assert printed.returncode == 0
-    assert printed.stdout.startswith("Usage: omnibench")
-
-
 def test_evaluate_prints_the_documented_document(command: Command, prepared: Prepared) -> None:
     found = document(command("evaluate", prepared.calibration, prepared.data, "--json"))
     assert [*found] == ["dataset", "trajectories", "splits", "held_out", "sessions", "warnings"]
@@ -62,15 +56,11 @@ def test_evaluate_prints_the_documented_document(command: Command, prepared: Pre
     assert found["splits"]["all"]["cost"] == pytest.approx(np.mean(both))
 
 
-def test_evaluate_shows_the_design_values_beside_the_calibration(command: Command, prepared: Prepared) -> None:
+def test_evaluate_shows_the_design_values_and_how_many_runs_were_held_out(command: Command, prepared: Prepared) -> None:
     shown = command("evaluate", prepared.calibration, prepared.data).stdout
     assert shown.count("\ncalibration") == shown.count("\ndesign") == 3
     assert "(simulated data)" in shown
-
-
-def test_evaluate_says_of_every_split_how_many_runs_were_held_out(command: Command, prepared: Prepared) -> None:
-    shown = command("evaluate", prepared.calibration, prepared.data).stdout.splitlines()
-    assert [line for line in shown if ": 6 runs" in line or ": 12 runs" in line] == [
+    assert [line for line in shown.splitlines() if ": 6 runs" in line or ": 12 runs" in line] == [
         *("train: 6 runs, none held out", "validation: 6 runs, all held out", "all: 12 runs, 6 held out")
     ]
 
@@ -86,10 +76,6 @@ def test_calibrate_and_evaluate_end_with_what_held_out_runs_say(command: Command
     calibrated = command("calibrate", prepared.data, "-o", "c.yaml").stdout.splitlines()
     evaluated = command("evaluate", "c.yaml", prepared.data).stdout.splitlines()
     assert calibrated[-2:] == evaluated[-3:-1]
-    assert evaluated[-1].startswith("Whether the sessions differ cannot be said: no session repeats a command")
-    assert calibrated[-2].startswith("held out (6 runs): ")
-    assert calibrated[-2].endswith(", better than the design")
-    assert "; runs: validation-001, validation-002, " in calibrated[-1]
     found = document(command("evaluate", "c.yaml", prepared.data, "--json"))["held_out"]
     assert (found["verdict"], found["unit"], found["units"], len(found["runs"])) == ("better", "run", 6, 6)
     assert calibrated[-2:] == [found["sentence"], found["detail"]]
@@ -102,32 +88,29 @@ def test_what_only_a_live_node_can_run_is_not_said_to_be_exported(
     term = EffectTerm(name="wheel_dead_zone", parameters={"c": -0.001})
     write_calibration(plain.model_copy(update={"effects": (term,), "covariance": None}), tmp_path / "effects.yaml")
     ending = command("evaluate", tmp_path / "effects.yaml", prepared.data).stderr
-    assert ending.endswith(
-        "; next, name it in the config of a live node, which alone has its effects:\n  omnibench guide live\n"
-    )
+    assert ending.endswith(":\n  omnibench guide live\n")
     assert " export " in command("evaluate", prepared.calibration, prepared.data).stderr
 
 
 def test_a_calibration_comes_close_to_the_truth_and_says_where_it_is_from(prepared: Prepared) -> None:
     calibration = read_calibration(prepared.calibration)
     assert np.abs(calibration.matrix_array - published_matrix("palacin2023_eq8")).max() < 0.005
+    assert calibration.noise is not None
+    assert calibration.covariance is not None
+    deviations = np.sqrt(np.diag(calibration.covariance))
+    assert (deviations > 0).all()
+    assert (deviations < 0.05).all()
     assert calibration.provenance is not None
     assert calibration.provenance.dataset_hash == load_dataset(prepared.data).hash
     assert (calibration.provenance.simulated, calibration.provenance.calibrator) == (True, "closed_form")
 
 
-def test_settings_reach_the_calibrator(command: Command, prepared: Prepared) -> None:
-    options = ("--set", "population=20", "--set", "generations=2", "--set", "tolerance=1e-3", "--seed", "5")
+def test_settings_reach_the_calibrator_and_infinity_is_null_in_json(command: Command, prepared: Prepared) -> None:
+    options = ("--set", "population=20", "--set", "generations=2", "--set", "tolerance=.inf", "--seed", "5")
     found = document(command("calibrate", prepared.data, "--json", "--calibrator", "genetic", *options))
     recorded = found["provenance"]["options"]
-    assert (recorded["population"], recorded["generations"], recorded["tolerance"]) == (20, 2, 0.001)
+    assert (recorded["population"], recorded["generations"], recorded["tolerance"]) == (20, 2, None)
     assert found["provenance"]["seed"] == 5
-
-
-def test_infinity_in_an_option_is_null_in_json(command: Command, prepared: Prepared) -> None:
-    arguments = ("--calibrator", "crs", "--set", "tolerance=.inf")
-    found = document(command("calibrate", prepared.data, "--json", *arguments))
-    assert found["provenance"]["options"]["tolerance"] is None
 
 
 @pytest.mark.parametrize("name", ["raises", "says_nan"])
@@ -170,50 +153,33 @@ def test_inspect_prints_one_document(command: Command, prepared: Prepared) -> No
     assert found["undriven"] == found["warnings"] == []
 
 
+@pytest.mark.slow
 def test_a_terminal_without_a_letter_shows_another(prepared: Prepared, tmp_path: Path) -> None:
-    for file in prepared.data.iterdir():
-        shutil.copy(file, tmp_path)
-    header = (tmp_path / "dataset.yaml").read_text()
-    (tmp_path / "dataset.yaml").write_text(header.replace("name: flower", "name: Größe"))
-    run = subprocess.run(
-        [*COMMAND, "inspect", str(tmp_path)],
-        env=ENVIRONMENT | {"PYTHONIOENCODING": "ascii"},
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-        check=False,
-    )
+    data = shutil.copytree(prepared.data, tmp_path / "data")
+    header = (data / "dataset.yaml").read_text()
+    (data / "dataset.yaml").write_text(header.replace("name: flower", "name: Größe"))
+    command = [*COMMAND, "inspect", str(data)]
+    environment = ENVIRONMENT | {"PYTHONIOENCODING": "ascii"}
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=PATIENCE, check=False)
     assert run.returncode == 0
     assert "Traceback" not in run.stderr
     assert run.stdout.startswith("Gr??e: simulated data")
 
 
 def test_inspect_warns_of_units_that_cannot_be_right(command: Command, prepared: Prepared, tmp_path: Path) -> None:
-    assert command("simulate", prepared.config, "-o", tmp_path / "data", "--format", "csv").returncode == 0
-    lines = [line.split(",") for line in (tmp_path / "data" / "poses.csv").read_text().splitlines()]
-    x, y = lines[0].index("x"), lines[0].index("y")
-    for line in lines[1:]:
-        line[x], line[y] = str(1000 * float(line[x])), str(1000 * float(line[y]))
-    (tmp_path / "data" / "poses.csv").write_text("".join(",".join(line) + "\n" for line in lines))
+    file = shutil.copytree(prepared.data, tmp_path / "data") / "poses.parquet"
+    pl.read_parquet(file).with_columns(pl.col("x", "y") * 1000).write_parquet(file)
     printed = command("inspect", tmp_path / "data")
     assert printed.returncode == 0
-    assert "warning: positions look like mm; x and y must be m" in printed.stderr
+    assert "warning: positions look like mm" in printed.stderr
 
 
 def test_list_names_everything_that_a_config_can_name(command: Command) -> None:
     found = document(command("list", "--plugins", CONFIGS.parent / "plugins", "--json"))
     assert {*found} == {"calibrators", "costs", "effects", "importers", "failures"}
     names = {kind: {row["name"] for row in found[kind]} for kind in ("calibrators", "costs", "importers")}
-    assert names["calibrators"] >= {
-        "closed_form",
-        "crs",
-        "genetic",
-        "isres",
-        "parametric",
-        "published",
-        "random_search",
-    }
-    assert names["calibrators"] >= {"theoretical", "cmaes", "differential_evolution", "maddahi"}
+    built_in = {"closed_form", "crs", "genetic", "isres", "parametric", "published", "random_search", "theoretical"}
+    assert names["calibrators"] >= built_in | {"cmaes", "differential_evolution", "maddahi"}
     assert names["costs"] >= {"final_pose", "final_position", "final_heading", "trajectory"}
     assert names["importers"] >= {"optiodom", "table1", "csv", "robotino"}
     origins = {row["name"]: row["from"] for row in found["calibrators"]}
@@ -222,11 +188,15 @@ def test_list_names_everything_that_a_config_can_name(command: Command) -> None:
     assert found["failures"] == []
 
 
+def test_the_schema_of_a_nodes_config_is_printed(command: Command) -> None:
+    assert "robots" in document(command("schema", "live"))["properties"]
+
+
 def test_list_takes_the_plugins_of_the_folder_one_is_in(command: Command, tmp_path: Path) -> None:
     write_plugin(tmp_path / "plugins", "chatty", CHATTY)
     printed = command("list")
     assert "chatty" in printed.stdout
-    assert "plug-ins of ./plugins are loaded; --plugins none loads none\n" in printed.stderr
+    assert "plug-ins of ./plugins" in printed.stderr
 
 
 @pytest.mark.parametrize("by_variable", [False, True])
@@ -259,8 +229,8 @@ def test_export_writes_to_standard_output_or_to_a_file(command: Command, prepare
     assert (tmp_path / "m.h").read_text() == shown.stdout
     assert written.stdout == ""
     warning, ending = written.stderr.splitlines()
-    assert warning == "warning: simulated: no robot drove the runs that this was calibrated on"
-    assert ending.startswith(f"{tmp_path / 'm.h'} is written for c_header; next, ")
+    assert warning.startswith("warning: simulated")
+    assert ending.startswith(f"{tmp_path / 'm.h'} ")
 
 
 def test_export_to_ros2_says_what_its_parameters_cannot_hold(command: Command, prepared: Prepared) -> None:
@@ -278,6 +248,7 @@ def test_simulate_writes_the_truth_to_its_own_folder_only(prepared: Prepared) ->
     assert "palacin" not in (prepared.data / "dataset.yaml").read_text()
 
 
+@pytest.mark.slow
 def test_import_turns_recordings_into_a_data_set(command: Command, tmp_path: Path) -> None:
     source = RECORDINGS / "optiodom" / "omni3"
     if not source.is_dir():
@@ -306,6 +277,7 @@ def test_a_data_set_has_the_name_of_its_folder_unless_another_is_given(command: 
     assert (load_dataset("data/day1").name, load_dataset("day2").name) == ("day1", "lab")
 
 
+@pytest.mark.slow
 def test_a_new_plugin_is_checked_and_compared(command: Command, tmp_path: Path) -> None:
     new = command("plugin", "new", "my_search")
     assert new.stdout.splitlines() == [
@@ -331,20 +303,16 @@ def test_a_plugin_that_breaks_the_contract_fails_its_check_with_exit_code_1(comm
     assert "failed  calibrator outside: bounds are kept" in printed.stdout
 
 
-def test_certify_prints_the_documented_document(command: Command, prepared: Prepared) -> None:
+def test_certify_says_what_is_proven(command: Command, prepared: Prepared) -> None:
     found = document(command("certify", prepared.calibration, prepared.data, "--gap", 0.3, "--json"))
     assert [*found] == ["cost", "lower_bound", "gap", "box", "seconds"]
     assert 0 < found["lower_bound"] <= found["cost"]
     assert found["gap"] == pytest.approx(1 - found["lower_bound"] / found["cost"])
     assert found["box"] == "row"
-
-
-def test_certify_says_in_words_what_is_proven(command: Command, prepared: Prepared) -> None:
     printed = command("certify", prepared.calibration, prepared.data, "--parts", 1)
     assert "(simulated data), training split, cost final_pose" in printed.stdout
-    assert "No matrix in the box 'row' costs less than that" in printed.stdout
+    assert "the box 'row'" in printed.stdout
     assert "1 part of the box examined" in printed.stdout
-    assert "with more (--seconds, --parts) the bound may rise" in printed.stdout
 
 
 def test_design_prints_one_document_and_writes_its_report(command: Command, tmp_path: Path) -> None:
@@ -355,15 +323,7 @@ def test_design_prints_one_document_and_writes_its_report(command: Command, tmp_
     assert (tmp_path / "out" / "report.html").stat().st_size > 10_000
 
 
-def test_a_calibration_comes_with_its_noise_and_covariance(prepared: Prepared) -> None:
-    calibration = read_calibration(prepared.calibration)
-    assert calibration.noise is not None
-    assert calibration.covariance is not None
-    deviations = np.sqrt(np.diag(calibration.covariance))
-    assert (deviations > 0).all()
-    assert (deviations < 0.05).all()
-
-
+@pytest.mark.slow
 def test_a_motion_that_was_hardly_driven_keeps_the_design_unless_it_is_to_be_fitted(
     command: Command, tmp_path: Path
 ) -> None:

@@ -1,26 +1,32 @@
-"""The command ``discover`` and the folder that it writes."""
+"""The command ``discover``, the folder that it writes, and what it shows on a terminal."""
 
 from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
+from collections.abc import Callable
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import polars as pl
 import pytest
-from commands import COMMAND, ENVIRONMENT, Command, assert_refused, omnibench
-from discovery_samples import EXPERIMENT, named, nothing, simulated
+from commands import COMMAND, ENVIRONMENT, Command, Printed, assert_refused, run_here
+from discovery_samples import EXPERIMENT, incomplete, named, nameless, nothing, simulated
+from rich.console import Console
 from timing import PATIENCE
 
+from omnibench.cli.terminal.discovery_summary import print_discovery
 from omnibench.config import parse_yaml
 from omnibench.data.dataset import Dataset
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.discover.output import DiscoverOptions, write_discovery
+from omnibench.discover.result import Discovery
 from omnibench.errors import DataError
 from omnibench.fit.evaluate import evaluate
 from omnibench.robot.calibration import read_calibration
@@ -44,7 +50,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 class Told(NamedTuple):
     """A run of the command and its folder."""
 
-    run: subprocess.CompletedProcess[str]
+    run: Printed
     folder: Path
 
     @property
@@ -60,41 +66,33 @@ def small() -> Dataset:
 
 @pytest.fixture(scope="module")
 def told(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Told:
-    """What the command says of the data, in one real process."""
+    """What the command says of the data."""
     folder = tmp_path_factory.mktemp("told") / "out"
-    return Told(omnibench("discover", data, "--output", folder, "--json"), folder)
+    return Told(run_here("discover", data, "--output", folder, "--json", cwd=folder.parent), folder)
 
 
 def test_json_is_one_document_and_the_same_as_the_file(told: Told) -> None:
     assert told.run.returncode == 0
+    assert "fitting the plain matrix\n" in told.run.stderr
+    assert told.run.stderr.endswith("writing the report\n")
     assert told.run.stdout == (told.folder / "discovery.json").read_text(encoding="utf-8")
     assert list(told.document)[: len(KEYS)] == KEYS
     assert {path.name for path in told.folder.iterdir()} == FILES
 
 
-def test_the_hidden_effect_is_named_and_is_in_the_extended_calibration(told: Told) -> None:
+def test_the_hidden_effect_is_named_and_the_extended_calibration_is_better(told: Told, data: Path) -> None:
     document = told.document
     assert document["verdict"] == "named"
     assert [effect["name"] for effect in document["effects"]] == ["rotation_translation_coupling"]
     assert set(document["held_out"]) == {"repetitions", "session"}
-    extended = read_calibration(document["model"])
+    extended, plain = (read_calibration(document[name]) for name in ("model", "plain_model"))
     assert [term.name for term in extended.effects] == ["rotation_translation_coupling"]
-    assert not read_calibration(document["plain_model"]).effects
+    assert not plain.effects
+    costs = [evaluate(model, load_dataset(data)).splits["validation"].cost for model in (extended, plain)]
+    assert costs[0] < 0.3 * costs[1]
 
 
-def test_the_extended_model_is_better_on_the_held_out_session(told: Told, data: Path) -> None:
-    costs = {
-        name: evaluate(read_calibration(told.document[name]), load_dataset(data)).splits["validation"].cost
-        for name in ("model", "plain_model")
-    }
-    assert costs["model"] < 0.3 * costs["plain_model"]
-
-
-def test_stages_are_told_on_standard_error(told: Told) -> None:
-    assert "fitting the plain matrix\n" in told.run.stderr
-    assert told.run.stderr.endswith("writing the report\n")
-
-
+@pytest.mark.slow
 def test_the_default_folder_has_the_name_of_the_data_and_the_newest_is_linked(command: Command, data: Path) -> None:
     run = command("discover", data, "--without", "rotation_translation_coupling", "--seed", 3)
     assert run.returncode == 0
@@ -113,27 +111,19 @@ def test_the_default_folder_has_the_name_of_the_data_and_the_newest_is_linked(co
     assert f"report: {Path('results/flower')}" in run.stdout
 
 
-def test_an_unknown_effect_gets_the_nearest_name(command: Command, data: Path) -> None:
-    run = command("discover", data, "--without", "centripetal_slipp")
-    assert_refused(run, "--without", "did you mean 'centripetal_slip'?")
-
-
-def test_a_missing_data_set_is_one_line(command: Command) -> None:
-    assert_refused(command("discover", "nowhere"), "nowhere")
-
-
-def test_another_robots_calibration_is_refused(command: Command, told: Told, data: Path) -> None:
+def test_a_mistake_is_refused_before_any_work(command: Command, told: Told, data: Path) -> None:
     plain = (told.folder / "plain.yaml").read_text(encoding="utf-8")
     Path("other.yaml").write_text(plain.replace("{name: ", "{name: w"), encoding="utf-8")
-    assert_refused(command("discover", data, "--model", "other.yaml"), "wheels wa, wb, wc")
-
-
-def test_somebody_elses_folder_is_refused_before_any_work(command: Command, data: Path) -> None:
     Path("mine").mkdir()
     Path("mine/notes.txt").write_text("mine", encoding="utf-8")
-    run = command("discover", data, "--output", "mine")
-    assert_refused(run, "mine", "holds other files", "name a new folder")
-    assert_refused(command("discover", data, "--output", "mine/notes.txt"), "is a file")
+    for arguments, parts in (
+        ((data, "--without", "centripetal_slipp"), ("--without", "'centripetal_slip'")),
+        (("nowhere",), ("nowhere",)),
+        ((data, "--model", "other.yaml"), ("wa, wb, wc",)),
+        ((data, "--output", "mine"), ("mine", "holds other files")),
+        ((data, "--output", "mine/notes.txt"), ("is a file",)),
+    ):
+        assert_refused(command("discover", *arguments), *parts)
 
 
 @pytest.fixture(scope="module")
@@ -162,12 +152,6 @@ def test_a_disk_that_refuses_one_file_leaves_all_as_they_were(written: Path, tmp
     assert {path.name for path in folder.iterdir()} == {*FILES, "experiment-1.yaml", "experiment-2.yaml"}
 
 
-def test_a_folder_that_cannot_be_made_is_one_line(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("", encoding="utf-8")
-    with pytest.raises(DataError, match="cannot be written"):
-        write_discovery(nothing(), OPTIONS, tmp_path / "file" / "out")
-
-
 def test_every_pose_has_a_row_with_its_residuals(written: Path) -> None:
     found = named()
     table = pl.read_parquet(written / "residuals.parquet")
@@ -186,6 +170,7 @@ def test_names_of_data_sets_become_folders_that_can_be(tmp_path: Path, monkeypat
         assert written.parent == Path("results") / folder
 
 
+@pytest.mark.slow
 def test_ctrl_c_leaves_nothing_half_written(data: Path, tmp_path: Path) -> None:
     process = subprocess.Popen(
         [*COMMAND, "discover", str(data)], cwd=tmp_path, env=ENVIRONMENT, text=True,
@@ -201,3 +186,50 @@ def test_ctrl_c_leaves_nothing_half_written(data: Path, tmp_path: Path) -> None:
     assert process.returncode == 130
     assert told.splitlines()[-1] == "interrupted; the same command begins anew"
     assert not (tmp_path / "results").exists()
+
+
+def printed(found: Discovery, width: int = 80) -> str:
+    console = Console(file=StringIO(), width=width, markup=False, emoji=False, highlight=False)
+    print_discovery(console, found, Path("results/flower/now"))
+    assert isinstance(console.file, StringIO)
+    return console.file.getvalue()
+
+
+@pytest.mark.parametrize("make", [named, nothing, nameless, incomplete])
+def test_eighty_columns_are_enough_and_nothing_is_cut(make: Callable[[], Discovery]) -> None:
+    told = printed(make())
+    assert max(len(line.rstrip()) for line in told.splitlines()) <= 80
+    assert "…" not in told
+
+
+def test_verdict_effect_places_gap_and_files_are_told_on_a_screen() -> None:
+    told = printed(named())
+    assert len(told.splitlines()) < 60
+    assert "flower (simulated data): 36 training runs" in told
+    assert "verdict: named" in told
+    assert re.search(r"rotation_translation_coupling \(body\), weight 9[5-9]\.\d %", told)
+    assert "held-out session: 36 runs" in told
+    assert "results/flower/now/report.html" in told
+    assert "results/flower/now/model.yaml" in told
+
+
+@pytest.mark.parametrize(
+    ("make", "parts"),
+    [
+        (lambda: replace(named(), verdict="class", effects=(DOUBTFUL,)), ("load_transfer", "few turns")),
+        (incomplete, ("acceleration_slip", "turning left on the spot at 1 rad/s 12.5 4", "Drive 4 runs, 1.8 minutes")),
+        (incomplete, ("wheel rate (2 × 10⁻¹¹)", "warning: not driven in training: v0.4_a90_w1", "experiment-1.yaml")),
+        (lambda: replace(nothing(), notes=tuple(f"note {n}" for n in range(9))), ("- note 2", "6 more notes")),
+    ],
+    ids=["doubts", "what to drive", "left over", "many notes"],
+)
+def test_what_is_in_doubt_left_over_and_to_be_driven_is_told(
+    make: Callable[[], Discovery], parts: tuple[str, ...]
+) -> None:
+    told = " ".join(printed(make()).split())
+    for part in parts:
+        assert part in told
+    assert "- note 3" not in told
+
+
+DOUBTFUL = replace(named().effects[0], confusable_with=("load_transfer",), in_doubt="few turns")

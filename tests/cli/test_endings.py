@@ -1,72 +1,113 @@
-"""Every command ends with one sentence: what came out, and what to do next."""
+"""Commands on a terminal: help, endings with what came out and what to do next, and no cut word in 60 columns."""
 
 from __future__ import annotations
 
 import re
+import sys
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import pytest
-from commands import Command, Prepared
+import typer
+from commands import Command, Prepared, flower, run_here, write_config
+from shared_results import made_once, shared_folder
 from typed_commands import parse
 
+from omnibench.cli.app import FAMILIES, app
+from omnibench.cli.examples import bundled_folder
 from omnibench.cli.terminal.console import print_ending
 
 _ENDING = re.compile(r"^[^;\n]+(?:; [^;\n]+)*; next, [^\n]+(?::\n  omnibench [^\n]+|\.)\n\Z", re.MULTILINE)
-
-
-def ending(stderr: str) -> str:
-    """The last sentence on standard error, with the command that stands below it."""
-    lines = stderr.splitlines(keepends=True)
-    return "".join(lines[-2:] if lines[-1].startswith("  ") else lines[-1:])
-
-
-QUICK = (
-    ("list",),
+_PATHS = ("report: ", "calibration: ", "plain calibration", "extended calibration")
+_WITHOUT_TABLES = (
     ("schema",),
     ("schema", "live"),
-    ("guide",),
-    ("guide", "data"),
-    ("example",),
     ("example", "small", "-o", "demo"),
     ("keys", "secrets"),
     ("plugin", "new", "mine"),
-)
-
-
-@pytest.mark.parametrize("typed", QUICK, ids=" ".join)
-def test_a_command_that_needs_no_data_ends_with_a_sentence(command: Command, typed: tuple[str, ...]) -> None:
-    printed = command(*typed)
-    assert printed.returncode == 0, printed.stderr
-    assert _ENDING.match(ending(printed.stderr)), printed.stderr
-    assert "; next, " not in printed.stdout
-
-
-WORKING = (
-    ("calibrate", "{data}"),
     ("calibrate", "{data}", "-o", "mine.yaml"),
-    ("evaluate", "{calibration}", "{data}"),
-    ("certify", "{calibration}", "{data}", "--gap", "0.5"),
     ("export", "{calibration}", "--to", "c_header"),
     ("export", "{calibration}", "--to", "c_header", "-o", "odometry.h"),
-    ("design", "{data}"),
-    ("inspect", "{data}"),
     ("check", "{data}"),
     ("simulate", "{config}", "-o", "simulated"),
+)
+_QUICK = (
+    ("list", "--plugins", "none"),
+    ("calibrate", "{data}"),
+    ("evaluate", "{calibration}", "{data}"),
+    ("inspect", "{swerve}"),
+    ("guide",),
+    ("guide", "data"),
+    ("example",),
+)
+_LONG = (
+    ("inspect", "{data}"),
+    ("calibrate", "{swerve}"),
+    ("calibrate", "{data}", "--calibrator", "parametric", "--evaluations", "300"),
+    ("certify", "{calibration}", "{data}", "--gap", "0.5"),
+    ("design", "{data}"),
     ("compare", "{config}", "-o", "compared"),
+    ("discover", "{data}", "-o", "found"),
 )
 
 
-@pytest.mark.parametrize("typed", WORKING, ids=" ".join)
-def test_a_command_on_recordings_ends_with_a_sentence_and_a_command_that_can_be_typed(
-    command: Command, prepared: Prepared, typed: tuple[str, ...]
-) -> None:
-    printed = command(*(word.format_map(prepared._asdict()) for word in typed))
+@made_once
+def swerve() -> Path:
+    """Simulated recordings of a robot whose matrix has eight columns."""
+    folder = shared_folder() / "swerve"
+    run = run_here("simulate", bundled_folder() / "configs/swerve.yaml", "-o", folder, cwd=shared_folder())
+    assert run.returncode == 0, run.stderr
+    return folder
+
+
+def filled_in(typed: tuple[str, ...], prepared: Prepared) -> list[str]:
+    places = {**prepared._asdict(), "swerve": swerve() if "{swerve}" in typed else None}
+    return [word.format_map(places) for word in typed]
+
+
+def assert_ends_with_a_sentence(stderr: str) -> None:
+    """Assert that the last sentence on standard error names a command that can be typed, or none."""
+    lines = stderr.splitlines(keepends=True)
+    ending = "".join(lines[-2:] if lines[-1].startswith("  ") else lines[-1:])
+    assert _ENDING.match(ending), stderr
+    if "\n  " in ending:
+        parse(ending.splitlines()[-1].strip())
+
+
+def words(text: str) -> set[str]:
+    return set(re.findall(r"[A-Za-z]+", text))
+
+
+@pytest.mark.parametrize("typed", _WITHOUT_TABLES, ids=" ".join)
+def test_a_command_ends_with_a_sentence(command: Command, prepared: Prepared, typed: tuple[str, ...]) -> None:
+    printed = command(*filled_in(typed, prepared))
     assert printed.returncode == 0, printed.stderr
-    last = ending(printed.stderr)
-    assert _ENDING.match(last), printed.stderr
+    assert_ends_with_a_sentence(printed.stderr)
     assert "; next, " not in printed.stdout
-    if "\n  " in last:
-        parse(last.splitlines()[-1].strip())
+
+
+@pytest.mark.parametrize(
+    "typed", [*_QUICK, *(pytest.param(typed, marks=pytest.mark.slow) for typed in _LONG)], ids=" ".join
+)
+def test_a_command_with_tables_ends_with_a_sentence_and_cuts_no_word_on_a_narrow_terminal(
+    command: Command, prepared: Prepared, monkeypatch: pytest.MonkeyPatch, typed: tuple[str, ...]
+) -> None:
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    shown = {}
+    for columns in (80, 60, 500):
+        monkeypatch.setenv("COLUMNS", str(columns))
+        printed = command(*filled_in(typed, prepared), *(["--force"] if "-o" in typed else []))
+        assert printed.returncode == 0, printed.stderr
+        assert "; next, " not in printed.stdout
+        shown[columns] = re.sub(r"\x1b\[[^m]*m", "", printed.stdout)
+    if typed[0] != "discover":  # which ends with its verdict
+        assert_ends_with_a_sentence(re.sub(r"\x1b\[[^m]*m", "", printed.stderr))
+    for width in (80, 60):
+        assert not [line for line in shown[width].splitlines() if len(line) > width and not line.startswith(_PATHS)]
+        left_out = words(" ".join(re.findall(r"left out for want of room: .*", shown[width])))
+        left_out |= words("left out for want of room columns show all")
+        assert words(shown[width]) - words(shown[500]) - left_out == set()
 
 
 @pytest.mark.parametrize("typed", [("list",), ("calibrate", "{data}"), ("evaluate", "{calibration}", "{data}")])
@@ -90,3 +131,63 @@ def test_a_calibration_that_was_only_shown_names_the_command_that_writes_it(
 def test_a_path_with_a_space_is_quoted_in_the_command_to_type(capfd: pytest.CaptureFixture[str]) -> None:
     print_ending("it is written", "look at it", "omnibench", "inspect", Path("my data"))
     assert capfd.readouterr().err == "it is written; next, look at it:\n  omnibench inspect 'my data'\n"
+
+
+def commands() -> dict[str, Any]:
+    """Every command by what is typed for it."""
+    group: Any = typer.main.get_command(app)
+    named: dict[str, Any] = dict(group.commands)
+    plugin = named.pop("plugin")
+    return named | {f"plugin {name}": command for name, command in plugin.commands.items()}
+
+
+def test_the_help_lists_every_command_under_a_heading(command: Command) -> None:
+    shown = command("--help").stdout
+    positions = [shown.index(f"\n{heading}:\n") for heading, _ in FAMILIES]
+    assert positions == sorted(positions)
+    assert "\nCommands:" not in shown
+    for name in {name.split()[0] for name in commands()}:
+        assert f"\n  {name} " in shown
+
+
+def test_the_help_of_no_command_is_cut_in_a_terminal_of_eighty_columns(
+    command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    shown = command("--help").stdout
+    assert shown.startswith("Usage: omnibench")
+    assert "..." not in shown.split("Options:")[1]
+    assert max(len(line) for line in shown.splitlines()) <= 80
+    assert command("compare", "--help").stdout.startswith("Usage: omnibench compare")
+
+
+@pytest.mark.parametrize("name", commands())
+def test_every_command_and_each_of_its_options_says_what_it_is(name: str) -> None:
+    described = commands()[name]
+    assert described.help
+    assert [parameter.name for parameter in described.params if not parameter.help and parameter.name != "help"] == []
+
+
+@pytest.mark.parametrize("name", commands())
+def test_an_output_can_be_written_short_or_long(name: str) -> None:
+    spellings = [{*parameter.opts} for parameter in commands()[name].params]
+    for options in spellings:
+        assert ("-o" in options) == ("--output" in options)
+    writes = {"compare", "calibrate", "export", "discover", "import", "fetch", "design", "slam", "simulate", "record"}
+    assert any("-o" in options for options in spellings) == (name in {*writes, "example", "plugin new"})
+
+
+def test_the_version_is_printed_and_nothing_else(command: Command) -> None:
+    printed = command("--version")
+    assert (printed.returncode, printed.stdout, printed.stderr) == (0, f"omnibench {version('omnibench')}\n", "")
+
+
+def test_one_run_is_not_said_to_be_several(command: Command, tmp_path: Path) -> None:
+    motion = {"speeds": [0.2], "directions_deg": [0], "turn_rates": [0.35]}
+    config = write_config(
+        tmp_path, datasets={"flower": {"simulate": flower(commands=motion)}}, calibrators=["theoretical"]
+    )
+    compared = command("compare", config, "-o", tmp_path / "out")
+    assert "\nCost of 1 training run\n" in compared.stdout
+    assert ", 1 evaluation, " in compared.stderr
+    assert command("simulate", config, "-o", tmp_path / "data").stdout.startswith("2 simulated trajectories: ")

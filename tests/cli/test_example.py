@@ -1,16 +1,21 @@
-"""``omnibench example``: configs and plug-ins to begin with, wherever omnibench is installed."""
+"""``omnibench example`` and the sample recording in the package."""
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
+import polars as pl
 import pytest
 import yaml
 from commands import CONFIGS, Command, assert_refused
+from rich.console import Console
 from typed_commands import parse
 
+import omnibench
 from omnibench.cli import examples
-from omnibench.cli.examples import EXAMPLES, Example, find_example, write_example
+from omnibench.cli.examples import EXAMPLES, SAMPLES, Example, find_example, write_example
+from omnibench.cli.terminal.calibration_tables import print_calibration
 from omnibench.compare.config import read_compare_config
 from omnibench.config import read_model
 from omnibench.study.config import StudyConfig
@@ -57,15 +62,14 @@ def test_what_an_example_says_to_type_next_can_be_typed(example: Example, comman
             assert (tmp_path / word).is_file()
 
 
-def test_an_example_says_what_to_type_next(command: Command) -> None:
+def test_an_example_says_what_to_type_next_and_is_as_good_as_written_where_it_is(command: Command) -> None:
     printed = command("example", "apr02", "-o", "demo").stdout.splitlines()
     assert printed[-2:] == ["  cd demo", "  omnibench compare configs/apr02.yaml"]
     assert any(line.startswith("written: demo/plugins (") for line in printed)
-
-
-def test_two_examples_share_a_folder(command: Command) -> None:
-    assert command("example", "apr02", "-o", ".").returncode == 0
-    assert command("example", "live", "-o", ".").stdout.startswith("written: configs/live.yaml\n")
+    assert command("example", "live", "-o", "demo").stdout.startswith("written: demo/configs/live.yaml\n")
+    again = command("example", "apr02", "-o", "demo")
+    assert again.returncode == 0
+    assert again.stdout.startswith("nothing is written")
 
 
 def test_a_file_that_differs_is_not_overwritten(command: Command) -> None:
@@ -76,24 +80,14 @@ def test_a_file_that_differs_is_not_overwritten(command: Command) -> None:
     assert not Path("plugins").exists()
 
 
-def test_an_example_that_is_there_unchanged_is_as_good_as_written(command: Command) -> None:
-    assert command("example", "apr02", "-o", "demo").returncode == 0
-    again = command("example", "apr02", "-o", "demo")
-    assert again.returncode == 0
-    assert again.stdout.startswith("nothing is written: all of it is there already")
-
-
 def test_a_recording_that_is_there_is_not_simulated_again(command: Command) -> None:
     assert command("example", "recording", "-o", "demo").returncode == 0
     assert_refused(command("example", "recording", "-o", "demo"), "is there already", "choose another folder")
 
 
-def test_a_wrong_name_is_answered_with_the_nearest(command: Command) -> None:
-    assert_refused(command("example", "apr2", "-o", "demo"), "unknown example 'apr2'; did you mean 'apr02'?")
-
-
-def test_an_example_without_a_folder_is_refused(command: Command) -> None:
-    assert_refused(command("example", "apr02"), "omnibench example apr02 -o DIR")
+def test_a_wrong_name_and_no_folder_are_refused(command: Command) -> None:
+    assert_refused(command("example", "apr2", "-o", "demo"), "'apr2'", "'apr02'")
+    assert_refused(command("example", "apr02"), "-o DIR")
 
 
 def test_an_installed_package_has_its_own_copies(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -102,3 +96,28 @@ def test_an_installed_package_has_its_own_copies(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(examples, "__file__", str(tmp_path / "examples.py"))
     assert write_example(find_example("small"), tmp_path / "demo") == [tmp_path / "demo" / "configs" / "small.yaml"]
     assert write_example(find_example("small"), tmp_path / "demo") == []
+
+
+ROBOT = SAMPLES / "robot"
+COMMANDS = ("circle_right", "circle_left", "straight", "turn_right", "turn_left", "square_right", "square_left")
+RUNS = [(f"{command}_{repetition}", command) for command in COMMANDS for repetition in (1, 2, 3)]
+
+
+def test_the_sample_is_small_and_brings_its_licence() -> None:
+    files = [file for file in ROBOT.rglob("*") if file.is_file()]
+    assert sum(file.stat().st_size for file in files) <= 300_000
+    assert (ROBOT / "LICENSE").read_text(encoding="utf-8").startswith("MIT License")
+    runs = pl.read_csv(ROBOT / "log" / "runs.csv").rows()
+    assert sorted(runs) == sorted(RUNS)
+    assert {file.stem for file in files if file.suffix == ".csv"} == {"runs", *(run for run, _ in runs)}
+
+
+def test_a_row_that_is_zero_by_design_is_called_so_and_warned_of_nowhere() -> None:
+    options = {"wheel_unit": "ticks/sample", "ticks_per_turn": 2796.8}
+    run = omnibench.calibrate(omnibench.import_dataset("csv", ROBOT / "log", options))
+    console = Console(file=io.StringIO(), width=100)
+    print_calibration(console, run)
+    assert isinstance(console.file, io.StringIO)
+    assert console.file.getvalue().count("by design") == 2
+    assert run.result.held == ("m21", "m22")
+    assert run.untouched == ()

@@ -12,18 +12,20 @@ from omnibench.data.storage import save_dataset
 from omnibench.errors import DataError
 from omnibench.report.figure_files import browser
 
-COMMANDS = (
+QUICK = ("inspect", "{data}", "--report", "out/report.html")
+LONG = (
     ("check", "{data}", "--report", "out/report.html"),
     ("compare", "{config}", "-o", "out"),
     ("design", "{data}", "-o", "out"),
     ("discover", "{data}", "-o", "out"),
-    ("inspect", "{data}", "--report", "out/report.html"),
     ("simulate", "{config}", "-o", "out/data", "--report", "out/report.html"),
     ("slam", "scans", "-o", "out/data", "--report", "out/report.html"),
 )
 
 
-@pytest.mark.parametrize("typed", COMMANDS, ids=lambda typed: typed[0])
+@pytest.mark.parametrize(
+    "typed", [QUICK, *(pytest.param(typed, marks=pytest.mark.slow) for typed in LONG)], ids=lambda typed: typed[0]
+)
 def test_every_figure_of_the_report_is_written_as_svg_and_png(
     command: Command, prepared: Prepared, typed: tuple[str, ...]
 ) -> None:

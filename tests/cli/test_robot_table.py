@@ -1,25 +1,33 @@
-"""``omnibench listen``: the table, plain lines and JSON, from real sessions."""
+"""``omnibench listen`` and ``omnibench record``: what they print and how they end, from real sessions."""
 
 from __future__ import annotations
 
 import json
 import math
+import re
+import signal
+import subprocess
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from io import StringIO
+from pathlib import Path
 from threading import Event, Thread
 from typing import Any
 
 import numpy as np
 import pytest
 from announced_robot import AnnouncedRobot
-from commands import omnibench
+from commands import COMMAND, ENVIRONMENT, omnibench
+from mcap.reader import make_reader
+from mcap_recordings import disk_with_room_for, messages_of, publishers
 from rich.console import Console
-from samples import odometry
-from sessions import Loopback
+from samples import odometry, sample
+from sessions import Loopback, until
 from timing import PATIENCE
 
-from omnibench.cli.terminal.live_tables import describe, listen, plain_line, view
+from omnibench.cli.terminal.live_tables import describe, listen, plain_line, record, view
 from omnibench.errors import ConfigError, DataError
 from omnibench.live.robot_monitor import HealthSummary, OdometryStatus, RobotMonitor, RobotStatus
 from omnibench.live.wire.messages import Odometry
@@ -41,14 +49,15 @@ def listened(loopback: Loopback, robot: str | None, *, terminal: bool = False, w
     return text.getvalue()
 
 
-def test_a_robot_that_is_not_there_is_one_line_with_the_nearest_that_is(
-    loopback: Loopback, apr02: AnnouncedRobot
-) -> None:
-    assert apr02.token
-    with pytest.raises(
-        DataError, match=r"'apr2': nothing was received from it in 0\.5 s; did you mean 'apr02'\? alive: apr02"
-    ):
+def test_a_robot_that_is_not_there_or_has_no_name_is_one_line(loopback: Loopback) -> None:
+    with pytest.raises(DataError, match="no robot is alive"):
+        listened(loopback, "apr02", patience=0.5)
+    robot = AnnouncedRobot(loopback.router, "apr02")
+    assert robot.token
+    with pytest.raises(DataError, match=r"'apr2': .*did you mean 'apr02'\?"):
         listened(loopback, "apr2", patience=0.5)
+    with pytest.raises(ConfigError, match="a robot's name is one word"):
+        listened(loopback, "apr02/odom")
 
 
 def test_control_characters_of_a_robot_do_not_reach_the_terminal(loopback: Loopback, apr02: AnnouncedRobot) -> None:
@@ -56,16 +65,6 @@ def test_control_characters_of_a_robot_do_not_reach_the_terminal(loopback: Loopb
     run = omnibench("listen", "apr02", "--connect", loopback.address, "--seconds", "4")
     assert "apr02: no odometry yet, stale: ?[2Jgone ?back?" in run.stdout
     assert (run.stdout + run.stderr).replace("\n", "").isprintable()
-
-
-def test_when_nobody_is_there_the_line_says_so(loopback: Loopback) -> None:
-    with pytest.raises(DataError, match="no robot is alive; is its node running"):
-        listened(loopback, "apr02", patience=0.5)
-
-
-def test_a_name_that_no_robot_can_have_is_refused(loopback: Loopback) -> None:
-    with pytest.raises(ConfigError, match="a robot's name is one word"):
-        listened(loopback, "apr02/odom")
 
 
 def test_listening_to_all_goes_on_while_nobody_is_there(loopback: Loopback) -> None:
@@ -115,12 +114,6 @@ def test_json_is_one_document_a_line_without_nan(loopback: Loopback, apr02: Anno
     assert document["odom"]["twist"] == [None, 0.0, None]
 
 
-def test_a_terminal_gets_a_table(loopback: Loopback, apr02: AnnouncedRobot) -> None:
-    text = listened(loopback, apr02.name, terminal=True)
-    assert "deg/s" in text
-    assert "no odometry yet" in text
-
-
 def test_listening_ends_at_once_when_told_to(loopback: Loopback) -> None:
     stop = Event()
     listener = Thread(target=listen, args=(None, loopback.client(), KEYS, Console(file=StringIO()), stop))
@@ -163,20 +156,13 @@ def test_the_table_fits_the_terminal_with_every_figure_whole(width: int) -> None
     assert "degraded: late, late 12" in " ".join(text.split())
 
 
-def test_a_silent_robot_has_no_rate_and_says_for_how_long() -> None:
-    status = RobotStatus("apr02", "alive", seen(age=3.21), None, HEALTHY)
-    assert "no message for 3.2 s" in describe(status)
-    assert " 100 " not in "\n".join(shown([status], 80))
-
-
-def test_a_robot_that_has_left_says_so_first() -> None:
+def test_the_description_says_silence_departure_counters_and_undecodable_messages() -> None:
+    silent = RobotStatus("apr02", "alive", seen(age=3.21), None, HEALTHY)
+    assert "no message for 3.2 s" in describe(silent)
+    assert " 100 " not in "\n".join(shown([silent], 80))
     assert describe(RobotStatus("apr02", "left", seen(age=0.1), None, HEALTHY)).startswith("left")
-
-
-def test_health_counters_and_undecodable_messages_stand_in_the_description() -> None:
     degraded = HealthSummary("degraded", "poses are refused", {"late": 3, "pose_rejected": 2})
-    stream = replace(seen(), undecodable=1)
-    assert describe(RobotStatus("apr02", "alive", stream, None, degraded)) == (
+    assert describe(RobotStatus("apr02", "alive", replace(seen(), undecodable=1), None, degraded)) == (
         "degraded: poses are refused, late 3, pose_rejected 2, undecodable odometry 1"
     )
 
@@ -186,3 +172,108 @@ def test_the_plain_line_gives_pose_twist_sigma_rate_and_age_with_units() -> None
         "apr02: ok: calibrated odometry; odom x 1.250 m y -2.500 m heading 40.1 deg (1 sigma 0.025 m 2.29 deg)"
         " vx 0.310 m/s vy -0.120 m/s w 25.8 deg/s, 100.0 Hz, age 4 ms (12 ms by its stamp)"
     )
+
+
+def test_the_command_ends_with_one_line_when_the_disk_is_full(loopback: Loopback, tmp_path: Path) -> None:
+    joints = publishers(loopback)["joint_states"]
+    with pytest.raises(DataError, match="cannot be written"):
+        run_record(loopback, tmp_path / "run.mcap", 10.0, lambda: joints.put(sample("joint_states")), room=300)
+    assert messages_of(tmp_path / "run.mcap") == {}
+
+
+def run_record(
+    loopback: Loopback, path: Path, seconds: float, feed: Callable[[], None], robot: str = "apr02", room: int = 10**9
+) -> str:
+    """What ``record`` prints when it is piped, with ``feed`` called meanwhile and a disk that has so much room."""
+    stop, text, session = Event(), StringIO(), loopback.client()
+
+    def keep_feeding() -> None:
+        while not stop.wait(0.01):
+            feed()
+
+    feeder = Thread(target=keep_feeding)
+    feeder.start()
+    try:
+        with disk_with_room_for(room):
+            console = Console(file=text, width=160)
+            record(session, KEYS, [robot], path, console, Event(), seconds=seconds, patience=0.2)
+    finally:
+        stop.set()
+        feeder.join()
+    return text.getvalue()
+
+
+def test_the_command_says_what_it_recorded(loopback: Loopback, tmp_path: Path) -> None:
+    odom = publishers(loopback)["odom"]
+    said = run_record(loopback, tmp_path / "run.mcap", 0.5, lambda: odom.put(sample("odom")))
+    count = len(messages_of(tmp_path / "run.mcap")["/apr02/odom"])
+    assert re.search(rf"run\.mcap: \d\.\d s, {count} messages, 0\.\d\d MB\n", said)
+    assert f"/apr02/odom: {count}" in said
+
+
+def test_the_command_ends_at_once_when_it_was_told_to_before(loopback: Loopback, tmp_path: Path) -> None:
+    stop = Event()
+    stop.set()
+    recorder = record(loopback.client(), KEYS, ["apr02"], tmp_path / "run.mcap", Console(file=StringIO()), stop)
+    assert recorder.messages == 0
+
+
+def test_the_command_says_when_nothing_comes_from_a_robot_and_who_is_there(loopback: Loopback, tmp_path: Path) -> None:
+    _token = loopback.router.liveliness().declare_token("omnibench/apr02/alive")
+    said = run_record(loopback, tmp_path / "run.mcap", 0.5, lambda: None, "apr20")
+    assert "robot 'apr20': nothing was received from it in" in said
+    assert "did you mean 'apr02'? alive: apr02; recording goes on" in said
+
+
+@contextmanager
+def recording_process(loopback: Loopback, path: Path) -> Iterator[subprocess.Popen[str]]:
+    """Another process that records to ``path``, from which messages come already."""
+    joints = publishers(loopback)["joint_states"]
+    process = subprocess.Popen(
+        [*COMMAND, "record", "apr02", "-o", str(path), "--connect", loopback.address],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=ENVIRONMENT,
+    )
+
+    def some_are_written() -> bool:
+        joints.put(sample("joint_states"))
+        assert process.poll() is None, process.communicate()[1]
+        return path.exists() and path.stat().st_size > 1000
+
+    try:
+        until(some_are_written, "the other process to have written something")
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
+def test_a_recording_that_is_told_to_stop_is_complete(
+    loopback: Loopback, tmp_path: Path, number: signal.Signals
+) -> None:
+    path = tmp_path / "run.mcap"
+    with recording_process(loopback, path) as process:
+        process.send_signal(number)
+        output, errors = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 0, errors
+    assert "Traceback" not in errors
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    assert summary.statistics is not None
+    assert f"{summary.statistics.message_count:,} messages" in output
+
+
+@pytest.mark.slow
+def test_a_killed_recorder_leaves_a_file_that_rosbags_and_mcap_read(loopback: Loopback, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with recording_process(loopback, path) as process:
+        process.kill()
+        process.communicate()
+    recorded = messages_of(path)["/apr02/joint_states"]
+    assert len(recorded) > 10
+    with path.open("rb") as file:
+        assert [message.data for _, _, message in make_reader(file).iter_messages()] == recorded

@@ -17,12 +17,15 @@ import polars as pl
 import pytest
 import yaml
 from commands import COMMAND, ENVIRONMENT, Command, Printed, assert_refused, run_here
+from drives import calibration
 from timing import PATIENCE
 
 from omnibench.data.dataset import make_dataset
 from omnibench.data.scans import ScansInMemory, TrajectoryScans
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.data.true_poses import TruePath, write_true_poses
+from omnibench.registry import effects, load_plugins
+from omnibench.robot.calibration import write_calibration
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.simulate.floor_plan import RoomPlan, make_plan
@@ -106,23 +109,12 @@ def test_the_poses_are_those_of_the_truth_and_the_rest_is_as_it_was(found: Found
         ends = [np.interp(new.pose_times[-1], path["t"], path[name]) for name in ("x", "y", "theta")]
         np.testing.assert_allclose(new.final_pose, ends, rtol=0, atol=0.01)
         assert new.pose_covariances is not None
-
-
-def test_the_table_says_how_sure_the_poses_are_and_how_far_from_the_recorded_reference(
-    found: Found, driven: Driven
-) -> None:
-    scans = load_dataset(driven.data).scans
-    assert scans is not None
-    count = sum(len(scans.times(name)) for name in ("01", "02", "03"))
-    printed = found.run.stdout
-    assert f"driven: simulated data; 3 runs, {count} scans, " in printed
-    assert "deviation stated at the end of a run" in printed
-    assert "distance from the recorded reference (12 poses)" in " ".join(printed.split())
-    assert "3 trajectories: found" in printed
-    assert "truth" not in printed
-    first, *others = found.run.stderr.splitlines()[:-2]  # the last sentence has two lines
-    assert first == "SLAM: 3 runs"
-    assert all(line.startswith("SLAM: ") for line in others)  # a busy machine is told every 10 s how far it is
+    count = sum(len(before.scans.times(run.id)) for run in before.trajectories)
+    assert f"driven: simulated data; 3 runs, {count} scans, " in found.run.stdout
+    assert "distance from the recorded reference (12 poses)" in " ".join(found.run.stdout.split())
+    assert "truth" not in found.run.stdout
+    # A busy machine is told every 10 s how far it is; the last sentence has two lines.
+    assert all(line.startswith("SLAM: ") for line in found.run.stderr.splitlines()[:-2])
 
 
 def test_json_holds_the_same_figures(document: dict[str, Any]) -> None:
@@ -136,6 +128,7 @@ def test_json_holds_the_same_figures(document: dict[str, Any]) -> None:
     assert accuracy["final"]["heading_mean_rad"] < math.radians(0.3)
 
 
+@pytest.mark.slow
 def test_the_search_can_start_from_the_last_pose_and_leave_scans_distorted(
     command: Command, driven: Driven, document: dict[str, Any]
 ) -> None:
@@ -161,77 +154,61 @@ def test_a_calibration_can_give_the_odometry(command: Command, driven: Driven, f
     assert apart.position_p95_m < 0.001
 
 
+@pytest.mark.slow
 def test_an_effect_of_a_plug_in_works_in_the_calibration(command: Command, driven: Driven) -> None:
     assert command("plugin", "new", "swerve", "--effect").returncode == 0
     assert command("calibrate", driven.data, "-o", "calibration.yaml").returncode == 0
-    calibration = yaml.safe_load(Path("calibration.yaml").read_text())
-    calibration["covariance"] = None
-    shown = command("list", "--plugins", "plugins", "--json")
-    (effect,) = [each for each in json.loads(shown.stdout)["effects"] if each["name"] == "swerve"]
-    calibration["effects"] = [{"name": effect["name"], "parameters": _parameters("swerve")}]
-    Path("calibration.yaml").write_text(yaml.safe_dump(calibration))
+    fitted = yaml.safe_load(Path("calibration.yaml").read_text())
+    fitted["covariance"] = None
+    load_plugins(["plugins"], installed=False)
+    parameters = effects.entry("swerve", "test").cls().parameters(ROBOT)
+    fitted["effects"] = [{"name": "swerve", "parameters": {parameter.name: 0.0 for parameter in parameters}}]
+    Path("calibration.yaml").write_text(yaml.safe_dump(fitted))
     run = command("slam", driven.data, "-o", "found", "--model", "calibration.yaml", "--plugins", "plugins")
     assert run.returncode == 0, run.stderr
     assert len(load_dataset("found").trajectories) == 3
 
 
-def _parameters(name: str) -> dict[str, float]:
-    """Small values of a plug-in effect's parameters."""
-    from omnibench.registry import effects, load_plugins
-
-    load_plugins(["plugins"], installed=False)
-    effect = effects.entry(name, "test").cls
-    return {parameter.name: 0.0 for parameter in effect().parameters(ROBOT)}
-
-
-def test_csv_can_be_written(command: Command, driven: Driven, found: Found) -> None:
-    assert command("slam", driven.data, "-o", "csv", "--format", "csv").returncode == 0
-    assert {file.suffix for file in Path("csv").iterdir()} == {".yaml", ".csv"}
-    assert load_dataset("csv").hash == load_dataset(found.data).hash
-
-
-def test_the_truth_gives_errors_bias_and_drift_and_the_report_is_written(command: Command, driven: Driven) -> None:
-    run = command("slam", driven.data, "--report", "slam.html", "--truth", driven.truth)
+def test_with_the_truth_there_are_errors_bias_and_drift_and_csv_and_a_report_are_written(
+    command: Command, driven: Driven, found: Found
+) -> None:
+    run = command(
+        *("slam", driven.data, "-o", "csv", "--format", "csv"), *("--report", "slam.html", "--truth", driven.truth)
+    )
     assert run.returncode == 0, run.stderr
     assert "Errors of the reference poses against the truth" in run.stdout
     assert "last of each run (3 poses)" in run.stdout
     assert re.search(r"Mean error along the robot's axes\n[^─]*forward[^─]*left[^─]*heading", run.stdout)
-    assert "deg a metre" in run.stdout
     assert re.search(r"3 runs, [23]\.\d+ m in all", run.stdout)
-    assert "report: slam.html" in run.stdout
     assert "SIMULATED DATA" in Path("slam.html").read_text(encoding="utf-8")
-    assert [file.name for file in Path().iterdir()] == ["slam.html"]
+    assert {file.suffix for file in Path("csv").iterdir()} == {".yaml", ".csv"}
+    assert load_dataset("csv").hash == load_dataset(found.data).hash
 
 
 @pytest.mark.parametrize(
     ("arguments", "parts"),
     [
-        (["DATA"], ["say where the poses go: -o DATASET"]),
-        (["DATA", "-o", "DATA"], ["is the recording itself; name another folder"]),
+        (["DATA"], ["-o DATASET"]),
+        (["DATA", "-o", "DATA"], ["is the recording itself"]),
         (["nowhere", "-o", "found"], ["nowhere: no such folder"]),
-        (["BARE", "-o", "found"], ["data set driven: it has no scans (scans.parquet), which SLAM needs"]),
-        (["BARE", "-o", "."], ["data set driven: it has no scans (scans.parquet), which SLAM needs"]),
+        (["BARE", "-o", "found"], ["data set driven", "scans.parquet"]),
         (["PART", "-o", "found"], ["trajectory 02 has no scans"]),
-        (["EMPTY", "-o", "found"], ["scans.parquet, row 2: the scan of trajectory 01 at ", " is empty: no range from"]),
-        (["DATA", "-o", "EMPTY/dataset.yaml"], ["is a file; name a folder"]),
-        (["DATA", "-o", "PLUGINS"], ["holds other files; name an empty or new folder"]),
-        (["DATA", "-o", "found", "--start", "lastpose"], ["--start", "'lastpose' is not one of"]),
-        (["DATA", "-o", "found", "--set", "spacng=1"], ["slam --set: unknown key 'spacng'; did you mean 'spacing'"]),
+        (["EMPTY", "-o", "found"], ["scans.parquet, row 2", "trajectory 01"]),
+        (["DATA", "-o", "EMPTY/dataset.yaml"], ["is a file"]),
+        (["DATA", "-o", "PLUGINS"], ["holds other files"]),
+        (["DATA", "-o", "found", "--start", "lastpose"], ["--start", "'lastpose'"]),
+        (["DATA", "-o", "found", "--set", "spacng=1"], ["slam --set", "'spacng'", "'spacing'"]),
         (["DATA", "-o", "found", "--set", "spacing=-1"], ["slam --set: spacing: ", "given: -1"]),
         (["DATA", "-o", "found", "--truth", "nowhere"], ["nowhere: no poses.parquet"]),
-        (["DATA", "-o", "found", "--truth", "OTHER"], ["trajectory 01 is not in it; name the truth of this data set"]),
+        (["DATA", "-o", "found", "--truth", "OTHER"], ["trajectory 01 is not in it"]),
         (["DATA", "-o", "found", "--model", "nowhere"], ["nowhere: no such file"]),
-        (
-            ["DATA", "-o", "found", "--model", "nowhere", "--start", "last_pose"],
-            ["--model nowhere: is for --start odometry"],
-        ),
-        (["DATA", "-o", "found", "--model", "FOUR"], ["is for wheels fl, fr, rl, rr, the data set", "has a, b, c"]),
+        (["DATA", "-o", "found", "--model", "x.yaml", "--start", "last_pose"], ["--model x.yaml", "--start odometry"]),
+        (["DATA", "-o", "found", "--model", "FOUR"], ["fl, fr, rl, rr", "a, b, c"]),
     ],
 )
 def test_a_mistake_is_one_line_and_writes_nothing(
-    command: Command, driven: Driven, tmp_path: Path, arguments: list[str], parts: list[str]
+    command: Command, driven: Driven, places: dict[str, Path], arguments: list[str], parts: list[str]
 ) -> None:
-    places = _places(tmp_path.with_name(f"{tmp_path.name}_places"), driven)
     named = [_placed(argument, places) for argument in arguments]
     before = load_dataset(driven.data).hash
     printed = command("slam", *named)
@@ -247,9 +224,10 @@ def _placed(argument: str, places: dict[str, Path]) -> str:
     return str(places[first] / rest) if first in places else argument
 
 
-def _places(folder: Path, driven: Driven) -> dict[str, Path]:
+@pytest.fixture(scope="module")
+def places(driven: Driven, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Data sets with one thing wrong in each, and other things that are none."""
-    data = load_dataset(driven.data)
+    folder, data = tmp_path_factory.mktemp("places"), load_dataset(driven.data)
     assert data.scans is not None
     places = {name: folder / name.lower() for name in ("BARE", "PART", "EMPTY", "OTHER", "PLUGINS")}
     save_dataset(replace(data, scans=None), places["BARE"])
@@ -264,16 +242,7 @@ def _places(folder: Path, driven: Driven) -> dict[str, Path]:
     write_true_poses(places["OTHER"], {"99": TruePath(np.array([0.0, 1.0]), np.zeros((2, 3)))})
     places["PLUGINS"].mkdir()
     (places["PLUGINS"] / "notes.txt").write_text("mine")
-    four = synthetic_robot(4)
-    calibration = {
-        "format": "omnibench-calibration/1",
-        "name": "four",
-        "robot": four.model_dump(mode="json"),
-        "sample_period": PERIOD,
-        "matrix": four.inverse_kinematic_matrix.tolist(),
-        "integration": "arc",
-    }
-    (folder / "four.yaml").write_text(yaml.safe_dump(calibration))
+    write_calibration(calibration(wheels=4), folder / "four.yaml")
     return places | {"DATA": driven.data, "FOUR": folder / "four.yaml"}
 
 
@@ -292,6 +261,7 @@ def save_runs(driven: Driven, folder: Path, scans: dict[str, TrajectoryScans]) -
     save_dataset(replace(data, trajectories=runs, scans=ScansInMemory(data.scans.scanner, scans)), folder)
 
 
+@pytest.mark.slow
 def test_after_ctrl_c_the_command_goes_on(
     command: Command, driven: Driven, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -314,8 +284,8 @@ def test_after_ctrl_c_the_command_goes_on(
     assert (process.returncode, out) == (130, "")
     files = {file: file.stat().st_mtime_ns for file in (tmp_path / "found.slam-paths").iterdir()}
     assert kept <= len(files) < 16
-    paths = "interrupted; the paths found so far are kept in found.slam-paths: run the command again"
-    assert [line for line in err.splitlines() if not line.startswith("SLAM: ")] == [paths]
+    (line,) = [line for line in err.splitlines() if not line.startswith("SLAM: ")]
+    assert "found.slam-paths" in line
     assert {file.name for file in tmp_path.iterdir()} == {"many", "found.slam-paths"}
     monkeypatch.chdir(tmp_path)
     run = command("slam", "many", "-o", "found")
@@ -334,12 +304,9 @@ def test_an_error_says_where_the_paths_found_before_it_are_kept(
     save_runs(driven, tmp_path / "four", {"1": scans, "2": scans, "3": scans, "4": empty})
     monkeypatch.chdir(tmp_path)
     run = command("slam", "four", "-o", "found")
-    kept = "the paths found so far are kept in found.slam-paths"
     assert (run.returncode, run.stdout) == (2, "")
-    assert run.stderr.splitlines()[-1] == (
-        "error: four/scans.parquet, row 49: the scan of trajectory 4 at 0 s is empty: "
-        f"no range from 0.1 to 30 m; remove the row; {kept}"
-    )
+    for part in ("four/scans.parquet, row 49", "trajectory 4", "found.slam-paths"):
+        assert part in run.stderr.splitlines()[-1]
     assert {file.name for file in tmp_path.iterdir()} == {"four", "found.slam-paths"}
 
 
@@ -373,10 +340,7 @@ def test_inspect_says_what_scans_there_are(command: Command, driven: Driven) -> 
     assert 0.99 < document["seen_share"] < 1
 
 
-def test_inspect_names_runs_without_scans_and_refuses_broken_ones(
-    command: Command, driven: Driven, tmp_path: Path
-) -> None:
-    places = _places(tmp_path.with_name(f"{tmp_path.name}_places"), driven)
+def test_inspect_names_runs_without_scans_and_refuses_broken_ones(command: Command, places: dict[str, Path]) -> None:
     assert json.loads(command("inspect", places["BARE"], "--json").stdout)["scans"] is None
-    assert "2 trajectories have no scans, e.g. 02, 03: SLAM needs them" in command("inspect", places["PART"]).stdout
-    assert_refused(command("inspect", places["EMPTY"]), "row 2: the scan of trajectory 01", "is empty")
+    assert "2 trajectories have no scans, e.g. 02, 03" in command("inspect", places["PART"]).stdout
+    assert_refused(command("inspect", places["EMPTY"]), "row 2: the scan of trajectory 01")

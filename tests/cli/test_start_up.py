@@ -1,12 +1,21 @@
-"""What happens before a command begins its work: quick help, and Ctrl-C while libraries are still being imported."""
+"""What happens before a command begins its work, and equations without a finite solution: one line each."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
+import scipy.linalg
+from scipy.linalg.lapack import dtbtrs
 from timing import PATIENCE
+
+import omnibench
+from omnibench.__main__ import _run
+from omnibench.errors import computable
 
 LOADED = """
 import sys
@@ -54,6 +63,7 @@ main()
 """
 
 
+LOADING = (("calibrate", "data"), ("discover", "data"), ("inspect", "data"), ("live", "node.yaml"))
 PROGRAM = """
 import signal, sys
 sys.argv = [{name!r}, "--version"]
@@ -84,15 +94,50 @@ def test_the_program_takes_ctrl_c_over_before_it_imports_anything_that_takes_tim
     [
         ("typer", ["--help"]),
         ("numpy", ["compare", "config.yaml"]),
-        ("numpy", ["calibrate", "data"]),
-        ("numpy", ["discover", "data"]),
-        ("numpy", ["inspect", "data"]),
-        ("numpy", ["live", "node.yaml"]),
-        ("pydantic", ["list"]),
-        ("omnibench.cli.handbook_topics", ["guide"]),
+        *(pytest.param("numpy", [*typed], marks=pytest.mark.slow) for typed in LOADING),
+        pytest.param("pydantic", ["list"], marks=pytest.mark.slow),
+        pytest.param("omnibench.cli.handbook_topics", ["guide"], marks=pytest.mark.slow),
     ],
 )
 def test_ctrl_c_during_the_imports_of_a_command_is_one_line(module: str, arguments: list[str]) -> None:
     program = INTERRUPTED.format(module=module, arguments=arguments)
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=PATIENCE, check=False)
     assert (run.returncode, run.stdout, run.stderr) == (130, "", "interrupted\n")
+
+
+UNKNOWN = np.full((3, 3), np.nan)
+
+
+@pytest.mark.parametrize(
+    "compute",
+    [
+        lambda: np.linalg.eigh(UNKNOWN),
+        lambda: np.linalg.svd(UNKNOWN),
+        lambda: np.linalg.inv(np.zeros((2, 2))),
+        lambda: np.linalg.cholesky(-np.eye(2)),
+        lambda: scipy.linalg.inv(UNKNOWN),
+        lambda: dtbtrs(np.ones((2, 3)), np.ones((2, 1))),
+    ],
+    ids=["eigenvalues", "singular values", "inverse", "Cholesky factor", "SciPy", "LAPACK"],
+)
+def test_a_failure_of_linear_algebra_is_one_line(
+    compute: Callable[[], object], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        _run(SimpleNamespace(main=lambda **_: compute()))
+    assert ended.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: the equations have no finite solution; omnibench check DATASET says")
+
+
+@pytest.mark.parametrize("name", ["calibrate", "check", "discover_effects", "evaluate"])
+def test_from_python_it_is_one_of_the_errors_that_are_told(name: str) -> None:
+    function = getattr(omnibench, name)
+    assert function is not function.__wrapped__
+    with pytest.raises(omnibench.OmnibenchError, match="no finite solution"):
+        computable(lambda: np.linalg.inv(np.zeros((2, 2))))()
+
+
+def test_other_mistakes_of_the_program_stay_visible() -> None:
+    with pytest.raises(ValueError, match="broadcast"):
+        _run(SimpleNamespace(main=lambda **_: np.zeros(2) + np.zeros(3)))

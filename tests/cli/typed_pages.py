@@ -1,8 +1,4 @@
-"""Pages of the README and the handbook, whose commands are typed one after the other, as a reader types them.
-
-``python tests/cli/typed_pages.py PAGE...`` does so by hand, with the omnibench that is installed, and says how long
-each command took.
-"""
+"""Pages of the README and the handbook, whose commands are typed one after the other, as a reader types them."""
 
 from __future__ import annotations
 
@@ -48,16 +44,13 @@ class Terminal:
     folder: Path
     before: Callable[[str, Path], None] = lambda _command, _folder: None
     environment: dict[str, str] = field(default_factory=lambda: os.environ | {"PATH": _path()})
-    seconds: dict[str, float] = field(default_factory=dict)
     _running: list[tuple[str, subprocess.Popen[bytes], IO[bytes]]] = field(default_factory=list)
 
     def type(self, line: str) -> None:
         """Run one line to its end, or, where it runs until Ctrl-C, leave it running. AssertionError: it failed."""
         for command in line.split(" && "):
             self.before(command, self.folder)
-            began = time.monotonic()
             self._type(command)
-            self.seconds[command] = time.monotonic() - began
 
     def close(self) -> None:
         """Press Ctrl-C in the terminals where something runs still."""
@@ -139,12 +132,3 @@ def _works(printed: str) -> bool:
 def _assert_fine(command: str, process: subprocess.Popen[bytes], printed: str) -> None:
     assert process.returncode == 0, f"{command}\nexit {process.returncode}\n{printed}"
     assert "Traceback" not in printed, f"{command}\n{printed}"
-
-
-if __name__ == "__main__":
-    with terminal(Path.cwd()) as typing:
-        for page in sys.argv[1:]:
-            for line in shell_commands(Path(page).read_text(encoding="utf-8")):
-                typing.type(line)
-        for line, seconds in typing.seconds.items():
-            print(f"{seconds:7.1f} s  {line}")  # noqa: T201

@@ -133,4 +133,3 @@ def header(key: str, value: Any) -> Change:
 
 
 # In wheels, rows 1 to 4 are run-1's and 5 to 8 are run-2's; in poses 1 to 3 and 4 to 6.
-# What is done, the file and perhaps the row that the message must name, and what it must say.

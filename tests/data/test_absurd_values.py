@@ -25,18 +25,28 @@ from omnibench.simulate.simulate import simulate_dataset
 
 
 @pytest.mark.parametrize(
-    "changes",
+    ("changes", "message"),
     [
-        {"sample_period": 1e-9},
-        {"pose_period": 1e-9},
-        {"repetitions": 10**9},
-        {"train": {"seed": 1, "distance": 1e9}},
-        {"commands": {"speeds": [1e-300], "directions_deg": [0], "turn_rates": [0.0]}},
+        ({"sample_period": 1e-9}, "more than 1e"),
+        ({"pose_period": 1e-9}, "more than 1e"),
+        ({"repetitions": 10**9}, "more than 1e"),
+        ({"train": {"seed": 1, "distance": 1e9}}, "more than 1e"),
+        ({"commands": {"speeds": [1e-300], "directions_deg": [0], "turn_rates": [0.0]}}, "more than 1e"),
+        ({"noise": {"encoder": 1e300}}, "encoder: .* less than or equal to"),
+        ({"train": {"seed": 1, "distance": 1.0, "noise_scale": 1e300}}, "noise_scale: .* less than or equal to"),
+        ({"noise": {"pose_position": 1e300}}, "pose_position: .* less than or equal to"),
+        (
+            {
+                "commands": {"speeds": [0.2], "directions_deg": list(range(100_001)), "turn_rates": [0.0]},
+                "train": {"seed": 1, "distance": 0.1},
+                "validation": None,
+            },
+            "100001 runs, more than 100000",
+        ),
     ],
-    ids=lambda changes: next(iter(changes)),
 )
-def test_a_simulation_beyond_all_measure_is_refused(changes: dict[str, Any]) -> None:
-    with pytest.raises(ConfigError, match="wheel samples and poses, more than 1e"):
+def test_a_simulation_beyond_all_measure_is_refused(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         validate(FlowerConfig, flower(**changes), "config")
 
 
@@ -47,11 +57,17 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "data"
 
 
-def test_a_pose_that_no_robot_can_reach_is_refused_with_its_row(folder: Path) -> None:
+@pytest.mark.parametrize(
+    ("far", "message"),
+    [(1e200, r"poses.parquet, row 2: x is 1e\+200"), *((far, "the pose at .* m from") for far in (1e9, 1e6, 1e5))],
+)
+def test_a_pose_that_no_robot_can_reach_or_far_beyond_what_the_wheels_rolled_is_refused(
+    folder: Path, far: float, message: str
+) -> None:
     table = pl.read_parquet(folder / "poses.parquet")
-    moved = pl.when(pl.int_range(pl.len()) == 1).then(1e200).otherwise(pl.col("x")).alias("x")
+    moved = pl.when(pl.int_range(pl.len()) == 1).then(far).otherwise(pl.col("x")).alias("x")
     table.with_columns(moved).write_parquet(folder / "poses.parquet")
-    with pytest.raises(DataError, match=r"poses.parquet, row 2: x is 1e\+200, which no robot can reach"):
+    with pytest.raises(DataError, match=message):
         load_dataset(folder)
 
 
@@ -59,7 +75,7 @@ def test_a_pose_that_no_robot_can_reach_is_refused_with_its_row(folder: Path) ->
 def test_a_sample_period_far_from_that_of_the_stamps_is_refused(folder: Path, period: float) -> None:
     header = yaml.safe_load((folder / "dataset.yaml").read_text())
     (folder / "dataset.yaml").write_text(yaml.safe_dump(header | {"sample_period": period}))
-    with pytest.raises(DataError, match=r"sample_period is .* s, but the wheel samples come every .* s .the median"):
+    with pytest.raises(DataError, match=r"sample_period is .* s, but"):
         load_dataset(folder)
 
 
@@ -70,7 +86,7 @@ def test_a_sample_period_that_no_calibration_file_takes_is_refused(folder: Path,
         replace(run, times=factor * run.times, rates=run.rates / factor, pose_times=factor * run.pose_times)
         for run in dataset.trajectories
     ]
-    with pytest.raises(DataError, match=r"expected 1e-06 to 3600 s; check the units of the times"):
+    with pytest.raises(DataError, match=r"expected 1e-06 to 3600 s"):
         make_dataset("x", dataset.robot, factor * dataset.sample_period, runs)
 
 
@@ -80,28 +96,8 @@ def test_standstill_between_runs_is_bounded(folder: Path) -> None:
     drive = concatenate_runs(short, pause=10.0)
     assert len(drive.wheel_times) < 3 * len(concatenate_runs(dataset, pause=10.0).wheel_times)
     runs = [replace(run, id=str(number)) for number, run in enumerate(dataset.trajectories * 40)]
-    with pytest.raises(ConfigError, match=r"the robot stands still for .* samples, more than 10000000"):
+    with pytest.raises(ConfigError, match=r"more than 10000000"):
         concatenate_runs(replace(dataset, trajectories=tuple(runs)), pause=3600.0)
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"noise": {"encoder": 1e300}},
-        {"train": {"seed": 1, "distance": 1.0, "noise_scale": 1e300}},
-        {"noise": {"pose_position": 1e300}},
-    ],
-)
-def test_noise_beyond_all_measure_is_refused(changes: dict[str, Any]) -> None:
-    with pytest.raises(ConfigError, match=r"(encoder|noise_scale|pose_position): .* less than or equal to"):
-        validate(FlowerConfig, flower(**changes), "config")
-
-
-def test_more_runs_than_anybody_drives_are_refused() -> None:
-    commands = {"speeds": [0.2], "directions_deg": list(range(100_001)), "turn_rates": [0.0]}
-    changes = {"commands": commands, "repetitions": 1, "train": {"seed": 1, "distance": 0.1}, "validation": None}
-    with pytest.raises(ConfigError, match="this is 100001 runs, more than 100000"):
-        validate(FlowerConfig, flower(**changes), "config")
 
 
 def test_simulating_many_runs_tells_of_every_run() -> None:
@@ -113,16 +109,7 @@ def test_simulating_many_runs_tells_of_every_run() -> None:
     assert events[-1].over
 
 
-@pytest.mark.parametrize("far", [1e9, 1e6, 1e5])
-def test_a_pose_far_beyond_what_the_wheels_rolled_is_refused(folder: Path, far: float) -> None:
-    table = pl.read_parquet(folder / "poses.parquet")
-    moved = pl.when(pl.int_range(pl.len()) == 1).then(far).otherwise(pl.col("x")).alias("x")
-    table.with_columns(moved).write_parquet(folder / "poses.parquet")
-    with pytest.raises(DataError, match=r"trajectory .*: the pose at .* m from the run's start, whose wheels rolled"):
-        load_dataset(folder)
-
-
-@pytest.mark.parametrize("shift", [10.0, 1e3, 1e4])
+@pytest.mark.parametrize("shift", [10.0, *(pytest.param(far, marks=pytest.mark.slow) for far in (1e3, 1e4))])
 @pytest.mark.parametrize("calibrator", ["closed_form", "trajectory_ml"])
 def test_a_pose_that_is_just_believed_gives_an_answer_or_one_line(folder: Path, shift: float, calibrator: str) -> None:
     dataset = load_dataset(folder)
@@ -139,7 +126,7 @@ def test_a_run_with_its_start_pose_alone_is_not_written_as_it_could_not_be_read(
     first, *others = dataset.trajectories
     short = replace(first, pose_times=first.pose_times[:1], poses=first.poses[:1])
     made = make_dataset("d", dataset.robot, dataset.sample_period, [short, *others])
-    with pytest.raises(DataError, match=f"trajectory {first.id} has no reference pose after its start; leave it out"):
+    with pytest.raises(DataError, match=f"trajectory {first.id} has no reference pose after its start"):
         save_dataset(made, tmp_path / "new")
     assert not (tmp_path / "new").exists()
 
@@ -169,25 +156,18 @@ def test_what_reading_refuses_making_refuses_too(folder: Path, name: str, row: i
         make_dataset("d", dataset.robot, dataset.sample_period, [changed(first, name, row, value), *others])
 
 
-def test_a_table_in_both_formats_is_refused(folder: Path) -> None:
-    pl.read_parquet(folder / "poses.parquet").write_csv(folder / "poses.csv")
-    with pytest.raises(DataError, match=r"both poses.parquet and poses.csv are there; remove the one"):
-        load_dataset(folder)
-
-
-def test_a_column_of_lists_is_refused(folder: Path) -> None:
+def test_tables_that_can_be_read_in_two_ways_are_refused(folder: Path, tmp_path: Path) -> None:
+    save_dataset(load_dataset(folder), tmp_path / "csv", "csv")
+    lines = (tmp_path / "csv" / "poses.csv").read_text().splitlines()
+    (tmp_path / "csv" / "poses.csv").write_text("".join(f"{line},{line.split(',')[2]}\n" for line in lines))
+    with pytest.raises(DataError, match=r"poses.csv: column 'x' is there twice"):
+        load_dataset(tmp_path / "csv")
     table = pl.read_parquet(folder / "wheels.parquet")
     table.with_columns(pl.concat_list("trajectory").alias("trajectory")).write_parquet(folder / "wheels.parquet")
     with pytest.raises(DataError, match=r"wheels.parquet: column 'trajectory' holds List"):
         load_dataset(folder)
-
-
-def test_a_csv_column_that_is_there_twice_is_refused(folder: Path) -> None:
-    save_dataset(load_dataset(folder), folder, "csv")
-    lines = (folder / "poses.csv").read_text().splitlines()
-    doubled = [f"{line},{line.split(',')[2]}" for line in lines]
-    (folder / "poses.csv").write_text("\n".join(doubled) + "\n")
-    with pytest.raises(DataError, match=r"poses.csv: column 'x' is there twice"):
+    pl.read_parquet(folder / "poses.parquet").write_csv(folder / "poses.csv")
+    with pytest.raises(DataError, match=r"both poses.parquet and poses.csv are there"):
         load_dataset(folder)
 
 

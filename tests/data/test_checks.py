@@ -103,6 +103,8 @@ MISTAKES = {
     "mm": (IN_MM, "positions look like mm; x and y must be m (import with --set position_unit=mm)"),
     "cm": (IN_CM, "positions look like cm; x and y must be m (import with --set position_unit=cm)"),
 }
+ANGLES = ("rpm", "degrees", "degrees within 180", "degrees within 360")
+RATES_AND_POSITIONS = ("rpm", "degrees per second", "mm", "cm")
 
 
 @pytest.mark.parametrize("sparse", [False, True])
@@ -113,24 +115,19 @@ def test_a_wrong_unit_is_named(mistake: str, robot: str, sparse: bool) -> None:
     assert warnings_of(recorded(robot=robot, sparse=sparse), change) == warning
 
 
-@pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_wrong_unit_is_named_wherever_the_robot_started(mistake: str) -> None:
-    change, warning = MISTAKES[mistake]
-    assert warnings_of(recorded(), shifted(-40.0, 25.0, 2.5), change) == warning
-
-
-@pytest.mark.parametrize("mistake", ["rpm", "degrees per second", "mm", "cm"])
-@pytest.mark.parametrize("motion", ["straight runs only", "forward only", "one turning run"])
-def test_wrong_rates_and_positions_are_named_in_simpler_motions_too(motion: str, mistake: str) -> None:
-    change, warning = MISTAKES[mistake]
-    assert warnings_of(recorded(motion), change) == warning
-
-
-@pytest.mark.parametrize("mistake", ["rpm", "degrees", "degrees within 180", "degrees within 360"])
-@pytest.mark.parametrize("motion", ["turns on the spot only", "one turning run"])
-def test_wrong_angles_are_named_where_the_robot_turns(motion: str, mistake: str) -> None:
+@pytest.mark.parametrize(
+    ("motion", "mistake"),
+    [
+        *(("flower", mistake) for mistake in MISTAKES),
+        *((motion, mistake) for motion in ("straight runs only", "forward only") for mistake in RATES_AND_POSITIONS),
+        *(("turns on the spot only", mistake) for mistake in ANGLES),
+        *(("one turning run", mistake) for mistake in MISTAKES),
+    ],
+)
+def test_a_wrong_unit_is_named_in_simpler_motions_and_wherever_the_robot_started(motion: str, mistake: str) -> None:
     change, warning = MISTAKES[mistake]
     assert warnings_of(recorded(motion), change) == warning
+    assert warnings_of(recorded(motion), shifted(-40.0, 25.0, 2.5), change) == warning
 
 
 @pytest.mark.parametrize(
@@ -218,38 +215,22 @@ def test_copies_of_training_runs_are_left_out_of_validation() -> None:
     assert "1 trajectory is a copy of a training run and is left out of validation: copy" in dataset.warnings
 
 
-@pytest.mark.parametrize("sparse", [False, True])
-@pytest.mark.parametrize("motion", MOTIONS)
-def test_sound_recordings_give_no_warning(motion: str, sparse: bool) -> None:
-    assert warnings_of(recorded(motion, sparse=sparse)) == ""
-
-
-@pytest.mark.parametrize("sparse", [False, True])
-def test_sound_recordings_of_mecanum_wheels_give_no_warning(sparse: bool) -> None:
-    assert warnings_of(recorded(robot="mecanum", sparse=sparse)) == ""
-
-
-@pytest.mark.parametrize("motion", MOTIONS)
-def test_sound_recordings_give_no_warning_wherever_the_robot_started(motion: str) -> None:
-    assert warnings_of(recorded(motion), shifted(-40.0, 25.0, 2.5)) == ""
-
-
-@pytest.mark.parametrize("motion", MOTIONS)
-def test_sound_recordings_with_wrapped_headings_give_no_warning(motion: str) -> None:
+@pytest.mark.parametrize(("motion", "robot"), [*((motion, "apr02") for motion in MOTIONS), ("flower", "mecanum")])
+def test_sound_recordings_give_no_warning(motion: str, robot: str) -> None:
     wrapped = headings(lambda values: (values + math.pi) % (2 * math.pi) - math.pi)
-    assert warnings_of(recorded(motion), shifted(0.0, 0.0, 3.0), wrapped) == ""
+    assert warnings_of(recorded(motion, robot)) == ""
+    assert warnings_of(recorded(motion, robot, sparse=True)) == ""
+    assert warnings_of(recorded(motion, robot), shifted(-40.0, 25.0, 2.5)) == ""
+    assert warnings_of(recorded(motion, robot), shifted(0.0, 0.0, 3.0), wrapped) == ""
 
 
-def test_a_robot_that_hardly_moved_gives_no_warning() -> None:
+def test_a_robot_that_hardly_moved_or_is_a_quarter_off_its_design_gives_no_warning() -> None:
     def hardly(run: Trajectory) -> Trajectory:
         return replace(run, rates=run.rates * 1e-3, poses=run.poses * 1e-3)
 
     assert warnings_of(recorded(), hardly) == ""
-
-
-@pytest.mark.parametrize("scale", [0.8, 1.25])
-def test_a_robot_a_quarter_off_its_design_gives_no_warning(scale: float) -> None:
-    assert warnings_of(recorded("straight runs only"), rates(lambda values: values * scale)) == ""
+    assert warnings_of(recorded("straight runs only"), rates(lambda values: values * 0.8)) == ""
+    assert warnings_of(recorded("straight runs only"), rates(lambda values: values * 1.25)) == ""
 
 
 @pytest.mark.parametrize("recorded", ["omni3", "robotino"])

@@ -1,18 +1,22 @@
-"""Clocks of the reference that are matched to the wheels', with known offsets and drifts."""
+"""Reference and wheels brought together: clocks, a common t = 0, and headings that are unwrapped once."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sample_robots import APR_02
 
-from omnibench.data.clock_matching import ClockMatch, Streams, match_clocks
-from omnibench.data.dataset import Dataset
-from omnibench.robot.kinematics import Array, Robot, Wheel
-from omnibench.robot.odometry import Path
+from omnibench.data.clock_matching import ClockMatch, Streams, align, match_clocks, median_period
+from omnibench.data.dataset import Dataset, Trajectory, make_dataset
+from omnibench.data.headings import unwrap
+from omnibench.robot.kinematics import Array, Robot, Wheel, wheel_equations
+from omnibench.robot.model import OdometryModel
+from omnibench.robot.odometry import Path, WheelLog
 
 ROBOT = Robot(
     name="base",
@@ -70,12 +74,6 @@ def errors(clock: ClockMatch, offset: float = OFFSET, drift: float = DRIFT) -> A
     return np.array([(clock.middle - middle) / clock.middle_error, (clock.drift - drift) / clock.drift_error])
 
 
-def test_offset_and_drift_of_a_clock_are_found() -> None:
-    (clock,) = matched(streams(1))
-    assert clock.offset == pytest.approx(OFFSET, abs=0.01)
-    assert clock.drift == pytest.approx(DRIFT, abs=4e-4)
-
-
 @settings(max_examples=15, deadline=None)
 @given(st.floats(-1.5, 1.5), st.floats(-0.01, 0.01), st.integers(0, 10_000))
 def test_clocks_are_within_five_standard_errors(offset: float, drift: float, seed: int) -> None:
@@ -101,14 +99,10 @@ def test_a_misread_recording_keeps_its_clock(misread: str) -> None:
     assert clock.middle == pytest.approx(right.middle, abs=0.01)
 
 
-def test_an_even_drive_does_not_tell_its_clock() -> None:
-    assert match_clocks(ROBOT, [streams(4, driven=False)]) == [None]
-
-
-def test_a_reference_that_stands_still_does_not_tell_its_clock() -> None:
+def test_an_even_drive_and_a_reference_that_stands_still_do_not_tell_their_clocks() -> None:
     of = streams(4)
     still = replace(of, poses=np.zeros_like(of.poses))
-    assert match_clocks(ROBOT, [still]) == [None]
+    assert match_clocks(ROBOT, [streams(4, driven=False), still]) == [None, None]
 
 
 def test_each_run_has_its_own_clock() -> None:
@@ -128,6 +122,8 @@ def test_a_short_run_has_an_offset_and_no_drift() -> None:
 def test_corrected_times_are_those_of_the_wheels() -> None:
     run = streams(8)
     (clock,) = matched(run)
+    assert clock.offset == pytest.approx(OFFSET, abs=0.01)
+    assert clock.drift == pytest.approx(DRIFT, abs=4e-4)
     wanted = run.pose_times + OFFSET + DRIFT * run.pose_times
     np.testing.assert_allclose(clock.corrected(run.pose_times), wanted, atol=0.02)
 
@@ -141,9 +137,147 @@ def test_clocks_of_a_real_robot_run_behind_by_a_tenth_of_a_second_a_minute(omni3
     )  # s a minute; data/README: about 0.1, the other way round
 
 
+@pytest.mark.slow
 def test_clocks_that_are_a_second_off_are_followed_until_they_settle(tricyc: Dataset) -> None:
     runs = [Streams.of_run(run) for run in tricyc.trajectories[:4]]
     later = [replace(run, pose_times=run.pose_times + 0.35) for run in runs]
     pairs = zip(match_clocks(tricyc.robot, runs), match_clocks(tricyc.robot, later), strict=True)
     moved = [other.middle - clock.middle for clock, other in pairs if clock is not None and other is not None]
     assert moved == pytest.approx([-0.35] * 4, abs=1e-3)
+
+
+TURN = 2 * math.pi
+
+
+def driven(turn_rates: Array, stamps: Array, start: float = 0.3) -> WheelLog:
+    """A run at 0.2 m/s that turns at each rate for 0.1 s."""
+    twists = np.column_stack([np.full(len(turn_rates), 0.2), np.zeros(len(turn_rates)), turn_rates])
+    times = 0.1 * np.arange(1, len(turn_rates) + 1)
+    return WheelLog(times, twists @ wheel_equations(APR_02.wheels).T, np.array([0.0, 0.0, start]), stamps)
+
+
+def true_headings(log: WheelLog) -> Array:
+    return OdometryModel.of_design(APR_02, "arc").poses([log])[0][:, 2]
+
+
+def wrapped(headings: Array) -> Array:
+    return (headings + math.pi) % TURN - math.pi
+
+
+def unwrapped(log: WheelLog, headings: Array) -> Array:
+    (found,), _ = unwrap(APR_02, [log], [headings])
+    return found
+
+
+@pytest.mark.parametrize("rate", [-1.5, 0.0, 0.02, 1.5])
+def test_dense_headings_that_wrap_become_continuous(rate: float) -> None:
+    log = driven(np.full(300, rate), np.arange(0, 30, 0.25))
+    for shown in (wrapped(true_headings(log)), true_headings(log) % TURN):
+        np.testing.assert_allclose(unwrapped(log, shown), true_headings(log), atol=1e-9)
+
+
+@pytest.mark.parametrize("rate", [-1.5, -0.7, 0.7, 1.5])
+def test_the_odometry_decides_where_only_start_and_end_are_known(rate: float) -> None:
+    log = driven(np.full(100, rate), np.array([0.0, 10.0]))
+    assert abs(true_headings(log)[1] - true_headings(log)[0]) > TURN
+    for factor in (1.0, 1.05):  # the robot may have turned by 5 % more than designed
+        truth = true_headings(log) * [1.0, factor]
+        np.testing.assert_allclose(unwrapped(log, wrapped(truth)), truth, atol=1e-9)
+
+
+def test_dense_headings_are_right_even_if_the_odometry_is_far_off() -> None:
+    log = driven(np.full(300, 1.0), np.arange(0, 30, 0.25))
+    slipping = 0.3 + (true_headings(log) - 0.3) * 0.4  # the odometry turns 2.5 times as far
+    np.testing.assert_allclose(unwrapped(log, wrapped(slipping)), slipping, atol=1e-9)
+
+
+@given(seed=st.integers(0, 2**16), gap=st.sampled_from([0.1, 0.5, 3.0]))
+def test_continuous_headings_stay_as_they_are_to_the_bit(seed: int, gap: float) -> None:
+    rng = np.random.default_rng(seed)
+    log = driven(rng.normal(0, 2, 100), np.arange(0, 10, gap))
+    headings = true_headings(log) + rng.normal(0, 0.05, len(log.stamps))
+    assert unwrapped(log, headings).tobytes() == headings.tobytes()
+
+
+@given(seed=st.integers(0, 2**16), gap=st.sampled_from([0.1, 0.5, 3.0]))
+def test_whole_turns_in_a_recording_change_nothing(seed: int, gap: float) -> None:
+    rng = np.random.default_rng(seed)
+    log = driven(rng.normal(0, 2, 100), np.arange(0, 10, gap))
+    headings = true_headings(log) + rng.normal(0, 0.05, len(log.stamps))
+    whole_turns = TURN * rng.integers(-3, 4, len(headings))
+    found = unwrapped(log, headings + whole_turns)
+    np.testing.assert_allclose(found - found[0], headings - headings[0], atol=1e-9)
+
+
+def test_the_start_heading_stays_as_recorded() -> None:
+    log = driven(np.full(50, 1.0), np.arange(0, 5, 0.5), start=-2.0)
+    assert unwrapped(log, wrapped(true_headings(log)))[0] == wrapped(true_headings(log))[0]
+
+
+def test_a_data_set_holds_unwrapped_headings_and_warns_of_doubtful_ones() -> None:
+    stamps = np.array([0.0, 10.0])
+    log = driven(np.full(100, 1.5), stamps)
+    poses = OdometryModel.of_design(APR_02, "arc").poses([log])[0]
+    truth = poses[:, 2]
+    sound = Trajectory("sound", "train", log.times, log.rates, stamps, np.column_stack([poses[:, :2], wrapped(truth)]))
+    odd = replace(sound, id="odd", poses=np.column_stack([poses[:, :2], wrapped(truth * [1.0, 1.12])]))
+    dataset = make_dataset("turns", APR_02, 0.1, [sound, odd])
+    np.testing.assert_allclose(dataset.trajectories[0].poses[:, 2], truth, atol=1e-9)
+    (warning,) = dataset.warnings
+    assert warning.endswith(": odd")
+
+
+WHEELS = 0.01 * np.arange(1, 101)
+
+
+def poses_at(times: np.ndarray) -> np.ndarray:
+    """A robot at constant speed, turning through +-pi."""
+    heading = 3.0 + 2.0 * times
+    return np.column_stack([0.2 * times, -0.1 * times, (heading + math.pi) % (2 * math.pi) - math.pi])
+
+
+@given(epoch=st.floats(-1e6, 1e6), first=st.floats(-0.2, 0.5), period=st.floats(0.05, 0.3))
+def test_the_epoch_of_the_clock_does_not_matter(epoch: float, first: float, period: float) -> None:
+    stamps = np.arange(first, 1.2, period)
+    here = align(0.0, WHEELS, stamps, poses_at(stamps))
+    there = align(epoch, WHEELS + epoch, stamps + epoch, poses_at(stamps))
+    assert here is not None
+    assert there is not None
+    assert there.zero - epoch == pytest.approx(here.zero, abs=1e-8)
+    np.testing.assert_allclose(there.pose_times, here.pose_times, atol=1e-8)
+
+
+@given(first=st.floats(-0.3, -1e-3), period=st.floats(0.05, 0.3))
+def test_the_start_pose_is_interpolated_through_the_heading_s_wrap(first: float, period: float) -> None:
+    stamps = np.arange(first, 1.0, period)
+    aligned = align(0.0, WHEELS, stamps, poses_at(stamps))
+    assert aligned is not None
+    assert aligned.zero == 0.0
+    np.testing.assert_allclose(aligned.poses[0, :2], [0, 0], atol=1e-9)
+    assert math.remainder(aligned.poses[0, 2] - 3.0, 2 * math.pi) == pytest.approx(0, abs=1e-9)
+
+
+def test_a_pose_at_the_wheels_begin_is_taken_as_it_is() -> None:
+    stamps = np.array([-0.1, 0.0, 0.5])
+    aligned = align(0.0, WHEELS, stamps, poses_at(stamps))
+    assert aligned is not None
+    assert aligned.poses[0].tolist() == poses_at(stamps)[1].tolist()
+    assert aligned.pose_times.tolist() == [0.0, 0.5]
+
+
+@pytest.mark.parametrize("stamps", [[5.0, 6.0], [-6.0, -5.0], [0.5, 3.0], [-1.0, 2.0], [0.5]])
+def test_streams_that_share_no_two_poses_are_told(stamps: list[float]) -> None:
+    times = np.array(stamps)
+    assert align(0.0, WHEELS, times, poses_at(times)) is None
+
+
+def test_the_inputs_stay_as_they_are() -> None:
+    stamps = np.array([-0.1, 0.4, 0.5])
+    poses = poses_at(stamps)
+    align(0.0, WHEELS, stamps, poses)
+    assert poses.tolist() == poses_at(stamps).tolist()
+
+
+def test_the_median_period_ignores_gaps_and_rounding() -> None:
+    times = np.concatenate([0.01 * np.arange(1, 50), [3.0]])
+    assert median_period([times, times + 1e-9]) == 0.01

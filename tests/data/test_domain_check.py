@@ -39,26 +39,20 @@ def run(name: str, *twists: tuple[float, float, float], command: str | None = No
 def test_runs_commands_motions_and_effects_are_told_in_one_line() -> None:
     runs = [run("1", FORWARDS), run("2", FORWARDS, SIDEWAYS, command="corner"), run("3", SIDEWAYS, command="side")]
     other = EffectTerm(name="heading_drift", parameters={"b": 0.001})
-    assert extrapolation_warning(calibration(SLIP, other), runs) == (
-        "2 of 3 runs drive motions that calibration 'mine' was not fitted to (side, corner), such as driving straight "
-        "at 0.20 m/s: centripetal_slip, heading_drift are not known to hold there, and errors may be larger than stated"
-    )
+    told = extrapolation_warning(calibration(SLIP, other), runs)
+    assert told is not None
+    for part in ("2 of 3 runs", "'mine'", "(side, corner)", "0.20 m/s", "centripetal_slip, heading_drift"):
+        assert part in told
 
 
-def test_repetitions_of_a_command_count_as_runs_and_are_named_once() -> None:
+def test_repetitions_of_a_command_are_named_once_and_of_many_commands_three() -> None:
     runs = [run(str(number), ON_THE_SPOT, command="turn") for number in range(4)]
-    told = extrapolation_warning(calibration(), runs)
-    assert told is not None
-    assert told.startswith(
-        "4 of 4 runs drive motions that calibration 'mine' was not fitted to (turn), such as turning"
+    told = str(extrapolation_warning(calibration(), runs))
+    assert "4 of 4 runs" in told
+    assert "(turn), such as turning" in told
+    assert "(a, b, c and 2 more)" in str(
+        extrapolation_warning(calibration(), [run(name, SIDEWAYS) for name in "abcde"])
     )
-
-
-def test_three_commands_are_named_and_the_others_counted() -> None:
-    runs = [run(name, SIDEWAYS) for name in "abcde"]
-    told = extrapolation_warning(calibration(), runs)
-    assert told is not None
-    assert "(a, b, c and 2 more)" in told
 
 
 @pytest.mark.parametrize(
@@ -78,5 +72,5 @@ def recorded(*runs: Trajectory) -> Dataset:
 
 def test_a_recording_simulated_again_is_warned_of_too() -> None:
     (warning,) = simulate_like(recorded(run("1", FORWARDS), run("2", SIDEWAYS)), calibration()).warnings
-    assert warning.startswith("1 of 2 runs drive motions that calibration 'mine' was not fitted to (2)")
+    assert warning.startswith("1 of 2 runs ")
     assert simulate_like(recorded(run("1", FORWARDS)), calibration()).warnings == ()

@@ -64,102 +64,91 @@ def test_a_wheel_that_is_counted_the_wrong_way_is_named_with_its_option(robot: s
     names = recorded(robot).robot.wheel_names
     (warning,) = warnings_of(robot, rates=times(-1, wheel))
     signs = ",".join("-1" if index == wheel else "1" for index in range(len(names)))
-    assert f"(import with --set wheel_signs=[{signs}], times the present ones; rosbag: joint_signs)" in warning
-    assert warning.startswith(f"wheel {names[wheel]} looks counted the wrong way round")
+    assert f"--set wheel_signs=[{signs}], times the present ones; rosbag: joint_signs" in warning
+    assert warning.startswith(f"wheel {names[wheel]} ")
 
 
 @pytest.mark.parametrize("robot", WHEELS)
 @pytest.mark.parametrize("count", [500, 1440, 4096])
 def test_ticks_taken_for_radians_are_named_with_their_count(robot: str, count: int) -> None:
     (warning,) = warnings_of(robot, rates=times(count / (2 * math.pi)))
-    told = float(warning.partition("as ticks would be at about ")[2].partition(" a turn")[0].replace(",", ""))
-    assert told == pytest.approx(count, rel=0.15)
-    assert "(import with --set wheel_unit=ticks --set ticks_per_turn=N" in warning
-    assert "correct the radius of the wheels, in m, in robot.yaml" in warning
+    assert told(warning, "at about ", " a turn") == pytest.approx(count, rel=0.15)
+    assert "--set wheel_unit=ticks --set ticks_per_turn=N" in warning
+
+
+def told(warning: str, before: str, after: str) -> float:
+    """The number between two texts of a warning."""
+    return float(warning.partition(before)[2].partition(after)[0].replace(",", ""))
 
 
 @each_steered
 def test_a_steering_column_in_degrees_is_named(robot: str) -> None:
-    expected = "steering angles look like degrees; steer_* must be rad (import with --set steering_unit=deg)"
-    assert warnings_of(robot, steering=times(180 / math.pi)) == (expected,)
-
-
-@each_steered
-def test_steering_angles_and_rates_in_degrees_are_both_named(robot: str) -> None:
+    (warning,) = warnings_of(robot, steering=times(180 / math.pi))
+    assert warning.startswith("steering angles look like degrees")
+    assert "--set steering_unit=deg" in warning
     rates, angles = warnings_of(robot, steering=times(180 / math.pi), rates=times(180 / math.pi))
     assert rates.startswith("wheel rates look like deg/s; ")
     assert angles.startswith("steering angles look like degrees; ")
 
 
-@each_of_several
-def test_one_of_several_steering_columns_in_degrees_is_named(robot: str, wheel: int) -> None:
-    (warning,) = warnings_of(robot, steering=times(180 / math.pi, wheel))
-    scales = ",".join("0.0174533" if index == wheel else "1" for index in range(len(STEERED[robot])))
-    name = STEERED[robot][wheel]
-    assert warning.startswith(f"the steering angle of wheel {name} looks like degrees; steer_{name} must be rad")
-    assert warning.endswith(f"(import with --set steering_scale=[{scales}], times the present ones)")
-
-
 @each_steered
-@pytest.mark.parametrize("degrees", [10, -10])
-def test_a_zero_of_all_steering_angles_10_degrees_off_is_named(robot: str, degrees: int) -> None:
-    (warning,) = warnings_of(robot, steering=plus(degrees))
-    assert f"looks 10 degrees too {'large' if degrees > 0 else 'small'}, its zero not straight ahead" in warning
-    assert f"--set steering_offsets_deg=[{','.join([str(-degrees)] * len(STEERED[robot]))}], added to" in warning
+@pytest.mark.parametrize(
+    ("change", "words", "option"),
+    [
+        (plus(10), "looks 10 degrees too large", "steering_offsets_deg=[-10{}], added to"),
+        (plus(-10), "looks 10 degrees too small", "steering_offsets_deg=[10{}], added to"),
+        (times(-1), "looks counted clockwise", "steering_signs=[-1{}], times the present ones"),
+    ],
+)
+def test_a_zero_and_a_sense_of_all_steering_angles_are_named(
+    robot: str, change: Change, words: str, option: str
+) -> None:
+    (warning,) = warnings_of(robot, steering=change)
+    first = option.partition("[")[2].partition("{")[0]
+    assert words in warning
+    assert option.format(f",{first}" * (len(STEERED[robot]) - 1)) in warning
 
 
 @each_of_several
-def test_the_zero_of_one_of_several_steering_angles_10_degrees_off_is_named(robot: str, wheel: int) -> None:
-    (warning,) = warnings_of(robot, steering=plus(10, wheel))
-    offsets = ",".join("-10" if index == wheel else "0" for index in range(len(STEERED[robot])))
-    assert warning.startswith(f"the steering angle of wheel {STEERED[robot][wheel]} looks 10 degrees too large")
-    assert f"--set steering_offsets_deg=[{offsets}], added to the present ones" in warning
+@pytest.mark.parametrize(
+    ("factor", "offset", "words", "option"),
+    [
+        (180 / math.pi, 0, "looks like degrees", ("steering_scale", "0.0174533", "1")),
+        (1, 10, "looks 10 degrees too large", ("steering_offsets_deg", "-10", "0")),
+        (-1, 0, "looks counted clockwise", ("steering_signs", "-1", "1")),
+    ],
+)
+def test_one_of_several_steering_angles_is_named(
+    robot: str, wheel: int, factor: float, offset: float, words: str, option: tuple[str, str, str]
+) -> None:
+    change = plus(offset, wheel) if offset else times(factor, wheel)
+    (warning,) = warnings_of(robot, steering=change)
+    key, wrong, right = option
+    values = ",".join(wrong if index == wheel else right for index in range(len(STEERED[robot])))
+    assert warning.startswith(f"the steering angle of wheel {STEERED[robot][wheel]} {words}")
+    assert f"--set {key}=[{values}], " in warning
 
 
 def test_a_swerve_base_s_zeros_may_be_the_reference_s_yaw() -> None:
-    turned = "; or the reference is turned: heading_offset_deg=-10 ("
-    assert turned in warnings_of("swerve", steering=plus(10))[0]
+    assert "heading_offset_deg=-10 (" in warnings_of("swerve", steering=plus(10))[0]
     assert "heading_offset_deg" not in warnings_of("tricycle", steering=plus(10))[0]
 
 
 @each_steered
-def test_steering_angles_counted_clockwise_are_named(robot: str) -> None:
-    (warning,) = warnings_of(robot, steering=times(-1))
-    signs = ",".join(["-1"] * len(STEERED[robot]))
-    assert "looks counted clockwise; it must count counter-clockwise" in warning
-    assert f"(import with --set steering_signs=[{signs}], times the present ones)" in warning
-
-
-@each_of_several
-def test_one_of_several_steering_angles_counted_clockwise_is_named(robot: str, wheel: int) -> None:
-    (warning,) = warnings_of(robot, steering=times(-1, wheel))
-    assert warning.startswith(f"the steering angle of wheel {STEERED[robot][wheel]} looks counted clockwise")
-
-
-@each_steered
-def test_ticks_of_the_steering_encoder_taken_for_radians_are_named_with_their_count(robot: str) -> None:
-    (warning,) = warnings_of(robot, steering=times(8192 / (2 * math.pi)))
-    told = float(warning.partition("as ticks would be at about ")[2].partition(" a turn")[0].replace(",", ""))
-    assert told == pytest.approx(8192, rel=0.1)
-    assert "import with --set steering_unit=ticks --set steering_ticks_per_turn=N; or --set steering_scale" in warning
-
-
-@each_steered
-@pytest.mark.parametrize("gear", [10, 0.2])
-def test_a_gear_of_the_steering_is_named_relative_to_the_present_scale(robot: str, gear: float) -> None:
+def test_ticks_and_a_gear_of_the_steering_are_named_relative_to_the_present_scale(robot: str) -> None:
     """A data set does not know by which scale it was imported."""
-    (warning,) = warnings_of(robot, steering=times(gear))
-    assert (
-        f"times too {'large' if gear > 1 else 'small'}; is there a gear between the encoder and the wheel?" in warning
-    )
-    told = float(warning.partition("steering_scale=")[2].partition(", times the present one")[0])
-    assert told == pytest.approx(1 / gear, rel=0.15)
+    (warning,) = warnings_of(robot, steering=times(8192 / (2 * math.pi)))
+    assert told(warning, "at about ", " a turn") == pytest.approx(8192, rel=0.1)
+    assert "--set steering_unit=ticks --set steering_ticks_per_turn=N; or --set steering_scale" in warning
+    for gear in (10, 0.2):
+        (warning,) = warnings_of(robot, steering=times(gear))
+        assert f"times too {'large' if gear > 1 else 'small'}" in warning
+        assert told(warning, "steering_scale=", ", times the present one") == pytest.approx(1 / gear, rel=0.15)
 
 
 @pytest.mark.parametrize(("robot", "wheel"), [("tricycle", 0), ("car", None), *(("swerve", i) for i in range(4))])
 def test_a_steering_angle_that_never_changes_is_named(robot: str, wheel: int | None) -> None:
     (warning,) = warnings_of(robot, steering=times(0, wheel))
     names = STEERED[robot] if wheel is None else (STEERED[robot][wheel],)
-    wheels = f"wheel{'s' if len(names) > 1 else ''} {', '.join(names)}"
-    assert warning.startswith(f"the steering angle of {wheels} never changes, though the reference shows that it must")
-    assert "(steering_columns; of bags steering_joints or steering_topic)" in warning
+    assert f"{', '.join(names)} never changes" in warning
+    assert "steering_columns; of bags steering_joints or steering_topic" in warning

@@ -78,12 +78,16 @@ def test_scans_come_back_to_the_bit_with_their_scanner(folder: Path) -> None:
         np.testing.assert_array_equal(found.times(trajectory), made.of(trajectory).times)
 
 
-def test_scans_of_trajectories_in_turns_are_told_apart(folder: Path) -> None:
+def test_scans_of_trajectories_in_turns_are_told_apart_and_a_trajectory_may_have_none(folder: Path) -> None:
     made = dict(scans_of(folder))
     frame = read_frame(folder, "scans")
     write_frame(folder, "scans", frame[[4, 0, 5, 1, 2, 6, 3]])
     for trajectory, expected in made.items():
         assert_same(scans_of(folder).of(trajectory), expected)
+    write_frame(folder, "scans", frame.filter(pl.col("trajectory") == "run-2"))
+    assert scans_of(folder).trajectories == ("run-2",)
+    with pytest.raises(DataError, match=r"scans\.\w+: trajectory run-1 has no scans"):
+        scans_of(folder).of("run-1")
 
 
 def test_scans_that_are_many_row_groups_long_come_back(tmp_path: Path) -> None:
@@ -93,27 +97,16 @@ def test_scans_that_are_many_row_groups_long_come_back(tmp_path: Path) -> None:
         assert_same(scans_of(tmp_path / "data").of(trajectory), expected)
 
 
-def test_a_trajectory_may_have_no_scans(folder: Path) -> None:
-    frame = read_frame(folder, "scans")
-    write_frame(folder, "scans", frame.filter(pl.col("trajectory") == "run-2"))
-    assert scans_of(folder).trajectories == ("run-2",)
-    with pytest.raises(DataError, match=r"scans\.\w+: trajectory run-1 has no scans"):
-        scans_of(folder).of("run-1")
-
-
-def test_a_part_of_a_data_set_is_saved_with_its_own_scans(folder: Path, tmp_path: Path) -> None:
+def test_a_part_of_a_data_set_is_saved_with_its_own_scans_and_without_scans_without_a_scanner(
+    folder: Path, tmp_path: Path
+) -> None:
     data = load_dataset(folder)
     save_dataset(replace(data, trajectories=data.trajectories[1:]), tmp_path / "part")
     assert scans_of(tmp_path / "part").trajectories == ("run-2",)
-
-
-def test_a_part_without_scans_is_saved_without_a_scanner(folder: Path, tmp_path: Path) -> None:
-    frame = read_frame(folder, "scans")
-    write_frame(folder, "scans", frame.filter(pl.col("trajectory") == "run-2"))
-    data = load_dataset(folder)
-    save_dataset(replace(data, trajectories=data.trajectories[:1]), tmp_path / "part")
-    assert load_dataset(tmp_path / "part").scans is None
-    assert yaml.safe_load((tmp_path / "part" / "dataset.yaml").read_text())["scanner"] is None
+    part = load_dataset(tmp_path / "part")
+    save_dataset(replace(data, trajectories=data.trajectories[:1], scans=part.scans), tmp_path / "none")
+    assert load_dataset(tmp_path / "none").scans is None
+    assert yaml.safe_load((tmp_path / "none" / "dataset.yaml").read_text())["scanner"] is None
 
 
 @pytest.mark.parametrize("table_format", FORMATS)
@@ -135,44 +128,32 @@ def test_a_file_that_changes_under_an_open_data_set_is_refused(folder: Path) -> 
         scans.of("run-1")
 
 
-def test_scans_that_break_off_while_saving_leave_the_folder_as_it_was(folder: Path) -> None:
-    frame = read_frame(folder, "scans")
-    before = {file.name: file.read_bytes() for file in folder.iterdir()}
+class Broken(ScansInMemory):
+    """Ctrl-C comes while the second run is read."""
 
-    class Broken(ScansInMemory):
-        def of(self, trajectory: str) -> TrajectoryScans:
-            if trajectory == "run-2":
-                raise KeyboardInterrupt
-            return super().of(trajectory)
-
-    made = scanned().scans
-    assert made is not None
-    broken = Broken(SCANNER, dict(made))
-    with pytest.raises(KeyboardInterrupt):
-        save_dataset(replace(scanned(), scans=broken), folder)
-    assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
-    assert len(frame) == 7
-
-
-def test_a_save_that_breaks_off_leaves_no_new_folder(tmp_path: Path) -> None:
-    class Broken(ScansInMemory):
-        def of(self, _: str) -> TrajectoryScans:
+    def of(self, trajectory: str) -> TrajectoryScans:
+        if trajectory == "run-2":
             raise KeyboardInterrupt
+        return super().of(trajectory)
 
-    with pytest.raises(KeyboardInterrupt):
-        save_dataset(
-            replace(everything_known(), scans=Broken(SCANNER, {"run-1": some_scans(2, 1)})), tmp_path / "a" / "b"
-        )
-    assert not list(tmp_path.iterdir())
+
+def test_a_save_that_breaks_off_leaves_the_folder_as_it_was_and_no_new_one(folder: Path, tmp_path: Path) -> None:
+    before = {file.name: file.read_bytes() for file in folder.iterdir()}
+    made = scanned()
+    assert made.scans is not None
+    broken = replace(made, scans=Broken(SCANNER, dict(made.scans)))
+    for place in (folder, tmp_path / "a" / "b"):
+        with pytest.raises(KeyboardInterrupt):
+            save_dataset(broken, place)
+    assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
+    assert list(tmp_path.iterdir()) == [folder]
 
 
 def test_a_full_disk_is_told_in_one_line(tmp_path: Path) -> None:
     save_dataset(scanned(), tmp_path / "data")
     (tmp_path / "data" / "scans.parquet").unlink()
     (tmp_path / "data" / "scans.parquet").symlink_to("/dev/full")
-    with pytest.raises(
-        DataError, match=r"cannot be written: .*No space left on device.*; free space or choose"
-    ) as told:
+    with pytest.raises(DataError, match=r"cannot be written: .*No space left on device") as told:
         save_dataset(scanned(), tmp_path / "data")
     assert "\n" not in str(told.value)
 
@@ -192,71 +173,47 @@ def with_cell(row: int, column: str, value: Any) -> Callable[[pl.DataFrame], pl.
 
 
 RANGES = [1.0] * 7
-BROKEN: dict[str, tuple[Callable[[pl.DataFrame], pl.DataFrame], str]] = {
-    "no column": (lambda frame: frame.rename({"ranges": "range"}), r"column 'ranges' is missing; did you mean 'range'"),
-    "no rows": (lambda frame: frame.clear(), "it has no rows"),
-    "no stamp": (with_cell(2, "t", None), "row 2: t is missing; remove or repair the row"),
-    "stamp not finite": (with_cell(2, "t", math.nan), "row 2: t is (nan|NaN); remove or repair the row"),
-    "stamp a word": (with_cell(2, "t", "soon"), "row 2: t is 'soon', expected a number"),
-    "stamp of unix time in ns": (
-        with_cell(4, "t", 1.7e18),
-        r"row 4: t is 1\.7e\+18, .*; count the time from the start",
-    ),
-    "stamp before the run": (with_cell(1, "t", -0.5), r"row 1: t is -0\.5; it must not be negative"),
-    "stamp repeated": (with_cell(3, "t", 0.1), r"row 3: t is repeated: 0\.1 after 0\.1"),
-    "time goes back": (with_cell(3, "t", 0.05), r"row 3: t goes backwards: 0\.05 after 0\.1"),
-    "no trajectory": (with_cell(2, "trajectory", None), "row 2: trajectory is missing"),
-    "stranger": (
-        with_cell(5, "trajectory", "run-3"),
-        "row 5: trajectory run-3 is not in the table of trajectories; did you mean",
-    ),
-    "too few ranges": (with_cell(6, "ranges", RANGES[1:]), r"row 6: the scan has 6 ranges, but scanner\.rays is 7"),
-    "too many ranges": (with_cell(2, "ranges", [*RANGES, 1.0]), "row 2: the scan has 8 ranges, but"),
-    "no ranges": (with_cell(7, "ranges", None), "row 7: the scan has 0 ranges, but"),
-    "NaN": (with_cell(6, "ranges", [*RANGES[1:], math.nan]), "row 6: a range is missing or NaN; write inf where"),
-    "empty scan": (
-        with_cell(6, "ranges", [math.inf] * 6 + [0.01]),
-        r"row 6: the scan of trajectory run-2 at 0\.15 s is empty: no range from 0\.1 to 30 m; remove the row",
-    ),
-    "millimetres": (
-        with_cell(6, "ranges", [1234.0] * 6 + [math.inf]),
-        r"row 6: .* is empty: no range from 0\.1 to 30 m; they look like mm, give m",
-    ),
-}
-
-
-@pytest.mark.parametrize(("change", "message"), BROKEN.values(), ids=BROKEN)
-def test_a_broken_table_is_refused_in_one_line(
-    folder: Path, change: Callable[[pl.DataFrame], pl.DataFrame], message: str
-) -> None:
-    write_frame(folder, "scans", change(read_frame(folder, "scans")))
-    with pytest.raises(DataError, match=rf"scans\.\w+[:,] {message}") as told:
-        list(scans_of(folder))
-    assert "\n" not in str(told.value)
+Change = Callable[[pl.DataFrame], pl.DataFrame]
+BROKEN: list[tuple[Change, str]] = [
+    (lambda frame: frame.rename({"ranges": "range"}), r"column 'ranges' is missing; did you mean 'range'"),
+    (lambda frame: frame.clear(), "it has no rows"),
+    (with_cell(2, "t", None), "row 2: t is missing"),
+    (with_cell(2, "t", math.nan), "row 2: t is (nan|NaN)"),
+    (with_cell(2, "t", "soon"), "row 2: t is 'soon'"),
+    (with_cell(4, "t", 1.7e18), r"row 4: t is 1\.7e\+18"),
+    (with_cell(1, "t", -0.5), r"row 1: t is -0\.5"),
+    (with_cell(3, "t", 0.1), r"row 3: t is repeated: 0\.1 after 0\.1"),
+    (with_cell(3, "t", 0.05), r"row 3: t goes backwards: 0\.05 after 0\.1"),
+    (with_cell(2, "trajectory", None), "row 2: trajectory is missing"),
+    (with_cell(5, "trajectory", "run-3"), "row 5: trajectory run-3 is not in .*; did you mean"),
+    (with_cell(6, "ranges", RANGES[1:]), r"row 6: the scan has 6 ranges, but scanner\.rays is 7"),
+    (with_cell(2, "ranges", [*RANGES, 1.0]), "row 2: the scan has 8 ranges"),
+    (with_cell(7, "ranges", None), "row 7: the scan has 0 ranges"),
+    (with_cell(6, "ranges", [*RANGES[1:], math.nan]), "row 6: a range is missing or NaN"),
+    (with_cell(6, "ranges", [math.inf] * 6 + [0.01]), r"row 6: the scan of trajectory run-2 at 0\.15 s is empty"),
+    (with_cell(6, "ranges", [1234.0] * 6 + [math.inf]), r"row 6: .* is empty: .*; they look like mm"),
+]
+BROKEN_PARQUET: list[tuple[Change, str]] = [
+    (lambda frame: frame.with_columns(ranges=pl.lit("1 2 3 4 five 6 7")), "row 1: ranges must be numbers"),
+    (lambda frame: frame.with_columns(ranges=pl.lit(3.0)), "column 'ranges' holds Float64, expected lists"),
+    (lambda frame: frame.with_columns(ranges=pl.col("ranges").cast(pl.List(pl.String))), "column 'ranges' holds"),
+    (lambda frame: frame.with_columns(ranges=pl.concat_list([pl.struct("t")] * 7)), "column 'ranges' holds"),
+    (lambda frame: frame.with_columns(t=pl.lit(True)), "column 't' holds Boolean, expected numbers"),
+    (lambda frame: frame.with_columns(trajectory=pl.col("ranges")), "column 'trajectory' holds List"),
+    (lambda frame: frame.with_columns(ranges=pl.lit([None, *RANGES[1:]], pl.List(pl.Float64))), "row 1: a range is"),
+]
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda frame: frame.with_columns(ranges=pl.lit("1 2 3 4 five 6 7")), "row 1: ranges must be numbers"),
-        (lambda frame: frame.with_columns(ranges=pl.lit(3.0)), "column 'ranges' holds Float64, expected lists"),
-        (lambda frame: frame.with_columns(ranges=pl.col("ranges").cast(pl.List(pl.String))), "column 'ranges' holds"),
-        (lambda frame: frame.with_columns(ranges=pl.concat_list([pl.struct("t")] * 7)), "column 'ranges' holds"),
-        (lambda frame: frame.with_columns(t=pl.lit(True)), "column 't' holds Boolean, expected numbers"),
-        (lambda frame: frame.with_columns(trajectory=pl.col("ranges")), "column 'trajectory' holds List"),
-        (
-            lambda frame: frame.with_columns(ranges=pl.lit([1.0, None, *RANGES[2:]], pl.List(pl.Float64))),
-            "row 1: a range is missing or NaN",
-        ),
-    ],
-)  # fmt: skip
-def test_another_type_in_parquet_is_refused(
-    tmp_path: Path, change: Callable[[pl.DataFrame], pl.DataFrame], message: str
-) -> None:
-    save_dataset(scanned(), tmp_path)
+    ("fmt", "change", "message"),
+    [*((fmt, *case) for case in BROKEN for fmt in FORMATS), *(("parquet", *case) for case in BROKEN_PARQUET)],
+)
+def test_a_broken_table_is_refused_in_one_line(tmp_path: Path, fmt: Format, change: Change, message: str) -> None:
+    save_dataset(scanned(), tmp_path, fmt)
     write_frame(tmp_path, "scans", change(read_frame(tmp_path, "scans")))
-    with pytest.raises(DataError, match=rf"scans\.parquet[:,] {message}"):
+    with pytest.raises(DataError, match=rf"scans\.\w+[:,] {message}") as told:
         list(scans_of(tmp_path))
+    assert "\n" not in str(told.value)
 
 
 @pytest.mark.parametrize(
@@ -280,30 +237,24 @@ def test_names_that_are_numbers_stay_names(tmp_path: Path) -> None:
         assert {name: len(found.times) for name, found in scans_of(tmp_path)} == {"007": 2, "7": 3}
 
 
-def test_scans_without_a_scanner_are_refused(folder: Path) -> None:
-    header = yaml.safe_load((folder / "dataset.yaml").read_text())
-    del header["scanner"]
-    (folder / "dataset.yaml").write_text(yaml.safe_dump(header))
-    with pytest.raises(DataError, match=r"dataset\.yaml: scanner is missing, which scans\.\w+ needs: rays"):
-        load_dataset(folder)
-
-
 @pytest.mark.parametrize(
-    ("key", "value", "message"),
+    ("changes", "message"),
     [
-        ("rays", 0, r"scanner\.rays: .*greater than 0 \(given: 0\)"),
-        ("range_max", 0.05, r"scanner: range_min 0\.1 m is not below range_max 0\.05 m"),
-        ("angle_increment", 0.0, "scanner: angle_increment is 0"),
-        ("angle_increment", 30.0, r"scanner: 7 rays, 30 rad apart, are more than a whole turn"),
-        ("angle_minimum", -1.0, r"unknown key 'scanner\.angle_minimum'; did you mean 'angle_min'"),
+        (None, r"dataset\.yaml: scanner is missing, which scans\.\w+ needs"),
+        ({"rays": 0}, r"scanner\.rays: .*greater than 0 \(given: 0\)"),
+        ({"range_max": 0.05}, r"scanner: range_min 0\.1 m .* range_max 0\.05 m"),
+        ({"angle_increment": 0.0}, "scanner: angle_increment is 0"),
+        ({"angle_increment": 30.0}, r"scanner: 7 rays, 30 rad apart"),
+        ({"angle_minimum": -1.0}, r"'scanner\.angle_minimum'; did you mean 'angle_min'"),
     ],
 )
-def test_a_scanner_that_cannot_be_is_refused(folder: Path, key: str, value: float, message: str) -> None:
-    header = yaml.safe_load((folder / "dataset.yaml").read_text())
-    header["scanner"][key] = value
-    (folder / "dataset.yaml").write_text(yaml.safe_dump(header))
+def test_a_scanner_that_cannot_be_is_refused(tmp_path: Path, changes: dict[str, float] | None, message: str) -> None:
+    save_dataset(scanned(), tmp_path)
+    header = yaml.safe_load((tmp_path / "dataset.yaml").read_text())
+    header["scanner"] = None if changes is None else header["scanner"] | changes
+    (tmp_path / "dataset.yaml").write_text(yaml.safe_dump(header))
     with pytest.raises(DataError, match=message):
-        load_dataset(folder)
+        load_dataset(tmp_path)
 
 
 def test_two_tables_of_scans_are_refused(tmp_path: Path) -> None:
@@ -315,25 +266,21 @@ def test_two_tables_of_scans_are_refused(tmp_path: Path) -> None:
 
 def test_damage_never_shows_as_a_traceback(folder: Path) -> None:
     file = table_file(folder, "scans")
-    content, rng, refused = file.read_bytes(), random.Random(3), 0
-    for length in (0, 4, len(content) // 2, len(content) - 3):
-        file.write_bytes(content[:length])
-        refused += _refused(folder)
-    for _ in range(60):
+    content, rng = file.read_bytes(), random.Random(3)
+    damages = [content[:length] for length in (0, 4, len(content) // 2, len(content) - 3)]
+    for _ in range(30):
         damaged = bytearray(content)
         for _ in range(3):
             damaged[rng.randrange(len(damaged))] = rng.randrange(256)
-        file.write_bytes(damaged)
-        refused += _refused(folder)
+        damages.append(bytes(damaged))
+    refused = 0
+    for damage in damages:
+        file.write_bytes(damage)
+        try:
+            list(scans_of(folder))
+        except OmnibenchError:
+            refused += 1
     assert refused > 5
-
-
-def _refused(folder: Path) -> bool:
-    try:
-        list(scans_of(folder))
-    except OmnibenchError:
-        return True
-    return False
 
 
 _LONG = """
@@ -359,6 +306,7 @@ print(total // 1000, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(resource, "RUSAGE_SELF"), reason="the system does not tell a process's memory")
 def test_scans_are_saved_and_read_without_being_in_memory_at_once(tmp_path: Path) -> None:
     ended = subprocess.run(

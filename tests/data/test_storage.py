@@ -1,7 +1,8 @@
-"""Data sets on disk: what is read comes back, whatever the format, and nothing of others is written over."""
+"""Data sets on disk: what is read comes back, what cannot be right is refused in one line, others stay."""
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 from dataclasses import fields, replace
@@ -11,15 +12,25 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from sample_robots import APR_02
 from storage_samples import (
     FORMATS,
+    Change,
     Format,
     a_trajectory,
+    drop_column,
+    drop_rows,
     everything_known,
+    header,
+    overwrite,
+    read_frame,
+    remove_file,
+    rename,
     set_cell,
     with_frame,
 )
+from wheeled_samples import CAR, DIFF, TRICYCLE, driven
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.storage import load_dataset, save_dataset
@@ -27,6 +38,12 @@ from omnibench.errors import DataError
 from omnibench.robot.kinematics import wheel_equations
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
+
+
+@pytest.fixture(params=FORMATS)
+def folder(good: dict[Format, Path], tmp_path: Path, request: pytest.FixtureRequest) -> Path:
+    """A copy of the sound data set, in either format."""
+    return Path(shutil.copytree(good[request.param], tmp_path / "dataset"))
 
 
 @pytest.mark.parametrize("fmt", FORMATS)
@@ -45,24 +62,36 @@ def test_parquet_and_csv_have_the_hash_of_what_was_written(good: dict[Format, Pa
 
 
 @pytest.mark.parametrize("fmt", FORMATS)
-def test_names_made_of_digits_stay_as_they_are(tmp_path: Path, fmt: Format) -> None:
-    run = a_trajectory("007", 0.4, command="0010", session="20221220")
-    save_dataset(make_dataset("digits", APR_02, 0.1, [run]), tmp_path / "d", fmt)
-    (found,) = load_dataset(tmp_path / "d").trajectories
-    assert (found.id, found.command, found.session) == ("007", "0010", "20221220")
-
-
-@pytest.mark.parametrize("fmt", FORMATS)
-def test_headings_of_many_turns_come_back_to_the_bit(tmp_path: Path, fmt: Format) -> None:
+def test_names_made_of_digits_headings_of_many_turns_and_steering_angles_come_back(tmp_path: Path, fmt: Format) -> None:
     times = 0.1 * np.arange(1, 400)
     rates = np.tile(wheel_equations(APR_02.wheels) @ [0.2, 0.1, 1.7], (len(times), 1))
     stamps = np.arange(0.0, 39.0, 0.3)
     (poses,) = OdometryModel.of_design(APR_02, "arc").poses([WheelLog(times, rates, np.array([0, 0, 0.1]), stamps)])
-    wrapped = poses.copy()
-    wrapped[:, 2] = np.arctan2(np.sin(poses[:, 2]), np.cos(poses[:, 2]))
-    dataset = make_dataset("turns", APR_02, 0.1, [Trajectory("a", "train", times, rates, stamps, wrapped)])
-    save_dataset(dataset, tmp_path / "d", fmt)
-    assert load_dataset(tmp_path / "d").hash == dataset.hash
+    poses[:, 2] = np.arctan2(np.sin(poses[:, 2]), np.cos(poses[:, 2]))
+    turns = Trajectory("007", "train", times, rates, stamps, poses, command="0010", session="20221220")
+    for dataset in (
+        make_dataset("turns", APR_02, 0.1, [turns]),
+        driven(TRICYCLE, runs=2, samples=10),
+        driven(CAR, runs=2, samples=10),
+    ):
+        save_dataset(dataset, tmp_path / dataset.name, fmt)
+        found = load_dataset(tmp_path / dataset.name)
+        assert found.hash == dataset.hash
+        for before, after in zip(dataset.trajectories, found.trajectories, strict=True):
+            assert (after.id, after.command, after.session) == (before.id, before.command, before.session)
+            np.testing.assert_array_equal(after.signals, before.signals)
+
+
+def test_the_tables_have_a_column_for_every_measured_rate_and_angle(tmp_path: Path) -> None:
+    for robot, columns in (
+        (TRICYCLE, ["omega_front", "steer_front"]),
+        (CAR, ["omega_rl", "omega_rr", "steer_fl", "steer_fr"]),
+        (DIFF, ["omega_right", "omega_left"]),
+    ):
+        folder = tmp_path / robot.name
+        save_dataset(driven(robot, runs=1, samples=5), folder)
+        assert read_frame(folder, "wheels").columns == ["trajectory", "t", *columns]
+        assert yaml.safe_load((folder / "dataset.yaml").read_text())["wheels"] == list(robot.wheel_names)
 
 
 def test_the_hash_ignores_the_data_sets_name() -> None:
@@ -79,10 +108,7 @@ def test_the_hash_depends_on_the_recordings(item: str) -> None:
     assert changed.hash != dataset.hash
 
 
-@pytest.mark.parametrize("fmt", FORMATS)
-def test_only_trajectory_and_split_are_needed(good: dict[Format, Path], tmp_path: Path, fmt: Format) -> None:
-    folder = tmp_path / "dataset"
-    shutil.copytree(good[fmt], folder)
+def test_only_trajectory_and_split_are_needed(folder: Path) -> None:
     for name, kept in (
         ("trajectories", ["trajectory", "split"]),
         ("wheels", ["trajectory", "t", "omega_a", "omega_b", "omega_c"]),
@@ -97,34 +123,20 @@ def test_only_trajectory_and_split_are_needed(good: dict[Format, Path], tmp_path
     }
 
 
-@pytest.mark.parametrize("fmt", FORMATS)
 @pytest.mark.parametrize(
     "column", ["command", "repetition", "session", "started_at", "v", "alpha", "omega", "distance"]
 )
-def test_what_is_unknown_of_one_run_may_stay_empty(
-    good: dict[Format, Path], tmp_path: Path, fmt: Format, column: str
-) -> None:
-    folder = tmp_path / "dataset"
-    shutil.copytree(good[fmt], folder)
+def test_what_is_unknown_of_one_run_may_stay_empty(folder: Path, column: str) -> None:
     set_cell("trajectories", 2, column, None)(folder)
     known, unknown = (getattr(run, column) for run in load_dataset(folder).trajectories)
     assert known == getattr(everything_known().trajectories[0], column)
     assert unknown is None
 
 
-@pytest.mark.parametrize("fmt", FORMATS)
-def test_rows_of_several_runs_may_be_mixed(good: dict[Format, Path], tmp_path: Path, fmt: Format) -> None:
-    folder = tmp_path / "dataset"
-    shutil.copytree(good[fmt], folder)
+def test_rows_of_several_runs_may_be_mixed_and_numbers_have_spaces(folder: Path) -> None:
     with_frame("wheels", lambda frame: frame[[0, 4, 1, 5, 2, 6, 3, 7]])(folder)
     with_frame("poses", lambda frame: frame[[3, 4, 5, 0, 1, 2]])(folder)
     assert load_dataset(folder).hash == everything_known().hash
-
-
-@pytest.mark.parametrize("fmt", FORMATS)
-def test_numbers_of_a_csv_may_have_spaces_and_integers(good: dict[Format, Path], tmp_path: Path, fmt: Format) -> None:
-    folder = tmp_path / "dataset"
-    shutil.copytree(good[fmt], folder)
     set_cell("trajectories", 1, "v", " 1 ")(folder)
     assert load_dataset(folder).trajectories[0].v == 1.0
 
@@ -141,13 +153,10 @@ def test_arrays_that_only_some_runs_have_are_left_out(tmp_path: Path, fmt: Forma
 
 
 @pytest.mark.parametrize("fmt", FORMATS)
-def test_a_data_set_is_replaced_by_one_in_either_format(good: dict[Format, Path], tmp_path: Path, fmt: Format) -> None:
-    folder = tmp_path / "dataset"
-    shutil.copytree(good[fmt], folder)
-    other: Format = "csv" if fmt == "parquet" else "parquet"
-    save_dataset(make_dataset("new", APR_02, 0.1, [a_trajectory("new", 0.1)]), folder, other, overwrite=True)
+def test_a_data_set_is_replaced_by_one_in_either_format(folder: Path, fmt: Format) -> None:
+    save_dataset(make_dataset("new", APR_02, 0.1, [a_trajectory("new", 0.1)]), folder, fmt, overwrite=True)
     assert [run.id for run in load_dataset(folder).trajectories] == ["new"]
-    assert {file.suffix for file in folder.iterdir()} == {f".{other}", ".yaml"}
+    assert {file.suffix for file in folder.iterdir()} == {f".{fmt}", ".yaml"}
 
 
 def test_another_data_set_is_not_replaced_unless_asked(good: dict[Format, Path], tmp_path: Path) -> None:
@@ -162,67 +171,44 @@ def test_another_data_set_is_not_replaced_unless_asked(good: dict[Format, Path],
     assert {file.suffix for file in folder.iterdir()} == {".parquet", ".yaml"}
 
 
-def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
+def test_a_place_that_is_no_folder_for_a_data_set_is_refused_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="nowhere: no such folder"):
         load_dataset(tmp_path / "nowhere")
-
-
-def test_a_folder_with_other_files_is_not_written_into(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
-    with pytest.raises(DataError, match="holds other files"):
-        save_dataset(everything_known(), tmp_path)
+    for place, words in (
+        (tmp_path, "holds other files"),
+        (tmp_path / "thesis.tex", "thesis.tex: is a file"),
+        (tmp_path / "thesis.tex" / "dataset", "cannot be written"),
+    ):
+        with pytest.raises(DataError, match=words) as refusal:
+            save_dataset(everything_known(), place)
+        assert "\n" not in str(refusal.value)
     assert [file.name for file in tmp_path.iterdir()] == ["thesis.tex"]
 
 
-def test_a_file_in_place_of_the_folder_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "dataset").write_text("")
-    with pytest.raises(DataError, match="dataset: is a file"):
-        save_dataset(everything_known(), tmp_path / "dataset")
-
-
-def test_a_folder_that_cannot_be_made_is_refused_in_one_line(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(DataError, match="cannot be written") as refusal:
-        save_dataset(everything_known(), tmp_path / "file" / "dataset")
-    assert "\n" not in str(refusal.value)
-
-
-@pytest.mark.parametrize("fmt", FORMATS)
-def test_a_folder_without_permission_is_refused_in_one_line(
-    good: dict[Format, Path], tmp_path: Path, fmt: Format
-) -> None:
-    folder = tmp_path / "dataset"
-    shutil.copytree(good["csv"], folder)
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_a_folder_without_permission_is_refused(folder: Path) -> None:
     folder.chmod(0o555)
-    if os.access(folder, os.W_OK):
-        pytest.skip("whoever runs the tests may write anywhere")
     with pytest.raises(DataError, match="cannot be written"):
-        save_dataset(everything_known(), folder, fmt)
+        save_dataset(everything_known(), folder)
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full here, a disk that is always full")
-@pytest.mark.parametrize("old", FORMATS)
 @pytest.mark.parametrize("new", FORMATS)
 @pytest.mark.parametrize("file", ["trajectories", "wheels", "poses", "dataset"])
-def test_a_full_disk_is_told_in_one_line_and_leaves_the_old_data_set(
-    good: dict[Format, Path], tmp_path: Path, old: Format, new: Format, file: str
-) -> None:
-    folder = tmp_path / "dataset"
-    shutil.copytree(good[old], folder)
+def test_a_full_disk_is_told_in_one_line_and_leaves_the_old_data_set(folder: Path, new: Format, file: str) -> None:
+    before = sorted(folder.iterdir())
     name = "dataset.yaml" if file == "dataset" else f"{file}.{new}"
     (folder / f".{name}.{os.getpid()}.partial").symlink_to("/dev/full")
     with pytest.raises(DataError, match=f"{name}: cannot be written: No space left on device"):
         save_dataset(make_dataset("new", APR_02, 0.1, [a_trajectory("new", 0.1)]), folder, new, overwrite=True)
     assert load_dataset(folder).hash == everything_known().hash
-    assert sorted(folder.iterdir()) == sorted(folder / source.name for source in good[old].iterdir())
+    assert sorted(folder.iterdir()) == before
 
 
-def test_two_runs_with_one_id_are_refused_in_memory_too() -> None:
-    with pytest.raises(DataError, match="data set twice: trajectory a is there twice"):
+def test_two_runs_with_one_id_and_no_runs_are_refused_in_memory_too() -> None:
+    with pytest.raises(DataError, match="data set twice: trajectory a "):
         make_dataset("twice", APR_02, 0.1, [a_trajectory("a", 0.1), a_trajectory("a", 0.2)])
-
-
-def test_a_data_set_without_runs_is_refused_in_memory_too() -> None:
     with pytest.raises(DataError, match="data set none: it has no trajectory"):
         make_dataset("none", APR_02, 0.1, [])
 
@@ -232,3 +218,106 @@ def test_poses_after_the_last_wheel_sample_are_warned_of() -> None:
     late = replace(run, pose_times=np.array([0.0, 0.2, 1.0]))
     (warning,) = make_dataset("late", APR_02, 0.1, [run, late][1:]).warnings[-1:]
     assert warning == "1 trajectory has reference poses after its last wheel sample, e.g. late"
+
+
+# What is done, the file and perhaps the row that the message must name, and what it must say.
+REFUSED: list[tuple[Change, str, str]] = [
+    (rename("wheels", "omega_b", "omega_bb"), "wheels.{x}: ", "'omega_b' is missing; did you mean 'omega_bb'"),
+    (drop_column("wheels", "t"), "wheels.{x}: ", "column 't' is missing"),
+    (rename("poses", "theta", "thetaa"), "poses.{x}: ", "did you mean 'thetaa'?"),
+    (drop_column("poses", "trajectory"), "poses.{x}: ", "column 'trajectory' is missing"),
+    (drop_column("trajectories", "split"), "trajectories.{x}: ", "column 'split' is missing"),
+    (drop_column("wheels", "phi_b"), "wheels.{x}: ", "column 'phi_b' is missing; give all of phi_a, phi_b, phi_c"),
+    (drop_column("poses", "cov_yy"), "poses.{x}: ", "column 'cov_yy' is missing"),
+    (set_cell("wheels", 6, "omega_c", math.nan), "wheels.{x}, row 6: ", "omega_c is nan"),
+    (set_cell("wheels", 2, "omega_a", math.inf), "wheels.{x}, row 2: ", "omega_a is inf"),
+    (set_cell("wheels", 3, "omega_b", None), "wheels.{x}, row 3: ", "omega_b is missing"),
+    (set_cell("wheels", 1, "phi_a", math.nan), "wheels.{x}, row 1: ", "phi_a is nan"),
+    (set_cell("wheels", 8, "target_c", -math.inf), "wheels.{x}, row 8: ", "target_c is -inf"),
+    (set_cell("wheels", 4, "t", math.nan), "wheels.{x}, row 4: ", "t is nan"),
+    (set_cell("poses", 5, "theta", math.nan), "poses.{x}, row 5: ", "theta is nan"),
+    (set_cell("poses", 1, "x", -math.inf), "poses.{x}, row 1: ", "x is -inf"),
+    (set_cell("poses", 2, "cov_xy", math.nan), "poses.{x}, row 2: ", "cov_xy is nan"),
+    (set_cell("poses", 6, "t", math.inf), "poses.{x}, row 6: ", "t is inf"),
+    (set_cell("trajectories", 2, "v", math.inf), "trajectories.{x}, row 2: ", "v is inf"),
+    (set_cell("trajectories", 1, "started_at", math.nan), "trajectories.{x}, row 1: ", "is nan"),
+    (set_cell("trajectories", 1, "repetition", 1.5), "trajectories.{x}, row 1: ", "repetition is 1.5"),
+    (set_cell("wheels", 7, "t", 0.15), "wheels.{x}, row 7: ", "t goes backwards: 0.15 after 0.2"),
+    (set_cell("wheels", 2, "t", 0.1), "wheels.{x}, row 2: ", "t is repeated: 0.1 after 0.1"),
+    (set_cell("poses", 6, "t", 0.1), "poses.{x}, row 6: ", "t goes backwards"),
+    (set_cell("poses", 3, "t", 0.2), "poses.{x}, row 3: ", "t is repeated"),
+    (set_cell("wheels", 1, "t", 0.0), "wheels.{x}, row 1: ", "after t = 0"),
+    (set_cell("wheels", 5, "t", -0.1), "wheels.{x}, row 5: ", "t is -0.1"),
+    (set_cell("poses", 4, "t", -0.1), "poses.{x}, row 4: ", "t is -0.1"),
+    (set_cell("poses", 4, "t", 0.05), "poses.{x}, row 4: ", "run-2 has no reference pose at t = 0"),
+    (drop_rows("poses", 5, 6), "poses.{x}, row 4: ", "run-2 has no reference pose after its start"),
+    (drop_rows("poses", 4, 5, 6), "poses.{x}: ", "run-2 (trajectories.{x}, row 2) has no reference poses"),
+    (drop_rows("wheels", 1, 2, 3, 4), "wheels.{x}: ", "run-1 (trajectories.{x}, row 1) has no wheel samples"),
+    (set_cell("trajectories", 2, "trajectory", "run-1"), "trajectories.{x}, row 2: ", "run-1 is there twice"),
+    (set_cell("poses", 2, "trajectory", None), "poses.{x}, row 2: ", "trajectory is missing"),
+    (set_cell("trajectories", 2, "split", "validate"), "trajectories.{x}, row 2: ", "did you mean 'validation'?"),
+    (set_cell("trajectories", 1, "split", None), "trajectories.{x}, row 1: ", "split is None"),
+    (set_cell("wheels", 5, "trajectory", "run-3"), "wheels.{x}, row 5: ", "run-3 is not in trajectories.{x}"),
+    (set_cell("poses", 3, "trajectory", "x"), "poses.{x}, row 3: ", "trajectory x is not in"),
+    (set_cell("wheels", 6, "omega_b", "fast"), "wheels.{x}, row 6: ", "omega_b is 'fast', expected a number"),
+    (set_cell("poses", 2, "x", "1,5"), "poses.{x}, row 2: ", "x is '1,5', expected a number"),
+    (set_cell("trajectories", 2, "omega", "left"), "trajectories.{x}, row 2: ", "omega is 'left'"),
+    (remove_file("wheels"), ": ", "wheels.parquet (or wheels.csv) is missing"),
+    (remove_file("poses"), ": ", "poses.parquet (or poses.csv) is missing"),
+    (remove_file("trajectories"), ": ", "trajectories.parquet (or trajectories.csv) is missing"),
+    (with_frame("wheels", lambda frame: frame.clear()), "wheels.{x}: ", "it has no rows"),
+    (with_frame("trajectories", lambda frame: frame.clear()), "trajectories.{x}: ", "it has no rows"),
+    (overwrite("poses", b""), "poses.{x}: ", "cannot be read"),
+    (overwrite("poses", b"\x89PNG\xff\xfe\x00"), "poses.{x}: ", ""),
+    (remove_file("dataset"), "dataset.yaml: ", "no such file"),
+    (overwrite("dataset", b"a: [1"), "dataset.yaml: ", "YAML"),
+    (header("format", "omnibench-dataset/9"), "dataset.yaml: ", "omnibench-dataset/1"),
+    (header("format", None), "dataset.yaml: ", "format is None"),
+    (header("robot", None), "dataset.yaml: ", "key 'robot' is missing"),
+    (header("sample_perod", 0.1), "dataset.yaml: ", "did you mean 'sample_period'?"),
+    (header("sample_period", 0), "dataset.yaml: ", "sample_period"),
+    (header("wheels", ["a", "b", "d"]), "dataset.yaml: ", "a, b, d"),
+    (header("wheels", ["c", "b", "a"]), "dataset.yaml: ", "the same order"),
+]
+REFUSED_STEERING: list[tuple[Change, str, str]] = [
+    (drop_column("wheels", "steer_front"), "wheels.{x}: ", "column 'steer_front'"),
+    (set_cell("wheels", 3, "steer_front", math.nan), "wheels.{x}, row 3: ", "steer_front is nan"),
+    (header("wheels", ["front", "left", "right"]), "dataset.yaml: ", "front"),
+]
+
+
+def assert_refused(folder: Path, place: str, reason: str, fmt: Format, most_in_memory: int = 100) -> None:
+    with pytest.raises(DataError) as refusal:
+        load_dataset(folder, most_in_memory=most_in_memory)
+    message = str(refusal.value)
+    separator = "" if place.startswith(":") else "/"
+    assert message.startswith(f"{folder}{separator}{place.format(x=fmt)}")
+    assert reason.format(x=fmt) in message
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize(("fmt", "most_in_memory"), [("csv", 100), ("parquet", 100), ("parquet", 0)])
+@pytest.mark.parametrize(("change", "place", "reason"), REFUSED)
+def test_refused_in_one_line_that_names_file_row_and_reason(
+    good: dict[Format, Path],
+    tmp_path: Path,
+    change: Change,
+    place: str,
+    reason: str,
+    fmt: Format,
+    most_in_memory: int,
+) -> None:
+    folder = tmp_path / "dataset"
+    shutil.copytree(good[fmt], folder)
+    change(folder)
+    assert_refused(folder, place, reason, fmt, most_in_memory)
+
+
+@pytest.mark.parametrize("fmt", ["csv", "parquet"])
+@pytest.mark.parametrize(("change", "place", "reason"), REFUSED_STEERING)
+def test_steering_angles_that_cannot_be_read_are_refused(
+    tmp_path: Path, change: Change, place: str, reason: str, fmt: Format
+) -> None:
+    save_dataset(driven(TRICYCLE, runs=1, samples=5), tmp_path / "d", fmt)
+    change(tmp_path / "d")
+    assert_refused(tmp_path / "d", place, reason, fmt)

@@ -116,17 +116,15 @@ def of_size(size: int, _: Reporter) -> bytes:
     return bytes(size)
 
 
-def test_results_of_one_parcel_arrive_whatever_their_sizes(dask: DaskBackend) -> None:
-    sizes = [10] * 40 + [10, 300_000] * 20
-    assert [len(result) for result in gathered(dask, of_size, sizes)] == sizes
-
-
 def trims_memory(_: int, __: Reporter) -> bool:
+    """Workers of Dask would give memory back all the time."""
     return "MALLOC_TRIM_THRESHOLD_" in os.environ
 
 
-def test_jobs_do_not_give_memory_back_all_the_time_as_workers_of_dask_do(dask: DaskBackend) -> None:
+def test_results_of_one_parcel_arrive_whatever_their_sizes_and_memory_is_not_trimmed(dask: DaskBackend) -> None:
     assert gathered(dask, trims_memory, [0]) == [False]
+    sizes = [10] * 40 + [10, 300_000] * 20
+    assert [len(result) for result in gathered(dask, of_size, sizes)] == sizes
 
 
 def test_results_of_ended_calls_are_not_held(dask: DaskBackend) -> None:
@@ -159,6 +157,7 @@ def test_data_that_jobs_share_are_pickled_once_and_go_with_none_of_them(dask: Da
     assert len({id(value) for _, shared in packed for value in shared.values()}) == 1
 
 
+@pytest.mark.slow
 class TestWorkersThatDie:
     def test_a_job_whose_process_is_killed_is_tried_three_times(self, dask: DaskBackend, tmp_path: Path) -> None:
         jobs = [Job("always", killed, (tmp_path, signal.SIGKILL)), Job("once", killed_once, tmp_path)]
@@ -198,6 +197,7 @@ class Crafted:
         return Path.touch, (self._file,)
 
 
+@pytest.mark.slow
 def test_events_that_another_client_sends_run_nothing(dask: DaskBackend, tmp_path: Path) -> None:
     crafted = Crafted(tmp_path / "ran")
     events = [pickle.dumps(crafted), pickle.dumps((0, [crafted])), Serialize(crafted), "no JSON", "[" * 100_000]
@@ -231,6 +231,7 @@ for place in sys.argv[1:]:
 """
 
 
+@pytest.mark.slow
 def test_a_process_without_the_certificate_reaches_no_part_of_a_cluster_of_this_machine(dask: DaskBackend) -> None:
     workers = dask.client.scheduler_info(n_workers=-1)["workers"]
     addresses = [dask.client.scheduler.address, *workers, *(worker["nanny"] for worker in workers.values())]
@@ -247,6 +248,7 @@ def noting(folder: Path, _: Reporter) -> Answer:
     raise AssertionError
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_what_is_at_work_and_what_waits(dask: DaskBackend, tmp_path: Path) -> None:
     notes = tmp_path / "notes"
     notes.mkdir()

@@ -2,37 +2,40 @@
 
 from __future__ import annotations
 
-import datetime
-import http.server
 import os
 import shutil
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from importlib.metadata import distribution, version
 from pathlib import Path
 
 import pytest
-from commands import ENVIRONMENT, assert_refused, compared, omnibench, search, summary, write_config, write_plugin
-from cryptography import x509
-from cryptography.hazmat.primitives import hashes, serialization
-from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.x509.oid import NameOID
-from dask_samples import program, scheduler, searched_first, worker
+from commands import (
+    ENVIRONMENT,
+    assert_refused,
+    compared,
+    omnibench,
+    search,
+    summary,
+    without_seconds,
+    write_config,
+    write_plugin,
+)  # fmt: skip
+from dask_samples import certificates, program, refusal, scheduler, searched_first, worker
 from job_samples import IMPORTING_THIS, Answer, Notes, jobs_of, wait_for
 from timing import PATIENCE
 
 import omnibench as package
 import omnibench.jobs.dask_backend as dask_backend
 import omnibench.jobs.dask_cluster as dask_cluster
-from omnibench.errors import ConfigError, OmnibenchError
-from omnibench.jobs.backend_choice import BackendChoice, check_backend, open_backend
+from omnibench.jobs.backend_choice import BackendChoice, open_backend
 from omnibench.jobs.job import BackendError, JobWatch, ResultStore, TlsFiles, run_jobs
 from omnibench.progress import Progress, Reporter
 
+pytestmark = pytest.mark.slow
 PACKAGE = Path(package.__file__).parent
 
 
@@ -43,59 +46,18 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         yield place
 
 
-def refusal(name: str, **others: object) -> str:
-    """The one line of a backend that cannot be opened."""
-    with pytest.raises(OmnibenchError) as refused, open_backend(BackendChoice(name=name, **others)):
-        pass
-    assert refused.value.exit_code == 2
-    return str(refused.value)
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("dusk", "unknown backend 'dusk'; did you mean 'dask'? known: processes, dask, tcp://HOST:PORT, tls://HOST:PO"),
-        ("tcp://127.0.0.1", "unknown backend 'tcp://127.0.0.1'; known:"),
-        ("tcp://:8786", "unknown backend 'tcp://:8786'; known:"),
-        ("tls://127.0.0.1:8786", "name the files of TLS, ca, cert and key (--tls-ca, --tls-cert, --tls-key)"),
-    ],
-)
-def test_a_wrong_backend_is_named(name: str, message: str) -> None:
-    with pytest.raises(ConfigError) as refused:
-        check_backend(name)
-    assert message in str(refused.value)
-
-
-def test_a_scheduler_that_nobody_started_is_one_line(tmp_path: Path) -> None:
-    run = omnibench("compare", write_config(tmp_path), "-o", tmp_path / "out", "--backend", "tcp://127.0.0.1:9")
-    assert_refused(run, "no Dask scheduler answers at tcp://127.0.0.1:9", "start one (dask scheduler)")
-
-
 def test_a_scheduler_without_tls_is_joined_with_a_line_that_says_who_runs_code_there(
     address: str, tmp_path: Path
 ) -> None:
     said: list[Progress] = []
     choice = BackendChoice(name=address)
-    with worker(address, tmp_path / "worker"), open_backend(choice, report=said.append):
-        pass
+    with worker(address, tmp_path / "worker"), open_backend(choice, report=said.append) as backend:
+        assert isinstance(backend, dask_backend.DaskBackend)
+        (of_worker,) = backend.client.nthreads()
+        assert refusal(of_worker).startswith(f"{of_worker} is a worker of Dask")
     (line,) = [event.result for event in said if event.result.startswith("warning")]
-    assert line == (
-        f"warning: whoever reaches {address} runs code on its workers and here; with tls://HOST:PORT it asks "
-        "for certificates (omnibench guide scale)"
-    )
-
-
-def test_without_dask_one_line_names_the_extra(tmp_path: Path) -> None:
-    without = "import sys; sys.modules['distributed'] = None; from omnibench.__main__ import main; main()"
-    command = [sys.executable, "-c", without, "compare", str(write_config(tmp_path)), "--backend", "dask"]
-    run = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, check=False, cwd=tmp_path)
-    assert_refused(run, 'backend dask: Dask is not installed; pip install "omnibench[dask]"')
-
-
-def test_dask_is_imported_only_where_it_is_asked_for() -> None:
-    program = "import sys, omnibench.compare.run, omnibench.cli.app; print('distributed' in sys.modules)"
-    run = subprocess.run([sys.executable, "-c", program], env=ENVIRONMENT, capture_output=True, text=True, check=True)
-    assert run.stdout == "False\n"
+    assert address in line
+    assert "tls://HOST:PORT" in line
 
 
 def test_a_worker_with_other_code_is_refused_before_the_first_job(address: str, tmp_path: Path) -> None:
@@ -117,14 +79,11 @@ def pretended(folder: Path, name: str, number: str) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("name", ["scipy", "dask"])
-def test_a_worker_with_another_version_of_a_package_is_refused(name: str, address: str, tmp_path: Path) -> None:
-    environment = searched_first(pretended(tmp_path / "other", name, "1.2.3"))
-    with worker(address, tmp_path / "worker", environment=environment):
-        assert f"has {name} 1.2.3 (here: {version(name)}): results could differ" in refusal(address)
-
-
-def test_a_scheduler_of_another_version_is_refused(tmp_path: Path) -> None:
+def test_a_worker_and_a_scheduler_with_another_version_of_a_package_are_refused(address: str, tmp_path: Path) -> None:
+    for name in ("scipy", "dask"):
+        environment = searched_first(pretended(tmp_path / name, name, "1.2.3"))
+        with worker(address, tmp_path / f"{name}_worker", environment=environment):
+            assert f"has {name} 1.2.3 (here: {version(name)})" in refusal(address)
     environment = searched_first(pretended(tmp_path / "other", "distributed", "2024.1.0"))
     with scheduler(tmp_path, environment=environment) as (place, _), worker(place, tmp_path / "worker"):
         assert f"scheduler {place} has distributed 2024.1.0 (here: {version('distributed')})" in refusal(place)
@@ -264,16 +223,6 @@ def test_ctrl_c_in_a_terminal_is_left_to_the_client(tmp_path: Path) -> None:
     assert client.communicate(timeout=PATIENCE)[1] == "interrupted\n"
 
 
-def test_a_web_server_is_no_scheduler() -> None:
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), http.server.SimpleHTTPRequestHandler)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    place = f"tcp://127.0.0.1:{server.server_port}"
-    try:
-        assert refusal(place).startswith(f"no Dask scheduler answers at {place} (whoever listens there says nothing")
-    finally:
-        server.shutdown()
-
-
 def test_a_scheduler_that_is_killed_is_one_line(tmp_path: Path) -> None:
     with scheduler(tmp_path) as (place, process), worker(place, tmp_path / "worker"):
         command = [sys.executable, "-c", CLIENT, place, str(tmp_path)]
@@ -316,26 +265,6 @@ def test_where_no_worker_is_left_it_is_said_and_ends(
     assert Progress("waiting for a worker") in said
 
 
-def test_the_address_of_a_worker_is_refused(address: str, tmp_path: Path) -> None:
-    with worker(address, tmp_path / "worker"), open_backend(BackendChoice(name=address)) as backend:
-        assert isinstance(backend, dask_backend.DaskBackend)
-        (of_worker,) = backend.client.nthreads()
-        assert refusal(of_worker) == f"{of_worker} is a worker of Dask; give the address of its scheduler"
-
-
-def test_a_file_of_tls_that_is_none_is_named(tmp_path: Path) -> None:
-    ca, cert, key = certificates(tmp_path)
-    text = tmp_path / "text"
-    text.write_text("no certificate")
-    place = "tls://127.0.0.1:1"
-    for files, line in (
-        (TlsFiles(ca=text, cert=cert, key=key), f"ca: {text}: holds no certificate in PEM"),
-        (TlsFiles(ca=ca, cert=cert, key=text), f"cert and key: {cert}, {text}: are no certificate in PEM with its key"),
-        (TlsFiles(ca=ca, cert=tmp_path, key=key), f"cert: {tmp_path}: is a folder"),
-    ):
-        assert refusal(place, tls=files).startswith(f"backend {place}: {line}")
-
-
 def test_a_comparison_over_tls_equals_one_by_processes(tmp_path: Path) -> None:
     ca, cert, key = certificates(tmp_path)
     tls = ("--tls-ca-file", str(ca), "--tls-cert", str(cert), "--tls-key", str(key))
@@ -348,38 +277,4 @@ def test_a_comparison_over_tls_equals_one_by_processes(tmp_path: Path) -> None:
         line = refusal(place, tls=TlsFiles(ca=other[0], cert=other[1], key=other[2]))
         assert line.startswith(f"no Dask scheduler answers at {place} (")
     compared(config, tmp_path / "processes")
-    assert without_times(tmp_path / "tls") == without_times(tmp_path / "processes")
-
-
-def without_times(output: Path) -> list[dict[str, object]]:
-    timed = ("seconds", "reference_seconds")
-    return [{name: value for name, value in run.items() if name not in timed} for run in summary(output)["runs"]]
-
-
-def certificates(folder: Path) -> tuple[Path, Path, Path]:
-    """An authority's certificate, and one of its own with the key, for scheduler, workers and client."""
-    folder.mkdir(exist_ok=True)
-    authority_key, key = (ec.generate_private_key(ec.SECP256R1()) for _ in range(2))
-    authority = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "test authority")])
-    now = datetime.datetime.now(datetime.UTC)
-
-    def certificate(subject: x509.Name, of_key: ec.EllipticCurvePrivateKey, *, is_ca: bool) -> x509.Certificate:
-        builder = x509.CertificateBuilder().subject_name(subject).issuer_name(authority).public_key(of_key.public_key())
-        builder = builder.serial_number(x509.random_serial_number())
-        builder = builder.not_valid_before(now - datetime.timedelta(days=1))
-        builder = builder.not_valid_after(now + datetime.timedelta(days=1))
-        builder = builder.add_extension(x509.BasicConstraints(ca=is_ca, path_length=None), critical=True)
-        return builder.sign(authority_key, hashes.SHA256())
-
-    contents = {
-        "ca.pem": certificate(authority, authority_key, is_ca=True).public_bytes(serialization.Encoding.PEM),
-        "cert.pem": certificate(
-            x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "cluster")]), key, is_ca=False
-        ).public_bytes(serialization.Encoding.PEM),
-        "key.pem": key.private_bytes(
-            serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-        ),
-    }
-    for name, content in contents.items():
-        (folder / name).write_bytes(content)
-    return folder / "ca.pem", folder / "cert.pem", folder / "key.pem"
+    assert without_seconds(tmp_path / "tls") == without_seconds(tmp_path / "processes")

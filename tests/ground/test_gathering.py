@@ -1,4 +1,4 @@
-"""Results of many jobs of one function, gathered in memory by processes that last."""
+"""Results of many jobs in memory and in files, and Ctrl-C while processes start."""
 
 from __future__ import annotations
 
@@ -7,18 +7,23 @@ import os
 import signal
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
+from multiprocessing import forkserver
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import psutil
 import pytest
-from job_samples import wait_for
+from job_samples import Answer, wait_for
 
 import omnibench.jobs.job_process as packing
 from omnibench.errors import DataError
 from omnibench.jobs.backend_choice import BackendChoice, open_backend
-from omnibench.jobs.job import Backend, Failure, Job, JobWatch, ResultStore, gathered, run_jobs
+from omnibench.jobs.job import Backend, Failure, Job, JobWatch, ResultStore, content_key, gathered, run_jobs
+from omnibench.processes import one_thread_processes
 from omnibench.progress import Progress, Reporter
+from omnibench.robot.kinematics import JsonArray
 
 
 @pytest.fixture
@@ -100,3 +105,69 @@ def test_a_job_that_reports_without_pause_ends_at_its_limit(one_process: Backend
     run_jobs([job], ResultStore(tmp_path, int), one_process, watch)
     assert watch.ending == Failure("over time (limit 0.5 s)", over_time=True)
     assert time.monotonic() - began < 15
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """A result with arrays."""
+
+    values: JsonArray
+    empty: JsonArray | None = None
+
+
+class TestStore:
+    def test_gives_arrays_back_to_the_last_bit(self, tmp_path: Path) -> None:
+        values = np.random.default_rng(5).normal(size=(4, 3, 3)) * 10.0 ** np.arange(-150, 150, 100)
+        values[0, 0] = [np.nan, np.inf, -0.0]
+        store = ResultStore(tmp_path, Table)
+        store.put("key", Table(values))
+        table = store.get("key")
+        assert table is not None
+        assert table.values.tobytes() == values.tobytes()
+        assert table.empty is None
+
+    def test_refuses_what_it_could_not_give_back(self, tmp_path: Path) -> None:
+        store = ResultStore(tmp_path, Answer)
+        three: Any = "three"  # on purpose not the whole number that an answer takes
+        with pytest.raises(ValueError, match="number"):
+            store.put("key", Answer(three))
+        assert list(tmp_path.iterdir()) == []
+
+    def test_removes_its_files_and_no_others(self, tmp_path: Path) -> None:
+        store = ResultStore(tmp_path / "results", Answer)
+        store.put("key", Answer(1))
+        (tmp_path / "results" / "notes.txt").touch()
+        store.remove()
+        assert [file.name for file in (tmp_path / "results").iterdir()] == ["notes.txt"]
+
+    def test_a_key_changes_with_every_bit_of_what_it_is_made_of(self) -> None:
+        values = np.arange(6.0)
+        keys = [
+            content_key({"table": Table(values), "number": 1}),
+            content_key({"table": Table(np.nextafter(values, 9.0)), "number": 1}),
+            content_key({"table": Table(values.reshape(2, 3)), "number": 1}),
+            content_key({"table": Table(values, values), "number": 1}),
+            content_key({"table": Table(values), "number": 2}),
+        ]
+        assert len(set(keys)) == len(keys)
+        assert keys[0] == content_key({"number": 1, "table": Table(values.copy())})
+
+
+def test_ctrl_c_while_the_fork_server_starts_is_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    started = []
+
+    def interrupted() -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        started.append(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ()))
+
+    monkeypatch.setattr(forkserver, "ensure_running", interrupted)
+    with pytest.raises(KeyboardInterrupt), one_thread_processes(()):
+        pytest.fail("the interrupt was lost")
+    assert started == [True]
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
+
+
+def test_processes_of_the_fork_server_leave_ctrl_c_to_their_parent() -> None:
+    with one_thread_processes(()) as context, context.Pool(1) as pool:
+        blocked = pool.apply(signal.pthread_sigmask, (signal.SIG_BLOCK, ()))
+    assert signal.SIGINT in blocked

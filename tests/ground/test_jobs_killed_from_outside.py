@@ -44,6 +44,7 @@ def little_memory_group() -> Iterator[Path]:
     group.rmdir()
 
 
+@pytest.mark.slow
 def test_a_job_that_the_system_kills_for_lack_of_memory_says_so(tmp_path: Path, little_memory_group: Path) -> None:
     command = [sys.executable, "-c", OUT_OF_MEMORY, str(tmp_path), str(little_memory_group)]
     done = subprocess.run(command, env=IMPORTING_THIS, capture_output=True, text=True, check=True)
@@ -80,6 +81,7 @@ def alive(session: int) -> list[str]:
     return [line for line in listed.stdout.splitlines() if not line.startswith("Z")]
 
 
+@pytest.mark.slow
 def test_when_the_parent_is_killed_no_worker_is_left_and_nothing_that_ended_is_run_again(tmp_path: Path) -> None:
     command = [sys.executable, "-c", PROGRAM, str(tmp_path)]
     parent = subprocess.Popen(command, env=IMPORTING_THIS, start_new_session=True)

@@ -1,4 +1,4 @@
-"""The package as it is imported and started."""
+"""The package as it is imported and started, and its rooms, whose imports run one way."""
 
 from __future__ import annotations
 
@@ -6,13 +6,16 @@ import ast
 import doctest
 import subprocess
 import sys
+from collections import defaultdict
 from collections.abc import Callable
 from functools import cache
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from commands import ROOT
 from start_up import NUMPY, PACKAGE, ratio
 from timing import PATIENCE
 
@@ -43,24 +46,15 @@ def test_a_name_that_is_not_public_is_missed_by_its_name() -> None:
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (
-            lambda: omnibench.calibrate("data/robot"),
-            "expected a Dataset, found 'data/robot'; make one with omnibench.load_dataset",
-        ),
-        (
-            lambda: omnibench.run_comparison("apr02.yaml"),
-            "expected a CompareConfig, found 'apr02.yaml'; .*read_comp",
-        ),
-        (lambda: omnibench.simulate_dataset("small.yaml"), "expected a RobotConfig, found 'small.yaml'; .*read_simul"),
-        (lambda: omnibench.LiveNode("live.yaml"), "expected a LiveConfig, found 'live.yaml'; .*read_live_config"),
-        (
-            lambda: omnibench.References.of([3], end=1.0),
-            r"expected a Reference, found 3; .*Reference\(kind, value,",
-        ),
+        (lambda: omnibench.calibrate("data/robot"), "expected a Dataset, found 'data/robot'; .*load_dataset"),
+        (lambda: omnibench.run_comparison("apr02.yaml"), "expected a CompareConfig, .*read_comp"),
+        (lambda: omnibench.simulate_dataset("small.yaml"), "expected a RobotConfig, .*read_simul"),
+        (lambda: omnibench.LiveNode("live.yaml"), "expected a LiveConfig, .*read_live_config"),
+        (lambda: omnibench.References.of([3], end=1.0), r"expected a Reference, found 3; .*Reference\(kind, value,"),
         (lambda: omnibench.inspect_dataset(Path("data")), "expected a Dataset, found PosixPath"),
         (lambda: omnibench.discover_effects("data"), "expected a Dataset"),
         (lambda: omnibench.save_dataset("data", "copy"), "expected a Dataset"),
-        (lambda: omnibench.evaluate("robot.yaml", "data"), "expected a Calibration, found 'robot.yaml'; .*read_calib"),
+        (lambda: omnibench.evaluate("robot.yaml", "data"), "expected a Calibration, .*read_calib"),
         (lambda: omnibench.certify_optimum("robot.yaml", "data"), "expected a Calibration"),
         (lambda: omnibench.export_calibration("robot.yaml", "c_header"), "expected a Calibration"),
         (lambda: omnibench.write_calibration("robot.yaml", "copy.yaml"), "expected a Calibration"),
@@ -94,10 +88,7 @@ def calibration() -> omnibench.Calibration:
     [
         (lambda: omnibench.Robot(name="cart"), "^Robot: key 'wheels' is missing$"),
         (lambda: omnibench.Wheel(name="l", radus=1), "^Wheel: unknown key 'radus'; did you mean 'radius'"),
-        (
-            lambda: omnibench.Wheel(name="l", type="fixed", radius=-0.05, x=0, y=0.1),
-            r"^Wheel: radius: .*\(given: -0.05\)$",
-        ),
+        (lambda: omnibench.Wheel(name="l", type="fixed", radius=-0.05, x=0, y=1), r"^Wheel: radius: .*-0.05\)$"),
         (lambda: omnibench.Budget(seconds=0), r"^Budget: seconds: Input should be greater than 0 \(given: 0\)$"),
         (lambda: omnibench.calibrate(DRIVEN, loss="hubr"), "unknown loss 'hubr'; did you mean 'huber'"),
         (lambda: omnibench.calibrate(DRIVEN, box="rows"), "unknown box 'rows'; did you mean 'row'"),
@@ -132,28 +123,6 @@ def test_one_folder_of_plug_ins_is_not_taken_for_a_list_of_letters() -> None:
         omnibench.load_plugins("nowhere")
 
 
-# Stands for Ctrl-C while a package that takes long is still being imported.
-INTERRUPTED = """
-import sys
-
-class Impatient:
-    def find_spec(self, name, path=None, target=None):
-        if name == "typer":
-            raise KeyboardInterrupt
-
-sys.meta_path.insert(0, Impatient())
-from omnibench.__main__ import main
-main()
-"""
-
-
-def test_ctrl_c_during_the_first_imports_is_one_line() -> None:
-    run = subprocess.run(
-        [sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, timeout=PATIENCE, check=False
-    )
-    assert (run.returncode, run.stdout, run.stderr) == (130, "", "interrupted\n")
-
-
 def test_importing_the_package_loads_no_heavy_library() -> None:
     program = "import sys, omnibench; print(sorted({'numpy', 'polars', 'plotly', 'cvxpy'} & set(sys.modules)))"
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=PATIENCE, check=True)
@@ -184,3 +153,70 @@ def test_the_examples_of_a_public_name_give_what_they_show(
     for each in methods if isinstance(found, type) else [found]:
         for example in doctest.DocTestFinder(recurse=False).find(each, name, globs=names):
             assert doctest.DocTestRunner().run(example).failed == 0
+
+
+MODULES = {".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): file
+           for file in sorted((ROOT / "omnibench").rglob("*.py"))}  # fmt: skip
+
+# What each room may import besides itself and the ground.
+BELOW = {
+    "robot": {"robot"},
+    "data": {"robot"},
+    "slam": {"robot", "data"},
+    "simulate": {"robot", "data", "slam"},
+    "fit": {"robot", "data"},
+    "report": {"robot", "data", "slam", "fit"},
+    "design": {"robot", "data", "slam", "simulate", "fit", "report"},
+    "compare": {"robot", "data", "slam", "simulate", "fit", "report"},
+    "study": {"robot", "data", "slam", "simulate", "fit", "report", "compare"},
+    "discover": {"robot", "data", "simulate", "fit", "report"},
+    "live": {"robot", "data", "simulate"},
+    "testing": {"robot", "data", "fit"},
+    "notebook": {"robot", "data", "slam", "simulate", "fit", "report", "design", "compare", "discover"},
+}
+BELOW["cli"] = {*BELOW, "testing"} - {"notebook"}
+GROUND = {"config", "registry", "errors", "files", "processes", "jobs", "environment", "words", "progress", "views"}
+
+
+@cache
+def imports(module: str) -> set[str]:
+    """The modules of the package that a module imports, wherever in its text."""
+    names = set()
+    for node in ast.walk(ast.parse(MODULES[module].read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+    return {name for name in names if name in MODULES and name not in (module, "omnibench")}
+
+
+def room(module: str) -> str:
+    return module.split(".")[1] if module.count(".") else ""
+
+
+@pytest.mark.parametrize("name", [*sorted(BELOW), "the ground"])
+def test_a_room_imports_only_rooms_below_it(name: str) -> None:
+    importing = GROUND if name == "the ground" else {name}
+    allowed = GROUND | BELOW.get(name, set()) | importing
+    wrong = [
+        f"{module} imports {other}"
+        for module in MODULES
+        if room(module) in importing
+        for other in imports(module)
+        if room(other) not in allowed
+    ]
+    assert not wrong
+
+
+def test_every_folder_of_the_package_is_a_known_room() -> None:
+    assert {room(module) for module in MODULES} - {"", "__main__"} == set(BELOW) | GROUND
+
+
+def test_imports_run_in_no_circle() -> None:
+    graph: dict[str, set[str]] = defaultdict(set)
+    for module in MODULES:
+        graph[module] = {other for other in imports(module) if not module.startswith(f"{other}.")}
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(f"circle: {' -> '.join(error.args[1])}")

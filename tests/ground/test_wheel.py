@@ -15,6 +15,7 @@ import yaml
 from commands import ROOT
 from timing import PATIENCE
 
+pytestmark = pytest.mark.slow
 Run = Callable[..., str]
 
 # Shortens the example's comparison; calibrators of the plug-ins that the example brings are among those that stay.

@@ -243,7 +243,13 @@ def _recorded(sent: Sequence[Sent]) -> list[Sent]:
 
 
 DRIVE = drive()
-FORMATS = pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
+FORMATS = pytest.mark.parametrize(
+    "write",
+    [
+        pytest.param(write, id=name, marks=[pytest.mark.slow] if name in ("rosbag2 mcap", "mcap-ros2-support") else [])
+        for name, write in WRITERS.items()
+    ],
+)
 
 
 def read(source: Path, **options: Any) -> Dataset:

@@ -34,7 +34,9 @@ class Drive:
     poses: Array
 
 
-def drive(seed: int, length: float = 20.0, start: tuple[float, float, float] = (0.5, -0.3, 0.4)) -> Drive:
+def drive(
+    seed: int, length: float = 20.0, start: tuple[float, float, float] = (0.5, -0.3, 0.4), noise: float = 1.0
+) -> Drive:
     """A second of rest, then speeds and turns that change every second or so, and a second of rest."""
     rng = np.random.default_rng(seed)
     times = PERIOD * np.arange(1, round(length / PERIOD) + 1)
@@ -46,7 +48,7 @@ def drive(seed: int, length: float = 20.0, start: tuple[float, float, float] = (
     rates = twists @ np.linalg.pinv(MODEL.matrix).T
     pose_times = POSE_PERIOD * np.arange(0, round(length / POSE_PERIOD) + 1)
     (poses,) = MODEL.poses([WheelLog(times, rates, np.array(start), pose_times)])
-    return Drive(times, rates, pose_times, poses + rng.normal(0, (0.001, 0.001, 0.002), poses.shape))
+    return Drive(times, rates, pose_times, poses + noise * rng.normal(0, (0.001, 0.001, 0.002), poses.shape))
 
 
 def trajectory(name: str, of: Drive, split: str = "train") -> Trajectory:

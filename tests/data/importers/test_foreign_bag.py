@@ -15,6 +15,7 @@ def foreign_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_mecanum_bag(tmp_path_factory.mktemp("foreign") / "drive")
 
 
+@pytest.mark.slow
 def test_every_error_line_names_the_option_that_leads_on(command: Command, tmp_path: Path, foreign_bag: Path) -> None:
     (tmp_path / "robot.yaml").write_text(yaml.safe_dump(DESIGN))
     said: list[str] = []

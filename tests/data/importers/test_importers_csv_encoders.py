@@ -23,14 +23,22 @@ from omnibench.slam.import_dataset import import_dataset
 DRIVE = tricycle_drive()
 
 
-def write_table(file: Path, columns: Mapping[str, Array], rows: Any = slice(None), header: bool = True) -> Path:
+def write_table(file: Path, columns: Mapping[str, Array], rows: Any = slice(None)) -> Path:
     lines = [",".join(f"{value:.12g}" for value in row) for row in np.column_stack(list(columns.values()))[rows]]
-    file.write_text("\n".join([",".join(columns)] * header + lines) + "\n")
+    file.write_text("\n".join([",".join(columns), *lines]) + "\n")
     return file
 
 
+def log(folder: Path, rows: Any = slice(None), **columns: Array) -> Path:
+    """The drive as a table, with other columns."""
+    return write_table(folder / "log.csv", dict(DRIVE) | columns, rows)
+
+
 def read(source: Path, **options: Any) -> Dataset:
-    return import_dataset("csv", source, {"robot": TRICYCLE} | options)
+    """A table with the columns of ``tricycle_drive``, unless the options say otherwise."""
+    named = {"robot": TRICYCLE, "wheel_columns": "angle", "steering_columns": "phi", "wheel_unit": "rad"}
+    given = {name: value for name, value in (named | options).items() if value is not None}
+    return import_dataset("csv", source, given)
 
 
 def odometry_error(data: Dataset, runs: int = 1) -> float:
@@ -43,109 +51,77 @@ def odometry_error(data: Dataset, runs: int = 1) -> float:
 def test_one_table_may_hold_wheels_steering_and_poses(tmp_path: Path) -> None:
     columns = {"t": DRIVE["t"], "phi_front": DRIVE["angle"], "steer_front": DRIVE["phi"]}
     poses = {key: DRIVE[key] for key in ("x", "y", "theta")}
-    data = read(write_table(tmp_path / "log.csv", columns | poses), wheel_unit="rad")
+    unnamed = {"wheel_columns": None, "steering_columns": None}
+    data = read(write_table(tmp_path / "log.csv", columns | poses), **unnamed)
     assert odometry_error(data) < 1e-9
     assert data.trajectories[0].id == "log"
-    whole = read(tmp_path, wheel_unit="rad", wheel_suffix=".csv", pose_suffix=".csv")
+    whole = read(tmp_path, wheel_suffix=".csv", pose_suffix=".csv", **unnamed)
     assert whole.trajectories[0].fingerprint == data.trajectories[0].fingerprint
 
 
+INCREMENTS = np.diff(DRIVE["angle"], prepend=0.0)
+TURN = 2 * math.pi
+
+
 @pytest.mark.parametrize(
-    ("per_radian", "options"),
+    ("angle", "options"),
     [
-        (1 / (2 * math.pi), {"wheel_unit": "rev"}),
-        (180 / math.pi * 30, {"wheel_unit": "deg", "gear_ratio": 30}),
-        (30 * 2048 / (2 * math.pi), {"wheel_unit": "ticks", "ticks_per_turn": 2048, "gear_ratio": [30]}),
-        (61440 / (2 * math.pi), {"wheel_unit": "ticks", "ticks_per_turn": 61440}),
-        (-1.0, {"wheel_unit": "rad", "wheel_signs": -1}),
+        (DRIVE["angle"] / TURN, {"wheel_unit": "rev"}),
+        (DRIVE["angle"] * 30 * 180 / math.pi, {"wheel_unit": "deg", "gear_ratio": 30}),
+        (DRIVE["angle"] * 30 * 2048 / TURN, {"wheel_unit": "ticks", "ticks_per_turn": 2048, "gear_ratio": [30]}),
+        (DRIVE["angle"] * 61440 / TURN, {"wheel_unit": "ticks", "ticks_per_turn": 61440}),
+        (-DRIVE["angle"], {"wheel_signs": -1}),
+        (INCREMENTS / PERIOD * 30 * 60 / TURN, {"wheel_unit": "rpm", "gear_ratio": 30}),
+        (INCREMENTS / TURN, {"wheel_unit": "rev/sample"}),
     ],
 )
-def test_positions_of_wheel_or_motor_in_any_unit_are_the_same(
-    tmp_path: Path, per_radian: float, options: dict[str, Any]
+def test_positions_rates_and_increments_of_wheel_or_motor_in_any_unit_are_the_same(
+    tmp_path: Path, angle: Array, options: dict[str, Any]
 ) -> None:
-    columns = dict(DRIVE) | {"angle": DRIVE["angle"] * per_radian}
-    source = write_table(tmp_path / "log.csv", columns)
-    data = read(source, wheel_columns="angle", steering_columns="phi", **options)
-    assert odometry_error(data) < 1e-8
+    assert odometry_error(read(log(tmp_path, angle=angle), **options)) < 1e-8
 
 
-def test_rates_of_the_motor_and_increments_are_read(tmp_path: Path) -> None:
-    increments = np.diff(DRIVE["angle"], prepend=0.0)
-    columns = dict(DRIVE) | {"rpm": increments / PERIOD * 30 * 60 / (2 * math.pi), "rev": increments / (2 * math.pi)}
-    source = write_table(tmp_path / "log.csv", columns)
-    for column, options in (("rpm", {"wheel_unit": "rpm", "gear_ratio": 30}), ("rev", {"wheel_unit": "rev/sample"})):
-        data = read(source, wheel_columns=column, steering_columns="phi", **options)
-        assert odometry_error(data) < 1e-8
-
-
-@pytest.mark.parametrize("bits", [16, 32])
-@pytest.mark.parametrize("signed", [False, True])
-@pytest.mark.parametrize("option", ["auto", "2^{}"])
+@pytest.mark.parametrize(("bits", "signed", "option"), [(16, False, "auto"), (16, True, "2^16"), (32, True, "auto")])
 def test_counters_begin_again_at_any_power_of_two(tmp_path: Path, bits: int, signed: bool, option: str) -> None:
     ticks = np.floor(DRIVE["angle"] * 30 * 2048 / (2 * math.pi))
     ticks = (ticks + 2**bits - 20000) % 2**bits - (2 ** (bits - 1) if signed else 0)
-    source = write_table(tmp_path / "log.csv", dict(DRIVE) | {"angle": ticks})
-    options = {"wheel_unit": "ticks", "ticks_per_turn": 2048, "gear_ratio": 30, "wraps_at": option.format(bits)}
-    data = read(source, wheel_columns="angle", steering_columns="phi", **options)
+    options = {"wheel_unit": "ticks", "ticks_per_turn": 2048, "gear_ratio": 30, "wraps_at": option}
+    data = read(log(tmp_path, angle=ticks), **options)
     assert odometry_error(data) < 1e-3
     said = f"wheel positions begin again after {2**bits} ticks and were counted on (wraps_at={2**bits} says so)"
     assert (said in data.warnings) == (option == "auto" and np.ptp(ticks) > 2 ** (bits - 1))
 
 
-def test_a_wrong_wrap_is_refused(tmp_path: Path) -> None:
-    source = write_table(tmp_path / "log.csv", DRIVE)
-    with pytest.raises(DataError, match=r"log\.csv: wraps_at is 100, but positions span \d+\.\d+ rad; correct it"):
-        read(source, wheel_columns="angle", steering_columns="phi", wheel_unit="rad", wraps_at=100)
-
-
-def test_ticks_taken_for_radians_are_told_from_a_wrong_gear(tmp_path: Path) -> None:
-    ticks = np.floor(DRIVE["angle"] * 30 * 2048 / (2 * math.pi))
-    source = write_table(tmp_path / "log.csv", dict(DRIVE) | {"angle": ticks})
-    columns = {"wheel_columns": "angle", "steering_columns": "phi"}
-    with pytest.raises(
-        DataError, match=r"log\.csv: .* positions are whole numbers: --set wheel_unit=ticks --set ticks_per"
-    ):
-        read(source, **columns, wheel_unit="rad")
-    with pytest.raises(
-        DataError, match=r"read in ticks, turn at up to 330 rad/s; --set ticks_per_turn=N, gear_ratio=N \(turns"
-    ):
-        read(source, **columns, wheel_unit="ticks", ticks_per_turn=2048)
+def test_a_wrong_wrap_and_ticks_taken_for_radians_or_without_their_gear_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"log\.csv: wraps_at is 100, but positions span \d+\.\d+ rad"):
+        read(log(tmp_path), wraps_at=100)
+    source = log(tmp_path, angle=np.floor(DRIVE["angle"] * 30 * 2048 / TURN))
+    with pytest.raises(DataError, match=r"log\.csv: .*--set wheel_unit=ticks --set ticks_per"):
+        read(source)
+    with pytest.raises(DataError, match=r"turn at up to 330 rad/s; --set ticks_per_turn=N, gear_ratio=N"):
+        read(source, wheel_unit="ticks", ticks_per_turn=2048)
 
 
 def test_a_counter_that_is_set_to_zero_ends_a_run(tmp_path: Path) -> None:
     angle = DRIVE["angle"] - np.where(np.arange(401) >= 200, DRIVE["angle"][200], 0)
-    data = read(
-        write_table(tmp_path / "log.csv", dict(DRIVE) | {"angle": angle}),
-        wheel_columns="angle",
-        steering_columns="phi",
-        wheel_unit="rad",
-    )
+    data = read(log(tmp_path, angle=angle))
     assert odometry_error(data, runs=2) < 0.01
     assert [(run.id, run.session) for run in data.trajectories] == [("log#1", "log"), ("log#2", "log")]
     assert "the positions begin anew 1 time, faster than any wheel turns" in data.warnings[0]
     assert "counter_restart" in {finding.kind for finding in findings_of(data.warnings)}
 
 
-def test_rows_that_repeat_a_time_are_left_out_and_said(tmp_path: Path) -> None:
+def test_rows_that_repeat_a_time_or_the_wheels_while_they_turned_are_left_out_and_said(tmp_path: Path) -> None:
     twice = np.sort(np.append(np.arange(401), [7, 7, 50]))
-    data = read(
-        write_table(tmp_path / "log.csv", DRIVE, twice), wheel_columns="angle", steering_columns="phi", wheel_unit="rad"
-    )
-    assert data.warnings[0] == f"{tmp_path}/log.csv: 3 rows that repeat the t of the one before left out"
+    data = read(log(tmp_path, twice))
+    assert data.warnings[0].endswith("log.csv: 3 rows that repeat the t of the one before left out")
     assert odometry_error(data) < 1e-9
-    coarse = dict(DRIVE) | {"t": np.floor(DRIVE["t"])}
     with pytest.raises(DataError, match=r"log\.csv, row 2 \(line 3\): t is repeated: 100 after 100"):
-        read(write_table(tmp_path / "log.csv", coarse), wheel_columns="angle", steering_columns="phi", wheel_unit="rad")
-
-
-def test_wheels_that_were_logged_again_while_they_turned_are_left_out(tmp_path: Path) -> None:
-    stale = dict(DRIVE) | {key: DRIVE[key].copy() for key in ("angle", "phi")}
-    for row in (60, 150):
-        stale["angle"][row], stale["phi"][row] = stale["angle"][row - 1], stale["phi"][row - 1]
-    data = read(
-        write_table(tmp_path / "log.csv", stale), wheel_columns="angle", steering_columns="phi", wheel_unit="rad"
-    )
-    assert data.warnings[0].endswith("log.csv: 2 rows that repeat the ones before while the wheels turn left out")
+        read(log(tmp_path, t=np.floor(DRIVE["t"])))
+    before = np.arange(401)
+    before[[60, 150]] -= 1
+    data = read(log(tmp_path, angle=DRIVE["angle"][before], phi=DRIVE["phi"][before]))
+    assert "log.csv: 2 rows that repeat the ones before" in data.warnings[0]
     assert len(data.trajectories[0].times) == 398
     assert odometry_error(data) < 0.01
 
@@ -164,8 +140,7 @@ def test_wheels_that_were_logged_again_while_they_turned_are_left_out(tmp_path: 
     ids=["degrees", "clockwise from another zero", "absolute behind a gear", "ticks of an absolute encoder"],
 )
 def test_steering_angles_in_any_unit_are_the_same(tmp_path: Path, shown: Array, options: dict[str, Any]) -> None:
-    source = write_table(tmp_path / "log.csv", dict(DRIVE) | {"phi": shown})
-    data = read(source, wheel_columns="angle", steering_columns="phi", wheel_unit="rad", **options)
+    data = read(log(tmp_path, phi=shown), **options)
     steering = data.trajectories[0].steering
     assert steering is not None
     np.testing.assert_allclose(steering[:, 0], DRIVE["phi"][1:], atol=2e-4)
@@ -173,28 +148,16 @@ def test_steering_angles_in_any_unit_are_the_same(tmp_path: Path, shown: Array, 
 
 @pytest.mark.parametrize("step", [1, 5])
 def test_a_steering_column_in_degrees_is_named_however_coarse_the_samples_are(tmp_path: Path, step: int) -> None:
-    rows = {key: column[::step] for key, column in DRIVE.items()} | {"phi": np.degrees(DRIVE["phi"][::step])}
-    source = write_table(tmp_path / "log.csv", rows)
-    data = read(source, wheel_columns="angle", steering_columns="phi", wheel_unit="rad")
+    data = read(log(tmp_path, slice(None, None, step), phi=np.degrees(DRIVE["phi"])))
     assert any(warning.startswith("steering angles look like degrees; ") for warning in data.warnings)
 
 
-def test_an_imported_table_of_a_robot_that_steers_comes_back_from_disk(tmp_path: Path) -> None:
-    data = read(
-        write_table(tmp_path / "log.csv", DRIVE), wheel_columns="angle", steering_columns="phi", wheel_unit="rad"
-    )
+def test_a_recording_is_cut_into_equal_runs_and_the_robot_s_own_odometry_is_warned_of(tmp_path: Path) -> None:
+    data = read(log(tmp_path))
+    assert "the robot's odometry, or simulated without noise" in data.warnings[-1]
     save_dataset(data, tmp_path / "data")
     assert load_dataset(tmp_path / "data").hash == data.hash
-
-
-def test_a_recording_is_cut_into_equal_runs(tmp_path: Path) -> None:
-    data = read(
-        write_table(tmp_path / "log.csv", DRIVE),
-        wheel_columns="angle",
-        steering_columns="phi",
-        wheel_unit="rad",
-        window=9,
-    )
+    data = read(log(tmp_path), window=9)
     assert [run.id for run in data.trajectories] == ["log#1", "log#2"]
     assert odometry_error(data, runs=2) < 0.01
     assert [(run.split, run.session, run.started_at) for run in data.trajectories] == [
@@ -203,41 +166,22 @@ def test_a_recording_is_cut_into_equal_runs(tmp_path: Path) -> None:
     ]
 
 
-def test_the_robot_s_own_odometry_in_a_table_is_warned_of(tmp_path: Path) -> None:
-    source = write_table(tmp_path / "log.csv", DRIVE)
-    data = read(source, wheel_columns="angle", steering_columns="phi", wheel_unit="rad")
-    assert "the reference is the robot's odometry, or simulated without noise" in data.warnings[-1]
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({}, r"'omega_front' and 'steer_front' are missing; .* --set \"columns={omega_front: NAME, steer_front: NAME}"),
-        ({"header_lines": 0}, r"it has no header and 6 columns; say by numbers, .* t, omega_front, steer_front, x, y"),
-        (
-            {"header_lines": 0, "wheel_time_column": 1},
-            r"which of them are omega_front, steer_front, x, y, theta:",
-        ),
+        ({}, r"'omega_front' and 'steer_front' are missing; .*\"columns={omega_front: NAME, steer_front: NAME}"),
+        ({"header_lines": 0}, r"it has no header and 6 columns; .* t, omega_front, steer_front, x, y"),
+        ({"header_lines": 0, "wheel_time_column": 1}, r"which of them are omega_front, steer_front, x, y, theta"),
         ({"wheel_columns": "angle", "steering_columns": 9}, r"column '9' is missing; found: t, angle, phi"),
     ],
 )
 def test_a_foreign_table_is_refused_with_the_options_that_describe_it(
     tmp_path: Path, options: dict[str, Any], message: str
 ) -> None:
-    source = write_table(tmp_path / "log.csv", DRIVE)
+    unnamed = {"wheel_columns": None, "steering_columns": None, "wheel_unit": None}
     with pytest.raises(DataError, match=message) as caught:
-        read(source, **options)
+        read(log(tmp_path), **(unnamed | options))
     assert "\n" not in str(caught.value)
-
-
-def corelli(**options: Any) -> Trajectory:
-    data = corelli_dataset(**options)
-    assert "4 steps of wheel positions ran back while the wheel turned on, as in a register of 65" in data.warnings[1]
-    assert "wheel positions begin again after 4294967296 ticks and were counted on" in data.warnings[0]
-    restarts = [finding.what for finding in findings_of(data.warnings) if finding.kind == "counter_restart"]
-    assert restarts == [data.warnings[1]]
-    assert "51 rows that repeat the ones before while the wheels turn" in data.warnings[2]
-    return data.trajectories[0]
 
 
 def errors(run: Trajectory, robot: dict[str, Any]) -> Array:
@@ -266,6 +210,13 @@ def test_the_steering_scale_of_another_laboratory_s_tricycle_is_told_relative_to
 
 
 def test_the_first_guesses_of_another_laboratory_s_tricycle_are_far_off() -> None:
-    run = corelli()
+    data = corelli_dataset()
+    for warning, part in zip(
+        data.warnings, ("4294967296 ticks", "4 steps of wheel positions ran back", "51 rows that repeat"), strict=False
+    ):
+        assert part in warning
+    restarts = [finding.what for finding in findings_of(data.warnings) if finding.kind == "counter_restart"]
+    assert restarts == [data.warnings[1]]
+    (run,) = data.trajectories
     assert (len(run.times), len(run.pose_times)) == (2382, 2434)
     assert errors(run, CORELLI_OPTIONS["robot"]).mean() == pytest.approx(14.33, abs=0.01)

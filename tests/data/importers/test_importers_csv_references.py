@@ -58,15 +58,13 @@ def measured(run: Trajectory) -> list[tuple[str, float, float, float]]:
     return list(zip(its.kinds.tolist(), its.t0.tolist(), its.t1.tolist(), its.values[:, 0].tolist(), strict=True))
 
 
-def test_a_run_with_a_table_of_references_needs_no_poses(tmp_path: Path) -> None:
-    run = the_run(write(tmp_path, a_wheels=wheels(), a_references=TAPE))
+def test_a_run_with_references_needs_no_poses_and_one_table_holds_those_of_all_runs(tmp_path: Path) -> None:
+    run = the_run(write(tmp_path / "one", a_wheels=wheels(), a_references=TAPE))
     assert not run.has_poses
     assert measured(run) == [("distance", 0.0, 5.0, 1.01)]
-
-
-def test_one_table_holds_the_references_of_all_runs(tmp_path: Path) -> None:
     table = "run,kind,value,sigma\nb,turn,3.1,0.01\na,distance,1.0,0.003\nb,turn,3.2,0.01\n"
-    runs = read(write(tmp_path, a_wheels=wheels(), b_wheels=wheels(0.0, (-2, 2)), references=table)).trajectories
+    source = write(tmp_path / "all", a_wheels=wheels(), b_wheels=wheels(0.0, (-2, 2)), references=table)
+    runs = read(source).trajectories
     assert [[kind for kind, *_ in measured(run)] for run in runs] == [["distance"], ["turn", "turn"]]
 
 
@@ -163,18 +161,12 @@ def test_a_recording_cut_into_windows_keeps_the_references_within_each(tmp_path:
 @pytest.mark.parametrize(
     ("tables", "words"),
     [
-        (
-            {"a_references": "kind,value,sigma\ndistnace,1,0.1\n"},
-            r"row 1 \(line 2\): kind is 'distnace'; did you mean 'distance'",
-        ),
+        ({"a_references": "kind,value,sigma\ndistnace,1,0.1\n"}, r"row 1 \(line 2\): .*did you mean 'distance'"),
         ({"a_references": "kind,value\ndistance,1\n"}, "sigma is missing"),
         ({"a_references": "value,sigma\n1,0.1\n"}, "column 'kind' is missing"),
         ({"a_references": "kind,t1,value,sigma\nheading,90,1,0.1\n"}, "none of its references lies within"),
         ({"references": "run,kind,value,sigma\nb,distance,1,0.1\n"}, "run 'a' is not in its column run"),
-        (
-            {"references": "run,kind,value,sigma\na,turn,1,0.1\nab,distance,1,0.1\n"},
-            "run 'ab' has no wheels; did you mean 'a'",
-        ),
+        ({"references": "run,kind,value,sigma\na,turn,1,0.1\nab,turn,1,0.1\n"}, "'ab' has no wheels; did you mean 'a'"),
         ({"references": TAPE, "b_wheels": wheels()}, "column 'run' is missing"),
         ({"b_references": TAPE}, "run 'a' has no a_poses.csv"),
         ({"a_references": TAPE, "b_references": TAPE}, "run 'b' has no b_wheels.csv"),
@@ -187,12 +179,7 @@ def test_what_is_wrong_with_references_is_said_in_one_line(tmp_path: Path, table
     assert "\n" not in str(refusal.value)
 
 
-def test_references_in_millimetres_are_warned_of_with_the_option(tmp_path: Path) -> None:
-    source = write(tmp_path, a_wheels=wheels(), a_references="kind,value,sigma\ndistance,1010,3\n")
-    assert any("--set position_unit=mm" in warning for warning in read(source).warnings)
-
-
-@pytest.mark.parametrize("robot_type", ["diff", "skid", "omni3", "mecanum", "tricycle", "car", "swerve"])
+@pytest.mark.parametrize("robot_type", ["diff", "omni3", "swerve"])
 def test_the_template_with_references_imports_as_it_is_written(tmp_path: Path, robot_type: str) -> None:
     write_template(tmp_path / "log", robot_type, references=True)
     dataset = Csv(CsvOptions.model_validate(Csv.completed({}, tmp_path / "log"))).read(tmp_path / "log")
@@ -218,6 +205,7 @@ def test_the_importer_of_data_sets_keeps_references_to_the_bit(tmp_path: Path) -
 
 def test_a_data_set_read_in_other_units_has_its_references_in_them_too(tmp_path: Path) -> None:
     source = write(tmp_path / "log", a_wheels=wheels(), a_references="kind,value,sigma\ndistance,1010,3\n")
+    assert any("--set position_unit=mm" in warning for warning in read(source).warnings)
     save_dataset(read(source), tmp_path / "old")
     (run,) = reread(tmp_path / "old", position_unit="mm").trajectories
     assert measured(run) == [("distance", 0.0, 5.0, pytest.approx(1.01))]

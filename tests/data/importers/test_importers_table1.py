@@ -86,13 +86,6 @@ def test_the_robots_odometry_and_the_commands_sent_to_it_are_kept_in_si_units(tm
     np.testing.assert_allclose(run.sent, [[0, 0.2, alpha, 0.35, 0.5], [0.3, 0.2, alpha, 0.35, 0.2]], atol=1e-12)
 
 
-def test_a_data_set_without_odometry_and_commands_has_none(tmp_path: Path) -> None:
-    write_trajectory(tmp_path / "t01")
-    run = only(tmp_path)
-    assert run.odometry is None
-    assert run.sent is None
-
-
 def test_odometry_and_commands_are_cut_with_the_run(tmp_path: Path) -> None:
     folder = write_trajectory(tmp_path / "t01", first_scan=0.25)
     write_recorded(folder, [PERIOD * k for k in range(1, SAMPLES + 1)])
@@ -104,23 +97,14 @@ def test_odometry_and_commands_are_cut_with_the_run(tmp_path: Path) -> None:
     np.testing.assert_allclose(run.sent[:, 0], [-0.25, 0.05])
 
 
-def test_odometry_at_other_times_than_the_wheels_is_refused(tmp_path: Path) -> None:
-    write_recorded(write_trajectory(tmp_path / "t01"), [0.1, 0.2])
-    with pytest.raises(DataError, match=r"odometry.csv: its times t are not those of wheels.csv; give a row for each"):
-        import_dataset("table1", tmp_path)
-
-
 def test_millimetres_are_an_option(tmp_path: Path) -> None:
     write_trajectory(tmp_path / "mm", metre=1000)
     write_trajectory(tmp_path / "m")
     in_mm = only(tmp_path / "mm", {"position_unit": "mm"})
     in_m = only(tmp_path / "m")
     np.testing.assert_allclose(in_mm.poses, in_m.poses, atol=1e-12)
-
-
-def test_millimetres_taken_for_metres_are_warned_of(tmp_path: Path) -> None:
-    write_trajectory(tmp_path / "mm", metre=1000)
-    (warning,) = import_dataset("table1", tmp_path).warnings
+    assert (in_m.odometry, in_m.sent) == (None, None)
+    (warning,) = import_dataset("table1", tmp_path / "mm").warnings
     assert "positions look like mm" in warning
 
 
@@ -166,7 +150,7 @@ def test_a_later_first_scan_becomes_time_zero(tmp_path: Path) -> None:
     np.testing.assert_allclose(odometry, run.poses[1:], atol=1e-10)
 
 
-def test_folders_called_train_and_validation_split(tmp_path: Path) -> None:
+def test_folders_called_train_and_validation_or_patterns_split(tmp_path: Path) -> None:
     write_trajectory(tmp_path / "train" / "t01")
     write_trajectory(tmp_path / "validation" / "t01")
     data = import_dataset("table1", tmp_path)
@@ -174,21 +158,19 @@ def test_folders_called_train_and_validation_split(tmp_path: Path) -> None:
         ("train/t01", "train", "train", 1),
         ("validation/t01", "validation", "validation", 1),
     ]
+    data = import_dataset("table1", tmp_path, {"validation": "train/*"})
+    assert [run.split for run in data.trajectories] == ["validation", "train"]
+    write_trajectory(tmp_path / "t02")
+    with pytest.raises(DataError, match="'t02' is in no folder train or validation"):
+        import_dataset("table1", tmp_path)
 
 
 def test_without_such_folders_every_second_repetition_validates(tmp_path: Path) -> None:
     for number in range(3):
-        write_trajectory(tmp_path / f"t{number}", (0.2, 0.0, 0.0))
-    write_trajectory(tmp_path / "t3", (0.2, 90.0, 0.0))
+        write_trajectory(tmp_path / f"t{number}")
+    write_trajectory(tmp_path / "t9", (0.2, 0.0, 0.0))
     data = import_dataset("table1", tmp_path)
     assert [run.split for run in data.trajectories] == ["train", "validation", "train", "train"]
-
-
-def test_patterns_split(tmp_path: Path) -> None:
-    for name in ("day1/t1", "day2/t1"):
-        write_trajectory(tmp_path / name)
-    data = import_dataset("table1", tmp_path, {"validation": "day1/*"})
-    assert {run.id: run.split for run in data.trajectories} == {"day1/t1": "validation", "day2/t1": "train"}
 
 
 def test_targets_are_left_out_unless_all_trajectories_have_them(tmp_path: Path) -> None:
@@ -239,10 +221,10 @@ def test_it_is_said_that_the_mount_of_the_scanner_is_not_known(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"rays": 1081}, r"lidar\.csv: it has more than the 1080 ranges of the scanner; set scanner="),
+        ({"rays": 1081}, r"lidar\.csv: it has more than the 1080 ranges of the scanner"),
         ({"rays": 1000}, r"lidar\.csv: column 'd1001' is missing"),
-        ({"metre": 1.0}, r"lidar\.csv, row 1 \(line 2\): no range is from 100 to 30000 mm; give mm"),
-        ({"stamps": [2.0, 3.0]}, r"lidar\.csv: no scan while poses and wheels were recorded, 0 to 1 s"),
+        ({"metre": 1.0}, r"lidar\.csv, row 1 \(line 2\): no range is from 100 to 30000 mm"),
+        ({"stamps": [2.0, 3.0]}, r"lidar\.csv: no scan while poses and wheels were recorded"),
         ({"stamps": [0.5, 0.25]}, r"lidar\.csv, row 2 \(line 3\): t goes backwards"),
     ],
 )
@@ -252,57 +234,34 @@ def test_a_malformed_scan_file_is_named(tmp_path: Path, changes: dict[str, Any],
         import_dataset("table1", tmp_path)
 
 
-def test_a_trajectory_outside_the_split_folders_is_refused(tmp_path: Path) -> None:
-    write_trajectory(tmp_path / "train" / "t01")
-    write_trajectory(tmp_path / "t02")
-    with pytest.raises(DataError, match="trajectory 't02' is in no folder train or validation"):
-        import_dataset("table1", tmp_path)
-
-
 @pytest.mark.parametrize(
     ("file", "old", "new", "message"),
     [
         ("wheels.csv", "0.05,", "0.03,", r"wheels\.csv, row 5 \(line 6\): t goes backwards: 0\.03 after 0\.04"),
         ("wheels.csv", "omega_b", "omegab", r"wheels\.csv: column 'omega_b' is missing; did you mean 'omegab'\?"),
         ("slam.csv", "0.50,", "0.50;", r"slam\.csv, row 3 \(line 4\): it has 3 fields, expected 4"),
-        ("slam.csv", "0.00,", "-0.10,", r"slam\.csv, row 1 \(line 2\): t is -0\.1; times count from the start"),
-        ("command.csv", "0.2,30", "fast,30", r"command\.csv, row 1 \(line 2\): v is 'fast', expected a number"),
+        ("slam.csv", "0.00,", "-0.10,", r"slam\.csv, row 1 \(line 2\): t is -0\.1"),
+        ("slam.csv", None, "t,x,y,theta\n2,0,0,0\n3,0,0,0\n", r"slam\.csv: no two poses while the wheels"),
+        ("command.csv", "0.2,30", "fast,30", r"command\.csv, row 1 \(line 2\): v is 'fast'"),
         ("command.csv", "omega,", "omega,omega,", r"command\.csv: column 'omega' is there 2 times"),
+        ("command.csv", None, "v,alpha,omega,d\n0.2,30,0,1\n0.2,0,0,1\n", r"command\.csv: it has 2 rows, expected one"),
+        ("odometry.csv", None, "t,x,y,theta\n0.1,0,0,0\n", r"odometry\.csv: its times t are not those of wheels\.csv"),
     ],
 )
-def test_a_malformed_file_is_named_with_its_row(tmp_path: Path, file: str, old: str, new: str, message: str) -> None:
+def test_a_malformed_file_is_named_with_its_row(
+    tmp_path: Path, file: str, old: str | None, new: str, message: str
+) -> None:
     path = write_trajectory(tmp_path / "t01") / file
-    path.write_text(path.read_text().replace(old, new, 1))
+    path.write_text(new if old is None else path.read_text().replace(old, new, 1))
     with pytest.raises(DataError, match=message):
         import_dataset("table1", tmp_path)
 
 
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    (write_trajectory(tmp_path / "t01") / "slam.csv").unlink()
-    with pytest.raises(DataError, match=r"t01.slam\.csv: no such file"):
+def test_a_missing_file_no_trajectory_and_an_unknown_unit_are_named(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"no command\.csv below it"):
         import_dataset("table1", tmp_path)
-
-
-def test_scans_after_the_wheels_only_are_refused(tmp_path: Path) -> None:
-    path = write_trajectory(tmp_path / "t01") / "slam.csv"
-    path.write_text("t,x,y,theta\n2,0,0,0\n3,0,0,0\n")
-    with pytest.raises(DataError, match=r"slam\.csv: no two poses while the wheels were recorded"):
-        import_dataset("table1", tmp_path)
-
-
-def test_two_commands_for_one_trajectory_are_refused(tmp_path: Path) -> None:
-    path = write_trajectory(tmp_path / "t01", targets=False) / "command.csv"
-    path.write_text(path.read_text() + "0.2,0,0,1\n")
-    with pytest.raises(DataError, match=r"command\.csv: it has 2 rows, expected one"):
-        import_dataset("table1", tmp_path)
-
-
-def test_an_unknown_unit_is_refused(tmp_path: Path) -> None:
-    write_trajectory(tmp_path / "t01")
     with pytest.raises(ConfigError, match="importer 'table1': position_unit"):
         import_dataset("table1", tmp_path, {"position_unit": "inch"})
-
-
-def test_a_folder_without_trajectories_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"no command\.csv below it"):
+    (write_trajectory(tmp_path / "t01") / "slam.csv").unlink()
+    with pytest.raises(DataError, match=r"t01.slam\.csv: no such file"):
         import_dataset("table1", tmp_path)

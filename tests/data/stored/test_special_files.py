@@ -133,30 +133,35 @@ def test_a_small_table_that_unpacks_to_gigabytes_is_refused_before_it_is_read(fo
 
 
 @pytest.mark.parametrize(
-    ("made", "words"),
-    [(pipe, "is a pipe"), (lambda file: file.write_text("a: &a [1]\nb: *a\n"), "line 2: aliases are not read")],
-    ids=["pipe", "aliases"],
+    ("name", "made", "message"),
+    [
+        ("metadata.yaml", pipe, "metadata.yaml: is a pipe"),
+        ("metadata.yaml", lambda file: file.write_text("a: &a [1]\nb: *a\n"), "metadata.yaml: not valid YAML: line 2"),
+        ("data.xyz", pipe, "data.xyz: is a pipe"),
+    ],
 )
-def test_a_bag_with_special_metadata_is_refused(tmp_path: Path, made: Callable[[Path], object], words: str) -> None:
-    (tmp_path / "bag").mkdir()
-    made(tmp_path / "bag" / "metadata.yaml")
+def test_a_bag_with_special_files_is_refused(
+    tmp_path: Path, name: str, made: Callable[[Path], object], message: str
+) -> None:
+    bag = tmp_path / "bag"
+    bag.mkdir()
     (tmp_path / "robot.yaml").write_text(APR_02.model_dump_json())
-    assert_refused(run_here("import", "rosbag", "bag", "-o", "new", cwd=tmp_path), "metadata.yaml: ", words)
+    if name != "metadata.yaml":
+        (bag / "metadata.yaml").write_text(f"rosbag2_bagfile_information: {{relative_file_paths: [{name}]}}\n")
+    made(bag / name)
+    assert_refused(run_here("import", "rosbag", "bag", "-o", "new", cwd=tmp_path), message)
 
 
-def test_a_pipe_among_the_files_of_a_bag_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "bag").mkdir()
-    (tmp_path / "bag" / "metadata.yaml").write_text("rosbag2_bagfile_information: {relative_file_paths: [data.xyz]}\n")
-    pipe(tmp_path / "bag" / "data.xyz")
-    (tmp_path / "robot.yaml").write_text(APR_02.model_dump_json())
-    assert_refused(run_here("import", "rosbag", "bag", "-o", "new", cwd=tmp_path), "data.xyz: is a pipe")
+def write_log(folder: Path, table: str) -> None:
+    """A folder of one table of a run, and its robot."""
+    folder.mkdir()
+    (folder / "robot.yaml").write_text(APR_02.model_dump_json())
+    rows = "".join(f"{0.1 * number},1,1,1,0,0,0\n" for number in range(1, 30))
+    (folder / table).write_text(f"t,omega_a,omega_b,omega_c,x,y,theta\n{rows}")
 
 
 def test_a_pipe_among_the_tables_of_a_folder_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "log").mkdir()
-    (tmp_path / "log" / "robot.yaml").write_text(APR_02.model_dump_json())
-    rows = "".join(f"{0.1 * number},1,1,1,0,0,0\n" for number in range(1, 30))
-    (tmp_path / "log" / "run.csv").write_text(f"t,omega_a,omega_b,omega_c,x,y,theta\n{rows}")
+    write_log(tmp_path / "log", "run.csv")
     pipe(tmp_path / "log" / "runs.csv")
     assert_refused(run_here("import", "csv", "log", "-o", "new", cwd=tmp_path), "runs.csv: is a pipe")
 
@@ -180,16 +185,11 @@ def test_a_table_with_a_text_that_is_no_name_is_refused(folder: Path) -> None:
 def test_names_that_are_not_in_utf_8_are_refused_in_one_line(folder: Path) -> None:
     name = os.fsdecode(b"d\xe4ta")
     folder.rename(folder.with_name(name))
-    for arguments in (("inspect", name), ("inspect", "--json", name), ("calibrate", name, "-o", "c.yaml")):
-        assert_refused(omnibench(*arguments, cwd=folder.parent), "d?ta: this name is not in UTF-8")
-
-
-def test_a_table_whose_name_is_not_in_utf_8_is_refused_in_one_line(tmp_path: Path) -> None:
-    (tmp_path / "log").mkdir()
-    (tmp_path / "log" / "robot.yaml").write_text(APR_02.model_dump_json())
-    rows = "".join(f"{0.1 * number},1,1,1,0,0,0\n" for number in range(1, 30))
-    (tmp_path / "log" / os.fsdecode(b"r\xe4n.csv")).write_text(f"t,omega_a,omega_b,omega_c,x,y,theta\n{rows}")
-    assert_refused(omnibench("import", "csv", "log", "-o", "new", cwd=tmp_path), "not in UTF-8")
+    assert_refused(omnibench("inspect", name, cwd=folder.parent), "d?ta: this name is not in UTF-8")
+    for arguments in (("inspect", "--json", name), ("calibrate", name, "-o", "c.yaml")):
+        assert_refused(run_here(*arguments, cwd=folder.parent), "this name is not in UTF-8")
+    write_log(folder.parent / "log", os.fsdecode(b"r\xe4n.csv"))
+    assert_refused(run_here("import", "csv", "log", "-o", "new", cwd=folder.parent), "not in UTF-8")
 
 
 def test_names_that_spreadsheets_would_run_are_quoted_in_csv_and_come_back(tmp_path: Path) -> None:
