@@ -229,7 +229,7 @@ class WheelGeometry:
 
 
 def _steered_rows(radius: Array, x: Array, y: Array, offset: Array) -> list[Array]:
-    """The two rows (P, 3) of a steered wheel, by which a twist gives its signals: Eq. (1) of kinematics.py, turned."""
+    """The two rows (P, 3) of a steered wheel, by which a twist gives its signals: Eq. (K1) of kinematics.py, turned."""
     cosine, sine = np.cos(offset), np.sin(offset)
     along = np.stack([cosine, sine, x * sine - y * cosine], axis=-1) / radius[:, None]
     across = np.stack([-sine, cosine, x * cosine + y * sine], axis=-1) / radius[:, None]

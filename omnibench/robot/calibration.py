@@ -95,10 +95,10 @@ class HeldOutVerdict(Model):
 
     basis: the runs that were held out from this fit, or, where these are few, quick fits to four fifths of the commands
     by turns, judged on the last fifth.
-    verdict: of the errors of the final pose, Eq. (6). Better or worse: the 95 % interval of the improvement leaves out
-    0; undecided: it does not, or the units are too few for one; unknown: nothing was held out. Positions (m) and
-    headings (rad) are means over the runs. improvement: share of the design values' Eq. (6) that is gone. unit, units,
-    method: what the interval rests on. sentence and detail: all of this in words.
+    verdict: of the errors of the final pose, Eq. (6) of Palacin et al. 2023. Better or worse: the 95 % interval of the
+    improvement leaves out 0; undecided: it does not, or the units are too few for one; unknown: nothing was held out.
+    Positions (m) and headings (rad) are means over the runs. improvement: share of the design values' Eq. (6) that is
+    gone. unit, units, method: what the interval rests on. sentence and detail: all of this in words.
     """
 
     basis: Literal["held_out", "cross_validation"] = Field("held_out", exclude_if=lambda basis: basis == "held_out")
@@ -238,7 +238,15 @@ class Calibration(Shown, Model):
             size = 3 * len(signals) + sum(len(term.parameters) for term in self.effects)
             if [len(row) for row in self.covariance] != [size] * size:
                 raise ValueError(f"covariance is not {size} x {size}")
-            _check_covariance(np.array(self.covariance))
+            covariance = np.array(self.covariance)
+            largest = float(np.abs(covariance).max())
+            symmetric = np.allclose(covariance, covariance.T, rtol=1e-6, atol=1e-9 * largest)
+            if largest > _LARGEST_ELEMENT**2 or not symmetric:
+                raise ValueError("covariance is not symmetric, or its values are impossibly large")
+            if np.linalg.eigvalsh(covariance)[0] < -1e-6 * largest:
+                raise ValueError(
+                    "covariance is not positive semi-definite: it has a negative variance in some direction"
+                )
         if self.plain is not None and not (self.covariance and self.driven):
             raise ValueError("plain is the matrix to which effects fade; for that, covariance and driven are needed")
         return self
@@ -296,14 +304,6 @@ def matrix_flaw(matrix: Array) -> str:
     if np.abs(matrix).max() > _LARGEST_ELEMENT:
         return f"{np.abs(matrix).max():g}, which no wheel can drive in m or rad per rad"
     return "" if matrix.any() else "zeros only: no wheel would move the robot"
-
-
-def _check_covariance(covariance: Array) -> None:
-    largest = float(np.abs(covariance).max())
-    if largest > _LARGEST_ELEMENT**2 or not np.allclose(covariance, covariance.T, rtol=1e-6, atol=1e-9 * largest):
-        raise ValueError("covariance is not symmetric, or its values are impossibly large")
-    if np.linalg.eigvalsh(covariance)[0] < -1e-6 * largest:
-        raise ValueError("covariance is not positive semi-definite: it has a negative variance in some direction")
 
 
 def fitted_calibration(name: str, **fields: Any) -> Calibration:

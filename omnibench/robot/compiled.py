@@ -1,9 +1,7 @@
-"""Compilation of inner loops to machine code by numba, which keeps the result on disk for the next process.
+"""Sums along the paths of runs, in one pass over their samples, compiled by numba and kept on disk as machine code.
 
-Sums along the paths of runs, in one pass over their samples, compiled.
-
-The equations are those of odometry.py. It serves runs that are read from their file where they are used, of which an
-array of every intermediate value would not fit in memory.
+The equations are those of odometry.py. The sums serve runs that are read from their file where they are used, of which
+an array of every intermediate value would not fit in memory.
 """
 
 from __future__ import annotations
@@ -17,15 +15,14 @@ import numpy as np
 
 F = TypeVar("F", bound=Callable[..., Any])
 
+# h, rad, below which sin(h)/h and its derivative are summed by their series: the first term left out is 1e-17 there.
+_SMALL = 0.03
+
 
 def compiled(function: F) -> F:
     """Decorator: compile a function of numbers and arrays at its first call, for the types of its arguments."""
     machine_code: F = numba.njit(cache=True)(function)
     return machine_code
-
-
-# h, rad, below which sin(h)/h and its derivative are summed by their series: the first term left out is 1e-17 there.
-_SMALL = 0.03
 
 
 @compiled

@@ -1,38 +1,12 @@
 """Twists of wheel samples, corrected by all terms of a model; batch and stream share this code.
 
-Fading: outside the training domain, corrections fade to the plain matrix as far as they are not sure.
-
-Let u be the drive signals of a sample, K the model's matrix, c(b) the corrections by parameters b, and K0 the plain
-matrix, which was fitted without corrections. The model changes the plain twist by
-
-    m = K u + c(b) - K0 u.                                                                                          (1)
-
-With S the covariance of b and R that of K with b, an error e of b goes along with an error R S^+ e of K, the
-conditional mean of normal errors. So m errs by D e, with the variance s^2,
-
-    D = dc/db + (R S^+) u,    s^2 = tr(D S D'),                                                                     (2)
-
-turning counted as the speed that it gives the wheels. Where motions are near to driven ones, runs that were held out
-confirmed the corrections. Beyond, at x widths of "near" from there, a correction may have another form, and the
-variance of what is extrapolated is taken to grow in proportion to that distance, as that of a random walk does:
-
-    v = GROWTH x s^2.                                                                                               (3)
-
-Of an estimate m with the variance v, the share
-
-    g = max(1 - v / m^2, 0)                                                                                         (4)
-
-is used (positive part of the estimator of James and Stein, Proc. 4th Berkeley Symposium, 1961; non-negative garrote of
-Breiman, Technometrics 37, 1995): m is kept where the parameters are known well; where they are not, or models that the
-recordings cannot tell apart disagree, the plain matrix is left. Every sample is judged by itself, batch and stream
-alike.
+Outside the training domain, the motions that a model was fitted to, its corrections may fade to the plain matrix.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -42,13 +16,23 @@ from omnibench.errors import DataError, PluginError
 from omnibench.robot.effects.effect import MotionEffect, Need, Term, correction_of
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import WheelLog
-from omnibench.robot.signals import Signals
+from omnibench.robot.signals import Signals, needed
 
 _MISSING: dict[Need, str] = {
     "wheel_angles": "absolute wheel angles (phi_* in wheels), which were not recorded",
     "session_time": "the time since the session's start (started_at in trajectories), which is not known",
     "session": "the session's name (session in trajectories), which is not known",
 }
+
+# Lengths of motions (m/s, turning as speed at the wheels) are shares of the largest in the domain. All are chosen.
+_NEAR = 0.15  # a motion nearer than this to one in the domain is inside
+_SPACING = 0.05  # least distance between the representatives that are kept
+_SMOOTHING = 0.25  # s, over which the twists of a run are averaged
+_STANDING = 0.02  # a smaller motion is standing still, which is inside every domain
+_OFTEN = 0.05  # share of a run's time: motions outside that take less are transitions, and do not count
+
+GROWTH = 4.0
+_VARIES = 1e-9  # share of the largest variance below which a direction of the parameters has none but by rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,19 +53,25 @@ def corrected(terms: Sequence[Term], signals: Signals) -> Corrected:
     """The wheel samples with all corrections, each computed from the uncorrected signals, so that their order does not
     matter. PluginError: a correction has a wrong shape.
     """
-    rates, steering, of_body, of_world = signals.rates, signals.steering, None, None
+    rates, steering, body, world = signals.rates, signals.steering, None, None
+    count, wheels = rates.shape
+    widths = {"body": 3, "world": 2, "steering": 0 if steering is None else steering.shape[1]}
     for term in terms:
-        stage, added = term.effect.stage, _correction(term, signals)
-        if stage == "body":
-            of_body = added if of_body is None else of_body + added
-        elif stage == "world":
-            of_world = added if of_world is None else of_world + added
-        elif stage == "steering":
-            assert steering is not None  # its shape was checked
-            steering = steering + added
+        effect = term.effect
+        assert isinstance(effect, MotionEffect)
+        added = correction_of(effect, signals, term.values)
+        shape = (count, widths.get(effect.stage, wheels))
+        if added.shape != shape:
+            raise PluginError(f"effect {term.name!r}: its correction has shape {added.shape}, expected {shape}")
+        if effect.stage == "body":
+            body = added if body is None else body + added
+        elif effect.stage == "world":
+            world = added if world is None else world + added
+        elif effect.stage == "steering":
+            steering = needed(steering) + added
         else:
             rates = rates + added
-    return Corrected(rates, steering, of_body, of_world)
+    return Corrected(rates, steering, body, world)
 
 
 def corrected_twists(terms: Sequence[Term], signals: Signals, matrix: Array) -> tuple[Array, Array | None]:
@@ -116,29 +106,14 @@ def check_needs(terms: Sequence[Term], log: WheelLog) -> None:
                 )
 
 
-def _correction(term: Term, signals: Signals) -> Array:
-    """The correction of one term, its shape checked."""
-    effect = term.effect
-    assert isinstance(effect, MotionEffect)
-    added = correction_of(effect, signals, term.values)
-    shape = signals.rates.shape
-    if effect.stage == "body":
-        shape = (shape[0], 3)
-    elif effect.stage == "world":
-        shape = (shape[0], 2)
-    elif effect.stage == "steering":
-        shape = (shape[0], len(signals.robot.drive.steered))
-    if added.shape != shape:
-        raise PluginError(f"effect {term.name!r}: its correction has shape {added.shape}, expected {shape}")
-    return added
+def _scale(robot: Robot) -> Array:
+    """Factors (3,) that make m/s of a twist: turning counts as the speed that it gives the wheels."""
+    return np.array([1.0, 1.0, robot.reach])
 
 
-# Lengths of motions (m/s, turning as speed at the wheels) are shares of the largest in the domain. All are chosen.
-_NEAR = 0.15  # a motion nearer than this to one in the domain is inside
-_SPACING = 0.05  # least distance between the representatives that are kept
-_SMOOTHING = 0.25  # s, over which the twists of a run are averaged
-_STANDING = 0.02  # a smaller motion is standing still, which is inside every domain
-_OFTEN = 0.05  # share of a run's time: motions outside that take less are transitions, and do not count
+def _size(at_wheels: Array) -> float:
+    """Length of the largest of some motions (k, 3), m/s."""
+    return max(float(np.linalg.norm(at_wheels, axis=1).max()), 1e-9)
 
 
 def motions_of(matrix: Array, times: Array, signals: Array) -> Array:
@@ -191,13 +166,19 @@ class TrainingDomain:
 
     def __init__(self, robot: Robot, motions: Array | Sequence[Sequence[float]]) -> None:
         self._scale = _scale(robot)
-        self._known = np.asarray(motions, dtype=float) * self._scale
-        self._size = _size(self._known)
+        self._fitted = np.asarray(motions, dtype=float) * self._scale
+        self._size = _size(self._fitted)
 
     def excess(self, motions: Array) -> Array:
-        """How far (k,) motions (k, 3) are outside, in widths of what counts as near to a known motion; 0 inside."""
+        """Distances (k,) of motions (k, 3) from the domain, in widths of what counts as near to it; 0 inside."""
         at_wheels = motions * self._scale
-        excess: Array = np.maximum(self._distances(at_wheels) / (_NEAR * self._size) - 1, 0.0)
+        if len(at_wheels) == 1:  # without SciPy, which is slow to import live
+            distances = np.sqrt(np.square(self._fitted - at_wheels).sum(axis=1).min(keepdims=True))
+        else:
+            from scipy.spatial import KDTree
+
+            distances = KDTree(self._fitted).query(at_wheels)[0]
+        excess: Array = np.maximum(distances / (_NEAR * self._size) - 1, 0.0)
         return np.where(np.linalg.norm(at_wheels, axis=1) < _STANDING * self._size, 0.0, excess)
 
     def is_outside(self, motion: Array) -> bool:
@@ -209,15 +190,6 @@ class TrainingDomain:
         outside: NDArray[np.bool_] = self.excess(motions) > 0
         return outside
 
-    def _distances(self, at_wheels: Array) -> Array:
-        """Distances (k,) of motions (k, 3), m/s, from the nearest known one; one without SciPy, slow to import live."""
-        if len(at_wheels) == 1:
-            return np.sqrt(np.square(self._known - at_wheels).sum(axis=1).min(keepdims=True))
-        from scipy.spatial import KDTree
-
-        distances: Array = KDTree(self._known).query(at_wheels)[0]
-        return distances
-
     def outside_in_run(self, motions: Array) -> NDArray[np.bool_]:
         """True (k,) for the motions (k, 3) of one run that are outside; all False where they are mere transitions."""
         outside = self.outside(motions)
@@ -225,7 +197,13 @@ class TrainingDomain:
 
     def in_words(self, motions: Array) -> str:
         """The kind of motion that these (k, 3) are, by their medians, in words."""
-        return _in_words(motions * self._scale, motions)
+        speed = float(np.median(np.hypot(motions[:, 0], motions[:, 1])))
+        turning = float(np.median(np.abs((motions * self._scale)[:, 2])))
+        if speed < 0.3 * turning:
+            return "turning on the spot"
+        if turning < 0.2 * speed:
+            return f"driving straight at {speed:.2f} m/s"
+        return f"turning while driving at {speed:.2f} m/s"
 
 
 def extrapolation_consequence(effects: Sequence[str], *, fading: bool = False) -> str:
@@ -237,30 +215,6 @@ def extrapolation_consequence(effects: Sequence[str], *, fading: bool = False) -
         f"{', '.join(names)} {'is' if one else 'are'} not known to hold there, {fades}and errors may be larger than "
         "stated"
     )
-
-
-def _scale(robot: Robot) -> Array:
-    """Factors (3,) that make m/s of a twist: turning counts as the speed that it gives the wheels."""
-    return np.array([1.0, 1.0, robot.reach])
-
-
-def _size(at_wheels: Array) -> float:
-    """Length of the largest of some motions (k, 3), m/s."""
-    return max(float(np.linalg.norm(at_wheels, axis=1).max()), 1e-9)
-
-
-def _in_words(at_wheels: Array, motions: Array) -> str:
-    speed = float(np.median(np.hypot(motions[:, 0], motions[:, 1])))
-    turning = float(np.median(np.abs(at_wheels[:, 2])))
-    if speed < 0.3 * turning:
-        return "turning on the spot"
-    if turning < 0.2 * speed:
-        return f"driving straight at {speed:.2f} m/s"
-    return f"turning while driving at {speed:.2f} m/s"
-
-
-GROWTH = 4.0
-_KNOWN = 1e-9  # share of the largest variance below which a direction of the parameters has none but by rounding
 
 
 class FadedTwists(NamedTuple):
@@ -276,7 +230,32 @@ class FadedTwists(NamedTuple):
 
 
 class Fade:
-    """How the corrections of a model fade.
+    """Fading: outside the training domain, corrections fade to the plain matrix as far as they are not sure.
+
+    Let u be the drive signals of a sample, K the model's matrix, c(b) the corrections by parameters b, and K0 the plain
+    matrix, which was fitted without corrections. The model changes the plain twist by
+
+        m = K u + c(b) - K0 u.                                                                            (1)
+
+    With S the covariance of b and R that of K with b, an error e of b goes along with an error R S^+ e of K, the
+    conditional mean of normal errors. So m errs by D e, with the variance s^2,
+
+        D = dc/db + (R S^+) u,    s^2 = tr(D S D'),                                                       (2)
+
+    turning counted as the speed that it gives the wheels. Where motions are near to driven ones, runs that were held
+    out confirmed the corrections. Beyond, at x widths of "near" from there, a correction may have another form, and the
+    variance of what is extrapolated is taken to grow in proportion to that distance, as that of a random walk does:
+
+        v = GROWTH x s^2.                                                                                 (3)
+
+    Of an estimate m with the variance v, the share
+
+        g = max(1 - v / m^2, 0)                                                                           (4)
+
+    is used (positive part of the estimator of James and Stein, Proc. 4th Berkeley Symposium, 1961; non-negative garrote
+    of Breiman, Technometrics 37, 1995): m is kept where the parameters are known well; where they are not, or models
+    that the recordings cannot tell apart disagree, the plain matrix is left. Every sample is judged by itself, batch
+    and stream alike.
 
     change (3, M): what the matrix has that the plain one has not. driven (n, 3): motions of the training domain, m/s,
     m/s, rad/s. covariance (3M + p, 3M + p): of the matrix, row by row, then of the values of all terms; 0 for those
@@ -289,14 +268,18 @@ class Fade:
         self._weights = np.array([1.0, 1.0, robot.reach, 1.0, 1.0])
         elements, variances = change.size, np.diag(covariance)
         values = [(number, name) for number, term in enumerate(terms) for name in term.values]
-        known = np.flatnonzero(variances[elements:] > 0)
-        sizes = np.sqrt(variances[elements + known])
-        self._fitted = [(*values[row], float(size)) for row, size in zip(known, sizes, strict=True)]
-        rows = elements + known
+        fitted = np.flatnonzero(variances[elements:] > 0)
+        sizes = np.sqrt(variances[elements + fitted])
+        self._fitted = [(*values[row], float(size)) for row, size in zip(fitted, sizes, strict=True)]
+        rest = [dict(term.values) for term in terms]
+        for number, name, _ in self._fitted:
+            rest[number][name] = 0.0
+        self._without_fitted = rest  # the values of each term, the fitted ones 0
+        rows = elements + fitted
         strengths, vectors = np.linalg.eigh(covariance[np.ix_(rows, rows)] / np.outer(sizes, sizes))
-        kept = strengths > _KNOWN * strengths.max(initial=0.0)
-        self._roots = vectors[:, kept] * np.sqrt(strengths[kept])  # square root of S, in standard deviations
-        inverse = vectors[:, kept] / np.sqrt(strengths[kept])
+        varied = strengths > _VARIES * strengths.max(initial=0.0)
+        self._roots = vectors[:, varied] * np.sqrt(strengths[varied])  # square root of S, in standard deviations
+        inverse = vectors[:, varied] / np.sqrt(strengths[varied])
         along = covariance[:elements, rows] / sizes @ inverse  # R S^+ of the roots
         self._matrices = along.T.reshape(-1, *change.shape)
 
@@ -308,7 +291,10 @@ class Fade:
         rows = np.flatnonzero(excess)
         if not len(rows):
             return FadedTwists(twists, drift, None)
-        doubts = np.sqrt(GROWTH * excess[rows])[:, None, None] * self._slopes(_at(signals, rows), drive[rows], matrix)
+        arrays = {field.name: getattr(signals, field.name) for field in fields(signals)}
+        of_rows: dict[str, Any] = {name: item[rows] for name, item in arrays.items() if isinstance(item, np.ndarray)}
+        slopes = self._slopes(replace(signals, **of_rows), drive[rows], matrix)
+        doubts = np.sqrt(GROWTH * excess[rows])[:, None, None] * slopes  # Eq. (3)
         plain = drive @ (matrix - self._change).T
         change = np.concatenate([twists - plain, np.zeros((len(twists), 2)) if drift is None else drift], axis=1)
         variance = np.square(doubts * self._weights[:, None]).sum(axis=(1, 2))
@@ -322,13 +308,14 @@ class Fade:
 
     def _slopes(self, signals: Signals, drive: Array, matrix: Array) -> Array:
         """D of Eq. (2) times the roots of S, (F, 5, r)."""
-        zeros = self._without_fitted
         twists, _ = corrected_twists((), signals, matrix)
         slopes = np.zeros((len(drive), 5, len(self._fitted)))
         for column, (number, name, size) in enumerate(self._fitted):
             effect = self._terms[number].effect
             if isinstance(effect, MotionEffect):
-                moved, drift = corrected_twists([Term(effect, zeros[number] | {name: size})], signals, matrix)
+                moved, drift = corrected_twists(
+                    [Term(effect, self._without_fitted[number] | {name: size})], signals, matrix
+                )
                 slopes[:, :3, column] = moved - twists
                 if drift is not None:
                     slopes[:, 3:, column] = drift
@@ -336,28 +323,9 @@ class Fade:
         slopes[:, :3] += np.einsum("rkm,fm->fkr", self._matrices, drive)
         return slopes
 
-    @cached_property
-    def _without_fitted(self) -> list[dict[str, float]]:
-        """The values of each term, the fitted ones 0."""
-        fitted = {(number, name) for number, name, _ in self._fitted}
-        return [
-            {name: 0.0 if (number, name) in fitted else value for name, value in term.values.items()}
-            for number, term in enumerate(self._terms)
-        ]
-
 
 def faded_twists(fade: Fade | None, terms: Sequence[Term], signals: Signals, matrix: Array) -> FadedTwists:
     """The corrected twists of samples, faded if a fade is given. PluginError as ``corrected_twists``."""
     if fade is None:
         return FadedTwists(*corrected_twists(terms, signals, matrix), None)
     return fade.applied(terms, signals, matrix)
-
-
-def _at(signals: Signals, rows: NDArray[np.intp]) -> Signals:
-    """The signals of some samples."""
-    of_rows: dict[str, Any] = {}
-    for field in fields(signals):
-        value = getattr(signals, field.name)
-        if isinstance(value, np.ndarray):
-            of_rows[field.name] = value[rows]
-    return replace(signals, **of_rows)

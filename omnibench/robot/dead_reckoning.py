@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, get_args
+from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -56,21 +56,18 @@ def odometry(
         wheel_angles=None if angles is None else finite_array("angles", angles, 2),
         steering=None if steering is None else finite_array("steering", steering, 2),
     )
-    model = _model(robot, integration)
-    _check(model.robot, log)
-    if not model.robot.drive.direct:
-        log = WheelLog(**(vars(log) | {"drive": model.robot.drive}))
-    return model.poses([log])[0]
-
-
-def _model(robot: Any, integration: Integration | None) -> OdometryModel:
     if integration is not None:
         require_choice("integration", integration, get_args(Integration))
     if isinstance(robot, Robot):
-        return OdometryModel.of_design(robot, integration or "arc")
-    require_type(robot, Calibration, "read_calibration, or a Robot with omnibench.Robot(name=..., wheels=[...])")
-    model = robot.model
-    return replace(model, integration=integration or model.integration)
+        model = OdometryModel.of_design(robot, integration or "arc")
+    else:
+        require_type(robot, Calibration, "read_calibration, or a Robot with omnibench.Robot(name=..., wheels=[...])")
+        model = robot.model
+        model = replace(model, integration=integration or model.integration)
+    _check(model.robot, log)
+    if not model.robot.drive.direct:
+        log = replace(log, drive=model.robot.drive)
+    return model.poses([log])[0]
 
 
 def _check(robot: Robot, log: WheelLog) -> None:
@@ -78,24 +75,19 @@ def _check(robot: Robot, log: WheelLog) -> None:
     steered = robot.drive.steered
     if steered and log.steering is None:
         raise DataError(f"steering is missing: angles (F, {len(steered)}) of the wheels {', '.join(steered)}, rad")
-    wheels = (len(log.times), len(robot.wheel_names))
-    for name, array, shape in (
-        ("rates", log.rates, wheels),
-        ("angles", log.wheel_angles, wheels),
-        ("steering", log.steering, (len(log.times), len(steered))),
-        ("start", log.start, (3,)),
+    samples = len(log.times)
+    rows = "a row for each of the times, a column for each of the wheels"
+    of_wheels, of_steered = f"{rows} {', '.join(robot.wheel_names)}", f"{rows} {', '.join(steered)}"
+    for name, array, shape, axes in (
+        ("rates", log.rates, (samples, len(robot.wheel_names)), of_wheels),
+        ("angles", log.wheel_angles, (samples, len(robot.wheel_names)), of_wheels),
+        ("steering", log.steering, (samples, len(steered)), of_steered),
+        ("start", log.start, (3,), "x, y in m and heading in rad"),
     ):
         if array is not None and array.shape != shape:
-            raise DataError(f"{name} has shape {array.shape}, expected {shape}: {_axes(name, robot)}")
+            raise DataError(f"{name} has shape {array.shape}, expected {shape}: {axes}")
     for name, values, least in (("times", log.times, np.nextafter(0.0, 1.0)), ("stamps", log.stamps, 0.0)):
         steps = np.diff(values, prepend=values[0] - 1.0)
         for row in np.flatnonzero((steps <= 0) | (values < least))[:1]:
             rule = "> 0" if name == "times" else ">= 0"
             raise DataError(f"{name}, row {row + 1}: it is {values[row]:g}; times increase and are {rule}")
-
-
-def _axes(name: str, robot: Robot) -> str:
-    if name == "start":
-        return "x, y in m and heading in rad"
-    names = robot.drive.steered if name == "steering" else robot.wheel_names
-    return f"a row for each of the times, a column for each of the wheels {', '.join(names)}"

@@ -36,15 +36,14 @@ class JointChoice:
         alone = self.only and len(self.wheels) == 1
         if not self.asked and (numbered(found) or alone) and len(found) == len(self.wheels):
             return tuple(range(len(found)))
-        wanted = self.asked or self.wheels
-        if (self.asked or not self.steering) and all(found.count(name) == 1 for name in wanted):
-            return tuple(found.index(name) for name in wanted)
+        names = self.asked or self.wheels
+        if (self.asked or not self.steering) and all(found.count(name) == 1 for name in names):
+            return tuple(found.index(name) for name in names)
         if self.asked:
             return None
-        places = [self.matching(wheel, found) for wheel in self.wheels]
-        if not all(len(each) == 1 for each in places) or len({each[0] for each in places}) < len(places):
-            return None
-        return tuple(each[0] for each in places)
+        matches = [self.matching(wheel, found) for wheel in self.wheels]
+        places = tuple(indices[0] for indices in matches if len(indices) == 1)
+        return places if len(set(places)) == len(matches) else None
 
     def matching(self, wheel: str, found: Sequence[str]) -> list[int]:
         """Indices of the joints that are called like a wheel, but for words such as ``wheel``, ``joint`` and case."""
@@ -78,7 +77,7 @@ def numbered(found: Sequence[str]) -> bool:
 
 
 def _core(name: str, steering: bool = False) -> str | None:
-    """What is a joint's or a wheel's own in its name; None for a joint that does not steer if it should."""
+    """A joint's or a wheel's name without usual words; None for a joint that does not steer if it should."""
     words = re.findall(r"[a-z]+|[0-9]+", name.lower().rpartition("/")[2])
     if steering and _STEERING.isdisjoint(words):
         return None

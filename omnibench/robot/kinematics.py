@@ -1,62 +1,41 @@
-"""Inverse kinematic matrix of a robot: Eq. (3) for three omni wheels, its general form for every kind of wheel.
+"""Kinematics of wheeled robots: wheels, drive signals, the inverse kinematic matrix, and algebra of planar poses.
 
 A wheel that rolls in one direction, or on rollers, has the equation ``omega = row . (vx, vy, w)`` with the row
 ``(-sin d + tan g cos d, cos d + tan g sin d, R) / r``: d is the direction of the wheel's axle, g the angle of its
 rollers (0: none), R the lever arm of the driving force about the robot's centre, r the radius. A steered wheel at
-(x, y) whose rate is measured has two, for its signals omega cos phi and omega sin phi (kinematics.py):
+(x, y) whose rate is measured has two, for its signals omega cos phi and omega sin phi, Eq. (D1):
 
-    (omega cos phi, omega sin phi) = (vx - y w, vy + x w) / r.                                        (1)
+    (omega cos phi, omega sin phi) = (vx - y w, vy + x w) / r.                                        (K1)
 
 A fixed wheel does not slide along its axle, which is the condition
 
-    0 = (cos d, sin d, x sin d - y cos d) . (vx, vy, w).                                              (2)
+    0 = (cos d, sin d, x sin d - y cos d) . (vx, vy, w).                                              (K2)
 
 The twists that all conditions allow have an orthonormal basis Z (3, D). With the equations E (M, 3) of all signals the
-matrix is K = Z (E Z)^+, which gives the least-squares twist among them. A skid-steered robot slides; the condition then
-is that the mean of its fixed wheels does not.
+matrix is K = Z (E Z)^+, which gives the least-squares twist among them; for three omni wheels it is Eq. (3) of Palacin
+et al. 2023. A skid-steered robot slides; the condition then is that the mean of its fixed wheels does not.
 
-Drive signals: the quantities u (M,) in which a robot's twist is linear, twist = K u, from what its wheels measure.
-
-Let omega_i be the rate of wheel i and phi_j the steering angle of wheel j, both in the middle of a sample. A wheel
-that rolls in a fixed direction, or on rollers, has the signal omega_i. A steered wheel whose rate is measured moves the
-robot over itself by
-
-    r omega (cos phi, sin phi)                                                    (1)
-
-along x and y, and has the two signals omega cos phi and omega sin phi; K then holds its radius, its place and the
-offset of its steering angle. A car steers by wheels of which only the angle is measured. Its rear wheels, at the rates
-omega_i, have the mean rate m. With w the rate of turn and v the speed of the middle of its rear axle, a front wheel at
-(L_j, y_j) from there rolls without sliding if
-
-    tan phi_j = L_j w / (v - y_j w),  so that  w / v = tan phi_j / (L_j + y_j tan phi_j),       (2)
-
-by which every steered wheel gives the tangent t_j = L w / v of the one on the middle line, L ahead, with L the mean of
-L_j. The car's signals are m, m t with t the mean of t_j, and, of two rear wheels, the difference of their rates.
-
-phi of sample k is the mean of phi(k-1) and phi(k), measured at the ends of the samples; the first sample holds phi(1).
-
-Algebra of planar poses (x, y, heading), m, m, rad. Headings are not wrapped.
-
-Functions of two arrays (..., 3) take every pose with its counterpart, by NumPy's rules of broadcasting.
+Poses are (x, y, heading), m, m, rad, and headings are not wrapped. Functions of two arrays (..., 3) of poses take every
+pose with its counterpart, by NumPy's rules of broadcasting.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from types import MappingProxyType
-from typing import Any, Literal
+from itertools import chain
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import (
+    AfterValidator,
     ConfigDict,
     Field,
     FiniteFloat,
     SerializerFunctionWrapHandler,
-    field_validator,
     model_serializer,
     model_validator,
 )
@@ -68,10 +47,38 @@ from omnibench.robot.arrays import JsonArray as JsonArray
 from omnibench.views import Shown
 
 WheelType = Literal["omni", "mecanum", "fixed", "steered"]
+RobotClass = Literal["omni", "mecanum", "differential", "skid", "tricycle", "car", "swerve", "mixed"]
 
 _FORWARD = 0.0  # rad, the direction of rolling where none is given
 _FARTHEST = 1e3  # m
 _ON_AN_AXIS = 1e-9  # m2: a wheel ahead of the centre, or beside it, may have its rollers either way
+
+FASTEST = 100.0  # rad/s; chosen, above the wheels of usual robots
+FASTEST_RIM = 5.0  # m/s, of small wheels, which turn faster; chosen
+
+# Of the largest singular value: directions below it are rounding of design values, which have some digits.
+_RANK = 1e-6
+_ZERO = 1e-9  # m, rad, or either per rad of wheel: no length, angle or element of a real robot is smaller but for 0
+_ROUNDING = 1e-12  # of the largest element: a smaller one is no design value
+
+# Standard deviations of measured poses, m and rad, beyond which a covariance means that it is unknown (chosen).
+_LEAST_SIGMA, _LARGEST_SIGMA = 1e-7, 1e7
+
+# Matrices of the APR-02 from Palacin et al. 2023: Eq. (8), the parametric calibration of the authors' earlier work, and
+# Eq. (9), the genetic, non-parametric calibration of the article.
+_PUBLISHED_ROWS = {
+    "palacin2023_eq8": (
+        (-0.0892930568372762, -0.0005606566978203, 0.0867466159313470),
+        (0.0520955668635434, -0.1010213675626970, 0.0533117820461363),
+        (0.2364093797047320, 0.2341358647406650, 0.2353792947863630),
+    ),
+    "palacin2023_eq9": (
+        (-0.0883286476963123, 0.0000000000000000, 0.0873330402667908),
+        (0.0522829495809178, -0.1008246738469390, 0.0536189007203205),
+        (0.2357044251338890, 0.2338948216993490, 0.2348793373133590),
+    ),
+}
+PUBLISHED = tuple(_PUBLISHED_ROWS)
 
 
 def in_radians(content: Any, *keys: str) -> Any:
@@ -109,11 +116,14 @@ def _with_usual_rollers(content: Any) -> Any:
     return content | {"roller_angle": math.copysign(math.pi / 4, ahead * left)}
 
 
-def looks_like_radians(angle: float | None) -> float | None:
+def _looks_like_radians(angle: float) -> float:
     """The angle, rad. ValueError: no angle is that large."""
-    if angle is not None and abs(angle) > 4 * math.pi:
+    if abs(angle) > 4 * math.pi:
         raise ValueError(f"{angle:g} cannot be an angle in rad; is it in degrees?")
     return angle
+
+
+_Angle = Annotated[FiniteFloat, AfterValidator(_looks_like_radians)]
 
 
 def in_degrees_too(*keys: str) -> Callable[[dict[str, Any]], None]:
@@ -145,7 +155,7 @@ class Wheel(Model):
     distance: FiniteFloat | None = Field(
         None, ge=1e-6, le=_FARTHEST, description="lever arm about the robot's centre, m"
     )
-    angle: FiniteFloat | None = Field(
+    angle: _Angle | None = Field(
         None, description="direction of the axle (omni, mecanum) or of rolling (fixed, default 0), rad"
     )
     x: FiniteFloat | None = Field(None, ge=-_FARTHEST, le=_FARTHEST, description="in front of the robot's centre, m")
@@ -159,15 +169,16 @@ class Wheel(Model):
     def _angles_in_radians(cls, content: Any) -> Any:
         return _with_usual_rollers(in_radians(content, "angle", "roller_angle"))
 
-    @field_validator("angle")
-    @classmethod
-    def _looks_like_radians(cls, angle: float | None) -> float | None:
-        return looks_like_radians(angle)
-
     @model_validator(mode="after")
     def _is_placed(self) -> Wheel:
         if self.kind in ("fixed", "steered"):
-            self._stands_at_x_y()
+            if self.distance is not None:
+                raise ValueError(f"a {self.type} wheel has x and y in the place of distance")
+            for key in ("x", "y"):
+                if getattr(self, key) is None:
+                    raise ValueError(f"{key} of a {self.type} wheel is missing (m, x forward, y left)")
+            if self.type == "steered" and self.angle is not None:
+                raise ValueError("a steered wheel has no angle: its steering angle is 0 where it rolls forward")
         elif self.distance is None and (self.x is None or self.y is None):
             missing = "distance" if self.x is None and self.y is None else "x" if self.x is None else "y"
             raise ValueError(f"{missing} is missing; give distance and angle (of the axle), or x, y and angle")
@@ -181,24 +192,10 @@ class Wheel(Model):
             raise ValueError("roller_angle of a mecanum wheel is missing: +-pi/4, or roller_angle_deg: +-45")
         return self
 
-    def _stands_at_x_y(self) -> None:
-        if self.distance is not None:
-            raise ValueError(f"a {self.type} wheel has x and y in the place of distance")
-        for key in ("x", "y"):
-            if getattr(self, key) is None:
-                raise ValueError(f"{key} of a {self.type} wheel is missing (m, x forward, y left)")
-        if self.type == "steered" and self.angle is not None:
-            raise ValueError("a steered wheel has no angle: its steering angle is 0 where it rolls forward")
-
     @model_serializer(mode="wrap")
     def _without_defaults(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Only what is said, so that files, hashes and documents of omni wheels stay as they were."""
-        plain: dict[str, Any] = {
-            "type": None,
-            "distance": None,
-            "angle": None,
-            "x": None,
-            "y": None,
+        plain: dict[str, Any] = dict.fromkeys(("type", "distance", "angle", "x", "y")) | {
             "driven": True,
             "measured": True,
         }
@@ -268,10 +265,6 @@ class Wheel(Model):
         return self.distance if self.distance is not None else math.hypot(*self.position)
 
 
-FASTEST = 100.0  # rad/s; chosen, above the wheels of usual robots
-FASTEST_RIM = 5.0  # m/s, of small wheels, which turn faster; chosen
-
-
 def fastest_rates(radii: Array) -> Array:
     """Rates (N,), rad/s, that no wheels of radii (N,), m, exceed."""
     rates: Array = np.maximum(FASTEST, FASTEST_RIM / radii)
@@ -280,7 +273,18 @@ def fastest_rates(radii: Array) -> Array:
 
 @dataclass(frozen=True)
 class Drive:
-    """The drive signals of a robot's measured wheels: Eq. (1) of each steered wheel, the rates of the others.
+    """Drive signals: the quantities u (M,) in which a robot's twist is linear, twist = K u, from what its wheels
+    measure.
+
+    Let omega_i be the rate of wheel i and phi_j the steering angle of wheel j, both in the middle of a sample. A wheel
+    that rolls in a fixed direction, or on rollers, has the signal omega_i. A steered wheel whose rate is measured moves
+    the robot over itself by
+
+        r omega (cos phi, sin phi)                                                    (D1)
+
+    along x and y, and has the two signals omega cos phi and omega sin phi; K then holds its radius, its place and the
+    offset of its steering angle. phi of sample k is the mean of phi(k-1) and phi(k), measured at the ends of the
+    samples; the first sample holds phi(1).
 
     wheels (N): names of the wheels with a measured rate. steered (S): of those with a measured steering angle. names
     (M): of the signals. pairs (N): index of the steering angle that turns each wheel; -1 for one that does not steer.
@@ -307,7 +311,7 @@ class Drive:
 
     @cached_property
     def _columns(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Of each signal (M) the wheel, and the column of 1, cos phi (S), sin phi (S) by which its rate counts."""
+        """The wheel (M) of each signal, and the column of (1, cos phi (S), sin phi (S)) that multiplies its rate."""
         columns: list[tuple[int, int]] = []
         for wheel, pair in enumerate(self.pairs):
             columns += [(wheel, 0)] if pair < 0 else [(wheel, 1 + pair), (wheel, 1 + pair + len(self.steered))]
@@ -352,9 +356,17 @@ class Drive:
 
 @dataclass(frozen=True)
 class CarDrive(Drive):
-    """The drive signals of a car: mean rate, mean rate times the tangent of Eq. (2), and difference of two rates.
+    """Drive signals of a car, which steers by wheels of which only the angle is measured.
 
-    ahead (S): L_j and y_j of every steered wheel as in Eq. (2), m.
+    Its rear wheels, at the rates omega_i, have the mean rate m. With w the rate of turn and v the speed of the middle
+    of its rear axle, a front wheel at (L_j, y_j) from there rolls without sliding if
+
+        tan phi_j = L_j w / (v - y_j w),  so that  w / v = tan phi_j / (L_j + y_j tan phi_j),       (D2)
+
+    by which every steered wheel gives the tangent t_j = L w / v of the one on the middle line, L ahead, with L the mean
+    of L_j. The car's signals are m, m t with t the mean of t_j, and, of two rear wheels, the difference of their rates.
+
+    ahead (S): L_j and y_j of every steered wheel as in Eq. (D2), m.
     """
 
     ahead: tuple[tuple[float, float], ...]
@@ -392,7 +404,7 @@ class CarDrive(Drive):
         return rates, steering
 
     def _tangent(self, steering: Array) -> Array:
-        """Mean t (F,) of the tangents by which the steering angles (F, S) turn the car, Eq. (2)."""
+        """Mean t (F,) of the tangents by which the steering angles (F, S) turn the car, Eq. (D2)."""
         along, across = np.array(self.ahead).T
         tangents = np.tan(steering)
         mean: Array = (along.mean() * tangents / (along + across * tangents)).mean(axis=1)
@@ -412,7 +424,7 @@ def drive_of(wheels: tuple[Wheel, ...]) -> Drive:
         ahead = tuple((front - x, left - y) for front, left in guiding)
         return CarDrive(names, angles, ("mean", "mean_tan", "difference")[: 1 + len(rolling)], pairs, ahead)
     signals = ((name,) if pair < 0 else (f"{name}_cos", f"{name}_sin") for name, pair in zip(names, pairs, strict=True))
-    return Drive(names, angles, tuple(name for each in signals for name in each), pairs)
+    return Drive(names, angles, tuple(chain.from_iterable(signals)), pairs)
 
 
 def in_the_middle(steering: Array) -> Array:
@@ -422,12 +434,6 @@ def in_the_middle(steering: Array) -> Array:
     return middle
 
 
-# Of the largest singular value: directions below it are rounding of design values, which have some digits.
-_RANK = 1e-6
-_ZERO = 1e-9  # m, rad, or either per rad of wheel: no length, angle or element of a real robot is smaller but for 0
-_ROUNDING = 1e-12  # of the largest element: a smaller one is no design value
-
-
 class Mount(Model):
     """Pose of the tracked point, whose poses the reference reports, in the robot's frame."""
 
@@ -435,18 +441,12 @@ class Mount(Model):
 
     x: FiniteFloat = Field(0.0, description="forward of the robot's centre, m")
     y: FiniteFloat = Field(0.0, description="to the left of the robot's centre, m")
-    yaw: FiniteFloat = Field(0.0, description="counter-clockwise, rad")
+    yaw: _Angle = Field(0.0, description="counter-clockwise, rad")
 
     @model_validator(mode="before")
     @classmethod
     def _yaw_in_radians(cls, content: Any) -> Any:
         return in_radians(content, "yaw")
-
-    @field_validator("yaw")
-    @classmethod
-    def _looks_like_radians(cls, yaw: float) -> float:
-        looks_like_radians(yaw)
-        return yaw
 
     @property
     def twist(self) -> Array:
@@ -470,11 +470,34 @@ class Robot(Shown, Model):
 
     @model_validator(mode="after")
     def _moves(self) -> Robot:
+        """Refuse a robot that cannot be, or whose motion its signals do not determine."""
         names = [wheel.name for wheel in self.wheels]
         if len(set(names)) < len(names):
             raise ValueError(f"wheel names must differ: {', '.join(names)}")
-        if flaw := _flaw(self):
-            raise ValueError(flaw)
+        drive, fixed = self.drive, [wheel for wheel in self.wheels if wheel.kind == "fixed"]
+        if len(drive.names) < 2:
+            measured = ", ".join(drive.names) or "none"
+            raise ValueError(
+                f"two measured wheels are needed, or one that steers and is measured (measured: {measured})"
+            )
+        if isinstance(drive, CarDrive):
+            _check_car(self, drive)
+        allowed = self.allowed_basis
+        if allowed.shape[1] < 2 or np.abs(allowed[2]).max() < _RANK:
+            raise ValueError(_sliding(fixed))
+        if self.skid and not fixed:
+            raise ValueError("skid: true is for fixed wheels; this robot has none")
+        driven = self.signal_equations @ allowed
+        strengths = np.linalg.svd(driven / np.linalg.norm(driven, axis=0), compute_uv=False)
+        if len(strengths) < allowed.shape[1] or strengths[-1] < _RANK * strengths[0]:
+            if not fixed and drive.direct:
+                raise ValueError(
+                    "these wheels cannot drive the robot in every direction; check angles and roller angles"
+                )
+            raise ValueError(
+                f"signals {', '.join(drive.names)} do not determine how the robot moves; "
+                "add a measured wheel or a steering angle"
+            )
         return self
 
     @model_serializer(mode="wrap")
@@ -517,12 +540,28 @@ class Robot(Shown, Model):
     @property
     def centre_matrix(self) -> Array:
         """K of the design values for the twist of the robot's centre, shape (3, M)."""
-        return _design(self)
+        drive = self.drive
+        if drive.direct and all(wheel.kind in ("omni", "mecanum") for wheel in self.wheels):
+            return inverse_kinematic_matrix(self.measured)
+        allowed, equations = self.allowed_basis, self.signal_equations
+        used = 2 if isinstance(drive, CarDrive) else len(equations)  # a car's difference of rates has no design
+        matrix = np.zeros((3, len(equations)))
+        matrix[:, :used] = allowed @ np.linalg.pinv(equations[:used] @ allowed)
+        matrix[np.abs(matrix) < _ROUNDING * np.abs(matrix).max()] = 0.0
+        return matrix
 
     @property
     def allowed_basis(self) -> Array:
-        """An orthonormal basis Z (3, D) of the centre's twists in which no fixed wheel slides."""
-        return _allowed(self)
+        """An orthonormal basis Z (3, D) of the centre's twists in which no fixed wheel slides, Eq. (K2)."""
+        fixed = [wheel for wheel in self.wheels if wheel.kind == "fixed"]
+        if not fixed:
+            return np.eye(3)
+        rows = _conditions(fixed)
+        conditions = np.mean(rows, axis=0, keepdims=True) if self.skid else rows
+        _, strengths, directions = np.linalg.svd(conditions)
+        rank = int((strengths > _RANK * strengths[0]).sum())
+        allowed: Array = directions[rank:].T
+        return allowed
 
     @property
     def row_scales(self) -> Array:
@@ -534,12 +573,20 @@ class Robot(Shown, Model):
     @property
     def signal_equations(self) -> Array:
         """The matrix (M, 3) from a twist of the robot's centre to its signals: 1/m (columns 1, 2), 1 (column 3)."""
-        return _equations(self)
+        rolling, drive = wheel_equations(self.measured), self.drive
+        if isinstance(drive, CarDrive):
+            ahead = float(np.mean([along for along, _ in drive.ahead]))
+            rows = [rolling.mean(axis=0), np.array([0.0, 0.0, ahead / float(self.radii.mean())])]
+            return np.array([*rows, rolling[1] - rolling[0]] if len(rolling) == 2 else rows)
+        rows = []
+        for wheel, row in zip(self.measured, rolling, strict=True):
+            rows += list(_steered(*wheel.position) / wheel.radius) if wheel.has_steering else [row]  # Eq. (K1)
+        return np.array(rows)
 
     @property
     def allowed_twists(self) -> Array:
         """The matrix (3, 3) that takes from a twist of the tracked point what makes a fixed wheel slide."""
-        allowed = _allowed(self)
+        allowed = self.allowed_basis
         projection: Array = allowed @ allowed.T
         projection[np.abs(projection) < _ROUNDING] = 0.0
         if self.mount is None or len(allowed.T) == 3:
@@ -549,37 +596,18 @@ class Robot(Shown, Model):
     @property
     def slides(self) -> bool:
         """True if it may move along the axles of its wheels: no fixed wheel forbids it, or it is skid-steered."""
-        return self.skid or len(_allowed(self).T) == 3
+        return self.skid or len(self.allowed_basis.T) == 3
 
     @property
     def motions(self) -> Array:
-        """Twists (D, 3) of the centre that span what it can do: ahead, aside where it can, and turning."""
-        return _motions(_allowed(self))
-
-
-def _flaw(robot: Robot) -> str:
-    """The reason why a robot cannot be, in words; empty if it can."""
-    drive, lateral = robot.drive, [wheel for wheel in robot.wheels if wheel.kind == "fixed"]
-    if len(drive.names) < 2:
-        measured = ", ".join(drive.names) or "none"
-        return f"two measured wheels are needed, or one that steers and is measured (measured: {measured})"
-    if isinstance(drive, CarDrive) and (flaw := _flaw_of_car(robot)):
-        return flaw
-    allowed = _allowed(robot)
-    if allowed.shape[1] < 2 or np.abs(allowed[2]).max() < _RANK:
-        return _sliding(lateral)
-    if robot.skid and not lateral:
-        return "skid: true is for fixed wheels; this robot has none"
-    driven = _equations(robot) @ allowed
-    strengths = np.linalg.svd(driven / np.linalg.norm(driven, axis=0), compute_uv=False)
-    if len(strengths) < allowed.shape[1] or strengths[-1] < _RANK * strengths[0]:
-        if not lateral and drive.direct:
-            return "these wheels cannot drive the robot in every direction; check angles and roller angles"
-        return (
-            f"signals {', '.join(drive.names)} do not determine how the robot moves; "
-            "add a measured wheel or a steering angle"
-        )
-    return ""
+        """Twists (D, 3) of the centre that span what it can do: for D = 3 x, y and turning, else a line and turning."""
+        allowed = self.allowed_basis
+        if allowed.shape[1] == 3:
+            return np.eye(3)
+        line = allowed @ np.array([allowed[2, 1], -allowed[2, 0]])  # the twist of Z that does not turn
+        turning = allowed @ allowed[2]  # the one nearest to turning on the spot
+        motions: Array = np.array([motion / motion[np.abs(motion).argmax()] for motion in (line, turning)])
+        return motions
 
 
 def _sliding(fixed: Sequence[Wheel]) -> str:
@@ -596,43 +624,8 @@ def _sliding(fixed: Sequence[Wheel]) -> str:
 
 
 def _conditions(fixed: Sequence[Wheel]) -> Array:
-    """Rows (n, 3) that are orthogonal to the twists in which wheels do not slide along their axles, Eq. (2)."""
+    """Rows (n, 3) that are orthogonal to the twists in which wheels do not slide along their axles, Eq. (K2)."""
     rows = [np.array([math.cos(wheel.axle), math.sin(wheel.axle)]) @ _steered(*wheel.position) for wheel in fixed]
-    return np.array(rows)
-
-
-def _flaw_of_car(robot: Robot) -> str:
-    """The reason why wheels that steer and are not driven cannot be read as a car's; empty if they can."""
-    assert isinstance(robot.drive, CarDrive)
-    guiding = ", ".join(wheel.name for wheel in robot.wheels if wheel.has_steering and not wheel.has_rate)
-    others = [wheel.name for wheel in robot.measured if wheel.kind != "fixed" or wheel.rolling]
-    if others:
-        return (
-            f"steered wheels {guiding} without a rate need fixed wheels that roll forward beside them, found "
-            f"{', '.join(others)}; say measured: false for {guiding}, or driven: true"
-        )
-    if len(robot.measured) > 2:
-        return (
-            f"a car has one or two measured rear wheels, found {', '.join(robot.wheel_names)}; measured: false for one"
-        )
-    for name, (ahead, _) in zip(robot.drive.steered, robot.drive.ahead, strict=True):
-        if abs(ahead) < _RANK or ahead * robot.drive.ahead[0][0] < 0:
-            return f"steered wheel {name} must stand ahead of the fixed wheels, or all behind them; check x"
-    return ""
-
-
-def _equations(robot: Robot) -> Array:
-    """E (M, 3) of a robot's signals."""
-    rolling = wheel_equations(robot.measured)
-    drive = robot.drive
-    if isinstance(drive, CarDrive):
-        ahead = float(np.mean([along for along, _ in drive.ahead]))
-        rows = [rolling.mean(axis=0), np.array([0.0, 0.0, ahead / float(robot.radii.mean())])]
-        return np.array([*rows, rolling[1] - rolling[0]] if len(rolling) == 2 else rows)
-    rows = []
-    for wheel, row in zip(robot.measured, rolling, strict=True):
-        x, y = wheel.position
-        rows += [row] if not wheel.has_steering else list(_steered(x, y) / wheel.radius)
     return np.array(rows)
 
 
@@ -641,58 +634,39 @@ def _steered(x: float, y: float) -> Array:
     return np.array([[1.0, 0.0, -y], [0.0, 1.0, x]])
 
 
-def _allowed(robot: Robot) -> Array:
-    """Z (3, D): an orthonormal basis of the twists in which no fixed wheel slides, Eq. (2)."""
-    fixed = [wheel for wheel in robot.wheels if wheel.kind == "fixed"]
-    if not fixed:
-        return np.eye(3)
-    rows = _conditions(fixed)
-    conditions = np.mean(rows, axis=0, keepdims=True) if robot.skid else rows
-    _, strengths, directions = np.linalg.svd(conditions)
-    rank = int((strengths > _RANK * strengths[0]).sum())
-    allowed: Array = directions[rank:].T
-    return allowed
-
-
-def _motions(allowed: Array) -> Array:
-    """Twists (D, 3) that span Z (3, D): for D = 3 x, y and turning, else along a line and turning."""
-    if allowed.shape[1] == 3:
-        return np.eye(3)
-    line = allowed @ np.array([allowed[2, 1], -allowed[2, 0]])  # the twist of Z that does not turn
-    turning = allowed @ allowed[2]  # the one nearest to turning on the spot
-    motions: Array = np.array([motion / motion[np.abs(motion).argmax()] for motion in (line, turning)])
-    return motions
-
-
-def _design(robot: Robot) -> Array:
-    """K (3, M) of a robot's centre."""
-    drive = robot.drive
-    if drive.direct and all(wheel.kind in ("omni", "mecanum") for wheel in robot.wheels):
-        return inverse_kinematic_matrix(robot.measured)
-    allowed, equations = _allowed(robot), _equations(robot)
-    used = 2 if isinstance(drive, CarDrive) else len(equations)  # a car's difference of rates has no design
-    matrix = np.zeros((3, len(equations)))
-    matrix[:, :used] = allowed @ np.linalg.pinv(equations[:used] @ allowed)
-    matrix[np.abs(matrix) < _ROUNDING * np.abs(matrix).max()] = 0.0
-    return matrix
+def _check_car(robot: Robot, drive: CarDrive) -> None:
+    """Raise ValueError if wheels that steer and are not driven cannot be read as a car's."""
+    guiding = ", ".join(wheel.name for wheel in robot.wheels if wheel.has_steering and not wheel.has_rate)
+    others = [wheel.name for wheel in robot.measured if wheel.kind != "fixed" or wheel.rolling]
+    if others:
+        raise ValueError(
+            f"steered wheels {guiding} without a rate need fixed wheels that roll forward beside them, found "
+            f"{', '.join(others)}; say measured: false for {guiding}, or driven: true"
+        )
+    if len(robot.measured) > 2:
+        raise ValueError(
+            f"a car has one or two measured rear wheels, found {', '.join(robot.wheel_names)}; measured: false for one"
+        )
+    for name, (ahead, _) in zip(drive.steered, drive.ahead, strict=True):
+        if abs(ahead) < _RANK or ahead * drive.ahead[0][0] < 0:
+            raise ValueError(f"steered wheel {name} must stand ahead of the fixed wheels, or all behind them; check x")
 
 
 def relative_deviations(values: Array, design: Array) -> Array:
-    """Shares (values - design) / design; NaN where the design value is 0 but for rounding, as m12 of Eq. (7)."""
+    """Shares (values - design) / design; NaN where the design value is 0 but for rounding, as m12 of Eq. (7) of Palacin
+    et al. 2023."""
     shares: Array = (values - design) / np.where(np.abs(design) < _ZERO, np.nan, design)
     return shares
 
 
 def wheel_equations(wheels: Sequence[Wheel]) -> Array:
     """The matrix M (N, 3) that maps a twist (vx, vy, w) to wheel rates: 1/m (columns 1, 2) and 1 (column 3)."""
-    radius, distance, angle = _columns(wheels)
-    return wheel_rows(radius, distance, angle, np.array([wheel.roller_angle for wheel in wheels]))
+    return wheel_rows(*_geometry(wheels))
 
 
 def inverse_kinematic_matrix(wheels: Sequence[Wheel]) -> Array:
-    """M^-1 of these wheels, shape (3, N): Eq. (3) for three omni wheels, else the pseudo-inverse."""
-    radius, distance, angle = _columns(wheels)
-    rollers = np.array([wheel.roller_angle for wheel in wheels])
+    """M^-1 of these wheels, shape (3, N): Eq. (3) of Palacin et al. for three omni wheels, else the pseudo-inverse."""
+    radius, distance, angle, rollers = _geometry(wheels)
     return inverse_kinematic_matrices(radius[None], distance[None], angle[None], rollers)[0]
 
 
@@ -709,12 +683,17 @@ def inverse_kinematic_matrices(
     rollers = np.broadcast_to(np.asarray(roller_angle, dtype=float), r.shape[-1:])
     if r.shape[-1] == 3 and not rollers.any():
         return _eq_3(r, R, d)
-    return _pseudo_inverse(wheel_rows(r, R, d, rollers))
+    equations = wheel_rows(r, R, d, rollers)
+    finite = np.isfinite(equations).all(axis=(-2, -1))  # LAPACK raises on NaN and never returns on infinity
+    inverse: Array = np.full(np.swapaxes(equations, -2, -1).shape, np.nan)
+    inverse[finite] = np.linalg.pinv(equations[finite])
+    return inverse
 
 
-def _columns(wheels: Sequence[Wheel]) -> Array:
-    """Radii, lever arms and directions of the axles (3, N)."""
-    return np.array([[wheel.radius, wheel.lever, wheel.axle] for wheel in wheels]).T
+def _geometry(wheels: Sequence[Wheel]) -> tuple[Array, Array, Array, Array]:
+    """Radii, lever arms, directions of the axles and roller angles (N,)."""
+    radius, lever, axle = np.array([[wheel.radius, wheel.lever, wheel.axle] for wheel in wheels]).T
+    return radius, lever, axle, np.array([wheel.roller_angle for wheel in wheels])
 
 
 def wheel_rows(radius: Array, distance: Array, angle: Array, rollers: Array) -> Array:
@@ -725,14 +704,8 @@ def wheel_rows(radius: Array, distance: Array, angle: Array, rollers: Array) -> 
     return np.stack([across, along, distance], axis=-1) / radius[..., None]
 
 
-def _pseudo_inverse(equations: Array) -> Array:
-    finite = np.isfinite(equations).all(axis=(-2, -1))  # LAPACK raises on NaN and never returns on infinity
-    inverse: Array = np.full(np.swapaxes(equations, -2, -1).shape, np.nan)
-    inverse[finite] = np.linalg.pinv(equations[finite])
-    return inverse
-
-
 def _eq_3(r: Array, R: Array, d: Array) -> Array:
+    """M^-1 (..., 3, 3) of three omni wheels, Eq. (3) of Palacin et al. 2023."""
     ra, rb, rc = (r[..., wheel] for wheel in range(3))
     Ra, Rb, Rc = (R[..., wheel] for wheel in range(3))
     sin_bc, sin_ac, sin_ab = (np.sin(d[..., i] - d[..., j]) for i, j in ((1, 2), (0, 2), (0, 1)))
@@ -746,9 +719,6 @@ def _eq_3(r: Array, R: Array, d: Array) -> Array:
     ]
     determinant = Ra * sin_bc - Rb * sin_ac + Rc * sin_ab
     return np.moveaxis(np.array(rows), (0, 1), (-2, -1)) / determinant[..., None, None]
-
-
-RobotClass = Literal["omni", "mecanum", "differential", "skid", "tricycle", "car", "swerve", "mixed"]
 
 
 def class_of(robot: Robot) -> RobotClass:
@@ -768,10 +738,6 @@ def class_of(robot: Robot) -> RobotClass:
     if kind == "steered":
         return "tricycle" if any(wheel.kind == "fixed" for wheel in robot.wheels) else "swerve"
     return kind
-
-
-# Standard deviations of measured poses, m and rad, beyond which a covariance means that it is unknown (chosen).
-_LEAST_SIGMA, _LARGEST_SIGMA = 1e-7, 1e7
 
 
 def rotation(angle: float) -> Array:
@@ -856,27 +822,8 @@ def usable_covariances(covariances: Array) -> NDArray[np.bool_]:
     return usable
 
 
-_ROWS: Mapping[str, tuple[tuple[float, float, float], ...]] = MappingProxyType(
-    {
-        # Eq. (8): the parametric calibration of the authors' earlier work.
-        "palacin2023_eq8": (
-            (-0.0892930568372762, -0.0005606566978203, 0.0867466159313470),
-            (0.0520955668635434, -0.1010213675626970, 0.0533117820461363),
-            (0.2364093797047320, 0.2341358647406650, 0.2353792947863630),
-        ),
-        # Eq. (9): the genetic, non-parametric calibration of the article.
-        "palacin2023_eq9": (
-            (-0.0883286476963123, 0.0000000000000000, 0.0873330402667908),
-            (0.0522829495809178, -0.1008246738469390, 0.0536189007203205),
-            (0.2357044251338890, 0.2338948216993490, 0.2348793373133590),
-        ),
-    }
-)
-PUBLISHED = tuple(_ROWS)
-
-
 def published_matrix(name: str) -> Array:
     """A published inverse kinematic matrix (3, 3) of the APR-02. UnknownNameError lists the names."""
-    if name not in _ROWS:
-        raise UnknownNameError("published matrix", name, _ROWS)
-    return np.array(_ROWS[name])
+    if name not in _PUBLISHED_ROWS:
+        raise UnknownNameError("published matrix", name, _PUBLISHED_ROWS)
+    return np.array(_PUBLISHED_ROWS[name])

@@ -1,6 +1,6 @@
 """The odometry model that a calibrator fits and the live node runs: matrix, integration and effects.
 
-Odometry with effects, one wheel sample at a time; the corrections are those of the batch.
+``OdometryModel`` computes poses of whole runs; ``EffectStream`` one wheel sample at a time, with the same corrections.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from omnibench.robot.stored_odometry import StoredOdometry, are_many
 
 # Chord by length of an arc. Below it the arc ends where it began, and no motion in the robot's frame displaces its end.
 _NO_STRETCH = 1e-6
+_BLOCK = 30_000  # samples that are evaluated at once: 1,000 to 100,000 take within 10 % as long each
 
 
 class EffectStream(OdometryStream):
@@ -53,9 +54,14 @@ class EffectStream(OdometryStream):
         if duration is None:
             raise ValueError("a model with effects needs the duration of every sample")
         angles = np.asarray(angles, dtype=float)
-        if duration <= 0:
-            return self._take_at_once(angles, wheel_angles, steering)
-        self._follow()
+        if self._needs_poses and self.pose is not self._left_at:  # the uncorrected path begins where the stream was put
+            self._signals.pose = self.pose
+        if duration <= 0:  # without rates no effect acts, and the matrix stands
+            self.doubts = None
+            self._signals.turn(angles, wheel_angles)
+            self._left_at = super().drive(angles, steering=steering)
+            self._signals.move(self.moved)
+            return self.pose
         middle = self.steer(steering)
         steered = None if middle is None or steering is None else (middle, np.asarray(steering, dtype=float))
         self.driven = self.driven_signals(angles, middle)
@@ -64,39 +70,20 @@ class EffectStream(OdometryStream):
         before, moved = self.pose, twists[0] * duration
         self.pose = advance(before, moved, self.integration)
         if drift is not None:
-            added = self._in_frame(drift[0] * duration)
+            # From the reference's frame to the stream's.
+            turn = complex(math.cos(self.frame_heading), -math.sin(self.frame_heading))
+            displaced = drift[0] * duration
+            added = complex(displaced[0], displaced[1]) * turn
             self.pose = self.pose + np.array([added.real, added.imag, 0.0])
             moved = moved + self._in_body(added, before[2], moved[2])
-        self.moved, self._left_at = moved, self.pose
-        self.doubts = None if doubts is None else self._all_in_body(duration * doubts[0], before[2])
+        self.moved, self._left_at, self.doubts = moved, self.pose, None
+        if doubts is not None:
+            # From deviations (5, r) of twist and drift to those (3, r) of the motion in the robot's frame.
+            deviations, heading = duration * doubts[0], self.frame_heading + before[2]
+            cosine, sine = math.cos(heading), math.sin(heading)
+            of_drift = np.array([[cosine, sine], [-sine, cosine], [0.0, 0.0]]) @ deviations[3:]
+            self.doubts = deviations[:3] + of_drift
         return self.pose
-
-    def _all_in_body(self, doubts: Array, heading: float) -> Array:
-        """Deviations (3, r) of a motion in the robot's frame from those (5, r) of its twist and of its drift."""
-        turn = self.frame_heading + heading
-        cosine, sine = math.cos(turn), math.sin(turn)
-        of_drift = np.array([[cosine, sine], [-sine, cosine], [0.0, 0.0]]) @ doubts[3:]
-        in_body: Array = doubts[:3] + of_drift
-        return in_body
-
-    def _take_at_once(self, angles: Array, wheel_angles: Array | None, steering: Array | None) -> Array:
-        """Advance by wheel angles (N,) rad that take no time: without rates no effect acts, and the matrix stands."""
-        self._follow()
-        self.doubts = None
-        self._signals.turn(angles, wheel_angles)
-        self._left_at = super().drive(angles, steering=steering)
-        self._signals.move(self.moved)
-        return self.pose
-
-    def _follow(self) -> None:
-        """Begin the uncorrected path where the stream was put."""
-        if self._needs_poses and self.pose is not self._left_at:
-            self._signals.pose = self.pose
-
-    def _in_frame(self, drift: Array) -> complex:
-        """A displacement (2,) in the reference's frame, m, as x + iy in the stream's frame."""
-        turn = complex(math.cos(self.frame_heading), -math.sin(self.frame_heading))
-        return complex(drift[0], drift[1]) * turn
 
     def _in_body(self, displacement: complex, heading: float, turned: float) -> Array:
         """Motion (3,) in the robot's frame that displaces the end of a sample which begins at ``heading`` and turns."""
@@ -106,9 +93,6 @@ class EffectStream(OdometryStream):
             return np.zeros(3)
         in_body = displacement * complex(math.cos(heading + half), -math.sin(heading + half)) / stretch
         return np.array([in_body.real, in_body.imag, 0.0])
-
-
-_BLOCK = 30_000  # samples that are evaluated at once: 1,000 to 100,000 take within 10 % as long each
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +116,7 @@ class OdometryModel:
 
     @classmethod
     def of_design(cls, robot: Robot, integration: Integration) -> OdometryModel:
-        """The model of the design values, Eq. (7) for the APR-02."""
+        """The model of the design values, Eq. (7) of Palacin et al. 2023 for the APR-02."""
         return cls(robot, robot.inverse_kinematic_matrix, integration)
 
     @cached_property
@@ -239,7 +223,7 @@ def reported_poses(
 
     poses_of: the poses of the logs' paths at the logs' stamps, in any order of these.
     """
-    taken = []
+    measured = []
     for log in logs:
         of_position = of_heading = log.stamps
         for term in terms:
@@ -247,9 +231,9 @@ def reported_poses(
             before = term.effect.delays(log.stamps, term.values)
             of_position, of_heading = of_position - before[0], of_heading - before[1]
         when = np.concatenate([of_position, of_heading])
-        taken.append(replace(log.continued(when.max(initial=0.0)), stamps=when))
+        measured.append(replace(log.continued(when.max(initial=0.0)), stamps=when))
     reported = []
-    for log, both in zip(logs, poses_of(taken), strict=True):
+    for log, both in zip(logs, poses_of(measured), strict=True):
         poses = np.column_stack([both[: len(log.stamps), :2], both[len(log.stamps) :, 2]])
         for term in terms:
             assert isinstance(term.effect, ReferenceEffect)

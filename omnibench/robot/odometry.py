@@ -1,12 +1,12 @@
-"""Odometry from drive signals, Eq. (1) and (2): many trajectories and candidates at once, or one sample at a time.
+"""Odometry from drive signals: many trajectories and candidates at once, or one sample at a time.
 
 With a(k) the signals of sample k times its duration (rad: wheel angles, for most robots), C(k) their sum up to sample k
 and m3 row 3 of the matrix, the heading is theta(k) = theta(0) + m3.C(k), and sample k moves the robot by
 
     dx + i dy = (m1 + i m2).a(k) * s * exp(i psi),
 
-Euler step (Eq. 1): psi = theta(k-1) and s = 1. Arc, the exact path at constant twist: psi = theta(k-1) + h and
-s = sin(h)/h with h = m3.a(k)/2. For a given row 3 positions are linear in rows 1 and 2.
+Euler step, Eq. (1) and (2) of Palacin et al. 2023: psi = theta(k-1) and s = 1. Arc, the exact path at constant twist:
+psi = theta(k-1) + h and s = sin(h)/h with h = m3.a(k)/2. For a given row 3 positions are linear in rows 1 and 2.
 """
 
 from __future__ import annotations
@@ -362,7 +362,7 @@ class OdometryStream:
 
 
 def advance(pose: Array, moved: Array, integration: Integration) -> Array:
-    """The pose (3,) after a motion (3,) in the robot's frame, m, m, rad: Eq. (1), (2), or the arc of constant twist."""
+    """The pose (3,) after a motion (3,) in the robot's frame, m, m, rad, by an Euler step or an arc."""
     x, y, heading = pose.tolist()
     moved_x, moved_y, turned = moved.tolist()
     direction = heading

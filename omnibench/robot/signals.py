@@ -59,6 +59,17 @@ class Signals:
     steering_side: Array | None = None
     caster_rates: Array | None = None
 
+    @property
+    def speed(self) -> Array:
+        """Speed (F,) of the robot's centre, m/s."""
+        return np.hypot(self.twists[:, 0], self.twists[:, 1])
+
+
+def needed(signal: Array | None) -> Array:
+    """A signal that is there: an effect names it among its needs, or applies to robots that steer only."""
+    assert signal is not None
+    return signal
+
 
 def signals_of(
     log: WheelLog, robot: Robot, matrix: Array, sample_period: float, needs: Collection[str] = ()
@@ -124,8 +135,8 @@ def signals_of_runs(
 
 def _joined(of_runs: Sequence[Array | None]) -> Array | None:
     """Values (F, n) of all runs one after another; None if those of a run are not known."""
-    known = [values for values in of_runs if values is not None]
-    return np.concatenate(known) if len(known) == len(of_runs) else None
+    recorded = [values for values in of_runs if values is not None]
+    return np.concatenate(recorded) if len(recorded) == len(of_runs) else None
 
 
 def _smoothed(twists: Array, samples: RunSamples, share: float) -> Array:
@@ -140,8 +151,7 @@ def _smoothed(twists: Array, samples: RunSamples, share: float) -> Array:
 
 def steering_rates(ends: Array, middles: Array | None, durations: Array) -> Array:
     """Rates (F, S) of steering angles from those at the samples' ends and in their middles, rad; durations (F,), s."""
-    assert middles is not None  # there are steering angles
-    rates: Array = 2 * (ends - middles) / durations[:, None]
+    rates: Array = 2 * (ends - needed(middles)) / durations[:, None]
     return rates
 
 
@@ -321,7 +331,7 @@ def _travelled(rates: Array, steps: Array, samples: RunSamples) -> Array:
 def _sides(angles: Array) -> Array:
     """Sides (F, S) of its gears' play on which a run's steering motors stand, at angles (F, S), rad."""
     gears = SteeringGears()
-    return np.array([gears.turned(each) for each in angles])
+    return np.array([gears.turned(row) for row in angles])
 
 
 def _swings(robot: Robot, twists: Array, durations: Array) -> Array:

@@ -19,13 +19,16 @@ from omnibench.robot.compiled import path_sums
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Complex, Integration, OdometryBatch, RunSamples, WheelLog
 
+Sampled = TypeVar("Sampled", bound=Any)  # a log, or a run
+
 # Samples up to which an OdometryBatch holds them, in 0.1 kB each of three wheels (chosen: beyond, reading them anew and
 # summing in compiled code takes a tenth of the time, too).
 _HELD = 1_000_000
-Sampled = TypeVar("Sampled", bound=Any)  # a log, or a run
 _TOGETHER = 500_000  # samples that are read together (chosen: as many as a block of a stored table)
 _PARTS_OF_A_JOB = 4  # read together one after another: some 0.1 s of work (chosen)
 _MATRICES = 3  # whose poses are kept: a descent goes on from one of the last (chosen)
+
+_WORKERS: ContextVar[Backend | None] = ContextVar("workers", default=None)
 
 
 def odometry_of(logs: Sequence[WheelLog], integration: Integration) -> OdometryBatch:
@@ -65,9 +68,6 @@ class AtStamps:
     slopes: Array | None
 
 
-_WORKERS: ContextVar[Backend | None] = ContextVar("workers", default=None)
-
-
 def workers() -> Backend | None:
     """The backend whose workers read many logs; None: this process does."""
     return _WORKERS.get()
@@ -97,20 +97,21 @@ class StoredOdometry(OdometryBatch):
         starts = np.array([log.start for log in logs])[self.trajectory]
         self._start, self._turn = starts, np.exp(1j * starts[:, 2])
         self._signals = logs[0].signals.shape[1]
-        self._kept: OrderedDict[bytes, AtStamps] = OrderedDict()
+        self._cached: OrderedDict[bytes, AtStamps] = OrderedDict()
         self._descends = False
 
     @cached_property
     def driven(self) -> Array:
         """Integrals (S, M) of the signals up to each stamp, rad."""
-        kept = next(iter(self._kept.values()), None) or self._of_all([np.zeros((3, self._signals))], slopes=False)[0]
-        return kept.driven
+        sums = next(iter(self._cached.values()), None) or self._of_all([np.zeros((3, self._signals))], slopes=False)[0]
+        return sums.driven
 
     def poses(self, matrices: Array) -> Array:
         """Poses (P, S, 3) of candidate matrices (P, 3, M), see OdometryBatch."""
-        found = [self._of(matrices[0], self._descends)] if len(matrices) == 1 else self._of_all(matrices, slopes=False)
+        one = len(matrices) == 1
+        sums_by_matrix = [self._of(matrices[0], self._descends)] if one else self._of_all(matrices, slopes=False)
         result = np.empty((len(matrices), *self._start.shape))
-        for poses, matrix, sums in zip(result, matrices, found, strict=True):
+        for poses, matrix, sums in zip(result, matrices, sums_by_matrix, strict=True):
             path = (sums.moved[:, 0] + 1j * sums.moved[:, 1]) * self._turn
             poses[:, 0], poses[:, 1] = self._start[:, 0] + path.real, self._start[:, 1] + path.imag
             poses[:, 2] = self._start[:, 2] + sums.driven @ matrix[2]
@@ -135,64 +136,56 @@ class StoredOdometry(OdometryBatch):
         )
 
     def _of(self, matrix: Array, slopes: bool) -> AtStamps:
+        """The sums for one matrix, from those of the last few if it is among them."""
         key = np.ascontiguousarray(matrix, dtype=float).tobytes()
-        kept = self._kept.pop(key, None)
-        if kept is None or (slopes and kept.slopes is None):
-            while len(self._kept) >= _MATRICES:
-                self._kept.popitem(last=False)
-            (kept,) = self._of_all([matrix], slopes)
-        self._kept[key] = kept
-        return kept
+        sums = self._cached.pop(key, None)
+        if sums is None or (slopes and sums.slopes is None):
+            while len(self._cached) >= _MATRICES:
+                self._cached.popitem(last=False)
+            (sums,) = self._of_all([matrix], slopes)
+        self._cached[key] = sums
+        return sums
 
     def _of_all(self, matrices: Sequence[Array] | Array, slopes: bool) -> list[AtStamps]:
         """The sums for some matrices, by one reading of the samples."""
-        tasks = [(part, list(matrices), self.integration, slopes) for part in together(self._logs, self._of_a_job)]
-        parts = gathered(workers(), sums_of_logs, tasks)
-        return _of_each(parts)
-
-    @property
-    def _of_a_job(self) -> int:
-        """Samples that are summed in a job, or at a time here."""
-        return _TOGETHER if workers() is None else _PARTS_OF_A_JOB * _TOGETHER
+        of_a_job = _TOGETHER if workers() is None else _PARTS_OF_A_JOB * _TOGETHER
+        tasks = [(part, list(matrices), self.integration, slopes) for part in together(self._logs, of_a_job)]
+        return _joined(gathered(workers(), sums_of_logs, tasks))
 
 
 def sums_of_logs(task: tuple[Sequence[WheelLog], Sequence[Array], Integration, bool], _: Reporter) -> list[AtStamps]:
     """The sums of some logs for some matrices. The task: logs, matrices, integration, and whether slopes are wanted."""
     logs, matrices, integration, slopes = task
-    parts = [[_sums(part, matrix, integration, slopes) for matrix in matrices] for part in _read(logs)]
-    return _of_each(parts)
-
-
-@dataclass(frozen=True, eq=False)
-class _Read:
-    """Samples, signals (F, M) and stamps of some logs."""
-
-    samples: RunSamples
-    signals: Array
-    stamps: list[Array]
-
-
-def _read(logs: Sequence[WheelLog]) -> Iterator[_Read]:
-    """The logs, some at a time."""
+    parts = []
     for part in together(logs):
         samples = RunSamples.of([np.asarray(log.times) for log in part])
         signals = np.ascontiguousarray(np.concatenate([np.asarray(log.signals) for log in part]))
-        yield _Read(samples, signals, [log.stamps for log in part])
+        stamps = [log.stamps for log in part]
+        parts.append([_sums(samples, signals, stamps, matrix, integration, slopes) for matrix in matrices])
+    return _joined(parts)
 
 
-def _sums(part: _Read, matrix: Array, integration: Integration, slopes: bool) -> AtStamps:
-    edges = np.cumsum([0, *map(len, part.stamps)])
-    count, size = int(edges[-1]), part.signals.shape[1]
+def _sums(
+    samples: RunSamples,
+    signals: Array,
+    stamps: Sequence[Array],
+    matrix: Array,
+    integration: Integration,
+    slopes: bool,
+) -> AtStamps:
+    """The sums of runs for one matrix. signals (F, M): of all runs. stamps: those of each run."""
+    edges = np.cumsum([0, *map(len, stamps)])
+    count, size = int(edges[-1]), signals.shape[1]
     moved, driven = np.empty((count, 2)), np.empty((count, size))
     rows = np.empty((2, count if slopes else 1, size), dtype=complex)
     path_sums(
-        part.samples.times, part.signals, part.samples.edges, np.concatenate(part.stamps), edges,
+        samples.times, signals, samples.edges, np.concatenate(stamps), edges,
         np.ascontiguousarray(matrix), integration == "arc", slopes, moved, rows[0], rows[1], driven,
     )  # fmt: skip
     return AtStamps(moved, driven, rows.view(float) if slopes else None)
 
 
-def _of_each(parts: Sequence[Sequence[AtStamps]]) -> list[AtStamps]:
+def _joined(parts: Sequence[Sequence[AtStamps]]) -> list[AtStamps]:
     """The sums for each matrix over all parts, each of which has its sums by matrix. They have ``driven`` in common."""
     driven = np.concatenate([part[0].driven for part in parts])
     joined = []

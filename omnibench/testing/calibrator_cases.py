@@ -62,19 +62,19 @@ class CostConformance(Conformance):
     def test_costs_are_finite_and_not_negative(self) -> None:
         """Finite errors have finite costs >= 0."""
         values = self.make().combine(*self.errors(20))
-        require(bool(np.isfinite(values).all()), "a cost of finite errors is not finite")
-        require(bool((values >= 0).all()), f"a cost is negative: {values.min():.4g}")
+        require(np.isfinite(values).all(), "a cost of finite errors is not finite")
+        require((values >= 0).all(), f"a cost is negative: {values.min():.4g}")
 
     def test_no_error_costs_nothing(self) -> None:
         """Poses equal to the reference cost 0."""
         errors, trajectory = self.errors(2)
         values = self.make().combine(np.zeros_like(errors), trajectory)
-        require(bool((values == 0).all()), f"errors of zero cost {values.max():.4g}")
+        require((values == 0).all(), f"errors of zero cost {values.max():.4g}")
 
     def test_errors_cost_something(self) -> None:
         """Errors in x, y and heading cost more than 0."""
         values = self.make().combine(*self.errors(6))
-        require(bool((values > 0).all()), "errors in x, y and heading cost nothing")
+        require((values > 0).all(), "errors in x, y and heading cost nothing")
 
     def test_nan_stays_with_its_candidate(self) -> None:
         """NaN errors give a NaN cost, for that candidate only, without an exception."""
@@ -82,10 +82,8 @@ class CostConformance(Conformance):
         clean = self.make().combine(errors.copy(), trajectory)
         errors[1, -1] = np.nan
         values = self.make().combine(errors, trajectory)
-        require(bool(np.isnan(values[1])), f"NaN errors cost {values[1]:.4g}; they must cost NaN")
-        require(
-            bool(np.allclose(values[[0, 2]], clean[[0, 2]], rtol=1e-12)), "NaN of one candidate spoils another's cost"
-        )
+        require(np.isnan(values[1]), f"NaN errors cost {values[1]:.4g}; they must cost NaN")
+        require(np.allclose(values[[0, 2]], clean[[0, 2]], rtol=1e-12), "NaN of one candidate spoils another's cost")
 
     def test_costs_do_not_depend_on_the_batch(self) -> None:
         """A candidate costs the same alone and in a batch of any order, up to rounding."""
@@ -94,19 +92,15 @@ class CostConformance(Conformance):
         alone = np.concatenate([self.make().combine(errors[[index]], trajectory) for index in range(7)])
         backwards = self.make().combine(errors[::-1].copy(), trajectory)[::-1]
         for values in (alone, backwards):
-            require(
-                bool(np.allclose(values, together, rtol=1e-12)), "a candidate's cost depends on the others in its batch"
-            )
+            require(np.allclose(values, together, rtol=1e-12), "a candidate's cost depends on the others in its batch")
 
     def test_inputs_are_left_unchanged(self) -> None:
         """The errors are not overwritten."""
         errors, trajectory = self.errors(3)
-        kept, kept_trajectory = errors.copy(), trajectory.copy()
+        before = errors.copy(), trajectory.copy()
         self.make().combine(errors, trajectory)
-        require(
-            np.array_equal(kept, errors) and np.array_equal(kept_trajectory, trajectory),
-            "combine changed its arguments; work on copies",
-        )
+        same = np.array_equal(before[0], errors) and np.array_equal(before[1], trajectory)
+        require(same, "combine changed its arguments; work on copies")
 
     def test_exact_recordings_cost_nothing(self) -> None:
         """The true matrix costs 0 on recordings without noise, the design matrix more."""
@@ -159,13 +153,19 @@ class CalibratorConformance(Conformance):
         """A synthetic problem in the calibrator's own parameterisation; see ``synthetic_problem``."""
         calibrator = self.make()
         if "wheels" not in changes:
-            changes = {"robot": _first_robot(calibrator)} | changes
+            robot = next((robot for robot in synthetic_robots() if calibrator.applies(robot)), None)
+            names = ", ".join(robot.name for robot in synthetic_robots())
+            require(
+                robot is not None,
+                f"applies() is false for every synthetic robot ({names}), so nothing can be tested",
+            )
+            changes = {"robot": robot} | changes
         return synthetic_problem(parameterisation or calibrator.parameterisation, **changes)
 
     def attempt(self, problem: ObservedProblem, calibrator: Calibrator | None = None) -> Attempt:
         """Run the calibrator; Nonconformance if it raises a forbidden exception or does not end."""
         calibrator = calibrator or self.make()
-        watched = _watching(calibrator)
+        watched = (_Watching if calibrator.bounded else _WatchingUnbounded)(calibrator)
         try:
             result = run_calibrator(watched, problem)
         except Runaway:
@@ -175,7 +175,7 @@ class CalibratorConformance(Conformance):
         answer = watched.solution
         if watched.error is None:
             require(isinstance(answer, Solution), f"calibrate returned {type(answer).__name__}, expected a Solution")
-            require(bool(answer.reason.strip()), "the solution's reason is empty; say why it stopped")
+            require(answer.reason.strip(), "the solution's reason is empty; say why it stopped")
         return Attempt(result, problem, answer, watched.error, watched.uncounted)
 
     def test_same_seed_twice_gives_the_same_answer(self) -> None:
@@ -214,11 +214,15 @@ class CalibratorConformance(Conformance):
             raise SkipTest("its answer does not depend on the box")
         for fixed in (False, True):
             attempt = self.attempt(self.problem(fixed=fixed))
-            strays = attempt.problem.strays
+            problem, strays = attempt.problem, attempt.problem.strays
             if strays:
-                require(
-                    False,
-                    f"{plural(len(strays), 'candidate')} outside the box, e.g. {_shown(attempt.problem, strays[0])}",
+                stray = strays[0]
+                outside = (stray < problem.lower) | (stray > problem.upper) | ~np.isfinite(stray)
+                first = int(np.flatnonzero(outside)[0])
+                place = f"not in [{problem.lower[first]:.6g}, {problem.upper[first]:.6g}]"
+                raise Nonconformance(
+                    f"{plural(len(strays), 'candidate')} outside the box, e.g. {problem.names[first]} = "
+                    f"{stray[first]:.6g}, {place}"
                 )
             require(attempt.result.outcome is not Outcome.INVALID, attempt.result.reason)
 
@@ -250,7 +254,8 @@ class CalibratorConformance(Conformance):
 
     def test_nan_cost_is_survived(self) -> None:
         """The cost is NaN in most of the box, except near the start and the optimum."""
-        attempt = self.attempt(self.problem(undefined=_outer_shell))
+        # Any free element in the upper tenth of its range: 61 % of a box of nine.
+        attempt = self.attempt(self.problem(undefined=lambda points: (points > 0.9).any(axis=1)))
         if self.make().bounded:
             require(attempt.result.outcome is not Outcome.INVALID, f"beside NaN costs: {attempt.result.reason}")
 
@@ -300,9 +305,9 @@ class CalibratorConformance(Conformance):
         printed, folder = io.StringIO(), tempfile.TemporaryDirectory()
         with folder as path, chdir(path), redirect_stdout(printed), redirect_stderr(printed):
             self.attempt(self.problem(evaluations=300))
-            left = sorted(file.name for file in Path(path).iterdir())
+            files = sorted(file.name for file in Path(path).iterdir())
         require(not printed.getvalue(), f"it printed {printed.getvalue()[:60]!r}; put what matters into the reason")
-        require(not left, f"it left files in the working folder: {', '.join(left)}")
+        require(not files, f"it left files in the working folder: {', '.join(files)}")
 
 
 class _Watching(Calibrator):
@@ -336,24 +341,6 @@ class _WatchingUnbounded(_Watching):
     bounded = False
 
 
-def _watching(calibrator: Calibrator) -> _Watching:
-    return _Watching(calibrator) if calibrator.bounded else _WatchingUnbounded(calibrator)
-
-
-def _first_robot(calibrator: Calibrator) -> Robot:
-    """The first synthetic robot to which a calibrator applies; Nonconformance if there is none."""
-    for robot in synthetic_robots():
-        if calibrator.applies(robot):
-            return robot
-    names = ", ".join(robot.name for robot in synthetic_robots())
-    raise Nonconformance(f"applies() is false for every synthetic robot ({names}), so nothing can be tested")
-
-
-def _outer_shell(points: Array) -> NDArray[np.bool_]:
-    """True for points (P,) with any free element in the upper tenth of its range: 61 % of a box of nine."""
-    return np.asarray((points > 0.9).any(axis=1), dtype=bool)
-
-
 def _require_honest_end(attempt: Attempt) -> None:
     # A wrapped library may ask for a few more costs until its stop takes effect; only the claim is checked.
     require(
@@ -372,10 +359,3 @@ def _contents(problem: CalibrationProblem) -> dict[str, bytes]:
 
 def _bytes(array: Any) -> bytes:
     return b"" if array is None else np.asarray(array).tobytes()
-
-
-def _shown(problem: CalibrationProblem, vector: Array) -> str:
-    outside = (vector < problem.lower) | (vector > problem.upper) | ~np.isfinite(vector)
-    first = int(np.flatnonzero(outside)[0])
-    low, high = problem.lower[first], problem.upper[first]
-    return f"{problem.names[first]} = {vector[first]:.6g}, not in [{low:.6g}, {high:.6g}]"

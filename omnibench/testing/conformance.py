@@ -40,7 +40,7 @@ class Conformance:
     def test_class_and_options_are_documented(self) -> None:
         """``omnibench list`` and the JSON schema show these texts."""
         cls = type(self.make())
-        require(bool((cls.__doc__ or "").strip()), f"{cls.__name__} has no docstring; its first line is its summary")
+        require((cls.__doc__ or "").strip(), f"{cls.__name__} has no docstring; its first line is its summary")
         model: type[BaseModel] = getattr(cls, "Options", Options)
         bare = [name for name, field in model.model_fields.items() if not field.description]
         require(not bare, f"options without a description: {', '.join(bare)}; use Field(..., description=...)")
@@ -78,26 +78,19 @@ def run_cases(suite: Conformance, watch: Reporter = no_progress) -> list[CaseRes
     defined = [name for cls in reversed(type(suite).__mro__) for name in vars(cls) if name.startswith("test_")]
     results = []
     for method in dict.fromkeys(defined):
-        watch(Progress(f"{suite.registry.kind} {suite.name} is tested: {_in_words(method)}"))
-        results.append(_run_case(suite, method))
+        case = method.removeprefix("test_").replace("_", " ")
+        watch(Progress(f"{suite.registry.kind} {suite.name} is tested: {case}"))
+        outcome, message = CaseOutcome.PASSED, ""
+        try:
+            getattr(suite, method)()
+        except SkipTest as skipped:
+            outcome, message = CaseOutcome.SKIPPED, str(skipped)
+        except (Nonconformance, OmnibenchError) as error:
+            outcome, message = CaseOutcome.FAILED, str(error)
+        except (Exception, SystemExit) as error:  # a plug-in may raise anything
+            outcome, message = CaseOutcome.FAILED, f"{type(error).__name__}: {error}"
+        results.append(CaseResult(suite.registry.kind, suite.name, case, outcome, " ".join(message.split())))
     return results
-
-
-def _run_case(suite: Conformance, method: str) -> CaseResult:
-    outcome, message = CaseOutcome.PASSED, ""
-    try:
-        getattr(suite, method)()
-    except SkipTest as skipped:
-        outcome, message = CaseOutcome.SKIPPED, str(skipped)
-    except (Nonconformance, OmnibenchError) as error:
-        outcome, message = CaseOutcome.FAILED, str(error)
-    except (Exception, SystemExit) as error:  # a plug-in may raise anything
-        outcome, message = CaseOutcome.FAILED, f"{type(error).__name__}: {error}"
-    return CaseResult(suite.registry.kind, suite.name, _in_words(method), outcome, " ".join(message.split()))
-
-
-def _in_words(method: str) -> str:
-    return method.removeprefix("test_").replace("_", " ")
 
 
 def load_plugin(path: Path) -> None:
@@ -111,7 +104,7 @@ def load_plugin(path: Path) -> None:
         raise PluginError(f"{failure.origin} cannot be loaded: {failure.error}")
 
 
-def require(condition: bool, message: str) -> None:
+def require(condition: object, message: str) -> None:
     """Nonconformance with ``message`` unless ``condition`` holds."""
     if not condition:
         raise Nonconformance(" ".join(message.split()))
@@ -120,14 +113,14 @@ def require(condition: bool, message: str) -> None:
 @contextmanager
 def global_random_state(seed: int) -> Iterator[None]:
     """Seed the global generators of ``random`` and NumPy within the block, and restore them after it."""
-    kept, kept_numpy = random.getstate(), np.random.get_state()  # noqa: NPY002 (what a plug-in must not use)
+    before, numpy_before = random.getstate(), np.random.get_state()  # noqa: NPY002 (what a plug-in must not use)
     random.seed(seed)
     np.random.seed(seed)  # noqa: NPY002
     try:
         yield
     finally:
-        random.setstate(kept)
-        np.random.set_state(kept_numpy)  # noqa: NPY002
+        random.setstate(before)
+        np.random.set_state(numpy_before)  # noqa: NPY002
 
 
 def global_random_fingerprint() -> str:

@@ -29,6 +29,14 @@ from omnibench.testing.synthetic import synthetic_robot, synthetic_robots
 PERIOD: Final = 0.01  # s, of the wheel samples
 SAMPLES: Final = 200
 SESSIONS: Final = ("morning", "evening")
+_KINDS = {
+    "MotionEffect": (MotionEffect, ("wheel", "steering", "clock", "body", "world")),
+    "ReferenceEffect": (ReferenceEffect, ("reference",)),
+    "ActuatorEffect": (ActuatorEffect, ("actuator",)),
+}
+_OPTIONAL = {"wheel_angles", "session_time", "session", "poses", "steering_side", "caster_rates"}
+_ROUNDING = 1e-9  # relative to the largest value
+_NOTHING = 1e-12  # m, rad, rad/s: a smaller change is rounding
 _OMNI: Final = frozenset({synthetic_robot(3).name, synthetic_robot(4).name})
 Poses = tuple[Array, Array, Array]  # stamps (K,), poses (K, 3), start (3,)
 Motors = tuple[Array, Array]  # durations (F,), targets (F, N)
@@ -46,6 +54,9 @@ def driven_signals(robot: Robot, samples: int = SAMPLES, speed: float = 1.0) -> 
     gears, caster = SteeringGears(), Caster(robot)
     twists = robot.drive.signals(rates, steering) @ robot.inverse_kinematic_matrix.T
     middle = ends - PERIOD / 2
+    # Headings of the twists, positions on a loop beside the origin.
+    headings = 0.3 + PERIOD * np.cumsum(twists[:, 2])
+    poses = np.column_stack([0.5 + 0.8 * np.sin(middle), -0.4 + 0.8 * np.cos(1.3 * middle), headings])
     return Signals(
         robot=robot,
         durations=np.full(samples, PERIOD),
@@ -57,18 +68,12 @@ def driven_signals(robot: Robot, samples: int = SAMPLES, speed: float = 1.0) -> 
         wheel_angles=3.0 + np.cumsum(rates, axis=0) * PERIOD,
         session_time=600.0 + middle,
         session=SESSIONS[1],
-        poses=_poses(twists, middle),
+        poses=poses,
         steering=steering,
         steering_rates=None if steering is None else np.diff(swings, axis=0, prepend=swings[:1]) / PERIOD,
         steering_side=None if steering is None else np.array([gears.turned(angles) for angles in steering]),
         caster_rates=np.array([caster.moved(twist, PERIOD) for twist in twists.tolist()]),
     )
-
-
-def _poses(twists: Array, elapsed: Array) -> Array:
-    """Poses (F, 3): headings of the twists, positions on a loop beside the origin."""
-    heading = 0.3 + PERIOD * np.cumsum(twists[:, 2])
-    return np.column_stack([0.5 + 0.8 * np.sin(elapsed), -0.4 + 0.8 * np.cos(1.3 * elapsed), heading])
 
 
 def robots(effect: Effect) -> tuple[Robot, ...]:
@@ -84,7 +89,8 @@ def trial_values(effect: Effect, robot: Robot, seed: int = 0) -> Iterator[Values
     free = {item.name: float(rng.uniform(item.low, item.high)) for item in parameters if not item.choices}
     shapes = [item for item in parameters if item.choices]
     for number in range(max((len(item.choices) for item in shapes), default=1)):
-        yield {item.name: _choice(item, number) if item.choices else free[item.name] for item in parameters}
+        chosen = {item.name: item.choices[number % len(item.choices)] for item in shapes}
+        yield {item.name: chosen[item.name] if item.choices else free[item.name] for item in parameters}
 
 
 def trials(effect: Effect) -> Iterator[tuple[Robot, Values]]:
@@ -119,18 +125,18 @@ def motor_input(robot: Robot, samples: int = SAMPLES, speed: float = 1.0) -> Mot
     return np.full(samples, PERIOD), driven_signals(robot, samples, speed).rates
 
 
-def results(effect: Effect, given: Input, values: Values) -> dict[str, Array]:
+def results(effect: Effect, inputs: Input, values: Values) -> dict[str, Array]:
     """Results of the effect's methods, by name; an effect that has weights gets its trial weights."""
-    if isinstance(given, Signals):
+    if isinstance(inputs, Signals):
         if effect.weighted:
-            effect = effect.with_weights(effect.trial_weights(given.robot), given.robot, f"effect {effect.name!r}")
+            effect = effect.with_weights(effect.trial_weights(inputs.robot), inputs.robot, f"effect {effect.name!r}")
         assert isinstance(effect, MotionEffect)
-        return {"correction": effect.correction(given, values)}
-    if len(given) == 2:
+        return {"correction": effect.correction(inputs, values)}
+    if len(inputs) == 2:
         assert isinstance(effect, ActuatorEffect)
-        return {"driven": effect.driven(given[0], given[1], values)}
+        return {"driven": effect.driven(inputs[0], inputs[1], values)}
     assert isinstance(effect, ReferenceEffect)
-    stamps, poses, start = given
+    stamps, poses, start = inputs
     position, heading = effect.delays(stamps, values)
     return {
         "delays of position": position,
@@ -140,43 +146,28 @@ def results(effect: Effect, given: Input, values: Values) -> dict[str, Array]:
     }
 
 
-def changes(effect: Effect, given: Input, values: Values) -> Array:
+def changes(effect: Effect, inputs: Input, values: Values) -> Array:
     """Changes by the effect: of wheel rates or twists (F, n), or of delays and poses, reported and corrected (K, 8)."""
-    outputs = results(effect, given, values)
-    changed = {"driven": given[1], "reported": given[1], "corrected": given[1]} if isinstance(given, tuple) else {}
+    outputs = results(effect, inputs, values)
+    changed = {"driven": inputs[1], "reported": inputs[1], "corrected": inputs[1]} if isinstance(inputs, tuple) else {}
     return np.column_stack([np.asarray(value) - changed.get(name, 0.0) for name, value in outputs.items()])
 
 
-def arrays(given: Input) -> dict[str, Array]:
+def arrays(inputs: Input) -> dict[str, Array]:
     """The arrays of an input by name."""
-    if isinstance(given, tuple):
-        return {str(number): array for number, array in enumerate(given)}
-    values = {name: getattr(given, name) for name in type(given).__dataclass_fields__}
+    if isinstance(inputs, tuple):
+        return {str(number): array for number, array in enumerate(inputs)}
+    values = {name: getattr(inputs, name) for name in type(inputs).__dataclass_fields__}
     return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
 
 
-def one_row(given: Signals | Poses, row: int) -> Signals | Poses:
+def one_row(inputs: Signals | Poses, row: int) -> Signals | Poses:
     """The input reduced to one sample or pose."""
-    if isinstance(given, Signals):
-        alone: dict[str, Any] = {name: value[row : row + 1] for name, value in arrays(given).items()}
-        return replace(given, **alone)
-    stamps, poses, start = given
+    if isinstance(inputs, Signals):
+        alone: dict[str, Any] = {name: value[row : row + 1] for name, value in arrays(inputs).items()}
+        return replace(inputs, **alone)
+    stamps, poses, start = inputs
     return stamps[row : row + 1], poses[row : row + 1], start
-
-
-def _choice(parameter: Parameter, number: int) -> float:
-    """The choice of that number, counted cyclically."""
-    return parameter.choices[number % len(parameter.choices)]
-
-
-_KINDS = {
-    "MotionEffect": (MotionEffect, ("wheel", "steering", "clock", "body", "world")),
-    "ReferenceEffect": (ReferenceEffect, ("reference",)),
-    "ActuatorEffect": (ActuatorEffect, ("actuator",)),
-}
-_OPTIONAL = {"wheel_angles", "session_time", "session", "poses", "steering_side", "caster_rates"}
-_ROUNDING = 1e-9  # relative to the largest value
-_NOTHING = 1e-12  # m, rad, rad/s: a smaller change is rounding
 
 
 class EffectConformance(Conformance):
@@ -203,7 +194,7 @@ class EffectConformance(Conformance):
     def test_it_applies_to_robots_that_it_names(self) -> None:
         """It applies to one of the trial robots, and says for which it is where it does not apply to all."""
         effect = self.make()
-        require(bool(robots(effect)), "applies is False for robots on omni, mecanum, fixed and steered wheels")
+        require(robots(effect), "applies is False for robots on omni, mecanum, fixed and steered wheels")
         everywhere = all(effect.applies(robot) for robot in synthetic_robots())
         require(everywhere or bool(effect.only_for), "only_for is missing: say in words to which robots it applies")
 
@@ -222,13 +213,23 @@ class EffectConformance(Conformance):
                 any(not item.choices for item in parameters), "it needs a parameter without choices, 0 for no effect"
             )
             for parameter in parameters:
-                _check_parameter(parameter)
+                place, low, high = f"parameter {parameter.name!r}", parameter.low, parameter.high
+                named = bool(parameter.name) and parameter.name.isprintable()
+                require(named, f"{place}: its name is empty, or cannot be printed")
+                require(parameter.unit.strip(), f"{place} has no unit; that of a ratio is 1")
+                require(parameter.description.strip(), f"{place} has no description")
+                require(math.isfinite(low) and math.isfinite(high), f"{place}: its range is not finite")
+                require(low < high, f"{place}: low {low:g} is not below high {high:g}")
+                inside = all(low <= choice <= high for choice in parameter.choices)
+                require(inside, f"{place}: a choice is not within {low:g} and {high:g}")
+                zero = bool(parameter.choices) or low <= 0 <= high
+                require(zero, f"{place}: 0, where it does not act, is not within {low:g} and {high:g}")
 
     def test_parameters_have_names_of_their_own(self) -> None:
         """Names are keys of the calibration file: unique, and the same in every call."""
         for robot in robots(self.make()):
             first, again = (self.make().parameters(robot, SESSIONS) for _ in range(2))
-            names = [each.name for each in first]
+            names = [parameter.name for parameter in first]
             require(len(set(names)) == len(names), f"two parameters have one name: {', '.join(names)}")
             require(first == again, "parameters gives other parameters in a second call")
 
@@ -236,33 +237,33 @@ class EffectConformance(Conformance):
         """Results have the right shape for one sample and many, three wheels and four."""
         effect = self.make()
         for (robot, values), samples in product(trials(effect), (1, SAMPLES)):
-            given = trial_input(effect, robot, samples=samples)
-            for name, result in results(effect, given, values).items():
-                shape, expected = np.shape(result), _shape(name, effect.stage, given, robot)
+            inputs = trial_input(effect, robot, samples=samples)
+            for name, result in results(effect, inputs, values).items():
+                shape, expected = np.shape(result), _shape(name, effect.stage, inputs, robot)
                 require(shape == expected, f"{name} has shape {shape}, expected {expected}")
 
     def test_zero_parameters_change_nothing(self) -> None:
         """An effect whose parameters are 0 changes nothing."""
         effect = self.make()
         for robot, values in trials(effect):
-            given = trial_input(effect, robot)
-            largest = float(np.abs(changes(effect, given, without(effect, robot, values))).max())
+            inputs = trial_input(effect, robot)
+            largest = float(np.abs(changes(effect, inputs, without(effect, robot, values))).max())
             require(largest <= _NOTHING, f"parameters of 0 change something, by {largest:.3g}")
 
     def test_parameters_change_something(self) -> None:
         """It changes something in a varied drive."""
         effect = self.make()
         for robot in robots(effect):
-            given = trial_input(effect, robot)
-            seen = any((np.abs(changes(effect, given, each)) > 0).any() for each in trial_values(effect, robot))
-            require(seen, f"no parameters change anything on {len(robot.wheel_names)} wheels")
+            inputs = trial_input(effect, robot)
+            acts = any((np.abs(changes(effect, inputs, values)) > 0).any() for values in trial_values(effect, robot))
+            require(acts, f"no parameters change anything on {len(robot.wheel_names)} wheels")
 
     def test_results_are_finite(self) -> None:
         """Results are finite while the robot drives, drives fast and stands."""
         effect = self.make()
         for (robot, values), speed in product(trials(effect), (0.0, 1.0, 20.0)):
             finite = np.isfinite(changes(effect, trial_input(effect, robot, speed), values)).all()
-            require(bool(finite), f"a result is not finite where the robot {'drives' if speed else 'stands'}")
+            require(finite, f"a result is not finite where the robot {'drives' if speed else 'stands'}")
 
     def test_it_is_linear_in_its_parameters(self) -> None:
         """Fits and ``discover`` rely on it; parameters with choices are exempt."""
@@ -272,12 +273,12 @@ class EffectConformance(Conformance):
         # reported poses need be linear for small parameters only: rotations are not linear in their angle
         size, tolerance = (1.0, _ROUNDING) if isinstance(effect, MotionEffect) else (1e-5, 1e-3)
         for robot in robots(effect):
-            given = trial_input(effect, robot)
+            inputs = trial_input(effect, robot)
             for first, second in zip(trial_values(effect, robot, 1), trial_values(effect, robot, 2), strict=True):
                 free = [name for name in first if first[name] != second[name]]
                 one, other = (dict(values) | {name: size * values[name] for name in free} for values in (first, second))
                 both = one | {name: one[name] - 2 * other[name] for name in free}
-                of_one, of_other, of_both = (changes(effect, given, values) for values in (one, other, both))
+                of_one, of_other, of_both = (changes(effect, inputs, values) for values in (one, other, both))
                 error = float(np.abs(of_both - (of_one - 2 * of_other)).max())
                 scale = float(max(np.abs(of_one).max(), np.abs(of_other).max()))
                 require(error <= tolerance * scale, f"it is not linear in its parameters: off by {error:.3g}")
@@ -286,35 +287,35 @@ class EffectConformance(Conformance):
         """Signals, poses and values are not overwritten."""
         effect = self.make()
         for robot, values in trials(effect):
-            given = trial_input(effect, robot)
-            before, kept = {name: array.copy() for name, array in arrays(given).items()}, dict(values)
-            results(effect, given, values)
-            same = all(np.array_equal(array, before[name]) for name, array in arrays(given).items())
-            require(same and values == kept, "it changed its arguments; work on copies")
+            inputs = trial_input(effect, robot)
+            before, values_before = {name: array.copy() for name, array in arrays(inputs).items()}, dict(values)
+            results(effect, inputs, values)
+            same = all(np.array_equal(array, before[name]) for name, array in arrays(inputs).items())
+            require(same and values == values_before, "it changed its arguments; work on copies")
 
     def test_each_sample_is_corrected_by_itself(self) -> None:
         """A sample is corrected the same alone, as in a stream, and in a batch."""
         effect = self.make()
         for robot, values in trials(effect):
-            given = trial_input(effect, robot)
-            if not isinstance(given, Signals) and len(given) == 2:
+            inputs = trial_input(effect, robot)
+            if not isinstance(inputs, Signals) and len(inputs) == 2:
                 raise SkipTest("only for effects that act in a stream")
-            together = changes(effect, given, values)
+            together = changes(effect, inputs, values)
             for row in (0, 7, SAMPLES - 1, 3):
-                alone = changes(effect, one_row(given, row), values)
+                alone = changes(effect, one_row(inputs, row), values)
                 same = len(alone) == 1 and np.allclose(alone[0], together[row], rtol=1e-9, atol=_NOTHING)
                 require(same, f"row {row} differs between a batch and a stream; it must not depend on other samples")
 
     def test_results_are_reproducible(self) -> None:
         """Results are equal in every call and instance, and no global random generator is used."""
         for robot, values in trials(self.make()):
-            given = trial_input(self.make(), robot)
+            inputs = trial_input(self.make(), robot)
             repeated = []
             for seed in (1, 2):
                 with global_random_state(seed):
                     before = global_random_fingerprint()
                     effect = self.make()
-                    repeated += [changes(effect, given, values) for _ in range(2)]
+                    repeated += [changes(effect, inputs, values) for _ in range(2)]
                     require(global_random_fingerprint() == before, "it draws random numbers")
             same = all(np.array_equal(repeated[0], result) for result in repeated[1:])
             require(same, "its results differ from call to call")
@@ -358,25 +359,9 @@ class EffectConformance(Conformance):
             require(not np.any(still), "the wheels turn though all targets are 0")
 
 
-def _check_parameter(parameter: Parameter) -> None:
-    """Nonconformance unless name, unit, description and range are valid."""
-    place = f"parameter {parameter.name!r}"
-    low, high = parameter.low, parameter.high
-    require(bool(parameter.name) and parameter.name.isprintable(), f"{place}: its name is empty, or cannot be printed")
-    require(bool(parameter.unit.strip()), f"{place} has no unit; that of a ratio is 1")
-    require(bool(parameter.description.strip()), f"{place} has no description")
-    require(math.isfinite(low) and math.isfinite(high), f"{place}: its range is not finite")
-    require(low < high, f"{place}: low {low:g} is not below high {high:g}")
-    if parameter.choices:
-        inside = all(low <= each <= high for each in parameter.choices)
-        require(inside, f"{place}: a choice is not within {low:g} and {high:g}")
-    else:
-        require(low <= 0 <= high, f"{place}: 0, where it does not act, is not within {low:g} and {high:g}")
-
-
-def _shape(result: str, stage: str, given: Input, robot: Robot) -> tuple[int, ...]:
+def _shape(result: str, stage: str, inputs: Input, robot: Robot) -> tuple[int, ...]:
     """The shape that the contract gives to a result."""
-    if isinstance(given, Signals):
+    if isinstance(inputs, Signals):
         widths = {"body": 3, "world": 2, "steering": len(robot.drive.steered)}
-        return len(given.durations), widths.get(stage, len(robot.wheel_names))
-    return given[0].shape if result.startswith("delays") else given[1].shape
+        return len(inputs.durations), widths.get(stage, len(robot.wheel_names))
+    return inputs[0].shape if result.startswith("delays") else inputs[1].shape

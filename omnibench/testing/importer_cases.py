@@ -18,6 +18,8 @@ from omnibench.errors import DataError
 from omnibench.registry import importers
 from omnibench.testing.conformance import Conformance, require
 
+_FOREIGN = b"\x89PNG\r\n\x1a\n not a recording; \xff\xfe\x00 1,2,3\n"
+
 
 class ImporterConformance(Conformance):
     """Requirements on every importer.
@@ -74,12 +76,12 @@ class ImporterConformance(Conformance):
             expected = ((len(run.times), wheels), (len(run.pose_times), 3))
             require(shapes == expected, f"{place}: rates and poses have shapes {shapes}, expected {expected}")
             for name in ("times", "rates", "pose_times", "poses"):
-                require(bool(np.isfinite(getattr(run, name)).all()), f"{place}: {name} holds NaN or infinity")
+                require(np.isfinite(getattr(run, name)).all(), f"{place}: {name} holds NaN or infinity")
             require(run.split in SPLITS, f"{place}: split is {run.split!r}; it must be one of {', '.join(SPLITS)}")
             require(len(run.times) > 0 and run.times[0] > 0, f"{place}: wheel samples must start after t = 0")
             require(len(run.pose_times) > 1 and run.pose_times[0] == 0, f"{place}: poses must start at t = 0 and go on")
             steps = np.concatenate([np.diff(run.times), np.diff(run.pose_times)])
-            require(bool((steps > 0).all()), f"{place}: times must increase")
+            require((steps > 0).all(), f"{place}: times must increase")
 
     def test_sample_raises_no_warning(self) -> None:
         """``make_dataset`` does not warn of implausible units or wheels."""
@@ -113,14 +115,11 @@ class ImporterConformance(Conformance):
             try:
                 self.make().read(source)
             except DataError as error:
-                require(bool(str(error).strip()), f"{what}: the DataError has no message")
+                require(str(error).strip(), f"{what}: the DataError has no message")
                 return
             except Exception as error:
                 require(False, f"{what}: it raised {type(error).__name__}: {error}; raise DataError in one line")
         require(False, f"{what} was read without complaint; raise DataError in one line")
-
-
-_FOREIGN = b"\x89PNG\r\n\x1a\n not a recording; \xff\xfe\x00 1,2,3\n"
 
 
 def _difference(made: Dataset, loaded: Dataset) -> str:

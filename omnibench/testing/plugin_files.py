@@ -21,7 +21,7 @@ from omnibench.files import refuse_existing, write_text
 from omnibench.jobs.job import Failure, Job, JobWatch, ResultStore, run_jobs
 from omnibench.jobs.local_backends import Processes
 from omnibench.progress import Progress, Reporter, no_progress
-from omnibench.registry import REGISTRIES, Entry, Registry, calibrators, costs, effects, importers, registered_from
+from omnibench.registry import REGISTRIES, Registry, calibrators, costs, effects, importers, registered_from
 from omnibench.testing.calibrator_cases import CalibratorConformance, CostConformance
 from omnibench.testing.conformance import CaseOutcome, CaseResult, Conformance, load_plugin, run_cases
 from omnibench.testing.effect_cases import EffectConformance
@@ -66,13 +66,22 @@ def new_plugin(
     """
     if kind not in PLUGIN_KINDS:
         raise UnknownNameError("kind of plug-in", kind, PLUGIN_KINDS)
-    _check_identifier(name)
+    if not name.isidentifier() or not name.isascii() or keyword.iskeyword(name) or name != name.lower():
+        raise ConfigError(f"{name!r} cannot name a plug-in; use lower-case letters, digits and _, as in my_search")
+    if name.startswith(("_", "test_", "conftest")):
+        raise ConfigError(f"{name!r} cannot name a plug-in; files that begin with _, test_ or conftest are not loaded")
     targets = {
         Path(folder) / f"{name}.py": f"{kind}.py.txt",
         Path(folder) / f"test_{name}.py": f"test_{kind}.py.txt",
     }
     refuse_existing(*targets, force=force)
-    _check_free(name, kind)
+    for registry in REGISTRIES:
+        for entry in registry.entries() if registry.kind == kind else ():
+            if entry.name == name:
+                raise ConfigError(f"there is a {kind} {name!r} already ({entry.origin}); choose another name")
+    # pytest puts the folder first on Python's path, where the file would hide the module from everyone.
+    if importlib.util.find_spec(name) is not None:
+        raise ConfigError(f"{name}.py would hide the Python module {name!r}; choose another name")
     texts = {path: (_TEMPLATES / template).read_text(encoding="utf-8") for path, template in targets.items()}
     title = "".join(part.capitalize() for part in name.split("_"))
     if any(re.search(rf"\b{title}\b", text) for text in texts.values()):  # it would hide an import
@@ -119,20 +128,13 @@ def _check_apart(arguments: tuple[Path, Path | None], report: Reporter) -> Check
     path, sample = arguments
     with redirect_stdout(sys.stderr):  # a plug-in that prints must not spoil the report
         checked = check_plugin(path, sample, report)
-    if not _has_child():
-        return checked
-    message = "it started or forked a process that still runs or was not waited for; end what it starts"
-    left = CaseResult("plug-in", path.stem, "it leaves no process behind", CaseOutcome.FAILED, message)
-    return replace(checked, results=(*checked.results, left))
-
-
-def _has_child() -> bool:
-    """True if this process started one that still runs, or for whose end nobody has waited."""
     try:
         os.waitpid(-1, os.WNOHANG)
-    except ChildProcessError:
-        return False
-    return True
+    except ChildProcessError:  # none that still runs, or for whose end nobody has waited
+        return checked
+    message = "it started or forked a process that still runs or was not waited for; end what it starts"
+    failed = CaseResult("plug-in", path.stem, "it leaves no process behind", CaseOutcome.FAILED, message)
+    return replace(checked, results=(*checked.results, failed))
 
 
 def check_plugin(path: Path | str, sample: Path | str | None = None, watch: Reporter = no_progress) -> CheckReport:
@@ -147,34 +149,16 @@ def check_plugin(path: Path | str, sample: Path | str | None = None, watch: Repo
     if not registered:
         raise PluginError(f"{path} registers nothing; decorate a class with @calibrators.register(...), for example")
     source = None if sample is None else Path(sample)
-    return CheckReport(
-        path, tuple(result for registry, entry in registered for result in _check(registry, entry, source, watch))
-    )
-
-
-def _check(registry: Registry[Any], entry: Entry[Any], source: Path | None, watch: Reporter) -> list[CaseResult]:
-    try:
-        validate(entry.options, {}, f"{registry.kind} {entry.name!r}")
-    except ConfigError as error:
-        message = f"{error}; give every option a default, or subclass the conformance class and set options there"
-        return [CaseResult(registry.kind, entry.name, "can be made without options", CaseOutcome.FAILED, message)]
-    base = _SUITES.get(registry, Conformance)
-    suite = type("Checked", (base,), {"name": entry.name, "registry": registry, "source": source})
-    return run_cases(suite(), watch)
-
-
-def _check_identifier(name: str) -> None:
-    if not name.isidentifier() or not name.isascii() or keyword.iskeyword(name) or name != name.lower():
-        raise ConfigError(f"{name!r} cannot name a plug-in; use lower-case letters, digits and _, as in my_search")
-    if name.startswith(("_", "test_", "conftest")):
-        raise ConfigError(f"{name!r} cannot name a plug-in; files that begin with _, test_ or conftest are not loaded")
-
-
-def _check_free(name: str, kind: str) -> None:
-    for registry in REGISTRIES:
-        for entry in registry.entries() if registry.kind == kind else ():
-            if entry.name == name:
-                raise ConfigError(f"there is a {kind} {name!r} already ({entry.origin}); choose another name")
-    # pytest puts the folder first on Python's path, where the file would hide the module from everyone.
-    if importlib.util.find_spec(name) is not None:
-        raise ConfigError(f"{name}.py would hide the Python module {name!r}; choose another name")
+    results: list[CaseResult] = []
+    for registry, entry in registered:
+        try:
+            validate(entry.options, {}, f"{registry.kind} {entry.name!r}")
+        except ConfigError as error:
+            message = f"{error}; give every option a default, or subclass the conformance class and set options there"
+            failed = CaseResult(registry.kind, entry.name, "can be made without options", CaseOutcome.FAILED, message)
+            results.append(failed)
+            continue
+        base = _SUITES.get(registry, Conformance)
+        suite = type("Checked", (base,), {"name": entry.name, "registry": registry, "source": source})
+        results += run_cases(suite(), watch)
+    return CheckReport(path, tuple(results))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from itertools import product
+from itertools import cycle, product
 from typing import Any, Literal
 
 import numpy as np
@@ -86,21 +86,14 @@ def true_robot(robot: Robot) -> Robot:
 
     On fixed and steered wheels: radii 0.8 % below to 1.2 % above the design, distances 3 % above.
     """
-    if not _on_rollers(robot):
-        return _true_wheeled_robot(robot)
-    wheels = (
-        wheel.model_copy(update={"radius": wheel.radius * share, "distance": wheel.lever * _DISTANCE})
-        for wheel, share in zip(robot.wheels, _RADII, strict=False)
-    )
-    return robot.model_copy(update={"wheels": tuple(wheels)})
-
-
-def _true_wheeled_robot(robot: Robot) -> Robot:
-    wheels = []
-    for number, wheel in enumerate(robot.wheels):
-        x, y = (_WHEELED_PLACE * value for value in wheel.position)
-        share = _WHEELED_RADII[number % len(_WHEELED_RADII)]
-        wheels.append(wheel.model_copy(update={"radius": wheel.radius * share, "x": x, "y": y}))
+    on_rollers, wheels = _on_rollers(robot), []
+    for wheel, share in zip(robot.wheels, cycle(_RADII if on_rollers else _WHEELED_RADII), strict=False):
+        changed = {"radius": wheel.radius * share}
+        if on_rollers:
+            changed["distance"] = wheel.lever * _DISTANCE
+        else:
+            changed["x"], changed["y"] = (_WHEELED_PLACE * value for value in wheel.position)
+        wheels.append(wheel.model_copy(update=changed))
     return robot.model_copy(update={"wheels": tuple(wheels)})
 
 
@@ -110,18 +103,31 @@ def synthetic_trajectories(robot: Robot, integration: Integration = "arc") -> tu
     Robots on omni and mecanum wheels: twelve of 4 s, four directions, straight and turning either way. Others: two
     repetitions of each motion that they can make; see ``synthetic_motions``.
     """
-    if not _on_rollers(robot):
-        return _wheeled_trajectories(robot, integration)
     model = OdometryModel(robot, true_robot(robot).inverse_kinematic_matrix, integration)
-    times: Array = (PERIOD * np.arange(1, _SAMPLES + 1)).astype(float)
-    stamps = np.append(0.0, times[3::4])
     runs: list[Trajectory] = []
-    for direction, turn in product((0.2, 1.8, 3.3, 4.9), (-0.4, 0.0, 0.4)):
-        twist = np.array([_SPEED * math.cos(direction), _SPEED * math.sin(direction), turn])
-        rates = np.tile(wheel_equations(robot.wheels) @ twist, (_SAMPLES, 1))
-        poses = model.poses([WheelLog(times, rates, np.zeros(3), stamps)])[0]
-        runs.append(Trajectory(f"{len(runs) + 1:02d}", "train", times, rates, stamps, poses))
+    if _on_rollers(robot):
+        for direction, turn in product((0.2, 1.8, 3.3, 4.9), (-0.4, 0.0, 0.4)):
+            twist = np.array([_SPEED * math.cos(direction), _SPEED * math.sin(direction), turn])
+            rates = np.tile(wheel_equations(robot.wheels) @ twist, (_SAMPLES, 1))
+            runs.append(_recorded(model, len(runs) + 1, rates, np.zeros(3)))
+        return tuple(runs)
+    for command, legs in synthetic_motions(robot).items():
+        parts = [_commanded(robot, *leg) for leg in legs]
+        rates = np.concatenate([rates for rates, _ in parts])
+        steering = None if robot.drive.direct else np.concatenate([angles for _, angles in parts])
+        for repetition, start in enumerate((np.zeros(3), np.array(_SECOND_START)), start=1):
+            more = {"command": command, "repetition": repetition, "steering": steering}
+            runs.append(_recorded(model, len(runs) + 1, rates, start, **more))
     return tuple(runs)
+
+
+def _recorded(model: OdometryModel, number: int, rates: Array, start: Array, **more: Any) -> Trajectory:
+    """The recording of a run with wheel rates (F, N) from a start pose (3,). more: further fields of it."""
+    times: Array = PERIOD * np.arange(1, len(rates) + 1)
+    stamps = np.append(0.0, times[3::4])
+    drive = None if model.robot.drive.direct else model.robot.drive
+    log = WheelLog(times, rates, start, stamps, steering=more.get("steering"), drive=drive)
+    return Trajectory(f"{number:02d}", "train", times, rates, stamps, model.poses([log])[0], drive=drive, **more)
 
 
 def synthetic_motions(robot: Robot) -> dict[str, tuple[Leg, ...]]:
@@ -145,34 +151,6 @@ def synthetic_motions(robot: Robot) -> dict[str, tuple[Leg, ...]]:
         if len(robot.motions) == 3:
             motions[f"aside {side}"] = (((0.0, sign, 0.0), _STRAIGHT),)
     return motions
-
-
-def _wheeled_trajectories(robot: Robot, integration: Integration) -> tuple[Trajectory, ...]:
-    model = OdometryModel(robot, true_robot(robot).inverse_kinematic_matrix, integration)
-    drive = None if robot.drive.direct else robot.drive
-    runs: list[Trajectory] = []
-    for command, legs in synthetic_motions(robot).items():
-        parts = [_commanded(robot, *leg) for leg in legs]
-        rates = np.concatenate([rates for rates, _ in parts])
-        steering = None if drive is None else np.concatenate([angles for _, angles in parts])
-        times: Array = PERIOD * np.arange(1, len(rates) + 1)
-        stamps = np.append(0.0, times[3::4])
-        for repetition, start in enumerate((np.zeros(3), np.array(_SECOND_START)), start=1):
-            log = WheelLog(times, rates, start, stamps, steering=steering, drive=drive)
-            run = Trajectory(
-                id=f"{len(runs) + 1:02d}",
-                split="train",
-                times=times,
-                rates=rates,
-                pose_times=stamps,
-                poses=model.poses([log])[0],
-                command=command,
-                repetition=repetition,
-                steering=steering,
-                drive=drive,
-            )
-            runs.append(run)
-    return tuple(runs)
 
 
 def _commanded(robot: Robot, motion: tuple[float, float, float], samples: int) -> tuple[Array, Array]:
@@ -253,7 +231,7 @@ def synthetic_problem(
     undefined: Callable[[Array], NDArray[np.bool_]] | None = None,
     trajectories: Sequence[Trajectory] | None = None,
 ) -> ObservedProblem:
-    """The problem of Eq. (6) on the recordings; its least cost is 0, up to rounding.
+    """The problem of Eq. (6) of Palacin et al. 2023 on the recordings; its least cost is 0, up to rounding.
 
     robot: default: the synthetic robot on ``wheels`` omni or mecanum wheels.
     fixed: use a box that fixes some elements (zeros of the matrix, or the wheels' angles).

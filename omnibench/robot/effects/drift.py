@@ -6,9 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.registry import effects
-from omnibench.robot.effects.effect import MotionEffect, Parameter, ReferenceEffect, Values
+from omnibench.robot.effects.effect import MotionEffect, Parameter, ReferenceEffect, Values, body_change
 from omnibench.robot.kinematics import Array, Robot, class_of
-from omnibench.robot.signals import STILL, Signals
+from omnibench.robot.signals import STILL, Signals, needed
+
+_FURGALE = (
+    "P. Furgale, J. Rehder and R. Siegwart, Unified temporal and spatial calibration for multi-sensor systems, 2013"
+)
 
 
 def _driving(rates: Array) -> NDArray[np.bool_]:
@@ -28,9 +32,7 @@ class HeadingDrift(MotionEffect):
     fixed_parameters = (Parameter("b", "rad/s", -0.005, 0.005, "rate of turn that is added while a wheel turns"),)
 
     def correction(self, signals: Signals, values: Values) -> Array:
-        added = np.zeros(signals.twists.shape)
-        added[:, 2] = values["b"] * _driving(signals.rates)
-        return added
+        return body_change(signals, turning=values["b"] * _driving(signals.rates))
 
 
 @effects.register("body_velocity_bias")
@@ -68,9 +70,7 @@ class StartTransient(MotionEffect):
 
     def correction(self, signals: Signals, values: Values) -> Array:
         lost = values["k"] * np.exp(-signals.travelled / values["length"])
-        added = np.zeros(signals.twists.shape)
-        added[:, :2] = -lost[:, None] * signals.twists[:, :2]
-        return added
+        return body_change(signals, velocity=-lost[:, None] * signals.twists[:, :2])
 
 
 @effects.register("caster_pull")
@@ -96,10 +96,7 @@ class CasterPull(MotionEffect):
         return class_of(robot) == "differential"
 
     def correction(self, signals: Signals, values: Values) -> Array:
-        assert signals.caster_rates is not None  # they are needed
-        added = np.zeros(signals.twists.shape)
-        added[:, 2] = values["k"] * signals.caster_rates
-        return added
+        return body_change(signals, turning=values["k"] * needed(signals.caster_rates))
 
 
 @effects.register("floor_drift")
@@ -116,13 +113,7 @@ class FloorDrift(MotionEffect):
     )
 
     def correction(self, signals: Signals, values: Values) -> Array:
-        speed = np.hypot(signals.twists[:, 0], signals.twists[:, 1])
-        return speed[:, None] * np.array([values["dx"], values["dy"]])
-
-
-_FURGALE = (
-    "P. Furgale, J. Rehder and R. Siegwart, Unified temporal and spatial calibration for multi-sensor systems, 2013"
-)
+        return signals.speed[:, None] * np.array([values["dx"], values["dy"]])
 
 
 @effects.register("reference_time_offset")

@@ -1,7 +1,6 @@
-"""The interface of effects: named corrections of the odometry model, with their physics and plausible ranges.
+"""Effects: named corrections of the odometry model, with their physics and plausible ranges, and forms of them.
 
-Forms of an effect: its size varies with a covariate, or from wheel to wheel, where the textbook has it constant.
-
+In a form of an effect its size varies with a covariate, or from wheel to wheel, where the textbook has it constant.
 With c the textbook's correction by a parameter, x a covariate scaled to [-1, 1] over the range that was driven and held
 outside, and m_1, m_2 the means of x and x^2 weighted by c^2 (of all parameters), the family of the effect is
 
@@ -23,7 +22,7 @@ import base64
 import binascii
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Real
 from types import MappingProxyType
@@ -34,11 +33,30 @@ import numpy as np
 from omnibench.errors import DataError, UnknownNameError
 from omnibench.registry import Options, effects
 from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.signals import Signals
+from omnibench.robot.signals import Signals, needed
 
 Stage = Literal["actuator", "wheel", "steering", "clock", "body", "world", "reference"]
 Need = Literal["wheel_angles", "session_time", "session", "targets", "poses", "steering_side", "caster_rates"]
 Values = Mapping[str, float]
+
+MOST_BYTES: Final = 48 * 1024  # decoded: with the rest of a calibration they fit in a request to the live node
+_NUMBER = np.dtype("<f4")
+_SCALES = -1e9, 1e9  # range of the values that scale a form's covariate; chosen
+_FAR_OUTSIDE = 1e3  # multiple of the plausible range beyond which a value is refused; chosen
+
+_POWERS = (1, 2)
+_LARGEST = 2.0  # plausible size of a form's parameter, times that of the textbook's
+_TOP = 0.99  # quantile of a covariate up to which its forms vary, so that no single sample stretches them; chosen
+_VARIES = 0.02  # share of its largest value by which a covariate must vary
+_BY_SHOWN = {
+    "wheel rate": ("wheel rate",),
+    "acceleration": ("acceleration",),
+    "elapsed time": ("elapsed time", "session time"),
+    "order of runs": ("session time",),
+    "wheel angle": ("wheel angle",),
+    "steering angle": ("steering angle",),
+    "heading": ("speed",),
+}
 
 
 @dataclass(frozen=True)
@@ -159,23 +177,12 @@ class ActuatorEffect(Effect):
 effects.contract = Effect
 
 
-_POWERS = (1, 2)
-_LARGEST = 2.0  # plausible size of a form's parameter, times that of the textbook's
-_TOP = 0.99  # quantile of a covariate up to which its forms vary, so that no single sample stretches them; chosen
-_VARIES = 0.02  # share of its largest value by which a covariate must vary
-_BY_SHOWN = {
-    "wheel rate": ("wheel rate",),
-    "acceleration": ("acceleration",),
-    "elapsed time": ("elapsed time", "session time"),
-    "order of runs": ("session time",),
-    "wheel angle": ("wheel angle",),
-    "steering angle": ("steering angle",),
-    "heading": ("speed",),
-}
-
-
-def _speed(signals: Signals) -> Array:
-    return np.hypot(signals.twists[:, 0], signals.twists[:, 1])
+def body_change(signals: Signals, velocity: Array | float = 0.0, turning: Array | float = 0.0) -> Array:
+    """A change (F, 3) of the twist of the robot's centre by a velocity (F, 2), m/s, and a rate of turn (F,), rad/s."""
+    change = np.zeros(signals.twists.shape)
+    change[:, :2] = velocity
+    change[:, 2] = turning
+    return change
 
 
 def _total_acceleration(signals: Signals) -> Array:
@@ -184,29 +191,27 @@ def _total_acceleration(signals: Signals) -> Array:
     return np.hypot(ahead - turn * left, aside + turn * forward)
 
 
-_COVARIATES: dict[str, Callable[[Signals], Array | None]] = {
-    "wheel rate": lambda signals: np.abs(signals.rates),
-    "speed": _speed,
-    "turning": lambda signals: np.abs(signals.twists[:, 2]),
-    "acceleration": _total_acceleration,
-    "centripetal acceleration": lambda signals: np.abs(signals.twists[:, 2]) * _speed(signals),
-    "elapsed time": lambda signals: signals.elapsed,
-    "session time": lambda signals: signals.session_time,
-    "distance": lambda signals: signals.travelled,
-    "wheel angle": lambda signals: None if signals.wheel_angles is None else np.cos(signals.wheel_angles),
-    "steering angle": lambda signals: None if signals.steering is None else np.abs(signals.steering).mean(axis=1),
-}
-_IN_WORDS = {
-    "wheel rate": "fast wheels",
-    "speed": "fast driving",
-    "turning": "fast turning",
-    "acceleration": "large accelerations",
-    "centripetal acceleration": "large centripetal accelerations",
-    "elapsed time": "the end of a run",
-    "session time": "the end of the session",
-    "distance": "the end of the way",
-    "wheel angle": "wheel angle 0",
-    "steering angle": "large steering angles",
+# Of each covariate: the end of its range at which it is largest, in words, and its values.
+_COVARIATES: dict[str, tuple[str, Callable[[Signals], Array | None]]] = {
+    "wheel rate": ("fast wheels", lambda signals: np.abs(signals.rates)),
+    "speed": ("fast driving", lambda signals: signals.speed),
+    "turning": ("fast turning", lambda signals: np.abs(signals.twists[:, 2])),
+    "acceleration": ("large accelerations", _total_acceleration),
+    "centripetal acceleration": (
+        "large centripetal accelerations",
+        lambda signals: np.abs(signals.twists[:, 2]) * signals.speed,
+    ),
+    "elapsed time": ("the end of a run", lambda signals: signals.elapsed),
+    "session time": ("the end of the session", lambda signals: signals.session_time),
+    "distance": ("the end of the way", lambda signals: signals.travelled),
+    "wheel angle": (
+        "wheel angle 0",
+        lambda signals: None if signals.wheel_angles is None else np.cos(signals.wheel_angles),
+    ),
+    "steering angle": (
+        "large steering angles",
+        lambda signals: None if signals.steering is None else np.abs(signals.steering).mean(axis=1),
+    ),
 }
 
 
@@ -229,13 +234,10 @@ class Forms:
 
 def forms_of(effect: MotionEffect, signals: Signals, corrections: Mapping[str, Array]) -> Forms:
     """The forms that recordings can tell. corrections: the textbook's by 1 of each linear parameter, by its name."""
-    robot, linear = (
-        signals.robot,
-        {each.name: each for each in _linear(effect, signals.robot) if each.name in corrections},
-    )
+    linear = [parameter for parameter in _linear(effect, signals.robot) if parameter.name in corrections]
     parameters: list[Parameter] = []
     scales: dict[str, float] = {}
-    weight = np.sum([np.square(each) for each in corrections.values()], axis=0)
+    weight = np.sum([np.square(correction) for correction in corrections.values()], axis=0)
     for covariate in form_covariates(effect):
         values = _covariate(covariate, effect, signals)
         if values is None or np.ptp(values) <= _VARIES * np.abs(values).max():
@@ -248,14 +250,14 @@ def forms_of(effect: MotionEffect, signals: Signals, corrections: Mapping[str, A
             scale[f"mean_{power}"] = float((of_samples * share**power).sum()) / total
         scales |= {f"{covariate}:{key}": value for key, value in scale.items()}
         parameters += [
-            _form(each, f"{covariate}:{power}", f"over {covariate}, power {power}")
-            for each in linear.values()
+            _form(parameter, f"{covariate}:{power}", f"over {covariate}, power {power}")
+            for parameter in linear
             for power in _POWERS
         ]
     parameters += [
-        _form(each, f"wheel:{wheel}", f"wheel {wheel} against the mean")
-        for each in linear.values()
-        for wheel in _unequal_wheels(effect, robot)
+        _form(parameter, f"wheel:{wheel}", f"wheel {wheel} against the mean")
+        for parameter in linear
+        for wheel in _unequal_wheels(effect, signals.robot)
     ]
     return Forms(tuple(parameters), scales)
 
@@ -266,11 +268,16 @@ def correction_of(effect: MotionEffect, signals: Signals, values: Values) -> Arr
         return effect.correction(signals, values)
     textbook = {name: value for name, value in values.items() if ":" not in name}
     correction = effect.correction(signals, textbook)
-    for key, weights in _forms_given(values).items():
-        changed = {each.name: weights.get(each.name, 0.0) for each in _linear(effect, signals.robot)}
-        correction = correction + effect.correction(signals, textbook | changed) * form_profile(
-            key, effect, signals, values
-        )
+    # The parameters that are not 0, by what they vary with: speed:1, wheel:a.
+    by_form: dict[str, dict[str, float]] = {}
+    for name, value in values.items():
+        parameter, _, form = name.partition(":")
+        if value and form.count(":") == 1:
+            by_form.setdefault(form, {})[parameter] = value
+    for form, sizes in by_form.items():
+        changed = {parameter.name: sizes.get(parameter.name, 0.0) for parameter in _linear(effect, signals.robot)}
+        profile = form_profile(form, effect, signals, values)
+        correction = correction + effect.correction(signals, textbook | changed) * profile
     return correction
 
 
@@ -279,7 +286,7 @@ def accepts_form(effect: MotionEffect, robot: Robot, name: str) -> bool:
     first, _, rest = name.partition(":")
     if first in form_covariates(effect):
         return rest in ("low", "high", *(f"mean_{power}" for power in _POWERS))
-    if first not in {each.name for each in _linear(effect, robot)}:
+    if first not in {parameter.name for parameter in _linear(effect, robot)}:
         return False
     covariate, _, last = rest.rpartition(":")
     if covariate == "wheel":
@@ -290,7 +297,7 @@ def accepts_form(effect: MotionEffect, robot: Robot, name: str) -> bool:
 def form_in_words(values: Values) -> str:
     """The form of an effect in words: how its size varies, or that it is the textbook's."""
     words = []
-    for covariate, end in _IN_WORDS.items():
+    for covariate, (end, _) in _COVARIATES.items():
         varied = {name.partition(":")[0] for name in values if name.endswith((f":{covariate}:1", f":{covariate}:2"))}
         if varied:
             ends = [[_size(values, name, covariate, share) for name in varied] for share in (-1.0, 1.0)]
@@ -316,25 +323,15 @@ def _form(parameter: Parameter, suffix: str, description: str) -> Parameter:
     )
 
 
-def _linear(effect: MotionEffect, robot: Robot) -> Iterator[Parameter]:
-    return (each for each in effect.parameters(robot) if not each.choices)
+def _linear(effect: MotionEffect, robot: Robot) -> list[Parameter]:
+    return [parameter for parameter in effect.parameters(robot) if not parameter.choices]
 
 
 def _unequal_wheels(effect: MotionEffect, robot: Robot) -> Sequence[str]:
     """The wheels but the last of an effect that has one parameter for all of them."""
     names = robot.wheel_names
-    shared = not any(each.name.endswith(f"_{name}") for each in effect.parameters(robot) for name in names)
+    shared = not any(item.name.endswith(f"_{name}") for item in effect.parameters(robot) for name in names)
     return names[:-1] if effect.stage == "wheel" and shared else ()
-
-
-def _forms_given(values: Values) -> dict[str, dict[str, float]]:
-    """The parameters that are not 0, by what they vary with: ``speed:1``, ``wheel:a``."""
-    given: dict[str, dict[str, float]] = {}
-    for name, value in values.items():
-        first, _, rest = name.partition(":")
-        if value and rest.count(":") == 1:
-            given.setdefault(rest, {})[first] = value
-    return given
 
 
 def form_profile(key: str, effect: MotionEffect, signals: Signals, values: Values) -> Array:
@@ -345,26 +342,23 @@ def form_profile(key: str, effect: MotionEffect, signals: Signals, values: Value
         of_wheels = np.array([[1.0 if name == last else 0.0 for name in names]])
         of_wheels[0, -1] = -1.0
         return of_wheels
-    shown = _covariate(covariate, effect, signals)
-    assert shown is not None  # it was recorded
-    share = _scaled(shown, values[f"{covariate}:low"], values[f"{covariate}:high"])
+    share = _scaled(
+        needed(_covariate(covariate, effect, signals)), values[f"{covariate}:low"], values[f"{covariate}:high"]
+    )
     profile: Array = share ** int(last) - values[f"{covariate}:mean_{last}"]
     return profile if profile.ndim == 2 else profile[:, None]
 
 
 def _covariate(name: str, effect: MotionEffect, signals: Signals) -> Array | None:
     """A covariate (F,), or of each wheel (F, N) for an effect of the wheels; None if it was not recorded."""
-    values = _COVARIATES[name](signals)
+    _, values_of = _COVARIATES[name]
+    values = values_of(signals)
     return values.mean(axis=1) if values is not None and values.ndim == 2 and effect.stage != "wheel" else values
 
 
 def _scaled(values: Array, low: float, high: float) -> Array:
     """A covariate on [-1, 1] from low to high, held outside."""
     return np.clip((2 * values - low - high) / max(high - low, 1e-12), -1.0, 1.0)
-
-
-MOST_BYTES: Final = 48 * 1024  # decoded: with the rest of a calibration they fit in a request to the live node
-_NUMBER = np.dtype("<f4")
 
 
 def encode_weights(weights: Array) -> str:
@@ -394,10 +388,6 @@ def decode_weights(text: str, prefix: str = "weights") -> Array:
     if not np.isfinite(weights).all():
         raise DataError(f"{prefix} hold NaN or infinity; calibrate again")
     return weights
-
-
-_SCALES = -1e9, 1e9  # range of the values that scale a form's covariate; chosen
-_FAR_OUTSIDE = 1e3  # multiple of the plausible range beyond which a value is refused; chosen
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -433,44 +423,35 @@ def make_term(
     effect = effects.create(name, where=where)
     prefix = f"{where}: effect {name!r}" if where else f"effect {name!r}"
     check_applies(effect, robot, prefix)
-    known = {parameter.name: parameter for parameter in effect.parameters(robot, sessions)}
-    for given, value in parameters.items():
-        if given not in known and not effect.accepts(given) and not _is_form(effect, robot, given):
-            raise UnknownNameError("parameter", given, known, prefix)
+    listed = {parameter.name: parameter for parameter in effect.parameters(robot, sessions)}
+    for key, value in parameters.items():
+        is_form = isinstance(effect, MotionEffect) and accepts_form(effect, robot, key)
+        if key not in listed and not effect.accepts(key) and not is_form:
+            raise UnknownNameError("parameter", key, listed, prefix)
         if not _is_number(value) or not math.isfinite(value):
-            raise DataError(f"{prefix}: parameter {given!r} is {value!r}, not a finite number")
-        formed = given.partition(":")[0]
-        low, high = _SCALES if ":" in given and formed not in known else _limits(known.get(formed))
+            raise DataError(f"{prefix}: parameter {key!r} is {value!r}, not a finite number")
+        formed = key.partition(":")[0]
+        low, high = _SCALES if ":" in key and formed not in listed else _limits(listed.get(formed))
         if not low <= value <= high:
-            raise DataError(f"{prefix}: parameter {given!r} is {value:g}, not within {low:g} and {high:g}")
-    for parameter in known.values():
+            raise DataError(f"{prefix}: parameter {key!r} is {value:g}, not within {low:g} and {high:g}")
+    for parameter in listed.values():
         if parameter.name not in parameters:
             raise DataError(
                 f"{prefix}: parameter {parameter.name!r} ({parameter.unit}) is missing; {parameter.description}"
             )
-    values = MappingProxyType({given: float(value) for given, value in parameters.items()})
-    return Term(_weighted(effect, robot, weights, prefix), values, weights)
-
-
-def _weighted(effect: Effect, robot: Robot, weights: str | None, prefix: str) -> Effect:
-    """The effect with its weights, if it has some."""
-    if weights is None:
-        if effect.weighted:
-            raise DataError(f"{prefix}: weights are missing; take it whole from the file that calibrate wrote")
-        return effect
-    if not effect.weighted:
-        raise DataError(f"{prefix} has no weights; leave them out")
-    return effect.with_weights(decode_weights(weights, f"{prefix}: weights"), robot, prefix)
+    if weights is None and effect.weighted:
+        raise DataError(f"{prefix}: weights are missing; take it whole from the file that calibrate wrote")
+    if weights is not None:
+        if not effect.weighted:
+            raise DataError(f"{prefix} has no weights; leave them out")
+        effect = effect.with_weights(decode_weights(weights, f"{prefix}: weights"), robot, prefix)
+    return Term(effect, MappingProxyType({key: float(value) for key, value in parameters.items()}), weights)
 
 
 def check_applies(effect: Effect, robot: Robot, prefix: str) -> None:
     """DataError, in one line that begins with ``prefix``: the effect does not apply to the robot."""
     if not effect.applies(robot):
         raise DataError(f"{prefix} is for {effect.only_for}; robot {robot.name} is none, leave the effect out")
-
-
-def _is_form(effect: Effect, robot: Robot, name: str) -> bool:
-    return isinstance(effect, MotionEffect) and accepts_form(effect, robot, name)
 
 
 def _is_number(value: object) -> bool:
@@ -483,5 +464,5 @@ def _limits(parameter: Parameter | None) -> tuple[float, float]:
         return -_FAR_OUTSIDE, _FAR_OUTSIDE
     if parameter.choices:
         return parameter.low, parameter.high
-    largest = _FAR_OUTSIDE * max(abs(parameter.low), abs(parameter.high))
+    largest = _FAR_OUTSIDE * parameter.largest
     return -largest, largest

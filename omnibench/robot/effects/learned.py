@@ -14,7 +14,6 @@ s (M,), t (3,), and then W_1 row by row, b_1, ..., W_L, b_L, W_(L+1).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -80,11 +79,11 @@ def unpacked(weights: Array, signals: int, prefix: str) -> Network:
     """The network of numbers (n,) for so many drive signals. DataError, which begins with ``prefix``: they are none."""
     if len(weights) < _BEGIN or weights[0] != _VERSION or weights[1] not in (0.0, 1.0):
         raise DataError(f"{prefix}: weights do not begin as those of a network, version {_VERSION}; calibrate again")
-    depth, wanted = weights[2], weights[3]
-    if wanted != signals:
-        raise DataError(f"{prefix}: weights are for {wanted:g} drive signals, the robot has {signals}")
+    depth, trained_signals = weights[2], weights[3]
+    if trained_signals != signals:
+        raise DataError(f"{prefix}: weights are for {trained_signals:g} drive signals, the robot has {signals}")
     sizes = weights[_BEGIN : _BEGIN + int(min(max(depth, 0), _MOST_LAYERS))]
-    if depth not in range(1, _MOST_LAYERS + 1) or not _are_sizes(sizes.tolist()):
+    if depth not in range(1, _MOST_LAYERS + 1) or not all(size in range(1, _LARGEST_LAYER + 1) for size in sizes):
         raise DataError(f"{prefix}: weights have no layers of a network; calibrate again")
     widths = [int(size) for size in sizes]
     shapes: list[tuple[int, ...]] = [(signals,), (3,)]
@@ -101,10 +100,6 @@ def unpacked(weights: Array, signals: int, prefix: str) -> Network:
         raise DataError(f"{prefix}: weights have scales that are not above 0; calibrate again")
     layers = tuple(zip(rest[:-1:2], rest[1:-1:2], strict=True))
     return Network(bool(weights[1]), inputs, outputs, layers, rest[-1])
-
-
-def _are_sizes(sizes: Sequence[float]) -> bool:
-    return all(size in range(1, _LARGEST_LAYER + 1) for size in sizes)
 
 
 @effects.register("learned")

@@ -2,7 +2,8 @@
 
 They describe an error without its cause, and are never proposed as names. A change in turning is proportional to the
 distance that the wheels move, so that a standing robot is never changed. No function extrapolates beyond the data: each
-is constant there or fades to zero.
+is constant there or fades to zero. Eccentric wheels and their rollers, whose cause is known, are waves of the same
+kind.
 """
 
 from __future__ import annotations
@@ -17,13 +18,10 @@ from numpy.polynomial import chebyshev
 
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import MotionEffect, Parameter, ReferenceEffect, Values
-from omnibench.robot.effects.wheels import has_rollers, of_wheels, one_for_each_wheel
+from omnibench.robot.effects.wheels import EachWheelEffect, has_rollers, of_wheels
 from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.signals import STILL, Signals
+from omnibench.robot.signals import STILL, Signals, needed
 
-SURFACES = ("x", "y", "xx", "xy", "yy", "xxx", "xxy", "xyy", "yyy")
-_LARGEST = 0.1  # plausible size of a coefficient, a share of the motion; chosen
-_SLOW = 1e-3  # m/s, below which the direction of travel is ill-defined; chosen
 MODES = {
     "along": "along the way",
     "across": "across the way, to the left",
@@ -31,11 +29,37 @@ MODES = {
     "rotation": "of the rate of turn",
 }
 ALL_MODES = tuple(MODES)
+SURFACES = ("x", "y", "xx", "xy", "yy", "xxx", "xxy", "xyy", "yyy")
+HARMONICS = (0.5, *(float(number) for number in range(1, 17)), 1.5, 2.5, 3.5)  # waves in a turn of a wheel; chosen
+KNOTS = 8  # knots of the function of each wheel's rate; chosen
+_COMMON_KNOTS = 33  # knots of the function that all wheels share; chosen
+_TURNS = ("cos1", "sin1", "cos2", "sin2", "cos3", "sin3")
+_AXES = {"x": "m", "y": "m", "theta": "rad"}
+_LARGEST = 0.1  # plausible size of a coefficient, a share of the motion; chosen
+_SLOW = 1e-3  # m/s, below which the direction of travel is ill-defined; chosen
+_ROUNDS = 200  # steps of the fixed-point iteration that inverts a map, at most; chosen
+_SAME = 1e-13  # m, rad: a smaller change ends the iteration
 
 
 def scale(name: str, unit: str, low: float, high: float, usual: float, description: str) -> Parameter:
     """A parameter that sets the range of a function; usual: the value to try."""
     return Parameter(name, unit, low, high, description, choices=(usual,))
+
+
+AREA = (
+    scale("centre_x", "m", -1e6, 1e6, 0.0, "middle of the places that were seen"),
+    scale("centre_y", "m", -1e6, 1e6, 0.0, "middle of the places that were seen"),
+    scale("reach", "m", 1e-6, 1e6, 2.0, "how far from there places were seen"),
+)
+PATCH = (
+    *AREA[:2],
+    scale("radius", "m", 1e-6, 1e6, 2.0, "from the centre, where 1/e of the change is left"),
+)
+LINE = (
+    scale("normal", "rad", -7.0, 7.0, 0.0, "direction across the line, in the reference's frame"),
+    scale("distance", "m", -1e6, 1e6, 0.0, "of the line from the reference's origin along that direction"),
+)
+_TOP = scale("top", "rad/s", 1e-6, 1e6, 6.0, "the fastest rate that was seen; knots are spread from -top to top")
 
 
 def shared(modes: Sequence[str], labels: Sequence[str], of_what: str) -> tuple[Parameter, ...]:
@@ -58,7 +82,7 @@ def direction(mode: str, signals: Signals) -> Array:
     elif mode == "rotation":
         changes[:, 2] = twists[:, 2]
     else:
-        changes[:, 2] = np.abs(twists[:, 2]) + np.hypot(twists[:, 0], twists[:, 1]) / lever(signals.robot)
+        changes[:, 2] = np.abs(twists[:, 2]) + signals.speed / lever(signals.robot)
     return changes
 
 
@@ -101,23 +125,6 @@ def beyond(places: Array, values: Values) -> Array:
     return (0.5 + 0.5 * np.tanh(across(places, values) / values["width"]))[:, None]
 
 
-AREA = (
-    scale("centre_x", "m", -1e6, 1e6, 0.0, "middle of the places that were seen"),
-    scale("centre_y", "m", -1e6, 1e6, 0.0, "middle of the places that were seen"),
-    scale("reach", "m", 1e-6, 1e6, 2.0, "how far from there places were seen"),
-)
-PATCH = (
-    *AREA[:2],
-    scale("radius", "m", 1e-6, 1e6, 2.0, "from the centre, where 1/e of the change is left"),
-)
-
-
-LINE = (
-    scale("normal", "rad", -7.0, 7.0, 0.0, "direction across the line, in the reference's frame"),
-    scale("distance", "m", -1e6, 1e6, 0.0, "of the line from the reference's origin along that direction"),
-)
-
-
 class WithoutCause:
     """Attributes of effects that describe an error and not its cause, and so are not in the catalogue."""
 
@@ -127,11 +134,21 @@ class WithoutCause:
 
 
 class SmoothEffect(WithoutCause, MotionEffect):
-    """Changes of the motion that depend on a covariate: for each of ``modes`` a sum of the ``labels`` functions."""
+    """Changes of the motion that depend on a covariate: for each of ``modes`` a sum of the ``labels`` functions.
+
+    covariate: in words. scales: parameters that set the ranges of the functions. fixed_parameters: by default the
+    coefficients ``<mode>_<label>`` and the scales.
+    """
 
     stage = "body"
     modes: ClassVar[tuple[str, ...]] = ("along", "across", "turn")
-    labels: ClassVar[tuple[str, ...]]
+    labels: ClassVar[tuple[str, ...]] = ()
+    covariate: ClassVar[str] = ""
+    scales: ClassVar[tuple[Parameter, ...]] = ()
+
+    def __init_subclass__(cls) -> None:
+        if "fixed_parameters" not in vars(cls):
+            cls.fixed_parameters = (*shared(cls.modes, cls.labels, cls.covariate), *cls.scales)
 
     @abstractmethod
     def shares(self, signals: Signals, values: Values) -> Array:
@@ -146,7 +163,34 @@ class SmoothEffect(WithoutCause, MotionEffect):
         return added
 
 
-_TIMES = tuple(str(order) for order in range(16))
+class _SmoothWave(SmoothEffect):
+    """A wave whose phase depends on a covariate."""
+
+    modes = ALL_MODES
+    labels = ("cos", "sin")
+
+    @abstractmethod
+    def phase(self, signals: Signals, values: Values) -> Array:
+        """Phase (F,), rad."""
+
+    def shares(self, signals: Signals, values: Values) -> Array:
+        return waves(self.phase(signals, values), (1.0,))
+
+
+class _SmoothFloor(SmoothEffect):
+    """Changes that depend on the place on the floor."""
+
+    shows_in = "place"
+    needs = frozenset({"poses"})
+    modes = ALL_MODES
+    covariate = "the place"
+
+    @abstractmethod
+    def functions(self, places: Array, values: Values) -> Array:
+        """Values (F, J) of the J functions at positions (F, 2), m."""
+
+    def shares(self, signals: Signals, values: Values) -> Array:
+        return self.functions(needed(signals.poses)[:, :2], values)
 
 
 @effects.register("smooth_elapsed_time")
@@ -154,35 +198,28 @@ class SmoothElapsedTime(SmoothEffect):
     """Unknown effect: cosines of the time since the start of a run; after the longest run seen the value is held."""
 
     shows_in = "elapsed time"
-    labels = _TIMES
-    fixed_parameters = (
-        *shared(SmoothEffect.modes, _TIMES, "the time since the start"),
-        scale("duration", "s", 1e-3, 1e6, 5.0, "of the longest run that was seen"),
-    )
+    covariate = "the time since the start"
+    labels = tuple(str(order) for order in range(16))
+    scales = (scale("duration", "s", 1e-3, 1e6, 5.0, "of the longest run that was seen"),)
 
     def shares(self, signals: Signals, values: Values) -> Array:
         part = np.clip(signals.elapsed / values["duration"], 0.0, 1.0)
-        return np.cos(np.pi * np.arange(len(_TIMES)) * part[:, None])
-
-
-_TURNS = ("cos1", "sin1", "cos2", "sin2", "cos3", "sin3")
+        return np.cos(np.pi * np.arange(len(self.labels)) * part[:, None])
 
 
 @effects.register("smooth_time_wave")
-class SmoothTimeWave(SmoothEffect):
+class SmoothTimeWave(_SmoothWave):
     """Unknown effect: a wave of the time since the start of a run; after the longest run seen the value is held."""
 
     shows_in = "elapsed time"
-    modes = ALL_MODES
-    labels = ("cos", "sin")
-    fixed_parameters = (
-        *shared(ALL_MODES, labels, "the time since the start"),
+    covariate = "the time since the start"
+    scales = (
         scale("frequency", "Hz", 1e-6, 1e6, 1.0, "waves in a second"),
         scale("duration", "s", 1e-3, 1e6, 5.0, "of the longest run that was seen"),
     )
 
-    def shares(self, signals: Signals, values: Values) -> Array:
-        return waves(2 * np.pi * np.minimum(signals.elapsed, values["duration"]), (values["frequency"],))
+    def phase(self, signals: Signals, values: Values) -> Array:
+        return values["frequency"] * (2 * np.pi * np.minimum(signals.elapsed, values["duration"]))
 
 
 @effects.register("smooth_heading")
@@ -191,30 +228,24 @@ class SmoothHeading(SmoothEffect):
 
     shows_in = "heading"
     needs = frozenset({"poses"})
+    covariate = "the heading"
     labels = _TURNS
-    fixed_parameters = shared(SmoothEffect.modes, _TURNS, "the heading")
 
     def shares(self, signals: Signals, values: Values) -> Array:  # noqa: ARG002
-        assert signals.poses is not None  # they are needed
-        return waves(signals.poses[:, 2], (1, 2, 3))
+        return waves(needed(signals.poses)[:, 2], (1, 2, 3))
 
 
 @effects.register("smooth_heading_wave")
-class SmoothHeadingWave(SmoothEffect):
+class SmoothHeadingWave(_SmoothWave):
     """Unknown effect: a wave of the robot's heading, so many times a turn."""
 
     shows_in = "heading"
     needs = frozenset({"poses"})
-    modes = ALL_MODES
-    labels = ("cos", "sin")
-    fixed_parameters = (
-        *shared(ALL_MODES, labels, "the heading"),
-        scale("harmonic", "1", 1.0, 64.0, 4.0, "waves in a turn of the robot"),
-    )
+    covariate = "the heading"
+    scales = (scale("harmonic", "1", 1.0, 64.0, 4.0, "waves in a turn of the robot"),)
 
-    def shares(self, signals: Signals, values: Values) -> Array:
-        assert signals.poses is not None  # they are needed
-        return waves(signals.poses[:, 2], (values["harmonic"],))
+    def phase(self, signals: Signals, values: Values) -> Array:
+        return values["harmonic"] * needed(signals.poses)[:, 2]
 
 
 @effects.register("smooth_course")
@@ -234,107 +265,83 @@ class SmoothCourse(SmoothEffect):
     )
 
     def shares(self, signals: Signals, values: Values) -> Array:  # noqa: ARG002
-        assert signals.poses is not None  # they are needed
         forward, left, _ = signals.twists.T
-        driving = np.minimum(1.0, np.hypot(forward, left) / _SLOW)
-        return driving[:, None] * waves(signals.poses[:, 2] + np.arctan2(left, forward), (1, 2))
+        driving = np.minimum(1.0, signals.speed / _SLOW)
+        return driving[:, None] * waves(needed(signals.poses)[:, 2] + np.arctan2(left, forward), (1, 2))
 
     def correction(self, signals: Signals, values: Values) -> Array:
-        assert signals.poses is not None
         added = super().correction(signals, values)
-        push = complex(values["east"], values["north"]) * np.exp(-1j * signals.poses[:, 2])
-        push *= np.hypot(signals.twists[:, 0], signals.twists[:, 1])
+        push = complex(values["east"], values["north"]) * np.exp(-1j * needed(signals.poses)[:, 2])
+        push *= signals.speed
         added[:, 0] += push.real
         added[:, 1] += push.imag
         return added
 
 
 @effects.register("smooth_place")
-class SmoothPlace(SmoothEffect):
+class SmoothPlace(_SmoothFloor):
     """Unknown effect: polynomials of degree 3 in the place on the floor; beyond the places seen the value is held."""
 
-    shows_in = "place"
-    needs = frozenset({"poses"})
+    modes = SmoothEffect.modes
     labels = SURFACES
-    fixed_parameters = (*shared(SmoothEffect.modes, SURFACES, "the place"), *AREA)
+    scales = AREA
 
-    def shares(self, signals: Signals, values: Values) -> Array:
-        assert signals.poses is not None  # they are needed
-        return surfaces(inside_of(signals.poses[:, :2], values))
+    def functions(self, places: Array, values: Values) -> Array:
+        return surfaces(inside_of(places, values))
 
 
 @effects.register("smooth_patch")
-class SmoothPatch(SmoothEffect):
+class SmoothPatch(_SmoothFloor):
     """Unknown effect: a round patch of the floor, outside of which the change fades to zero."""
 
-    shows_in = "place"
-    needs = frozenset({"poses"})
-    modes = ALL_MODES
     labels = ("bump",)
-    fixed_parameters = (*shared(ALL_MODES, labels, "the place"), *PATCH)
+    scales = PATCH
 
-    def shares(self, signals: Signals, values: Values) -> Array:
-        assert signals.poses is not None  # they are needed
-        return bump(signals.poses[:, :2], values)
+    def functions(self, places: Array, values: Values) -> Array:
+        return bump(places, values)
 
 
 @effects.register("smooth_place_wave")
-class SmoothPlaceWave(SmoothEffect):
+class SmoothPlaceWave(_SmoothFloor):
     """Unknown effect: a plane wave over the floor, as of tiles; beyond the places seen the value is held."""
 
-    shows_in = "place"
-    needs = frozenset({"poses"})
-    modes = ALL_MODES
     labels = ("cos", "sin")
-    fixed_parameters = (
-        *shared(ALL_MODES, labels, "the place"),
+    scales = (
         scale("along_x", "rad/m", -1e3, 1e3, 10.0, "phase per way along x of the reference"),
         scale("along_y", "rad/m", -1e3, 1e3, 0.0, "phase per way along y of the reference"),
         *AREA,
     )
 
-    def shares(self, signals: Signals, values: Values) -> Array:
-        assert signals.poses is not None  # they are needed
-        held = values["reach"] * inside_of(signals.poses[:, :2], values)
+    def functions(self, places: Array, values: Values) -> Array:
+        held = values["reach"] * inside_of(places, values)
         return waves(held @ [values["along_x"], values["along_y"]], (1.0,))
 
 
 @effects.register("smooth_edge")
-class SmoothEdge(SmoothEffect):
+class SmoothEdge(_SmoothFloor):
     """Unknown effect: the floor beyond a straight line, as a carpet's edge."""
 
-    shows_in = "place"
-    needs = frozenset({"poses"})
-    modes = ALL_MODES
+    covariate = "the line"
     labels = ("beyond",)
-    fixed_parameters = (
-        *shared(ALL_MODES, labels, "the line"),
-        *LINE,
-        scale("width", "m", 1e-6, 1e6, 0.05, "over which the change sets in"),
-    )
+    scales = (*LINE, scale("width", "m", 1e-6, 1e6, 0.05, "over which the change sets in"))
 
-    def shares(self, signals: Signals, values: Values) -> Array:
-        assert signals.poses is not None  # they are needed
-        return beyond(signals.poses[:, :2], values)
+    def functions(self, places: Array, values: Values) -> Array:
+        return beyond(places, values)
 
 
 @effects.register("smooth_joint")
-class SmoothJoint(SmoothEffect):
+class SmoothJoint(_SmoothFloor):
     """Unknown effect: a joint of the floor along a straight line, as between two rows of tiles."""
 
-    shows_in = "place"
-    needs = frozenset({"poses"})
-    modes = ALL_MODES
+    covariate = "the line"
     labels = ("joint",)
-    fixed_parameters = (
-        *shared(ALL_MODES, labels, "the line"),
+    scales = (
         *LINE,
         scale("width", "m", 1e-6, 1e6, 0.03, "across the joint, where 1/e of the change is left on either side"),
     )
 
-    def shares(self, signals: Signals, values: Values) -> Array:
-        assert signals.poses is not None  # they are needed
-        return np.exp(-np.square(across(signals.poses[:, :2], values) / values["width"]))[:, None]
+    def functions(self, places: Array, values: Values) -> Array:
+        return np.exp(-np.square(across(places, values) / values["width"]))[:, None]
 
 
 @effects.register("smooth_command")
@@ -342,9 +349,9 @@ class SmoothCommand(SmoothEffect):
     """Unknown effect: motions near one, by direction of travel and turning; for all others the change fades to zero."""
 
     shows_in = "command"
+    covariate = "the motion"
     labels = ("bump",)
-    fixed_parameters = (
-        *shared(SmoothEffect.modes, labels, "the motion"),
+    scales = (
         scale("vx", "m/s", -1e3, 1e3, 0.2, "the motion, forwards"),
         scale("vy", "m/s", -1e3, 1e3, 0.0, "the motion, to the left"),
         scale("omega", "rad/s", -1e3, 1e3, 0.0, "the motion, turning"),
@@ -358,22 +365,19 @@ class SmoothCommand(SmoothEffect):
 
 
 @effects.register("smooth_session_wave")
-class SmoothSessionWave(SmoothEffect):
+class SmoothSessionWave(_SmoothWave):
     """Unknown effect: a wave of the time since the session's start; after the longest seen the value is held."""
 
     shows_in = "order of runs"
     needs = frozenset({"session_time"})
-    modes = ALL_MODES
-    labels = ("cos", "sin")
-    fixed_parameters = (
-        *shared(ALL_MODES, labels, "the session's time"),
+    covariate = "the session's time"
+    scales = (
         scale("frequency", "Hz", 1e-9, 1e6, 1e-3, "waves in a second"),
         scale("duration", "s", 1e-3, 1e9, 3600.0, "of the longest session that was seen"),
     )
 
-    def shares(self, signals: Signals, values: Values) -> Array:
-        assert signals.session_time is not None  # it is needed
-        return waves(2 * np.pi * np.minimum(signals.session_time, values["duration"]), (values["frequency"],))
+    def phase(self, signals: Signals, values: Values) -> Array:
+        return values["frequency"] * (2 * np.pi * np.minimum(needed(signals.session_time), values["duration"]))
 
 
 @effects.register("smooth_order_of_runs")
@@ -382,16 +386,13 @@ class SmoothOrderOfRuns(SmoothEffect):
 
     shows_in = "order of runs"
     needs = frozenset({"session_time"})
+    covariate = "the session's time"
     modes = ("along", "rotation", "turn")
     labels = tuple(str(order) for order in range(1, 13))
-    fixed_parameters = (
-        *shared(modes, labels, "the session's time"),
-        scale("duration", "s", 1e-3, 1e9, 3600.0, "of the longest session that was seen"),
-    )
+    scales = (scale("duration", "s", 1e-3, 1e9, 3600.0, "of the longest session that was seen"),)
 
     def shares(self, signals: Signals, values: Values) -> Array:
-        assert signals.session_time is not None  # it is needed
-        unit = np.clip(2 * signals.session_time / values["duration"] - 1, -1.0, 1.0)
+        unit = np.clip(2 * needed(signals.session_time) / values["duration"] - 1, -1.0, 1.0)
         functions: Array = chebyshev.chebvander(unit, len(self.labels))[:, 1:]
         return functions
 
@@ -402,10 +403,9 @@ def mean_waves(signals: Signals, wheel: int, harmonic: float) -> Array:
     phi turns at the constant rate omega. With phi in the middle of a sample of duration d the means are cos(n phi) and
     sin(n phi) times 2 sin(n omega d / 2) / (n d).
     """
-    assert signals.wheel_angles is not None  # they are needed
     half = harmonic / 2 * signals.durations
     amplitude = np.sin(half * signals.rates[:, wheel]) / half
-    means: Array = amplitude[:, None] * waves(signals.wheel_angles[:, wheel], (harmonic,))
+    means: Array = amplitude[:, None] * waves(needed(signals.wheel_angles)[:, wheel], (harmonic,))
     return means
 
 
@@ -414,79 +414,61 @@ def ripple(signals: Signals, harmonic: float, values: Values) -> Array:
 
     harmonic: n. values: a_<wheel> and b_<wheel>.
     """
-    assert signals.wheel_angles is not None  # they are needed
-    if len(signals.rates) == 1:
-        return _ripple_of_one_sample(signals, signals.wheel_angles, harmonic, values)
     added = np.zeros(signals.rates.shape)
-    for wheel, name in enumerate(signals.robot.wheel_names):
-        amplitudes = np.array([values[f"a_{name}"], values[f"b_{name}"]])
-        if amplitudes.any():
-            added[:, wheel] = mean_waves(signals, wheel, harmonic) @ amplitudes
+    if len(signals.rates) > 1:
+        for index, name in enumerate(signals.robot.wheel_names):
+            amplitudes = np.array([values[f"a_{name}"], values[f"b_{name}"]])
+            if amplitudes.any():
+                added[:, index] = mean_waves(signals, index, harmonic) @ amplitudes
+        return added
+    # Python floats are faster than NumPy for a few wheels in a stream.
+    half = harmonic / 2 * float(signals.durations[0])
+    rates, angles = signals.rates[0].tolist(), needed(signals.wheel_angles)[0].tolist()
+    for index, (wheel, rate, angle) in enumerate(zip(signals.robot.measured, rates, angles, strict=True)):
+        a, b, phase = values[f"a_{wheel.name}"], values[f"b_{wheel.name}"], harmonic * angle
+        added[0, index] = (a * math.cos(phase) + b * math.sin(phase)) * math.sin(half * rate) / half
     return added
 
 
-def _ripple_of_one_sample(signals: Signals, angles: Array, harmonic: float, values: Values) -> Array:
-    """``ripple`` of one sample in Python floats, which are faster than NumPy for a few wheels in a stream."""
-    half = harmonic / 2 * float(signals.durations[0])
-    samples = zip(signals.robot.measured, signals.rates[0].tolist(), angles[0].tolist(), strict=True)
-    added = []
-    for wheel, rate, angle in samples:
-        a, b, phase = values[f"a_{wheel.name}"], values[f"b_{wheel.name}"], harmonic * angle
-        added.append((a * math.cos(phase) + b * math.sin(phase)) * math.sin(half * rate) / half)
-    return np.array([added])
-
-
 @effects.register("wheel_eccentricity")
-class WheelEccentricity(MotionEffect):
+class WheelEccentricity(EachWheelEffect):
     """A wheel's radius changes over one turn: r (1 + a cos phi + b sin phi)."""
 
-    stage = "wheel"
     physics = "The axle does not stand in the middle of the wheel."
     source = "first principles"
     shows_in = "wheel angle"
     needs = frozenset({"wheel_angles"})
-
-    def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
-        return (
-            *one_for_each_wheel(robot, "a", "1", -0.02, 0.02, "share of the radius, with the cosine of the angle"),
-            *one_for_each_wheel(robot, "b", "1", -0.02, 0.02, "share of the radius, with the sine of the angle"),
-        )
+    for_each_wheel = (
+        Parameter("a", "1", -0.02, 0.02, "share of the radius, with the cosine of the angle"),
+        Parameter("b", "1", -0.02, 0.02, "share of the radius, with the sine of the angle"),
+    )
 
     def correction(self, signals: Signals, values: Values) -> Array:
         return ripple(signals, 1.0, values)
 
 
 @effects.register("roller_ripple")
-class RollerRipple(MotionEffect):
+class RollerRipple(EachWheelEffect):
     """A wheel's radius changes from roller to roller: r (1 + a cos(n phi) + b sin(n phi)), n rollers."""
 
-    stage = "wheel"
     physics = "The rollers do not make a perfect circle: the wheel sinks in between two of them."
     source = "first principles"
     shows_in = "wheel angle"
     needs = frozenset({"wheel_angles"})
     only_for = "robots with a wheel on rollers"
+    for_each_wheel = (
+        Parameter("a", "1", -0.03, 0.03, "share of the radius, with the cosine of n angles"),
+        Parameter("b", "1", -0.03, 0.03, "share of the radius, with the sine of n angles"),
+    )
+    fixed_parameters = (
+        Parameter("rollers", "1", 2, 64, "rollers along a wheel's circumference, n", tuple(map(float, range(3, 17)))),
+    )
 
     def applies(self, robot: Robot) -> bool:
         return has_rollers(robot)
 
-    def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
-        counts = tuple(float(count) for count in range(3, 17))
-        return (
-            *one_for_each_wheel(robot, "a", "1", -0.03, 0.03, "share of the radius, with the cosine of n angles"),
-            *one_for_each_wheel(robot, "b", "1", -0.03, 0.03, "share of the radius, with the sine of n angles"),
-            Parameter("rollers", "1", 2, 64, "rollers along a wheel's circumference, n", choices=counts),
-        )
-
     def correction(self, signals: Signals, values: Values) -> Array:
         return ripple(signals, values["rollers"], values)
-
-
-KNOTS = 8  # knots of the function of each wheel's rate; chosen
-_COMMON_KNOTS = 33  # knots of the function that all wheels share; chosen
-HARMONICS = (0.5, *(float(number) for number in range(1, 17)), 1.5, 2.5, 3.5)  # waves in a turn of a wheel; chosen
-
-_TOP = scale("top", "rad/s", 1e-6, 1e6, 6.0, "the fastest rate that was seen; knots are spread from -top to top")
 
 
 def hat_functions(rates: Array, top: float) -> Array:
@@ -504,18 +486,14 @@ def _between_knots(rates: Array, top: float, heights: Array) -> Array:
 
 
 @effects.register("smooth_wheel_rate")
-class SmoothWheelRate(WithoutCause, MotionEffect):
+class SmoothWheelRate(WithoutCause, EachWheelEffect):
     """Unknown effect: a piecewise linear function of each wheel's rate, which holds its value beyond the rates seen."""
 
-    stage = "wheel"
     shows_in = "wheel rate"
-
-    def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
-        at_knots = [
-            one_for_each_wheel(robot, f"change_{knot}", "rad/s", -0.02, 0.02, f"change at knot {knot} of 0 to 7")
-            for knot in range(KNOTS)
-        ]
-        return (*(parameter for knot in at_knots for parameter in knot), _TOP)
+    for_each_wheel = tuple(
+        Parameter(f"change_{knot}", "rad/s", -0.02, 0.02, f"change at knot {knot} of 0 to 7") for knot in range(KNOTS)
+    )
+    fixed_parameters = (_TOP,)
 
     def correction(self, signals: Signals, values: Values) -> Array:
         heights = np.array([of_wheels(signals.robot, f"change_{knot}", values) for knot in range(KNOTS)])
@@ -543,36 +521,19 @@ class SmoothCommonRate(WithoutCause, MotionEffect):
 
 
 @effects.register("smooth_wheel_angle")
-class SmoothWheelAngle(WithoutCause, MotionEffect):
+class SmoothWheelAngle(WithoutCause, EachWheelEffect):
     """Unknown effect: a wave of each wheel's angle, so many times a turn."""
 
-    stage = "wheel"
     shows_in = "wheel angle"
     needs = frozenset({"wheel_angles"})
-
-    def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
-        return (
-            *one_for_each_wheel(robot, "a", "1", -0.03, 0.03, "share of the radius, with the cosine"),
-            *one_for_each_wheel(robot, "b", "1", -0.03, 0.03, "share of the radius, with the sine"),
-            Parameter("harmonic", "1", 0.1, 256.0, "waves in a turn of the wheel", choices=HARMONICS),
-        )
+    for_each_wheel = (
+        Parameter("a", "1", -0.03, 0.03, "share of the radius, with the cosine"),
+        Parameter("b", "1", -0.03, 0.03, "share of the radius, with the sine"),
+    )
+    fixed_parameters = (Parameter("harmonic", "1", 0.1, 256.0, "waves in a turn of the wheel", choices=HARMONICS),)
 
     def correction(self, signals: Signals, values: Values) -> Array:
         return ripple(signals, values["harmonic"], values)
-
-
-_OF_ACCELERATION = (
-    Parameter("straight", "s", -0.1, 0.1, "change of the velocity, of the acceleration"),
-    Parameter("aside", "s", -0.1, 0.1, "change of the velocity to the left of the acceleration, of its size"),
-    Parameter("about_x", "rad s/m", -0.1, 0.1, "change of the rate of turn, of the acceleration forwards"),
-    Parameter("about_y", "rad s/m", -0.1, 0.1, "change of the rate of turn, of the acceleration to the left"),
-    Parameter("about_omega", "s", -0.1, 0.1, "change of the rate of turn, of its own rate of change"),
-    Parameter("about_size", "rad s/m", -0.1, 0.1, "change of the rate of turn, of the acceleration's size"),
-    Parameter("about_turning", "s", -0.1, 0.1, "change of the rate of turn, of the size of its rate of change"),
-    Parameter("along", "s2/m", -0.1, 0.1, "change along the way, of the speed times the acceleration's size"),
-    Parameter("across", "s2/m", -0.1, 0.1, "change across the way, of the speed times the acceleration's size"),
-    Parameter("rotation", "s2/m", -0.1, 0.1, "change of the rate of turn, of itself times the acceleration's size"),
-)
 
 
 @effects.register("smooth_acceleration")
@@ -582,7 +543,16 @@ class SmoothAcceleration(WithoutCause, MotionEffect):
     stage = "body"
     shows_in = "acceleration"
     fixed_parameters = (
-        *_OF_ACCELERATION,
+        Parameter("straight", "s", -0.1, 0.1, "change of the velocity, of the acceleration"),
+        Parameter("aside", "s", -0.1, 0.1, "change of the velocity to the left of the acceleration, of its size"),
+        Parameter("about_x", "rad s/m", -0.1, 0.1, "change of the rate of turn, of the acceleration forwards"),
+        Parameter("about_y", "rad s/m", -0.1, 0.1, "change of the rate of turn, of the acceleration to the left"),
+        Parameter("about_omega", "s", -0.1, 0.1, "change of the rate of turn, of its own rate of change"),
+        Parameter("about_size", "rad s/m", -0.1, 0.1, "change of the rate of turn, of the acceleration's size"),
+        Parameter("about_turning", "s", -0.1, 0.1, "change of the rate of turn, of the size of its rate of change"),
+        Parameter("along", "s2/m", -0.1, 0.1, "change along the way, of the speed times the acceleration's size"),
+        Parameter("across", "s2/m", -0.1, 0.1, "change across the way, of the speed times the acceleration's size"),
+        Parameter("rotation", "s2/m", -0.1, 0.1, "change of the rate of turn, of itself times the acceleration's size"),
         scale("top", "m/s2", 1e-9, 1e9, 10.0, "the largest acceleration that was seen"),
         scale("top_turning", "rad/s2", 1e-9, 1e9, 50.0, "the largest change of the rate of turn that was seen"),
     )
@@ -602,11 +572,6 @@ class SmoothAcceleration(WithoutCause, MotionEffect):
         for mode in ("along", "across", "rotation"):
             added += values[mode] * size[:, None] * direction(mode, signals)
         return added
-
-
-_AXES = {"x": "m", "y": "m", "theta": "rad"}
-_ROUNDS = 200  # steps of the fixed-point iteration that inverts a map, at most; chosen
-_SAME = 1e-13  # m, rad: a smaller change ends the iteration
 
 
 class BentMap(WithoutCause, ReferenceEffect):

@@ -11,9 +11,8 @@ import numpy as np
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import ActuatorEffect, MotionEffect, Parameter, Values
 from omnibench.robot.kinematics import Array, CarDrive, Robot
-from omnibench.robot.signals import Signals
+from omnibench.robot.signals import Signals, needed
 
-_STEERED = "robots with a measured steering angle"
 _KALLASI = (
     "F. Kallasi, D. Lodi Rizzini, F. Oleari, M. Magnani and S. Caselli, A novel calibration method for industrial "
     "AGVs, 2017"
@@ -24,7 +23,7 @@ class _SteeringEffect(MotionEffect):
     """An effect on the steering angles, the same for all of a robot's."""
 
     stage = "steering"
-    only_for = _STEERED
+    only_for = "robots with a measured steering angle"
 
     def applies(self, robot: Robot) -> bool:
         return bool(robot.drive.steered)
@@ -40,8 +39,7 @@ class SteeringGain(_SteeringEffect):
     fixed_parameters = (Parameter("g", "1", -0.1, 0.1, "by how much the true angle is larger"),)
 
     def correction(self, signals: Signals, values: Values) -> Array:
-        assert signals.steering is not None  # the robot steers
-        return values["g"] * signals.steering
+        return values["g"] * needed(signals.steering)
 
 
 @effects.register("steering_play")
@@ -58,8 +56,7 @@ class SteeringPlay(_SteeringEffect):
     fixed_parameters = (Parameter("b", "rad", 0.0, 0.04, "half of the play"),)
 
     def correction(self, signals: Signals, values: Values) -> Array:
-        assert signals.steering_side is not None  # it is needed
-        return -values["b"] * signals.steering_side
+        return -values["b"] * needed(signals.steering_side)
 
 
 @effects.register("steering_lag")
@@ -72,8 +69,7 @@ class SteeringLag(_SteeringEffect):
     fixed_parameters = (Parameter("tau", "s", -0.2, 0.2, "time by which the wheel follows the measured angle"),)
 
     def correction(self, signals: Signals, values: Values) -> Array:
-        assert signals.steering_rates is not None  # the robot steers
-        return -values["tau"] * signals.steering_rates
+        return -values["tau"] * needed(signals.steering_rates)
 
 
 @effects.register("steering_offset")
@@ -90,8 +86,7 @@ class SteeringOffset(_SteeringEffect):
         return isinstance(robot.drive, CarDrive)
 
     def correction(self, signals: Signals, values: Values) -> Array:
-        assert signals.steering is not None  # a car steers
-        return np.full(signals.steering.shape, values["c"])
+        return np.full(needed(signals.steering).shape, values["c"])
 
 
 @effects.register("steering_coupling")
@@ -111,12 +106,8 @@ class SteeringCoupling(MotionEffect):
         return any(pair >= 0 for pair in robot.drive.pairs)
 
     def correction(self, signals: Signals, values: Values) -> Array:
-        assert signals.steering_rates is not None  # the robot steers
         pairs = np.array(signals.robot.drive.pairs)
-        return np.where(pairs < 0, 0.0, values["k"] * signals.steering_rates[:, pairs])
-
-
-_SOURCE = "first principles"
+        return np.where(pairs < 0, 0.0, values["k"] * needed(signals.steering_rates)[:, pairs])
 
 
 @effects.register("motor_lag")
@@ -124,7 +115,7 @@ class MotorLag(ActuatorEffect):
     """Wheels follow their targets with a first-order lag."""
 
     physics = "Inertia and a controller of finite bandwidth delay what was told."
-    source = _SOURCE
+    source = "first principles"
     shows_in = "acceleration"
     needs = frozenset({"targets"})
     fixed_parameters = (Parameter("tau", "s", 0.0, 0.3, "time constant"),)
@@ -134,20 +125,17 @@ class MotorLag(ActuatorEffect):
         tau = values["tau"]
         if tau <= 0:
             return targets.copy()
-        mean_left = (-np.expm1(-durations / tau) * tau / durations)[:, None]
-        return targets + (_reached(np.exp(-durations / tau), targets) - targets) * mean_left
+        from scipy.linalg.lapack import dtbtrs  # slow to import, and not needed by a live node
 
-
-def _reached(left: Array, targets: Array) -> Array:
-    """Rates (F, N) at the beginning of each sample; left (F,): share of the distance to the target after a sample."""
-    from scipy.linalg.lapack import dtbtrs  # slow to import, and not needed by a live node
-
-    before = np.zeros(targets.shape)
-    if len(targets) > 1:
-        bands = np.ones((2, len(targets) - 1))
-        bands[1, :-1] = -left[1:-1]
-        before[1:] = dtbtrs(bands, (1 - left[:-1, None]) * targets[:-1], uplo="L")[0]
-    return before
+        # Rates (F, N) at the beginning of each sample; remaining (F,): share of the distance to the target after one.
+        remaining = np.exp(-durations / tau)
+        begins = np.zeros(targets.shape)
+        if len(targets) > 1:
+            bands = np.ones((2, len(targets) - 1))
+            bands[1, :-1] = -remaining[1:-1]
+            begins[1:] = dtbtrs(bands, (1 - remaining[:-1, None]) * targets[:-1], uplo="L")[0]
+        mean_remaining = (-np.expm1(-durations / tau) * tau / durations)[:, None]
+        return targets + (begins - targets) * mean_remaining
 
 
 @effects.register("motor_dead_band")
@@ -169,7 +157,7 @@ class MotorGain(ActuatorEffect):
     """Wheels turn faster or slower than they were told, by a factor."""
 
     physics = "The controller's scale of counts per turn, or its supply, is off."
-    source = _SOURCE
+    source = "first principles"
     shows_in = "wheel rate"
     needs = frozenset({"targets"})
     fixed_parameters = (Parameter("g", "1", -0.05, 0.05, "by how much wheels turn faster than they were told"),)

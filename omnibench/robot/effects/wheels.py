@@ -1,14 +1,30 @@
-"""Parameters with one value for each wheel, named by a prefix and the wheel's name."""
+"""Effects on wheels and tread, slip of the robot on its wheels, friction, and how wheels and the LIDAR are mounted."""
 
 from __future__ import annotations
+
+from dataclasses import replace
+from typing import ClassVar
 
 import numpy as np
 
 from omnibench.registry import effects
-from omnibench.robot.effects.effect import MotionEffect, Parameter, ReferenceEffect, Values
+from omnibench.robot.effects.effect import MotionEffect, Parameter, ReferenceEffect, Values, body_change
 from omnibench.robot.kinematics import Array, Robot, class_of
 from omnibench.robot.odometry import Complex
-from omnibench.robot.signals import Signals
+from omnibench.robot.signals import Signals, needed
+
+_PACEJKA = "H. B. Pacejka, Tire and Vehicle Dynamics"
+_BORENSTEIN = (
+    "J. Borenstein and L. Feng, Measurement and correction of systematic odometry errors in mobile robots, 1996"
+)
+_CENSI = (
+    "A. Censi, A. Franchi, L. Marchionni and G. Oriolo, Simultaneous calibration of odometry and sensor parameters "
+    "for mobile robots, 2013"
+)
+
+_RADIUS_OF = "radius_"
+_WOBBLES = 4  # wheels: three stand on any floor, of four one may be lighter
+_KNEE = 0.05  # rad/s, half-width of the smoothed sign function; chosen
 
 
 def has_rollers(robot: Robot) -> bool:
@@ -16,21 +32,24 @@ def has_rollers(robot: Robot) -> bool:
     return any(wheel.kind in ("omni", "mecanum") for wheel in robot.measured)
 
 
-def one_for_each_wheel(
-    robot: Robot, prefix: str, unit: str, low: float, high: float, description: str
-) -> tuple[Parameter, ...]:
-    """The parameters ``prefix_<wheel>`` of a robot's wheels."""
-    return tuple(
-        Parameter(f"{prefix}_{name}", unit, low, high, f"{description}, wheel {name}") for name in robot.wheel_names
-    )
+class EachWheelEffect(MotionEffect):
+    """An effect on the wheel rates, with parameters ``<name>_<wheel>`` of each wheel before the fixed ones."""
+
+    stage = "wheel"
+    for_each_wheel: ClassVar[tuple[Parameter, ...]]
+
+    def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
+        of_wheels = (
+            replace(item, name=f"{item.name}_{name}", description=f"{item.description}, wheel {name}")
+            for item in self.for_each_wheel
+            for name in robot.wheel_names
+        )
+        return (*of_wheels, *self.fixed_parameters)
 
 
 def of_wheels(robot: Robot, prefix: str, values: Values) -> Array:
     """The values (N,) of the parameters ``prefix_<wheel>``."""
     return np.array([values[f"{prefix}_{name}"] for name in robot.wheel_names])
-
-
-_RADIUS_OF = "radius_"
 
 
 @effects.register("speed_dependent_radius")
@@ -48,16 +67,13 @@ class SpeedDependentRadius(MotionEffect):
 
 
 @effects.register("direction_dependent_radius")
-class DirectionDependentRadius(MotionEffect):
+class DirectionDependentRadius(EachWheelEffect):
     """A wheel drives farther one way than the other: omega + k_i abs(omega)."""
 
-    stage = "wheel"
     physics = "Rollers, tread or backlash give way differently when a wheel turns backwards."
     source = "first principles"
     shows_in = "command"
-
-    def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
-        return one_for_each_wheel(robot, "k", "1", -0.01, 0.01, "half the relative difference between both directions")
+    for_each_wheel = (Parameter("k", "1", -0.01, 0.01, "half the relative difference between both directions"),)
 
     def correction(self, signals: Signals, values: Values) -> Array:
         return of_wheels(signals.robot, "k", values) * np.abs(signals.rates)
@@ -76,8 +92,7 @@ class ThermalRadiusDrift(MotionEffect):
     fixed_parameters = (Parameter("k", "1/s", -2e-5, 2e-5, "relative change of the radius per second of the session"),)
 
     def correction(self, signals: Signals, values: Values) -> Array:
-        assert signals.session_time is not None  # it is needed
-        return (values["k"] * signals.session_time)[:, None] * signals.rates
+        return (values["k"] * needed(signals.session_time))[:, None] * signals.rates
 
 
 @effects.register("tyre_wear")
@@ -86,9 +101,7 @@ class TyreWear(MotionEffect):
 
     stage = "wheel"
     physics = "Treads wear off, or are changed or pumped up, between two sessions."
-    source = (
-        "J. Borenstein and L. Feng, Measurement and correction of systematic odometry errors in mobile robots, 1996"
-    )
+    source = _BORENSTEIN
     shows_in = "order of runs"
     needs = frozenset({"session"})
 
@@ -104,10 +117,6 @@ class TyreWear(MotionEffect):
     def correction(self, signals: Signals, values: Values) -> Array:
         """The correction; zero in a session without a radius of its own."""
         return values.get(f"{_RADIUS_OF}{signals.session}", 0.0) * signals.rates
-
-
-_PACEJKA = "H. B. Pacejka, Tire and Vehicle Dynamics"
-_WOBBLES = 4  # wheels: three stand on any floor, of four one may be lighter
 
 
 def _centripetal(twists: Array) -> Array:
@@ -128,9 +137,7 @@ class AccelerationSlip(MotionEffect):
     fixed_parameters = (Parameter("k", "s", 0.0, 0.1, "velocity that is lost per acceleration"),)
 
     def correction(self, signals: Signals, values: Values) -> Array:
-        added = np.zeros(signals.twists.shape)
-        added[:, :2] = -values["k"] * signals.accelerations[:, :2]
-        return added
+        return body_change(signals, velocity=-values["k"] * signals.accelerations[:, :2])
 
 
 @effects.register("centripetal_slip")
@@ -147,9 +154,7 @@ class CentripetalSlip(MotionEffect):
     )
 
     def correction(self, signals: Signals, values: Values) -> Array:
-        added = np.zeros(signals.twists.shape)
-        added[:, :2] = values["k"] * _centripetal(signals.twists)
-        return added
+        return body_change(signals, velocity=values["k"] * _centripetal(signals.twists))
 
 
 @effects.register("load_transfer")
@@ -187,9 +192,7 @@ class RotationTranslationCoupling(MotionEffect):
 
     def correction(self, signals: Signals, values: Values) -> Array:
         vx, vy, w = signals.twists.T
-        added = np.zeros(signals.twists.shape)
-        added[:, 2] = w * (values["kx"] * vx + values["ky"] * vy)
-        return added
+        return body_change(signals, turning=w * (values["kx"] * vx + values["ky"] * vy))
 
 
 @effects.register("quadratic_rotation_slip")
@@ -205,9 +208,7 @@ class QuadraticRotationSlip(MotionEffect):
 
     def correction(self, signals: Signals, values: Values) -> Array:
         rate_of_turn = signals.twists[:, 2]
-        added = np.zeros(signals.twists.shape)
-        added[:, 2] = -values["k"] * rate_of_turn * np.abs(rate_of_turn)
-        return added
+        return body_change(signals, turning=-values["k"] * rate_of_turn * np.abs(rate_of_turn))
 
 
 @effects.register("icr_shift")
@@ -240,24 +241,21 @@ class IcrShift(MotionEffect):
 
 
 @effects.register("light_wheel")
-class LightWheel(MotionEffect):
+class LightWheel(EachWheelEffect):
     """A wheel that stands lightly slips in proportion to the force that is asked of it: omega - k_i a.u_i / r.
 
     u_i is the direction in which the wheel drives the robot, a the whole acceleration of the body in its own frame,
     dv/dt + w x v.
     """
 
-    stage = "wheel"
     physics = "Four wheels or more share the weight as floor and frame will have it; grip goes with a wheel's share."
     source = f"{_PACEJKA} (slip stiffness in proportion to the load)"
     shows_in = "acceleration"
     only_for = "robots on four measured wheels or more"
+    for_each_wheel = (Parameter("k", "s", 0.0, 0.1, "rim speed that is lost per acceleration"),)
 
     def applies(self, robot: Robot) -> bool:
         return len(robot.wheel_names) >= _WOBBLES
-
-    def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
-        return one_for_each_wheel(robot, "k", "s", 0.0, 0.1, "rim speed that is lost per acceleration")
 
     def correction(self, signals: Signals, values: Values) -> Array:
         robot, acceleration = signals.robot, signals.accelerations[:, :2] + _centripetal(signals.twists)
@@ -266,14 +264,10 @@ class LightWheel(MotionEffect):
             rollers = wheel.roller_angle
             angles: Array = np.full(len(lost), wheel.rolling - rollers)
             if pair >= 0:
-                assert signals.steering is not None  # the robot steers
-                angles = angles + signals.steering[:, pair]
+                angles = angles + needed(signals.steering)[:, pair]
             driving = np.cos(angles) * acceleration[:, 0] + np.sin(angles) * acceleration[:, 1]
             lost[:, index] = driving / (wheel.radius * np.cos(rollers))
         return -of_wheels(robot, "k", values) * lost
-
-
-_KNEE = 0.05  # rad/s, half-width of the smoothed sign function; chosen
 
 
 def _smooth_sign(rates: Array) -> Array:
@@ -311,15 +305,7 @@ class CoulombCreep(MotionEffect):
         return has_rollers(robot)
 
     def correction(self, signals: Signals, values: Values) -> Array:
-        speed = np.hypot(signals.twists[:, 0], signals.twists[:, 1])
-        radii = signals.robot.radii
-        return values["c"] * _smooth_sign(signals.rates) * (speed[:, None] / radii)
-
-
-_CENSI = (
-    "A. Censi, A. Franchi, L. Marchionni and G. Oriolo, Simultaneous calibration of odometry and sensor parameters "
-    "for mobile robots, 2013"
-)
+        return values["c"] * _smooth_sign(signals.rates) * (signals.speed[:, None] / signals.robot.radii)
 
 
 def _about_the_start(poses: Array, start: Array, factor: complex) -> Array:
@@ -409,48 +395,36 @@ class SamplePeriodScale(MotionEffect):
 
 
 @effects.register("wheel_radius")
-class WheelRadius(MotionEffect):
+class WheelRadius(EachWheelEffect):
     """Wheels are larger or smaller than stated: omega (1 + k_i)."""
 
-    stage = "wheel"
     physics = "Treads are worn, pumped up or pressed flat, and no two wheels are alike."
-    source = (
-        "J. Borenstein and L. Feng, Measurement and correction of systematic odometry errors in mobile robots, 1996 "
-        "(unequal wheel diameters)"
-    )
+    source = f"{_BORENSTEIN} (unequal wheel diameters)"
     shows_in = "command"
     measurement = "a tape: the way that each wheel rolls in ten turns under load"
     only_for = "differential and skid-steered robots, tricycles and swerve drives"
+    for_each_wheel = (Parameter("k", "1", -0.05, 0.05, "by how much the radius is larger"),)
 
     def applies(self, robot: Robot) -> bool:
         return class_of(robot) in ("differential", "skid", "tricycle", "swerve")
-
-    def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
-        return one_for_each_wheel(robot, "k", "1", -0.05, 0.05, "by how much the radius is larger")
 
     def correction(self, signals: Signals, values: Values) -> Array:
         return of_wheels(signals.robot, "k", values) * signals.rates
 
 
 @effects.register("wheel_position")
-class WheelPosition(MotionEffect):
+class WheelPosition(EachWheelEffect):
     """Fixed wheels stand farther out than stated: omega + y_i w / r to the left, in the direction of rolling ahead."""
 
-    stage = "wheel"
     physics = "The track is not the one of the drawing: wheels touch the floor at another place of their width."
-    source = (
-        "J. Borenstein and L. Feng, Measurement and correction of systematic odometry errors in mobile robots, 1996 "
-        "(uncertainty about the effective wheelbase)"
-    )
+    source = f"{_BORENSTEIN} (uncertainty about the effective wheelbase)"
     shows_in = "command"
     measurement = "a ruler from wheel to wheel, or better: ten turns on the spot against a mark on the floor"
     only_for = "differential and skid-steered robots"
+    for_each_wheel = (Parameter("y", "m", -0.02, 0.02, "by how much farther to the left it stands"),)
 
     def applies(self, robot: Robot) -> bool:
         return class_of(robot) in ("differential", "skid")
-
-    def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
-        return one_for_each_wheel(robot, "y", "m", -0.02, 0.02, "by how much farther to the left it stands")
 
     def correction(self, signals: Signals, values: Values) -> Array:
         robot = signals.robot
@@ -473,17 +447,12 @@ class DrivenSteeringOffset(MotionEffect):
         return any(pair >= 0 for pair in robot.drive.pairs)
 
     def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
+        driven = [robot.drive.steered[pair] for pair in robot.drive.pairs if pair >= 0]
         return tuple(
             Parameter(f"c_{name}", "rad", -0.05, 0.05, f"true angle where 0 is measured, wheel {name}")
-            for name in _driven_and_steered(robot)
+            for name in driven
         )
 
     def correction(self, signals: Signals, values: Values) -> Array:
-        assert signals.steering is not None  # the robot steers
         offsets = [values.get(f"c_{name}", 0.0) for name in signals.robot.drive.steered]
-        return np.tile(offsets, (len(signals.steering), 1))
-
-
-def _driven_and_steered(robot: Robot) -> tuple[str, ...]:
-    """Names of the wheels of which both rate and steering angle are measured."""
-    return tuple(robot.drive.steered[pair] for pair in robot.drive.pairs if pair >= 0)
+        return np.tile(offsets, (len(needed(signals.steering)), 1))

@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from omnibench.errors import ConfigError, one_line
-from omnibench.robot.calibration import Calibration
+from omnibench.robot.calibration import Calibration, Noise
 from omnibench.robot.export.ros2_controllers import (
     Parameter,
     RemainingError,
@@ -23,9 +23,8 @@ from omnibench.robot.export.ros2_controllers import (
     matrix_deviations,
     pose_variances,
     to_node,
-    twist_variances,
 )
-from omnibench.robot.kinematics import Array, Mount
+from omnibench.robot.kinematics import Mount
 
 # m2/s and rad2/s, then as often per s2 and s4: x, y, z, roll, pitch, yaw, their velocities, accelerations. The
 # package's defaults (params/ekf.yaml), but for x, y and yaw.
@@ -43,39 +42,44 @@ def robot_localization(calibration: Calibration) -> tuple[str, tuple[str, ...]]:
     except ConfigError:
         publisher = None
     base = Mount() if publisher is None else publisher.base
-    growth, twist = pose_variances(calibration, base), twist_variances(calibration, base)
-    if growth is None or twist is None:
+    noise, growth = calibration.noise, pose_variances(calibration, base)
+    if noise is None or growth is None:
         raise ConfigError(
             f"robot_localization: calibration {calibration.name!r} has no noise model, of which covariances are made; "
             "calibrate once more with closed_form, which estimates it"
         )
-    warnings = _warnings(calibration, base)
+    warnings = _warnings(calibration, noise, base)
+    along_x, along_y, heading = np.sqrt(growth).tolist()
     lines = [
         f"robot_localization for robot {one_line(calibration.robot.name)!r},",
         f"from the omnibench calibration {one_line(calibration.name)!r} of {calibration.created:%Y-%m-%d}.",
         *(f"- {warning}" for warning in warnings),
-        f"Random walk of the odometry: {_walk(growth)}; the filter's pose grows by that.",
+        f"Random walk of the odometry: {1e3 * along_x:.3g} mm in x, {1e3 * along_y:.3g} mm in y, "
+        f"{np.degrees(heading):.3g} deg per root second; the filter's pose grows by that.",
     ]
     fused = ("true" if index in _FUSED else "false" for index in range(len(_PROCESS_NOISE)))
+    process_noise = ",\n      ".join(
+        ", ".join(str(value) if column == row else "0.0" for column in range(len(_PROCESS_NOISE)))
+        for row, value in enumerate(_PROCESS_NOISE)
+    )
     node = (
         Parameter("two_d_mode", "true"),
         Parameter("odom0", "/odom" if publisher is None else f"/{publisher.name}/{publisher.topic}"),
         Parameter("odom0_config", tuple(fused), "vx, vy, vyaw: velocities only"),
         Parameter("odom0_differential", "false"),
-        Parameter("process_noise_covariance", _process_noise()),
+        Parameter("process_noise_covariance", f"[{process_noise}]"),
     )
     text = "".join(f"# {line}\n" for line in lines) + to_node("ekf_filter_node", node)
     if publisher is not None:
         return text + to_node(publisher.name, covariance_parameters(calibration, publisher)), warnings
-    along_x, along_y, turning = (f"{value:.6e}" for value in twist.tolist())
+    along_x, along_y, turning = (f"{value:.6e}" for value in (growth / calibration.sample_period).tolist())
     return text + (
         f"# twist.covariance of the messages: [0] {along_x}, [7] {along_y} m2/s2, [35] {turning} rad2/s2\n"
     ), warnings
 
 
-def _warnings(calibration: Calibration, base: Mount) -> tuple[str, ...]:
-    noise, interval = calibration.noise, interval_in_words(calibration)
-    assert noise is not None  # it was checked
+def _warnings(calibration: Calibration, noise: Noise, base: Mount) -> tuple[str, ...]:
+    interval = interval_in_words(calibration)
     warnings = [
         f"twist variances are of messages every {interval}; for another interval T multiply them by {interval} / T",
         "white noise and bias of the calibration's noise are the reference's, and not used",
@@ -89,32 +93,16 @@ def _warnings(calibration: Calibration, base: Mount) -> tuple[str, ...]:
     deviations = matrix_deviations(calibration, base)
     if deviations is None:
         warnings.append("the calibration has no covariance of its matrix: how far that may be off is not known")
-    else:
-        warnings.append(
-            f"the matrix may be off by {_of_matrix(deviations)} (1 sigma); that is the same in every message, so that "
-            "no variance of a message stands for it, and is left out"
-        )
-        if calibration.provenance is not None and calibration.provenance.on_bounds:
-            names = ", ".join(calibration.provenance.on_bounds)
-            warnings.append(f"of {names}, on a bound of the box, no variance is known and none is counted")
-    return tuple(warnings)
-
-
-def _of_matrix(deviations: Array) -> RemainingError:
-    """Standard deviations (D, 3) in the worst direction of straight driving and on the spot."""
+        return tuple(warnings)
+    # Standard deviations in the worst direction of straight driving and on the spot.
     positions = np.hypot(deviations[:, 0], deviations[:, 1]).tolist()
     headings = deviations[:, 2].tolist()
-    return RemainingError(max(positions[:-1]), max(headings[:-1]), positions[-1], headings[-1])
-
-
-def _walk(growth: Array) -> str:
-    along_x, along_y, heading = np.sqrt(growth).tolist()
-    return f"{1e3 * along_x:.3g} mm in x, {1e3 * along_y:.3g} mm in y, {np.degrees(heading):.3g} deg per root second"
-
-
-def _process_noise() -> str:
-    rows = [
-        ", ".join(str(value) if column == row else "0.0" for column in range(len(_PROCESS_NOISE)))
-        for row, value in enumerate(_PROCESS_NOISE)
-    ]
-    return "[" + ",\n      ".join(rows) + "]"
+    sigma = RemainingError(max(positions[:-1]), max(headings[:-1]), positions[-1], headings[-1])
+    warnings.append(
+        f"the matrix may be off by {sigma} (1 sigma); that is the same in every message, so that no variance of a "
+        "message stands for it, and is left out"
+    )
+    if calibration.provenance is not None and calibration.provenance.on_bounds:
+        names = ", ".join(calibration.provenance.on_bounds)
+        warnings.append(f"of {names}, on a bound of the box, no variance is known and none is counted")
+    return tuple(warnings)

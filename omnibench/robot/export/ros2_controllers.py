@@ -1,218 +1,41 @@
 """The controller of ros2_controllers for a robot, with the parameters that come closest to its calibration.
 
-Error that remains of a calibrated matrix in software that cannot hold it, on the motions that the robot can drive.
-
-With the motions T (3, D) of a robot and its design's signal equations E (M, 3), it drives along the signals U = E T
-(M, D). The true matrix K makes of them the motions K U, of which P = T^+ takes the D coordinates; so the signals
-U (P K U)^-1 move the robot by one metre ahead, or aside, or by one radian, and a matrix L in the place of K errs by
-
-    (L - K) U (P K U)^-1                                                                                   (1)
-
-in x, y and heading. Software that reads Q = D numbers A u of the signals u sees of K the matrix K U (A U)^-1.  (2)
-
-Variances of odometry from a calibration: the random walk of its noise model, and the covariance of its matrix.
-
-A random walk of s per root second makes the mean velocity over T err by s^2 / T, independently from one interval to the
-next, and the pose by s^2 t after a time t. The tracked point walks alike in x and y; a base frame whose twist is F
-times the tracked point's walks with the covariance F diag(p^2, p^2, h^2) F^T. The matrix errs in the same way all the
-time: a motion by the signals u errs by F C(u) F^T, of which C(u)_ij = u^T cov(row i, row j) u.
-
-Parameters of diff_drive_controller (ros2_controllers) that come closest to a calibrated matrix.
-
-With the mean rates l and r of the left and the right wheels the controller computes, at the middle between them,
-
-    v = (R_l l + R_r r) / 2,    w = (R_r r - R_l l) / B,                                              (1)
-
-with R_l = left_wheel_radius_multiplier wheel_radius, R_r alike, and B = wheel_separation_multiplier wheel_separation
-(odometry.cpp and diff_drive_controller.cpp of the package, 2020 to 2026). By column k_l of a matrix the left wheel
-alone turns the robot about a point k_1l / k_3l to the left of the frame, for Eq. (1) at -B / 2, and the right one about
-one k_1r / k_3r to the left, at B / 2. So B = k_1r / k_3r - k_1l / k_3l, R_l = -B k_3l and R_r = B k_3r hold distances
-and headings of rows 1 and 3 exactly, for a frame in the middle between these points. What is left is its lever arm,
-which displaces the robot where it turns and does not add up.
-
-Parameters of the steering controllers of ros2_controllers for cars that come closest to a calibrated matrix.
-
-With the rates l and r of the wheels that do not steer, wheel_radius R, wheelbase L, the track widths B of these wheels
-and D of the steered ones, the controllers compute, in the middle of the rear axle,
-
-    tan phi of each steered wheel's  L tan phi_j / (L +- (D / 2) tan phi_j),  + on the left, and phi their mean,
-    v = (R / 2) (l / (1 - q) + r / (1 + q)),  q = B tan phi / (2 L),    w = v tan phi / L                 (1)
-
-(steering_kinematics.cpp of steering_controllers_library, 2025 and 2026). If the wheels roll as designed, q is what the
-rates differ by, and v = R m, w = (R / L) m tan phi with their mean m: on the signals of a car the matrix has the
-elements R and R / L and else zeros, which are the closest parameters. The calibration takes tan phi by the design's
-wheelbase L_0; the track widths of the design times L / L_0 make the controller's the same at every angle.
-
-Parameters of mecanum_drive_controller (ros2_controllers) that come closest to a calibrated matrix.
-
-With the rates f, g, h and j of the front left, rear left, rear right and front right wheel, and
-
-    a = (f + g + h + j) / 4,    b = (-f + g - h + j) / 4,    c = (-f - g + h + j) / 4,                (1)
-
-the controller has the twist (r a, r b, (r / k) c) of the wheels' centre, r = kinematics.wheels_radius and k =
-kinematics.sum_of_robot_center_projection_on_X_Y_axis, and makes of it that of its base frame, whose pose in the wheels'
-centre is kinematics.base_frame_offset (x, y, theta) (odometry.cpp of the package, 2023 to 2026). As x + iy, the columns
-of a, b and c in rows 1 and 2 of its matrix are r e^(-i theta), i r e^(-i theta) and i e^(-i theta) (x + iy) r / k, and
-row 3 is (0, 0, r / k): so the closest parameters in the sum of squares are found in closed form.
-
-Parameters of omni_wheel_drive_controller (ros2_controllers) that come closest to a calibrated matrix.
-
-The controller solves, by least squares over its wheels i = 0 .. N-1, counted counter-clockwise,
-
-    wheel_radius * omega_i = sin(t_i) vx - cos(t_i) vy - robot_radius w,    t_i = wheel_offset + 2 pi i / N
-
-(odometry.cpp of the package, 2025), which with omega_i negated is the wheel equation of omnibench: its positive rate
-turns the robot clockwise. Its matrix is, in columns,
-
-    m1 + i m2 = (2 r / N) i exp(i t_i),    m3 = r / (N R),
-
-so the closest one in the sum of squares is found in closed form: r exp(i wheel_offset) from rows 1 and 2, then R from
-the mean of row 3.
-
-Parameters of tricycle_controller (ros2_controllers) that come closest to a calibrated matrix.
-
-With the rate omega and the angle alpha of its one driven and steered wheel the controller computes, in the middle of
-the axle of the wheels that do not steer,
-
-    v = r omega cos alpha,    w = r omega sin alpha / L,    r = wheel_radius, L = wheelbase             (1)
-
-(odometry.cpp of the package, 2022 to 2026). On the signals (omega cos alpha, omega sin alpha) its matrix has the
-elements r and r / L and else zeros, which are the closest parameters. It has no offset of the steering angle: if the
-wheel stands at alpha + beta, the columns of row 1 are r (cos beta, -sin beta) and those of row 3 (r / L) (sin beta,
-cos beta), so that z1 = k_11 - i k_12 and z3 = k_32 + i k_31 have the phase beta. Where the joint's zero can be turned,
-the offset that makes (Re z1 e^(-i beta))^2 + (L Re z3 e^(-i beta))^2 largest comes closest.          (2)
+``controller`` takes the controller of the robot's kind and computes its parameters in closed form; the equations stand
+at each. ``ros2_controllers`` writes them as YAML, with warnings of what the controller cannot hold of the calibration.
 """
 
 from __future__ import annotations
 
 import cmath
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from omnibench.errors import ConfigError, one_line
 from omnibench.robot.calibration import Calibration
-from omnibench.robot.kinematics import Array, CarDrive, Mount, Robot, Wheel
-
-
-@dataclass(frozen=True)
-class RemainingError:
-    """Odometry error of a matrix against another, in the worst direction of straight driving and on the spot."""
-
-    straight_position: float  # m per m
-    straight_heading: float  # rad per m
-    turn_position: float  # m per rad
-    turn_heading: float  # rad per rad
-
-    def __str__(self) -> str:
-        return (
-            f"{1000 * self.straight_position:.1f} mm and {math.degrees(self.straight_heading):.2f} deg a metre, "
-            f"{math.degrees(self.turn_heading * 2 * math.pi):.1f} deg and {2000 * math.pi * self.turn_position:.1f} mm "
-            "a full turn"
-        )
-
-
-def remaining_errors(robot: Robot, used: Array, true: Array, base: Mount | None = None) -> Array:
-    """Errors (3, D), Eq. (1), of odometry with the matrix ``used`` (3, M) on a robot whose matrix is ``true`` (3, M).
-
-    base: the frame of the robot that both matrices are of; default: its centre.
-    """
-    motions, signals = driven_motions(robot, base)
-    errors: Array = (used - true) @ signals @ np.linalg.inv(np.linalg.pinv(motions.T) @ true @ signals)
-    return errors
-
-
-def remaining_error(robot: Robot, used: Array, true: Array, base: Mount | None = None) -> RemainingError:
-    """The errors of ``remaining_errors`` in the worst direction of straight driving and on the spot."""
-    errors = remaining_errors(robot, used, true, base)
-    return RemainingError(
-        float(np.linalg.norm(errors[:2, :-1], 2)),
-        float(np.linalg.norm(errors[2, :-1])),
-        float(np.linalg.norm(errors[:2, -1])),
-        float(abs(errors[2, -1])),
-    )
-
-
-def driven_motions(robot: Robot, base: Mount | None = None) -> tuple[Array, Array]:
-    """Motions (D, 3) of a frame of a robot that it can drive, and the design's signals (M, D) for them.
-
-    Straight by 1 m, aside where it can, too, and a turn by 1 rad: on the spot, or as nearly as it can. base: the frame;
-    default: the robot's centre.
-    """
-    frame = (base or Mount()).twist
-    motions = robot.motions @ frame.T
-    turn = motions[-1] / motions[-1, 2]
-    straight = motions[:-1] - np.outer(motions[:-1, 2], turn)
-    straight /= np.linalg.norm(straight, axis=1, keepdims=True)
-    motions = np.vstack([straight, turn - straight.T @ (straight @ turn)])
-    return motions, robot.signal_equations @ np.linalg.solve(frame, motions.T)
-
-
-def as_read(robot: Robot, matrix: Array, reading: Array) -> Array:
-    """The matrix (3, D) that acts on what software reads, Eq. (2), for a matrix (3, M) and the reading A (D, M)."""
-    _, signals = driven_motions(robot)
-    seen: Array = matrix @ signals @ np.linalg.inv(reading @ signals)
-    return seen
-
-
-def of_centre(robot: Robot, matrix: Array) -> Array:
-    """The matrix (3, M) of a robot's centre from that of its tracked point."""
-    centre: Array = matrix if robot.mount is None else np.linalg.solve(robot.mount.twist, matrix)
-    return centre
-
-
-def walk_covariance(calibration: Calibration, base: Mount) -> Array | None:
-    """Covariance (3, 3) that a second adds to the pose of a frame of the robot, m2, rad2; None without noise model."""
-    noise = calibration.noise
-    if noise is None:
-        return None
-    frame = _from_tracked(calibration, base)
-    return (frame * np.square([noise.walk_position, noise.walk_position, noise.walk_heading])) @ frame.T
-
-
-def pose_variances(calibration: Calibration, base: Mount) -> Array | None:
-    """Variances (3,) that a second adds to x, y (m2) and heading (rad2); None without a noise model."""
-    covariance = walk_covariance(calibration, base)
-    return None if covariance is None else np.diag(covariance)
-
-
-def twist_variances(calibration: Calibration, base: Mount) -> Array | None:
-    """Variances (3,) of a sample's mean twist, m2/s2, m2/s2, rad2/s2; None without a noise model."""
-    growth = pose_variances(calibration, base)
-    return None if growth is None else growth / calibration.sample_period
-
-
-def matrix_deviations(calibration: Calibration, base: Mount) -> Array | None:
-    """Standard deviations (D, 3) of x, y and heading by the matrix's covariance; None where that is not known.
-
-    One row for each of ``driven_motions``: a metre, or a radian.
-    """
-    if calibration.covariance is None:
-        return None
-    frame, count = _from_tracked(calibration, base), len(calibration.robot.drive.names)
-    blocks = np.array(calibration.covariance)[: 3 * count, : 3 * count].reshape(3, count, 3, count)
-    _, signals = driven_motions(calibration.robot, base)
-    variances = np.einsum("ai,aj,imjn,md,nd->da", frame, frame, blocks, signals, signals, optimize=True)
-    deviations: Array = np.sqrt(np.maximum(variances, 0.0))
-    return deviations
-
-
-def interval_in_words(calibration: Calibration) -> str:
-    """The sample period, in ms."""
-    return f"{1e3 * calibration.sample_period:g} ms"
-
-
-def _from_tracked(calibration: Calibration, base: Mount) -> Array:
-    """F (3, 3): the twist of a frame of the robot from that of the tracked point."""
-    mount = calibration.robot.mount
-    frame: Array = base.twist if mount is None else base.twist @ np.linalg.inv(mount.twist)
-    return frame
-
+from omnibench.robot.kinematics import Array, CarDrive, Mount, Robot
 
 _STEPS = {"arc": "arcs", "euler": "Euler steps"}
-_NEGLIGIBLE = 1e-4  # m: a base frame so near to where it should be is there; chosen
+_WRONG_WAY = "ros2_controllers: the matrix does not drive this robot ahead and turn it counter-clockwise; check "
+_NO_TURN = "ros2_controllers: the matrix does not turn this robot counter-clockwise; check wheel signs"
+_TAKES_END = "the controller takes the steering angle at a sample's end, the calibration in its middle"
+
+# All chosen.
+_NEGLIGIBLE = 1e-4  # m: a base frame so near to where it should be is there
+_ALONG = math.cos(math.radians(10))  # of the largest angle to the robot's x axis
+_ALIKE = 1e-3  # m, by which wheels may stand off where the controller has them
+_SPACING_TOLERANCE = math.radians(10)  # rad, largest deviation from equal spacing
+_STRAIGHT = math.radians(0.01)  # rad per m, of straight driving
+_WORTH_IT = 0.5  # of the heading error in straight driving: an offset that leaves more is not noted
+
+# Of the wheels of mecanum_drive_controller in its order: signs in a, b and c of Eq. (5).
+_CORNERS = {
+    "front_left": (1, -1, -1),
+    "rear_left": (1, 1, -1),
+    "rear_right": (1, -1, 1),
+    "front_right": (1, 1, 1),
+}
 
 
 @dataclass(frozen=True)
@@ -248,29 +71,37 @@ class Controller:
     topic: str = "odom"
     lever: bool = True
 
-    def seen(self, robot: Robot, matrix: Array) -> Array:
-        """The matrix (3, M) of the base frame from that of the tracked point."""
-        seen: Array = self.base.twist @ of_centre(robot, matrix)
-        return seen
+
+@dataclass(frozen=True)
+class RemainingError:
+    """Odometry error of a matrix against another, in the worst direction of straight driving and on the spot."""
+
+    straight_position: float  # m per m
+    straight_heading: float  # rad per m
+    turn_position: float  # m per rad
+    turn_heading: float  # rad per rad
+
+    def __str__(self) -> str:
+        return (
+            f"{1000 * self.straight_position:.1f} mm and {math.degrees(self.straight_heading):.2f} deg a metre, "
+            f"{math.degrees(self.turn_heading * 2 * math.pi):.1f} deg and {2000 * math.pi * self.turn_position:.1f} mm "
+            "a full turn"
+        )
 
 
-def joint_name(wheel: str) -> str:
-    """A made-up name of a wheel's joint."""
-    return f"wheel_{wheel}_joint"
+def ros2_controllers(calibration: Calibration) -> tuple[str, tuple[str, ...], str]:
+    """The controller's parameters as YAML with comments, warnings of what they cannot hold, and the controller's name.
 
-
-def reversed_joints(wheels: list[str], what: str = "") -> tuple[str, ...]:
-    """The note on wheels whose joints turn the other way; none for none."""
-    return (f"reverse the axes of the {what}joints of {', '.join(wheels)}",) if wheels else ()
-
-
-def document(calibration: Calibration, fitted: Controller, design: Controller) -> tuple[str, tuple[str, ...]]:
-    """The controller's parameters as YAML with comments, and the warnings among these.
-
-    design: the same controller for the design values.
+    ConfigError: no controller can describe this robot.
     """
+    fitted = controller(calibration.robot, calibration.matrix_without_effects)
+    design = controller(calibration.robot, calibration.robot.inverse_kinematic_matrix)
     warnings = _warnings(calibration, fitted, design)
-    values = [f"{each.name} {_number(each.value, 6)}" for each in design.parameters if isinstance(each.value, float)]
+    values = [
+        f"{parameter.name} {_number(parameter.value, 6)}"
+        for parameter in design.parameters
+        if isinstance(parameter.value, float)
+    ]
     lines = [
         f"{fitted.name} (ros2_controllers) for robot {one_line(calibration.robot.name)!r},",
         f"closest to the omnibench calibration {one_line(calibration.name)!r} of {calibration.created:%Y-%m-%d}.",
@@ -278,62 +109,31 @@ def document(calibration: Calibration, fitted: Controller, design: Controller) -
         f"Design values: {', '.join(values)}",
     ]
     parameters = (*fitted.parameters, *covariance_parameters(calibration, fitted))
-    return "".join(f"# {line}\n" for line in lines) + to_node(fitted.name, parameters), warnings
+    return "".join(f"# {line}\n" for line in lines) + to_node(fitted.name, parameters), warnings, fitted.name
 
 
-def covariance_parameters(calibration: Calibration, controller: Controller) -> tuple[Parameter, ...]:
-    """The controller's covariances by the calibration's noise; empty where it is not known."""
-    twist = twist_variances(calibration, controller.base)
-    if twist is None:
-        return ()
-    pose = pose_variances(calibration, controller.base)
-    assert pose is not None  # the noise is known
-    return (
-        Parameter(controller.covariances.format("pose"), _diagonal(pose), "m2, rad2: what 1 s adds"),
-        Parameter(
-            controller.covariances.format("twist"),
-            _diagonal(twist),
-            f"m2/s2, rad2/s2: of messages every {interval_in_words(calibration)}",
-        ),
-    )
-
-
-def to_node(name: str, parameters: tuple[Parameter, ...]) -> str:
-    """Parameters of a node as YAML."""
-    lines, opened = [f"{name}:", "  ros__parameters:"], list[str]()
-    for parameter in parameters:
-        *path, key = parameter.name.split(".")
-        shared = next((at for at, (a, b) in enumerate(zip(path, opened, strict=False)) if a != b), len(opened))
-        lines.extend(f"{'  ' * (depth + 2)}{path[depth]}:" for depth in range(min(shared, len(path)), len(path)))
-        opened = path
-        comment = f"  # {parameter.comment}" if parameter.comment else ""
-        lines.append(f"{'  ' * (len(path) + 2)}{key}: {_value(parameter.value)}{comment}")
-    return "\n".join(lines) + "\n"
-
-
-def _value(value: float | str | tuple[str, ...]) -> str:
-    if isinstance(value, float):
-        return _number(value, 12)
-    return value if isinstance(value, str) else f"[{', '.join(value)}]"
-
-
-def _number(value: float, decimals: int) -> str:
-    return f"{round(value, decimals) + 0.0:.{decimals}f}"  # no -0
-
-
-def _diagonal(variances: Array) -> tuple[str, ...]:
-    """Variances (3,) of x, y and heading as the diagonal of ROS: x, y, z, roll, pitch, yaw."""
-    x, y, heading = (f"{value:.6e}" for value in variances.tolist())
-    return (x, y, "0.0", "0.0", "0.0", heading)
+def controller(robot: Robot, matrix: Array) -> Controller:
+    """The controller of a robot, closest to a matrix (3, M) of its tracked point. ConfigError: there is none."""
+    matrix = of_centre(robot, matrix)
+    kinds = {wheel.kind for wheel in robot.measured}
+    if isinstance(robot.drive, CarDrive):
+        return car(robot, robot.drive, matrix)
+    if "steered" in kinds:
+        return tricycle(robot, matrix)
+    if "fixed" in kinds:
+        return diff_drive(robot, matrix)
+    return mecanum_drive(robot, matrix) if "mecanum" in kinds else omni_wheel_drive(robot, matrix)
 
 
 def _warnings(calibration: Calibration, fitted: Controller, design: Controller) -> tuple[str, ...]:
-    robot, true = calibration.robot, fitted.seen(calibration.robot, calibration.matrix_without_effects)
-    left = remaining_error(robot, fitted.matrix, true, fitted.base)
-    by_design = remaining_error(robot, design.matrix, true, fitted.base)
+    """Warnings of what the controller cannot hold. design: the same controller for the design values."""
+    robot, base = calibration.robot, fitted.base
+    true = base.twist @ of_centre(robot, calibration.matrix_without_effects)
+    remaining = remaining_error(robot, fitted.matrix, true, base)
+    by_design = remaining_error(robot, design.matrix, true, base)
     warnings = [
         f"{fitted.holds} stand for the whole matrix{fitted.lost}",
-        f"that leaves up to {left}; with the design values it would be {by_design}",
+        f"that leaves up to {remaining}; with the design values it would be {by_design}",
         *fitted.notes,
         f"{fitted.joints} are made up from the calibration's wheels: put in the joints of your URDF, in this order",
     ]
@@ -345,12 +145,7 @@ def _warnings(calibration: Calibration, fitted: Controller, design: Controller) 
             "effects of the calibration are left out, the controller has none, and what that costs is not counted "
             f"above: {calibration.effects_in_words}"
         )
-    return (*warnings, *_frames(robot, fitted, true), *_doubts(calibration))
-
-
-def _frames(robot: Robot, fitted: Controller, true: Array) -> list[str]:
-    """Warnings of frames that are not the robot's centre, and of a base frame that would leave less."""
-    warnings, base = [], fitted.base
+    # Frames that are not the robot's centre, and a base frame that would leave less.
     if robot.mount is not None:
         warnings.append("the calibration is of the tracked point, the parameters are of the robot's centre (mount)")
     if max(abs(base.x), abs(base.y)) > _NEGLIGIBLE:
@@ -362,54 +157,214 @@ def _frames(robot: Robot, fitted: Controller, true: Array) -> list[str]:
     if fitted.lever and max(abs(ahead), abs(to_right)) > _NEGLIGIBLE:
         place = _place(base.x + ahead, base.y - to_right)
         warnings.append(f"the millimetres a full turn are a lever arm: a base_frame_id at {place} would leave none")
-    return warnings
+    if robot.skid:
+        warnings.append("the robot skids: the parameters are those of the floor, the load and the speeds driven")
+    if calibration.noise is None:
+        warnings.append("covariances are left at the controller's defaults: the calibration has no noise model")
+    return tuple(warnings)
 
 
 def _place(x: float, y: float) -> str:
     return f"x {x:.4f} m, y {y:.4f} m of the robot's centre"
 
 
-def _doubts(calibration: Calibration) -> list[str]:
-    """Warnings of what the parameters say nothing of."""
-    warnings = []
-    if calibration.robot.skid:
-        warnings.append("the robot skids: the parameters are those of the floor, the load and the speeds driven")
-    if calibration.noise is None:
-        warnings.append("covariances are left at the controller's defaults: the calibration has no noise model")
-    return warnings
+def covariance_parameters(calibration: Calibration, controller: Controller) -> tuple[Parameter, ...]:
+    """The controller's covariances by the calibration's noise; empty without a noise model."""
+    pose = pose_variances(calibration, controller.base)
+    if pose is None:
+        return ()
+    quantities = (
+        ("pose", pose, "m2, rad2: what 1 s adds"),
+        (
+            "twist",
+            pose / calibration.sample_period,
+            f"m2/s2, rad2/s2: of messages every {interval_in_words(calibration)}",
+        ),
+    )
+    parameters = []
+    for quantity, variances, comment in quantities:
+        x, y, heading = (f"{value:.6e}" for value in variances.tolist())
+        diagonal = (x, y, "0.0", "0.0", "0.0", heading)
+        parameters.append(Parameter(controller.covariances.format(quantity), diagonal, comment))
+    return tuple(parameters)
 
 
-_ALONG = math.cos(math.radians(10))  # of the largest angle to the robot's x axis; chosen
+def to_node(name: str, parameters: tuple[Parameter, ...]) -> str:
+    """Parameters of a node as YAML."""
+    lines, opened = [f"{name}:", "  ros__parameters:"], list[str]()
+    for parameter in parameters:
+        *path, key = parameter.name.split(".")
+        shared = next((at for at, (a, b) in enumerate(zip(path, opened, strict=False)) if a != b), len(opened))
+        lines.extend(f"{'  ' * (depth + 2)}{path[depth]}:" for depth in range(min(shared, len(path)), len(path)))
+        opened = path
+        value = parameter.value
+        if isinstance(value, float):
+            value = _number(value, 12)
+        elif isinstance(value, tuple):
+            value = f"[{', '.join(value)}]"
+        comment = f"  # {parameter.comment}" if parameter.comment else ""
+        lines.append(f"{'  ' * (len(path) + 2)}{key}: {value}{comment}")
+    return "\n".join(lines) + "\n"
+
+
+def _number(value: float, decimals: int) -> str:
+    return f"{round(value, decimals) + 0.0:.{decimals}f}"  # no -0
+
+
+def interval_in_words(calibration: Calibration) -> str:
+    """The sample period, in ms."""
+    return f"{1e3 * calibration.sample_period:g} ms"
+
+
+def remaining_error(robot: Robot, used: Array, true: Array, base: Mount | None = None) -> RemainingError:
+    """The errors of ``remaining_errors`` in the worst direction of straight driving and on the spot."""
+    errors = remaining_errors(robot, used, true, base)
+    return RemainingError(
+        float(np.linalg.norm(errors[:2, :-1], 2)),
+        float(np.linalg.norm(errors[2, :-1])),
+        float(np.linalg.norm(errors[:2, -1])),
+        float(abs(errors[2, -1])),
+    )
+
+
+def remaining_errors(robot: Robot, used: Array, true: Array, base: Mount | None = None) -> Array:
+    """Errors (3, D) in x, y and heading of odometry with the matrix L, ``used``, for a robot with K, ``true``.
+
+    With the motions T (3, D) of a robot and its design's signal equations E (M, 3), it drives along the signals
+    U = E T (M, D). The matrix K (3, M) makes of them the motions K U, of which P = T^+ takes the D coordinates; so the
+    signals U (P K U)^-1 move the robot by one metre ahead, or aside, or by one radian, and L (3, M) in the place of K
+    errs by
+
+        (L - K) U (P K U)^-1.                                                                          (1)
+
+    base: the frame of the robot that both matrices are of; default: its centre.
+    """
+    motions, signals = driven_motions(robot, base)
+    errors: Array = (used - true) @ signals @ np.linalg.inv(np.linalg.pinv(motions.T) @ true @ signals)
+    return errors
+
+
+def as_read(robot: Robot, matrix: Array, reading: Array) -> Array:
+    """The matrix (3, D) that acts on what software reads, for a matrix K (3, M) and the reading A (D, M).
+
+    Software that reads D numbers A u of the signals u sees of K, with U as in Eq. (1), the matrix
+
+        K U (A U)^-1.                                                                                  (2)
+    """
+    _, signals = driven_motions(robot)
+    seen: Array = matrix @ signals @ np.linalg.inv(reading @ signals)
+    return seen
+
+
+def driven_motions(robot: Robot, base: Mount | None = None) -> tuple[Array, Array]:
+    """Motions (D, 3) of a frame of a robot that it can drive, and the design's signals (M, D) for them.
+
+    Straight by 1 m, aside where it can, too, and a turn by 1 rad: on the spot, or as nearly as it can. base: the frame;
+    default: the robot's centre.
+    """
+    frame = (base or Mount()).twist
+    motions = robot.motions @ frame.T
+    turn = motions[-1] / motions[-1, 2]
+    straight = motions[:-1] - np.outer(motions[:-1, 2], turn)
+    straight /= np.linalg.norm(straight, axis=1, keepdims=True)
+    motions = np.vstack([straight, turn - straight.T @ (straight @ turn)])
+    return motions, robot.signal_equations @ np.linalg.solve(frame, motions.T)
+
+
+def of_centre(robot: Robot, matrix: Array) -> Array:
+    """The matrix (3, M) of a robot's centre from that of its tracked point."""
+    centre: Array = matrix if robot.mount is None else np.linalg.solve(robot.mount.twist, matrix)
+    return centre
+
+
+def pose_variances(calibration: Calibration, base: Mount) -> Array | None:
+    """Variances (3,) that a second adds to x, y (m2) and heading (rad2) of a frame; None without a noise model.
+
+    A random walk of s per root second makes the mean velocity over T err by s^2 / T, independently from one interval to
+    the next, and the pose by s^2 t after a time t. The tracked point walks alike in x and y; a base frame whose twist
+    is F times the tracked point's walks with the covariance F diag(p^2, p^2, h^2) F^T.
+    """
+    noise = calibration.noise
+    if noise is None:
+        return None
+    frame = _from_tracked(calibration, base)
+    return np.diag((frame * np.square([noise.walk_position, noise.walk_position, noise.walk_heading])) @ frame.T)
+
+
+def matrix_deviations(calibration: Calibration, base: Mount) -> Array | None:
+    """Standard deviations (D, 3) of x, y and heading by the matrix's covariance; None where that is not known.
+
+    One row for each of ``driven_motions``: a metre, or a radian. The matrix errs in the same way all the time: a motion
+    by the signals u errs by F C(u) F^T, of which C(u)_ij = u^T cov(row i, row j) u, F as in ``pose_variances``.
+    """
+    if calibration.covariance is None:
+        return None
+    frame, count = _from_tracked(calibration, base), len(calibration.robot.drive.names)
+    blocks = np.array(calibration.covariance)[: 3 * count, : 3 * count].reshape(3, count, 3, count)
+    _, signals = driven_motions(calibration.robot, base)
+    variances = np.einsum("ai,aj,imjn,md,nd->da", frame, frame, blocks, signals, signals, optimize=True)
+    deviations: Array = np.sqrt(np.maximum(variances, 0.0))
+    return deviations
+
+
+def _from_tracked(calibration: Calibration, base: Mount) -> Array:
+    """F (3, 3): the twist of a frame of the robot from that of the tracked point."""
+    mount = calibration.robot.mount
+    frame: Array = base.twist if mount is None else base.twist @ np.linalg.inv(mount.twist)
+    return frame
+
+
+def joint_name(wheel: str) -> str:
+    """A made-up name of a wheel's joint."""
+    return f"wheel_{wheel}_joint"
+
+
+def joint_notes(backwards: list[str], unread: list[str], kind: str = "") -> tuple[str, ...]:
+    """Notes on wheels whose joints turn the other way, and on those that the controller does not read."""
+    notes = [f"reverse the axes of the {kind}joints of {', '.join(backwards)}"] if backwards else []
+    if unread:
+        notes.append(f"the controller does not read {', '.join(unread)}")
+    return tuple(notes)
 
 
 def diff_drive(robot: Robot, matrix: Array) -> Controller:
-    """The controller closest to a matrix (3, N) of the robot's centre. ConfigError: it cannot describe this robot."""
-    left, right = _sides(robot)
+    """The diff_drive_controller closest to a matrix (3, N) of the robot's centre. ConfigError: none can describe it.
+
+    With the mean rates l and r of the left and the right wheels the controller computes, at the middle between them,
+
+        v = (R_l l + R_r r) / 2,    w = (R_r r - R_l l) / B,                                           (3)
+
+    with R_l = left_wheel_radius_multiplier wheel_radius, R_r alike, and B = wheel_separation_multiplier
+    wheel_separation (odometry.cpp and diff_drive_controller.cpp of the package, 2020 to 2026). By column k_l of a
+    matrix the left wheel alone turns the robot about a point k_1l / k_3l to the left of the frame, for Eq. (3) at -B /
+    2, and the right one about one k_1r / k_3r to the left, at B / 2. So B = k_1r / k_3r - k_1l / k_3l, R_l = -B k_3l
+    and R_r = B k_3r hold distances and headings of rows 1 and 3 exactly, for a frame in the middle between these
+    points. What is left is its lever arm, which displaces the robot where it turns and does not add up.
+    """
+    sides = _sides(robot)
+    forward = [math.copysign(1.0, math.cos(wheel.rolling)) for wheel in robot.measured]
     reading = np.zeros((2, len(robot.measured)))
-    for row, side in enumerate((left, right)):
+    for row, side in enumerate(sides):
         for index in side:
-            reading[row, index] = _sign(robot.measured[index]) / len(side)
+            reading[row, index] = forward[index] / len(side)
     places = np.array([wheel.position for wheel in robot.measured])
-    middles = np.array([places[side].mean(axis=0) for side in (left, right)])
+    middles = np.array([places[side].mean(axis=0) for side in sides])
     base, apart = Mount(x=middles[:, 0].mean(), y=middles[:, 1].mean()), float(middles[0, 1] - middles[1, 1])
     ahead, _, turning = base.twist @ as_read(robot, matrix, reading)
     separation = float(np.diff(ahead / turning)[0]) if turning[0] < 0 < turning[1] else 0.0
     if separation <= 0:
-        raise ConfigError(
-            "ros2_controllers: the matrix does not drive this robot ahead and turn it counter-clockwise; check wheel "
-            "signs and which wheels are on the left"
-        )
+        raise ConfigError(f"{_WRONG_WAY}wheel signs and which wheels are on the left")
     radii = separation * turning * (-1, 1)
     by_side = np.array([[radii[0] / 2, radii[1] / 2], [0.0, 0.0], [-radii[0] / separation, radii[1] / separation]])
-    radius = float(robot.radii[[*left, *right]].mean())
-    wheels = [[robot.wheel_names[index] for index in side] for side in (left, right)]
-    unread = [name for name in robot.wheel_names if name not in wheels[0] + wheels[1]]
-    backwards = [name for name in robot.wheel_names if _sign(robot.measured[robot.wheel_names.index(name)]) < 0]
+    radius = float(robot.radii[[*sides[0], *sides[1]]].mean())
+    left, right = ([robot.wheel_names[index] for index in side] for side in sides)
+    backwards = [name for name, sign in zip(robot.wheel_names, forward, strict=True) if sign < 0]
+    unread = [name for name in robot.wheel_names if name not in left + right]
     return Controller(
         "diff_drive_controller",
         (
-            Parameter("left_wheel_names", tuple(map(joint_name, wheels[0]))),
-            Parameter("right_wheel_names", tuple(map(joint_name, wheels[1]))),
+            Parameter("left_wheel_names", tuple(map(joint_name, left))),
+            Parameter("right_wheel_names", tuple(map(joint_name, right))),
             Parameter("wheel_separation", apart, "m, as designed"),
             Parameter("wheel_radius", radius, "m, as designed"),
             Parameter("wheel_separation_multiplier", separation / apart),
@@ -420,10 +375,7 @@ def diff_drive(robot: Robot, matrix: Array) -> Controller:
         by_side @ reading,
         "two wheel radii and one separation",
         "left_wheel_names and right_wheel_names",
-        notes=(
-            *reversed_joints([name for name in backwards if name not in unread]),
-            *([f"the controller does not read {', '.join(unread)}"] if unread else []),
-        ),
+        notes=joint_notes([name for name in backwards if name not in unread], unread),
         base=base,
     )
 
@@ -449,33 +401,47 @@ def _sides(robot: Robot) -> tuple[list[int], list[int]]:
     return left, right
 
 
-def _sign(wheel: Wheel) -> float:
-    """1 for a wheel whose positive rate drives the robot forward, else -1."""
-    return math.copysign(1.0, math.cos(wheel.rolling))
+def car(robot: Robot, drive: CarDrive, matrix: Array) -> Controller:
+    """The steering controller closest to a matrix (3, M) of a car's centre. ConfigError: none can describe it.
 
+    With the rates l and r of the wheels that do not steer, wheel_radius R, wheelbase L, the track widths B of these
+    wheels and D of the steered ones, the controllers compute, in the middle of the rear axle,
 
-_ALIKE = 1e-3  # m, by which wheels may stand off where the controller has them; chosen
+        tan phi of each steered wheel's  L tan phi_j / (L +- (D / 2) tan phi_j),  + on the left, and phi their mean,
+        v = (R / 2) (l / (1 - q) + r / (1 + q)),  q = B tan phi / (2 L),    w = v tan phi / L          (4)
 
-
-def car(robot: Robot, matrix: Array) -> Controller:
-    """The controller closest to a matrix (3, M) of the robot's centre. ConfigError: none can describe this robot."""
-    drive = robot.drive
-    assert isinstance(drive, CarDrive)
-    name, rear, track, front, steering_track = _axles(robot, drive)
-    ahead = float(np.mean([along for along, _ in drive.ahead]))
+    (steering_kinematics.cpp of steering_controllers_library, 2025 and 2026). If the wheels roll as designed, q is what
+    the rates differ by, and v = R m, w = (R / L) m tan phi with their mean m: on the signals of a car the matrix has
+    the elements R and R / L and else zeros, which are the closest parameters. The calibration takes tan phi by the
+    design's wheelbase L_0; the track widths of the design times L / L_0 make the controller's the same at every angle.
+    """
+    # The wheels of the rear axle and those that steer, from the right.
+    across = [wheel.position[1] for wheel in robot.measured]
+    along, beside = np.array(drive.ahead).T
+    rear = [name for _, name in sorted(zip(across, drive.wheels, strict=True))]
+    front = [name for _, name in sorted(zip(beside.tolist(), drive.steered, strict=True))]
+    name = {
+        (2, 2): "ackermann_steering_controller",
+        (2, 1): "tricycle_steering_controller",
+        (1, 1): "bicycle_steering_controller",
+    }.get((len(rear), len(front)))
+    if name is None or np.ptp(along) > _ALIKE or abs(beside.sum()) > _ALIKE:
+        raise ConfigError(
+            f"ros2_controllers: no controller holds a car that steers by {', '.join(drive.steered)} and measures "
+            f"{', '.join(drive.wheels)} there; it needs as many on the left as on the right of them, or one and one in "
+            "the middle; use c_header"
+        )
+    ahead = float(np.mean(along))
     x, y = np.mean([wheel.position for wheel in robot.measured], axis=0).tolist()
     base = Mount(x=x, y=y)
     reading = np.eye(2, len(drive.names)) * [[1.0], [math.copysign(1.0, ahead)]]
     seen = base.twist @ as_read(robot, matrix, reading)
     radius, turn = float(seen[0, 0]), float(seen[2, 1])
     if radius <= 0 or turn <= 0:
-        raise ConfigError(
-            "ros2_controllers: the matrix does not drive this robot ahead and turn it counter-clockwise; check the "
-            "signs of the wheels and of the steering angles"
-        )
+        raise ConfigError(f"{_WRONG_WAY}the signs of the wheels and of the steering angles")
     wheelbase = radius / turn
     share = wheelbase / abs(ahead)
-    widths = [("traction_track_width", track), ("steering_track_width", steering_track)]
+    widths = [("traction_track_width", float(np.ptp(across))), ("steering_track_width", float(np.ptp(beside)))]
     return Controller(
         name,
         (
@@ -494,63 +460,58 @@ def car(robot: Robot, matrix: Array) -> Controller:
         "one wheel radius and one wheelbase",
         "traction_joints_names and steering_joints_names",
         notes=(
-            *reversed_joints(list(drive.steered) if ahead < 0 else [], "steering "),
+            *joint_notes(list(drive.steered) if ahead < 0 else [], [], "steering "),
             "the parameters' names are those of ROS 2 Jazzy and later; the wheels are taken to roll as designed",
-            "the controller takes the steering angle at a sample's end, the calibration in its middle",
+            _TAKES_END,
         ),
         base=base,
         topic="odometry",
     )
 
 
-def _axles(robot: Robot, drive: CarDrive) -> tuple[str, list[str], float, list[str], float]:
-    """Controller, wheels of the rear axle from the right and their track width, those that steer and theirs, m."""
-    across = [wheel.position[1] for wheel in robot.measured]
-    rear = [name for _, name in sorted(zip(across, drive.wheels, strict=True))]
-    front = [name for _, name in sorted(zip([y for _, y in drive.ahead], drive.steered, strict=True))]
-    name = {
-        (2, 2): "ackermann_steering_controller",
-        (2, 1): "tricycle_steering_controller",
-        (1, 1): "bicycle_steering_controller",
-    }.get((len(rear), len(front)))
-    along, beside = np.array(drive.ahead).T
-    if name is None or np.ptp(along) > _ALIKE or abs(beside.sum()) > _ALIKE:
-        raise ConfigError(
-            f"ros2_controllers: no controller holds a car that steers by {', '.join(drive.steered)} and measures "
-            f"{', '.join(drive.wheels)} there; it needs as many on the left as on the right of them, or one and one in "
-            "the middle; use c_header"
-        )
-    return name, rear, float(np.ptp(across)), front, float(np.ptp(beside))
-
-
-# Of the wheels in the controller's order: signs in a, b and c of Eq. (1).
-_SLOTS = {
-    "front_left": (1, -1, -1),
-    "rear_left": (1, 1, -1),
-    "rear_right": (1, -1, 1),
-    "front_right": (1, 1, 1),
-}
-
-
 def mecanum_drive(robot: Robot, matrix: Array) -> Controller:
-    """The controller closest to a matrix (3, N) of the robot's centre. ConfigError: it cannot describe this robot."""
-    wheels, signs = _slots(robot)
+    """The mecanum_drive_controller closest to a matrix (3, N) of the robot's centre. ConfigError: none can describe it.
+
+    With the rates f, g, h and j of the front left, rear left, rear right and front right wheel, and
+
+        a = (f + g + h + j) / 4,    b = (-f + g - h + j) / 4,    c = (-f - g + h + j) / 4,             (5)
+
+    the controller has the twist (r a, r b, (r / k) c) of the wheels' centre, r = kinematics.wheels_radius and k =
+    kinematics.sum_of_robot_center_projection_on_X_Y_axis, and makes of it that of its base frame, whose pose in the
+    wheels' centre is kinematics.base_frame_offset (x, y, theta) (odometry.cpp of the package, 2023 to 2026). As x + iy,
+    the columns of a, b and c in rows 1 and 2 of its matrix are r e^(-i theta), i r e^(-i theta) and
+    i e^(-i theta) (x + iy) r / k, and row 3 is (0, 0, r / k): so the closest parameters in the sum of squares are found
+    in closed form.
+    """
+    wheels, signs = _corners(robot)
     reading = np.zeros((3, len(robot.measured)))
-    for slot, index in wheels.items():
-        reading[:, index] = signs[index] * np.array(_SLOTS[slot]) / 4
+    for corner, index in wheels.items():
+        reading[:, index] = signs[index] * np.array(_CORNERS[corner]) / 4
     seen = as_read(robot, matrix, reading)
     a, b, c = (seen[0] + 1j * seen[1]).tolist()
     along, turn = (a - 1j * b) / 2, float(seen[2, 2])
     if turn <= 0 or not along:
-        raise ConfigError("ros2_controllers: the matrix does not turn this robot counter-clockwise; check wheel signs")
+        raise ConfigError(_NO_TURN)
     radius, theta = abs(along), -cmath.phase(along)
     offset = c / (1j * cmath.exp(-1j * theta) * turn)
     twist = Mount(x=offset.real, y=offset.imag, yaw=theta).twist
-    names = {slot: joint_name(robot.wheel_names[index]) for slot, index in wheels.items()}
+    notes = joint_notes([name for name, sign in zip(robot.wheel_names, signs, strict=True) if sign < 0], [])
+    # Wheels that do not stand where the controller's names say.
+    elsewhere = []
+    for corner, index in wheels.items():
+        wheel = robot.measured[index]
+        x, y = wheel.position
+        if wheel.x is not None and (x > 0, y > 0) != (corner.startswith("front"), corner.endswith("left")):
+            elsewhere.append(f"{corner} is {wheel.name}")
+    if elsewhere:
+        notes += (f"the rollers form an O seen from above, so that {', '.join(elsewhere)}",)
     return Controller(
         "mecanum_drive_controller",
         (
-            *(Parameter(f"{slot}_wheel_command_joint_name", name) for slot, name in names.items()),
+            *(
+                Parameter(f"{corner}_wheel_command_joint_name", joint_name(robot.wheel_names[index]))
+                for corner, index in wheels.items()
+            ),
             Parameter("kinematics.base_frame_offset.x", offset.real, "m"),
             Parameter("kinematics.base_frame_offset.y", offset.imag, "m"),
             Parameter("kinematics.base_frame_offset.theta", theta, "rad"),
@@ -560,51 +521,40 @@ def mecanum_drive(robot: Robot, matrix: Array) -> Controller:
         twist @ np.diag([radius, radius, turn]) @ reading,
         "one wheel radius, one sum of distances and one pose of the base frame",
         "joint names",
-        notes=(
-            *reversed_joints([name for name, sign in zip(robot.wheel_names, signs, strict=True) if sign < 0]),
-            *_elsewhere(robot, wheels),
-        ),
+        notes=notes,
         integration="every step along the heading at its end",
         topic="odometry",
     )
 
 
-def _elsewhere(robot: Robot, wheels: dict[str, int]) -> tuple[str, ...]:
-    """The note on wheels that do not stand where the controller's names say; none for none."""
-    wrong = []
-    for slot, index in wheels.items():
-        wheel = robot.measured[index]
-        x, y = wheel.position
-        if wheel.x is not None and (x > 0, y > 0) != (slot.startswith("front"), slot.endswith("left")):
-            wrong.append(f"{slot} is {wheel.name}")
-    return (f"the rollers form an O seen from above, so that {', '.join(wrong)}",) if wrong else ()
-
-
-def _slots(robot: Robot) -> tuple[dict[str, int], list[float]]:
-    """The wheel (index) in each place of the controller, and the sign (N,) of each wheel's rate driving forward."""
+def _corners(robot: Robot) -> tuple[dict[str, int], list[float]]:
+    """The wheel (index) in each corner of the controller, and the sign (N,) of each wheel's rate driving forward."""
     equations = robot.signal_equations
     signs = np.sign(equations[:, 0])
-    found = {}
+    wheels = {}
     for index, (sign, row) in enumerate(zip(signs, equations, strict=True)):
-        place = next((slot for slot, pattern in _SLOTS.items() if (sign * np.sign(row) == pattern).all()), None)
-        if place is not None and robot.measured[index].kind == "mecanum":
-            found[place] = index
-    if len(found) < 4 or len(robot.measured) > 4:
+        corner = next((name for name, pattern in _CORNERS.items() if (sign * np.sign(row) == pattern).all()), None)
+        if corner is not None and robot.measured[index].kind == "mecanum":
+            wheels[corner] = index
+    if len(wheels) < 4 or len(robot.measured) > 4:
         raise ConfigError(
             "ros2_controllers: mecanum_drive_controller needs one mecanum wheel in each corner, with rollers that form "
             f"an X or an O seen from above; {', '.join(robot.wheel_names)} do not; check roller angles, or use c_header"
         )
-    return {slot: found[slot] for slot in _SLOTS}, signs.tolist()
-
-
-_SPACING_TOLERANCE = math.radians(10)  # rad, largest deviation from equal spacing; chosen
+    return {corner: wheels[corner] for corner in _CORNERS}, signs.tolist()
 
 
 @dataclass(frozen=True)
 class OmniWheelDrive:
-    """The controller's parameters: order of the wheels (indices), radii in m, offset in rad.
+    """The parameters of omni_wheel_drive_controller: order of the wheels (indices), radii in m, offset in rad.
 
-    clockwise (N,): True for a wheel whose positive rate turns the robot clockwise, as the controller has it.
+    The controller solves, by least squares over its wheels i = 0 .. N-1, counted counter-clockwise,
+
+        wheel_radius * omega_i = sin(t_i) vx - cos(t_i) vy - robot_radius w,    t_i = wheel_offset + 2 pi i / N     (6)
+
+    (odometry.cpp of the package, 2025), which with omega_i negated is the wheel equation of omnibench: its positive
+    rate turns the robot clockwise. clockwise (N,): True for a wheel whose positive rate turns the robot clockwise, as
+    the controller has it.
     """
 
     order: tuple[int, ...]
@@ -628,19 +578,43 @@ class OmniWheelDrive:
 def closest_omni_wheel_drive(robot: Robot, matrix: Array) -> OmniWheelDrive:
     """The parameters whose matrix is closest to ``matrix`` (3, N) in the sum of squares of each row.
 
+    The matrix of Eq. (6) is, in columns,
+
+        m1 + i m2 = (2 r / N) i exp(i t_i),    m3 = r / (N R),                                         (7)
+
+    so the closest one is found in closed form: r exp(i wheel_offset) from rows 1 and 2, then R from the mean of row 3.
+
     Raises ConfigError for a robot that the controller cannot describe: fewer than three wheels, wheels farther than 10
     degrees from equal spacing, or a matrix that turns the robot clockwise.
     """
-    clockwise = tuple(wheel.lever < 0 for wheel in robot.measured)
-    order = _counter_clockwise(robot)
-    count = len(order)
-    slots = np.exp(-2j * np.pi * np.arange(count) / count) / 1j
+    wheels = robot.measured
+    count = len(wheels)
+    if count < 3:
+        raise ConfigError("ros2_controllers: omni_wheel_drive_controller needs three wheels or more; use c_header")
+    # Order counter-clockwise from the first wheel on.
+    clockwise = tuple(wheel.lever < 0 for wheel in wheels)
+    angles = np.array([wheel.axle if wheel.lever > 0 else wheel.axle + math.pi for wheel in wheels])
+    turned = np.mod(angles - angles[0], 2 * np.pi)
+    # By rounding, the first wheel or one at the same angle may be a full turn away.
+    turned[np.isclose(turned, 2 * np.pi)] = 0.0
+    order = np.argsort(turned, kind="stable")
+    away = turned[order] - 2 * np.pi * np.arange(count) / count
+    away -= (away.max() + away.min()) / 2
+    if np.abs(away).max() > _SPACING_TOLERANCE:
+        raise ConfigError(
+            f"ros2_controllers: omni_wheel_drive_controller needs wheels at equal angles, and these are up to "
+            f"{math.degrees(np.abs(away).max()):.0f} degrees off "
+            f"({', '.join(f'{value:.4g}' for value in np.degrees(angles))} deg); use c_header"
+        )
     columns = np.where(clockwise, -matrix, matrix)[:, order]
+    slots = np.exp(-2j * np.pi * np.arange(count) / count) / 1j
     scaled = complex(((columns[0] + 1j * columns[1]) * slots).sum() / 2)
     turn = float(columns[2].mean())
     if turn <= 0 or abs(scaled) == 0:
-        raise ConfigError("ros2_controllers: the matrix does not turn this robot counter-clockwise; check wheel signs")
-    return OmniWheelDrive(order, abs(scaled) / (count * turn), abs(scaled), float(np.angle(scaled)), clockwise)
+        raise ConfigError(_NO_TURN)
+    return OmniWheelDrive(
+        tuple(order.tolist()), abs(scaled) / (count * turn), abs(scaled), float(np.angle(scaled)), clockwise
+    )
 
 
 def omni_wheel_drive(robot: Robot, matrix: Array) -> Controller:
@@ -654,8 +628,8 @@ def omni_wheel_drive(robot: Robot, matrix: Array) -> Controller:
         "calibration: reverse the joints' axes"
     )
     if any(fitted.clockwise):
-        kept = [name for name, turns in zip(robot.wheel_names, fitted.clockwise, strict=True) if turns]
-        sign += f", but not of {', '.join(kept)}"
+        as_they_are = [name for name, turns in zip(robot.wheel_names, fitted.clockwise, strict=True) if turns]
+        sign += f", but not of {', '.join(as_they_are)}"
     return Controller(
         "omni_wheel_drive_controller",
         (
@@ -675,38 +649,29 @@ def omni_wheel_drive(robot: Robot, matrix: Array) -> Controller:
     )
 
 
-def _counter_clockwise(robot: Robot) -> tuple[int, ...]:
-    """Indices of the wheels in counter-clockwise order from the first one on."""
-    wheels = robot.measured
-    if len(wheels) < 3:
-        raise ConfigError("ros2_controllers: omni_wheel_drive_controller needs three wheels or more; use c_header")
-    angles = np.array([wheel.axle if wheel.lever > 0 else wheel.axle + math.pi for wheel in wheels])
-    turned = np.mod(angles - angles[0], 2 * np.pi)
-    # By rounding, the first wheel or one at the same angle may be a full turn away.
-    turned[np.isclose(turned, 2 * np.pi)] = 0.0
-    order = np.argsort(turned, kind="stable")
-    slots = 2 * np.pi * np.arange(len(order)) / len(order)
-    away = turned[order] - slots
-    away -= (away.max() + away.min()) / 2
-    if np.abs(away).max() > _SPACING_TOLERANCE:
-        raise ConfigError(
-            f"ros2_controllers: omni_wheel_drive_controller needs wheels at equal angles, and these are up to "
-            f"{math.degrees(np.abs(away).max()):.0f} degrees off ({_degrees(angles)}); use c_header"
-        )
-    return tuple(int(index) for index in order)
-
-
-def _degrees(angles: Array) -> str:
-    return ", ".join(f"{value:.4g}" for value in np.degrees(angles)) + " deg"
-
-
-_STRAIGHT = math.radians(0.01)  # rad per m, of straight driving; chosen
-_WORTH_IT = 0.5  # of the heading error in straight driving: an offset that leaves more is not noted; chosen
-
-
 def tricycle(robot: Robot, matrix: Array) -> Controller:
-    """The controller closest to a matrix (3, M) of the robot's centre. ConfigError: it cannot describe this robot."""
-    name, base, wheelbase = _steered(robot)
+    """The tricycle_controller closest to a matrix (3, M) of the robot's centre. ConfigError: none can describe it.
+
+    With the rate omega and the angle alpha of its one driven and steered wheel the controller computes, in the middle
+    of the axle of the wheels that do not steer,
+
+        v = r omega cos alpha,    w = r omega sin alpha / L,    r = wheel_radius, L = wheelbase        (8)
+
+    (odometry.cpp of the package, 2022 to 2026). On the signals (omega cos alpha, omega sin alpha) its matrix has the
+    elements r and r / L and else zeros, which are the closest parameters.
+    """
+    steered = [wheel for wheel in robot.measured if wheel.has_steering]
+    if len(robot.motions) == 3 or len(steered) > 1:
+        names = ", ".join(wheel.name for wheel in steered)
+        raise ConfigError(
+            "ros2_controllers: no released controller of ros2_controllers holds this robot, which drives by the "
+            f"steered wheels {names}; c_header does"
+        )
+    # The base frame in the middle of the axle, and the steered wheel's distance ahead of it.
+    name, (x, y) = steered[0].name, steered[0].position
+    motions, _ = driven_motions(robot)
+    base = Mount(x=-float(motions[-1, 1]), y=y)
+    wheelbase = x - base.x
     forward = math.copysign(1.0, wheelbase)
     signals = robot.drive.names
     reading = np.zeros((2, len(signals)))
@@ -714,12 +679,8 @@ def tricycle(robot: Robot, matrix: Array) -> Controller:
     seen = base.twist @ as_read(robot, matrix, reading)
     radius, turn = float(seen[0, 0]), float(seen[2, 1])
     if radius <= 0 or turn <= 0:
-        raise ConfigError(
-            "ros2_controllers: the matrix does not drive this robot ahead and turn it counter-clockwise; check the "
-            "signs of the wheel and of its steering angle"
-        )
-    offset = _offset(robot, seen, reading, base, abs(wheelbase))
-    unread = [wheel for wheel in robot.wheel_names if wheel != name]
+        raise ConfigError(f"{_WRONG_WAY}the signs of the wheel and of its steering angle")
+    offset = _steering_offset(robot, seen, reading, base, abs(wheelbase))
     return Controller(
         "tricycle_controller",
         (
@@ -729,81 +690,47 @@ def tricycle(robot: Robot, matrix: Array) -> Controller:
             Parameter("wheel_radius", radius, "m"),
             Parameter("open_loop", "false"),
         ),
-        _held(radius, turn, 0.0) @ reading,
+        _tricycle_matrix(radius, turn, 0.0) @ reading,
         "one wheel radius and one wheelbase",
         "traction_joint_name and steering_joint_name",
         notes=(
-            *reversed_joints([name] if forward < 0 else [], "steering "),
+            *joint_notes([name] if forward < 0 else [], [], "steering "),
             *offset,
-            *([f"the controller does not read {', '.join(unread)}"] if unread else []),
-            "the controller takes the steering angle at a sample's end, the calibration in its middle",
+            *joint_notes([], [wheel for wheel in robot.wheel_names if wheel != name]),
+            _TAKES_END,
         ),
         base=base,
         lever=not offset,
     )
 
 
-def _steered(robot: Robot) -> tuple[str, Mount, float]:
-    """The steered wheel, the base frame in the middle of the axle, and the wheel's distance ahead of it, m."""
-    steered = [wheel for wheel in robot.measured if wheel.has_steering]
-    if len(robot.motions) == 3 or len(steered) > 1:
-        names = ", ".join(wheel.name for wheel in steered)
-        raise ConfigError(
-            "ros2_controllers: no released controller of ros2_controllers holds this robot, which drives by the "
-            f"steered wheels {names}; c_header does"
-        )
-    wheel = steered[0]
-    x, y = wheel.position
-    motions, _ = driven_motions(robot)
-    base = Mount(x=-float(motions[-1, 1]), y=y)
-    return wheel.name, base, x - base.x
-
-
-def _held(radius: float, turn: float, offset: float) -> Array:
-    """The controller's matrix (3, 2), Eq. (1), if the wheel's angle is larger by an offset, rad."""
+def _tricycle_matrix(radius: float, turn: float, offset: float) -> Array:
+    """The controller's matrix (3, 2), Eq. (8), if the wheel's angle is larger by an offset, rad. turn: r / L."""
     cosine, sine = math.cos(offset), math.sin(offset)
     return np.array([[radius * cosine, -radius * sine], [0.0, 0.0], [turn * sine, turn * cosine]])
 
 
-def _offset(robot: Robot, seen: Array, reading: Array, base: Mount, wheelbase: float) -> tuple[str, ...]:
-    """The note on a steering offset, Eq. (2), that would leave less; none for none."""
+def _steering_offset(robot: Robot, seen: Array, reading: Array, base: Mount, wheelbase: float) -> tuple[str, ...]:
+    """The note on an offset of the steering angle that would leave less; none for none.
+
+    tricycle_controller has no such offset: if the wheel stands at alpha + beta, the columns of row 1 are
+    r (cos beta, -sin beta) and those of row 3 (r / L) (sin beta, cos beta), so that z1 = k_11 - i k_12 and
+    z3 = k_32 + i k_31 have the phase beta. Where the joint's zero can be turned, the offset comes closest that makes
+    largest
+
+        (Re z1 e^(-i beta))^2 + (L Re z3 e^(-i beta))^2.                                               (9)
+    """
     ahead, turning = complex(seen[0, 0], -seen[0, 1]), complex(seen[2, 1], seen[2, 0])
     offset = cmath.phase(ahead**2 + (wheelbase * turning) ** 2) / 2
     back = cmath.exp(-1j * offset)
     radius, turn = (ahead * back).real, (turning * back).real
-    before, left = (
-        remaining_error(robot, held @ reading, seen @ reading, base)
-        for held in (_held(seen[0, 0], seen[2, 1], 0.0), _held(radius, turn, offset))
+    before, after = (
+        remaining_error(robot, matrix @ reading, seen @ reading, base)
+        for matrix in (_tricycle_matrix(seen[0, 0], seen[2, 1], 0.0), _tricycle_matrix(radius, turn, offset))
     )
-    if before.straight_heading < _STRAIGHT or left.straight_heading > _WORTH_IT * before.straight_heading:
+    if before.straight_heading < _STRAIGHT or after.straight_heading > _WORTH_IT * before.straight_heading:
         return ()
     return (
         f"with {math.degrees(offset):+.3f} deg added to the angle of the steering joint (its zero in the driver), "
-        f"wheelbase {radius / turn:.6f} and wheel_radius {radius:.6f} would leave {left}",
+        f"wheelbase {radius / turn:.6f} and wheel_radius {radius:.6f} would leave {after}",
     )
-
-
-def ros2_controllers(calibration: Calibration) -> tuple[str, tuple[str, ...], str]:
-    """The controller's parameters as YAML, warnings of what they cannot hold, and the controller's name.
-
-    ConfigError: no controller can describe this robot.
-    """
-    fitted = controller(calibration.robot, calibration.matrix_without_effects)
-    design = controller(calibration.robot, calibration.robot.inverse_kinematic_matrix)
-    return *document(calibration, fitted, design), fitted.name
-
-
-def controller(robot: Robot, matrix: Array) -> Controller:
-    """The controller of a robot, closest to a matrix (3, M) of its tracked point. ConfigError: there is none."""
-    return _closest(robot)(robot, of_centre(robot, matrix))
-
-
-def _closest(robot: Robot) -> Callable[[Robot, Array], Controller]:
-    kinds = {wheel.kind for wheel in robot.measured}
-    if isinstance(robot.drive, CarDrive):
-        return car
-    if "steered" in kinds:
-        return tricycle
-    if "fixed" in kinds:
-        return diff_drive
-    return mecanum_drive if "mecanum" in kinds else omni_wheel_drive
