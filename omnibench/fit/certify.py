@@ -1,100 +1,13 @@
 """Certificate of optimality: a proven bound on how much better than a calibration any matrix in a box could be.
 
 Branch and bound on the matrix elements (Horst and Tuy, Global Optimization, 1996, ch. IV): the parts P that the box is
-cut into have the bounds b(P) of fit/certify.py, and M is the best matrix that is known. At any time
+cut into have the lower bounds b(P) of the class LowerBounds, which rest on sums over the samples (StampSums) and on a
+dual solution (least_sum_of_norms); M is the best matrix that is known. At any time
 
     min over P of b(P)  <=  least cost in the box  <=  F(M)                                        (C1)
     gap = 1 - min b(P) / F(M).                                                                     (C2)
 
 The part with the lowest bound, which alone can raise the minimum, is cut in two until the gap is as small as wanted.
-
-Sums over the samples up to each stamp, of which a lower bound is made, and the error of computing them.
-
-At row 3 = m3 + d, with the angles a_k that sample k drives and c_k before it along the fitted directions,
-
-    S_sj(d) = sum_k a_kj exp(i (m3.C_k + d.c_k)),   dS_sj/dd_l = i sum_k a_kj c_kl exp(...)        (S1)
-    |d^2 S_sj / dd_l dd_m| <= sum_k |a_kj c_kl c_km|.                                              (S2)
-
-An Euler step is one sample k. An arc is an integral along the sample, taken by Gauss-Legendre quadrature with enough
-nodes that its error (evaluator.py) sums up to q = 1e-9 m at most over a run, for every matrix of the box.
-
-Rounding: with u = 2^-53, n additions into one number are wrong by less than 1.01 n u of the largest magnitude that
-their partial sums have (Higham, Accuracy and Stability of Numerical Algorithms, 2002, sections 3.1 and 4.2). With L the
-longest path of the box (m) and A the largest heading that it allows at any sample (rad), partial sums of phases are at
-most A and those of the sums at most L: the phases are wrong by at most 1.01 n u A, hence the sums by 1.01 n u (1 + A)
-L. In a part of the box the slopes are multiplied by delta with |delta.c_k| <= C, the bounds of curvature by C^2 / 2.
-Offsets and headings are differences of numbers of size P. Altogether the rounding is below
-
-    e = 8 n u (1 + L) (2 + A) (1 + C)^2 (1 + P).                                                   (S3)
-
-The factor 8 covers the few operations on each term; n are the samples, the stamps and 1000 for all else, which are some
-dozens.
-
-Lower bounds of a sum of norms over a box of matrices.
-
-The cost of a matrix M is
-
-    F(M) = sum_s share_s |W e_s(M)|                                                              (B1)
-
-with e_s the pose error (x, y, heading) at stamp s and W the diagonal matrix of its weights. Duality of the norm
-(|v| >= u.v for |u| <= 1) bounds it by a function that is simpler: for any vectors u_s in the unit ball
-
-    F(M) >= phi(M) = sum_s share_s u_s.W e_s(M).                                                 (B2)
-
-The choice of u_s decides how tight the bound is, not whether it holds.
-
-Matrices are M = M0 + D Q with the design M0 and orthonormal directions Q (r, N) of the wheel rates that are fitted, so
-that four wheels on three degrees of freedom have r = 3, too. A part of the box bounds the deviations D (3, r); where
-r < N the whole is the least such part that contains the box, so that the bound holds, but stays apart from the least
-cost of the box if the part holds a better matrix. With
-zeta_j = D_1j + i D_2j, the driven angles a_k of sample k and c_k before it, both along Q, position errors x + iy are
-
-    o_s + S_s0(d) + sum_j zeta_j S_sj(d),   S_sj(d) = sum_k a_kj exp(i (m3.C_k + d.c_k)),        (B3)
-
-d being row 3 of D, a_k0 the design's own displacement and m3.C_k its heading; heading errors are linear in d. Summed
-over the stamps with v_s = share_s (W u_s)_x - i share_s (W u_s)_y,
-
-    phi = k_0 + k.d + Re H_0(d) + sum_j Re(zeta_j H_j(d)),   H_j(d) = sum_s v_s S_sj(d).         (B4)
-
-About the middle of the part, d = middle + delta with |delta_l| <= rho_l, each H_j is expanded once. From
-|exp(ix) - 1 - ix| <= x^2 / 2
-
-    H_j(d) = H_j + dH_j.delta + R_j,   |R_j| <= 1/2 sum_lm rho_l rho_m B_jlm,                    (B5)
-    B_jlm = sum_s |v_s| sum_k |a_kj c_kl c_km|.
-
-Without the R_j, phi is linear in delta for given zeta and linear in zeta for given delta. Its least value over the box
-of zeta is a minimum of functions that are linear in delta, so that it is concave in delta and least at a corner of the
-box of delta (Al-Khayyal and Falk, Math. Oper. Res. 8:273, 1983; Horst and Tuy, Global Optimization, 1996, ch. I). With
-h_j = H_j + dH_j.delta there,
-
-    L = min over the corners of  k_0 + k.d + Re(H_0 + dH_0.delta)
-        + sum_j [min over D_1j of D_1j Re h_j + min over D_2j of -D_2j Im h_j]                   (B6)
-    F >= L - 1/2 sum_lm rho_l rho_m (B_0lm + sum_j max|zeta_j| B_jlm) - w (q + e),               (B7)
-
-w the largest weight, q the error of the quadrature of arcs and e that of rounding (certify.py). u_s with heading
-components alone have H = 0: they are taken where others prove nothing beyond the part that was cut, as in wide boxes.
-
-The part is cut where its width takes most from (B7), which is at most
-
-    row 1: width_j sum_l |Re dH_jl| rho_l,   row 2: width_j sum_l |Im dH_jl| rho_l,              (B8)
-    row 3: both, summed over j, and rho_l sum_m (B_0lm + sum_j max|zeta_j| B_jlm) rho_m.
-
-Vectors u_s in the unit ball that make a lower bound tight: the dual solution of a sum of norms in a box.
-
-The bound holds for any u_s; the best are u_s = e_s / |e_s| at the minimiser of the sum of norms
-
-    sum_s share_s |e_s|,   e_s = r_s + J_s v,   lower <= v <= upper,                              (D1)
-
-because sum_s share_s J_s^T u_s vanishes there (or points out of the box), so that phi does not fall with v. Iteratively
-reweighted least squares (Daubechies, DeVore, Fornasier and Guentuerk, Comm. Pure Appl. Math. 63:1, 2010) minimises
-
-    sum_s share_s w_s |r_s + J_s v|^2   with   w_s = 1 / sqrt(|e_s|^2 + eps^2)                    (D2)
-
-at the e_s before, with eps falling in steps. The residuals times w_s of the last step,
-
-    u_s = w_s e_s,                                                                                (D3)
-
-solve its normal equations exactly, so that they are balanced even where residuals vanish.
 """
 
 from __future__ import annotations
@@ -134,17 +47,58 @@ from omnibench.views import Brief
 # m: error of the quadrature of arcs, which bounds subtract: a millionth of the millimetre that poses are known to.
 # Half of it and twice move a bound by 6e-6 of the gap that is asked for (tests/studies/constants_fit.py).
 QUADRATURE = 1e-9
+# These numbers change how tight a bound is, not whether it holds. In tests/studies/constants_fit.py each is halved
+# and doubled: _SMOOTHING and _SETTLED then move the bound by 4 % and 0.3 % of the gap that is asked for, the others not
+# at all.
+_STEPS = 25  # steps of the reweighted least squares
+_SMOOTHING = 3.0  # digits: eps falls to this negative power of ten of the mean norm
+# The reweighting ends when no deviation changes by more, in units in which the normal equations' diagonal is 1.
+_SETTLED = 1e-5
+_RIDGE = 1e-13  # added to the normalised normal equations, which are singular where the data leave a direction open
+_INSIDE = 1 - 1e-14  # length of the vectors: the margin covers the rounding of their norm, some 1e-15
+# m or rad per rad: slope of phi that is assumed beside Eq. (B8), so that a part whose width does no harm to first order
+# is cut all the same. It decides only where nothing else does: a proof has the same parts with half of it and with
+# twice (tests/studies/constants_fit.py).
+_IMBALANCE = 1e-9
+_TIMED = 3  # parts whose mean time stands for that of all: the whole box and its first two parts
+# Parts of proofs to a gap of 0.1 %: the median and the fewest of twelve of simulated data (61 to 379), and the 901 of
+# the real omni3 in the box paper. A tenth of the gap takes about twice as many (tests/studies/proof_parts.py).
+_PARTS, _FEW_PARTS, _MANY_PARTS = 150, 60, 900
+_PARTS_GAP = 1e-3
+# Parts that are cut at once by a backend, and how often each, however many workers it has: a cut takes 10 to 20 ms, to
+# send what it needs as much again (chosen).
+_AT_ONCE, _CUTS = 8, 32
 
 
 class StampSums:
-    """The sums of Eq. (S1). curvature (S, 1 + r, r, r): bounds of their second derivatives, Eq. (S2).
+    """Sums over the samples up to each stamp, on which a lower bound rests, and the error of computing them.
 
-    fitted (r, N): orthonormal directions of wheel rates. elements: a box that holds all matrices of the problem's box.
-    ConfigError where arcs are too long for the quadrature.
+    At row 3 = m3 + d, with the angles a_k that sample k drives and c_k before it along the fitted directions,
+
+        S_sj(d) = sum_k a_kj exp(i (m3.C_k + d.c_k)),   dS_sj/dd_l = i sum_k a_kj c_kl exp(...)        (S1)
+        |d^2 S_sj / dd_l dd_m| <= sum_k |a_kj c_kl c_km|.                                              (S2)
+
+    An Euler step is one sample k. An arc is an integral along the sample, taken by Gauss-Legendre quadrature with
+    enough nodes that its error (fit/evaluator.py) sums up to q = 1e-9 m at most over a run, for every matrix of the
+    box.
+
+    Rounding: with u = 2^-53, n additions into one number are wrong by less than 1.01 n u of the largest magnitude that
+    their partial sums have (Higham, Accuracy and Stability of Numerical Algorithms, 2002, sections 3.1 and 4.2). With L
+    the longest path of the box (m) and A the largest heading that it allows at any sample (rad), partial sums of phases
+    are at most A and those of the sums at most L: the phases are wrong by at most 1.01 n u A, hence the sums by 1.01 n
+    u (1 + A) L. In a part of the box the slopes are multiplied by delta with |delta.c_k| <= C, the bounds of curvature
+    by C^2 / 2. Offsets and headings are differences of numbers of size P. Altogether the rounding is below
+
+        e = 8 n u (1 + L) (2 + A) (1 + C)^2 (1 + P).                                                   (S3)
+
+    The factor 8 covers the few operations on each term; n are the samples, the stamps and 1000 for all else, which are
+    some dozens.
+
+    curvature (S, 1 + r, r, r): the bounds of Eq. (S2). fitted (r, N): orthonormal directions of wheel rates. elements:
+    a box that holds all matrices of the problem's box. ConfigError where arcs are too long for the quadrature.
     """
 
     def __init__(self, problem: CalibrationProblem, fitted: Array, elements: ElementBox) -> None:
-        design = problem.start.reshape(3, -1)
         logs = problem.objective.logs(problem.trajectories)
         integration = problem.integration
         paths = _Paths(logs, integration) if are_many(logs) else [make_path(log, integration) for log in logs]
@@ -153,12 +107,15 @@ class StampSums:
         if nodes is None:
             raise ConfigError("samples turn too far for a lower bound with arcs; use integration euler")
         self._quadrature = QUADRATURE if integration == "arc" else 0.0
-        columns = _Columns(paths, [float(log.start[2]) for log in logs], design, fitted, row, integration, nodes)
-        self._runs: Iterable[_RunColumns] = columns if isinstance(paths, _Paths) else list(columns)
-        self.curvature = np.concatenate([of_run.curvature for of_run in self._runs])
-        reaches = np.array([[(np.abs(path.angles) @ speed).sum(), _most(path.before, row)] for path in paths])
-        longest, angle = reaches.max(axis=0).tolist()
-        self._farthest = np.max([np.abs(of_run.turns).max(axis=0) for of_run in self._runs], axis=0)  # |c|: (r,)
+        headings = [float(log.start[2]) for log in logs]
+        runs = _Runs(paths, headings, problem.start.reshape(3, -1), fitted, row, integration, nodes)
+        self._runs: Iterable[_RunColumns] = runs if isinstance(paths, _Paths) else list(runs)
+        self.curvature = np.concatenate([run.curvature for run in self._runs])
+        reaches = [
+            ((np.abs(path.angles) @ speed).sum(), (np.abs(path.before) @ row).max(initial=0.0)) for path in paths
+        ]
+        longest, angle = np.array(reaches).max(axis=0).tolist()
+        self._farthest = np.max([np.abs(run.turns).max(axis=0) for run in self._runs], axis=0)  # |c|: (r,)
         additions = nodes * max(len(path.angles) for path in paths) + len(self.curvature) + 1000
         self._rounding = 4 * np.finfo(float).eps * additions * (1 + longest) * (2 + angle)  # eps = 2 u
 
@@ -167,7 +124,7 @@ class StampSums:
 
         The first of the 1 + r is the design's displacement, the others are the regressors of rows 1 and 2.
         """
-        sums = np.concatenate([of_run.up_to_stamps(row_3) for of_run in self._runs])  # (S, (2 + r)(1 + r))
+        sums = np.concatenate([run.up_to_stamps(row_3) for run in self._runs])  # (S, (2 + r)(1 + r))
         size = len(row_3)
         parts = sums.reshape(len(sums), 1 + size, 2 + size)
         whole = np.concatenate([parts[:, :, :1] + 1j * parts[:, :, 1:2], parts[:, :, 2:]], axis=2)
@@ -182,11 +139,6 @@ class StampSums:
         return self._quadrature + self._rounding * (1 + turned) ** 2 * (1 + size)
 
 
-def _most(before: Array, row: Array) -> float:
-    """The largest heading, rad, that a row of magnitudes allows at the pieces of a path."""
-    return float((np.abs(before) @ row).max(initial=0.0))
-
-
 @dataclass(frozen=True, eq=False)
 class _Paths:
     """The paths of logs, made anew whenever they are gone through, as their samples are read then."""
@@ -199,7 +151,7 @@ class _Paths:
 
 
 @dataclass(frozen=True, eq=False)
-class _Columns:
+class _Runs:
     """Terms of the sums of each run, computed whenever it is gone through.
 
     headings: of the runs' starts, rad. row: the largest magnitudes of row 3. Else as in StampSums.
@@ -214,22 +166,20 @@ class _Columns:
     nodes: int
 
     def __iter__(self) -> Iterator[_RunColumns]:
-        for path, heading in zip(self.paths, self.headings, strict=True):
-            yield self._of(path, heading)
-
-    def _of(self, path: Path, heading: float) -> _RunColumns:
         design, fitted = self.design, self.fitted
-        (whole,) = cut(path, self.row, np.inf)
-        # One row of zeros more: the sum up to a stamp at the end, or at t = 0, then begins at a row that exists.
-        angles, before = (
-            np.vstack([np.reshape(part, (-1, design.shape[1])), np.zeros((1, design.shape[1]))])
-            for part in impulses(path, whole, self.integration, self.nodes)
-        )
-        moved, turns = angles @ (design[0] + 1j * design[1]), before @ fitted.T
-        sources = np.column_stack([moved.real, moved.imag, angles @ fitted.T])
-        columns = np.concatenate([sources, *(sources * turn[:, None] for turn in turns.T)], axis=1)
-        sizes = np.column_stack([np.abs(moved), np.abs(angles @ fitted.T)])
-        return _RunColumns(columns, before @ design[2] + heading, turns, path.ends * self.nodes, sizes)
+        nothing = np.zeros((1, design.shape[1]))
+        for path, heading in zip(self.paths, self.headings, strict=True):
+            (whole,) = cut(path, self.row, np.inf)
+            # One row of zeros more: the sum up to a stamp at the end, or at t = 0, then begins at a row that exists.
+            angles, before = (
+                np.vstack([np.reshape(part, (-1, design.shape[1])), nothing])
+                for part in impulses(path, whole, self.integration, self.nodes)
+            )
+            moved, along, turns = angles @ (design[0] + 1j * design[1]), angles @ fitted.T, before @ fitted.T
+            sources = np.column_stack([moved.real, moved.imag, along])
+            columns = np.concatenate([sources, *(sources * turn[:, None] for turn in turns.T)], axis=1)
+            sizes = np.column_stack([np.abs(moved), np.abs(along)])
+            yield _RunColumns(columns, before @ design[2] + heading, turns, path.ends * self.nodes, sizes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,8 +198,8 @@ class _RunColumns:
     def curvature(self) -> Array:
         """Bounds (S, 1 + r, r, r) of the second derivatives, Eq. (S2)."""
         pairs = np.einsum("ij,il,im->ijlm", self.sizes, np.abs(self.turns), np.abs(self.turns))
-        sums: Array = np.cumsum(np.roll(pairs, 1, axis=0), axis=0)[self.ends]  # the row of zeros comes first
-        return sums
+        sums = np.cumsum(np.roll(pairs, 1, axis=0), axis=0)  # the row of zeros comes first
+        return np.asarray(sums[self.ends])
 
     def up_to_stamps(self, row_3: Array) -> Complex:
         """Sums (S, c) of columns (n, c) times exp(i (phase + turns.row_3)) up to each stamp."""
@@ -267,17 +217,6 @@ class _RunColumns:
         return np.cumsum(between, axis=0)
 
 
-# These numbers change how tight a bound is, not whether it holds. In tests/studies/constants_fit.py each is halved
-# and doubled: _SMOOTHING and _SETTLED then move the bound by 4 % and 0.3 % of the gap that is asked for, the others not
-# at all.
-_STEPS = 25  # steps of the reweighted least squares
-_SMOOTHING = 3.0  # digits: eps falls to this negative power of ten of the mean norm
-# The reweighting ends when no deviation changes by more, in units in which the normal equations' diagonal is 1.
-_SETTLED = 1e-5
-_RIDGE = 1e-13  # added to the normalised normal equations, which are singular where the data leave a direction open
-_INSIDE = 1 - 1e-14  # length of the vectors: the margin covers the rounding of their norm, some 1e-15
-
-
 class Minimum(NamedTuple):
     """An approximate minimiser (n,) of Eq. (D1) and its directions (S, k), Eq. (D3)."""
 
@@ -288,7 +227,26 @@ class Minimum(NamedTuple):
 def least_sum_of_norms(
     residuals: Array, jacobian: Array, shares: Array, lower: Array, upper: Array, begin: Array
 ) -> Minimum:
-    """Minimise sum_s shares_s |residuals_s + jacobian_s v| over v (n,) in the box; residuals (S, k)."""
+    """Minimum over v (n,) in a box of a sum of norms, with the vectors u_s of the best bound, its dual solution.
+
+    The bound holds for any u_s; the best are u_s = e_s / |e_s| at the minimiser of the sum of norms
+
+        sum_s share_s |e_s|,   e_s = r_s + J_s v,   lower <= v <= upper,                              (D1)
+
+    because sum_s share_s J_s^T u_s vanishes there (or points out of the box), so that phi does not fall with v.
+    Iteratively reweighted least squares (Daubechies, DeVore, Fornasier and Guentuerk, Comm. Pure Appl. Math. 63:1,
+    2010) minimises
+
+        sum_s share_s w_s |r_s + J_s v|^2   with   w_s = 1 / sqrt(|e_s|^2 + eps^2)                    (D2)
+
+    at the e_s before, with eps falling in steps. The residuals times w_s of the last step,
+
+        u_s = w_s e_s,                                                                                (D3)
+
+    solve its normal equations exactly, so that they are balanced even where residuals vanish.
+
+    residuals (S, k), jacobian (S, k, n), shares (S,), lower, upper and begin (n,).
+    """
     free = (upper > lower) & (np.abs(jacobian).max(axis=(0, 1)) > 0)
     point = np.clip(begin, lower, upper)
     errors = residuals + jacobian @ point
@@ -302,10 +260,10 @@ def least_sum_of_norms(
         normal, target = weighted.T @ columns, weighted.T @ fixed.ravel()
         scale = 1 / np.sqrt(np.diag(normal))
         factor = np.linalg.cholesky(normal * np.outer(scale, scale) + _RIDGE * np.eye(len(scale))).T
-        wanted = -np.linalg.solve(factor.T, scale * target)
-        best = scale * np.linalg.solve(factor, wanted)
+        solved = -np.linalg.solve(factor.T, scale * target)
+        best = scale * np.linalg.solve(factor, solved)
         if (best < lower[free]).any() or (best > upper[free]).any():
-            best = lsq_linear(factor / scale, wanted, (lower[free], upper[free]), method="bvls").x
+            best = lsq_linear(factor / scale, solved, (lower[free], upper[free]), method="bvls").x
         settled = 1 + step / 2 > _SMOOTHING and np.abs((best - point[free]) / scale).max() < _SETTLED
         point[free] = np.clip(best, lower[free], upper[free])
         errors = fixed + moving @ point[free]
@@ -326,12 +284,6 @@ def into_unit_ball(directions: Array) -> tuple[Array, Array, Array]:
     return directions / max(1.0, float(lengths.max())) * _INSIDE, one_by_one, of_length_one
 
 
-# m or rad per rad: slope of phi that is assumed beside Eq. (B8), so that a part whose width does no harm to first order
-# is cut all the same. It decides only where nothing else does: a proof has the same parts with half of it and with
-# twice (tests/studies/constants_fit.py).
-_IMBALANCE = 1e-9
-
-
 @dataclass(frozen=True, eq=False)
 class Node(ElementBox):
     """A part of the box, given by its deviations (3, r), with its proven bound.
@@ -346,7 +298,55 @@ class Node(ElementBox):
 
 
 class LowerBounds:
-    """Lower bounds of a problem's cost over parts of its box.
+    """Lower bounds of a problem's cost, a sum of norms, over parts of its box.
+
+    The cost of a matrix M is
+
+        F(M) = sum_s share_s |W e_s(M)|                                                              (B1)
+
+    with e_s the pose error (x, y, heading) at stamp s and W the diagonal matrix of its weights. Duality of the norm
+    (|v| >= u.v for |u| <= 1) bounds it by a function that is simpler: for any vectors u_s in the unit ball
+
+        F(M) >= phi(M) = sum_s share_s u_s.W e_s(M).                                                 (B2)
+
+    The choice of u_s decides how tight the bound is, not whether it holds.
+
+    Matrices are M = M0 + D Q with the design M0 and orthonormal directions Q (r, N) of the wheel rates that are fitted,
+    so that four wheels on three degrees of freedom have r = 3, too. A part of the box bounds the deviations D (3, r);
+    where r < N the whole is the least such part that contains the box, so that the bound holds, but stays apart from
+    the least cost of the box if the part holds a better matrix. With zeta_j = D_1j + i D_2j, the driven angles a_k of
+    sample k and c_k before it, both along Q, position errors x + iy are
+
+        o_s + S_s0(d) + sum_j zeta_j S_sj(d),   S_sj(d) = sum_k a_kj exp(i (m3.C_k + d.c_k)),        (B3)
+
+    d being row 3 of D, a_k0 the design's own displacement and m3.C_k its heading; heading errors are linear in d.
+    Summed over the stamps with v_s = share_s (W u_s)_x - i share_s (W u_s)_y,
+
+        phi = k_0 + k.d + Re H_0(d) + sum_j Re(zeta_j H_j(d)),   H_j(d) = sum_s v_s S_sj(d).         (B4)
+
+    About the middle of the part, d = middle + delta with |delta_l| <= rho_l, each H_j is expanded once. From |exp(ix) -
+    1 - ix| <= x^2 / 2
+
+        H_j(d) = H_j + dH_j.delta + R_j,   |R_j| <= 1/2 sum_lm rho_l rho_m B_jlm,                    (B5)
+        B_jlm = sum_s |v_s| sum_k |a_kj c_kl c_km|.
+
+    Without the R_j, phi is linear in delta for given zeta and linear in zeta for given delta. Its least value over the
+    box of zeta is a minimum of functions that are linear in delta, so that it is concave in delta and least at a corner
+    of the box of delta (Al-Khayyal and Falk, Math. Oper. Res. 8:273, 1983; Horst and Tuy, Global Optimization, 1996,
+    ch. I). With h_j = H_j + dH_j.delta there,
+
+        L = min over the corners of  k_0 + k.d + Re(H_0 + dH_0.delta)
+            + sum_j [min over D_1j of D_1j Re h_j + min over D_2j of -D_2j Im h_j]                   (B6)
+        F >= L - 1/2 sum_lm rho_l rho_m (B_0lm + sum_j max|zeta_j| B_jlm) - w (q + e),               (B7)
+
+    w the largest weight, q the error of the quadrature of arcs and e that of rounding, Eq. (S3). u_s with heading
+    components alone have H = 0: they are taken where others prove nothing beyond the part that was cut, as in wide
+    boxes.
+
+    The part is cut where its width takes most from (B7), which is at most
+
+        row 1: width_j sum_l |Re dH_jl| rho_l,   row 2: width_j sum_l |Im dH_jl| rho_l,              (B8)
+        row 3: both, summed over j, and rho_l sum_m (B_0lm + sum_j max|zeta_j| B_jlm) rho_m.
 
     ConfigError for another parameterisation than the matrix, or a cost that is no sum of norms.
     """
@@ -366,8 +366,13 @@ class LowerBounds:
                 "no bound is known, and their calibration cannot be certified"
             )
         self._design = problem.start.reshape(3, -1)
-        self._fitted = _complement(parameterisation.null, self._design.shape[1])
-        self._box = self._deviations_of_box(problem)
+        # Orthonormal directions (r, N) of wheel rates across the null ones, the unit vectors if there are none.
+        null, unit = parameterisation.null, np.eye(self._design.shape[1])
+        self._fitted = unit if len(null) == 0 else np.linalg.svd(unit - null.T @ null)[2][: len(unit) - len(null)]
+        # The least part (3, r) whose deviations contain those of all vectors in the problem's box.
+        low, high = (bound.reshape(3, -1) - self._design for bound in (problem.lower, problem.upper))
+        positive, negative = np.maximum(self._fitted, 0).T, np.minimum(self._fitted, 0).T
+        self._box = ElementBox(low @ positive + high @ negative, high @ positive + low @ negative)
         owner = odometry.trajectory
         self._shares = objective.shares(owner)
         self._weights = np.array(objective.weights)
@@ -406,18 +411,22 @@ class LowerBounds:
         matrix: Array = self._design + deviations @ self._fitted
         return matrix.ravel()
 
-    def _deviations_of_box(self, problem: CalibrationProblem) -> ElementBox:
-        """The least part (3, r) whose deviations contain those of all vectors in the problem's box."""
-        low = problem.lower.reshape(3, -1) - self._design
-        high = problem.upper.reshape(3, -1) - self._design
-        positive, negative = np.maximum(self._fitted, 0).T, np.minimum(self._fitted, 0).T
-        return ElementBox(low @ positive + high @ negative, high @ positive + low @ negative)
-
     def _node(self, part: ElementBox, near: Array, proven: float = 0.0) -> Node:
         """A part of the box with its bound; near (3, r): first guess of a good matrix; proven: bound of the whole."""
         begin = np.clip(near, part.lower, part.upper)
         sums, slopes = self._stamps.at(part.centre[2])
-        residuals, jacobian = self._linearised(part, sums, slopes, begin[:2])
+        # Weighted errors (S, 3) of the part's middle in row 3 and no deviation in rows 1 and 2, and their slopes
+        # (S, 3, 3r) at rows 1 and 2 of the first guess, Eq. (B3) and (B5).
+        moved, driving = self._offset + sums[:, 0], sums[:, 1:]
+        turning = slopes[:, 0] + np.einsum("sjl,j->sl", slopes[:, 1:], begin[0] + 1j * begin[1])
+        errors = np.stack([moved.real, moved.imag, self._heading + self._turned @ part.centre[2]], axis=1)
+        still = np.zeros_like(driving.real)
+        x = np.concatenate([driving.real, -driving.imag, turning.real], axis=1)
+        y = np.concatenate([driving.imag, driving.real, turning.imag], axis=1)
+        heading = np.concatenate([still, still, self._turned], axis=1)
+        residuals = errors * self._weights
+        jacobian = np.stack([x, y, heading], axis=1) * self._weights[:, None]
+        # The dual solution of the sum of norms, and the best of the bounds that its directions prove.
         middle = part.centre * [[0.0], [0.0], [1.0]]
         box = (part.lower - middle).ravel(), (part.upper - middle).ravel(), (begin - middle).ravel()
         point, directions = least_sum_of_norms(residuals, jacobian, self._shares, *box)
@@ -426,29 +435,9 @@ class LowerBounds:
         if self._weights[2] and bound <= proven:
             turns = least_sum_of_norms(residuals[:, 2:], jacobian[:, 2:], self._shares, *box).directions
             headings = np.column_stack([np.zeros((len(turns), 2)), turns])
-            proven = max(proven, *(self._dual_bound(part, sums, slopes, each)[0] for each in into_unit_ball(headings)))
+            bounds = [self._dual_bound(part, sums, slopes, scaled) for scaled in into_unit_ball(headings)]
+            proven = max(proven, *(by_headings for by_headings, _ in bounds))
         return Node(part.lower, part.upper, max(proven, bound), point.reshape(3, -1) + middle, looseness)
-
-    def _linearised(self, part: ElementBox, sums: Complex, slopes: Complex, rows_12: Array) -> tuple[Array, Array]:
-        """Weighted errors (S, 3) of the part's middle in row 3 and no deviation in rows 1 and 2, and their slopes.
-
-        The slopes (S, 3, 3r) are those at rows 1 and 2 of ``rows_12`` (2, r), Eq. (B3) and (B5).
-        """
-        zeta = rows_12[0] + 1j * rows_12[1]
-        moved = self._offset + sums[:, 0]
-        turning = slopes[:, 0] + np.einsum("sjl,j->sl", slopes[:, 1:], zeta)
-        driving = sums[:, 1:]
-        residuals = np.stack([moved.real, moved.imag, self._heading + self._turned @ part.centre[2]], axis=1)
-        still = np.zeros_like(driving.real)
-        jacobian = np.stack(
-            [
-                np.concatenate([driving.real, -driving.imag, turning.real], axis=1),
-                np.concatenate([driving.imag, driving.real, turning.imag], axis=1),
-                np.concatenate([still, still, self._turned], axis=1),
-            ],
-            axis=1,
-        )
-        return residuals * self._weights, jacobian * self._weights[:, None]
 
     def _dual_bound(self, part: ElementBox, sums: Complex, slopes: Complex, directions: Array) -> tuple[float, Array]:
         """Bound (B7) of a part for u_s = ``directions`` (S, 3), and its looseness (3, r), Eq. (B8)."""
@@ -475,24 +464,6 @@ class LowerBounds:
         in_row_3 = bilinear.sum(axis=(0, 1)) + reach * (bending @ reach + _IMBALANCE)
         error = float(np.abs(self._weights).max()) * self._stamps.error(reach, self._size)
         return float(total.min() - remainder - error), np.vstack([in_rows_12, in_row_3])  # Eq. (B7), (B8)
-
-
-def _complement(null: Array, wheels: int) -> Array:
-    """Orthonormal directions (r, N) of wheel rates across the null ones; the unit vectors if there are none."""
-    if len(null) == 0:
-        return np.eye(wheels)
-    _, _, directions = np.linalg.svd(np.eye(wheels) - null.T @ null)
-    return directions[: wheels - len(null)]
-
-
-_TIMED = 3  # parts whose mean time stands for that of all: the whole box and its first two parts
-# Parts of proofs to a gap of 0.1 %: the median and the fewest of twelve of simulated data (61 to 379), and the 901 of
-# the real omni3 in the box paper. A tenth of the gap takes about twice as many (tests/studies/proof_parts.py).
-_PARTS, _FEW_PARTS, _MANY_PARTS = 150, 60, 900
-_PARTS_GAP = 1e-3
-# Parts that are cut at once by a backend, and how often each, however many workers it has: a cut takes 10 to 20 ms, to
-# send what it needs as much again (chosen).
-_AT_ONCE, _CUTS = 8, 32
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -608,8 +579,8 @@ def certify_optimum(
     def foretell(event: Progress) -> None:
         watch(event)
         if event.done == _TIMED and (parts or math.inf) > _TIMED and gap > 0:  # to a gap of 0 the limits end it
-            each = (time.perf_counter() - began) / _TIMED
-            watch(Progress("duration", result=_duration_in_words(gap, each, seconds, parts)))
+            of_part = (time.perf_counter() - began) / _TIMED
+            watch(Progress("duration", result=_duration_in_words(gap, of_part, seconds, parts)))
 
     known = vector if inside else problem.start
     proof = prove(problem, known, gap=gap, seconds=seconds, parts=parts, watch=foretell, backend=backend)
@@ -684,61 +655,41 @@ def prove(
 
 
 def _cut_at_once(
-    boxes: list[tuple[float, int, Node]], bounds: LowerBounds, wanted: float, left: float, backend: Backend
+    boxes: list[tuple[float, int, Node]], bounds: LowerBounds, enough: float, allowed: float, backend: Backend
 ) -> tuple[list[Node], int]:
     """Take the lowest parts and cut each as a job: the parts that they become, and how many were bounded for that.
 
-    wanted: bound from which on a part needs no cut. left: parts that may still be bounded.
+    enough: bound from which on a part needs no cut. allowed: parts that may still be bounded.
     """
-    taken = [heapq.heappop(boxes)[2]]
-    while boxes and len(taken) < _AT_ONCE and boxes[0][0] < wanted and boxes[0][2].looseness.any():
-        taken.append(heapq.heappop(boxes)[2])
-    cuts = _CUTS if math.isinf(left) else int(min(_CUTS, max(left // (2 * len(taken)), 1)))
-    branches = gathered(backend, _branch, [(bounds, node, wanted, cuts) for node in taken], shared=(bounds,))
-    return [node for branch in branches for node in branch.nodes()], sum(branch.made for branch in branches)
+    lowest = [heapq.heappop(boxes)[2]]
+    while boxes and len(lowest) < _AT_ONCE and boxes[0][0] < enough and boxes[0][2].looseness.any():
+        lowest.append(heapq.heappop(boxes)[2])
+    cuts = _CUTS if math.isinf(allowed) else int(min(_CUTS, max(allowed // (2 * len(lowest)), 1)))
+    branches = gathered(backend, _branch, [(bounds, node, enough, cuts) for node in lowest], shared=(bounds,))
+    return [node for nodes, _ in branches for node in nodes], sum(made for _, made in branches)
 
 
-@dataclass(frozen=True, eq=False)
-class _Branch:
-    """The parts (P) that a node was cut into: deviations, good matrices, loosenesses (P, 3, r) and bounds (P,).
+def _branch(order: tuple[LowerBounds, Node, float, int], _: Reporter) -> tuple[list[Node], int]:
+    """Cut a node in a job, its lowest part first, until all bounds reach the one that is enough, or so many times.
 
-    made: parts that were bounded on the way.
+    Returns the parts, and how many were bounded on the way.
     """
-
-    lower: Array
-    upper: Array
-    good: Array
-    looseness: Array
-    bound: Array
-    made: int
-
-    def nodes(self) -> Iterator[Node]:
-        """The parts."""
-        fields = (self.lower, self.upper, self.bound, self.good, self.looseness)
-        for low, high, bound, good, loose in zip(*fields, strict=True):
-            yield Node(low, high, float(bound), good, loose)
-
-
-def _branch(order: tuple[LowerBounds, Node, float, int], _: Reporter) -> _Branch:
-    """Cut a node in a job, its lowest part first, until all bounds reach the wanted one, or so many times."""
-    bounds, node, wanted, cuts = order
+    bounds, node, enough, cuts = order
     boxes, made = [(node.bound, 0, node)], 0
-    while made < 2 * cuts and boxes[0][0] < wanted and boxes[0][2].looseness.any():
+    while made < 2 * cuts and boxes[0][0] < enough and boxes[0][2].looseness.any():
         for part in bounds.split(heapq.heappop(boxes)[2]):
             made += 1
             heapq.heappush(boxes, (part.bound, made, part))
-    parts = [part for _, _, part in boxes]
-    names = ("lower", "upper", "good", "looseness", "bound")
-    return _Branch(**{name: np.array([getattr(part, name) for part in parts]) for name in names}, made=made)
+    return [part for _, _, part in boxes], made
 
 
-def _duration_in_words(gap: float, each: float, seconds: float, parts: int | None) -> str:
-    """How long a proof takes that examines a part in ``each`` s, and when it ends at the latest."""
+def _duration_in_words(gap: float, of_part: float, seconds: float, parts: int | None) -> str:
+    """Duration of a proof that examines a part in ``of_part`` s, and when it ends at the latest, in words."""
     growth = 2 ** math.log10(_PARTS_GAP / gap)
     about, least, most = (growth * number for number in (_PARTS, _FEW_PARTS, _MANY_PARTS))
     limits = [f"{seconds:g} s"] * math.isfinite(seconds) + [f"{parts} parts"] * (parts is not None)
     words = (
-        f"a proof to within {gap:.3g} of the cost takes about {each * about:.2g} s here ({each * least:.2g} to "
-        f"{each * most:.2g} s: {least:.0f} to {most:.0f} parts at {each:.2g} s)"
+        f"a proof to within {gap:.3g} of the cost takes about {of_part * about:.2g} s here ({of_part * least:.2g} to "
+        f"{of_part * most:.2g} s: {least:.0f} to {most:.0f} parts at {of_part:.2g} s)"
     )
     return f"{words}; it ends after {' or '.join(limits)} at the latest" if limits else words

@@ -17,6 +17,8 @@ from omnibench.robot.model import OdometryModel
 from omnibench.words import plural
 
 TWO_WHEELS = "differential drives with two measured wheels"
+_OFF_CORNER = 0.15  # share of the side: farthest of a square's odometry from its corners; a circle's is 1 (chosen)
+_OFF_TURN = 0.5  # rad by which the odometry's whole turn may be off one (chosen: 7 degrees at each corner)
 
 
 def has_two_wheels(robot: Robot) -> bool:
@@ -62,27 +64,6 @@ def with_axle(robot: Robot, radii: Mapping[str, float], length: float) -> Robot:
     return robot.model_copy(update={"wheels": tuple(wheels)})
 
 
-def with_diameter_ratio(robot: Robot, ratio: float, length: float) -> Robot:
-    """The robot with diameters in a ratio, right to left, their mean kept, and its axle times a factor.
-
-    With E_d the ratio and D the mean, D_right = 2 D / (1 + 1/E_d) and D_left = 2 D / (1 + E_d) (Borenstein and Feng,
-    IEEE T-RA 12:869, 1996); where the design's differ, each is multiplied.
-    """
-    sides = sides_of_axle(robot)
-    return with_axle(robot, {name: 2 / (1 + ratio ** float(np.sign(side))) for name, side in sides.items()}, length)
-
-
-def left_and_right(robot: Robot) -> tuple[str, str]:
-    """Name and radius, mm, of the left wheel and of the right one."""
-    sides = sides_of_axle(robot)
-    left, right = sorted(robot.measured, key=lambda wheel: -sides[wheel.name])
-    return f"{left.name} {1000 * left.radius:.3f}", f"{right.name} {1000 * right.radius:.3f}"
-
-
-_OFF_CORNER = 0.15  # share of the side: farthest of a square's odometry from its corners; a circle's is 1 (chosen)
-_OFF_TURN = 0.5  # rad by which the odometry's whole turn may be off one (chosen: 7 degrees at each corner)
-
-
 @dataclass(frozen=True)
 class Square:
     """A square that was driven.
@@ -113,9 +94,17 @@ class SquaresBothWays:
         return f"{len(self.clockwise)} clockwise and {len(self.counter)} counter-clockwise squares of {self.side:.2f} m"
 
     def solution(self, robot: Robot, wheelbase: float, diameters: float) -> Solution:
-        """The robot with the wheelbase times a factor E_b and the wheels' diameters in a ratio E_d, right to left."""
-        corrected = with_diameter_ratio(robot, diameters, wheelbase)
-        left, right = left_and_right(corrected)
+        """The robot with the wheelbase times a factor E_b and the wheels' diameters in a ratio E_d, right to left.
+
+        With the mean D of the diameters, D_right = 2 D / (1 + 1/E_d) and D_left = 2 D / (1 + E_d) (Borenstein and Feng,
+        IEEE T-RA 12:869, 1996); where the design's differ, each is multiplied.
+        """
+        sides = sides_of_axle(robot)
+        factors = {name: 2 / (1 + diameters ** float(np.sign(side))) for name, side in sides.items()}
+        corrected = with_axle(robot, factors, wheelbase)
+        sides = sides_of_axle(corrected)
+        wheels = sorted(corrected.measured, key=lambda wheel: -sides[wheel.name])
+        left, right = (f"{wheel.name} {1000 * wheel.radius:.3f}" for wheel in wheels)
         return Solution(
             corrected.inverse_kinematic_matrix.ravel(),
             f"wheelbase {1000 * axle_length(corrected):.1f} mm (E_b {wheelbase:.4f}), radii {left} and {right} mm "
@@ -132,8 +121,8 @@ def squares_both_ways(problem: CalibrationProblem) -> SquaresBothWays:
     stamps = [np.append(run.times[run.times < run.end], run.end) for run in runs]
     model = OdometryModel.of_design(problem.robot, problem.integration)
     paths = model.poses([run.log(np.append(0.0, times)) for run, times in zip(runs, stamps, strict=True)])
-    found = [_square(problem.robot, run, path) for run, path in zip(runs, paths, strict=True)]
-    squares = [square for square in found if square is not None]
+    driven = (_square(problem.robot, run, path) for run, path in zip(runs, paths, strict=True))
+    squares = [square for square in driven if square is not None]
     clockwise = tuple(square for square in squares if square.way < 0)
     counter = tuple(square for square in squares if square.way > 0)
     if not clockwise or not counter:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -30,6 +30,11 @@ from omnibench.views import Shown
 from omnibench.words import noun_for, plural
 
 _SHOWN = 6  # runs that are named; the rest are counted (chosen: two lines of a terminal)
+_PARTS = 5  # of the commands, each left out once by cross-validation
+_FEWEST_CROSSED = 4  # runs, below which nothing can be left out
+_MOST = 120  # runs that quick fits look at; chosen: a second
+# Share of what a quick fit gains on all runs: a model that gains less is not judged by quick fits. Chosen.
+_AS_GOOD = 0.9
 _MEANINGS = {"better": "better than the design", "worse": "worse than the design: do not use"}
 _BASES = {"held_out": "held out", "cross_validation": "cross-validated"}
 _HOLD_OUT = (
@@ -44,18 +49,6 @@ def nothing_held_out(reason: str = "no run was held out") -> HeldOutVerdict:
     return HeldOutVerdict(verdict="unknown", sentence=sentence, detail=f"to have it said, {_HOLD_OUT}")
 
 
-def unfitted_runs(dataset: Dataset, fitted: Collection[str]) -> tuple[Trajectory, ...]:
-    """The runs of a data set that are not among those fitted to another, which are given by their fingerprints.
-
-    A run with the wheel samples of a fitted run is that run with a reference made anew, unless fitted runs share theirs
-    (commanded rates, or simulated ones without noise).
-    """
-    runs, wheels = set(fitted), {fingerprint[:WHEEL_DIGITS] for fingerprint in fitted}
-    if len(wheels) < len(runs):
-        return tuple(run for run in dataset.trajectories if run.fingerprint not in runs)
-    return tuple(run for run in dataset.trajectories if run.fingerprint[:WHEEL_DIGITS] not in wheels)
-
-
 def judge(
     design: Array,
     calibrated: Array,
@@ -65,7 +58,7 @@ def judge(
 ) -> HeldOutVerdict:
     """The verdict by the final pose errors (Z, 3), m, m, rad, of the design values and of the calibration.
 
-    Of runs without poses they are what ``final_errors`` of evaluate.py says. basis: as in HeldOutVerdict.
+    Of runs without poses they are what ``final_errors`` says. basis: as in HeldOutVerdict.
     """
     if not runs:
         return nothing_held_out()
@@ -82,7 +75,15 @@ def judge(
         float(np.hypot(errors[:, 0], errors[:, 1])[placed].mean()) for errors in (design, calibrated) if placed.any()
     ]
     headings = [float(np.abs(errors[:, 2])[turned].mean()) for errors in (design, calibrated) if turned.any()]
-    changes = [*([_lengths(*positions)] if positions else []), *([_angles(*headings)] if headings else [])]
+    changes = []
+    if positions:
+        factor, unit = (1.0, "m") if max(positions) >= 1 else (1e3, "mm")
+        changes.append(_change(factor * positions[0], factor * positions[1], unit))
+    if headings:
+        changes.append(_change(math.degrees(headings[0]), math.degrees(headings[1]), "deg"))
+    names = ", ".join(run.id for run in runs[:_SHOWN])
+    if len(runs) > _SHOWN:
+        names += f" and {len(runs) - _SHOWN} more"
     meaning = (
         _MEANINGS[verdict] if verdict != "undecided" else _undecided(gain, units, same=bool((costs == before).all()))
     )
@@ -101,7 +102,7 @@ def judge(
         units=units.count,
         method=units.method,
         sentence=f"{_BASES[basis]} ({plural(len(runs), 'run')}): {', '.join([*changes, meaning])}",
-        detail=f"{_gain_in_words(gain, units)}{noun_for(len(runs), 'run')}: {_named(runs)}",
+        detail=f"{_gain_in_words(gain, units)}{noun_for(len(runs), 'run')}: {names}",
     )
 
 
@@ -129,32 +130,11 @@ def _gain_in_words(gain: Interval | None, units: Units) -> str:
     return f"Eq. (6) {'falls' if gain.value >= 0 else 'rises'} by {100 * abs(gain.value):.1f} % ({basis}); "
 
 
-def _named(runs: Sequence[Trajectory]) -> str:
-    rest = f" and {len(runs) - _SHOWN} more" if len(runs) > _SHOWN else ""
-    return ", ".join(run.id for run in runs[:_SHOWN]) + rest
-
-
-def _lengths(before: float, after: float) -> str:
-    """Two lengths in the unit and with the decimals that show the larger and the smaller: ``22 mm -> 33 mm``."""
-    factor, unit = (1.0, "m") if max(before, after) >= 1 else (1e3, "mm")
-    return _change(factor * before, factor * after, unit)
-
-
-def _angles(before: float, after: float) -> str:
-    return _change(math.degrees(before), math.degrees(after), "deg")
-
-
 def _change(before: float, after: float, unit: str) -> str:
+    """Two values with the decimals that show the smaller: ``22 mm -> 33 mm``."""
     smaller = min(value for value in (before, after, 1e3) if value > 0)
     decimals = min(3, max(0, 1 - math.floor(math.log10(smaller))))
     return f"{before:.{decimals}f} {unit} -> {after:.{decimals}f} {unit}"
-
-
-_PARTS = 5  # of the commands, each left out once by cross-validation
-_FEWEST_CROSSED = 4  # runs, below which nothing can be left out
-_MOST = 120  # runs that quick fits look at; chosen: a second
-# Share of what a quick fit gains on all runs: a model that gains less is not judged by quick fits. Chosen.
-_AS_GOOD = 0.9
 
 
 class ReferenceErrors(Model):
@@ -232,13 +212,16 @@ def evaluate(calibration: Calibration, dataset: Dataset) -> Evaluation:
     sessions = compare_sessions(calibration.model, dataset.trajectories)
     held_out, unknown = _held_out(calibration, dataset)
     provenance, tested = calibration.provenance, {run.id for run in held_out or ()}
-    known = provenance is not None and (provenance.fitted is not None or provenance.dataset_hash == dataset.hash)
-    training = [run for run in dataset.trajectories if known and run.id not in tested]
+    runs_known = provenance is not None and (provenance.fitted is not None or provenance.dataset_hash == dataset.hash)
+    training = [run for run in dataset.trajectories if runs_known and run.id not in tested]
+    unfitted = None
+    if held_out is not None:
+        unfitted = {name: len(tested & {run.id for run in group}) for name, group in groups.items()}
     verdict = nothing_held_out(unknown) if unknown else verdict_on(calibration.model, training, held_out or ())
     warning = extrapolation_warning(calibration, dataset.trajectories)
     return Evaluation(
         dataset=dataset.name,
-        loss=calibration.provenance.loss if calibration.provenance else None,
+        loss=provenance.loss if provenance else None,
         simulated=dataset.simulated,
         trajectories=len(dataset.trajectories),
         splits={
@@ -246,7 +229,7 @@ def evaluate(calibration: Calibration, dataset: Dataset) -> Evaluation:
             for name, group in groups.items()
         },
         design={name: designed.on(group) for name, group in groups.items()},
-        unfitted=None if held_out is None else {name: _count(held_out, group) for name, group in groups.items()},
+        unfitted=unfitted,
         held_out=verdict,
         sessions=(*sessions.sentences, *sessions.doubts),
         warnings=() if warning is None else (warning,),
@@ -267,18 +250,19 @@ def _held_out(calibration: Calibration, dataset: Dataset) -> tuple[Sequence[Traj
     if provenance.dataset_hash == dataset.hash:
         return runs, ""
     if provenance.fitted is not None:
-        runs = unfitted_runs(dataset, provenance.fitted)
+        # A run with the wheel samples of a fitted run is that run with a reference made anew, unless fitted runs share
+        # theirs (commanded rates, or simulated ones without noise).
+        fitted = set(provenance.fitted)
+        wheels = {fingerprint[:WHEEL_DIGITS] for fingerprint in fitted}
+        digits = None if len(wheels) < len(fitted) else WHEEL_DIGITS
+        seen = fitted if digits is None else wheels
+        runs = tuple(run for run in dataset.trajectories if run.fingerprint[:digits] not in seen)
         samples = "the wheel samples of a run that the calibration was fitted to"
         return runs, "" if runs else f"every run of {dataset.name} has {samples}"
     if provenance.dataset == dataset.name:
         changed = f"the data set {dataset.name} or its split was changed after the fit"
         return None, f"{changed}, so that which runs were fitted is not known"
     return runs or dataset.trajectories, ""
-
-
-def _count(runs: Sequence[Trajectory], group: Sequence[Trajectory]) -> int:
-    """The number of runs that are in a group."""
-    return len({run.id for run in runs} & {run.id for run in group})
 
 
 def verdict_on(model: OdometryModel, training: Sequence[Trajectory], held_out: Sequence[Trajectory]) -> HeldOutVerdict:
@@ -311,7 +295,7 @@ def verdict_on(model: OdometryModel, training: Sequence[Trajectory], held_out: S
         fitted = replace(model, matrix=quick_fit(model.robot, rest, model.integration))
         errors.append((final_errors(design, out), final_errors(fitted, out)))
         parts += out
-    before, after = (np.concatenate(each) for each in zip(*errors, strict=True))
+    before, after = (np.concatenate(of_parts) for of_parts in zip(*errors, strict=True))
     crossed = judge(before, after, parts, basis="cross_validation")
     beside = f"no run was held out from this fit; {verdict.detail}"
     if held_out:
@@ -376,9 +360,14 @@ class ModelErrors:
         errors = self.of_runs(trajectories)
         positions, headings = positions_and_headings(errors)
         placed, turned = measured_parts(trajectories)
+        cost = costs.create("final_pose")  # Eq. (6)
+        if any(run.references is not None for run in trajectories):
+            value = cost.of_model(self.model, trajectories)
+        else:
+            value = float(cost.combine(errors[None], np.arange(len(errors)))[0])
         return SplitErrors(
             trajectories=len(trajectories),
-            cost=self._cost(trajectories, errors),
+            cost=value,
             position_mean_m=float(positions[placed].mean()) if placed.any() else None,
             position_max_m=float(positions[placed].max()) if placed.any() else None,
             heading_mean_rad=float(headings[turned].mean()) if turned.any() else None,
@@ -395,10 +384,3 @@ class ModelErrors:
                 for kind, of_kind in errors_by_kind(self.model, trajectories).items()
             ),
         )
-
-    def _cost(self, trajectories: Sequence[Trajectory], errors: Array) -> float:
-        """Eq. (6) of some of the runs."""
-        cost = costs.create("final_pose")
-        if any(run.references is not None for run in trajectories):
-            return cost.of_model(self.model, trajectories)
-        return float(cost.combine(errors[None], np.arange(len(errors)))[0])

@@ -1,60 +1,33 @@
 """Poses of many candidate matrices at once, from moments of the wheel angles that were summed up once.
 
-For a given row 3 of the matrix positions are linear in rows 1 and 2 (odometry.py), and their regressors
+For a given row 3 of the matrix positions are linear in rows 1 and 2 (odometry.py): the displacement up to a stamp is
+the sum of exponentials
 
-    G_j(m3) = sum_i a_ij exp(i m3.c_i)
+    x + iy = sum_i (m1 + i m2).a_i exp(i m3.c_i),                                                 (1)
 
-are smooth functions of row 3 alone. Over a box they are expanded once in Chebyshev polynomials, of which a singular
-value decomposition leaves some hundred combinations (evaluator.py). The poses of a population then are two matrix
+an impulse a_i (wheel angles driven, rad) in the heading that the robot has after the wheel angles c_i. The regressors
+
+    G_j(m3) = sum_i a_ij exp(i m3.c_i)                                                            (2)
+
+are smooth functions of row 3 alone. Over a box they are expanded once in Chebyshev polynomials (the class Basis), of
+which a singular value decomposition leaves some hundred combinations. The poses of a population then are two matrix
 products, whatever the sampling rate. A recording whose heading the box turns too far for one expansion is cut into
-segments, each in the frame of its anchor, whose heading is linear in row 3 too; they are joined in the end.
-Runs that are read from files have an evaluator for each part of them.
-
-Recordings and matrices in the coordinates of the directions that the recordings drive.
-
-Along directions that a calibration keeps at the design K0, matrices do not differ. With orthonormal rows Q (r, M) of
-the others, a matrix K moves the robot by
-
-    K u = (K Q') (Q u) + K0 (u - Q'Q u),                                                          (1)
-
-so that it is a matrix of r + 3 columns, K Q' and the identity, for the signals Q u and the design's twist by the rest.
-The evaluator's expansion grows fast with the number of columns whose row 3 varies, which are then r in the place of M:
-three for a mecanum base that does not slip, and for a swerve base whose modules are steered as they should be.
-
-Odometry as a sum of exponentials, and its cutting into segments that one expansion can express.
-
-The displacement up to a stamp is x + iy = sum_i (m1 + i m2).a_i exp(i m3.c_i): an impulse a_i (wheel angles driven,
-rad) in the heading that the robot has after the wheel angles c_i. An Euler step is one impulse. An arc is an integral
-of exp(i m3.c) along the sample, taken by Gauss-Legendre quadrature, whose error is bounded by
-
-    |error| <= |(m1 + i m2).a| * (q!)^4 / ((2q + 1) (2q)!^3) * (m3.a)^(2q)      for q nodes.
-
-Plan of the expansion of recordings: the cut into segments that makes a candidate cheapest.
-
-Chebyshev expansion of sums of exponentials exp(i m3.c) over a box of row 3, with a proven bound of its error.
-
-With m3 = centre + reach * d and d in [-1, 1]^N, each exponential is exp(i centre.c) times a product over the wheels of
-(Jacobi-Anger)
-
-    exp(i z d) = J_0(z) + 2 sum_n i^n J_n(z) T_n(d),        z = reach_j c_j.
-
-Terms of total degree above D are left out. From |J_n(z)| <= |z/2|^n / n! they sum to at most
-2^N sum_{n > D} (zeta/2)^n / n!, zeta = sum_j |z_j|.
+segments, each in the frame of its anchor, whose heading is linear in row 3 too; they are joined in the end. Of the
+cuts the one is taken that makes a candidate cheapest (make_plan). Runs that are read from files have an evaluator for
+each part of them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import product
 from math import comb, factorial
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from omnibench.fit.parameterisation import MatrixElements, ParameterisationName
+from omnibench.fit.parameterisation import MatrixElements, Parameterisation, ParameterisationName
 from omnibench.processes import one_thread
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Complex, Integration, OdometryBatch, WheelLog
@@ -65,14 +38,38 @@ from omnibench.robot.stored_odometry import together
 # a third at most (tests/studies/constants_fit.py).
 _MARGIN = 0.1
 _WIDENED = 1e-9, 1e-15  # shares of the reach and of a row's largest element by which a box is widened against rounding
-
-
-class _Matrices(Protocol):
-    """What a box is made around."""
-
-    @property
-    def name(self) -> ParameterisationName: ...
-    def matrices(self, vectors: Array) -> Array: ...
+# Nodes of the quadrature, at most: samples that need more turn by radians. Half of it and twice change nothing
+# (tests/studies/constants_fit.py).
+_MOST_NODES = 8
+# Pieces of a segment, at most, so that the time of cutting is linear in the length of a recording. Half of it and twice
+# change nothing (tests/studies/constants_fit.py).
+_LONGEST_SEGMENT = 4096
+# Terms of a basis, at most: it bounds memory. Half of it and twice choose the same bases
+# (tests/studies/constants_fit.py).
+_MOST_TERMS = 3000
+# rad: beyond it the power series of J_n loses digits, since its alternating terms add up to I_0(4) = 11 (Abramowitz and
+# Stegun 1964, 9.1.10 and 9.6.10). Half of it and twice choose the same bases (tests/studies/constants_fit.py).
+_LARGEST_ANGLE = 4.0
+_LAST_TERM = 1e-17  # share of the first term of a power series: less than a tenth of the rounding of its sum
+# Largest error of a position by truncation, by quadrature and by the decomposition, as shares of the longest path (at
+# least 1 m): some ten times the rounding of direct integration. They bound sums of absolute values; half of each and
+# twice change costs by 1e-13 m and the memory by a tenth at most (tests/studies/constants_fit.py).
+_TRUNCATION, _QUADRATURE, _DECOMPOSITION = 1e-12, 1e-12, 5e-12
+# The numbers from here on decide only which way is faster (bench_evaluator.py). Half of each and twice change costs by
+# 5e-14 m and the memory by less than a factor of two (tests/studies/constants_fit.py).
+# How far the box may turn the heading of a segment about its anchor, rad; infinity leaves recordings whole.
+_LIMITS = (np.inf, 2.0, 1.0, 0.5, 0.25)
+# Time that a sample of direct integration, a segment and a term of the basis take, in units of one multiplication and
+# addition of a matrix product.
+_SAMPLE, _SEGMENT, _TERM = 400.0, 1000.0, 100.0
+_MOST_BYTES = 48e6  # bytes of the large matrix product, at most
+_RANK, _POWER = 1.65, 0.7  # likely rank of the decomposition of n terms: a power law through omnibench's recordings
+_NO_WIDTH = 1e-14  # share of row 3's largest element: one with less width in the box is fixed, up to rounding
+# Share of the largest pose: rounding of a direct sum of some thousand samples, which the check allows beside the bound.
+_ROUNDING = 1e-12
+# Values of the large product at a time, 2 MB, so that they stay in the processor's cache. It changes the order of sums
+# alone, hence costs by 1e-16 m (tests/studies/constants_fit.py); bench_evaluator.py measures the speed.
+_BLOCK = 250_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +80,7 @@ class ElementBox:
     upper: Array
 
     @classmethod
-    def of(cls, parameterisation: _Matrices, lower: Array, upper: Array) -> ElementBox:
+    def of(cls, parameterisation: Parameterisation | DrivenFrame, lower: Array, upper: Array) -> ElementBox:
         """The box around the matrices of all vectors between ``lower`` and ``upper`` (n,).
 
         It holds all of them where the matrix is linear in the vector, and nearly all where it is curved.
@@ -113,13 +110,23 @@ class ElementBox:
     @property
     def speed(self) -> Array:
         """The largest |m1j + i m2j| (N,) in the box, m per rad."""
-        speed: Array = np.hypot(*self.largest[:2])
-        return speed
+        return np.asarray(np.hypot(*self.largest[:2]))
 
 
 @dataclass(frozen=True, eq=False)
 class DrivenFrame:
-    """The coordinates: ``driven`` Q (r, M), and the design K0 (3, M) of Eq. (1)."""
+    """Coordinates of recordings and matrices: the directions that the recordings drive.
+
+    Along directions that a calibration keeps at the design K0, matrices do not differ. With orthonormal rows Q (r, M)
+    of the others, a matrix K moves the robot by
+
+        K u = (K Q') (Q u) + K0 (u - Q'Q u),                                                      (3)
+
+    so that it is a matrix of r + 3 columns, K Q' and the identity, for the signals Q u and the design's twist by the
+    rest. The evaluator's expansion grows fast with the number of columns whose row 3 varies, which are then r in the
+    place of M: three for a mecanum base that does not slip, and for a swerve base whose modules are steered as they
+    should be. driven: Q. design: K0 (3, M).
+    """
 
     searched: MatrixElements
     driven: Array
@@ -153,14 +160,6 @@ class DrivenFrame:
             rest = (log.signals - along @ self.driven) @ self.design.T
             moved.append(replace(log, rates=np.hstack([along, rest]), wheel_angles=None, steering=None, drive=None))
         return moved
-
-
-# Nodes of the quadrature, at most: samples that need more turn by radians. Half of it and twice change nothing
-# (tests/studies/constants_fit.py).
-_MOST_NODES = 8
-# Pieces of a segment, at most, so that the time of cutting is linear in the length of a recording. Half of it and twice
-# change nothing (tests/studies/constants_fit.py).
-_LONGEST_SEGMENT = 4096
 
 
 @dataclass(frozen=True)
@@ -209,6 +208,11 @@ def quadrature(
 ) -> int | None:
     """Gauss-Legendre nodes that a piece needs for an error of at most ``tolerance`` (m) over a path; None: too many.
 
+    An Euler step is one impulse of Eq. (1). An arc is an integral of exp(i m3.c) along the sample, whose error with q
+    nodes is bounded by
+
+        |error| <= |(m1 + i m2).a| * (q!)^4 / ((2q + 1) (2q)!^3) * (m3.a)^(2q).                   (4)
+
     row (N,): the largest absolute elements of row 3; weight (N,): those of rows 1 and 2 together (m per rad).
     """
     if integration == "euler":
@@ -251,28 +255,18 @@ def impulses(path: Path, segment: Segment, integration: Integration, nodes: int)
     before = path.before[segment.first : segment.last, None, :] - segment.anchor
     if integration == "euler":
         return angles, before
-    place, share = _gauss_legendre(nodes)
-    return angles * share[:, None], before + angles * place[:, None]
-
-
-def _gauss_legendre(nodes: int) -> tuple[Array, Array]:
-    """Places and weights on [0, 1]."""
-    place, weight = np.polynomial.legendre.leggauss(nodes)
-    return (place + 1) / 2, weight / 2
-
-
-# Terms of a basis, at most: it bounds memory. Half of it and twice choose the same bases
-# (tests/studies/constants_fit.py).
-_MOST_TERMS = 3000
-# rad: beyond it the power series of J_n loses digits, since its alternating terms add up to I_0(4) = 11 (Abramowitz and
-# Stegun 1964, 9.1.10 and 9.6.10). Half of it and twice choose the same bases (tests/studies/constants_fit.py).
-_LARGEST_ANGLE = 4.0
-_LAST_TERM = 1e-17  # share of the first term of a power series: less than a tenth of the rounding of its sum
+    place, weight = np.polynomial.legendre.leggauss(nodes)  # on [-1, 1]
+    return angles * (weight / 2)[:, None], before + angles * ((place + 1) / 2)[:, None]
 
 
 @dataclass(frozen=True)
 class Basis:
     """Products of Chebyshev polynomials, one for each wheel, of total degree ``degree`` or less.
+
+    With m3 = centre + reach * d and d in [-1, 1]^N, each exponential is exp(i centre.c) times a product over the wheels
+    of (Jacobi-Anger)
+
+        exp(i z d) = J_0(z) + 2 sum_n i^n J_n(z) T_n(d),        z = reach_j c_j.                  (5)
 
     orders (n, N): order of each wheel's polynomial in the n products; always 0 for an element without width.
     """
@@ -308,8 +302,7 @@ class Basis:
     @property
     def quarter_turns(self) -> NDArray[np.intp]:
         """Total degree (n,) modulo 4: the power of i that belongs to each term."""
-        turns: NDArray[np.intp] = self.orders.sum(axis=1) % 4
-        return turns
+        return np.asarray(self.orders.sum(axis=1) % 4)
 
 
 def degree_for(
@@ -317,12 +310,16 @@ def degree_for(
 ) -> tuple[int | None, float]:
     """Lowest degree whose truncation error over every path is within ``tolerance`` (m), and the bound of that error.
 
+    From |J_n(z)| <= |z/2|^n / n! the terms of total degree above D sum to at most
+
+        2^N sum_{n > D} (zeta/2)^n / n! <= 2^N exp(zeta/2) (zeta/2)^(D + 1) / (D + 1)!,    zeta = sum_j |z_j|.    (6)
+
     zeta (M,): sum of the angles |z_j| of each exponential, rad. steps (M,): its factor, m. firsts (Z,): index of each
     path's first exponential. The degree is None if it would need too many terms.
     """
     if zeta.max(initial=0.0) > _LARGEST_ANGLE:
         return None, 0.0
-    half, power = zeta / 2, steps * truncation_factor(zeta, wheels)
+    half, power = zeta / 2, steps * (2.0**wheels * np.exp(zeta / 2))
     degree = -1
     while True:
         degree += 1
@@ -332,15 +329,6 @@ def degree_for(
         neglected = float(np.add.reduceat(power, firsts).max())
         if neglected <= tolerance:
             return degree, neglected
-
-
-def truncation_factor(zeta: Array, wheels: int) -> Array:
-    """The factor of (zeta/2)^(D + 1) / (D + 1)! in the bound of the terms above degree D.
-
-    It follows from sum_{n > D} x^n / n! <= x^(D + 1) / (D + 1)! * exp(x).
-    """
-    factor: Array = 2.0**wheels * np.exp(zeta / 2)
-    return factor
 
 
 def _bessel(angles: Array, degree: int) -> Array:
@@ -374,22 +362,6 @@ def _power_series(order: int, square: Array) -> Array:
         total *= -square
         total += 1.0 / (factorial(m) * factorial(order + m))
     return total
-
-
-# Largest error of a position by truncation, by quadrature and by the decomposition, as shares of the longest path (at
-# least 1 m): some ten times the rounding of direct integration. They bound sums of absolute values; half of each and
-# twice change costs by 1e-13 m and the memory by a tenth at most (tests/studies/constants_fit.py).
-_TRUNCATION, _QUADRATURE, _DECOMPOSITION = 1e-12, 1e-12, 5e-12
-# The numbers from here on decide only which way is faster (bench_evaluator.py). Half of each and twice change costs by
-# 5e-14 m and the memory by less than a factor of two (tests/studies/constants_fit.py).
-# How far the box may turn the heading of a segment about its anchor, rad; infinity leaves recordings whole.
-_LIMITS = (np.inf, 2.0, 1.0, 0.5, 0.25)
-# Time that a sample of direct integration, a segment and a term of the basis take, in units of one multiplication and
-# addition of a matrix product.
-_SAMPLE, _SEGMENT, _TERM = 400.0, 1000.0, 100.0
-_MOST_BYTES = 48e6  # bytes of the large matrix product, at most
-_RANK, _POWER = 1.65, 0.7  # likely rank of the decomposition of n terms: a power law through omnibench's recordings
-_NO_WIDTH = 1e-14  # share of row 3's largest element: one with less width in the box is fixed, up to rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -442,15 +414,18 @@ def make_plan(logs: Sequence[WheelLog], integration: Integration, box: ElementBo
     cheapest, chosen = _SAMPLE * len(steps), None
     for limit in _LIMITS:
         segments = [cut(path, box.reach[2], limit) for path in paths]
-        zeta = np.concatenate(
-            [_largest_turns(path, parts, box.reach[2]) for path, parts in zip(paths, segments, strict=True)]
-        )
+        turns = []  # the most (n,) that the box turns the heading of each piece about its anchor, rad
+        for path, parts in zip(paths, segments, strict=True):
+            anchors = np.repeat([part.anchor for part in parts], [part.last - part.first for part in parts], axis=0)
+            begin = path.before - anchors
+            turns.append(np.maximum(np.abs(begin), np.abs(begin + path.angles)) @ box.reach[2])
+        zeta = np.concatenate(turns)
         degree, neglected = degree_for(zeta, steps, firsts, _TRUNCATION * length, wheels)
         if degree is None:
             continue
         terms, count = comb(degree + wheels, wheels), sum(map(len, segments))
         rows = max(sum(len(path.ends) for path in paths), count)
-        rank = _likely_rank(terms)
+        rank = min(float(terms), _RANK * terms**_POWER)
         values = 2 * len(row) * rows * rank
         cost = values + terms * (rank + _TERM) + (0.0 if np.isinf(limit) else _SEGMENT * count)
         if 8 * values < _MOST_BYTES and cost < cheapest:
@@ -462,19 +437,6 @@ def make_plan(logs: Sequence[WheelLog], integration: Integration, box: ElementBo
     spare = _DECOMPOSITION * length / max(map(len, segments))
     basis = Basis.make(degree, free)
     return ExpansionPlan(logs, box, integration, paths, segments, nodes, basis, free, error, spare)
-
-
-def _likely_rank(terms: int) -> float:
-    """Rank that the decomposition will have for so many terms."""
-    return min(float(terms), _RANK * terms**_POWER)
-
-
-def _largest_turns(path: Path, segments: list[Segment], reach: Array) -> Array:
-    """The most (n,) that the box turns the heading of each piece about its anchor, rad."""
-    anchors = np.repeat([s.anchor for s in segments], [s.last - s.first for s in segments], axis=0)
-    begin = path.before - anchors
-    turns: Array = np.maximum(np.abs(begin), np.abs(begin + path.angles)) @ reach
-    return turns
 
 
 @dataclass(frozen=True, eq=False)
@@ -511,7 +473,29 @@ def moments_of(plan: ExpansionPlan) -> Array:
 
     n: terms of the plan's basis.
     """
-    return np.concatenate([_moments_of_log(plan, index) for index in range(len(plan.paths))])
+    centre, reach = plan.box.centre[2], np.where(plan.free, plan.box.reach[2], 0.0)
+    quarter_turns = plan.basis.quarter_turns[:, None]
+    moments = []
+    for index, (path, log) in enumerate(zip(plan.paths, plan.logs, strict=True)):
+        rows = []  # sums (n, 2N) of cosines and sines up to each row
+        for segment, ends in plan.row_ends(index):
+            angles, about = impulses(path, segment, plan.integration, plan.nodes)
+            heading = about @ centre + log.start[2]
+            sources = np.concatenate([angles * np.cos(heading)[..., None], angles * np.sin(heading)[..., None]], axis=2)
+            wheels = about.shape[2]
+            coefficients = plan.basis.coefficients(about.reshape(-1, wheels) * reach)
+            total = 0.0
+            for first, last in zip([segment.first, *ends[:-1]], ends, strict=True):
+                pieces = slice(first - segment.first, last - segment.first)
+                summed = slice(pieces.start * plan.nodes, pieces.stop * plan.nodes)
+                total = total + coefficients[:, summed] @ sources[pieces].reshape(-1, 2 * wheels)
+                rows.append(total)
+        # Each term is to be times i^(total degree), Eq. (5).
+        cosine, sine = np.split(np.array(rows), 2, axis=2)
+        real = np.choose(quarter_turns, [cosine, -sine, -cosine, sine])
+        imaginary = np.choose(quarter_turns, [sine, cosine, -sine, -cosine])
+        moments.append(np.concatenate([real, imaginary], axis=2))
+    return np.concatenate(moments)
 
 
 def compress(moments: Array, plan: ExpansionPlan) -> tuple[Array, float]:
@@ -525,8 +509,8 @@ def compress(moments: Array, plan: ExpansionPlan) -> tuple[Array, float]:
     _, _, directions = np.linalg.svd(np.linalg.qr(scaled, mode="r"), full_matrices=False)
 
     def neglected(count: int) -> float:
-        kept = directions[:count]
-        residual = np.abs(scaled - (scaled @ kept.T) @ kept).sum(axis=1).reshape(rows, 2, components // 2)
+        used = directions[:count]
+        residual = np.abs(scaled - (scaled @ used.T) @ used).sum(axis=1).reshape(rows, 2, components // 2)
         return float(np.hypot(residual[:, 0], residual[:, 1]).sum(axis=1).max())
 
     low, high = 0, len(directions)
@@ -534,35 +518,6 @@ def compress(moments: Array, plan: ExpansionPlan) -> tuple[Array, float]:
         middle = (low + high) // 2
         low, high = (low, middle) if neglected(middle) <= plan.spare else (middle + 1, high)
     return directions[:low].T, neglected(low) * max(map(len, plan.segments))
-
-
-def _moments_of_log(plan: ExpansionPlan, index: int) -> Array:
-    """The moments (R, n, 2N) of one log."""
-    path, basis = plan.paths[index], plan.basis
-    start = plan.logs[index].start[2]
-    centre, reach = plan.box.centre[2], np.where(plan.free, plan.box.reach[2], 0.0)
-    sums = []
-    for segment, ends in plan.row_ends(index):
-        angles, about = impulses(path, segment, plan.integration, plan.nodes)
-        heading = about @ centre + start
-        sources = np.concatenate([angles * np.cos(heading)[..., None], angles * np.sin(heading)[..., None]], axis=2)
-        wheels = about.shape[2]
-        coefficients = basis.coefficients(about.reshape(-1, wheels) * reach)
-        total = 0.0
-        for first, last in zip([segment.first, *ends[:-1]], ends, strict=True):
-            pieces = slice(first - segment.first, last - segment.first)
-            summed = slice(pieces.start * plan.nodes, pieces.stop * plan.nodes)
-            total = total + coefficients[:, summed] @ sources[pieces].reshape(-1, 2 * wheels)
-            sums.append(total)
-    return _times_powers_of_i(np.array(sums), basis.quarter_turns)
-
-
-def _times_powers_of_i(sums: Array, quarter_turns: NDArray[np.intp]) -> Array:
-    """Real and imaginary parts (R, n, 2N) of sums (R, n, 2N) of cosines and sines times i^quarter_turns (n,)."""
-    cosine, sine = np.split(sums, 2, axis=2)
-    real = np.choose(quarter_turns[:, None], [cosine, -sine, -cosine, sine])
-    imaginary = np.choose(quarter_turns[:, None], [sine, cosine, -sine, -cosine])
-    return np.concatenate([real, imaginary], axis=2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -582,7 +537,7 @@ class SegmentJoin:
 
     def positions(self, displacements: Array, matrices: Array) -> Array:
         """x and y (P, 2, S) relative to the start, m, from displacements (P, 2, R) within the rows' segments."""
-        if self._uncut:  # the anchors are the starts
+        if not self.anchors.any():  # uncut: the anchors are the starts
             alike = len(self.segment_of_row) == len(self.row_of_stamp)
             return displacements if alike else displacements[:, :, self.row_of_stamp]
         phase = matrices[:, 2] @ self.anchors.T
@@ -595,18 +550,10 @@ class SegmentJoin:
         path = at_rows[:, self.row_of_stamp]
         return np.stack([path.real, path.imag], axis=1)
 
-    @cached_property
-    def _uncut(self) -> bool:
-        return not self.anchors.any()
-
 
 def join_segments(plan: ExpansionPlan) -> SegmentJoin:
     """The indices of a plan's rows, segments and stamps."""
-    row_of_stamp: list[int] = []
-    log_of_stamp: list[int] = []
-    segment_of_row: list[int] = []
-    last_row: list[int] = []
-    first_of_log: list[int] = []
+    row_of_stamp, log_of_stamp, segment_of_row, last_row, first_of_log = (list[int]() for _ in range(5))
     for index, path in enumerate(plan.paths):
         first = len(last_row)
         row_at: dict[int, int] = {}
@@ -618,21 +565,8 @@ def join_segments(plan: ExpansionPlan) -> SegmentJoin:
         row_of_stamp += [row_at[end] for end in path.ends.tolist()]
         log_of_stamp += [index] * len(path.ends)
     anchors = np.array([segment.anchor for segments in plan.segments for segment in segments])
-    return SegmentJoin(
-        np.array(row_of_stamp),
-        np.array(log_of_stamp),
-        np.array(segment_of_row),
-        anchors,
-        np.array(last_row),
-        np.array(first_of_log),
-    )
-
-
-# Share of the largest pose: rounding of a direct sum of some thousand samples, which the check allows beside the bound.
-_ROUNDING = 1e-12
-# Values of the large product at a time, 2 MB, so that they stay in the processor's cache. It changes the order of sums
-# alone, hence costs by 1e-16 m (tests/studies/constants_fit.py); bench_evaluator.py measures the speed.
-_BLOCK = 250_000
+    of_stamps = np.array(row_of_stamp), np.array(log_of_stamp)
+    return SegmentJoin(*of_stamps, np.array(segment_of_row), anchors, np.array(last_row), np.array(first_of_log))
 
 
 class PoseEvaluator:
@@ -703,8 +637,7 @@ class PoseEvaluator:
         first, second = matrices[:, 0], matrices[:, 1]
         weights = np.concatenate([first, -second, second, first], axis=1).reshape(len(matrices), 2, -1)
         regressors = (features.T @ self._product).reshape(len(matrices), weights.shape[2], -1)
-        displacements: Array = weights @ regressors
-        return displacements
+        return np.asarray(weights @ regressors)
 
 
 def make_evaluator(
@@ -719,16 +652,12 @@ def make_evaluator(
         return None
     with one_thread():
         evaluator = PoseEvaluator(plan)
-    return evaluator if _agrees(evaluator, odometry, box) else None
-
-
-def _agrees(evaluator: PoseEvaluator, odometry: OdometryBatch, box: ElementBox) -> bool:
-    """True if both ways give the same poses, up to the bound and rounding, at the box's centre and some corners."""
+    # Both ways give the same poses, up to the bound and rounding, at the box's centre and some corners.
     signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(3, *box.centre.shape))
     matrices = np.concatenate([box.centre[None], box.centre + signs * box.reach])
     direct = odometry.poses(matrices)
     fast = evaluator.poses(matrices)
     if fast.shape != direct.shape:
-        return False
+        return None
     length = max(1.0, float(np.abs(direct).max()))
-    return bool(np.abs(fast - direct).max() <= evaluator.error_bound + _ROUNDING * length)
+    return evaluator if np.abs(fast - direct).max() <= evaluator.error_bound + _ROUNDING * length else None

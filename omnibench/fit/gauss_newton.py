@@ -1,8 +1,6 @@
-"""Gauss-Newton steps of a trajectory fit within the box of a calibration problem.
+"""Gauss-Newton steps within the box of a calibration problem: of a trajectory fit, and to a robust cost's minimum.
 
-Minimum of a robust cost by reweighted Gauss-Newton steps within the box.
-
-At the weights w of fit/loss.py, Eq. (5), of the present errors e_i, a step d minimises
+The latter reweights: at the weights w of fit/loss.py, Eq. (5), of the present errors e_i, a step d minimises
 
     sum_i p_i w_i |e_i + J_i d|^2,                                                                        (1)
 
@@ -21,6 +19,7 @@ from scipy.optimize import lsq_linear
 
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
+from omnibench.fit.calibrator import Solution
 from omnibench.fit.loss import RobustCost
 from omnibench.fit.noise import roots_of
 from omnibench.fit.problem import CalibrationProblem
@@ -39,6 +38,8 @@ _SHARES = (1.0, 0.3, 0.0)  # parts of the nuisances' step that every run tries
 _NO_GAIN, _NO_SHARE = 1e-2, 1e-5
 _ROUNDING = 1e-12  # share of chi2: an increase that is no increase
 _ROOM = 1e-9  # share of the box: lsq_linear needs an interior, and the vector is clipped afterwards
+_MOST_REWEIGHTED_STEPS = 300  # steps; 20 to 60 are usual
+_MOST_REWEIGHTED_HALVINGS = 30  # lengths of one step that are tried, each half the one before: down to a billionth
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,10 +221,6 @@ def bounded_step(problem: CalibrationProblem, vector: Array, information: Array,
     return step
 
 
-_MOST_REWEIGHTED_STEPS = 300  # steps; 20 to 60 are usual
-_MOST_REWEIGHTED_HALVINGS = 30  # lengths of one step that are tried, each half the one before: down to a billionth
-
-
 def reweighted_minimum(
     problem: CalibrationProblem, objective: RobustCost, vector: Array, tolerance: float
 ) -> tuple[Array, int, bool]:
@@ -258,3 +255,14 @@ def reweighted_minimum(
         if moved < tolerance:
             return vector, count, True
     return vector, _MOST_REWEIGHTED_STEPS, False
+
+
+def minimum_in_turn(
+    problem: CalibrationProblem, costs: Sequence[RobustCost], vector: Array, tolerance: float, steps_name: str
+) -> Solution:
+    """The minimum of the last of some costs, each searched from that of the one before, the first from ``vector``."""
+    steps, settled = 0, True
+    for cost in costs:
+        vector, count, settled = reweighted_minimum(problem, cost, vector, tolerance)
+        steps += count
+    return Solution(vector, f"{'' if settled else 'not '}settled after {steps} {steps_name} steps", settled)

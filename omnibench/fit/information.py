@@ -24,6 +24,7 @@ from omnibench.robot.stored_odometry import StoredOdometry, are_many, together, 
 INTERVAL = 0.95  # probability of the intervals, by convention; every table of the program says 95 %
 # Degrees of freedom that stand for infinity: the quantile of Student's t differs from the normal one by 2e-9 there.
 MANY = 1e9
+Stamps = Literal["reference", "final"]
 _ROUNDING = 1e-12  # share of the largest derivative: a smaller one is rounding
 
 
@@ -62,9 +63,6 @@ def depending(slopes: Array, inputs: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray((np.abs(slopes[:, inputs]) > _ROUNDING * np.abs(slopes).max()).any(axis=1))
 
 
-Stamps = Literal["reference", "final"]
-
-
 def noise_of_matrix(
     runs: Sequence[Trajectory], matrix: Array, integration: Integration, loss: LossName = "squares"
 ) -> NoiseEstimate:
@@ -74,18 +72,14 @@ def noise_of_matrix(
     has any.
     """
     runs = [run for run in runs if run.has_poses]
-    odometry = _poses(runs, matrix, integration)
+    logs = [run.reference_log for run in runs]
+    if are_many(logs):
+        odometry = split_by(StoredOdometry(logs, integration).poses(matrix[None])[0], [log.stamps for log in logs])
+    else:
+        odometry = [OdometryBatch([log], integration).poses(matrix[None])[0] for log in logs]
     residuals: list[Array] = [poses - run.poses[1:] for poses, run in zip(odometry, runs, strict=True)]
     near, residuals = without_jumps(runs, residuals, loss)
     return estimate_noise(differences_between_repetitions(near, residuals))
-
-
-def _poses(runs: Sequence[Trajectory], matrix: Array, integration: Integration) -> list[Array]:
-    """The odometry (K, 3) of each run at its reference poses."""
-    logs = [run.reference_log for run in runs]
-    if are_many(logs):
-        return split_by(StoredOdometry(logs, integration).poses(matrix[None])[0], [log.stamps for log in logs])
-    return [OdometryBatch([log], integration).poses(matrix[None])[0] for log in logs]
 
 
 def information_of_run(
@@ -110,7 +104,8 @@ def information_of_runs(
     stamps: Stamps = "reference",
 ) -> Array:
     """Fisher information (Z, 3N, 3N) of each run; their sum is that of all runs together."""
-    logs = [run if isinstance(run, WheelLog) else _log(run, stamps) for run in runs]
+    name = "final_log" if stamps == "final" else "reference_log"
+    logs: list[WheelLog] = [run if isinstance(run, WheelLog) else getattr(run, name) for run in runs]
     if are_many(logs):
         tasks = [(StoredOdometry, part, matrix, integration, noise) for part in together(logs)]
         return np.concatenate(gathered(workers(), informations, tasks))
@@ -130,34 +125,23 @@ def informations(task: tuple[type[OdometryBatch], Sequence[WheelLog], Array, Int
     return information
 
 
-def _log(run: Trajectory, stamps: Stamps) -> WheelLog:
-    return run.final_log if stamps == "final" else run.reference_log
-
-
-def poses_near(residuals: Sequence[Array], loss: LossName) -> list[NDArray[np.bool_]]:
-    """True (K,) for the poses of each run that have not jumped, from their residuals (K, 3), m and rad alike.
-
-    Where most of a run's poses are off, its start is, which shifts or turns them all: it then has none.
-    """
-    chosen = make_loss(loss, 3)
-    if chosen is None:
-        return [np.ones(len(of_run), dtype=bool) for of_run in residuals]
-    counts = np.array([len(of_run) for of_run in residuals])
-    shares = np.repeat(1 / (np.maximum(counts, 1) * max(np.count_nonzero(counts), 1)), counts)
-    near = chosen.is_near(np.linalg.norm(np.concatenate(residuals), axis=1), shares)
-    return [of_run & (of_run.mean() > 1 / 2) for of_run in np.split(near, np.cumsum(counts)[:-1])]
-
-
 def without_jumps(
     runs: Sequence[Trajectory], residuals: Sequence[Array], loss: LossName
 ) -> tuple[list[Trajectory], list[Array]]:
-    """Runs and their residuals (K, 3) at the poses that have not jumped; runs that have none are left out."""
-    if loss == "squares":
+    """Runs and their residuals (K, 3) at the poses that have not jumped, m and rad alike.
+
+    Where most of a run's poses are off, its start is, which shifts or turns them all: the run is left out.
+    """
+    chosen = make_loss(loss, 3)
+    if chosen is None:
         return list(runs), list(residuals)
-    near = poses_near(residuals, loss)
+    counts = np.array([len(of_run) for of_run in residuals])
+    shares = np.repeat(1 / (np.maximum(counts, 1) * max(np.count_nonzero(counts), 1)), counts)
+    all_near = chosen.is_near(np.linalg.norm(np.concatenate(residuals), axis=1), shares)
+    near = [of_run & (of_run.mean() > 1 / 2) for of_run in np.split(all_near, np.cumsum(counts)[:-1])]
     shortened = [
-        (with_poses(run, np.append(0, 1 + np.flatnonzero(chosen))), of_run[chosen])
-        for run, of_run, chosen in zip(runs, residuals, near, strict=True)
-        if chosen.any()
+        (with_poses(run, np.append(0, 1 + np.flatnonzero(used))), of_run[used])
+        for run, of_run, used in zip(runs, residuals, near, strict=True)
+        if used.any()
     ]
     return [run for run, _ in shortened], [of_run for _, of_run in shortened]

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from omnibench.config import Model
-from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory
+from omnibench.data.dataset import SPLITS, Dataset, Split
 from omnibench.data.references import KINDS, ReferenceKind
 from omnibench.data.scans import Scans
 from omnibench.errors import require_type
@@ -84,10 +82,24 @@ def inspect_dataset(dataset: Dataset) -> Inspection:
     trajectories = dataset.trajectories
     periods = np.array([[steps.min(), steps.max()] for t in trajectories for steps in [np.diff(t.times, prepend=0.0)]])
     pose_periods = np.concatenate([np.diff(t.pose_times) for t in trajectories])
-    training = dataset.split("train") or trajectories
+    marked = dataset.split("train")
+    training = marked or trajectories
     span = driven_span(training)
     identifiable = identifiability(dataset.robot, training)
     undriven = tuple(direction_in_words(direction, dataset.robot.drive.names) for direction in span.null)
+    kinds = [kind for run in trajectories if run.references is not None for kind in run.references.kinds.tolist()]
+    findings = list(identifiable.sentences)
+    if not marked:
+        findings.append("no trajectory is marked train: nothing can be calibrated")
+    if not dataset.split("validation"):
+        findings.append("no trajectory is marked validation: calibrations cannot be judged on other data")
+    if marked and all(t.command is None for t in marked):
+        findings.append("no commands are named: repetitions are unknown")
+    scanned = None if dataset.scans is None else set(dataset.scans.trajectories)
+    if bare := [run.id for run in trajectories if scanned is not None and run.id not in scanned]:
+        have = "has" if len(bare) == 1 else "have"
+        shown = ", ".join(bare[:3])
+        findings.append(f"{plural(len(bare), 'trajectory')} {have} no scans, e.g. {shown}: SLAM needs them")
     return Inspection(
         dataset=dataset.name,
         description=dataset.description,
@@ -102,7 +114,7 @@ def inspect_dataset(dataset: Dataset) -> Inspection:
         pose_period_s=float(np.median(pose_periods)) if len(pose_periods) else None,
         wheel_samples=sum(len(t.times) for t in trajectories),
         reference_poses=len(pose_periods) + sum(run.start_known for run in trajectories),
-        references=_references(trajectories),
+        references={kind: kinds.count(kind) for kind in KINDS if kind in kinds},
         has_angles=all(t.angles is not None for t in trajectories),
         has_targets=all(t.targets is not None for t in trajectories),
         scans=None if dataset.scans is None else _scans(dataset.scans),
@@ -111,7 +123,7 @@ def inspect_dataset(dataset: Dataset) -> Inspection:
         driven_shares=tuple(span.shares.tolist()),
         undriven=undriven,
         identifiability=identifiable,
-        findings=tuple(_findings(dataset, identifiable)),
+        findings=tuple(findings),
         warnings=dataset.warnings,
     )
 
@@ -134,12 +146,6 @@ def _content(dataset: Dataset, split: Split) -> SplitContent:
     )
 
 
-def _references(runs: Sequence[Trajectory]) -> dict[ReferenceKind, int]:
-    """Numbers of references other than poses, by their kind."""
-    kinds = [kind for run in runs if run.references is not None for kind in run.references.kinds.tolist()]
-    return {kind: kinds.count(kind) for kind in KINDS if kind in kinds}
-
-
 def _scans(scans: Scans) -> ScansContent:
     scanner = scans.scanner
     periods, count, seen = [np.zeros(0)], 0, 0
@@ -157,22 +163,3 @@ def _scans(scans: Scans) -> ScansContent:
         range_max_m=scanner.range_max,
         seen_share=seen / max(count * scanner.rays, 1),
     )
-
-
-def _findings(dataset: Dataset, identifiable: Identifiability) -> list[str]:
-    findings = list(identifiable.sentences)
-    if not dataset.split("train"):
-        findings.append("no trajectory is marked train: nothing can be calibrated")
-    if not dataset.split("validation"):
-        findings.append("no trajectory is marked validation: calibrations cannot be judged on other data")
-    training = dataset.split("train")
-    if training and all(t.command is None for t in training):
-        findings.append("no commands are named: repetitions are unknown")
-    if dataset.scans is not None:
-        recorded = set(dataset.scans.trajectories)
-        bare = [run.id for run in dataset.trajectories if run.id not in recorded]
-        if bare:
-            have = "has" if len(bare) == 1 else "have"
-            shown = ", ".join(bare[:3])
-            findings.append(f"{plural(len(bare), 'trajectory')} {have} no scans, e.g. {shown}: SLAM needs them")
-    return findings

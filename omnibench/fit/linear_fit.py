@@ -24,6 +24,11 @@ from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import Integration, OdometryBatch
 from omnibench.robot.stored_odometry import odometry_of
 
+_SPARSE = 1.0  # s between poses, from which on headings do not lie on lines between them; chosen
+_REWEIGHTED = 10  # steps, of which the best counts; chosen: on README's log the cost is within 1 % of closed_form's
+_VANISHING = 1e-3  # of the mean norm: smaller ones have no larger weight; chosen
+_STEPS = 3  # Gauss-Newton steps by references, chosen: the design is so near that two settle
+
 
 def linear_fit(
     odometry: OdometryBatch, runs: Sequence[Trajectory], reference: Array, design: Array, directions: Array
@@ -38,8 +43,7 @@ def linear_fit(
     row_3 = basis @ np.linalg.lstsq(odometry.driven @ basis, turned, rcond=None)[0]  # Eq. (L1)
     missing = moved[:, 0] + 1j * moved[:, 1] - columns @ (design[0] + 1j * design[1])
     rows_12 = basis @ np.linalg.lstsq(columns @ basis, missing, rcond=None)[0]  # Eq. (L2)
-    matrix: Array = design + np.stack([rows_12.real, rows_12.imag, row_3])
-    return matrix
+    return np.asarray(design + np.stack([rows_12.real, rows_12.imag, row_3]))
 
 
 def linear_system(
@@ -61,12 +65,6 @@ def linear_system(
     return moved, odometry.position_design(headings)
 
 
-_SPARSE = 1.0  # s between poses, from which on headings do not lie on lines between them; chosen
-_REWEIGHTED = 10  # steps, of which the best counts; chosen: on README's log the cost is within 1 % of closed_form's
-_VANISHING = 1e-3  # of the mean norm: smaller ones have no larger weight; chosen
-_STEPS = 3  # Gauss-Newton steps by references, chosen: the design is so near that two settle
-
-
 def quick_fit(robot: Robot, runs: Sequence[Trajectory], integration: Integration = "arc") -> Array:
     """The matrix (3, M) that fits the poses of runs, or, where none has any, their references."""
     posed = [run for run in runs if run.has_poses]
@@ -74,9 +72,9 @@ def quick_fit(robot: Robot, runs: Sequence[Trajectory], integration: Integration
         return _by_references(robot, runs)
     odometry = odometry_of([run.reference_log for run in posed], integration)
     observed = np.concatenate([run.poses[1:] for run in posed])
-    kept = directions_kept(robot, driven_span(posed), "shrink")
-    _, _, directions = np.linalg.svd(np.vstack([kept, np.zeros((1, len(robot.drive.names)))]))
-    directions = directions[len(kept) :]
+    held = directions_kept(robot, driven_span(posed), "shrink")
+    _, _, directions = np.linalg.svd(np.vstack([held, np.zeros((1, len(robot.drive.names)))]))
+    directions = directions[len(held) :]
     matrix = linear_fit(odometry, posed, observed, robot.inverse_kinematic_matrix, directions)
     sparse = float(np.median(np.concatenate([np.diff(run.pose_times) for run in posed]))) > _SPARSE
     if default_cost(robot, len(posed)) == "final_pose":
@@ -108,6 +106,6 @@ def _by_references(robot: Robot, runs: Sequence[Trajectory]) -> Array:
     steps = np.zeros(root.shape[1])
     for _ in range(_STEPS):
         residuals, columns = fit.whitened(design + (root @ steps).reshape(design.shape), root)
-        slopes, left = np.concatenate(columns), np.concatenate(residuals)
-        steps = steps + np.linalg.solve(slopes.T @ slopes + np.eye(len(steps)), slopes.T @ left - steps)
+        slopes, errors = np.concatenate(columns), np.concatenate(residuals)
+        steps = steps + np.linalg.solve(slopes.T @ slopes + np.eye(len(steps)), slopes.T @ errors - steps)
     return design + (root @ steps).reshape(design.shape)

@@ -27,12 +27,8 @@ as the errors. Its derivatives by the errors are those of a weighted sum of squa
 Both sides of (2) and (4) that depend on q = 1/s^2 are concave in it and grow, so that Newton's steps from q = 0
 approach the root from one side, without fail.
 
-Starts and ends of runs whose reference pose has jumped, taken from the poses beside them.
-
-A start that is off shifts or turns every pose of its run, and no weight of single poses mends that. With the motions of
-the design robot from pose to pose, each of the three poses beside the end of a run says where that end was; the median
-of the three is what they agree on. An end that differs from it by far more than those of other runs do, by their weight
-under a robust loss, has jumped. Over so short a way the design is good enough; what it leaves is left to the loss.
+A start that has jumped shifts or turns every pose of its run, and no weight of single poses mends that:
+with_ends_from_others takes such starts, and ends, from the poses beside them.
 """
 
 from __future__ import annotations
@@ -68,11 +64,13 @@ CORNERS: Mapping[int, float] = MappingProxyType({1: 1.345, 2: 1.501, 3: 1.628})
 # that have no loss: errors of more than 8 (huber) or 4 (student_t) of their scales.
 OFF = 0.2
 DEGREES_OF_FREEDOM = 4.0  # Lange, Little and Taylor 1989
-_MOST_STEPS = (
-    100  # Newton's steps for the scale; errors of one size take 5, with a twentieth of them 100 times as large 15
-)
+# Newton's steps for the scale; errors of one size take 5, with a twentieth of them 100 times as large 15.
+_MOST_STEPS = 100
 _SAMPLE = 2000  # norms of which more are not needed to find where Newton's steps begin: they then take two or three
 _SETTLED = 1e-13  # relative change of 1/s^2 that ends them
+_BESIDE = 3  # poses beside an end that tell where it was: the fewest of which one may be off, too
+_NAMED = 5  # runs that a sentence names
+_FEWEST_RUNS = 5  # fewer ends do not tell how far an end usually is from what the poses beside it say
 
 
 class Loss(ABC):
@@ -113,6 +111,8 @@ class Loss(ABC):
 class ScaledLoss(Loss):
     """A loss whose scale is estimated with the norms."""
 
+    _target: float  # the right side of Eq. (2) or (4)
+
     def scales(self, norms: Array, shares: Array) -> Array:
         """Scales (P,) of P sets of norms (P, S) with shares (S,): the roots of Eq. (2) or (4)."""
         squares = np.square(norms)
@@ -139,22 +139,9 @@ class ScaledLoss(Loss):
                 break
         return precision
 
-    def costs(self, norms: Array, shares: Array) -> Array:
-        """Costs (P,), in the unit of the norms (P, S), at the scales that minimise them; NaN of norms that are NaN."""
-        return self._costs(norms, self.scales(norms, shares), shares)
-
-    @property
-    @abstractmethod
-    def _target(self) -> float:
-        """The right side of Eq. (2) or (4)."""
-
     @abstractmethod
     def _equation(self, squares: Array) -> tuple[Array, Array]:
         """The terms of the left side of Eq. (2) or (4) at squared ratios, and their derivatives by these."""
-
-    @abstractmethod
-    def _costs(self, norms: Array, scales: Array, shares: Array) -> Array:
-        """Eq. (1) or the exponential of Eq. (3)."""
 
 
 class Huber(ScaledLoss):
@@ -167,7 +154,7 @@ class Huber(ScaledLoss):
         self.corner = CORNERS[coordinates]
         square = self.corner**2
         inside = float(coordinates * chdtr(coordinates + 2, square))  # E R^2 of R < c
-        self._mean = inside + square * (1 - float(chdtr(coordinates, square)))  # b of Eq. (1)
+        self._target = inside + square * (1 - float(chdtr(coordinates, square)))  # b of Eq. (1)
 
     def weights(self, ratios: Array) -> Array:
         """min(1, c / x)."""
@@ -177,24 +164,25 @@ class Huber(ScaledLoss):
         """-c / x beyond the corner, 0 before."""
         return np.where(ratios > self.corner, -self.weights(ratios), 0.0)
 
-    @property
-    def _target(self) -> float:
-        return self._mean
-
     def _equation(self, squares: Array) -> tuple[Array, Array]:
         return np.minimum(squares, self.corner**2), np.where(squares < self.corner**2, 1.0, 0.0)
 
-    def _costs(self, norms: Array, scales: Array, shares: Array) -> Array:
+    def costs(self, norms: Array, shares: Array) -> Array:
+        """Costs (P,), the minima of Eq. (1), in the unit of the norms (P, S); NaN of norms that are NaN."""
+        scales = self.scales(norms, shares)
         ratios = norms / scales[:, None]
         small = np.minimum(ratios, self.corner)
-        total: Array = scales * ((small * (ratios - small / 2)) @ shares + self._mean / 2)
-        return total
+        return np.asarray(scales * ((small * (ratios - small / 2)) @ shares + self._target / 2))
 
 
 class StudentT(ScaledLoss):
     """Minus the log-likelihood of Student's t with four degrees of freedom, Eq. (3)."""
 
     name: LossName = "student_t"
+
+    def __init__(self, coordinates: int) -> None:
+        super().__init__(coordinates)
+        self._target = float(coordinates)
 
     def weights(self, ratios: Array) -> Array:
         """(n + d) / (n + x^2)."""
@@ -205,20 +193,17 @@ class StudentT(ScaledLoss):
         squares = np.square(ratios)
         return np.asarray(-2 * squares / (DEGREES_OF_FREEDOM + squares) * self.weights(ratios))
 
-    @property
-    def _target(self) -> float:
-        return float(self.coordinates)
-
     def _equation(self, squares: Array) -> tuple[Array, Array]:
         total = DEGREES_OF_FREEDOM + self.coordinates
         left = DEGREES_OF_FREEDOM + squares
         return total * squares / left, total * DEGREES_OF_FREEDOM / np.square(left)
 
-    def _costs(self, norms: Array, scales: Array, shares: Array) -> Array:
+    def costs(self, norms: Array, shares: Array) -> Array:
+        """Costs (P,), exp of the minima of Eq. (3), in the unit of the norms (P, S); NaN of norms that are NaN."""
+        scales = self.scales(norms, shares)
         logarithms = np.log1p(np.square(norms / scales[:, None]) / DEGREES_OF_FREEDOM) @ shares
         power = (DEGREES_OF_FREEDOM + self.coordinates) / (2 * self.coordinates)
-        total: Array = scales * np.exp(power * logarithms)
-        return total
+        return np.asarray(scales * np.exp(power * logarithms))
 
 
 class Squares(Loss):
@@ -249,15 +234,15 @@ def make_loss(name: LossName, coordinates: int) -> Loss | None:
     return kinds[name](coordinates) if name in kinds else None
 
 
-_BESIDE = 3  # poses beside an end that tell where it was: the fewest of which one may be off, too
-_NAMED = 5  # runs that a sentence names
-_FEWEST_RUNS = 5  # fewer ends do not tell how far an end usually is from what the poses beside it say
-
-
 def with_ends_from_others(
     runs: Sequence[Trajectory], robot: Robot, integration: Integration, loss: Loss, *, last: bool
 ) -> tuple[tuple[Trajectory, ...], tuple[str, ...]]:
     """The runs, starts that have jumped replaced by what the next poses say, and the names of those runs.
+
+    With the motions of the design robot from pose to pose, each of the three poses beside the end of a run says where
+    that end was; the median of the three is what they agree on. An end that differs from it by far more than those of
+    other runs do, by their weight under a robust loss, has jumped. Over so short a way the design is good enough; what
+    it leaves is left to the loss.
 
     loss: of three coordinates, m and rad alike. last: the last poses are treated alike, for a cost that uses no others.
     """
@@ -266,15 +251,22 @@ def with_ends_from_others(
     design = OdometryModel.of_design(robot, integration)
     moved, names = list(runs), set()
     for end in (0, -1) if last else (0,):
-        known = [index for index, run in enumerate(runs) if len(run.poses) > _BESIDE]
-        if len(known) < _FEWEST_RUNS:
+        long_enough = [index for index, run in enumerate(runs) if len(run.poses) > _BESIDE]
+        if len(long_enough) < _FEWEST_RUNS:
             continue
-        told = np.array([_told(design, runs[index], end) for index in known])
-        off = np.linalg.norm(told - [runs[index].poses[end] for index in known], axis=1)
-        near = loss.is_near(off, np.full(len(off), 1 / len(off)))
-        for index, pose in ((known[place], told[place]) for place in np.flatnonzero(~near)):
+        beside = np.arange(1, 1 + _BESIDE) if end == 0 else np.arange(-1 - _BESIDE, -1)
+        medians = []
+        for run in (runs[index] for index in long_enough):
+            (path,) = design.poses([run.reference_log])
+            path = np.vstack([run.start, path])
+            predicted = compose(run.poses[beside], relative(path[beside], path[end]))
+            medians.append(np.median(predicted, axis=0))
+        jumps = np.linalg.norm(np.array(medians) - [runs[index].poses[end] for index in long_enough], axis=1)
+        near = loss.is_near(jumps, np.full(len(jumps), 1 / len(jumps)))
+        for place in np.flatnonzero(~near):
+            index = long_enough[place]
             poses = moved[index].poses.copy()
-            poses[end] = pose
+            poses[end] = medians[place]
             moved[index] = replace(moved[index], poses=poses)
             names.add(runs[index].id)
     return tuple(moved), tuple(run.id for run in runs if run.id in names)
@@ -292,16 +284,8 @@ def moved_ends_in_words(names: Sequence[str], runs: int, *, last: bool) -> tuple
     )
 
 
-def _told(design: OdometryModel, run: Trajectory, end: int) -> Array:
-    """The pose (3,) of an end, 0 or -1, that the poses beside it say by the design's motions."""
-    beside = np.arange(1, 1 + _BESIDE) if end == 0 else np.arange(-1 - _BESIDE, -1)
-    (path,) = design.poses([run.reference_log])
-    path = np.vstack([run.start, path])
-    return np.asarray(np.median(compose(run.poses[beside], relative(path[beside], path[end])), axis=0))
-
-
 class RobustCost(Cost):
-    """The norms of a cost's pose errors under a loss with an estimated scale, Eq. (1) to (4) of loss.py.
+    """The norms of a cost's pose errors under a loss with an estimated scale, Eq. (1) to (4).
 
     base: the cost, whose stamps, norms and shares these are. Single poses that are far off have a bounded influence. A
     start that is off, or at costs of the final pose an end, spoils a run: its poses then are far off together.
@@ -319,7 +303,7 @@ class RobustCost(Cost):
 
     @property
     def of_poses(self) -> Loss:
-        """The same loss of whole poses, m, m, rad."""
+        """This kind of loss for whole poses, m, m, rad."""
         return type(self.loss)(3)
 
     def combine(self, errors: Array, trajectory: NDArray[np.intp]) -> Array:
@@ -333,8 +317,13 @@ class RobustCost(Cost):
     def ratios(self, errors: Array, trajectory: NDArray[np.intp]) -> Array:
         """Norms (S,) of errors (S, 3) of one candidate over their scale."""
         norms = self.base.norms(errors)
-        ratios: Array = norms / self.loss.scales(norms[None], self.base.shares(trajectory))[0]
-        return ratios
+        return np.asarray(norms / self.loss.scales(norms[None], self.base.shares(trajectory))[0])
+
+
+def beginning_with_huber(cost: RobustCost) -> list[RobustCost]:
+    """Huber's loss, whose minimum is the only one, and then the cost's own, where that is another."""
+    huber = RobustCost(cost.base, Huber(cost.loss.coordinates))
+    return [huber] if cost.loss.name == "huber" else [huber, cost]
 
 
 def with_loss(cost: Cost, loss: LossName) -> Cost:
@@ -369,8 +358,7 @@ class CostWeighting:
     def __call__(self, residuals: Array) -> Array:
         """Weighted residuals (k, 3) or derivatives (k, 3, n)."""
         chosen = residuals[-1:] if self.last_alone else residuals
-        weighted: Array = chosen * self.scale.reshape(*self.scale.shape, *([1] * (residuals.ndim - 2)))
-        return weighted
+        return np.asarray(chosen * self.scale.reshape(*self.scale.shape, *([1] * (residuals.ndim - 2))))
 
 
 def cost_weightings(cost: Cost, trajectories: Sequence[Trajectory], residuals: Sequence[Array]) -> list[CostWeighting]:

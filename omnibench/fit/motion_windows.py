@@ -69,7 +69,7 @@ def motions_in_windows(twists: Any, durations: Any, windows: Any, math: Any = np
     cosine, sine = chord * math.cos(middle), chord * math.sin(middle)
     ahead = math.cumsum(moved[..., 0] * cosine - moved[..., 1] * sine, axis=1)
     aside = math.cumsum(moved[..., 0] * sine + moved[..., 1] * cosine, axis=1)
-    x, y, heading = (math.pad(each, ((0, 0), (1, 0))) for each in (ahead, aside, turned))
+    x, y, heading = (math.pad(sums, ((0, 0), (1, 0))) for sums in (ahead, aside, turned))
     run, first, last = windows.T
     before = heading[run, first]
     along_x, along_y = x[run, last] - x[run, first], y[run, last] - y[run, first]
@@ -81,20 +81,19 @@ def motions_in_windows(twists: Any, durations: Any, windows: Any, math: Any = np
 def _edges(stamps: Array, step: float) -> tuple[Array, NDArray[np.intp]]:
     """Edges (J + 1,) of steps, s, and which of them (K,) are stamps of poses; these are about a step apart or more."""
     cells = np.floor(stamps / step + 1e-6)
-    kept = stamps[np.append(True, np.diff(cells) > 0)]
-    kept = kept if kept[-1] == stamps[-1] else np.append(kept, stamps[-1])
-    pieces = np.maximum(np.ceil(np.diff(kept) / (_LONGEST * step) - 1e-6), 1).astype(int)
+    edges = stamps[np.append(True, np.diff(cells) > 0)]
+    edges = edges if edges[-1] == stamps[-1] else np.append(edges, stamps[-1])
+    pieces = np.maximum(np.ceil(np.diff(edges) / (_LONGEST * step) - 1e-6), 1).astype(int)
     posed = np.append(0, np.cumsum(pieces))
-    return np.interp(np.arange(posed[-1] + 1), posed, kept), posed
+    return np.interp(np.arange(posed[-1] + 1), posed, edges), posed
 
 
 def _means(run: Trajectory, times: Array) -> Array:
     """Means (J, M) of a run's drive signals between edges (J + 1,), rad/s."""
-    known = np.append(0.0, run.times)
-    driven = np.cumsum(run.signals * np.diff(known)[:, None], axis=0)
-    of_edges = interpolated(times, known, np.vstack([np.zeros(driven.shape[1]), driven]))
-    means: Array = np.diff(of_edges, axis=0) / np.diff(times)[:, None]
-    return means
+    bounds = np.append(0.0, run.times)
+    driven = np.cumsum(run.signals * np.diff(bounds)[:, None], axis=0)
+    of_edges = interpolated(times, bounds, np.vstack([np.zeros(driven.shape[1]), driven]))
+    return np.asarray(np.diff(of_edges, axis=0) / np.diff(times)[:, None])
 
 
 def _pairs(times: Array, length: float) -> list[tuple[int, int]]:

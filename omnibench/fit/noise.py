@@ -30,6 +30,21 @@ from omnibench.words import noun_for
 # Share of the largest eigenvalue or variance below which another one is rounding: far above the rounding of products
 # between columns (1e-15), and far below a direction of wheel rates that are a hundredth of the strongest (1e-4).
 ROUNDING = 1e-12
+# White noise, m or rad, that keeps the covariance regular where there is neither white noise nor walk: a millionth of
+# the millimetre that poses are known to. Half of it and twice change nothing (tests/studies/constants_fit.py).
+LEAST_WHITE = 1e-9
+# Range of the search: logarithms of the components as shares of the residuals' RMS. Half as wide, it moves estimates by
+# 1e-4 of their standard deviations at most, twice as wide by 2e-3; either moves these deviations by 0.1 %
+# (tests/studies/constants_fit.py).
+_LOGARITHMS = (np.log(1e-4), np.log(1e2))
+# Change of twice the log-likelihood below which a component is set to zero: nothing beside 2.7, a test at 5 % (Self
+# and Liang 1987). Half of it and twice change nothing (tests/studies/constants_fit.py).
+_NO_LOSS = 1e-3
+_WIDE = 200  # columns from which on a row at a time is faster than LAPACK, which takes every column by itself
+_COORDINATES = (("position", slice(0, 2)), ("heading", slice(2, 3)))
+# First guess of the noise, replaced after one fit: 1 cm or 0.01 rad, and as much again in a second. Half of it and
+# twice move estimates by 0.002 of their standard deviations at most (tests/studies/constants_fit.py).
+FIRST_NOISE = Noise(pose_position=0.01, pose_heading=0.01, walk_position=0.01, walk_heading=0.01)
 
 
 def roots_of(information: Array) -> Array:
@@ -38,9 +53,8 @@ def roots_of(information: Array) -> Array:
     Directions whose eigenvalue is rounding are left out: R R' is the pseudo-inverse of A.
     """
     values, vectors = np.linalg.eigh(information)
-    known = values > ROUNDING * values.max(initial=0.0)
-    roots: Array = vectors[:, known] / np.sqrt(values[known])
-    return roots
+    significant = values > ROUNDING * values.max(initial=0.0)
+    return np.asarray(vectors[:, significant] / np.sqrt(values[significant]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,10 +150,7 @@ def repetitions_of_commands(trajectories: Sequence[Trajectory]) -> Repetitions:
     known = any(run.session is not None for run in trajectories)
     for keys, words in (
         (of_splits, f"each within one {'session' if known else 'split'}"),
-        (
-            of_sessions,
-            "each within one session, across both splits, so that the noise has seen validation runs",
-        ),
+        (of_sessions, "each within one session, across both splits, so that the noise has seen validation runs"),
     ):
         repeated = [group for group in grouped(keys) if len(group) > 1 and trajectories[group[0]].command is not None]
         if repeated:
@@ -186,10 +197,10 @@ def _contrasts(runs: list[tuple[Array, Array]]) -> Iterator[Difference]:
         if count:
             grid, chosen = _common([*(times for times, _ in sums.values()), stamps])
             before = np.sum([total[index] for (_, total), index in zip(sums.values(), chosen, strict=False)], axis=0)
-            own = values[chosen[-1]]
+            now = values[chosen[-1]]
             if len(grid):
-                contrast = (before[..., 0] / count - own[..., 0]) * np.sqrt(count / (count + 1))
-                yield Difference(grid, contrast, (before + own)[..., 1:] / (count + 1))
+                contrast = (before[..., 0] / count - now[..., 0]) * np.sqrt(count / (count + 1))
+                yield Difference(grid, contrast, (before + now)[..., 1:] / (count + 1))
         sums[key] = (stamps, sums[key][1] + values if key in sums else values)
 
 
@@ -207,33 +218,10 @@ def _common(stamps: Sequence[Array]) -> tuple[Array, list[NDArray[np.intp]]]:
     end = min(times[-1] for times in stamps)
     coarsest = min(stamps, key=lambda times: int((times <= end).sum()))
     grid = coarsest[coarsest <= end]
-    chosen = [_nearest(times, grid) for times in stamps]
+    chosen = [np.searchsorted((times[1:] + times[:-1]) / 2, grid) for times in stamps]  # between the middles
     # A pose is used for one stamp only: using it twice would correlate the white noise.
     fresh = (np.diff(chosen, axis=1, prepend=-1) > 0).all(axis=0)
     return grid[fresh], [index[fresh] for index in chosen]
-
-
-def _nearest(stamps: Array, grid: Array) -> NDArray[np.intp]:
-    """Index of the stamp that is nearest to each of a grid (K,)."""
-    middles = (stamps[1:] + stamps[:-1]) / 2
-    return np.searchsorted(middles, grid)
-
-
-# White noise, m or rad, that keeps the covariance regular where there is neither white noise nor walk: a millionth of
-# the millimetre that poses are known to. Half of it and twice change nothing (tests/studies/constants_fit.py).
-LEAST_WHITE = 1e-9
-# Range of the search: logarithms of the components as shares of the residuals' RMS. Half as wide, it moves estimates by
-# 1e-4 of their standard deviations at most, twice as wide by 2e-3; either moves these deviations by 0.1 %
-# (tests/studies/constants_fit.py).
-_LOGARITHMS = (np.log(1e-4), np.log(1e2))
-# Change of twice the log-likelihood below which a component is set to zero: nothing beside 2.7, a test at 5 % (Self
-# and Liang 1987). Half of it and twice change nothing (tests/studies/constants_fit.py).
-_NO_LOSS = 1e-3
-_WIDE = 200  # columns from which on a row at a time is faster than LAPACK, which takes every column by itself
-_COORDINATES = (("position", slice(0, 2)), ("heading", slice(2, 3)))
-# First guess of the noise, replaced after one fit: 1 cm or 0.01 rad, and as much again in a second. Half of it and
-# twice move estimates by 0.002 of their standard deviations at most (tests/studies/constants_fit.py).
-FIRST_NOISE = Noise(pose_position=0.01, pose_heading=0.01, walk_position=0.01, walk_heading=0.01)
 
 
 @dataclass(frozen=True, eq=False)
@@ -437,13 +425,6 @@ class _Factor:
         return inner, -below[:-1] / diagonal[:-1] * inner[1:]
 
 
-def _condensed(differences: Array) -> Array:
-    """At most K columns (K, n) with the products D D' of differences D (K, N), all that their likelihood needs."""
-    if differences.shape[1] <= len(differences):
-        return np.asfortranarray(differences)
-    return np.linalg.qr(differences.T).R.T
-
-
 def _differences(residuals: Array) -> Array:
     """Differences (K, n) of residuals (K, ...) from one stamp to the next, the first from 0."""
     flat = residuals.reshape(len(residuals), -1)
@@ -478,21 +459,14 @@ def estimate_noise(differences: Differences, near: Noise | None = None) -> Noise
     """
     if not differences.each:
         raise DataError("no trajectory has a reference pose after its start; the noise cannot be estimated")
-    return NoiseEstimate(
-        _components(differences, near), differences.source, len(differences.each), differences.description
-    )
-
-
-def _components(differences: Differences, near: Noise | None) -> Noise:
-    """The noise model of largest likelihood, position and heading independent."""
-    groups = differences.by_stamps
+    # Position and heading are independent.
     components: dict[str, float] = {}
     for name, columns in _COORDINATES:
-        samples = [(stamps, values[:, columns].reshape(len(stamps), -1)) for stamps, values, _ in groups]
+        samples = [(stamps, values[:, columns].reshape(len(stamps), -1)) for stamps, values, _ in differences.by_stamps]
         names = [f"{kind}_{name}" for kind in ("pose", "walk", "bias")]
         start = None if near is None else np.array([getattr(near, component) for component in names])
         components |= dict(zip(names, _most_likely(samples, start), strict=True))
-    return Noise(**components)
+    return NoiseEstimate(Noise(**components), differences.source, len(differences.each), differences.description)
 
 
 def _most_likely(groups: list[tuple[Array, Array]], near: Array | None) -> tuple[float, float, float]:
@@ -504,9 +478,12 @@ def _most_likely(groups: list[tuple[Array, Array]], near: Array | None) -> tuple
     longest = max(float(stamps[-1]) for stamps, _ in groups)
     units = size * np.array([1.0, longest**-0.5, 1.0])
 
-    prepared = [
-        (np.diff(stamps, prepend=0.0), values.shape[1], _condensed(_differences(values))) for stamps, values in groups
-    ]
+    prepared = []
+    for stamps, values in groups:
+        differences = _differences(values)  # D (K, n): all that the likelihood needs is D D', of at most K columns
+        wide = differences.shape[1] > len(differences)
+        condensed = np.linalg.qr(differences.T).R.T if wide else np.asfortranarray(differences)
+        prepared.append((np.diff(stamps, prepend=0.0), values.shape[1], condensed))
 
     def negative_log_likelihood(components: Array) -> float:
         """Twice the negative log-likelihood for each value, up to a constant."""

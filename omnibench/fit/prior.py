@@ -10,24 +10,22 @@ turn, in row 3, the rows of x and y change by
 
     D_1 = -y K0_3,    D_2 = x K0_3.                                                               (2)
 
-Physical prior of a matrix and of the rate that its wheels lose: what is known of a robot before it has been driven.
+The physical prior of a matrix, and of the rate that its wheels lose, is what is known of a robot before it has been
+driven. With independent normal numbers of mean 0 the matrix is K0 + D with
 
-With the design K0 (3, M), the largest element s_i of its row i, and independent normal numbers of mean 0, the matrix is
-K0 + D with
-
-    D_ij = K0_ij (c_j + g_i) + s_i e_ij + (rotations and shifts below).                             (1)
+    D_ij = K0_ij (c_j + g_i) + s_i e_ij + (rotations and shifts below).                             (3)
 
 c_j: the radius of the wheel of column j, which stretches all of the column. g_i: what shortens a whole motion, such as
 rollers that slip (rows 1 and 2) or tyres that scrub in a turn (row 3). e_ij: all else. A driven wheel that is steered
 by a measured angle has two columns, (omega cos phi, omega sin phi), which share its radius and which the offset a of
 the angle turns into each other:
 
-    D = a K0 [0 -1; 1 0] on these two.                                                              (2)
+    D = a K0 [0 -1; 1 0] on these two.                                                              (4)
 
-Where the tracked point of a robot is not known (prior.py), it stands at (x, y) from where the robot says, and looks
+Where the tracked point of a robot is not known, it stands at (x, y) from where the robot says, and looks
 into the direction b: the rows of x and y change by
 
-    D_1 = -y K0_3 + b K0_2,    D_2 = x K0_3 - b K0_1.                                               (3)
+    D_1 = -y K0_3 + b K0_2,    D_2 = x K0_3 - b K0_1.                                               (5)
 
 Every wheel that turns loses the rate -d (effect ``wheel_dead_zone``), d being normal, too.
 """
@@ -45,6 +43,12 @@ from numpy.typing import NDArray
 from omnibench.robot.kinematics import Array, Robot, RobotClass, class_of
 
 MountChoice = Literal["known", "fit"]
+_NUMBERS_EACH = 2  # measured ones for each that is fitted; chosen
+# The tracked point of these stands in front of the rear axle, which is the robot's centre, and is seldom known as well
+# as the middle of a body is.
+_UNKNOWN_MOUNTS: frozenset[RobotClass] = frozenset({"tricycle", "car"})
+_OFFSET = 0.1  # rad, of a steering angle's zero: a mounted encoder is trued to some degrees
+_POINT, _YAW = 0.05, 0.035  # m, rad: a tracker that is not on the axle's middle; of the corelli tricycle by 0.1 m
 
 
 @dataclass(frozen=True)
@@ -78,10 +82,6 @@ TOLERANCES: Mapping[RobotClass, Tolerance] = MappingProxyType(
         "mixed": _USUAL,
     }
 )
-_NUMBERS_EACH = 2  # measured ones for each that is fitted; chosen
-# The tracked point of these stands in front of the rear axle, which is the robot's centre, and is seldom known as well
-# as the middle of a body is.
-_UNKNOWN_MOUNTS: frozenset[RobotClass] = frozenset({"tricycle", "car"})
 
 
 def tolerance_of(robot: Robot, elements: float | None = None) -> Tolerance:
@@ -131,17 +131,13 @@ def default_cost(robot: Robot, runs: int) -> Literal["final_pose", "trajectory"]
 
 
 def default_mount(robot: Robot) -> MountChoice:
-    """Whether the tracked point counts as where the robot says, or is fitted: that of a tricycle and of a car is."""
+    """Default treatment of the tracked point: fitted on a tricycle and on a car, else where the robot says."""
     return "fit" if class_of(robot) in _UNKNOWN_MOUNTS else "known"
-
-
-_OFFSET = 0.1  # rad, of a steering angle's zero: a mounted encoder is trued to some degrees
-_POINT, _YAW = 0.05, 0.035  # m, rad: a tracker that is not on the axle's middle; of the corelli tricycle by 0.1 m
 
 
 @dataclass(frozen=True)
 class PhysicalTolerance:
-    """Standard deviations: of radii, each row's factor and elements, Eq. (1), as shares; of the lost rate, rad/s."""
+    """Standard deviations: of radii, each row's factor and elements, Eq. (3), as shares; of the lost rate, rad/s."""
 
     radius: float
     rows: tuple[float, float, float]
@@ -174,7 +170,7 @@ def physical_tolerance(robot: Robot) -> PhysicalTolerance:
 
 
 def physical_prior_root(robot: Robot, tolerance: PhysicalTolerance) -> Array:
-    """A root (3M, k) of the covariance of the matrix elements, row by row, about the design: Eq. (1) to (3).
+    """A root (3M, k) of the covariance of the matrix elements, row by row, about the design: Eq. (3) to (5).
 
     Rows that no wheel drives (the sideways one of a robot that cannot slide) move with the tracked point alone.
     """
@@ -187,7 +183,12 @@ def physical_prior_root(robot: Robot, tolerance: PhysicalTolerance) -> Array:
             root = np.zeros_like(design)
             root[row, column] = scales[row] * tolerance.elements
             roots.append(root)
-    roots += [_turned(design, pair) * _OFFSET for pair in _pairs(robot, columns)]
+    for wheel in np.unique(columns) if class_of(robot) != "car" else ():
+        pair = np.flatnonzero(columns == wheel)
+        if len(pair) == 2:  # the wheel steers: an offset of 1 rad turns its columns
+            turned = np.zeros_like(design)
+            turned[:, pair] = design[:, pair] @ np.array([[0.0, -1.0], [1.0, 0.0]])
+            roots.append(turned * _OFFSET)
     if default_mount(robot) == "fit" and not robot.slides:
         x, y, _ = design
         roots += [*(_POINT * changes_by_centre(robot)), _YAW * np.array([y, -x, np.zeros_like(x)])]
@@ -201,20 +202,5 @@ def _wheels_of_columns(robot: Robot) -> NDArray[np.intp]:
         return np.arange(len(drive.names), dtype=np.intp)
     if len(drive.names) != sum(1 if pair < 0 else 2 for pair in drive.pairs):  # a car's mean, tangent and difference
         return np.zeros(len(drive.names), dtype=np.intp)
-    each = [wheel for wheel, pair in enumerate(drive.pairs) for _ in range(1 if pair < 0 else 2)]
-    return np.array(each, dtype=np.intp)
-
-
-def _pairs(robot: Robot, columns: NDArray[np.intp]) -> list[tuple[int, int]]:
-    """The two columns of every driven wheel that steers."""
-    if class_of(robot) == "car":
-        return []
-    found = [np.flatnonzero(columns == wheel) for wheel in np.unique(columns)]
-    return [(int(both[0]), int(both[1])) for both in found if len(both) == 2]
-
-
-def _turned(design: Array, pair: tuple[int, int]) -> Array:
-    """Eq. (2) on two columns, for an offset of 1 rad."""
-    turned = np.zeros_like(design)
-    turned[:, list(pair)] = design[:, list(pair)] @ np.array([[0.0, -1.0], [1.0, 0.0]])
-    return turned
+    wheels = [wheel for wheel, pair in enumerate(drive.pairs) for _ in range(1 if pair < 0 else 2)]
+    return np.array(wheels, dtype=np.intp)

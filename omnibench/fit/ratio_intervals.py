@@ -110,7 +110,7 @@ class Units:
 
     @property
     def method(self) -> Literal["bootstrap", "Student's t", "none"]:
-        """How their intervals are made."""
+        """Method of their intervals."""
         return "none" if self.count < FEWEST else "bootstrap" if self.count >= BOOTSTRAPPED else "Student's t"
 
     @property
@@ -122,8 +122,7 @@ class Units:
 
     def sums(self, values: Array) -> Array:
         """Sums (n,) over the runs of each unit."""
-        sums: Array = np.bincount(self.of_run, weights=values, minlength=self.count).astype(float)
-        return sums
+        return np.asarray(np.bincount(self.of_run, weights=values, minlength=self.count).astype(float))
 
 
 def units_of(runs: Sequence[Trajectory], unit: UnitName | None = None) -> Units:
@@ -165,12 +164,24 @@ class RatioIntervals:
         ratio = float(numerators.mean() / denominators.mean())  # Eq. (R1)
         if units.count < FEWEST:
             return Interval(ratio, None, None)
-        left = upper - ratio * lower
-        if np.abs(left).max() <= _ALIKE * np.abs(numerators).sum():
+        errors = upper - ratio * lower
+        if np.abs(errors).max() <= _ALIKE * np.abs(numerators).sum():
             return Interval(ratio, ratio, ratio)
         if units.count < BOOTSTRAPPED:
             return _jackknifed(ratio, upper, lower, logarithm)
-        below, above = self._quantiles(left)
+        # Quantiles of Eq. (R3) by Eq. (R4).
+        count = units.count
+        if count not in self._counts:
+            rng = np.random.default_rng(self._bootstrap.seed)
+            drawn = rng.multinomial(count, np.full(count, 1 / count), size=self._bootstrap.resamples)
+            self._counts[count] = drawn / count
+        means = self._counts[count] @ errors
+        spreads = np.maximum(self._counts[count] @ np.square(errors) - np.square(means), 0.0)
+        # A resample of one unit only, or of equal ones, has no spread: it counts as far from the estimate.
+        spreads = np.maximum(spreads, np.finfo(float).eps * np.square(errors).max())
+        statistics = means / np.sqrt(spreads / (count - 1))
+        least, most = np.percentile(statistics, [50 * (1 - INTERVAL), 50 * (1 + INTERVAL)])
+        below, above = max(-float(least), 0.0), max(float(most), 0.0)
         low, high = _end(upper, lower, above, -1), _end(upper, lower, below, 1)
         return Interval(ratio, None, None) if low is None or high is None else Interval(ratio, low, high)
 
@@ -178,24 +189,10 @@ class RatioIntervals:
         """The share of the costs ``before`` (Z,) that is gone; None where their mean is not above ``rounding``."""
         if before.mean() <= rounding:
             return None
-        left = self.ratio(values, before, units)
-        if left.low is None or left.high is None:
-            return Interval(1 - left.value, None, None)
-        return Interval(1 - left.value, 1 - left.high, 1 - left.low)
-
-    def _quantiles(self, left: Array) -> tuple[float, float]:
-        """q_low and q_high of Eq. (R3) by Eq. (R4), from the numerators (n,) less the ratio times the denominators."""
-        count = len(left)
-        if count not in self._counts:
-            rng = np.random.default_rng(self._bootstrap.seed)
-            drawn = rng.multinomial(count, np.full(count, 1 / count), size=self._bootstrap.resamples)
-            self._counts[count] = drawn / count
-        means = self._counts[count] @ left
-        spreads = np.maximum(self._counts[count] @ np.square(left) - np.square(means), 0.0)
-        # A resample of one unit only, or of equal ones, has no spread: it counts as far from the estimate.
-        spreads = np.maximum(spreads, np.finfo(float).eps * np.square(left).max())
-        low, high = np.percentile(means / np.sqrt(spreads / (count - 1)), [50 * (1 - INTERVAL), 50 * (1 + INTERVAL)])
-        return max(-float(low), 0.0), max(float(high), 0.0)  # Eq. (R4)
+        ratio = self.ratio(values, before, units)
+        if ratio.low is None or ratio.high is None:
+            return Interval(1 - ratio.value, None, None)
+        return Interval(1 - ratio.value, 1 - ratio.high, 1 - ratio.low)
 
 
 def _jackknifed(ratio: float, upper: Array, lower: Array, logarithm: bool) -> Interval:

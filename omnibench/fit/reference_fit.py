@@ -5,7 +5,7 @@ which wanders by random walks w_p of position and w_h of heading (m and rad per 
 
     C = diag(s^2) + w_p^2 G_p + w_h^2 G_h,                                                                (1)
 
-with the G of reference_fit.py. With the columns J of what is fitted, N of the run's start
+with the G of Eq. (5) for steps of 1 m and 1 rad per sqrt s. With the columns J of what is fitted, N of the run's start
 where it is not known, and P = C^-1 - C^-1 N (N'C^-1 N)^-1 N'C^-1, the walks maximise the restricted likelihood
 
     -2 ln L = sum_z (ln |C| + ln |N'C^-1 N| + r'P r) + ln |A| - b'A^-1 b,   A = sum J'P J,   b = sum J'P r   (2)
@@ -24,12 +24,10 @@ I = 1/2 sum tr (P G)^2 times the share of numbers that the fit leaves, so that V
 
 degrees of freedom (Satterthwaite 1946), and any number where no walk is found.
 
-How odometry that wanders moves what references say: covariances for a random walk of position and of heading.
-
 While a robot drives, its odometry errs by small independent steps: of the position, by as much in any direction, and of
 the heading. A step dW of the heading at the time s turns all of the path that follows about the place p(s),
 
-    dp(t) = dW J (p(t) - p(s)),   J = (0, -1; 1, 0),                                                      (1)
+    dp(t) = dW J (p(t) - p(s)),   J = (0, -1; 1, 0),                                                      (5)
 
 so that the end of a long straight run is known far worse to the side than ahead. With the derivatives S of the numbers
 that a run's references measure by all steps, walks of 1 m and 1 rad per sqrt s give them the covariances S S' dt.
@@ -54,6 +52,13 @@ from omnibench.robot.kinematics import Array, interpolated, rotation
 from omnibench.robot.odometry import Integration, OdometryBatch
 
 _STEPS = 60  # steps of a run: variances at its end come out to a thousandth
+# Shares of the references' own variance at which the search for the odometry's begins: nothing, and as much again.
+_STARTS = (0.0, 1.0)
+# Times the sigma of positions that do not tell the heading from which they count; chosen: a millionth of their weight
+# is none, and the covariance still has a root.
+_UNTOLD = 1e3
+_MANY = 1e9  # degrees of freedom that stand for any number
+_MOST = 1e6  # times the references' own variance: the most that is searched; chosen, odometry a thousand times as bad
 
 
 def wander_of(batch: ReferenceBatch, matrix: Array, integration: Integration) -> list[tuple[Array, Array]]:
@@ -67,23 +72,22 @@ def wander_of(batch: ReferenceBatch, matrix: Array, integration: Integration) ->
     logs = [run.log(stamps) for run, stamps in zip(rows.runs, ends, strict=True)]
     poses = OdometryBatch(logs, integration).poses(matrix[None])[0].reshape(len(logs), _STEPS + 1, 3)
     turns = batch.start_turns(matrix)
-    return [_of_run(rows, run, ends[run], poses[run], float(turns[run])) for run in range(len(rows.runs))]
+    return [_wander_of_run(rows, run, ends[run], poses[run], float(turns[run])) for run in range(len(rows.runs))]
 
 
-def _of_run(rows: ReferenceRows, run: int, ends: Array, ends_of_steps: Array, turn: float) -> tuple[Array, Array]:
+def _wander_of_run(rows: ReferenceRows, run: int, ends: Array, poses: Array, turn: float) -> tuple[Array, Array]:
     """The covariances (k, k) of one run, whose path has poses (_STEPS + 1, 3) at ``ends``, s, turned by ``turn``."""
-    own = np.flatnonzero(rows.trajectory == run)
     times, width = (ends[1:] + ends[:-1]) / 2, float(ends[1])
-    path = interpolated(times, ends, ends_of_steps)
-    moved = np.diff(ends_of_steps[:, :2], axis=0)
+    path = interpolated(times, ends, poses)
+    moved = np.diff(poses[:, :2], axis=0)
     along = moved / np.maximum(np.linalg.norm(moved, axis=1), 1e-12)[:, None]
     by_position, by_heading = [], []
-    for row in own:
+    for row in np.flatnonzero(rows.trajectory == run):
         begin = 0.0 if rows.begins_at_start[row].any() else float(rows.t0[row])
         inside = (times > begin) & (times < rows.t1[row])
-        first, last = interpolated(np.array([begin, rows.t1[row]]), ends, ends_of_steps)
+        first, last = interpolated(np.array([begin, rows.t1[row]]), ends, poses)
         frame = rotation(-first[2] if rows.lengths[row] == "displacement" else turn)[:2, :2]
-        lever = (last[:2] - path[:, :2]) @ rotation(np.pi / 2)[:2, :2].T @ frame.T * inside[:, None]  # Eq. (1)
+        lever = (last[:2] - path[:, :2]) @ rotation(np.pi / 2)[:2, :2].T @ frame.T * inside[:, None]  # Eq. (5)
         nothing = np.zeros((len(times), 2))
         if rows.lengths[row] == "distance":
             by_position.append((along * inside[:, None]).ravel())
@@ -96,15 +100,6 @@ def _of_run(rows: ReferenceRows, run: int, ends: Array, ends_of_steps: Array, tu
             by_heading.append(inside.astype(float))
     position, heading = np.array(by_position), np.array(by_heading)
     return width * position @ position.T, width * heading @ heading.T
-
-
-# Shares of the references' own variance at which the search for the odometry's begins: nothing, and as much again.
-_STARTS = (0.0, 1.0)
-# Times the sigma of positions that do not tell the heading from which they count; chosen: a millionth of their weight
-# is none, and the covariance still has a root.
-_UNTOLD = 1e3
-_MANY = 1e9  # degrees of freedom that stand for any number
-_MOST = 1e6  # times the references' own variance: the most that is searched; chosen, odometry a thousand times as bad
 
 
 @dataclass(frozen=True)
@@ -146,7 +141,13 @@ class ReferenceFit:
         for root, *parts, of_start in zip(self._roots, residuals, columns, self._offsets, starts, strict=True):
             values = solve_triangular(root, np.column_stack([*parts, of_start]), lower=True)
             white.append(_without(values, of_start.shape[1]))
-        white = _without_offsets(white, self._sessions)
+        if self._sessions:  # whitened for the offsets of the last columns, without these
+            offsets = [of_run[:, -self._sessions :] for of_run in white]
+            white = [of_run[:, : -self._sessions] for of_run in white]
+            squares = sum(np.square(of_run).sum(axis=0) for of_run in offsets)
+            shared = sum(by.T @ of_run for by, of_run in zip(offsets, white, strict=True))
+            share = ((1 - 1 / np.sqrt(1 + squares)) / np.maximum(squares, np.finfo(float).tiny))[:, None]  # Eq. (3)
+            white = [of_run - by @ (share * shared) for of_run, by in zip(white, offsets, strict=True)]
         return [of_run[:, 0] for of_run in white], [of_run[:, 1:] for of_run in white]
 
     def chi_square(self, matrix: Array) -> float:
@@ -156,22 +157,30 @@ class ReferenceFit:
     def with_walk(self, matrix: Array, slopes: Array) -> ReferenceFit:
         """The fit with the walk of largest restricted likelihood, Eq. (2), linearised at a matrix (3, M)."""
         residuals, columns, starts = self._unweighted(matrix, slopes)
-        means = [[float(own[which].mean()) for own, which in part if which.any()] for part in self._sizes]
-        size = [float(np.mean(part)) if part else 0.0 for part in means]
-        known = [unit > 0 for unit in size]
+        # Units of the variances of both walks: those of the references over the diagonal of G_p and G_h, where not 0.
+        size = []
+        for part in range(2):
+            means = []
+            for sigmas, of_run in zip(self._sigmas, self.wander, strict=True):
+                diagonal = np.diag(of_run[part])
+                moved = diagonal > 1e-9
+                if moved.any():
+                    means.append(float((np.square(sigmas) / np.maximum(diagonal, 1e-9))[moved].mean()))
+            size.append(float(np.mean(means)) if means else 0.0)
+        driven = [unit > 0 for unit in size]
 
         def walk_of(shares: Array) -> Walk:
             position, heading = (np.sqrt(max(share, 0.0) * unit) for share, unit in zip(shares, size, strict=True))
             return Walk(float(position), float(heading))
 
-        groups = _Group.of(self._own, self.wander, residuals, self._with_offsets(columns), starts)
+        groups = _Group.of(self._sigmas, self.wander, residuals, self._with_offsets(columns), starts)
 
         def value(shares: Array) -> float:
             return _minus_log_likelihood(groups, walk_of(shares), self._sessions)
 
-        bounds = [(0.0, _MOST if each else 0.0) for each in known]
+        bounds = [(0.0, _MOST if unit > 0 else 0.0) for unit in size]
         tries = [
-            minimize(value, np.where(known, start, 0.0), method="L-BFGS-B", bounds=bounds, options={"eps": 1e-4})
+            minimize(value, np.where(driven, start, 0.0), method="L-BFGS-B", bounds=bounds, options={"eps": 1e-4})
             for start in _STARTS
         ]
         return replace(self, walk=walk_of(min(tries, key=lambda answer: float(answer.fun)).x))
@@ -187,11 +196,15 @@ class ReferenceFit:
     def freedom(self, matrix: Array, slopes: Array, covariance: Array) -> Array:
         """Degrees of freedom (n,) of the variances on the diagonal of a covariance (n, n), Eq. (4)."""
         residuals, columns, starts = self._unweighted(matrix, slopes)
-        groups = _Group.of(self._own, self.wander, residuals, self._with_offsets(columns), starts)
-        fixed = _given_offsets(groups, self.walk, self._sessions)
+        groups = _Group.of(self._sigmas, self.wander, residuals, self._with_offsets(columns), starts)
+        # Changes (n + G, n) of the coefficients by the first n columns, with the offsets fitted along.
+        size = groups[0].size - self._sessions
+        whole = np.sum([group.information(self.walk) for group in groups], axis=0)
+        along = np.linalg.solve(whole[size:, size:] + np.eye(self._sessions), whole[size:, :size])
+        fixed = np.vstack([np.eye(size), -along])
         rows, fitted = self.batch.rows, len(roots_of(covariance).T)
         numbers = int(rows.measured.sum()) - rows.numbers_of_starts
-        left = max(numbers - fitted, 1) / max(numbers, 1)
+        free = max(numbers - fitted, 1) / max(numbers, 1)
         reciprocals = np.zeros(len(covariance))
         for part, walk in enumerate((self.walk.position, self.walk.heading)):
             if walk == 0:
@@ -199,13 +212,13 @@ class ReferenceFit:
             information, change = 0.0, np.zeros_like(covariance)
             for group in groups:
                 of_run, by_columns = group.by_walk(self.walk, part)
-                information += left * of_run / 2
+                information += free * of_run / 2
                 change += fixed.T @ by_columns @ fixed
             moved = np.diag(covariance @ change @ covariance)
             reciprocals += np.square(moved) / max(information, 1e-300)
         doubled = 2 * np.square(np.diag(covariance))
-        known = reciprocals * _MANY > doubled
-        return np.where(known, doubled / np.where(known, reciprocals, 1.0), _MANY)
+        bounded = reciprocals * _MANY > doubled
+        return np.where(bounded, doubled / np.where(bounded, reciprocals, 1.0), _MANY)
 
     def _unweighted(self, matrix: Array, slopes: Array | None) -> tuple[list[Array], list[Array], list[Array]]:
         """Residuals (k,), columns (k, n) and derivatives (k, 0 or 3) by the start of each run, in m and rad."""
@@ -215,21 +228,26 @@ class ReferenceFit:
         jacobian = np.zeros((*errors.shape, 0))
         if slopes is not None:
             jacobian = self.batch.jacobian(matrix).reshape(*errors.shape, -1) @ slopes
-        chosen = [(own, rows.measured[own]) for own in self._owned]
-        starts = [rows.start_columns(index, predicted)[which] for index, (_, which) in enumerate(chosen)]
-        return [errors[own][which] for own, which in chosen], [jacobian[own][which] for own, which in chosen], starts
+        residuals, columns, starts = [], [], []
+        for index, of_run in enumerate(self._rows_of_runs):
+            measured = rows.measured[of_run]
+            residuals.append(errors[of_run][measured])
+            columns.append(jacobian[of_run][measured])
+            starts.append(rows.start_columns(index, predicted)[measured])
+        return residuals, columns, starts
 
     @cached_property
-    def _owned(self) -> list[NDArray[np.intp]]:
+    def _rows_of_runs(self) -> list[NDArray[np.intp]]:
+        """Indices of the rows of each run."""
         return [np.flatnonzero(self.batch.trajectory == index) for index in range(len(self.runs))]
 
     @cached_property
-    def _own(self) -> list[Array]:
+    def _sigmas(self) -> list[Array]:
         """Standard deviations (k,) that the references of each run have."""
         rows = self.batch.rows
         sigmas = rows.sigmas.copy()
         sigmas[rows.tells_no_heading, :2] *= _UNTOLD  # a heading of the same time keeps its weight
-        return [sigmas[own][rows.measured[own]] for own in self._owned]
+        return [sigmas[of_run][rows.measured[of_run]] for of_run in self._rows_of_runs]
 
     def _with_offsets(self, columns: Sequence[Array]) -> list[Array]:
         return [np.column_stack(pair) for pair in zip(columns, self._offsets, strict=True)]
@@ -240,24 +258,18 @@ class ReferenceFit:
         rows = self.batch.rows
         # Parts of a recording, cut where samples are missing, are sessions with a number: ``name#2``.
         names = [(run.session or "").partition("#")[0] for run in self.runs]
-        number = {
-            name: index
-            for index, name in enumerate(
-                dict.fromkeys(
-                    name
-                    for name, run in zip(names, self.runs, strict=True)
-                    if run.references and run.references.rate_sigma
-                )
-            )
-        }
-        found: list[Array] = []
-        for name, own in zip(names, self._owned, strict=True):
-            sigmas = rows.offset_sigmas[own][rows.measured[own]]
+        number: dict[str, int] = {}
+        for name, run in zip(names, self.runs, strict=True):
+            if run.references and run.references.rate_sigma:
+                number.setdefault(name, len(number))
+        offsets: list[Array] = []
+        for name, of_run in zip(names, self._rows_of_runs, strict=True):
+            sigmas = rows.offset_sigmas[of_run][rows.measured[of_run]]
             columns = np.zeros((len(sigmas), len(number)))
             if name in number:
                 columns[:, number[name]] = sigmas
-            found.append(columns)
-        return found
+            offsets.append(columns)
+        return offsets
 
     @property
     def _sessions(self) -> int:
@@ -265,55 +277,24 @@ class ReferenceFit:
         return self._offsets[0].shape[1]
 
     @cached_property
-    def _sizes(self) -> list[list[tuple[Array, NDArray[np.bool_]]]]:
-        """For G_p and G_h: own variance over G's diagonal (k,) of each run, and where that is not 0 (k,)."""
-        return [
-            [
-                (np.square(own) / np.maximum(np.diag(of_run[part]), 1e-9), np.diag(of_run[part]) > 1e-9)
-                for own, of_run in zip(self._own, self.wander, strict=True)
-            ]
-            for part in range(2)
-        ]
-
-    @cached_property
     def _roots(self) -> list[Array]:
         """Lower triangular roots (k, k) of the covariance of each run, Eq. (1)."""
         position, heading = self.walk.position**2, self.walk.heading**2
         return [
-            np.linalg.cholesky(np.diag(np.square(own)) + position * lengths + heading * angles)
-            for own, (lengths, angles) in zip(self._own, self.wander, strict=True)
+            np.linalg.cholesky(np.diag(np.square(sigmas)) + position * lengths + heading * angles)
+            for sigmas, (lengths, angles) in zip(self._sigmas, self.wander, strict=True)
         ]
-
-
-def _without_offsets(white: Sequence[Array], count: int) -> list[Array]:
-    """Whitened values (k, n + count) of each run, whitened for the offsets of their last columns, without these."""
-    if not count:
-        return list(white)
-    values, offsets = [of_run[:, :-count] for of_run in white], [of_run[:, -count:] for of_run in white]
-    squares = sum(np.square(of_run).sum(axis=0) for of_run in offsets)
-    shared = sum(of_run.T @ values_of_run for of_run, values_of_run in zip(offsets, values, strict=True))
-    share = ((1 - 1 / np.sqrt(1 + squares)) / np.maximum(squares, np.finfo(float).tiny))[:, None]  # Eq. (3)
-    return [of_run - by @ (share * shared) for of_run, by in zip(values, offsets, strict=True)]
-
-
-def _given_offsets(groups: Sequence[_Group], walk: Walk, count: int) -> Array:
-    """Changes (n + count, n) of the columns' coefficients by the first n, with the last, of offsets, fitted along."""
-    size = groups[0].size
-    information = np.sum([group.information(walk) for group in groups], axis=0)
-    own = information[size - count :, size - count :] + np.eye(count)
-    along = np.linalg.solve(own, information[size - count :, : size - count])
-    return np.vstack([np.eye(size - count), -along])
 
 
 def _without(values: Array, count: int) -> Array:
     """Values (..., k, n) less what their last ``count`` columns explain, and without these."""
     if not count:
         return values
-    left, nuisances = values[..., :-count], values[..., -count:]
+    others, nuisances = values[..., :-count], values[..., -count:]
     basis, sizes, _ = np.linalg.svd(nuisances, full_matrices=False)
     basis = basis * (sizes > ROUNDING * sizes.max(axis=-1, initial=0.0)[..., None])[..., None, :]
-    explained: Array = basis @ (basis.swapaxes(-1, -2) @ left)
-    return np.asarray(left - explained)
+    explained: Array = basis @ (basis.swapaxes(-1, -2) @ others)
+    return np.asarray(others - explained)
 
 
 @dataclass(frozen=True, eq=False)
@@ -332,7 +313,7 @@ class _Group:
     @classmethod
     def of(
         cls,
-        own: Sequence[Array],
+        sigmas: Sequence[Array],
         wander: Sequence[tuple[Array, Array]],
         residuals: Sequence[Array],
         columns: Sequence[Array],
@@ -340,13 +321,11 @@ class _Group:
     ) -> list[_Group]:
         """The groups of all runs."""
         groups = []
-        for members in grouped(
-            [(len(values), of_start.shape[1]) for values, of_start in zip(own, starts, strict=True)]
-        ):
+        for members in grouped([(len(run), start.shape[1]) for run, start in zip(sigmas, starts, strict=True)]):
             values = [np.column_stack([residuals[run], columns[run], starts[run]]) for run in members]
             groups.append(
                 cls(
-                    np.array([np.square(own[run]) for run in members]),
+                    np.array([np.square(sigmas[run]) for run in members]),
                     np.array([wander[run][0] for run in members]),
                     np.array([wander[run][1] for run in members]),
                     np.array(values),
@@ -362,29 +341,24 @@ class _Group:
 
     def information(self, walk: Walk) -> Array:
         """J'P J (n, n)."""
-        left = _without(self.whitened(walk)[0], self.count)[..., 1:]
-        total: Array = np.einsum("gki,gkj->ij", left, left)
-        return total
+        columns = _without(self.whitened(walk)[0], self.count)[..., 1:]
+        return np.asarray(np.einsum("gki,gkj->ij", columns, columns))
 
     def by_walk(self, walk: Walk, part: int) -> tuple[float, Array]:
         """Sum of tr (P G)^2, and J'P G P J (n, n), G being G_p (part 0) or G_h (1)."""
-        white, _, roots = self._white(walk)
+        white, _, roots = self.whitened(walk)
         shared = np.linalg.solve(roots, (self.lengths, self.angles)[part])
         shared = np.linalg.solve(roots, shared.swapaxes(1, 2))  # L^-1 G L'^-1
         starts = white[..., white.shape[2] - self.count :]
         basis, sizes, _ = np.linalg.svd(starts, full_matrices=False)
         basis = basis * (sizes > ROUNDING * sizes.max(axis=1, initial=0.0)[:, None])[:, None, :]
         free = np.eye(shared.shape[1]) - basis @ basis.swapaxes(1, 2)
-        left = free @ shared @ free
+        projected = free @ shared @ free
         columns = white[..., 1 : white.shape[2] - self.count]
-        return float(np.square(left).sum()), np.einsum("gki,gkl,glj->ij", columns, left, columns)
+        return float(np.square(projected).sum()), np.einsum("gki,gkl,glj->ij", columns, projected, columns)
 
-    def whitened(self, walk: Walk) -> tuple[Array, Array]:
-        """Values (G, k, ...) whitened under a walk, starts among them, and ln |C| (G,)."""
-        white, logarithms, _ = self._white(walk)
-        return white, logarithms
-
-    def _white(self, walk: Walk) -> tuple[Array, Array, Array]:
+    def whitened(self, walk: Walk) -> tuple[Array, Array, Array]:
+        """Values (G, k, ...) whitened under a walk, starts among them, ln |C| (G,), and roots (G, k, k) of C."""
         shared = walk.position**2 * self.lengths + walk.heading**2 * self.angles
         roots = np.linalg.cholesky(self.variances[..., None] * np.eye(self.variances.shape[1]) + shared)
         logarithms = 2 * np.log(np.diagonal(roots, axis1=1, axis2=2)).sum(axis=1)
@@ -397,20 +371,20 @@ def _minus_log_likelihood(groups: Sequence[_Group], walk: Walk, offsets: int) ->
     total, scores = 0.0, np.zeros(size)
     information = np.diag(np.repeat([0.0, 1.0], [size - offsets, offsets]))
     for group in groups:
-        white, logarithms = group.whitened(walk)
+        white, logarithms, _ = group.whitened(walk)
         total += float(logarithms.sum())
         if group.count:
             sizes = np.linalg.svd(white[..., -group.count :], compute_uv=False)
-            known = sizes > ROUNDING * sizes.max(axis=1, initial=0.0)[:, None]
-            total += 2 * float(np.log(sizes[known]).sum())
-        left = _without(white, group.count)
-        total += float(np.square(left[..., 0]).sum())
-        information += np.einsum("gki,gkj->ij", left[..., 1:], left[..., 1:])
-        scores += np.einsum("gki,gk->i", left[..., 1:], left[..., 0])
+            significant = sizes > ROUNDING * sizes.max(axis=1, initial=0.0)[:, None]
+            total += 2 * float(np.log(sizes[significant]).sum())
+        free = _without(white, group.count)
+        total += float(np.square(free[..., 0]).sum())
+        information += np.einsum("gki,gkj->ij", free[..., 1:], free[..., 1:])
+        scores += np.einsum("gki,gk->i", free[..., 1:], free[..., 0])
     eigenvalues, vectors = np.linalg.eigh(information)
-    told = eigenvalues > ROUNDING * eigenvalues.max(initial=0.0)
-    along = vectors[:, told].T @ scores
-    return total + float(np.log(eigenvalues[told]).sum() - np.square(along) @ (1 / eigenvalues[told]))
+    determined = eigenvalues > ROUNDING * eigenvalues.max(initial=0.0)
+    along = vectors[:, determined].T @ scores
+    return total + float(np.log(eigenvalues[determined]).sum() - np.square(along) @ (1 / eigenvalues[determined]))
 
 
 def with_references(

@@ -3,21 +3,6 @@
 A reference of a length stands in the first coordinate, one of a place in the first two, one of an angle in the third;
 references of one span of time share a row where they can. A coordinate that was not measured is 0 in what is observed
 and in what a model predicts, so that a cost of pose errors takes rows of every kind.
-
-Unknown start poses of runs in the frame of their positions and headings: likeliest values, and what moves them.
-
-Let q_i be the odometry's positions from the origin, f_k its headings, z_i and h_k what was measured, with the weights
-u_i, v_i (of x and y) and w_k. The start (p, s) minimises
-
-    F = 1/2 sum_i |p + R(s) q_i - z_i|^2_(u, v) + 1/2 sum_k w_k (s + f_k - h_k)^2.                        (1)
-
-For a given s the likeliest p makes the weighted means of x and y agree, so that q and z count from their means, x and y
-each with its own weights. With c = cos s, n = sin s and sums such as A_xx = sum u q_x^2, what is left is
-
-    F(s) = 1/2 (c^2 A + n^2 B - 2 c n C) - c a + n b + 1/2 W s^2 - s d + const,                           (2)
-
-of one variable: the lowest of a grid, then Newton's steps. Its derivatives by the q and f are those of an implicit
-function, F_ss ds = -dF_s.
 """
 
 from __future__ import annotations
@@ -42,11 +27,32 @@ _GRID = 16  # headings among which Newton's steps begin: Eq. (2) has two waves a
 _STEPS = 12  # Newton's steps; four settle
 _FARTHEST, _SETTLED = 0.3, 1e-13  # rad: the longest step, and one that is rounding
 _LEAST = 1e-12  # share of the weights: less curvature is rounding, and the heading is not determined
+PoseRows = Literal["final", "reference", "none"]
+_SINCE = ("turn", "gyro")  # angles that count from t0
+# Squares of distances from their mean, in standard deviations and less what noise adds, that positions of a run need to
+# tell its start heading: to 0.1 rad, which makes lengths 0.5 % wrong. Chosen.
+_TELLING = 100.0
+_NAMES = {(True, True, False): "position", (False, False, True): "heading"}
+_BLOCK = 200_000  # speeds at a time (candidates x samples), 2 MB, as in odometry.py
+_STANDING = 1e-12  # m: a sample that is shorter has no direction, and its length no derivative
 
 
 @dataclass(frozen=True, eq=False)
 class StartPoses:
-    """The profile of the start poses of Z runs, numbered from 0.
+    """Unknown start poses of Z runs, numbered from 0, in the frame of their positions and headings: the profile.
+
+    Let q_i be the odometry's positions from the origin, f_k its headings, z_i and h_k what was measured, with the
+    weights u_i, v_i (of x and y) and w_k. The start (p, s) minimises
+
+        F = 1/2 sum_i |p + R(s) q_i - z_i|^2_(u, v) + 1/2 sum_k w_k (s + f_k - h_k)^2.                        (1)
+
+    For a given s the likeliest p makes the weighted means of x and y agree, so that q and z count from their means, x
+    and y each with its own weights. With c = cos s, n = sin s and sums such as A_xx = sum u q_x^2, what is left is
+
+        F(s) = 1/2 (c^2 A + n^2 B - 2 c n C) - c a + n b + 1/2 W s^2 - s d + const,                           (2)
+
+    of one variable: the lowest of a grid, then Newton's steps. Its derivatives by the q and f are those of an implicit
+    function, F_ss ds = -dF_s.
 
     placed (I,), headed (J,): their positions and headings among all rows; of_placed (I,), of_headed (J,): the run of
     each. positions (I, 2), headings (J,): what was measured. position_weights (I, 2), heading_weights (J,): 1/sigma^2.
@@ -101,8 +107,8 @@ class StartPoses:
         total = self._sum_placed((weights * np.square(centred)).sum(axis=1)) + of_headings
         by_positions = (weights * by_turn)[..., None] * direct + (weights * errors)[..., None] * turned
         change = self._sum_placed(by_positions.sum(axis=1).T) + self._sum_headings(self.heading_weights * turning.T)
-        known = curvature > _LEAST * total
-        by_candidate = np.where(known, -change / np.where(known, curvature, 1.0), 0.0).T  # (Z, n)
+        determined = curvature > _LEAST * total
+        by_candidate = np.where(determined, -change / np.where(determined, curvature, 1.0), 0.0).T  # (Z, n)
         of_positions = direct + by_turn[..., None] * by_candidate[self.of_placed][:, None]
         return of_positions, turning + by_candidate[self.of_headed]
 
@@ -142,13 +148,11 @@ class StartPoses:
 
     def _sum_placed(self, values: Array) -> Array:
         """Sums (..., Z) of values (..., I) over the positions of each run."""
-        sums: Array = values @ self._indicators[0]
-        return sums
+        return np.asarray(values @ self._indicators[0])
 
     def _sum_headings(self, values: Array) -> Array:
         """Sums (..., Z) of values (..., J) over the headings of each run."""
-        sums: Array = values @ self._indicators[1]
-        return sums
+        return np.asarray(values @ self._indicators[1])
 
     @cached_property
     def _indicators(self) -> tuple[Array, Array]:
@@ -160,26 +164,16 @@ class StartPoses:
         """Values (..., I) replaced by their run's mean with the weights of x (axis 0) or y (1)."""
         weights = self.position_weights[:, axis]
         totals = np.maximum(self._sum_placed(weights), np.finfo(float).tiny)
-        means: Array = (self._sum_placed(values * weights) / totals)[..., self.of_placed]
-        return means
+        return np.asarray((self._sum_placed(values * weights) / totals)[..., self.of_placed])
 
     def _about(self, values: Array, axis: int) -> Array:
         """Values (..., I) less their run's mean with the weights of x (axis 0) or y (1)."""
-        about: Array = values - self._means(values, axis)
-        return about
+        return np.asarray(values - self._means(values, axis))
 
     def _centred(self, values: Array) -> Array:
         """Values (I, 2) or (I, 2, n) less their run's means, those of x with the weights of x, of y with y's."""
         parts = [np.moveaxis(self._about(np.moveaxis(values[:, axis], 0, -1), axis), -1, 0) for axis in range(2)]
         return np.stack(parts, axis=1)
-
-
-PoseRows = Literal["final", "reference", "none"]
-_SINCE = ("turn", "gyro")  # angles that count from t0
-# Squares of distances from their mean, in standard deviations and less what noise adds, that positions of a run need to
-# tell its start heading: to 0.1 rad, which makes lengths 0.5 % wrong. Chosen.
-_TELLING = 100.0
-_NAMES = {(True, True, False): "position", (False, False, True): "heading"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,7 +197,7 @@ class ReferenceRows:
 
     @cached_property
     def observed(self) -> Array:
-        """What was observed (S, 3), 0 where nothing was measured."""
+        """Observed values (S, 3), 0 where nothing was measured."""
         return np.nan_to_num(self.values)
 
     @cached_property
@@ -230,15 +224,14 @@ class ReferenceRows:
         """True (S,) for rows that are no poses."""
         return np.asarray(self.lengths != "pose")
 
-    def kinds_in(self, kind: ReferenceKind) -> NDArray[np.bool_]:
-        """True (S,) for the rows that hold a reference of some kind; headings from the start are headings."""
-        kinds = ("heading", "gyro") if kind == "heading" else (kind,)
-        return np.asarray(np.isin(self.angles if UNITS[kind] == "rad" else self.lengths, kinds))
-
     @cached_property
     def logs(self) -> list[WheelLog]:
         """The runs' logs, with stamps at all times of their rows."""
-        return [run.log(self._stamps(index)) for index, run in enumerate(self.runs)]
+        logs = []
+        for index, run in enumerate(self.runs):
+            rows = self.trajectory == index
+            logs.append(run.log(np.unique(np.concatenate([self.t0[rows], self.t1[rows]]))))
+        return logs
 
     @cached_property
     def needs_lengths(self) -> bool:
@@ -257,23 +250,23 @@ class ReferenceRows:
 
         A heading that is fitted to noise makes the path longer than it was: such positions say nothing of lengths.
         """
-        found = np.zeros(len(self.trajectory), dtype=bool)
+        untold = np.zeros(len(self.trajectory), dtype=bool)
         if (start := self._unknown_starts) is None:
-            return found
+            return untold
         squares = start.spread - 2 * np.maximum(np.bincount(start.of_placed, minlength=start.count) - 1, 0)
-        found[start.placed] = (squares < _TELLING)[start.of_placed]
-        return found
+        untold[start.placed] = (squares < _TELLING)[start.of_placed]
+        return untold
 
     def start_columns(self, run: int, predicted: Array) -> Array:
         """Derivatives (K, 3, 3) of the rows of a run by its start x, y and heading, (K, 3, 0) where that is known.
 
         predicted (S, 3): of all rows.
         """
-        own = self.trajectory == run
-        fixed = self.begins_at_start[own]
+        rows = self.trajectory == run
+        fixed = self.begins_at_start[rows]
         if self.runs[run].start_known or not fixed.any():
             return np.zeros((*fixed.shape, 0))
-        x, y = (predicted[own] - predicted[own].mean(axis=0))[:, :2].T
+        x, y = (predicted[rows] - predicted[rows].mean(axis=0))[:, :2].T
         nothing, one = np.zeros(len(fixed)), np.ones(len(fixed))
         columns = np.array([[one, nothing, -y], [nothing, one, x], [nothing, nothing, one]])  # (3, 3, K)
         return np.moveaxis(columns, 2, 0) * fixed[..., None]
@@ -287,7 +280,7 @@ class ReferenceRows:
         return int(np.where(places > 0, np.minimum(3, 2 * places + headings), 1).sum())
 
     def predicted(self, poses: Array, lengths: Array) -> Array:
-        """What a model predicts (P, S, 3), from its poses (P, T, 3) and distances driven (P, T) at the logs' stamps."""
+        """Predictions (P, S, 3) of a model from its poses (P, T, 3) and distances driven (P, T) at the logs' stamps."""
         begin, end = self._stamp_of_rows
         first, last = poses[:, begin], poses[:, end]
         result = np.zeros((len(poses), len(self.trajectory), 3))
@@ -322,7 +315,14 @@ class ReferenceRows:
         driven = self.lengths == "distance"
         result[driven, 0] = driving[end[driven]] - driving[begin[driven]]
         moved = self.lengths == "displacement"
-        result[moved, :2] = _displacement_slopes(poses, moving, begin[moved], end[moved])
+        # Displacements are seen in the frame of the first pose.
+        first, last = begin[moved], end[moved]
+        cosine, sine = np.cos(poses[first, 2])[:, None], np.sin(poses[first, 2])[:, None]
+        across, by = poses[last, :2] - poses[first, :2], moving[last, :2] - moving[first, :2]
+        forward = cosine * across[:, :1] + sine * across[:, 1:]
+        left = cosine * across[:, 1:] - sine * across[:, :1]
+        result[moved, 0] = cosine * by[:, 0] + sine * by[:, 1] + left * moving[first, 2]
+        result[moved, 1] = cosine * by[:, 1] - sine * by[:, 0] - forward * moving[first, 2]
         absolute = (self.angles == "pose") | (self.angles == "heading")
         result[absolute, 2] = moving[end[absolute], 2]
         turned = np.isin(self.angles, _SINCE)
@@ -338,9 +338,8 @@ class ReferenceRows:
         turns = np.zeros(len(self.runs))
         if (start := self._unknown_starts) is not None:
             _, end = self._stamp_of_rows
-            found = start.turns(poses[None, end[start.placed], :2], poses[None, end[start.headed], 2])[0]
             runs = np.unique(self.trajectory[np.concatenate([start.placed, start.headed])])
-            turns[runs] = found
+            turns[runs] = start.turns(poses[None, end[start.placed], :2], poses[None, end[start.headed], 2])[0]
         return turns
 
     @cached_property
@@ -357,19 +356,15 @@ class ReferenceRows:
         measured = self.values[placed, :2], self.values[headed, 2]
         return StartPoses(len(runs), placed, headed, of_placed, of_headed, *measured, position_weights, heading_weights)
 
-    def _stamps(self, index: int) -> Array:
-        own = self.trajectory == index
-        return np.unique(np.concatenate([self.t0[own], self.t1[own]]))
-
     @cached_property
     def _stamp_of_rows(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Indices (S,) among all stamps, run after run, of the rows' t0 and t1."""
         begin, end = (np.zeros(len(self.trajectory), dtype=np.intp) for _ in range(2))
         before = 0
         for index, log in enumerate(self.logs):
-            own = self.trajectory == index
-            begin[own] = before + np.searchsorted(log.stamps, self.t0[own])
-            end[own] = before + np.searchsorted(log.stamps, self.t1[own])
+            rows = self.trajectory == index
+            begin[rows] = before + np.searchsorted(log.stamps, self.t0[rows])
+            end[rows] = before + np.searchsorted(log.stamps, self.t1[rows])
             before += len(log.stamps)
         return begin, end
 
@@ -385,7 +380,12 @@ def reference_rows(
     used = np.array(weights, dtype=bool)
     parts = []
     for index, run in enumerate(runs):
-        rows = [*_pose_rows(run, poses), *_rows_of(run.references)]
+        rows = []
+        if run.has_poses and poses != "none":
+            for number in [len(run.poses) - 1] if poses == "final" else range(1, len(run.poses)):
+                time = float(run.pose_times[number])
+                rows.append(_Row(time, time, "pose", "pose", run.poses[number], np.full(3, np.nan)))
+        rows += _rows_of(run.references)
         rows = [row for row in rows if (used & ~np.isnan(row.values)).any()]
         if not rows and poses != "none":
             what = _NAMES.get(tuple(used.tolist()), "motion")
@@ -415,24 +415,16 @@ class _Row:
     sigmas: Array
 
 
-def _pose_rows(run: Trajectory, poses: PoseRows) -> list[_Row]:
-    if not run.has_poses or poses == "none":
-        return []
-    chosen = [len(run.poses) - 1] if poses == "final" else range(1, len(run.poses))
-    nothing = np.full(3, np.nan)
-    return [_Row(t, t, "pose", "pose", run.poses[row], nothing) for row in chosen for t in [float(run.pose_times[row])]]
-
-
 def _rows_of(references: References | None) -> list[_Row]:
     """The references' rows; an angle joins the first row of the same span that has none."""
     rows: list[_Row] = []
     free: dict[tuple[float, float], list[_Row]] = {}  # rows without an angle by their span, the first one last
     if references is None:
         return rows
-    each = zip(
+    measured = zip(
         references.kinds.tolist(), references.t0, references.t1, references.values, references.sigmas, strict=True
     )
-    for kind, t0, t1, value, sigma in sorted(each, key=lambda one: (one[2], one[1], UNITS[one[0]])):
+    for kind, t0, t1, value, sigma in sorted(measured, key=lambda one: (one[2], one[1], UNITS[one[0]])):
         if UNITS[kind] == "m":
             row = _Row(t0, t1, kind, "", np.append(value, np.nan), np.append(sigma, np.nan))
             rows.append(row)
@@ -446,26 +438,6 @@ def _rows_of(references: References | None) -> list[_Row]:
             rows.append(row)
         row.angle, row.values[2], row.sigmas[2] = angle, value[0], sigma[0]
     return rows
-
-
-def _displacement_slopes(poses: Array, moving: Array, begin: NDArray[np.intp], end: NDArray[np.intp]) -> Array:
-    """Derivatives (D, 2, n) of displacements in the frames of poses ``begin`` (D,)."""
-    cosine, sine = np.cos(poses[begin, 2])[:, None], np.sin(poses[begin, 2])[:, None]
-    across, by = poses[end, :2] - poses[begin, :2], moving[end, :2] - moving[begin, :2]
-    forward = cosine * across[:, :1] + sine * across[:, 1:]
-    left = cosine * across[:, 1:] - sine * across[:, :1]
-    turning = moving[begin, 2]
-    return np.stack(
-        [
-            cosine * by[:, 0] + sine * by[:, 1] + left * turning,
-            cosine * by[:, 1] - sine * by[:, 0] - forward * turning,
-        ],
-        axis=1,
-    )
-
-
-_BLOCK = 200_000  # speeds at a time (candidates x samples), 2 MB, as in odometry.py
-_STANDING = 1e-12  # m: a sample that is shorter has no direction, and its length no derivative
 
 
 class ReferenceBatch:
@@ -483,7 +455,10 @@ class ReferenceBatch:
     def poses(self, matrices: Array) -> Array:
         """Predictions (P, S, 3) in m, m, rad of candidate matrices (P, 3, M)."""
         poses = self._odometry.poses(matrices)
-        return self.rows.predicted(poses, self._lengths(matrices))
+        lengths = np.zeros((len(matrices), len(self._odometry.trajectory)))  # driven at the logs' stamps
+        if self._ways:
+            lengths = np.concatenate([way.lengths(matrices) for way in self._ways], axis=1)
+        return self.rows.predicted(poses, lengths)
 
     def start_turns(self, matrix: Array) -> Array:
         """Likeliest headings (Z,) of the runs' unknown starts by a matrix (3, M), 0 of those that are known, rad."""
@@ -499,12 +474,6 @@ class ReferenceBatch:
             driving[:, : of_rows_12.shape[1]] = of_rows_12
         slopes = self.rows.slopes(self._odometry.poses(matrix[None])[0], moving, driving)
         return slopes.reshape(len(slopes), 3, *matrix.shape)
-
-    def _lengths(self, matrices: Array) -> Array:
-        """Distances driven (P, T) at the logs' stamps."""
-        if not self._ways:
-            return np.zeros((len(matrices), len(self._odometry.trajectory)))
-        return np.concatenate([way.lengths(matrices) for way in self._ways], axis=1)
 
 
 class _Ways:
@@ -542,12 +511,11 @@ class _Ways:
     def _at_stamps(self, of_samples: Array) -> Array:
         """Sums (T, n) up to the stamps of values of samples (F, n)."""
         before = np.vstack([np.zeros(of_samples.shape[1]), np.cumsum(of_samples, axis=0)])
-        sums: Array = before[self._sample] + self._share[:, None] * of_samples[self._sample]
-        return sums
+        return np.asarray(before[self._sample] + self._share[:, None] * of_samples[self._sample])
 
 
 def predicted_by(model: OdometryModel, rows: ReferenceRows) -> Array:
-    """What a model, with its effects, predicts (S, 3) of some rows. DataError: a run lacks what an effect needs."""
+    """Predictions (S, 3) of some rows by a model with its effects. DataError: a run lacks what an effect needs."""
     poses = np.concatenate(model.reported(rows.logs))
     lengths = np.concatenate(model.lengths(rows.logs)) if rows.needs_lengths else np.zeros(len(poses))
     return rows.predicted(poses[None], lengths[None])[0]
@@ -595,13 +563,15 @@ def errors_by_kind(model: OdometryModel, runs: Sequence[Trajectory]) -> dict[Ref
     rows = reference_rows(measured, "none")
     errors = predicted_by(model, rows) - rows.observed
     ratios = np.square(errors / np.where(rows.measured, rows.whole_sigmas, np.inf))
-    found: dict[ReferenceKind, Array] = {}
+    magnitudes: dict[ReferenceKind, Array] = {}
     for kind in KINDS:
-        own = rows.kinds_in(kind)
-        if not own.any():
+        angle = UNITS[kind] == "rad"
+        kinds = ("heading", "gyro") if kind == "heading" else (kind,)  # headings from the start are headings
+        of_kind = np.isin(rows.angles if angle else rows.lengths, kinds)
+        if not of_kind.any():
             continue
-        part = slice(2, 3) if UNITS[kind] == "rad" else slice(0, 2)
-        size = np.linalg.norm(errors[own][:, part], axis=1)
-        counts = rows.measured[own][:, part].sum(axis=1)
-        found[kind] = np.column_stack([size, np.sqrt(ratios[own][:, part].sum(axis=1) / counts)])
-    return found
+        part = slice(2, 3) if angle else slice(0, 2)
+        size = np.linalg.norm(errors[of_kind][:, part], axis=1)
+        counts = rows.measured[of_kind][:, part].sum(axis=1)
+        magnitudes[kind] = np.column_stack([size, np.sqrt(ratios[of_kind][:, part].sum(axis=1) / counts)])
+    return magnitudes

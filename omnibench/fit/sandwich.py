@@ -51,17 +51,15 @@ Repetitions that agree exactly are exceeded by whatever scatter there is. Cluste
 the noise of a run, are often missed: then 84 to 92 % of the 95 % intervals of a linear model hold the truth, with 4 to
 12 clusters, and 92 % of closed_form's with 5 (tests/studies/interval_coverage.py --only slight, 60 sets).
 
-Score vectors of runs whose references are no poses, for the sandwich.
+Of runs whose references are no poses, a norm |e| of normal errors e of k coordinates with the standard deviations s_i,
+known up to a factor f, has for u = e / |e| and derivatives J the expected curvature
 
-A norm |e| of normal errors e of k coordinates with the standard deviations s_i, known up to a factor f, has for
-u = e / |e| and derivatives J the expected curvature
-
-    J' E[(1 - u u') / |e|] J / f,   E[u_i u_j] = 0 of i != j,                                             (1)
+    J' E[(1 - u u') / |e|] J / f,   E[u_i u_j] = 0 of i != j,                                            (10)
 
 which for k = 1 is the density of the error at 0, sqrt(2/pi) / s. With e = S g, S = diag(s), g standard normal of length
 r and direction w,
 
-    E[u_i^2] = E_w[s_i^2 w_i^2 / |S w|^2],   E[u_i^2 / |e|] = E[1/r] E_w[s_i^2 w_i^2 / |S w|^3].          (2)
+    E[u_i^2] = E_w[s_i^2 w_i^2 / |S w|^2],   E[u_i^2 / |e|] = E[1/r] E_w[s_i^2 w_i^2 / |S w|^3].         (11)
 
 f^2 is the mean square of the errors in standard deviations where that is more than chance, else 1: references know how
 exact they are, and not what slip adds. The scores of errors of one coordinate that the fit makes zero are those that
@@ -71,7 +69,7 @@ make the sum of all scores zero.
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -114,6 +112,8 @@ _FEWEST_CLUSTERS = 4
 _KERNEL = 0.7
 _LEAST_SEEN = 0.1  # share of the working model's variance; see Sandwich.steadied
 _INTERPOLATED = 1e-6  # share of the median error: smaller ones were made zero by the fit, up to rounding
+_ZERO = 1e-3  # standard deviations: a smaller error of one coordinate was made zero by the fit
+_DIRECTIONS = 400  # of Eq. (11) around the circle, and a tenth of them from pole to pole: integrals to 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,26 +190,26 @@ def scores_of_runs(
     middle = float(np.median(norms))
     if middle <= _INTERPOLATED * norms.max():
         raise DataError("the answer passes exactly through half of the poses, and the others are too few")
-    left = norms > _INTERPOLATED * middle
+    apart = norms > _INTERPOLATED * middle
     if len(used) == 1:  # the fit makes n errors exactly zero; they do not belong to the density of the others
-        shares = np.where(left, shares * len(left) / left.sum(), 0.0)
-        width = _KERNEL * count**-0.2 * float(np.median(norms[left]))
+        shares = np.where(apart, shares * len(apart) / apart.sum(), 0.0)
+        width = _KERNEL * count**-0.2 * float(np.median(norms[apart]))
     else:
-        width = count**-0.5 * float(np.median(norms[left]))
+        width = count**-0.5 * float(np.median(norms[apart]))
     lengths = np.sqrt(norms**2 + width**2)
     along = np.einsum("ski,sk->si", slopes, errors)
     scores, hessians, working = [], [], []
     curvature = np.zeros((slopes.shape[2],) * 2)
     for run in range(count):
-        own = owner == run
-        share, length = shares[own], lengths[own]
-        scores.append((share / length) @ along[own])
-        columns = (slopes[own] * np.sqrt(share / length)[:, None, None]).reshape(-1, slopes.shape[2])
-        rays = along[own] * np.sqrt(share / length**3)[:, None]
+        rows = owner == run
+        share, length = shares[rows], lengths[rows]
+        scores.append((share / length) @ along[rows])
+        columns = (slopes[rows] * np.sqrt(share / length)[:, None, None]).reshape(-1, slopes.shape[2])
+        rays = along[rows] * np.sqrt(share / length**3)[:, None]
         squares = columns.T @ columns
         curvature += squares
         hessians.append(squares - rays.T @ rays)
-        curved = slopes[own] - errors[own][:, :, None] * (along[own] / length[:, None] ** 2)[:, None]
+        curved = slopes[rows] - errors[rows][:, :, None] * (along[rows] / length[:, None] ** 2)[:, None]
         by_errors = curved * (share / length)[:, None, None] * weights[used][:, None]
         working.append(covariance_of_sums(noise, stamps[run], by_errors, used.tolist()))  # D'C D
     roots = roots_of(curvature)
@@ -239,7 +239,10 @@ def sandwich(scores: Scores) -> Sandwich:
         words = f"the scatter between {count} runs: {repeated.words}, so what the model cannot express counts too"
         return whitened.between([(index,) for index in range(count)]).sandwich(roots, words)
     within = whitened.within(repeated.groups)
-    clusterings = _clusterings(runs)
+    clusterings: list[tuple[str, list[tuple[int, ...]]]] = []
+    for name in ("command", "session"):
+        keys = [(name, key) if (key := getattr(run, name)) is not None else ("run", run.id) for run in runs]
+        clusterings.append((name, grouped(keys)))
     few = [
         f"; {len(members)} {name}s are too few to tell whether they scatter more"
         for name, members in clusterings
@@ -273,17 +276,8 @@ def sandwich(scores: Scores) -> Sandwich:
 
 
 def times_the(usual: float, seen: float) -> float:
-    """How many times a usual variance another one is; infinite where the usual one is rounding beside it."""
+    """Ratio of a variance to a usual one; infinite where the usual one is rounding beside it."""
     return seen / usual if usual > ROUNDING * seen else math.inf
-
-
-def _clusterings(runs: Sequence[Trajectory]) -> list[tuple[str, list[tuple[int, ...]]]]:
-    """Clusterings of the runs, by command and by session."""
-    keys_of: list[tuple[str, list[Hashable]]] = [
-        ("command", [run.command if run.command is not None else ("run", run.id) for run in runs]),
-        ("session", [run.session if run.session is not None else ("run", run.id) for run in runs]),
-    ]
-    return [(name, grouped(keys)) for name, keys in keys_of]
 
 
 @dataclass(frozen=True, eq=False)
@@ -310,8 +304,7 @@ class _Scatter:
     @property
     def covariance(self) -> Array:
         """R'BR, Eq. (5)."""
-        completed: Array = self.spread + self.size * self.unseen
-        return completed
+        return np.asarray(self.spread + self.size * self.unseen)
 
     @property
     def freedom_of_trace(self) -> float:
@@ -350,12 +343,12 @@ class _Whitened:
             spread += len(members) / (len(members) - 1) * apart.T @ apart
         alone = [(index,) for index in sorted(set(range(len(self.scores))).difference(*groups))]
         scores, leverages, corrections, unseen = self._corrected(alone)
-        left = corrections @ (leverages - leverages @ leverages) @ corrections
-        shares = np.array([*(self.hessians[list(members)].sum(axis=0) for members in groups), *left])
+        of_alone = corrections @ (leverages - leverages @ leverages) @ corrections
+        shares = np.array([*(self.hessians[list(members)].sum(axis=0) for members in groups), *of_alone])
         freedoms = np.array([*(len(members) - 1.0 for members in groups), *np.ones(len(alone))])
-        own = np.einsum("nd,gde,ne->gn", self.directions, shares, self.directions)
+        terms = np.einsum("nd,gde,ne->gn", self.directions, shares, self.directions)
         squares = (shares @ shares / freedoms[:, None, None]).sum(axis=0)  # Eq. (7)
-        of_numbers = (np.square(own) / freedoms[:, None]).sum(axis=0)
+        of_numbers = (np.square(terms) / freedoms[:, None]).sum(axis=0)
         spread += scores.T @ scores
         return self._scatter(spread, shares.sum(axis=0), unseen, squares, of_numbers, freedoms.sum())
 
@@ -366,9 +359,9 @@ class _Whitened:
         whole, absorbed = rooted @ corrections, rooted @ rooted
         squares = (whole @ (whole - 2 * absorbed) + rooted @ absorbed.sum(axis=0) @ rooted).sum(axis=0)  # Eq. (8)
         along = self.directions @ rooted
-        own = np.einsum("nd,cde,ne->cn", self.directions, whole, self.directions)
+        terms = np.einsum("nd,cde,ne->cn", self.directions, whole, self.directions)
         shared = np.square(np.einsum("cnd,cne->nde", along, along)).sum(axis=(1, 2))
-        of_numbers = (own * (own - 2 * np.square(along).sum(axis=2))).sum(axis=0) + shared
+        of_numbers = (terms * (terms - 2 * np.square(along).sum(axis=2))).sum(axis=0) + shared
         expected = (whole - absorbed).sum(axis=0)
         return self._scatter(scores.T @ scores, expected, unseen, squares, of_numbers, len(clusters) - 1.0)
 
@@ -376,8 +369,8 @@ class _Whitened:
         """Corrected scores M s (C, d) of clusters, leverages (C, d, d), corrections M (C, d, d) and N (d, d)."""
         size = self.hessians.shape[1]
         leverages, working = (
-            np.array([each[list(members)].sum(axis=0) for members in clusters]).reshape(-1, size, size)
-            for each in (self.hessians, self.working)
+            np.array([of_runs[list(members)].sum(axis=0) for members in clusters]).reshape(-1, size, size)
+            for of_runs in (self.hessians, self.working)
         )
         scores = np.array([self.scores[list(members)].sum(axis=0) for members in clusters]).reshape(-1, size)
         values, vectors = np.linalg.eigh(np.eye(size) - leverages)
@@ -411,12 +404,7 @@ def wider(first: Array, second: Array) -> Array:
     roots = roots_of(first + second)
     values, vectors = np.linalg.eigh(roots.T @ second @ roots)
     turned = np.linalg.pinv(roots.T) @ vectors
-    larger: Array = (turned * np.maximum(values, 1 - values)) @ turned.T
-    return larger
-
-
-_ZERO = 1e-3  # standard deviations: a smaller error of one coordinate was made zero by the fit
-_DIRECTIONS = 400  # of Eq. (2) around the circle, and a tenth of them from pole to pole: integrals to 1e-6
+    return np.asarray((turned * np.maximum(values, 1 - values)) @ turned.T)
 
 
 def scores_of_references(
@@ -427,45 +415,42 @@ def scores_of_references(
     trajectories: Sequence[Trajectory],
     noise: Noise,
 ) -> Scores:
-    """Score vectors and expected Hessians of the runs; arguments as those of ``scores_of_runs`` of sandwich.py."""
+    """Score vectors and expected Hessians of the runs; arguments as those of ``scores_of_runs``."""
     weights, shares = np.array(objective.weights), objective.shares(batch.trajectory)
-    sigmas = sigmas_of_rows(batch, noise)
-    factor = scale_of(errors, sigmas, jacobian.shape[2])
+    # Standard deviations (S, 3) of the rows, those of poses by the noise model; 0 where nothing was measured.
+    rows = batch.rows
+    walked = np.square([[noise.walk_position] * 2 + [noise.walk_heading]]) * rows.t1[:, None]
+    white = np.square([[noise.pose_position] * 2 + [noise.pose_heading]])
+    bias = np.square([[noise.bias_position] * 2 + [noise.bias_heading]])
+    of_poses = np.sqrt(np.maximum(white + walked + bias, np.finfo(float).tiny))
+    sigmas = np.where(rows.of_references[:, None], np.nan_to_num(rows.whole_sigmas), of_poses)
+    # The factor f of the standard deviations, from the errors after the fit; 1 or more.
+    measured = sigmas > 0
+    square = float(np.square(errors[measured] / sigmas[measured]).sum())
+    freedom = max(int(measured.sum()) - jacobian.shape[2], 1)
+    factor = math.sqrt(square / freedom) if float(chdtrc(freedom, square)) < DOUBT else 1.0
     errors, slopes, spread = errors * weights, jacobian * weights[:, None], sigmas * np.abs(weights)
     norms = np.linalg.norm(errors, axis=1)
     single = (spread > 0).sum(axis=1) == 1
     zero = single & (norms < _ZERO * factor * spread.sum(axis=1))
     units = np.where(zero[:, None], 0.0, errors / np.maximum(norms, np.finfo(float).tiny)[:, None])
     pulls = shares[:, None] * np.einsum("ski,sk->si", slopes, units)
-    pulls[zero] = _balancing(pulls.sum(axis=0), shares[zero, None] * slopes[zero].sum(axis=1))
+    if zero.any():  # the scores of errors that the fit made zero balance the others, as nearly as they can
+        columns = shares[zero, None] * slopes[zero].sum(axis=1)
+        balancing = np.linalg.lstsq(columns.T, -pulls.sum(axis=0), rcond=None)[0]
+        pulls[zero] = np.clip(balancing, -1.0, 1.0)[:, None] * columns
     moments = np.array([_moments(tuple(of_row)) for of_row in spread.tolist()])  # (S, 2, 3)
     curved = moments[:, 1] / factor * shares[:, None]
-    count = range(len(trajectories))
-    own = [batch.trajectory == run for run in count]
-    hessians = np.array([np.einsum("ski,sk,skj->ij", slopes[of_run], curved[of_run], slopes[of_run]) for of_run in own])
     squares = moments[:, 0] * np.square(shares)[:, None]
-    working = np.array([np.einsum("ski,sk,skj->ij", slopes[of_run], squares[of_run], slopes[of_run]) for of_run in own])
-    scores = np.array([pulls[of_run].sum(axis=0) for of_run in own])
-    roots = roots_of(hessians.sum(axis=0))
-    return Scores(scores, hessians, trajectories, -roots @ roots.T @ scores.sum(axis=0), working)
-
-
-def sigmas_of_rows(batch: ReferenceBatch, noise: Noise) -> Array:
-    """Standard deviations (S, 3) of the rows, those of poses by a noise model; 0 where nothing was measured."""
-    rows = batch.rows
-    walked = np.square([[noise.walk_position] * 2 + [noise.walk_heading]]) * rows.t1[:, None]
-    white = np.square([[noise.pose_position] * 2 + [noise.pose_heading]])
-    bias = np.square([[noise.bias_position] * 2 + [noise.bias_heading]])
-    of_poses = np.sqrt(np.maximum(white + walked + bias, np.finfo(float).tiny))
-    return np.where(rows.of_references[:, None], np.nan_to_num(rows.whole_sigmas), of_poses)
-
-
-def scale_of(errors: Array, sigmas: Array, fitted: int) -> float:
-    """The factor f of the standard deviations (S, 3), from errors (S, 3) after a fit of some numbers; 1 or more."""
-    measured = sigmas > 0
-    square = float(np.square(errors[measured] / sigmas[measured]).sum())
-    freedom = max(int(measured.sum()) - fitted, 1)
-    return math.sqrt(square / freedom) if float(chdtrc(freedom, square)) < DOUBT else 1.0
+    scores, hessians, working = [], [], []
+    for run in range(len(trajectories)):
+        of_run = batch.trajectory == run
+        scores.append(pulls[of_run].sum(axis=0))
+        hessians.append(np.einsum("ski,sk,skj->ij", slopes[of_run], curved[of_run], slopes[of_run]))
+        working.append(np.einsum("ski,sk,skj->ij", slopes[of_run], squares[of_run], slopes[of_run]))
+    roots = roots_of(np.array(hessians).sum(axis=0))
+    step = -roots @ roots.T @ np.array(scores).sum(axis=0)
+    return Scores(np.array(scores), np.array(hessians), trajectories, step, np.array(working))
 
 
 def covariance_of_rows(batch: ReferenceBatch, run: int, by_errors: Array, noise: Noise) -> Array:
@@ -474,27 +459,19 @@ def covariance_of_rows(batch: ReferenceBatch, run: int, by_errors: Array, noise:
     Poses have the noise model's covariance, references their own.
     """
     rows = batch.rows
-    own = batch.trajectory == run
-    references = rows.of_references[own]
-    sigmas = np.nan_to_num(rows.whole_sigmas[own][references])
+    of_run = batch.trajectory == run
+    references = rows.of_references[of_run]
+    sigmas = np.nan_to_num(rows.whole_sigmas[of_run][references])
     scaled = (by_errors[references] * sigmas[..., None]).reshape(-1, by_errors.shape[2])
     total: Array = scaled.T @ scaled
     if not references.all():
-        total = total + covariance_of_sums(noise, rows.t1[own][~references], by_errors[~references], (0, 1, 2))
+        total = total + covariance_of_sums(noise, rows.t1[of_run][~references], by_errors[~references], (0, 1, 2))
     return total
-
-
-def _balancing(total: Array, columns: Array) -> Array:
-    """Scores (z, n) of z rows along their columns (z, n) that make a sum of scores (n,) zero, as nearly as they can."""
-    if not len(columns):
-        return columns
-    units = np.linalg.lstsq(columns.T, -total, rcond=None)[0]
-    return np.clip(units, -1.0, 1.0)[:, None] * columns
 
 
 @cache
 def _moments(sigmas: tuple[float, ...]) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """E[u_i^2] and E[(1 - u_i^2) / |e|] of each of three coordinates, Eq. (1) and (2); 0 of one with no deviation."""
+    """E[u_i^2] and E[(1 - u_i^2) / |e|] of each of three coordinates, Eq. (10) and (11); 0 of one with no deviation."""
     used = [axis for axis, sigma in enumerate(sigmas) if sigma > 0]
     squares, curved = np.zeros(3), np.zeros(3)
     if len(used) == 1:

@@ -1,13 +1,14 @@
-"""Contrasts between sessions: a deviation that the runs of one share, tested by the scatter of its repetitions.
+"""Sessions that differ, and by what: the radii of the wheels, one of them, or more than radii.
 
-Runs z of a command c are compared at stamps that they have in common, in the frames of their starts. With r_z the
-residuals of a run by any decent model (reference minus odometry), C their covariance by the noise and the nuisances,
-and X_c the mean derivatives of the command's poses by the elements of the matrix, a run has the score and information
+A deviation that the runs of a session share is tested by the scatter of its repetitions. Runs z of a command c are
+compared at stamps that they have in common, in the frames of their starts. With r_z the residuals of a run by any
+decent model (reference minus odometry), C their covariance by the noise and the nuisances, and X_c the mean derivatives
+of the command's poses by the elements of the matrix, a run has the score and information
 
     s_z = X_c' C^-1 r_z,    H_z = X_c' C^-1 X_c.                                                          (1)
 
-What the model lacks is alike in all runs of a command, and so is its part in their scores. It cancels between a
-session B and the others, A, where these drive the command, too, n_A and n_B times: with weights
+What the model lacks is alike in all runs of a command, and so is its part in their scores. It cancels between a session
+B and the others, A, where these drive the command, too, n_A and n_B times: with weights
 
     g_z = n_A / (n_A + n_B) in B,    g_z = -n_B / (n_A + n_B) in A,                                       (2)
 
@@ -34,24 +35,22 @@ A run that its session does not repeat has the terms of the groups of its comman
 proportion to the noise model's E_k, and adds its E_k to theirs in (5). A command that no session repeats is left out:
 nothing says how much its runs scatter.
 
-Where the validation split drives no command of the training, J and S come from the estimates of both, with
-I_A = sum of H_z in A, in which whatever the model lacks counts, too:
+Where the validation split drives no command of the training, J and S come from the estimates of both, with I_A = sum of
+H_z in A, in which whatever the model lacks counts, too:
 
     J = (I_A^-1 + I_B^-1)^-1,    u_z = R'J I_B^-1 s_z in B,    u_z = -R'J I_A^-1 s_z in A.                (7)
 
 A deviation then says that sessions or commands differ, and not which. A run of a command that no session repeats has
 the term E_k, by the s of its session's repetitions, or of all where it has none.
 
-Sessions that differ, and by what: the radii of the wheels, one of them, or more than radii.
-
-The tests are those of sessions.py. Looked for are a common change of all radii (d = 1), one of each (d = N) and
-any change of the matrix (d = 3N); the least chance counts, times three and times the number of sessions that are tested
-(Bonferroni). The session that differs most is taken out, and the others are tested again.
+Looked for are a common change of all radii (d = 1), one of each (d = N) and any change of the matrix (d = 3N); the
+least chance counts, times three and times the number of sessions that are tested (Bonferroni). The session that differs
+most is taken out, and the others are tested again.
 
 Derivatives are at a matrix that is fitted to all runs, to a share p of which a session's change belongs. Relative to
 that matrix a radius changes by u, and relative to that of the other sessions by
 
-    k = u / (1 - p u).                                                                                    (1)
+    k = u / (1 - p u).                                                                                    (8)
 """
 
 from __future__ import annotations
@@ -70,16 +69,7 @@ from omnibench.data.stored_rows import drawn_runs
 from omnibench.errors import DataError
 from omnibench.fit.information import INTERVAL
 from omnibench.fit.noise import common_poses, grouped, roots_of, whiteners
-from omnibench.fit.trajectory_fit import (
-    FitNoise,
-    Nuisances,
-    TrajectoryFit,
-    given,
-    in_start_frames,
-    noise_of_fit,
-    usable_runs,
-    whitened,
-)
+from omnibench.fit.trajectory_fit import Nuisances, TrajectoryFit, in_start_frames, noise_of_fit, usable_runs, whitened
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
@@ -90,6 +80,20 @@ _WHOLE = 0.5
 # Share of the largest singular value below which a direction is rounding, and of the noise model's variance below which
 # the scatter is: repetitions that agree exactly (trajectory_ml.py).
 _ROUNDING = 1e-6
+# Chance at which sessions are said to differ that do not, over all that is tested: strict, as one such answer in a
+# hundred is too many, and enough to see 0.5 % of one radius in 60 + 60 runs (tests/studies/session_study.py).
+CHANCE = 0.001
+# Level of the tests for nuisances, that of discover (discover/fitting.py).
+_NUISANCES = 1e-4
+# Chance of what is left from which on a change of radii counts as all that differs: chosen; words alone hang on it.
+_ALL = 0.01
+# Chance below which no figure is printed but "< 10⁻⁹": tails that thin are not those of real noise (chosen).
+_LEAST = 1e-9
+# Names of sessions, or of wheels, that a sentence lists (chosen).
+_LISTED = 3
+_SPLITS = "train", "validation"
+_ALONE = "all runs are of one session"
+Kind = Literal["all wheels", "one wheel", "wheels", "matrix"]
 
 
 def sessions_of(runs: Sequence[Trajectory]) -> tuple[str, ...]:
@@ -124,14 +128,18 @@ class SessionScores:
             )
         ]
         values = in_start_frames(fit.runs, values)
-        kept: list[int] = []
+        used: list[int] = []
         parts: list[tuple[Array, Array, Array]] = []  # residuals, columns, slopes by nuisances
         stamps_of: list[Array] = []
-        for members in _whole_runs(fit.runs):
+        for of_command in grouped([run.command for run in fit.runs]):
+            if fit.runs[of_command[0]].command is None:
+                continue
+            ends = np.array([fit.runs[index].pose_times[-1] for index in of_command])
+            members = [index for index, end in zip(of_command, ends, strict=True) if end >= _WHOLE * np.median(ends)]
             stamps, poses = common_poses([(fit.runs[index].pose_times[1:], values[index]) for index in members])
             if len(stamps):
                 columns = poses.mean(axis=0)[..., 1:]
-                kept += members
+                used += members
                 stamps_of += [stamps] * len(members)
                 parts += [(of_run[..., 0], columns[..., :elements], columns[..., elements:]) for of_run in poses]
         deviations = fit.nuisances.deviations[fit.nuisances.estimated]
@@ -141,8 +149,8 @@ class SessionScores:
         data = whitened(residuals, fitted, whiteners(noise, stamps_of), slopes, deviations)
         names = sessions_of(fit.runs)
         return cls(
-            tuple(fit.runs[index] for index in kept),
-            tuple(names[index] for index in kept),
+            tuple(fit.runs[index] for index in used),
+            tuple(names[index] for index in used),
             data.scores,
             data.information_of_runs,
             fit.model.matrix,
@@ -179,13 +187,13 @@ class SessionScores:
 
     def without(self, session: str) -> SessionScores:
         """The scores of all other sessions."""
-        kept = [index for index, name in enumerate(self.sessions) if name != session]
+        others = [index for index, name in enumerate(self.sessions) if name != session]
         return replace(
             self,
-            runs=tuple(self.runs[index] for index in kept),
-            sessions=tuple(self.sessions[index] for index in kept),
-            scores=self.scores[kept],
-            information=self.information[kept],
+            runs=tuple(self.runs[index] for index in others),
+            sessions=tuple(self.sessions[index] for index in others),
+            scores=self.scores[others],
+            information=self.information[others],
         )
 
     def _contrast(self, used: NDArray[np.intp], factors: Array) -> Contrast:
@@ -193,14 +201,6 @@ class SessionScores:
         spreads = factors @ self.information[used] @ factors.swapaxes(1, 2)
         runs = [self.runs[index] for index in used]
         return Contrast(pulls, spreads, runs, [self.sessions[index] for index in used])
-
-
-def _whole_runs(runs: Sequence[Trajectory]) -> Iterator[list[int]]:
-    """The runs of each command, but those that were cut short."""
-    for members in grouped([run.command for run in runs]):
-        if runs[members[0]].command is not None:
-            ends = np.array([runs[index].pose_times[-1] for index in members])
-            yield [index for index, end in zip(members, ends, strict=True) if end >= _WHOLE * np.median(ends)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,8 +215,7 @@ class Contrast:
     @property
     def information(self) -> Array:
         """J (n, n), Eq. (3)."""
-        total: Array = self.spreads.sum(axis=0)
-        return total
+        return np.asarray(self.spreads.sum(axis=0))
 
     def roots(self, directions: Array) -> Array:
         """R (n, d) of directions T (n, q), Eq. (4)."""
@@ -225,11 +224,9 @@ class Contrast:
     def beyond(self, directions: Array) -> Array:
         """R (n, d) of all directions that are independent of T (n, q)."""
         roots = roots_of(self.information)
-        taken = roots.T @ self.information @ directions
-        basis, sizes, _ = np.linalg.svd(taken)
+        basis, sizes, _ = np.linalg.svd(roots.T @ self.information @ directions)
         rank = int((sizes > _ROUNDING * sizes.max(initial=0.0)).sum())
-        rest: Array = roots @ basis[:, rank:]
-        return rest
+        return np.asarray(roots @ basis[:, rank:])
 
     def chance(self, roots: Array) -> tuple[float, float]:
         """The chance of t, Eq. (6), and t' V^-1 t; 1 where the repetitions are too few for so many directions."""
@@ -248,7 +245,7 @@ class Contrast:
         counts = np.array([len(members) for members in groups], dtype=float)
         expected = np.array([roots.T @ self.spreads[list(members)].sum(axis=0) @ roots for members in groups])
         apart = [pulls[list(members)] - pulls[list(members)].mean(axis=0) for members in groups]
-        seen = np.array([count / max(count - 1, 1) * each.T @ each for count, each in zip(counts, apart, strict=True)])
+        seen = np.array([n / max(n - 1, 1) * errors.T @ errors for n, errors in zip(counts, apart, strict=True)])
         of_session, of_command = (
             np.array([names[members[0]] for members in groups], dtype=object)
             for names in (self.sessions, [run.command for run in self.runs])
@@ -256,62 +253,37 @@ class Contrast:
         repeated = counts > 1
         if not repeated.any():
             return pulls.sum(axis=0), seen.sum(axis=0), 0.0
-        traces = [np.trace(each, axis1=1, axis2=2) * (counts - 1) for each in (seen, expected)]
+        traces = [np.trace(terms, axis1=1, axis2=2) * (counts - 1) for terms in (seen, expected)]
         plain = np.trace(expected, axis1=1, axis2=2)
         for name in dict.fromkeys(self.sessions):  # s^2 of each session, or of all where one repeats nothing
             inside = of_session == name
-            known = inside if repeated[inside].any() else repeated
-            expected[inside] *= max(traces[0][known].sum() / max(traces[1][known].sum(), 1e-300), _ROUNDING)
-        shares = _shares(counts, of_command, of_session)
-        seen_units, expected_units = (each / np.maximum(plain, 1e-300)[:, None, None] for each in (seen, expected))
+            repeating = inside if repeated[inside].any() else repeated
+            expected[inside] *= max(traces[0][repeating].sum() / max(traces[1][repeating].sum(), 1e-300), _ROUNDING)
+        # A run without repetition scatters as the groups of its command, else as those of its session, else as all.
+        shares = np.zeros((len(counts), len(counts)))
+        seen_units, expected_units = (terms / np.maximum(plain, 1e-300)[:, None, None] for terms in (seen, expected))
         for index in np.flatnonzero(~repeated):
-            told = np.flatnonzero(shares[index])
-            if of_command[told[0]] == of_command[index]:  # with their s: that of its session may rest on two runs
+            alike = (names == names[index] for names in (of_command, of_session, np.ones(len(counts))))
+            groups_like = next(
+                groups for groups in (np.flatnonzero(repeated & those) for those in alike) if len(groups)
+            )
+            shares[index, groups_like] = (counts[groups_like] - 1) / (counts[groups_like] - 1).sum()
+            if of_command[groups_like[0]] == of_command[index]:  # with their s: its session's may rest on two runs
                 seen[index] = plain[index] * np.tensordot(shares[index], seen_units, 1)
                 expected[index] = plain[index] * np.tensordot(shares[index], expected_units, 1)
             else:
                 seen[index] = expected[index]
-        known_by = expected + np.tensordot(shares.T, expected, 1)
-        freedom = _total_variance(expected.sum(axis=0)) / np.sum(
-            [
-                _total_variance(each) / (count - 1)
-                for each, count in zip(known_by[repeated], counts[repeated], strict=True)
-            ]
-        )
+        whole = expected + np.tensordot(shares.T, expected, 1)
+        terms = [
+            _total_variance(of_group) / (n - 1) for of_group, n in zip(whole[repeated], counts[repeated], strict=True)
+        ]
+        freedom = _total_variance(expected.sum(axis=0)) / np.sum(terms)
         return pulls.sum(axis=0), seen.sum(axis=0) + _ROUNDING * np.eye(len(roots.T)), float(freedom)
-
-
-def _shares(counts: Array, of_command: NDArray[np.object_], of_session: NDArray[np.object_]) -> Array:
-    """Shares (K, K) of the groups that say how much the run of a group without repetitions, a row, scatters.
-
-    Those of its command do, else those of its session, else all.
-    """
-    shares = np.zeros((len(counts), len(counts)))
-    for index in np.flatnonzero(counts == 1):
-        alike = (names == names[index] for names in (of_command, of_session, np.ones(len(counts))))
-        told = next(each for each in ((counts > 1) & those for those in alike) if each.any())
-        shares[index, told] = (counts[told] - 1) / (counts[told] - 1).sum()
-    return shares
 
 
 def _total_variance(covariance: Array) -> float:
     """tr A^2 + (tr A)^2, Eq. (5)."""
     return float(np.square(covariance).sum() + np.trace(covariance) ** 2)
-
-
-# Chance at which sessions are said to differ that do not, over all that is tested: strict, as one such answer in a
-# hundred is too many, and enough to see 0.5 % of one radius in 60 + 60 runs (tests/studies/session_study.py).
-CHANCE = 0.001
-# Level of the tests for nuisances, that of discover (discover/fitting.py).
-_NUISANCES = 1e-4
-# Chance of what is left from which on a change of radii counts as all that differs: chosen; words alone hang on it.
-_ALL = 0.01
-# Chance below which no figure is printed but "< 10⁻⁹": tails that thin are not those of real noise (chosen).
-_LEAST = 1e-9
-# Names of sessions, or of wheels, that a sentence lists (chosen).
-_LISTED = 3
-_ALONE = "all runs are of one session"
-Kind = Literal["all wheels", "one wheel", "wheels", "matrix"]
 
 
 @dataclass(frozen=True)
@@ -358,7 +330,7 @@ class SessionComparison:
     @property
     def sentences(self) -> tuple[str, ...]:
         """A sentence for each session that differs, or for a validation split that drives other commands."""
-        return (*(_in_words(each) for each in self.differences), *self.of_other_commands)
+        return (*map(_in_words, self.differences), *self.of_other_commands)
 
     @property
     def doubts(self) -> tuple[str, ...]:
@@ -391,48 +363,35 @@ def compare_sessions(model: OdometryModel, trajectories: Sequence[Trajectory]) -
         runs = usable_runs(drawn_runs(trajectories), "all")
     except DataError as error:
         return SessionComparison(untested=str(error))
-    if untested := _untested(runs):
-        few = "the runs of all sessions but one have no reference poses after their start"
-        return SessionComparison(untested=few if untested == _ALONE else untested)
+    names = sessions_of(runs)
+    if len(set(names)) < 2:
+        return SessionComparison(untested="the runs of all sessions but one have no reference poses after their start")
+    driven = [(name, run.command) for name, run in zip(names, runs, strict=True) if run.command is not None]
+    if not any(len(members) > 1 for members in grouped(driven)):
+        return SessionComparison(
+            untested="no session repeats a command, so that nothing says how much its runs scatter"
+        )
     fit = TrajectoryFit(model, runs, Nuisances(np.zeros((len(runs), 3)), np.zeros(3)))
     noise = noise_of_fit(fit, range(3), None, _NUISANCES)
-    fit = _centred(replace(fit, nuisances=Nuisances(fit.nuisances.values, noise.deviations)), noise)
+    fit = replace(fit, nuisances=Nuisances(fit.nuisances.values, noise.deviations))
+    # The matrix is fitted to all runs, by one step, so that the sessions' changes about it are small.
+    whitened_fit = fit.linearised(fit.matrix_jacobian(), whiteners(noise.estimate.noise, fit.stamps))
+    step, _ = whitened_fit.given([]).estimate(range(model.matrix.size))
+    fit = replace(fit, model=replace(model, matrix=model.matrix + step.reshape(model.matrix.shape)))
     try:
         data = SessionScores.of(fit, noise.estimate.noise)
     except DataError as error:
         return SessionComparison(untested=str(error))
-    chance = _with_other_commands(data)
-    untested = "" if chance is not None else _uncomparable(sessions_of(fit.runs), data.comparable)
+    chance, untested, comparable = None, "", data.comparable
+    training, validation = ({run.command for run in data.runs if run.split == split} for split in _SPLITS)
+    if training and validation and not training & validation:
+        chance = 3 * _least_chance(data, data.between_splits())
+    elif not comparable:
+        untested = "the sessions share no command that any of them repeats"
+    elif apart := [name for name in dict.fromkeys(names) if name not in comparable]:
+        untested = f"no run of {_listed(apart)} drives a command of another session that either repeats"
     deviates = chance is not None and chance < CHANCE
     return SessionComparison(tuple(_differences(data)), chance if deviates else None, untested)
-
-
-def _centred(fit: TrajectoryFit, noise: FitNoise) -> TrajectoryFit:
-    """The fit with its matrix fitted to all runs, by one step, so that the sessions' changes about it are small."""
-    data = fit.linearised(fit.matrix_jacobian(), whiteners(noise.estimate.noise, fit.stamps))
-    step, _ = given(data, []).estimate(range(fit.model.matrix.size))
-    return replace(fit, model=replace(fit.model, matrix=fit.model.matrix + step.reshape(fit.model.matrix.shape)))
-
-
-def _untested(runs: Sequence[Trajectory]) -> str:
-    """Why sessions cannot be compared; empty if they can."""
-    names = sessions_of(runs)
-    if len(set(names)) < 2:
-        return _ALONE
-    driven = [(name, run.command) for name, run in zip(names, runs, strict=True) if run.command is not None]
-    if not any(len(members) > 1 for members in grouped(driven)):
-        return "no session repeats a command, so that nothing says how much its runs scatter"
-    return ""
-
-
-def _uncomparable(names: Sequence[str], comparable: Sequence[str]) -> str:
-    """The sessions that share with another one no command that either repeats, in words; empty if there are none."""
-    left = [name for name in dict.fromkeys(names) if name not in comparable]
-    if not comparable:
-        return "the sessions share no command that any of them repeats"
-    if not left:
-        return ""
-    return f"no run of {_listed(left)} drives a command of another session that either repeats"
 
 
 def _differences(data: SessionScores) -> Iterator[SessionDifference]:
@@ -440,11 +399,35 @@ def _differences(data: SessionScores) -> Iterator[SessionDifference]:
     names = data.comparable
     tests = 3 * (1 if len(names) == 2 else len(names))  # two sessions differ from each other: one test
     while len(names) > 1:
-        chances = {name: _least_chance(data, data.between(name)) for name in names}
+        contrasts = {name: data.between(name) for name in names}
+        chances = {name: _least_chance(data, contrast) for name, contrast in contrasts.items()}
         session = min(chances, key=lambda name: chances[name])
         if tests * chances[session] >= CHANCE:
             break
-        yield _difference(data, session, tests * chances[session])
+        # The least change that explains the deviation: of one number, of each radius, or of the matrix.
+        contrast = contrasts[session]
+        kind, directions, wheels = _least_change(data, contrast)
+        roots = contrast.roots(directions)
+        total, scatter, freedom = contrast.scatter(roots)
+        change, inverse = roots @ total, np.linalg.pinv(directions)
+        values, deviations = inverse @ change, np.sqrt(np.diag(inverse @ roots @ scatter @ roots.T @ inverse.T))
+        reach = float(stdtrit(freedom, (1 + INTERVAL) / 2)) * deviations
+        count = contrast.sessions.count(session)
+        share = count / len(contrast.sessions)
+        radii = []
+        for wheel, value, width in zip(wheels, values, reach, strict=False):  # none of the matrix
+            limits = (float(u / (1 - share * u)) for u in (value, value - width, value + width))  # Eq. (8)
+            radii.append(RadiusChange(wheel, *limits))
+        yield SessionDifference(
+            session=session,
+            others=tuple(sorted(set(contrast.sessions) - {session})),
+            runs=count,
+            commands=len({run.command for run in contrast.runs}),
+            chance=tests * chances[session],
+            kind=kind,
+            radii=tuple(radii),
+            matrix=tuple(tuple(float(value) for value in row) for row in change.reshape(data.matrix.shape)),
+        )
         data = data.without(session)
         names = data.comparable
 
@@ -452,69 +435,36 @@ def _differences(data: SessionScores) -> Iterator[SessionDifference]:
 def _directions(data: SessionScores) -> tuple[Array, Array, Array]:
     """Directions (3N, d) of a change of all radii, of each radius, and of the matrix."""
     wheels = np.eye(data.matrix.shape[1])
-    each = np.stack([(data.matrix * wheel).ravel() for wheel in wheels], axis=1)
-    return data.matrix.reshape(-1, 1), each, np.eye(data.matrix.size)
+    radii = np.stack([(data.matrix * wheel).ravel() for wheel in wheels], axis=1)
+    return data.matrix.reshape(-1, 1), radii, np.eye(data.matrix.size)
 
 
 def _least_chance(data: SessionScores, contrast: Contrast) -> float:
     return min(contrast.chance(contrast.roots(directions))[0] for directions in _directions(data))
 
 
-def _difference(data: SessionScores, session: str, chance: float) -> SessionDifference:
-    """The least change that explains a session's deviation: of one number, of each radius, or of the matrix."""
-    contrast = data.between(session)
-    kind, directions, wheels = _least_change(data, contrast)
-    roots = contrast.roots(directions)
-    total, scatter, freedom = contrast.scatter(roots)
-    change, inverse = roots @ total, np.linalg.pinv(directions)
-    values, deviations = inverse @ change, np.sqrt(np.diag(inverse @ roots @ scatter @ roots.T @ inverse.T))
-    reach = float(stdtrit(freedom, (1 + INTERVAL) / 2)) * deviations
-    share = contrast.sessions.count(session) / len(contrast.sessions)
-    return SessionDifference(
-        session=session,
-        others=tuple(sorted(set(contrast.sessions) - {session})),
-        runs=contrast.sessions.count(session),
-        commands=len({run.command for run in contrast.runs}),
-        chance=chance,
-        kind=kind,
-        radii=tuple(
-            RadiusChange(wheel, *(float(each / (1 - share * each)) for each in (value, value - width, value + width)))
-            for wheel, value, width in zip(wheels, values, reach, strict=False)  # none of the matrix; Eq. (1)
-        ),
-        matrix=tuple(tuple(float(value) for value in row) for row in change.reshape(data.matrix.shape)),
-    )
-
-
 def _least_change(data: SessionScores, contrast: Contrast) -> tuple[Kind, Array, tuple[str, ...]]:
     """The least change beside which nothing is left: its kind, its directions (3N, d) and its wheels."""
-    common, each, every = _directions(data)
-    single = {"": common} | {wheel: each[:, [column]] for column, wheel in enumerate(data.wheels)}
-    able = {name: directions for name, directions in single.items() if _explains(contrast, directions)}
-    if able:
-        name = max(able, key=lambda name: contrast.chance(contrast.roots(able[name]))[1])
-        return ("one wheel" if name else "all wheels"), able[name], (name,)
-    if _explains(contrast, each):
-        return "wheels", each, data.wheels
-    return "matrix", every, ()
+    common, radii, matrix = _directions(data)
+    single = {"": common} | {wheel: radii[:, [column]] for column, wheel in enumerate(data.wheels)}
+    explaining = {name: directions for name, directions in single.items() if _explains(contrast, directions)}
+    if explaining:
+        name = max(explaining, key=lambda name: contrast.chance(contrast.roots(explaining[name]))[1])
+        return ("one wheel" if name else "all wheels"), explaining[name], (name,)
+    if _explains(contrast, radii):
+        return "wheels", radii, data.wheels
+    return "matrix", matrix, ()
 
 
 def _explains(contrast: Contrast, directions: Array) -> bool:
     return contrast.chance(contrast.beyond(directions))[0] >= _ALL
 
 
-def _with_other_commands(data: SessionScores) -> float | None:
-    """The chance of the validation split's deviation, where it drives no command of the training."""
-    driven = [{run.command for run in data.runs if run.split == split} for split in ("train", "validation")]
-    if not all(driven) or driven[0] & driven[1]:
-        return None
-    return 3 * _least_chance(data, data.between_splits())
-
-
 def _in_words(difference: SessionDifference) -> str:
     others = _listed(difference.others)
     changes = " and ".join(
-        f"{f'the radius of wheel {each.wheel} looks' if each.wheel else 'the radii of all wheels look'} {_size(each)}"
-        for each in difference.radii
+        f"{f'the radius of wheel {one.wheel} looks' if one.wheel else 'the radii of all wheels look'} {_size(one)}"
+        for one in difference.radii
     )
     what = changes or "more than the wheels' radii is another (floor, load, or the mount of wheels or reference)"
     return (
@@ -534,7 +484,7 @@ def _listed(names: Sequence[str]) -> str:
 
 def _size(change: RadiusChange) -> str:
     """``2.04 % larger (95 %: 1.95 to 2.13 %)``."""
-    value, low, high = (100 * each for each in (change.value, change.low, change.high))
+    value, low, high = (100 * share for share in (change.value, change.low, change.high))
     decimals = max(0, math.ceil(0.7 - math.log10(max((high - low) / 2, 1e-9))))  # 2 for a half width of 0.05 to 0.5
     low, high = sorted((low, high) if value >= 0 else (-low, -high))
     than = "larger" if value >= 0 else "smaller"

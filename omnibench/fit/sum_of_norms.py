@@ -80,14 +80,14 @@ class SumOfNormsProgram:
         free = self._upper > self._lower
         unit = self._unit[free]
         columns, step = self._jacobian[..., free] * unit, np.zeros(len(unit))
-        left = self._residuals
+        errors = self._residuals
         for _ in range(_MOST_STEPS):
             self.newton_steps += 1
-            sizes = np.linalg.norm(left, axis=1)
+            sizes = np.linalg.norm(errors, axis=1)
             value, used = float(shares @ sizes), shares > 0
             if (sizes[used] <= _VANISHING * value).any():
                 return None
-            directions = left / np.maximum(sizes, 1e-300)[:, None]
+            directions = errors / np.maximum(sizes, 1e-300)[:, None]
             along = np.einsum("sk,skn->sn", directions, columns)
             weighted = np.sqrt(shares / np.maximum(sizes, 1e-300))
             spread = (columns * weighted[:, None, None]).reshape(-1, len(unit))
@@ -99,17 +99,17 @@ class SumOfNormsProgram:
             change = -np.linalg.solve(curvature, slope)
             gain = -float(slope @ change)
             if gain <= _NO_GAIN * value:
-                found = np.zeros(len(free))
-                found[free] = (step + change) * unit
-                inside = (found > self._lower) & (found < self._upper)
-                return found if inside[free].all() else None
+                best = np.zeros(len(free))
+                best[free] = (step + change) * unit
+                inside = (best > self._lower) & (best < self._upper)
+                return best if inside[free].all() else None
             part = 1.0
-            while shares @ np.linalg.norm(left + columns @ (part * change), axis=1) > value - part * gain / 4:
+            while shares @ np.linalg.norm(errors + columns @ (part * change), axis=1) > value - part * gain / 4:
                 part /= 2
                 if part < _LEAST_PART:
                     return None
             step = step + part * change
-            left = self._residuals + columns @ step
+            errors = self._residuals + columns @ step
         return None
 
 

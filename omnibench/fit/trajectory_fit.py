@@ -9,26 +9,23 @@ step (d, e) minimises over all runs
 Whatever d is, the nuisances eta + e of a run are those of Eq. (1) for the residuals r + N eta - J d. Eliminated, they
 leave plain least squares in d.
 
-Nuisances of each run: its start heading, and the offset and slope of the reference's clock.
-
-They belong to the recording of one run and say nothing of the robot. A shift of the start position is none of them: it
-is a bias of the run, which the noise model contains. Nuisances eta of a run are normal from run to run, with standard
-deviations S (a diagonal matrix). With r the whitened residuals of a run and N the whitened derivatives of its poses by
+The nuisances are the start heading of a run, and the offset and slope of its reference's clock. They belong to the
+recording of one run and say nothing of the robot. A shift of the start position is none of them: it is a bias of the
+run, which the noise model contains. Nuisances eta of a run are normal from run to run, with standard deviations S (a
+diagonal matrix). With r the whitened residuals of a run and N the whitened derivatives of its poses by
 eta, the likeliest values for the residuals that a model would leave without nuisances are
 
-    eta = (N'N + S^-2)^-1 N'r.                                                                            (1)
+    eta = (N'N + S^-2)^-1 N'r.                                                                            (2)
 
-Noise of the reference poses and of the runs' nuisances, by maximum likelihood from repetitions.
+The noise of the reference poses and of the nuisances is estimated by maximum likelihood from repetitions. Nuisances add
+N S S N' to the covariance of a run's poses. With residuals r and N both whitened under the noise, whose covariance is
+C, up to a constant
 
-Nuisances of a run whose standard deviations from run to run are S (a diagonal matrix) add N S S N' to the covariance of
-its poses, N being the derivatives of the poses by them. With residuals r and N both whitened under the noise, whose
-covariance is C, up to a constant
-
-    -2 ln L = ln |1 + S N'N S| - (S N'r)' (1 + S N'N S)^-1 (S N'r) + r'r + ln |C|.                        (1)
+    -2 ln L = ln |1 + S N'N S| - (S N'r)' (1 + S N'N S)^-1 (S N'r) + r'r + ln |C|.                        (3)
 
 Its derivative by a variance v of the noise or of a nuisance is, with a = (C + N S S N')^-1 r before whitening,
 
-    d(-2 ln L) / dv = tr((C + N S S N')^-1 dC/dv) - a' dC/dv a,    dC/dv = N_j N_j' for nuisance j.        (2)
+    d(-2 ln L) / dv = tr((C + N S S N')^-1 dC/dv) - a' dC/dv a,    dC/dv = N_j N_j' for nuisance j.        (4)
 
 A deviation is zero unless a likelihood ratio test rejects that, all components of the noise and the nuisances found
 before being fitted anew. Nuisances and noise resemble each other: an error of the start heading shifts the headings by
@@ -66,6 +63,37 @@ from omnibench.robot.kinematics import Array, rotation
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import OdometryBatch, WheelLog, split_by
 
+NUISANCES = ("start heading", "clock offset", "clock slope")
+TURN, OFFSET, SLOPE = range(3)  # their columns
+# A function from a run's residuals (K, 3), or their derivatives (K, 3, n), to weighted ones (k, 3) or (k, 3, n).
+Weighting = Callable[[Array], Array]
+
+# tests/studies/constants.py varies each number by 0.5 and 2: on a small set with heading drift no verdict and no
+# name changes.
+_MOST_STAMPS = 80  # reference poses used of a run: neighbours in denser references share their errors
+_STANDING = 1e-3  # rad/s: slower wheels count as standing; one of 0.1 m moves 0.1 mm in a second
+_OVERHANG = 0.5  # s after the last wheel sample in which reference poses are still used, see ``log_of``
+# Share of a direction's information that must be left beyond other columns for it to count: a thousandth of its length,
+# far above rounding. Half of it and twice change no calibration (tests/studies/constants_fit.py) and no discovery
+# (tests/studies/constants.py).
+_DETERMINED = 1e-6
+_NOTHING = 1e-22  # share of the largest information: with _DETERMINED, columns of 1e-14 of its size are rounding
+_KEPT = 4  # Schur complements that are kept: beyond the matrix and beyond all effects, with forms or without (chosen)
+_TOGETHER = 20  # runs of about the same length whose derivatives are computed at once (chosen)
+
+_NAMES = ("pose_position", "walk_position", "bias_position", "pose_heading", "walk_heading", "bias_heading")
+# Level of the tests, shared by the nuisances that are asked about (Bonferroni): noise alone shows any of them in one
+# set of twenty.
+CHANCE = 0.05
+# Share of the critical value that a nuisance alone must gain before all components are fitted with it: the others do
+# not add four times as much. Half of this and twice give the same estimates from right and wrong starts
+# (tests/studies/constants_fit.py).
+_PROMISING = 0.25
+# rad, s, s per s: largest deviations that are searched, 17 degrees and several times those of clocks that are
+# synchronised by hand (0.2 s, 0.003). Half and twice as wide, the search finds the same to 1e-5
+# (tests/studies/constants_fit.py).
+_LARGEST = np.array([0.3, 0.5, 0.02])
+
 
 def in_start_frames(runs: Sequence[Trajectory], values: Sequence[Array]) -> list[Array]:
     """Residuals (K, 3), or derivatives of poses (K, 3, m), turned into the frame of each run's start.
@@ -76,13 +104,6 @@ def in_start_frames(runs: Sequence[Trajectory], values: Sequence[Array]) -> list
     for run, of_run in zip(runs, values, strict=True):
         turned.append(np.einsum("ij,kj...->ki...", rotation(-run.start[2]), of_run))
     return turned
-
-
-# tests/studies/constants.py varies each number by 0.5 and 2: on a small set with heading drift no verdict and no
-# name changes.
-_MOST_STAMPS = 80  # reference poses used of a run: neighbours in denser references share their errors
-_STANDING = 1e-3  # rad/s: slower wheels count as standing; one of 0.1 m moves 0.1 mm in a second
-_OVERHANG = 0.5  # s after the last wheel sample in which reference poses are still used, see ``log_of``
 
 
 def usable_runs(trajectories: Sequence[Trajectory], split: str = "train") -> tuple[Trajectory, ...]:
@@ -103,7 +124,14 @@ def usable_runs(trajectories: Sequence[Trajectory], split: str = "train") -> tup
     if max(float(np.abs(run.rates).max()) for run in runs) < _STANDING:
         raise DataError(f"the wheels stand in all runs of the split {split}; drive some, or check the columns omega_*")
     runs.sort(key=lambda run: (str(run.session), run.started_at or 0.0))
-    return tuple(_thinned(run) for run in runs)
+    thinned = []
+    for run in runs:
+        last = _covered_poses(run) - 1
+        if not last == len(run.pose_times) - 1 <= _MOST_STAMPS:
+            chosen = np.round(np.linspace(last, 0, min(last, _MOST_STAMPS) + 1))
+            run = with_poses(run, np.unique(chosen.astype(int)))
+        thinned.append(run)
+    return tuple(thinned)
 
 
 def with_poses(run: Trajectory, index: Array) -> Trajectory:
@@ -115,19 +143,6 @@ def with_poses(run: Trajectory, index: Array) -> Trajectory:
 def _covered_poses(run: Trajectory) -> int:
     """The number of poses, the start among them, up to the end of the wheel samples and the overhang."""
     return int((run.pose_times <= run.times[-1] + _OVERHANG).sum())
-
-
-def _thinned(run: Trajectory) -> Trajectory:
-    last = _covered_poses(run) - 1
-    if last == len(run.pose_times) - 1 <= _MOST_STAMPS:
-        return run
-    return with_poses(run, np.unique(np.round(np.linspace(last, 0, min(last, _MOST_STAMPS) + 1)).astype(int)))
-
-
-NUISANCES = ("start heading", "clock offset", "clock slope")
-TURN, OFFSET, SLOPE = range(3)  # their columns
-# A function from a run's residuals (K, 3), or their derivatives (K, 3, n), to weighted ones (k, 3) or (k, 3, n).
-Weighting = Callable[[Array], Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,9 +165,8 @@ class Nuisances:
     @property
     def chi_square(self) -> Array:
         """Squares (Z,) of the estimated values in units of their deviations, summed for each run."""
-        known = self.estimated
-        total: Array = np.square(self.values[:, known] / self.deviations[known]).sum(axis=1)
-        return total
+        estimated = self.estimated
+        return np.asarray(np.square(self.values[:, estimated] / self.deviations[estimated]).sum(axis=1))
 
     def held(self) -> Nuisances:
         """These values, none of which is estimated any more."""
@@ -168,33 +182,24 @@ def log_of(run: Trajectory, nuisances: Array) -> WheelLog:
     return replace(log, start=log.start + np.array([0.0, 0.0, turn])) if turn else log
 
 
-def nuisance_columns(path: Array, velocity: Array, stamps: Array) -> Array:
-    """Derivatives (K, 3, 3) of a run's poses by its nuisances.
-
-    path (K, 3): the poses less that of the start, about which the path turns. velocity (K, 3): m/s, m/s, rad/s.
-    """
-    turning = np.stack([-path[:, 1], path[:, 0], np.ones(len(path))], axis=1)
-    return np.stack([turning, -velocity, -velocity * stamps[:, None]], axis=2)
-
-
 def likeliest_nuisances(
     residuals: Sequence[Array], slopes: Sequence[Array], weightings: Sequence[Weighting], nuisances: Nuisances
 ) -> Array:
-    """Values (Z, 3) of the nuisances of largest likelihood, Eq. (1); those that are not estimated keep theirs.
+    """Values (Z, 3) of the nuisances of largest likelihood, Eq. (2); those that are not estimated keep theirs.
 
     residuals (K, 3): of each run if all nuisances that are estimated were 0. slopes (K, 3, m): derivatives of its poses
     by these.
     """
-    values, known = nuisances.values.copy(), nuisances.estimated
-    if not known.any():
+    values, estimated = nuisances.values.copy(), nuisances.estimated
+    if not estimated.any():
         return values
-    prior = np.diag(nuisances.deviations[known] ** -2.0)
+    prior = np.diag(nuisances.deviations[estimated] ** -2.0)
     both = [np.concatenate([of_run[..., None], extra], axis=2) for of_run, extra in zip(residuals, slopes, strict=True)]
     for members, white in weighed_together(weightings, both):
         inner = white[..., 1:]
         products = inner.swapaxes(1, 2) @ white
-        found = np.linalg.solve(products[..., 1:] + prior, products[..., :1])
-        values[np.ix_(np.array(members), known)] = found[..., 0]
+        likeliest = np.linalg.solve(products[..., 1:] + prior, products[..., :1])
+        values[np.ix_(np.array(members), estimated)] = likeliest[..., 0]
     return values
 
 
@@ -211,14 +216,6 @@ def weighed_together(
         white = weightings[members[0]](together.reshape(*together.shape[:2], -1))
         of_runs = white.reshape(*white.shape[:2], len(members), columns)
         yield members, of_runs.transpose(2, 0, 1, 3).reshape(len(members), white.shape[0] * white.shape[1], columns)
-
-
-# Share of a direction's information that must be left beyond other columns for it to count: a thousandth of its length,
-# far above rounding. Half of it and twice change no calibration (tests/studies/constants_fit.py) and no discovery
-# (tests/studies/constants.py).
-_DETERMINED = 1e-6
-_NOTHING = 1e-22  # share of the largest information: with _DETERMINED, columns of 1e-14 of its size are rounding
-_KEPT = 4  # Schur complements that are kept: beyond the matrix and beyond all effects, with forms or without (chosen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,11 +245,13 @@ class Whitened:
 
     def less(self, index: Sequence[int], values: Array) -> Whitened:
         """The columns with the residuals less some of the columns times values (n,)."""
-        rows, left, scores = list(index), list[Array](), np.empty_like(self.scores)
-        for run, (residuals, columns) in enumerate(zip(self.residuals, self.columns, strict=True)):
-            left.append(residuals - columns[:, rows] @ values)
-            scores[run] = left[-1] @ columns
-        return replace(self, residuals=left, scores=scores)
+        rows = list(index)
+        both = zip(self.residuals, self.columns, strict=True)
+        remaining = [residuals - columns[:, rows] @ values for residuals, columns in both]
+        scores = np.empty_like(self.scores)
+        for run, columns in enumerate(self.columns):
+            scores[run] = remaining[run] @ columns
+        return replace(self, residuals=remaining, scores=scores)
 
     def given(self, index: Sequence[int]) -> Given:
         """Schur complement of all columns once the columns ``index`` are fitted; the last few are kept."""
@@ -279,19 +278,19 @@ def whitened(
     another way than the residuals.
     """
     count, width = len(residuals), columns[0].shape[2]
-    beside = [np.concatenate([each[..., None], extra], axis=2) for each, extra in zip(residuals, slopes, strict=True)]
+    beside = [np.concatenate([errors[..., None], by], axis=2) for errors, by in zip(residuals, slopes, strict=True)]
     free_residuals, free_columns = [np.empty(0)] * count, [np.empty((0, width))] * count
     information, scores = np.zeros((width, width)), np.empty((count, width))
     weighed = weighed_together(weightings, beside), weighed_together(of_columns or weightings, columns)
     for (members, white), (_, fitted) in zip(*weighed, strict=True):
-        left = white[..., :1]
+        remaining = white[..., :1]
         if len(deviations):
             nuisances = white[..., 1:] * deviations
-            left, fitted = without(left, nuisances), without(fitted, nuisances)
+            remaining, fitted = without(remaining, nuisances), without(fitted, nuisances)
         flat = fitted.reshape(fitted.shape[0] * fitted.shape[1], width)
         information += flat.T @ flat
-        scores[list(members)] = (left.swapaxes(1, 2) @ fitted)[:, 0]
-        for index, of_residuals, of_run in zip(members, left, fitted, strict=True):
+        scores[list(members)] = (remaining.swapaxes(1, 2) @ fitted)[:, 0]
+        for index, of_residuals, of_run in zip(members, remaining, fitted, strict=True):
             free_residuals[index], free_columns[index] = of_residuals[:, 0], of_run
     return Whitened(tuple(free_residuals), tuple(free_columns), information, scores)
 
@@ -300,8 +299,7 @@ def without(values: Array, nuisances: Array) -> Array:
     """Values (..., k, n) less what nuisances (..., k, m) of unit variance explain: (1 + N N')^(-1/2) values."""
     basis, sizes, _ = np.linalg.svd(nuisances, full_matrices=False)
     shrink = 1 - 1 / np.sqrt(1 + sizes**2)
-    left: Array = values - basis @ (shrink[..., None] * (basis.swapaxes(-1, -2) @ values))
-    return left
+    return np.asarray(values - basis @ (shrink[..., None] * (basis.swapaxes(-1, -2) @ values)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -330,22 +328,17 @@ class Given:
         """Matrix (n, d) that turns the scores of n columns into d independent ones of unit variance."""
         key = tuple(index)
         if key not in self._roots:
-            self._roots[key] = self._roots_of(list(key))
+            scale = self.scale(key)
+            inner = self.information[np.ix_(key, key)] * np.outer(scale, scale)
+            values, vectors = np.linalg.eigh(inner)
+            determined = values > _DETERMINED
+            self._roots[key] = scale[:, None] * vectors[:, determined] / np.sqrt(values[determined])
         return self._roots[key]
-
-    def _roots_of(self, index: list[int]) -> Array:
-        scale = self.scale(index)
-        inner = self.information[np.ix_(index, index)] * np.outer(scale, scale)
-        values, vectors = np.linalg.eigh(inner)
-        known = values > _DETERMINED
-        roots: Array = scale[:, None] * vectors[:, known] / np.sqrt(values[known])
-        return roots
 
     def scale(self, index: Sequence[int]) -> Array:
         """Units (n,) in which columns have length one; of signals that no motion drives they are not their own."""
         least = max(_NOTHING * float(self.total.max(initial=0.0)), 1e-300)
-        scale: Array = 1 / np.sqrt(np.maximum(self.total[list(index)], least))
-        return scale
+        return np.asarray(1 / np.sqrt(np.maximum(self.total[list(index)], least)))
 
     def share_left(self, index: Sequence[int]) -> float:
         """The largest share of itself that any direction of some columns keeps beyond those that are fitted, 0 to 1."""
@@ -379,11 +372,8 @@ def _beyond(information: Array, scores: Array, total: Array, index: Sequence[int
     if not index:
         return Given(information, scores, total)
     roots = Given(information, scores, total).roots(index)
-    taken = information[:, index] @ roots
-    return Given(information - taken @ taken.T, scores - (scores[:, index] @ roots) @ taken.T, total)
-
-
-_TOGETHER = 20  # runs of about the same length whose derivatives are computed at once (chosen)
+    explained = information[:, index] @ roots
+    return Given(information - explained @ explained.T, scores - (scores[:, index] @ roots) @ explained.T, total)
 
 
 @dataclass(frozen=True, eq=False)
@@ -399,8 +389,8 @@ class TrajectoryFit:
         other = replace(self, **changes)
         same_runs = len(other.runs) == len(self.runs) and all(map(operator.is_, other.runs, self.runs))
         if same_runs and np.array_equal(other.nuisances.values, self.nuisances.values):
-            known = ("logs", "poses", "residuals", "slopes") if other.model is self.model else ("logs",)
-            vars(other).update({name: vars(self)[name] for name in known if name in vars(self)})
+            valid = ("logs", "poses", "residuals", "slopes") if other.model is self.model else ("logs",)
+            vars(other).update({name: vars(self)[name] for name in valid if name in vars(self)})
         return other
 
     @cached_property
@@ -425,9 +415,13 @@ class TrajectoryFit:
 
     @cached_property
     def slopes(self) -> list[Array]:
-        """Derivatives (K, 3, 3) of the model's poses by the nuisances."""
-        paths = [poses - log.start for poses, log in zip(self.poses, self.logs, strict=True)]
-        return [nuisance_columns(*of_run) for of_run in zip(paths, self.velocities, self.stamps, strict=True)]
+        """Derivatives (K, 3, 3) of the model's poses by the nuisances; the path turns about its start."""
+        columns = []
+        for poses, log, velocity, stamps in zip(self.poses, self.logs, self.velocities, self.stamps, strict=True):
+            path = poses - log.start
+            turning = np.stack([-path[:, 1], path[:, 0], np.ones(len(path))], axis=1)
+            columns.append(np.stack([turning, -velocity, -velocity * stamps[:, None]], axis=2))
+        return columns
 
     @property
     def velocities(self) -> list[Array]:
@@ -446,10 +440,10 @@ class TrajectoryFit:
     @property
     def estimated_slopes(self) -> list[Array]:
         """Derivatives (K, 3, m) by the m nuisances that are estimated."""
-        known = self.nuisances.estimated
-        if not known.any():
+        estimated = self.nuisances.estimated
+        if not estimated.any():
             return [np.empty((*residuals.shape, 0)) for residuals in self.residuals]
-        return [slopes[..., known] for slopes in self.slopes]
+        return [slopes[..., estimated] for slopes in self.slopes]
 
     @cached_property
     def nuisance_free_residuals(self) -> list[Array]:
@@ -498,26 +492,6 @@ class TrajectoryFit:
         return likeliest_nuisances(values, self.estimated_slopes, weightings, self.nuisances)
 
 
-def split_runs(columns: Array, runs: Sequence[Trajectory]) -> list[Array]:
-    """Values of all poses (S, ...), cut into those of each run (K, ...)."""
-    ends = np.cumsum([len(run.pose_times) - 1 for run in runs])[:-1]
-    return np.split(columns, ends)
-
-
-_NAMES = ("pose_position", "walk_position", "bias_position", "pose_heading", "walk_heading", "bias_heading")
-# Level of the tests, shared by the nuisances that are asked about (Bonferroni): noise alone shows any of them in one
-# set of twenty.
-CHANCE = 0.05
-# Share of the critical value that a nuisance alone must gain before all components are fitted with it: the others do
-# not add four times as much. Half of this and twice give the same estimates from right and wrong starts
-# (tests/studies/constants_fit.py).
-_PROMISING = 0.25
-# rad, s, s per s: largest deviations that are searched, 17 degrees and several times those of clocks that are
-# synchronised by hand (0.2 s, 0.003). Half and twice as wide, the search finds the same to 1e-5
-# (tests/studies/constants_fit.py).
-_LARGEST = np.array([0.3, 0.5, 0.02])
-
-
 @dataclass(frozen=True, eq=False)
 class FitNoise:
     """The noise of the reference poses, and the standard deviations (3,) of the nuisances: rad, s, s per s."""
@@ -558,7 +532,7 @@ def differences_without_nuisances(fit: TrajectoryFit, kinds: Sequence[int]) -> D
 
 @dataclass(frozen=True, eq=False)
 class SeparateNoise:
-    """A noise without that of nuisances, their deviations (3,), and -2 ln L of both, Eq. (1).
+    """A noise without that of nuisances, their deviations (3,), and -2 ln L of both, Eq. (3).
 
     slopes (9,): derivatives of -2 ln L by the logarithms of the noise's components and of the deviations.
     """
@@ -571,11 +545,27 @@ class SeparateNoise:
     @classmethod
     def of(cls, differences: Differences, noise: Noise, deviations: Array) -> SeparateNoise:
         """This noise with these deviations, as likely as differences between repetitions make them."""
+        estimated = np.flatnonzero(deviations)
+        sizes = deviations[estimated]
         total, slopes = 0.0, np.zeros(len(_NAMES) + 3)
         for stamps, values, columns in differences.by_stamps:
-            of_group, of_variances = _likelihood(Whitener(noise, stamps), values, columns, deviations)
-            total += of_group
-            slopes += of_variances
+            whitener = Whitener(noise, stamps)
+            white = _whitened(whitener, values, columns[..., estimated])
+            products = _Products.of(whitener, white)
+            total += products.minus_log_likelihood(sizes)
+            # Eq. (4): a, and columns Z such that (C + N S S N')^-1 = C^-1 - Z Z'.
+            beside, inner, lower = products.beside, products.inner, products.lower(sizes)
+            reduced = np.linalg.solve(lower, sizes[:, None] * np.concatenate([beside[..., None], inner], axis=2))
+            solved = whitener.transposed(white)
+            roots = np.linalg.solve(lower, sizes[:, None] * np.eye(len(sizes)))
+            removed = np.einsum("ksnj,nij->ksni", solved[..., 1:], roots)
+            remaining = solved[..., 0] - np.einsum("ksni,ni->ksn", removed, reduced[..., 0])
+            both = np.concatenate([remaining[..., None], removed], axis=3)
+            forms = whitener.forms(both.reshape(*values.shape[:2], -1))
+            slopes[: len(_NAMES)] += values.shape[2] * whitener.traces - forms
+            projected = beside - np.einsum("nij,ni->nj", reduced[..., 1:], reduced[..., 0])  # N' a
+            traces = np.diagonal(inner, axis1=1, axis2=2) - np.square(reduced[..., 1:]).sum(axis=1)
+            slopes[len(_NAMES) + estimated] += (traces - np.square(projected)).sum(axis=0)
         components = np.concatenate([[getattr(noise, name) for name in _NAMES], deviations])
         return cls(noise, deviations, total, 2 * np.square(components) * slopes)
 
@@ -601,11 +591,10 @@ class _Products:
 
     def lower(self, sizes: Array) -> Array:
         """Cholesky factors (n, m, m) of 1 + S N'N S, S being the sizes (m,)."""
-        lower: Array = np.linalg.cholesky(np.eye(len(sizes)) + self.inner * np.outer(sizes, sizes))
-        return lower
+        return np.asarray(np.linalg.cholesky(np.eye(len(sizes)) + self.inner * np.outer(sizes, sizes)))
 
     def minus_log_likelihood(self, sizes: Array) -> float:
-        """-2 ln L, Eq. (1), of nuisances with standard deviations (m,)."""
+        """-2 ln L, Eq. (3), of nuisances with standard deviations (m,)."""
         lower = self.lower(sizes)
         reduced = np.linalg.solve(lower, (sizes * self.beside)[..., None])
         determinants = 2 * np.log(np.diagonal(lower, axis1=1, axis2=2)).sum()
@@ -626,28 +615,6 @@ def _products(differences: Differences, noise: Noise, used: NDArray[np.intp]) ->
         whitener = Whitener(noise, stamps)
         products.append(_Products.of(whitener, _whitened(whitener, values, columns[..., used])))
     return products
-
-
-def _likelihood(whitener: Whitener, values: Array, columns: Array, deviations: Array) -> tuple[float, Array]:
-    """-2 ln L of differences (K, 3, n), and its derivatives (9,) by the variances; columns (K, 3, n, 3): N."""
-    count, known = values.shape[2], np.flatnonzero(deviations)
-    sizes = deviations[known]
-    white = _whitened(whitener, values, columns[..., known])
-    products = _Products.of(whitener, white)
-    beside, inner, lower = products.beside, products.inner, products.lower(sizes)
-    reduced = np.linalg.solve(lower, sizes[:, None] * np.concatenate([beside[..., None], inner], axis=2))
-    # Eq. (2): a, and columns Z such that (C + N S S N')^-1 = C^-1 - Z Z'.
-    solved = whitener.transposed(white)
-    roots = np.linalg.solve(lower, sizes[:, None] * np.eye(len(known)))
-    removed = np.einsum("ksnj,nij->ksni", solved[..., 1:], roots)
-    remaining = solved[..., 0] - np.einsum("ksni,ni->ksn", removed, reduced[..., 0])
-    forms = whitener.forms(np.concatenate([remaining[..., None], removed], axis=3).reshape(*values.shape[:2], -1))
-    slopes = np.zeros(len(_NAMES) + 3)
-    slopes[: len(_NAMES)] = count * whitener.traces - forms
-    left = beside - np.einsum("nij,ni->nj", reduced[..., 1:], reduced[..., 0])  # N' a
-    of_nuisances = np.diagonal(inner, axis1=1, axis2=2) - np.square(reduced[..., 1:]).sum(axis=1) - np.square(left)
-    slopes[len(_NAMES) + known] = of_nuisances.sum(axis=0)
-    return products.minus_log_likelihood(sizes), slopes
 
 
 def separate_nuisances(
@@ -700,23 +667,23 @@ def _along(differences: Differences, now: SeparateNoise, kind: int) -> SeparateN
         return sum(of_group.minus_log_likelihood(deviations_with(deviation)[used]) for of_group in products)
 
     answer = minimize_scalar(minus_log_likelihood, bounds=(0.0, reach), method="bounded", options={"xatol": 1e-6})
-    found = float(answer.x)
-    return SeparateNoise.of(differences, noise_with(found), deviations_with(found))
+    deviation = float(answer.x)
+    return SeparateNoise.of(differences, noise_with(deviation), deviations_with(deviation))
 
 
 def _polished(differences: Differences, near: SeparateNoise) -> SeparateNoise:
     """All components of the noise and the deviations that are not 0 estimated together, from a good start."""
-    known = near.deviations > 0
-    start = np.array([*(getattr(near.noise, name) for name in _NAMES), *near.deviations[known]])
+    estimated = near.deviations > 0
+    start = np.array([*(getattr(near.noise, name) for name in _NAMES), *near.deviations[estimated]])
     # The search is on a logarithmic scale, where zero cannot be left. Start headings are the first of the nuisances.
-    for of_one_unit in (start[:3], start[3 : 6 + known[TURN]]):
+    for of_one_unit in (start[:3], start[3 : 6 + estimated[TURN]]):
         np.maximum(of_one_unit, 0.1 * max(of_one_unit.max(), LEAST_WHITE), out=of_one_unit)
 
-    moved = np.concatenate([np.ones(len(_NAMES), dtype=bool), known])
+    moved = np.concatenate([np.ones(len(_NAMES), dtype=bool), estimated])
 
     def described(logarithms: Array) -> SeparateNoise:
         values, deviations = start * np.exp(logarithms), np.zeros(3)
-        deviations[known] = values[len(_NAMES) :]
+        deviations[estimated] = values[len(_NAMES) :]
         noise = Noise(**dict(zip(_NAMES, map(float, values), strict=False)))
         return SeparateNoise.of(differences, noise, deviations)
 

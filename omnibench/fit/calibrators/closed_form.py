@@ -20,9 +20,9 @@ from pydantic import Field
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.cost import SumOfNorms
-from omnibench.fit.gauss_newton import reweighted_minimum
+from omnibench.fit.gauss_newton import minimum_in_turn, reweighted_minimum
 from omnibench.fit.linear_fit import linear_fit
-from omnibench.fit.loss import Huber, RobustCost, Squares, norms_of
+from omnibench.fit.loss import RobustCost, Squares, beginning_with_huber, norms_of
 from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
@@ -68,7 +68,9 @@ class ClosedForm(Calibrator):
         if not isinstance(problem.parameterisation, MatrixElements):
             raise ConfigError("closed_form works on the matrix parameterisation; search the geometry with another")
         if isinstance(problem.objective, RobustCost):
-            return self._robust(problem, problem.objective)
+            vector = self._better(problem, problem.start, linear_start(problem))
+            costs = beginning_with_huber(problem.objective)
+            return minimum_in_turn(problem, costs, vector, self.options.tolerance, "reweighted")
         if not isinstance(problem.objective, SumOfNorms):
             raise ConfigError(f"closed_form needs a cost that is a sum of norms, which {problem.objective.name} is not")
         vector = self._better(problem, problem.start, linear_start(problem))
@@ -83,46 +85,32 @@ class ClosedForm(Calibrator):
             try:
                 step = program.step(shares)
             except SolverError as error:
-                return Solution(vector, _stopped(problem, problem.objective, cost, error), converged=False)
+                reason = f"{error} at a cost of {cost:.1e} in a cone program"
+                errors = len(problem.reference) * sum(map(bool, problem.objective.weights))
+                fitted = int(problem.free.sum())
+                if errors < 2 * fitted:  # usually errors are as few as the numbers fitted
+                    reason += f": {errors} errors for {fitted} numbers are met almost exactly, record more runs"
+                return Solution(vector, reason, converged=False)
             newton_steps, cone_programs = newton_steps + program.newton_steps, cone_programs + program.cone_programs
             counts = ((newton_steps, "Newton step"), (cone_programs, "cone program"))
             work = " and ".join(plural(count, name) for count, name in counts if count)
             before = problem.matrix(vector)
             vector, cost, descended = _descend(problem, vector, cost, step)
             if not descended:
-                wanted = float(np.abs(step).max())
-                reason = f"no part of the last step ({wanted:.1e}) lowers the cost after {work}"
-                return Solution(vector, reason, converged=wanted < _FLAT * float(np.ptp(problem.matrix(vector))))
+                length = float(np.abs(step).max())
+                reason = f"no part of the last step ({length:.1e}) lowers the cost after {work}"
+                return Solution(vector, reason, converged=length < _FLAT * float(np.ptp(problem.matrix(vector))))
             moved = float(np.abs(problem.matrix(vector) - before).max())
             if moved < self.options.tolerance:
                 return Solution(vector, f"step below {self.options.tolerance:g} after {work}")
         reason = f"step still {moved:.1e} after {work}"
         return Solution(vector, reason, converged=False)
 
-    def _robust(self, problem: CalibrationProblem, objective: RobustCost) -> Solution:
-        """The minimum of a robust loss."""
-        huber = RobustCost(objective.base, Huber(objective.loss.coordinates))
-        vector, steps, settled = self._better(problem, problem.start, linear_start(problem)), 0, True
-        for cost in [huber] if objective.loss.name == "huber" else [huber, objective]:
-            vector, count, settled = reweighted_minimum(problem, cost, vector, self.options.tolerance)
-            steps += count
-        return Solution(vector, f"{'' if settled else 'not '}settled after {steps} reweighted steps", settled)
-
     @staticmethod
     def _better(problem: CalibrationProblem, *vectors: Array) -> Array:
         """The vector of lowest cost."""
         costs = problem.cost(np.array(vectors))
         return vectors[int(np.nanargmin(np.where(np.isfinite(costs), costs, np.inf)))]
-
-
-def _stopped(problem: CalibrationProblem, objective: SumOfNorms, cost: float, error: Exception) -> str:
-    """The reason of an answer for which the solver finds no better one: usually errors as few as the numbers fitted."""
-    errors = len(problem.reference) * sum(map(bool, objective.weights))
-    fitted = int(problem.free.sum())
-    reason = f"{error} at a cost of {cost:.1e} in a cone program"
-    if errors < 2 * fitted:
-        reason += f": {errors} errors for {fitted} numbers are met almost exactly, record more runs"
-    return reason
 
 
 def linear_start(problem: CalibrationProblem) -> Array:

@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import Calibrator, Solution
-from omnibench.fit.gauss_newton import bounded_step, reweighted_minimum
+from omnibench.fit.gauss_newton import bounded_step, minimum_in_turn
 from omnibench.fit.linear_fit import linear_system
-from omnibench.fit.loss import Huber, Loss, RobustCost, Squares, norms_of
+from omnibench.fit.loss import Loss, RobustCost, Squares, beginning_with_huber, norms_of
 from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
@@ -54,10 +54,16 @@ class LeastSquares(Calibrator):
         """Minimise Eq. (2). ConfigError for another parameterisation or a cost that is no sum of norms."""
         if not isinstance(problem.parameterisation, MatrixElements):
             raise ConfigError("least_squares works on the matrix parameterisation; search the geometry with another")
-        if norms_of(problem.objective) is None:
+        base = norms_of(problem.objective)
+        if base is None:
             raise ConfigError(f"least_squares squares the norms of a sum, which {problem.objective.name} is not")
         if not isinstance(problem.odometry, OdometryBatch):
-            return _minimum_of_references(problem)
+            # References that are no poses do not have the headings that Eq. (1) needs: the squares have a minimum all
+            # the same, from which a robust loss goes on.
+            costs = [RobustCost(base, Squares(3))]
+            if isinstance(problem.objective, RobustCost):
+                costs += beginning_with_huber(problem.objective)
+            return minimum_in_turn(problem, costs, problem.start, _SMALL, "Gauss-Newton")
         if isinstance(problem.objective, RobustCost):
             vector, reason, settled = _robust_minimum(problem, problem.objective)
         else:
@@ -65,21 +71,6 @@ class LeastSquares(Calibrator):
         vector = problem.settled(vector)
         problem.cost(vector[None])
         return Solution(vector, reason, settled)
-
-
-def _minimum_of_references(problem: CalibrationProblem) -> Solution:
-    """The minimum where references are no poses, whose headings Eq. (1) would need: by Gauss-Newton steps."""
-    base = norms_of(problem.objective)
-    assert base is not None  # the calibrator has checked
-    costs = [RobustCost(base, Squares(3))]
-    if isinstance(problem.objective, RobustCost):
-        costs.append(RobustCost(base, Huber(problem.objective.loss.coordinates)))
-        costs += [problem.objective] * (problem.objective.loss.name != "huber")
-    vector, steps, settled = problem.start, 0, True
-    for cost in costs:
-        vector, count, settled = reweighted_minimum(problem, cost, vector, _SMALL)
-        steps += count
-    return Solution(vector, f"{'' if settled else 'not '}settled after {steps} Gauss-Newton steps", settled)
 
 
 class _LinearErrors:
@@ -139,14 +130,12 @@ class _LinearErrors:
         scale = max(float(np.abs(missing).max()), np.finfo(float).tiny)
         within = [step >= (problem.lower - problem.start) / unit, step <= (problem.upper - problem.start) / unit]
         solve_program(cp.Problem(cp.Minimize(cp.sum_squares(errors / scale)), within))
-        vector: Array = problem.start + unit * step.value
-        return vector
+        return np.asarray(problem.start + unit * step.value)
 
 
 def _robust_minimum(problem: CalibrationProblem, objective: RobustCost) -> tuple[Array, str, bool]:
     """The vector (n,) of the least loss, how it was found, and True if the fits settled."""
-    huber: Loss = Huber(objective.loss.coordinates)
-    losses = [huber] if objective.loss.name == "huber" else [huber, objective.loss]
+    losses = [cost.loss for cost in beginning_with_huber(objective)]
     errors = _LinearErrors(problem)
     vector, used, fits, settled = errors.minimum(), np.ones(errors.shares.shape, dtype=bool), 0, True
     for _ in range(_MOST_ROUNDS):
@@ -161,15 +150,12 @@ def _robust_minimum(problem: CalibrationProblem, objective: RobustCost) -> tuple
     return vector, f"{fits} reweighted fits", settled
 
 
-def _weights(errors: _LinearErrors, loss: Loss, vector: Array) -> Array:
-    norms = errors.norms(vector)
-    return loss.weights(norms / loss.scales(norms[None], errors.shares)[0])
-
-
 def _reweighted(errors: _LinearErrors, loss: Loss, vector: Array) -> tuple[Array, int, bool]:
     """The vector (n,) that its own weights lead back to, from another one, after how many fits, and True if it does."""
     for count in range(1, _MOST_FITS + 1):
-        before, vector = vector, errors.reweighted(_weights(errors, loss, vector))
+        norms = errors.norms(vector)
+        weights = loss.weights(norms / loss.scales(norms[None], errors.shares)[0])
+        before, vector = vector, errors.reweighted(weights)
         if (np.abs(vector - before) < _STILL * errors.unit).all():
             return vector, count, True
     return vector, _MOST_FITS, False

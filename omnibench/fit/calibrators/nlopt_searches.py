@@ -70,25 +70,27 @@ def search(problem: CalibrationProblem, algorithm: int, options: NloptOptions) -
     return Solution(problem.best_vector, reason, converged=code != nlopt.MAXEVAL_REACHED)
 
 
-@calibrators.register("crs")
-class Crs(Calibrator):
-    """Controlled random search with local mutation: NLopt GN_CRS2_LM."""
+class _NloptSearch(Calibrator):
+    """A search by an NLopt algorithm."""
 
     Options = NloptOptions
     options: NloptOptions
+    algorithm: int
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """Search until NLopt's tolerances are met or the budget is spent."""
-        return search(problem, nlopt.GN_CRS2_LM, self.options)
+        return search(problem, self.algorithm, self.options)
+
+
+@calibrators.register("crs")
+class Crs(_NloptSearch):
+    """Controlled random search with local mutation: NLopt GN_CRS2_LM."""
+
+    algorithm = nlopt.GN_CRS2_LM
 
 
 @calibrators.register("isres")
-class Isres(Calibrator):
+class Isres(_NloptSearch):
     """Improved stochastic ranking evolution strategy: NLopt GN_ISRES."""
 
-    Options = NloptOptions
-    options: NloptOptions
-
-    def calibrate(self, problem: CalibrationProblem) -> Solution:
-        """Search until NLopt's tolerances are met or the budget is spent."""
-        return search(problem, nlopt.GN_ISRES, self.options)
+    algorithm = nlopt.GN_ISRES

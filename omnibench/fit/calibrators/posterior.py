@@ -116,8 +116,16 @@ class _Fit:
         self._problem, self._lost = problem, lost
         self._root = block_diag(root, [[lost]]) if lost else root
         self._design = problem.robot.inverse_kinematic_matrix
-        self._chosen = [_poses_looked_at(run) for run in problem.trajectories]
-        stretches = [_stretches(len(chosen)) for chosen in self._chosen]
+        self._chosen: list[NDArray[np.intp]] = []  # indices of the reference poses that are looked at
+        stretches = []  # the stretch of each of a run's poses; its end, where the robot stands, is one of its own
+        for run in problem.trajectories:
+            count = len(run.pose_times) - 1
+            spread = np.linspace(1, count, min(_POSES * _STRETCHES, count))
+            self._chosen.append(np.unique(np.round(spread).astype(np.intp)))
+            looked_at = len(self._chosen[-1])
+            parts = np.arange(looked_at) * _STRETCHES // looked_at
+            parts[-1] = _STRETCHES
+            stretches.append(np.unique(parts, return_inverse=True)[1].astype(np.intp))
         offsets = np.cumsum([0, *(int(of_run.max()) + 1 for of_run in stretches)])
         self._firsts = offsets[:-1]  # each run's first stretch
         self._stretch: NDArray[np.intp] = np.concatenate(
@@ -138,43 +146,38 @@ class _Fit:
     def minimum(self) -> tuple[Array, Array, int, bool]:
         """The unknowns at the minimum, covariance of matrix and rate, steps, and whether they came to rest."""
         unknowns, weights = np.zeros(self._root.shape[1]), np.ones(len(self._shares))
-        scaled, left, steps, rests = np.empty((0, 3, len(unknowns))), np.empty((0, 3)), 0, False
+        scaled, errors, steps, rests = np.empty((0, 3, len(unknowns))), np.empty((0, 3)), 0, False
         while steps < _MOST_STEPS and not rests and (self._problem.seconds_left > 0 or not steps):
             medians, slopes = self._errors(unknowns)
-            deviations = self._deviations(medians, weights, steps)
+            deviations = np.full(3, _FIRST)
+            if steps >= _FIRST_STEPS:  # p, p and q of Eq. (2)
+                shares = weights * self._shares
+                squares = self._runs / shares.sum() * (shares @ medians**2) / max(self._runs - 1, 1)
+                place = (squares[0] + squares[1]) / 2
+                deviations = np.maximum(np.sqrt([place, place, squares[2]]), _LEAST)
             weights = 1 / np.maximum(np.sqrt(np.square(medians / deviations).mean(axis=1)) / _HUBER, 1.0)
             scales = np.sqrt(weights * self._shares)[:, None] / deviations
-            scaled, left = slopes * scales[..., None], medians * scales
+            scaled, errors = slopes * scales[..., None], medians * scales
             information = np.einsum("sci,scj->ij", scaled, scaled) + np.eye(len(unknowns))
-            step = np.linalg.solve(information, -np.einsum("sci,sc->i", scaled, left) - unknowns)
+            step = np.linalg.solve(information, -np.einsum("sci,sc->i", scaled, errors) - unknowns)
             unknowns, steps = unknowns + step, steps + 1
             rests = steps > _FIRST_STEPS and bool(np.abs(step).max() < _RESTING)
             self._problem.report(steps, _MOST_STEPS, "step")
-        return unknowns, self._covariance(scaled, left, weights < 1), steps, rests
+        return unknowns, self._covariance(scaled, errors, weights < 1), steps, rests
 
-    def _covariance(self, scaled: Array, left: Array, far: NDArray[np.bool_]) -> Array:
+    def _covariance(self, scaled: Array, errors: Array, far: NDArray[np.bool_]) -> Array:
         """Eq. (3) and (4) of matrix and rate, from weighted slopes (S, 3, k), errors (S, 3), and which are far off."""
-        slopes = np.einsum("sci,sc->si", scaled, left)
-        bent = slopes * (far / np.maximum(np.linalg.norm(left, axis=1), np.finfo(float).tiny))[:, None]
+        slopes = np.einsum("sci,sc->si", scaled, errors)
+        bent = slopes * (far / np.maximum(np.linalg.norm(errors, axis=1), np.finfo(float).tiny))[:, None]
         curvatures = np.einsum("sci,scj->sij", scaled, scaled) - np.einsum("si,sj->sij", bent, bent)
         of_runs = np.add.reduceat(curvatures, self._firsts, axis=0)
         whole = of_runs.sum(axis=0) + np.eye(slopes.shape[1])
         inverse = np.linalg.inv(whole)
         if self._runs > 1:
-            own = np.add.reduceat(slopes, self._firsts, axis=0)
-            moved = np.linalg.solve(whole - of_runs, own[..., None])[..., 0]
+            gradients = np.add.reduceat(slopes, self._firsts, axis=0)
+            moved = np.linalg.solve(whole - of_runs, gradients[..., None])[..., 0]
             inverse = inverse @ inverse + (self._runs - 1) / self._runs * moved.T @ moved
-        covariance: Array = self._root @ inverse @ self._root.T
-        return covariance
-
-    def _deviations(self, medians: Array, weights: Array, steps: int) -> Array:
-        """p, p and q of Eq. (2)."""
-        if steps < _FIRST_STEPS:
-            return np.full(3, _FIRST)
-        shares = weights * self._shares
-        squares = self._runs / shares.sum() * (shares @ medians**2) / max(self._runs - 1, 1)
-        place = (squares[0] + squares[1]) / 2
-        return np.maximum(np.sqrt([place, place, squares[2]]), _LEAST)
+        return np.asarray(self._root @ inverse @ self._root.T)
 
     def _errors(self, unknowns: Array) -> tuple[Array, Array]:
         """Medians (S, 3) of the errors by stretch, and their derivatives (S, 3, k) by the unknowns."""
@@ -185,7 +188,12 @@ class _Fit:
         if self._lost:
             further = self._odometry(rate + _STEP * self._lost).poses(matrix[None])[0]
             slopes += ((further - poses) / (_STEP * self._lost))[..., None] * self._root[size]
-        return _by_stretch(poses - self._reference, slopes, self._stretch)
+        # Medians of the errors and means of their derivatives; poses stand in the stretches' order.
+        edges = np.searchsorted(self._stretch, np.arange(int(self._stretch[-1]) + 1))
+        counts = np.diff([*edges, len(self._stretch)])
+        medians = np.array([np.median(part, axis=0) for part in np.split(poses - self._reference, edges[1:])])
+        means: Array = np.add.reduceat(slopes, edges, axis=0) / counts[:, None, None]
+        return medians, means
 
     def _odometry(self, rate: float) -> OdometryBatch:
         """The odometry at the poses looked at, of wheels that gain a rate, rad/s, when they turn."""
@@ -196,26 +204,3 @@ class _Fit:
             runs = corrected_runs(problem.robot, runs, [term], problem.sample_period)
         logs = [run.log(run.pose_times[chosen]) for run, chosen in zip(runs, self._chosen, strict=True)]
         return OdometryBatch(logs, problem.integration)
-
-
-def _poses_looked_at(run: Trajectory) -> NDArray[np.intp]:
-    """Indices of the reference poses after the start that the fit looks at."""
-    count = len(run.pose_times) - 1
-    spread = np.linspace(1, count, min(_POSES * _STRETCHES, count))
-    return np.unique(np.round(spread).astype(np.intp))
-
-
-def _stretches(count: int) -> NDArray[np.intp]:
-    """The stretch of each of a run's poses; its end, where the robot stands, is one of its own."""
-    stretches = np.arange(count) * _STRETCHES // count
-    stretches[-1] = _STRETCHES
-    return np.unique(stretches, return_inverse=True)[1].astype(np.intp)
-
-
-def _by_stretch(errors: Array, slopes: Array, stretch: NDArray[np.intp]) -> tuple[Array, Array]:
-    """Medians (S, 3) of errors by stretch, and means of their derivatives (S, 3, k)."""
-    edges = np.searchsorted(stretch, np.arange(int(stretch[-1]) + 1))  # poses stand in the stretches' order
-    counts = np.diff([*edges, len(stretch)])
-    medians = np.array([np.median(part, axis=0) for part in np.split(errors, edges[1:])])
-    means: Array = np.add.reduceat(slopes, edges, axis=0) / counts[:, None, None]
-    return medians, means

@@ -25,8 +25,8 @@ class RandomSearch(Calibrator):
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """Draw candidates until their number is reached or the budget is spent."""
         problem.cost(problem.start[None])  # so that the answer is never worse than the start
-        wanted = self.options.candidates or problem.budget.evaluations
-        for first in range(0, wanted, self.options.batch):
-            count = min(self.options.batch, wanted - first)
+        total = self.options.candidates or problem.budget.evaluations
+        for first in range(0, total, self.options.batch):
+            count = min(self.options.batch, total - first)
             problem.cost(problem.from_unit(problem.rng.uniform(size=(count, np.count_nonzero(problem.free)))))
-        return Solution(problem.best_vector, f"{wanted} candidates tried", converged=False)
+        return Solution(problem.best_vector, f"{total} candidates tried", converged=False)

@@ -15,14 +15,10 @@ squared pose errors at the stamps of the problem's cost are then minimised, with
 likelihood found them. The covariance is that of the noise model, or the sandwich of the scatter
 (fit/sandwich.py), also where no repetition shows the noise.
 
-With a robust loss poses and starts that are off have less weight, and the noise is that
-of the others.
-
-Noise with heavy tails: single poses, and starts of runs, that are off by more than the noise explains.
-
-An error of a pose is compared with what the other poses of its run say of it. With u its difference from that and V
-the variance of u under the noise, diagonal over the coordinates, and s the scale of all poses by Eq. (2) or (4) of
-fit/loss.py, at least 1, its weight w (Eq. 5 there, 1 for no error) gives the pose the variance
+With a robust loss poses and starts that are off by more than the noise explains have less weight, and the noise is that
+of the others. An error of a pose is compared with what the other poses of its run say of it. With u its difference from
+that and V the variance of u under the noise, diagonal over the coordinates, and s the scale of all poses by Eq. (2) or
+(4) of fit/loss.py, at least 1, its weight w (Eq. 5 there, 1 for no error) gives the pose the variance
 
     V / w,   w = w(x / s),   x^2 = u' V^-1 u,                                                              (1)
 
@@ -32,28 +28,27 @@ is off shifts a run. Where the likeliest shift has a weight of less than a fifth
 the noise's bias in V, its square adds to that of the bias. A heading that is off there turns the
 path, too: the run then has the weight. Misfit of the model is in all runs, and in s.
 
-Covariance of a trajectory fit, from its noise model or from the scatter of the runs.
+The covariance is from the noise model or from the scatter of the runs. In coordinates in which the information of all
+runs is the unit matrix, the scatter of d directions, S, has the unit matrix for its expectation under the noise model.
+Where commands and sessions scatter no more than their repetitions explain, which the sandwich tests, it is wider than
+that at the level a if
 
-In coordinates in which the information of all runs is the unit matrix, the scatter of d directions, S, has the unit
-matrix for its expectation under the noise model. Where commands and sessions scatter no more than their repetitions
-explain, which the sandwich tests, it is wider than that at the level a if
-
-    tr S / d > chi2(1 - a; v) / v,                                                                        (1)
+    tr S / d > chi2(1 - a; v) / v,                                                                        (2)
 
 v being the degrees of freedom of the sandwich's trace, its Eq. (9). The noise model itself is known from D differences
 between runs. The part of the noise that all poses of a run share is one number a difference and coordinate, and a
 position has two coordinates of the same variance. The variances of positions have at least
 
-    2 D                                                                                                   (2)
+    2 D                                                                                                   (3)
 
-degrees of freedom, more where white noise dominates. Those of headings have one coordinate, and D. (2) is taken for
+degrees of freedom, more where white noise dominates. Those of headings have one coordinate, and D. (3) is taken for
 all numbers: with such a shared part, of the elements of the heading's row 99 % of the intervals hold the truth with
 D = 4, and 97 % with D = 6.
 
 Without repetitions the residuals of D runs stand in for differences. Of the 3 D numbers of the shared parts a fit of n
 numbers leaves 3 D - n, and for the variances of positions two thirds of these,
 
-    2 D - 2 n / 3.                                                                                        (3)
+    2 D - 2 n / 3.                                                                                        (4)
 
 One is taken where that is less. Likelihood does not know what the fit has taken either, and finds variances that are
 too small. So the scatter of the runs, which is corrected for that, stands for the noise model wherever the runs are
@@ -81,7 +76,6 @@ from omnibench.fit.information import EstimatedCovariance
 from omnibench.fit.loss import OFF, Loss, LossName, RobustCost, cost_weightings, loss_of, make_loss, mean_curvature
 from omnibench.fit.noise import FIRST_NOISE, ExtraVariance, NoiseEstimate, Whitener, is_near, roots_of, whiteners
 from omnibench.fit.problem import CalibrationProblem
-from omnibench.fit.reference_fit import ReferenceFit
 from omnibench.fit.sandwich import CHANCE, Sandwich, Scores, sandwich
 from omnibench.fit.trajectory_fit import (
     TURN,
@@ -98,6 +92,18 @@ from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 
 _PASSES = 3  # of weights that follow from each other: neighbours that are off hide each other
+# Share of the noise model's variance below which the scatter is rounding. The noise is 1e-9 m or rad at least; exact
+# models of exact poses leave 1e-14 of its variance, Euler steps in flowers 1e10 times it.
+_ROUNDING = 1e-6
+# Rounds of noise and fit settle after two or three; only where the clocks' errors are estimated, too, do they take more
+# than five. In tests/studies/constants_fit.py five rounds at most, or a change of 0.2, move an estimate with clocks
+# by 0.1 and 0.2 of its standard deviation; 20 rounds, a change of 0.05 and half and twice _NEAR move none.
+_MOST_ROUNDS = 10
+_FIRST_WEIGHTS = 5  # fits with Huber's weights before the noise is estimated from poses that are not off
+_MOST_REWEIGHTED = 50  # fits by the weights of a robust cost
+_WALKS = 2  # times that the walk of the odometry beside references is estimated, and the fit done again
+_NEAR = 0.01  # share of the largest component of the noise by which components of the same noise differ
+_STILL = 0.1  # standard errors: a smaller change of the vector ends the rounds
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,11 +152,11 @@ class RobustNoise:
     def without_jumps(self, fit: TrajectoryFit) -> TrajectoryFit:
         """The fit without the poses, and without the runs, that are off; the whole fit if nothing were left."""
         chosen = [np.flatnonzero(of_run.poses >= OFF) for of_run in self.runs]
-        kept = [index for index, of_run in enumerate(self.runs) if of_run.near and len(chosen[index])]
-        if not kept:
+        near = [index for index, of_run in enumerate(self.runs) if of_run.near and len(chosen[index])]
+        if not near:
             return fit
-        runs = tuple(with_poses(fit.runs[index], np.append(0, 1 + chosen[index])) for index in kept)
-        return replace(fit, runs=runs, nuisances=replace(fit.nuisances, values=fit.nuisances.values[kept]))
+        runs = tuple(with_poses(fit.runs[index], np.append(0, 1 + chosen[index])) for index in near)
+        return replace(fit, runs=runs, nuisances=replace(fit.nuisances, values=fit.nuisances.values[near]))
 
 
 def robust_noise(noise: Noise, fit: TrajectoryFit, loss: LossName, before: RobustNoise | None = None) -> RobustNoise:
@@ -159,7 +165,13 @@ def robust_noise(noise: Noise, fit: TrajectoryFit, loss: LossName, before: Robus
     assert of_pose is not None  # the calibrator has checked that it is no loss of squares
     assert of_position is not None
     assert of_heading is not None
-    extras = [_none(len(stamps)) for stamps in fit.stamps] if before is None else [run.extra for run in before.runs]
+    if before is None:
+        nothing = [np.zeros(len(stamps)) for stamps in fit.stamps]
+        extras = [ExtraVariance((zeros, 0.0), (zeros, 0.0)) for zeros in nothing]
+    else:
+        extras = [run.extra for run in before.runs]
+    unbiased = noise.model_copy(update={"bias_position": 0.0, "bias_heading": 0.0})
+    bias = np.square([noise.bias_position, noise.bias_position, noise.bias_heading])
     for _ in range(_PASSES):
         left_out = [
             Whitener(noise, stamps, extra).left_out(residuals)
@@ -173,7 +185,13 @@ def robust_noise(noise: Noise, fit: TrajectoryFit, loss: LossName, before: Robus
         weights, curvature = _weights(of_pose, np.concatenate(norms))
         of_runs = np.split(weights, np.cumsum([len(of_run) for of_run in norms])[:-1])
         poses = [(v[:, 0] * (1 / w - 1), v[:, 2] * (1 / w - 1)) for v, w in zip(usual, of_runs, strict=True)]
-        shifts, variances = _shifts(noise, fit, poses)
+        # Likeliest shifts (Z, 3) of the runs, and their variances with the bias.
+        likeliest = [
+            Whitener(unbiased, stamps, ExtraVariance((position, 0.0), (heading, 0.0))).shift(residuals)
+            for stamps, (position, heading), residuals in zip(fit.stamps, poses, fit.residuals, strict=True)
+        ]
+        shifts = np.array([shift for shift, _ in likeliest])
+        variances = np.array([of_shift for _, of_shift in likeliest]) + bias
         positions, _ = _weights(of_position, np.sqrt((np.square(shifts) / variances)[:, :2].sum(axis=1)))
         headings, _ = _weights(of_heading, np.abs(shifts[:, 2]) / np.sqrt(variances[:, 2]))
         positions, headings = (np.where(of_start < OFF, of_start, 1.0) for of_start in (positions, headings))
@@ -192,31 +210,11 @@ def robust_noise(noise: Noise, fit: TrajectoryFit, loss: LossName, before: Robus
     return RobustNoise(noise, tuple(RunWeights(w, float(whole), x, bool(n)) for w, whole, x, n in runs), curvature)
 
 
-def _none(count: int) -> ExtraVariance:
-    return ExtraVariance((np.zeros(count), 0.0), (np.zeros(count), 0.0))
-
-
 def _weights(loss: Loss, norms: Array) -> tuple[Array, float]:
     """Weights (S,) of norms (S,), Eq. (1), and the curvature of the loss, see RobustNoise."""
     shares = np.full(len(norms), 1 / len(norms))
     ratios = norms / max(float(loss.scales(norms[None], shares)[0]), 1.0)
     return loss.weights(ratios) / float(loss.weights(np.zeros(1))[0]), loss.mean_curvature(ratios, shares)
-
-
-def _shifts(noise: Noise, fit: TrajectoryFit, poses: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
-    """Likeliest shifts (Z, 3) of the runs, whose poses have extra variances, and their variances with the bias."""
-    unbiased = noise.model_copy(update={"bias_position": 0.0, "bias_heading": 0.0})
-    found = [
-        Whitener(unbiased, stamps, ExtraVariance((position, 0.0), (heading, 0.0))).shift(residuals)
-        for stamps, (position, heading), residuals in zip(fit.stamps, poses, fit.residuals, strict=True)
-    ]
-    bias = np.square([noise.bias_position, noise.bias_position, noise.bias_heading])
-    return np.array([shift for shift, _ in found]), np.array([of_shift for _, of_shift in found]) + bias
-
-
-# Share of the noise model's variance below which the scatter is rounding. The noise is 1e-9 m or rad at least; exact
-# models of exact poses leave 1e-14 of its variance, Euler steps in flowers 1e10 times it.
-_ROUNDING = 1e-6
 
 
 class FitCovariance:
@@ -242,8 +240,8 @@ class FitCovariance:
         scores, information = data.scores * unit, data.information_of_runs * np.outer(unit, unit)
         roots = roots_of(information.sum(axis=0))
         self._noise, self._roots = noise, unit[:, None] * roots
-        taken = roots.shape[1] if noise.source == "within runs" else 0
-        freedom: Array | float = max(2 * noise.degrees_of_freedom - 2 * taken / 3, 1)  # Eq. (2), (3)
+        fitted = roots.shape[1] if noise.source == "within runs" else 0
+        freedom: Array | float = max(2 * noise.degrees_of_freedom - 2 * fitted / 3, 1)  # Eq. (3), (4)
         covariance = self._roots @ self._roots.T
         if freedom_of is not None:
             freedom = np.minimum(freedom, freedom_of(covariance))
@@ -251,13 +249,13 @@ class FitCovariance:
         if not roots.size:
             return
         with suppress(DataError):
-            found = sandwich(Scores(scores, curvature * information, runs, np.zeros(len(unit)), information))
+            scatter = sandwich(Scores(scores, curvature * information, runs, np.zeros(len(unit)), information))
             real = float(np.square(scores @ roots).sum()) > _ROUNDING * roots.shape[1]
             self.scatter = replace(
-                found,
-                covariance=found.covariance * np.outer(unit, unit),
-                clustered=found.clustered and real,
-                lack_of_fit=found.lack_of_fit and real,
+                scatter,
+                covariance=scatter.covariance * np.outer(unit, unit),
+                clustered=scatter.clustered and real,
+                lack_of_fit=scatter.lack_of_fit and real,
             )
 
     def chosen(self, robust: bool) -> tuple[EstimatedCovariance, str]:
@@ -284,18 +282,7 @@ class FitCovariance:
         back = np.linalg.pinv(self._roots)
         values = np.linalg.eigvalsh(back @ self.scatter.covariance @ back.T)
         freedom = self.scatter.freedom_of_trace
-        return float(values.mean()) > float(chdtri(freedom, CHANCE)) / freedom  # Eq. (1)
-
-
-# Rounds of noise and fit settle after two or three; only where the clocks' errors are estimated, too, do they take more
-# than five. In tests/studies/constants_fit.py five rounds at most, or a change of 0.2, move an estimate with clocks
-# by 0.1 and 0.2 of its standard deviation; 20 rounds, a change of 0.05 and half and twice _NEAR move none.
-_MOST_ROUNDS = 10
-_FIRST_WEIGHTS = 5  # fits with Huber's weights before the noise is estimated from poses that are not off
-_MOST_REWEIGHTED = 50  # fits by the weights of a robust cost
-_WALKS = 2  # times that the walk of the odometry beside references is estimated, and the fit done again
-_NEAR = 0.01  # share of the largest component of the noise by which components of the same noise differ
-_STILL = 0.1  # standard errors: a smaller change of the vector ends the rounds
+        return float(values.mean()) > float(chdtri(freedom, CHANCE)) / freedom  # Eq. (2)
 
 
 class TrajectoryMLOptions(Options):
@@ -371,7 +358,12 @@ class TrajectoryML(Calibrator):
         if fit.references is not None:
             self._check_references(problem)
         if not fit.trajectories.runs and fit.references is not None:
-            return self._by_references(fit, fit.references)
+            # No run has poses: references say how exact they are, their errors how odometry wanders.
+            now = descend(fit, [], self.options.tolerance)
+            for _ in range(_WALKS):
+                now = descend(now.fit.with_walk(), [], self.options.tolerance)
+            references = now.fit.references or fit.references
+            return self._conclude(now, references.noise, 1 + _WALKS, now.settled, 1.0)
         stamps = fit.trajectories.stamps
         now = descend(self._with_deviations(fit, 0.0), whiteners(FIRST_NOISE, stamps), _STILL)
         loss = loss_of(problem.objective)
@@ -384,7 +376,10 @@ class TrajectoryML(Calibrator):
         while not settled and rounds < _MOST_ROUNDS:
             before, earlier = now.fit, noise
             usual = before.trajectories if heavy is None else heavy.without_jumps(before.trajectories)
-            noise = self._noise(usual, earlier)
+            kinds = [] if self.options.start == "exact" else [TURN]
+            noise = noise_of_fit(usual, kinds, None if earlier is None else earlier.estimate.noise)
+            least = noise.estimate.noise.pose_heading if self.options.start == "noisy" else 0.0
+            noise = replace(noise, deviations=np.maximum(noise.deviations, [least, 0.0, 0.0]))
             fit = self._with_deviations(before, noise.deviations[TURN]).with_walk()
             weightings: Sequence[Weighting] = whiteners(noise.estimate.noise, stamps)
             if heavy is not None:
@@ -399,14 +394,6 @@ class TrajectoryML(Calibrator):
             rounds += 1
         assert noise is not None  # there is at least one round
         return self._conclude(now, noise.estimate, rounds, settled, 1.0 if heavy is None else heavy.curvature)
-
-    def _by_references(self, fit: BoxedFit, references: ReferenceFit) -> TrajectoryEstimate:
-        """The estimate where no run has poses: references say how exact they are, their errors how odometry wanders."""
-        now = descend(fit, [], self.options.tolerance)
-        for _ in range(_WALKS):
-            now = descend(now.fit.with_walk(), [], self.options.tolerance)
-        references = now.fit.references or references
-        return self._conclude(now, references.noise, 1 + _WALKS, now.settled, 1.0)
 
     def _check_references(self, problem: CalibrationProblem) -> None:
         """ConfigError: an option is asked for that is of poses, and references of other kinds are fitted, too."""
@@ -456,18 +443,9 @@ class TrajectoryML(Calibrator):
     def _with_deviations(self, fit: BoxedFit, start_heading: float) -> BoxedFit:
         """The fit with the nuisances' standard deviations; those that are not estimated are 0."""
         clock, offset, slope = self.options.clock, self.options.clock_offset, self.options.clock_slope
-        asked = [start_heading, offset * (clock != "none"), slope * (clock == "offset_and_slope")]
-        deviations = np.array(asked)
+        deviations = np.array([start_heading, offset * (clock != "none"), slope * (clock == "offset_and_slope")])
         values = np.where(deviations > 0, fit.trajectories.nuisances.values, 0.0)
         return fit.with_nuisances(Nuisances(values, deviations))
-
-    def _noise(self, fit: TrajectoryFit, earlier: FitNoise | None) -> FitNoise:
-        """The noise and the deviation of the start headings, from the residuals of a fit."""
-        start = self.options.start
-        near = None if earlier is None else earlier.estimate.noise
-        found = noise_of_fit(fit, [] if start == "exact" else [TURN], near)
-        least = found.estimate.noise.pose_heading if start == "noisy" else 0.0
-        return replace(found, deviations=np.maximum(found.deviations, [least, 0.0, 0.0]))
 
 
 def _descend_cost(fit: BoxedFit, tolerance: float) -> tuple[Descent, float]:
@@ -476,14 +454,16 @@ def _descend_cost(fit: BoxedFit, tolerance: float) -> tuple[Descent, float]:
     The second value is the curvature of its loss, see RobustNoise.
     """
     objective = fit.problem.objective
-    if not isinstance(objective, RobustCost):
-        trajectories = fit.trajectories
-        return descend(fit, cost_weightings(objective, trajectories.runs, trajectories.residuals), tolerance), 1.0
+    settled = False
     for _ in range(_MOST_REWEIGHTED):
         trajectories = fit.trajectories
         now = descend(fit, cost_weightings(objective, trajectories.runs, trajectories.residuals), tolerance)
         moved = now.fit.vector - fit.vector
-        if float(moved @ now.data.information @ moved) < tolerance**2:
-            return now, mean_curvature(objective, now.fit.trajectories.residuals)
+        settled = not isinstance(objective, RobustCost) or float(moved @ now.data.information @ moved) < tolerance**2
+        if settled:
+            break
         fit = now.fit
-    return replace(now, settled=False), mean_curvature(objective, now.fit.trajectories.residuals)
+    curvature = 1.0
+    if isinstance(objective, RobustCost):
+        curvature = mean_curvature(objective, now.fit.trajectories.residuals)
+    return replace(now, settled=now.settled and settled), curvature

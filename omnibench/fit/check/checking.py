@@ -48,6 +48,24 @@ from omnibench.views import screenful
 from omnibench.words import noun_for, plural
 
 _WIDTH = 110  # characters of a line of a report at a Python prompt
+_QUANTITIES = {"": "positions", "/sample": "increments since the row before", "/s": "rates"}
+_SMALL = 0.1  # share of the cost: a larger gain that is not significant is left open; chosen
+_ENOUGH = 10  # commands, from which on a gain would have shown if there were one; chosen
+_REACHED = 0.05  # share of a run's time after which its last pose comes at least; chosen
+# Share of the runs' turns (squares of the whole runs') that the best matrix leaves: at most 0.005 on OptiOdom's
+# recordings, and 0.68 to 1.45 where the poses of each run were given to one of another command.
+_LEFT = 0.25
+_TURNED = 0.5  # rad, root mean square of the runs' turns: less of it tells nothing; chosen
+_FEWEST = 3  # runs whose turns a matrix of a few numbers cannot all follow; chosen
+_BENT = ("heading_unit", "time_unit", "steering")  # misreadings that no matrix takes up, as it does others
+_SPOILED = ("reference_frozen", "reference_is_odometry")  # after which the wheels cannot be judged by the reference
+_ORDER = {"error": 0, "warning": 1, "note": 2}
+_TOLD = 12  # restarts that are told one by one; chosen
+# Poses in a row that two runs must share, changes among them, and share of the later run's rows (chosen: a reference
+# scatters, so that no two drives share any; wheel rates as commanded are alike in all repetitions).
+_ROWS, _CHANGES, _SHARED = 12, 8, 0.3
+_MOST_KEYS = 2_000_000  # stretches of poses that are kept, some 0.2 GB; of more every second, or third... (chosen)
+_DIGIT = 1e-7  # m, to which positions are compared; below the noise of any reference
 Verdict = Literal["ready", "fix", "record more"]
 
 
@@ -69,13 +87,10 @@ class CheckReport(Model):
     clocks: tuple[ClockMatch | None, ...] = Field((), exclude=True, repr=False)
 
     def __repr__(self) -> str:
-        found = [f"{each.severity}: {each.what} [{each.where}]" for each in self.findings]
+        findings = [f"{finding.severity}: {finding.what} [{finding.where}]" for finding in self.findings]
         typed = ["its .command mends what can be mended"] if self.command else []
-        said = [f"{self.verdict}: {self.sentence}", *found, *filter(None, [self.gain]), *typed]
+        said = [f"{self.verdict}: {self.sentence}", *findings, *filter(None, [self.gain]), *typed]
         return "\n".join(screenful([line for text in said for line in wrap(text, _WIDTH, subsequent_indent="    ")]))
-
-
-_QUANTITIES = {"": "positions", "/sample": "increments since the row before", "/s": "rates"}
 
 
 def read_otherwise(read: RecordingSource, explained: Explained) -> RecordingSource | None:
@@ -92,16 +107,15 @@ def read_otherwise(read: RecordingSource, explained: Explained) -> RecordingSour
         other = _mended(read, warned)
         return None if other is None or _unit_warnings(other) or search(recorded(other.dataset)).mistakes else other
     senseless = explained.unexplained > UNRELATED or (not explained.told and odd_times(read.dataset))
-    if senseless and not any(finding.kind == "wheel_unit" for finding in read.findings):
-        return next(filter(None, (_mended(read, findings) for findings in _other_units(read))), None)
-    return None
-
-
-def _other_units(read: RecordingSource) -> Iterator[list[Finding]]:
-    """Findings that another quantity of the wheels would mend, each with another unit of times that are odd."""
+    if not senseless or any(finding.kind == "wheel_unit" for finding in read.findings):
+        return None
+    # Another quantity of the wheels is tried with each other unit of times that are odd.
     odd = odd_times(read.dataset)
-    times = [[finding] for finding in other_times(read.importer, read.options)] if odd else [[]]
-    return ([*time, quantity] for time in times for quantity in _other_quantities(read))
+    for times in [[finding] for finding in other_times(read.importer, read.options)] if odd else [[]]:
+        for quantity in _other_quantities(read):
+            if (other := _mended(read, [*times, quantity])) is not None:
+                return other
+    return None
 
 
 def _unit_warnings(read: RecordingSource) -> list[Finding]:
@@ -111,13 +125,13 @@ def _unit_warnings(read: RecordingSource) -> list[Finding]:
 
 def _mended(read: RecordingSource, findings: list[Finding]) -> RecordingSource | None:
     """The recording read anew without the mistakes of findings, old and new; None if it makes no sense then."""
-    found = (*read.findings, *findings)
+    mistakes = (*read.findings, *findings)
     try:
-        options = mended_options(read, read.importer, read.options, [finding.changes for finding in found])
+        options = mended_options(read, read.importer, read.options, [finding.changes for finding in mistakes])
     except CannotBeTypedError:
         return None
     dataset = attempt(read.importer, read.source, options)
-    return None if dataset is None else replace(read, dataset=dataset, findings=found)
+    return None if dataset is None else replace(read, dataset=dataset, findings=mistakes)
 
 
 def _other_quantities(read: RecordingSource) -> Iterator[Finding]:
@@ -133,10 +147,6 @@ def _other_quantities(read: RecordingSource) -> Iterator[Finding]:
                 severity="error",
                 changes={"wheel_quantity": f"{unit}{ending}"},
             )
-
-
-_SMALL = 0.1  # share of the cost: a larger gain that is not significant is left open; chosen
-_ENOUGH = 10  # commands, from which on a gain would have shown if there were one; chosen
 
 
 @dataclass(frozen=True)
@@ -166,14 +176,6 @@ def expected_gain(dataset: Dataset, *, clocks_agree: bool = True) -> Gain:
         runs = plural(len(dataset.trajectories), "run")
         return Gain(None, f"whether a calibration is needed cannot be told from {runs}; record four, of three commands")
     return Gain(needed, verdict.sentence)
-
-
-_REACHED = 0.05  # share of a run's time after which its last pose comes at least; chosen
-# Share of the runs' turns (squares of the whole runs') that the best matrix leaves: at most 0.005 on OptiOdom's
-# recordings, and 0.68 to 1.45 where the poses of each run were given to one of another command.
-_LEFT = 0.25
-_TURNED = 0.5  # rad, root mean square of the runs' turns: less of it tells nothing; chosen
-_FEWEST = 3  # runs whose turns a matrix of a few numbers cannot all follow; chosen
 
 
 def foreign_reference(recording: Recorded, runs: Sequence[Trajectory]) -> Iterator[Finding]:
@@ -213,11 +215,6 @@ def _turns_left(recording: Recorded) -> float | None:
     return float((missed**2).sum() / (turned**2).sum())
 
 
-_BENT = ("heading_unit", "time_unit", "steering")  # misreadings that no matrix takes up, as it does others
-_SPOILED = ("reference_frozen", "reference_is_odometry")  # after which the wheels cannot be judged by the reference
-_ORDER = {"error": 0, "warning": 1, "note": 2}
-
-
 @computable
 def check(
     source: Dataset | Path | str,
@@ -242,7 +239,13 @@ def check_recording(read: RecordingSource) -> CheckReport:
     dataset, robot = read.dataset, read.dataset.robot
     runs = [replace(run, poses=continuous(run.pose_times, run.poses)) for run in dataset.trajectories if run.has_poses]
     clocks = clocks_of(robot, runs)
-    aligned = [_by_wheels(run, clock) for run, clock in zip(runs, clocks, strict=True)]
+    aligned = []  # poses by the wheels' clock
+    for run, clock in zip(runs, clocks, strict=True):
+        times = run.pose_times if clock is None else clock.corrected(run.pose_times)
+        used = np.flatnonzero((times >= 0) & (times <= run.times[-1]))
+        if clock is not None and len(used) >= max(3, len(times) // 2):
+            run = replace(run, pose_times=times[used], poses=run.poses[used], pose_covariances=None)
+        aligned.append(run)
     faults = list(stream_faults(robot, [*aligned, *(run for run in dataset.trajectories if not run.has_poses)]))
     odometry = list(_odometry(dataset, drawn_runs(runs)))
     spoiled = {finding.kind for finding in (*faults, *odometry)} & set(_SPOILED)
@@ -252,7 +255,12 @@ def check_recording(read: RecordingSource) -> CheckReport:
     frozen = any(fault.kind in ("steering_frozen", "wheel_dead") and not fault.changes for fault in faults)
     if not frozen and not spoiled and (otherwise := read_otherwise(read, explained)) is not None:
         return check_recording(otherwise).model_copy(update={"clocks": tuple(clocks)})
-    misread = [] if frozen else list(_misreadings(explained)) if explained.told else _reading_errors(dataset)
+    if frozen:
+        misread = []
+    elif explained.told:
+        misread = list(_misreadings(explained))
+    else:  # the search for misreadings needs more poses than there are: what reading the data set warned of stands
+        misread = [finding for finding in findings_of(dataset.warnings) if finding.severity == "error"]
     if misread:  # wheels that are misread tell no jumps
         faults = [fault for fault in faults if fault.kind != "reference_jump"]
     odd = _odd_references(dataset) if explained.told else []
@@ -261,13 +269,16 @@ def check_recording(read: RecordingSource) -> CheckReport:
     foreign = [] if wrong or bent else list(foreign_reference(seen, aligned))
     if foreign:
         misread = []
-    found = [*read.findings, *_noted(dataset), *misread, *odd, *foreign, *odometry, *faults, *copied_runs(runs)]
+    findings = [*read.findings, *_noted(dataset), *misread, *odd, *foreign, *odometry, *faults, *copied_runs(runs)]
     off = [] if spoiled or foreign else list(clock_findings(runs, clocks))
-    found += off
+    findings += off
     measured = any(run.references is not None for run in dataset.trajectories)
-    found += _left_open(dataset) if measured else missing_motions(robot, drawn_runs(aligned))
-    found += [*too_few(dataset.trajectories), *_drawn(dataset.trajectories)]
-    findings = with_fixes(read, sorted(_distinct(found), key=lambda finding: _ORDER[finding.severity]))
+    findings += _left_open(dataset) if measured else missing_motions(robot, drawn_runs(aligned))
+    findings += [*too_few(dataset.trajectories), *_drawn(dataset.trajectories)]
+    distinct: dict[tuple[str, str], Finding] = {}
+    for finding in findings:
+        distinct.setdefault((finding.kind, finding.where), finding)
+    findings = with_fixes(read, sorted(distinct.values(), key=lambda finding: _ORDER[finding.severity]))
     clocks_agree = not any(finding.severity == "error" for finding in off)
     gain = Gain(None, "") if misread or odd or foreign or spoiled else expected_gain(dataset, clocks_agree=clocks_agree)
     return _report(read, findings, gain, clocks)
@@ -326,27 +337,11 @@ def _left_open(dataset: Dataset) -> Iterator[Finding]:
         )
 
 
-def _by_wheels(run: Trajectory, clock: ClockMatch | None) -> Trajectory:
-    """A run with its poses by the wheels' clock."""
-    if clock is None:
-        return run
-    times = clock.corrected(run.pose_times)
-    kept = np.flatnonzero((times >= 0) & (times <= run.times[-1]))
-    if len(kept) < max(3, len(times) // 2):
-        return run
-    return replace(run, pose_times=times[kept], poses=run.poses[kept], pose_covariances=None)
-
-
 def _misreadings(explained: Explained) -> Iterator[Finding]:
     others = " or ".join("; ".join(mistake.what for mistake in mistakes) for mistakes in explained.alike)
     for index, mistake in enumerate(explained.mistakes):
         alike = f" (this recording cannot tell that from another reading: {others})" if others and not index else ""
         yield mistake.finding(alike)
-
-
-def _reading_errors(dataset: Dataset) -> list[Finding]:
-    """Findings that reading a data set warned of, where the search for misreadings needs more poses than there are."""
-    return [finding for finding in findings_of(dataset.warnings) if finding.severity == "error"]
 
 
 def _odd_references(dataset: Dataset) -> list[Finding]:
@@ -385,9 +380,6 @@ def _drawn(runs: Sequence[Trajectory]) -> Iterator[Finding]:
         )
 
 
-_TOLD = 12  # restarts that are told one by one; chosen
-
-
 def _noted(dataset: Dataset) -> Iterator[Finding]:
     """Restarts of counters that the importer has mended."""
     notes = [finding.what for finding in findings_of(dataset.warnings) if finding.kind == "counter_restart"]
@@ -399,21 +391,6 @@ def _noted(dataset: Dataset) -> Iterator[Finding]:
             severity="note",
             fix="nothing: the import has mended it",
         )
-
-
-def _distinct(findings: Sequence[Finding]) -> list[Finding]:
-    """Each kind and place once."""
-    kept: dict[tuple[str, str], Finding] = {}
-    for finding in findings:
-        kept.setdefault((finding.kind, finding.where), finding)
-    return list(kept.values())
-
-
-# Poses in a row that two runs must share, changes among them, and share of the later run's rows (chosen: a reference
-# scatters, so that no two drives share any; wheel rates as commanded are alike in all repetitions).
-_ROWS, _CHANGES, _SHARED = 12, 8, 0.3
-_MOST_KEYS = 2_000_000  # stretches of poses that are kept, some 0.2 GB; of more every second, or third... (chosen)
-_DIGIT = 1e-7  # m, to which positions are compared; below the noise of any reference
 
 
 def copied_runs(runs: Sequence[Trajectory]) -> Iterator[Finding]:

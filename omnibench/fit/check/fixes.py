@@ -1,4 +1,4 @@
-"""What to type for a finding: the import of its source, with the options that mend it beside those that were given."""
+"""Command line that mends a finding: the import of its source, with more options beside those that were given."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from glob import escape
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,12 @@ _ANY_RATE = 1e9  # rad/s: the option ``fastest`` with which rates in any unit ar
 _SLOWEST, _SLOWEST_POSES, _FASTEST = 1.5, 5.0, 3e-4
 _UNITS = ("ms", "us")
 _EXPLAINED = 0.35  # share of the way that the wheels may leave unexplained with the right unit of time; chosen
+_RATES = {"rpm": 2 * 3.141592653589793 / 60, "deg/s": 3.141592653589793 / 180, "rev/s": 2 * 3.141592653589793}
+_POSITIONS = {"deg/s": "deg", "rev/s": "rev"}
+_HEADER = 10_000  # characters of a header that are looked at
+_TABLES = 8  # whose headers are looked at
+_IDENTITY = {"position_unit": "m", "heading_unit": "rad", "wheel_time_unit": "s", "pose_time_unit": "s"}
+_COLUMNS = {"wheel_order": "wheel_columns", "steering_order": "steering_columns", "pose_order": "pose_columns"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,10 +72,10 @@ def read_source(
 
     DataError or ConfigError in one line where it cannot be read.
     """
-    given = dict(options or {}) | ({"robot": str(robot)} if robot else {})
+    settings = dict(options or {}) | ({"robot": str(robot)} if robot else {})
     places = dataset_folders(source)
     if len(places) > 1:
-        if form or given:
+        if form or settings:
             raise ConfigError(
                 f"{places[0]} and {len(places) - 1} more: an importer reads one source; import each by itself"
             )
@@ -76,21 +83,18 @@ def read_source(
     (source,) = places
     check_source(source)
     name = form or recognised(source)
-    if name == "dataset" and not given:
-        return _of_folder(source)
-    return _imported(name, source, given)
-
-
-def _of_folder(folder: Path) -> RecordingSource:
-    """A data set folder, in other units of time if it cannot be read, or makes no sense, in s."""
+    is_dataset = name == "dataset" and not settings
+    # Other units of time are tried where the source cannot be read, or makes no sense, in those given.
     try:
-        dataset = load_dataset(folder)
+        dataset = load_dataset(source) if is_dataset else _read(name, source, settings)
     except DataError:
-        if (mended := _by_other_times("dataset", folder, {})) is None:
+        if (mended := _by_other_times(name, source, settings)) is None:
             raise
-        return replace(mended, folder=folder)
-    mended = _by_other_times("dataset", folder, {}) if odd_times(dataset) else None
-    return of_dataset(dataset, folder) if mended is None else replace(mended, folder=folder)
+    else:
+        mended = _by_other_times(name, source, settings) if odd_times(dataset) else None
+    if mended is not None:
+        return replace(mended, folder=source) if is_dataset else mended
+    return of_dataset(dataset, source) if is_dataset else RecordingSource(dataset, name, source, settings)
 
 
 def of_dataset(dataset: Dataset, folder: Path | None = None) -> RecordingSource:
@@ -119,18 +123,6 @@ def recognised(source: Path) -> str:
         if next(source.rglob(pattern), None) is not None:
             return name
     raise ConfigError(f"{source}: no recording is recognised there; name the importer with --format (omnibench list)")
-
-
-def _imported(name: str, source: Path, given: Mapping[str, Any]) -> RecordingSource:
-    """A source read by an importer, in other units of time if it cannot be read, or makes no sense, in those given."""
-    try:
-        dataset = _read(name, source, given)
-    except DataError:
-        if (mended := _by_other_times(name, source, given)) is None:
-            raise
-        return mended
-    mended = _by_other_times(name, source, given) if odd_times(dataset) else None
-    return mended or RecordingSource(dataset, name, source, given)
 
 
 def _by_other_times(name: str, source: Path, given: Mapping[str, Any]) -> RecordingSource | None:
@@ -222,14 +214,6 @@ def _time_unit(changes: Mapping[str, Any]) -> Finding:
     )
 
 
-_POSE = ("x", "y", "theta")
-_RATES = {"rpm": 2 * 3.141592653589793 / 60, "deg/s": 3.141592653589793 / 180, "rev/s": 2 * 3.141592653589793}
-_POSITIONS = {"deg/s": "deg", "rev/s": "rev"}
-_HEADER = 10_000  # characters of a header that are looked at
-_TABLES = 8  # whose headers are looked at
-_IDENTITY = {"position_unit": "m", "heading_unit": "rad", "wheel_time_unit": "s", "pose_time_unit": "s"}
-
-
 class CannotBeTypedError(Exception):
     """The importer of a recording has no option for a fix."""
 
@@ -249,8 +233,19 @@ def command(read: RecordingSource, findings: Sequence[Finding]) -> str:
     changes = [finding.changes for finding in findings if finding.changes]
     if not changes:
         return ""
-    typed = _command(read, changes)
-    return typed if read.readable or read.places else f"{typed}  # after save_dataset(dataset, {str(read.source)!r})"
+    if read.places:
+        return f'for each in {in_few_words(read.places)}; do omnibench check "$each"; done'
+    saved = "" if read.readable else f"  # after save_dataset(dataset, {str(read.source)!r})"
+    target = _target(read)
+    try:
+        options = mended_options(read, read.importer, read.options, changes)
+        return _import(read.importer, read.source, options, target) + saved
+    except CannotBeTypedError:
+        options = mended_options(read, "dataset", {}, changes)
+    if read.folder is not None and (read.folder / "dataset.yaml").is_file():
+        return _import("dataset", read.folder, options, _beside(read.folder)) + saved
+    first = _import(read.importer, read.source, read.options, target)
+    return f"{first} && {_import('dataset', target, options, _beside(target))}{saved}"
 
 
 def next_command(read: RecordingSource) -> str:
@@ -259,23 +254,6 @@ def next_command(read: RecordingSource) -> str:
     if places:
         return f"omnibench calibrate {in_few_words(places)} -o calibration.yaml"
     return _import(read.importer, read.source, read.options, _target(read))
-
-
-def _command(read: RecordingSource, changes: Sequence[Mapping[str, Any]]) -> str:
-    """The command line; by way of a data set where the importer cannot."""
-    if read.places:
-        return f'for each in {in_few_words(read.places)}; do omnibench check "$each"; done'
-    try:
-        return _import(
-            read.importer, read.source, mended_options(read, read.importer, read.options, changes), _target(read)
-        )
-    except CannotBeTypedError:
-        pass
-    if read.folder is not None and (read.folder / "dataset.yaml").is_file():
-        return _import("dataset", read.folder, mended_options(read, "dataset", {}, changes), _beside(read.folder))
-    first = _target(read)
-    given = _import(read.importer, read.source, read.options, first)
-    return f"{given} && {_import('dataset', first, mended_options(read, 'dataset', {}, changes), _beside(first))}"
 
 
 def _target(read: RecordingSource) -> Path:
@@ -317,22 +295,19 @@ def _with_change(
     """The options after one change, relative to them."""
     robot = read.dataset.robot
     changed = dict(options)
-    if key == "wheel_order":
-        changed = _permuted(read, importer, options, "wheel_columns", value)
-        for option in ("wheel_signs", "ticks_per_turn", "gear_ratio"):
+    if key in _COLUMNS:
+        changed = _permuted(read, importer, options, _COLUMNS[key], value)
+        for option in ("wheel_signs", "ticks_per_turn", "gear_ratio") if key == "wheel_order" else ():
             if isinstance(options.get(option), list | tuple) and len(options[option]) == len(value):
                 changed[option] = [options[option][column] for column in value]
-    elif key == "wheel_signs":
-        changed["wheel_signs"] = _product(options.get("wheel_signs"), value)
+    elif key in ("wheel_signs", "pose_signs"):
+        changed[key] = _product(options.get(key), value)
     elif key == "rate_factors":
-        option = "ticks_per_turn" if options.get("ticks_per_turn") else "gear_ratio"
-        changed[option] = _one_or_all(_product(options.get(option), value))
+        changed |= _geared(options, value)
     elif key == "wheel_quantity":
         changed["wheel_unit"] = value
     elif key == "wheel_unit":
         changed |= _wheel_unit(options, value, len(robot.wheel_names))
-    elif key == "steering_order":
-        changed = _permuted(read, importer, options, "steering_columns", value)
     elif key == "steering_signs":
         changed["steering_signs"] = _product(options.get("steering_signs"), value)
         if options.get("steering_offsets_deg"):
@@ -340,16 +315,13 @@ def _with_change(
     elif key == "steering_factors":
         changed["steering_scale"] = _one_or_all(_product(options.get("steering_scale"), value))
     elif key == "steering_offsets_deg":
-        changed[key] = _one_or_all(_sum(options.get(key), value))
-    elif key == "pose_order":
-        changed = _permuted(read, importer, options, "pose_columns", value)
-    elif key == "pose_signs":
-        changed[key] = _product(options.get(key), value)
+        offsets = zip(_listed(options.get(key), len(value), 0.0), value, strict=True)
+        changed[key] = _one_or_all([round(present + offset, 3) for present, offset in offsets])
     elif key == "heading_offset_deg":
         changed[key] = round(float(options.get(key, 0.0)) + value, 3)
     elif key == "leave_out":
         before = options.get(key, [])
-        changed[key] = [*([before] if isinstance(before, str) else before), *map(_pattern, value)]
+        changed[key] = [*([before] if isinstance(before, str) else before), *map(escape, value)]
     elif key in _IDENTITY and options.get(key) not in (None, _IDENTITY[key], value):
         raise CannotBeTypedError(key)
     else:
@@ -363,37 +335,13 @@ def _wheel_unit(options: Mapping[str, Any], unit: str, count: int) -> dict[str, 
         return {"wheel_unit": unit}
     if present == "rad" and unit in _POSITIONS:
         return {"wheel_unit": _POSITIONS[unit]}
+    return _geared(options, [float(f"{1 / _RATES[unit]:.6g}")] * count)
+
+
+def _geared(options: Mapping[str, Any], factors: Sequence[float]) -> dict[str, Any]:
+    """The option of the ticks, or of the gears, by which the wheels' rates become those divided by factors."""
     option = "ticks_per_turn" if options.get("ticks_per_turn") else "gear_ratio"
-    return {option: _one_or_all(_product(options.get(option), [float(f"{1 / _RATES[unit]:.6g}")] * count))}
-
-
-def _columns(read: RecordingSource, importer: str, options: Mapping[str, Any], key: str) -> list[str]:
-    """Names of the columns that are read, in the robot's order. key: wheel_columns, steering_columns or pose_columns.
-
-    CannotBeTypedError: they are not known.
-    """
-    robot = read.dataset.robot
-    names = {"wheel_columns": robot.wheel_names, "steering_columns": robot.drive.steered, "pose_columns": _POSE}[key]
-    if importer == "dataset":
-        return list(options.get(key) or names)
-    if importer != "csv":
-        raise CannotBeTypedError(key)
-    prefix = {"wheel_columns": _prefix(options), "steering_columns": "steer_", "pose_columns": ""}[key]
-    mapping = options.get("columns") or {}
-    given = options.get(key) or [prefix + name for name in names]
-    columns = [
-        str(mapping.get(prefix + name) or mapping.get(name) or present)
-        for name, present in zip(names, given, strict=True)
-    ]
-    if not options.get(key) and not set(columns) <= _header_words(read.source):
-        raise CannotBeTypedError(key)
-    return columns
-
-
-def _prefix(options: Mapping[str, Any]) -> str:
-    """What the columns of the wheels begin with, by their unit."""
-    unit = str(options.get("wheel_unit", "rad/s"))
-    return "omega_" if unit.endswith("/s") or unit == "rpm" else "ticks_" if "ticks" in unit else "phi_"
+    return {option: _one_or_all(_product(options.get(option), factors))}
 
 
 def _header_words(source: Path) -> set[str]:
@@ -409,19 +357,36 @@ def _header_words(source: Path) -> set[str]:
 def _permuted(
     read: RecordingSource, importer: str, options: Mapping[str, Any], key: str, order: Sequence[int]
 ) -> dict[str, Any]:
-    """The options with columns in another order."""
-    columns = _columns(read, importer, options, key)
+    """The options with columns in another order. key: wheel_columns, steering_columns or pose_columns.
+
+    CannotBeTypedError: the names of the columns are not known.
+    """
+    robot, mapping = read.dataset.robot, options.get("columns") or {}
+    unit = str(options.get("wheel_unit", "rad/s"))
+    by_unit = "omega_" if unit.endswith("/s") or unit == "rpm" else "ticks_" if "ticks" in unit else "phi_"
+    names, prefix = {
+        "wheel_columns": (robot.wheel_names, by_unit),
+        "steering_columns": (robot.drive.steered, "steer_"),
+        "pose_columns": (("x", "y", "theta"), ""),
+    }[key]
+    if importer == "dataset":
+        columns = list(options.get(key) or names)
+    elif importer == "csv":
+        present = options.get(key) or [prefix + name for name in names]
+        columns = [
+            str(mapping.get(prefix + name) or mapping.get(name) or column)
+            for name, column in zip(names, present, strict=True)
+        ]
+        if not options.get(key) and not set(columns) <= _header_words(read.source):
+            raise CannotBeTypedError(key)
+    else:
+        raise CannotBeTypedError(key)
     changed = {**options, key: [columns[column] for column in order]}
-    if mapping := options.get("columns"):
-        kept = {name: column for name, column in mapping.items() if str(column) not in columns}
+    if mapping:
+        others = {name: column for name, column in mapping.items() if str(column) not in columns}
         changed = {name: value for name, value in changed.items() if name != "columns"}
-        changed |= {"columns": kept} if kept else {}
+        changed |= {"columns": others} if others else {}
     return changed
-
-
-def _pattern(name: str) -> str:
-    """A pattern that matches one run only."""
-    return "".join(f"[{letter}]" if letter in "*?[" else letter for letter in name)
 
 
 def _listed(present: Any, count: int, default: float) -> list[float]:
@@ -435,11 +400,6 @@ def _product(present: Any, factors: Sequence[float]) -> list[float]:
     return [
         value if isinstance(value, int) else float(f"{value:.6g}") for value in (one * other for one, other in both)
     ]
-
-
-def _sum(present: Any, offsets: Sequence[float]) -> list[float]:
-    both = zip(_listed(present, len(offsets), 0.0), offsets, strict=True)
-    return [round(one + other, 3) for one, other in both]
 
 
 def _one_or_all(values: Sequence[float]) -> Any:

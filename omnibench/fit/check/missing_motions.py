@@ -17,7 +17,6 @@ from omnibench.data.checks.misread_search import Windows
 from omnibench.data.dataset import Trajectory
 from omnibench.fit.span import driven_span
 from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.odometry import Complex
 from omnibench.words import plural
 
 # Least share of the time in motion that counts as driven on purpose; chosen: about a second in a minute.
@@ -26,6 +25,10 @@ TURNING, _STRAIGHT = 0.06, 0.04  # rad/s from which on a robot turns, and up to 
 MOVING = 0.02  # m/s from which on it moves; chosen
 _ON_THE_SPOT = 0.1  # way ahead, as a share of the wheels' way by turning, below which it turns on the spot; chosen
 _SECTOR = 30.0  # deg about an axis that count as along it; chosen
+_SLIDING = 0.35  # rad between two directions of motion that count as different; chosen
+_FEW_RUNS, _SOME_RUNS = 3, 7  # runs up to which no interval can be had, and few
+_LEAST_REPEATED = 2
+_ALIKE = 0.1  # by which the angles that wheels turn may differ in repetitions of a command; chosen
 _SIDES = ("left", "right")
 
 Kinds = Mapping[str, NDArray[np.bool_]]
@@ -62,12 +65,6 @@ def turning(kinds: Kinds, side: str) -> NDArray[np.bool_]:
     return curves | kinds.get(f"on the spot to the {side}", np.zeros_like(curves))
 
 
-_SLIDING = 0.35  # rad between two directions of motion that count as different; chosen
-_FEW_RUNS, _SOME_RUNS = 3, 7  # runs up to which no interval can be had, and few
-_LEAST_REPEATED = 2
-_ALIKE = 0.1  # by which the angles that wheels turn may differ in repetitions of a command; chosen
-
-
 def missing_motions(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Finding]:
     """Motions that a robot of this kind needs and that were not driven; none where the reference does not move."""
     if not any(run.rates.any() for run in runs):
@@ -95,13 +92,17 @@ def missing_motions(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Findin
         yield _missing(f"the robot never turned {side}", f"drive {_turns(robot)}, to the {side}")
     if share(kinds["straight"]) < SHARE:
         yield _missing("the robot never went straight", "drive three straight lines of 2 m and more")
-    if robot.slides and not robot.skid and not _sideways(windows.moved[np.abs(velocity) > MOVING]):
-        yield _missing("the robot went in one direction only", "drive forward, and sideways to either side, 2 m each")
+    moved = windows.moved[np.abs(velocity) > MOVING]
+    if robot.slides and not robot.skid and len(moved):
+        # 1 if the robot moved along one line in its frame, 0 all round.
+        spread = abs(complex(np.sum(moved**2))) / float(np.sum(np.abs(moved) ** 2))
+        if spread >= math.cos(2 * _SLIDING):
+            yield _missing(
+                "the robot went in one direction only", "drive forward, and sideways to either side, 2 m each"
+            )
     if robot.drive.direct and left >= SHARE and right >= SHARE and robot.slides:
-        spot, shares = (
-            share(kinds["on the spot to the left"] | kinds["on the spot to the right"]),
-            driven_span(runs).shares,
-        )
+        spot = share(kinds["on the spot to the left"] | kinds["on the spot to the right"])
+        shares = driven_span(runs).shares
         if spot < SHARE and shares[-1] < SHARE / 2 and len(shares) == 3:
             yield _missing("the robot never turned on the spot", "drive three turns at 0.5 rad/s, to either side")
 
@@ -112,14 +113,6 @@ def _missing(what: str, fix: str) -> Finding:
 
 def _turns(robot: Robot) -> str:
     return "three circles" if robot.drive.steered else "three turns on the spot at 0.5 rad/s"
-
-
-def _sideways(moved: Complex) -> bool:
-    """True if a robot moved in directions that are no line in its frame. moved (W,): complex, m."""
-    if not len(moved):
-        return True
-    spread = abs(complex(np.sum(moved**2))) / float(np.sum(np.abs(moved) ** 2))  # 1 along one line, 0 all round
-    return spread < math.cos(2 * _SLIDING)
 
 
 def too_few(runs: Sequence[Trajectory]) -> Iterator[Finding]:
@@ -149,7 +142,11 @@ def command_names(runs: Sequence[Trajectory]) -> list[str]:
     """The command of every run; of runs without one, runs whose wheels turn alike share a name."""
     names = [run.command or "" for run in runs]
     nameless = [index for index, run in enumerate(runs) if run.command is None]
-    driven = np.array([_driven(runs[index]) for index in nameless])
+    angles = []  # that the drive signals of each run count, with their signs and without (2 M,), rad
+    for run in (runs[index] for index in nameless):
+        seconds = np.diff(run.times, prepend=0.0)
+        angles.append(np.concatenate([run.signals.T @ seconds, np.abs(run.signals).T @ seconds]))
+    driven = np.array(angles)
     firsts: list[int] = []  # index of the first run of each group that drives alike
     for row, index in enumerate(nameless):
         alike = np.abs(driven[firsts] - driven[row]).max(axis=1) <= _ALIKE * np.abs(driven[row]).max()
@@ -157,9 +154,3 @@ def command_names(runs: Sequence[Trajectory]) -> list[str]:
         firsts += [row] if first == row else []
         names[index] = f"like {runs[nameless[first]].id}"
     return names
-
-
-def _driven(run: Trajectory) -> Array:
-    """Angles (2 M,) that the drive signals count, with their signs and without, rad."""
-    seconds = np.diff(run.times, prepend=0.0)
-    return np.concatenate([run.signals.T @ seconds, np.abs(run.signals).T @ seconds])
