@@ -7,7 +7,7 @@ TYPE_CHECKING = False  # that of ``typing`` would take its import, during which 
 # The public names and their modules. A name is imported when it is first asked for, so that the command line starts at
 # once.
 _PUBLIC = {
-    "Budget": "fit.problem",
+    "Budget": "fit.settings",
     "Calibration": "robot.calibration",
     "Dataset": "data.dataset",
     "LiveNode": "live.node",
@@ -68,7 +68,7 @@ if TYPE_CHECKING:  # imports for type checkers; tests/ground/test_package.py hol
     from omnibench.fit.check.checking import check as check
     from omnibench.fit.evaluate import evaluate as evaluate
     from omnibench.fit.inspect import inspect_dataset as inspect_dataset
-    from omnibench.fit.problem import Budget as Budget
+    from omnibench.fit.settings import Budget as Budget
     from omnibench.live.config import read_live_config as read_live_config
     from omnibench.live.node import LiveNode as LiveNode
     from omnibench.live.wire.subscriber import subscribe as subscribe
