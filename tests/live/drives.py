@@ -7,7 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from omnibench.live.estimation.live_odometry import Motion
+from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.wire.messages import JOINT_STATE, POSE_ESTIMATE, JointState, PoseEstimate
+from omnibench.live.wire.outputs import Update
 from omnibench.robot.calibration import Calibration, Noise, covariance_rows, matrix_rows
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, WheelLog
@@ -91,3 +93,17 @@ def slam(stamp: int, pose: Array, covariance: Array = EXACT, frame: str = "map")
 def motion(stamp: int, moved: Array, duration: float = PERIOD, variance: float = 1e-6) -> Motion:
     """A motion of the robot's own frame."""
     return Motion(stamp, duration, np.asarray(moved, dtype=float), "arc", variance, variance)
+
+
+def fed(robot: RobotTracker, payloads: list[bytes], begin: float = 0.0) -> list[Update]:
+    """What a robot publishes of wheel messages that arrive one every period, from ``begin`` s on."""
+    return [
+        update
+        for index, payload in enumerate(payloads)
+        for update in robot.take_wheels(payload, begin + PERIOD * index)
+    ]
+
+
+def odometry(updates: list[Update]) -> Array:
+    """Poses (N, 3) of updates."""
+    return np.array([update.pose for update in updates])

@@ -141,3 +141,29 @@ def peak_memory(process: int) -> int:
     """The most memory that a process has had, in MB."""
     lines = Path(f"/proc/{process}/status").read_text(encoding="ascii").splitlines()
     return next(int(line.split()[1]) // 1024 for line in lines if line.startswith("VmHWM"))
+
+
+def connected(port: int, token: str | None = None) -> zenoh.Session:
+    """A client of whoever listens there, once somebody does; token: whose liveliness it waits for, too."""
+    sessions: list[zenoh.Session] = []
+
+    def alive() -> bool:
+        try:
+            session = raw_session("client", connect=[f"tcp/127.0.0.1:{port}"])
+        except zenoh.ZError:
+            return False
+        if token is None or any(reply.ok for reply in session.liveliness().get(token)):
+            sessions.append(session)
+            return True
+        session.close()
+        return False
+
+    until(alive, "a router or node")
+    return sessions[0]
+
+
+def wheels_of(session: zenoh.Session, robot: str = "apr", topic: str = "joint_states") -> zenoh.Publisher:
+    """A publisher that the node has subscribed to; bursts lose nothing."""
+    publisher = session.declare_publisher(f"{robot}/{topic}", congestion_control=zenoh.CongestionControl.BLOCK)
+    until(lambda: publisher.matching_status.matching, "the node's subscription")
+    return publisher

@@ -1,38 +1,47 @@
-"""The node on Zenoh, with real sessions: what goes in, what comes out, how it starts and ends."""
+"""The node on Zenoh, with real sessions: what goes in, comes out, is recorded and served, its start and its end."""
 
 from __future__ import annotations
 
 import gc
+import json
 import math
+import socket
 import sys
 import time
+from contextlib import closing
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import zenoh
 from drives import SECOND, drive, slam
-from nodes import asked, config_of, running, sent, sent_one_by_one
+from mcap.reader import make_reader
+from nodes import asked, config_of, running, sent, sent_one_by_one, wheels_of
 from received_messages import ReceivedMessages
 from recordings import random_dataset
-from sessions import until
+from sessions import free_port, until
+from timing import PATIENCE
 
 from omnibench.errors import ConfigError, DataError
 from omnibench.live.config import LiveConfig, read_live_config
+from omnibench.live.estimation.health import Health
+from omnibench.live.network.presence import alive_robots
 from omnibench.live.node import LiveNode
 from omnibench.live.replay.concatenated_drive import ReplayConfig, concatenate_runs
 from omnibench.live.replay.replay_player import Player
 from omnibench.live.stopping import RateLimiter
-from omnibench.live.wire.messages import DIAGNOSTICS, ODOMETRY, TRANSFORMS, Odometry
-from omnibench.live.wire.topics import GraphNode, KeySpace
+from omnibench.live.wire.messages import DIAGNOSTICS, JOINT_STATE, ODOMETRY, TRANSFORMS, Odometry, packed
+from omnibench.live.wire.recorder import Recorder
+from omnibench.live.wire.topics import TOPICS, GraphNode, KeySpace
 
 
 def test_wheel_samples_become_the_batch_odometry_on_every_topic(tmp_path: Path) -> None:
     path = drive(1.0)
     with running(config_of(tmp_path)) as (_, session):
         heard = ReceivedMessages(session, apr__odom=ODOMETRY, apr__odometry__filtered=ODOMETRY, tf=TRANSFORMS)
-        wheels = session.declare_publisher("apr/joint_states")
-        until(lambda: wheels.matching_status.matching, "the node's subscription")
+        wheels = wheels_of(session)
         sent_one_by_one(wheels, path.samples(), heard["apr__odom"])
         until(lambda: len(heard["tf"]) == len(heard["apr__odometry__filtered"]) == 101, "the last of the others")
     odometry: list[Odometry] = heard["apr__odom"]
@@ -58,17 +67,11 @@ def test_slam_poses_locate_the_robot_in_the_map(tmp_path: Path) -> None:
     assert last.frame == "map"
 
 
-def test_without_fusion_slam_and_tf_are_left_alone(tmp_path: Path) -> None:
-    with running(config_of(tmp_path, fusion="none")) as (_, session):
-        publisher = session.declare_publisher("apr/slam_pose")
-        wheels = session.declare_publisher("apr/joint_states")
-        until(lambda: wheels.matching_status.matching, "the node's subscription")
-        assert not publisher.matching_status.matching
-
-
-def test_without_fusion_a_replay_with_poses_is_taken_whole(tmp_path: Path) -> None:
+def test_without_fusion_slam_is_left_alone_and_a_replay_with_poses_is_taken_whole(tmp_path: Path) -> None:
     played = concatenate_runs(random_dataset(1))
     with running(config_of(tmp_path, fusion="none")) as (node, session):
+        wheels_of(session).undeclare()
+        assert not session.declare_publisher("apr/slam_pose").matching_status.matching
         graph = GraphNode(session, KeySpace(), "replay")
         report = Player(graph, "apr", played, ReplayConfig(speed=math.inf)).play()
         assert report.taken == report.total > len(played.wheel_times)
@@ -139,59 +142,44 @@ def test_ros_2_finds_topics_under_its_own_keys(tmp_path: Path, profile: str) -> 
         assert content[16] == 16
 
 
-def test_a_config_is_refused_in_one_line(tmp_path: Path) -> None:
-    for changes, message in (
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
         ({"robots": [{"name": "a b", "calibration": "c.yaml"}]}, r"robots\.0\.name"),
-        ({"robots": [{"name": "a", "calibration": "c.yaml"}] * 2}, "names must differ: a, a"),
-        ({"fusion": "kalman"}, r"fusion\.name: Input should be 'none' or 'ekf'"),
-        ({"fusion": {"gate": 2}}, r"fusion\.settings\.gate: Input should be less than 1"),
-        ({"fusion": {"gat": 0.9}}, r"unknown key 'fusion\.settings\.gat'; did you mean 'gate'"),
-        ({"record": "."}, "name a file that ends in .mcap"),
-        ({"robots": [{"name": "a", "calibration": "c.yaml", "frames": {"odom": "map"}}]}, "must differ: map, map"),
-        ({"profil": "rmw"}, "unknown key 'profil'; did you mean 'profile'"),
-        ({"robots": [], "zenoh": {"mode": "client"}}, "without robots a node can only be a router"),
-    ):
-        with pytest.raises(ConfigError, match=message):
-            config_of(tmp_path, **changes)
+        ({"robots": [{"name": "a", "calibration": "c.yaml"}] * 2}, "a, a"),
+        ({"fusion": "kalman"}, r"fusion\.name: .*'none' or 'ekf'"),
+        ({"fusion": {"gate": 2}}, r"fusion\.settings\.gate"),
+        ({"fusion": {"gat": 0.9}}, r"'fusion\.settings\.gat'.*'gate'"),
+        ({"record": "."}, ".mcap"),
+        ({"robots": [{"name": "a", "calibration": "c.yaml", "frames": {"odom": "map"}}]}, "map, map"),
+        ({"profil": "rmw"}, "'profil'.*'profile'"),
+        ({"robots": [], "zenoh": {"mode": "client"}}, "without robots"),
+    ],
+)
+def test_a_config_that_cannot_be_is_refused(tmp_path: Path, changes: dict[str, Any], named: str) -> None:
+    with pytest.raises(ConfigError, match=named):
+        config_of(tmp_path, **changes)
 
 
 def test_a_robot_that_another_node_runs_already_is_refused(tmp_path: Path) -> None:
     config = config_of(tmp_path)
     with running(config):
         client = {"mode": "client", "connect": list(config.zenoh.listening)}
-        with pytest.raises(ConfigError, match="robot 'apr' is run by another node already; stop that"):
+        with pytest.raises(ConfigError, match="'apr' is run by another node"):
             LiveNode(config_of(tmp_path, zenoh=client))
 
 
-def test_a_missing_calibration_is_named(tmp_path: Path) -> None:
-    config = config_of(tmp_path)
+@pytest.mark.parametrize("joints", [["a", "b"], ["a", "b", "c", "d"], ["a", "b", "a"], []])
+def test_joints_that_are_not_one_for_each_wheel_and_a_missing_calibration_are_named(
+    tmp_path: Path, joints: list[str]
+) -> None:
+    robot = {"name": "apr", "calibration": "calibration.yaml", "wheels": {"joints": joints}}
+    config = config_of(tmp_path, robots=[robot])
+    with pytest.raises(ConfigError, match=rf"'apr': wheels\.joints: {', '.join(joints) or 'none'};"):
+        LiveNode(config)
     (tmp_path / "calibration.yaml").unlink()
     with pytest.raises(DataError, match=r"calibration\.yaml: no such file"):
         LiveNode(config)
-
-
-@pytest.mark.parametrize("joints", [["a", "b"], ["a", "b", "c", "d"], ["a", "b", "a"], []])
-def test_joints_that_are_not_one_for_each_wheel_are_refused(tmp_path: Path, joints: list[str]) -> None:
-    robot = {"name": "apr", "calibration": "calibration.yaml", "wheels": {"joints": joints}}
-    given = ", ".join(joints) or "none"
-    with pytest.raises(ConfigError, match=f"robot 'apr': wheels.joints: {given}; .* each of the wheels a, b, c$"):
-        LiveNode(config_of(tmp_path, robots=[robot]))
-
-
-def test_a_node_that_fails_to_start_leaves_port_and_state_to_the_next(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config = config_of(tmp_path, state="state")
-
-    def failing(*_: object) -> None:
-        raise zenoh.ZError("no more queryables")
-
-    with monkeypatch.context() as patch:
-        patch.setattr("omnibench.live.node.QueryServer", failing)
-        with pytest.raises(zenoh.ZError, match="no more queryables"):
-            LiveNode(config)
-    with running(config) as (_, session):
-        assert asked(session, "omnibench/apr/health")["status"] == "waiting"
 
 
 def test_the_interpreter_is_the_streams_until_the_last_node_of_a_process_has_gone(tmp_path: Path) -> None:
@@ -251,22 +239,6 @@ def test_a_reason_of_refusals_is_logged_again_only_with_new_ones(
     assert ["; the last: " in line for line in logged] == [True, True, False]
 
 
-def test_frames_of_a_single_robot_can_carry_its_name(tmp_path: Path) -> None:
-    robot = {"name": "apr", "calibration": "calibration.yaml", "frames": "prefixed"}
-    path = drive(0.1)
-    with running(config_of(tmp_path, robots=[robot])) as (_, session):
-        heard = ReceivedMessages(session, apr__odom=ODOMETRY, tf=TRANSFORMS)
-        wheels = session.declare_publisher("apr/joint_states")
-        until(lambda: wheels.matching_status.matching, "the node's subscription")
-        sent_one_by_one(wheels, path.samples(), heard["apr__odom"])
-        until(lambda: len(heard["tf"]) == 11, "the last transform")
-    assert (heard["apr__odom"][0].frame, heard["apr__odom"][0].child_frame) == ("apr/odom", "apr/base_link")
-    assert [(each.frame, each.child_frame) for each in heard["tf"][0]] == [
-        ("map", "apr/odom"),
-        ("apr/odom", "apr/base_link"),
-    ]
-
-
 @pytest.mark.parametrize(
     ("frames", "fusion", "told"), [(None, "ekf", True), ("prefixed", "ekf", False), (None, "none", False)]
 )
@@ -280,8 +252,7 @@ def test_a_node_whose_frames_meet_those_of_another_is_warned(
         assert "publishes tf" not in caplog.text
         with LiveNode(config_of(tmp_path, robots=robots, zenoh=other, fusion=fusion)):
             pass
-    warning = "robot bob publishes tf between map, odom and base_link, and so may apr on the same network"
-    assert (warning in caplog.text) == told
+    assert ("robot bob publishes tf between map, odom and base_link" in caplog.text) == told
 
 
 def test_the_configs_of_the_project_are_valid() -> None:
@@ -290,3 +261,190 @@ def test_the_configs_of_the_project_are_valid() -> None:
         config: LiveConfig = read_live_config(file)
         for robot in config.robots:
             assert robot.calibration.is_file()
+
+
+def driven(config: LiveConfig, seconds: float = 0.5) -> None:
+    """Run the node of a config and send it the wheel samples of a drive."""
+    path = drive(seconds)
+    with running(config) as (node, session):
+        wheels = wheels_of(session)
+        sent(wheels, path.samples())
+        until(lambda: node.health("apr").counts["samples"] == len(path.stamps), "the last sample")
+
+
+def recorded(file: Path) -> dict[str, int]:
+    """Messages in a complete recording, by ROS topic."""
+    with file.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    assert summary.statistics is not None
+    counts = summary.statistics.channel_message_counts
+    return {channel.topic: counts[number] for number, channel in summary.channels.items()}
+
+
+def assert_nothing_is_open(config: LiveConfig) -> None:
+    """The same robots start again on the same port, with the same state."""
+    usual = config.model_copy(update={"record": None, "foxglove": False})
+    with running(usual) as (_, session):
+        assert asked(session, "omnibench/apr/health")["status"] == "waiting"
+
+
+def test_a_config_with_record_writes_the_mcap_file_beside_one_that_exists_already(tmp_path: Path) -> None:
+    config = config_of(tmp_path, record="recordings/run.mcap")
+    driven(config)
+    file = tmp_path / "recordings" / "run.mcap"
+    counts, first = recorded(file), file.read_bytes()
+    counts.pop("/apr/diagnostics", None)  # once a second: one more where the machine is busy
+    assert counts == {"/apr/joint_states": 51, "/apr/odom": 51, "/apr/odometry/filtered": 51, "/tf": 51}
+    driven(config, 0.2)
+    (second,) = file.parent.glob("run-*.mcap")
+    assert file.read_bytes() == first
+    assert recorded(second)["/apr/odom"] == 21
+
+
+def test_a_recording_or_foxglove_server_that_cannot_begin_is_named_and_nothing_stays_open(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("not a folder")
+    with closing(socket.socket()) as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        for changes, named in (
+            ({"record": "file/run.mcap"}, r"file: exists already|run\.mcap: cannot be written"),
+            ({"record": "run.mcap", "foxglove": taken.getsockname()[1]}, r"127\.0\.0\.1:\d+: .*in use|foxglove-sdk"),
+        ):
+            config = config_of(tmp_path, state="state", **changes)
+            with pytest.raises((DataError, ConfigError), match=named):
+                LiveNode(config)
+            assert not (tmp_path / "run.mcap").exists()
+            assert_nothing_is_open(config)
+    monkeypatch.setitem(sys.modules, "foxglove", None)  # what an absent package looks like
+    with pytest.raises(ConfigError, match='pip install "foxglove-sdk"'):
+        LiveNode(config_of(tmp_path, foxglove=True))
+
+
+def test_what_has_started_is_closed_in_reverse_order_when_a_later_step_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    port = free_port()
+    foxglove = port if find_spec("foxglove") else False
+    config = config_of(tmp_path, record="run.mcap", foxglove=foxglove, state="state")
+
+    def failing(*_: object) -> None:
+        raise zenoh.ZError("no more queryables")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("omnibench.live.node.QueryServer", failing)
+        with pytest.raises(zenoh.ZError, match="no more queryables"):
+            LiveNode(config)
+    assert recorded(tmp_path / "run.mcap") == {}  # complete, with its index
+    with closing(socket.socket()) as again:
+        again.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        again.bind(("127.0.0.1", port))
+    assert_nothing_is_open(config)
+
+
+def test_a_replay_that_waits_for_a_subscriber_finds_the_node_before_its_recorder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    alive: list[tuple[str, ...]] = []
+
+    class LateRecorder(Recorder):
+        def start(self) -> None:
+            alive.append(alive_robots(self._session, 1.0))
+            super().start()
+
+    monkeypatch.setattr("omnibench.live.node.Recorder", LateRecorder)
+    driven(config_of(tmp_path, record="run.mcap"), 0.1)
+    assert alive == [("apr",)]
+    assert recorded(tmp_path / "run.mcap")["/apr/odom"] == 11
+
+
+def test_a_config_with_foxglove_serves_the_robots_topics(tmp_path: Path) -> None:
+    pytest.importorskip("foxglove", reason="foxglove-sdk is not installed")
+    client = pytest.importorskip("websockets.sync.client", reason="websockets is not installed")
+    port = free_port()
+    offered: dict[str, str] = {}
+    with (
+        running(config_of(tmp_path, foxglove=port)),
+        client.connect(f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"], close_timeout=0.5) as viewer,
+    ):
+        while len(offered) < len(TOPICS):
+            message = json.loads(viewer.recv(timeout=PATIENCE))
+            if message["op"] == "advertise":
+                offered |= {channel["topic"]: channel["schemaName"] for channel in message["channels"]}
+    assert offered["/apr/odom"] == "nav_msgs/msg/Odometry"
+    with pytest.raises(OSError, match="refused"):
+        client.connect(f"ws://127.0.0.1:{port}", open_timeout=1)
+
+
+SAMPLES = 60
+
+
+def sent_while_the_intake_waits(
+    tmp_path: Path, attachments: list[bytes | None], period: float
+) -> tuple[list[Odometry], Health, Health]:
+    """Odometry of samples, one for each attachment, all but the first of which wait for the last.
+
+    And the health, while they wait and afterwards.
+    """
+    path = drive(2.0)
+    with running(config_of(tmp_path)) as (node, session):
+        heard = ReceivedMessages(session, apr__odom=ODOMETRY)
+        service = node._services[0]
+        wheels = wheels_of(session)
+        samples, last = path.samples(), len(attachments) - 1
+        wheels.put(JOINT_STATE.encode(samples[0]), attachment=attachments[0])
+        until(lambda: heard["apr__odom"], "the first odometry")
+        with service._working:  # as if the machine had no time for it
+            for sample, attachment in zip(samples[1:], attachments[1:], strict=False):
+                wheels.put(JOINT_STATE.encode(sample), attachment=attachment)
+                time.sleep(period)
+            until(lambda: len(service._waiting) == last, "all samples in the queue")
+            time.sleep(0.15)  # all of them are late now
+            meanwhile = node.health("apr")
+        until(lambda: heard["apr__odom"][-1].stamp == path.stamps[last], "the newest odometry")
+        health = node.health("apr")
+        np.testing.assert_allclose(heard["apr__odom"][-1].pose, path.poses[last], atol=1e-9)
+        return list(heard["apr__odom"]), meanwhile, health
+
+
+def test_late_samples_are_all_integrated_and_only_the_newest_pose_is_published(tmp_path: Path) -> None:
+    odometry, meanwhile, health = sent_while_the_intake_waits(tmp_path, [None] * SAMPLES, 0.01)
+    assert len(odometry) < SAMPLES / 2
+    assert health.counts["samples"] == SAMPLES
+    assert health.counts["unpublished"] == SAMPLES - len(odometry)
+    for each in (meanwhile, health):  # not "stale" while samples wait
+        assert each.status == "degraded"
+        assert each.message.startswith("behind by ")
+        assert each.behind_s > 0.7
+
+
+FLOW = [packed(number + 1, bytes(16), (1, number, 0, False)) for number in range(SAMPLES)]
+
+
+@pytest.mark.parametrize(("attachments", "period"), [([None] * 180, 0.0), (FLOW, 0.01)], ids=["replay", "who waits"])
+def test_samples_of_a_replay_or_whose_sender_waits_are_all_published_however_late(
+    tmp_path: Path, attachments: list[bytes | None], period: float
+) -> None:
+    odometry, _, health = sent_while_the_intake_waits(tmp_path, attachments, period)
+    assert len(odometry) == len(attachments)
+    assert health.counts["unpublished"] == 0
+    assert health.behind_s == 0.0 or attachments is not FLOW  # no backlog
+
+
+@pytest.mark.parametrize(
+    ("payload", "sent", "overflow", "counter"),
+    [(bytes(500_000), 100, 36, "undecodable"), (bytes(4), 20_100, 100, "undecodable")],
+    ids=["in bytes", "in number"],
+)
+def test_messages_that_wait_are_bounded(tmp_path: Path, payload: bytes, sent: int, overflow: int, counter: str) -> None:
+    with running(config_of(tmp_path)) as (node, session):
+        service, wheels = node._services[0], wheels_of(session)
+        with service._working:
+            for _ in range(sent):
+                wheels.put(payload)
+            until(lambda: node.health("apr").counts["overflow"] == overflow, "the messages that had no place")
+        until(lambda: node.health("apr").counts[counter] == sent - overflow, "the messages that had")
+        wheels.put(JOINT_STATE.encode(drive(1.0).samples()[0]))  # and there is room again
+        until(lambda: node.health("apr").counts["samples"] == 1, "a sample")

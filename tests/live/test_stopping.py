@@ -15,10 +15,12 @@ from omnibench.live.stopping import stop_on_signals, ticks
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_sets_the_event(number: signal.Signals) -> None:
+def test_a_signal_sets_the_event_and_acts_as_before_when_it_is_over(number: signal.Signals) -> None:
+    before = signal.getsignal(number)
     with stop_on_signals() as stop:
         os.kill(os.getpid(), number)
         assert stop.wait(PATIENCE)
+    assert signal.getsignal(number) == before
 
 
 def interrupted_twice() -> None:
@@ -34,13 +36,6 @@ def test_a_second_ctrl_c_interrupts() -> None:
         interrupted_twice()
 
 
-def test_signals_act_as_before_when_it_is_over() -> None:
-    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
-    with stop_on_signals():
-        assert signal.getsignal(signal.SIGTERM) != before[1]
-    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
-
-
 def test_ticks_come_at_once_and_then_every_period_until_the_time_is_over() -> None:
     began = time.monotonic()
     passed = list(ticks(threading.Event(), 0.1, 0.35))
@@ -51,8 +46,7 @@ def test_ticks_come_at_once_and_then_every_period_until_the_time_is_over() -> No
 
 
 def test_ticks_end_when_stopped() -> None:
-    stop = threading.Event()
-    seen = []
+    stop, seen = threading.Event(), []
     for passed in ticks(stop, 0.01):
         seen.append(passed)
         if len(seen) == 3:

@@ -1,9 +1,12 @@
-"""What public objects show at a Python prompt and in a notebook."""
+"""What public objects show at a Python prompt and in a notebook, and the notebooks of the handbook."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,50 +16,48 @@ import pytest
 from commands import CONFIGS, compared_here, prepare
 from pydantic import BaseModel
 from shared_results import shared_folder
+from timing import PATIENCE
 from wheeled_samples import CAR, DIFF, SWERVE, TRICYCLE
 
 import omnibench
+from omnibench.cli.handbook_topics import HANDBOOK
 from omnibench.data.dataset import Dataset, Split, Trajectory, make_dataset
 from omnibench.data.references import Reference, References
+from omnibench.robot.calibration import read_calibration
 from omnibench.robot.kinematics import Robot
 from omnibench.views import Shown, brief
 
 
 @cache
-def results() -> dict[str, Any]:
-    """An object of every kind that public functions give."""
-    dataset = omnibench.load_dataset(prepare().data)
-    run = omnibench.calibrate(dataset)
-    return {
-        "dataset": dataset,
-        "trajectory": dataset.trajectories[0],
-        "robot": dataset.robot,
-        "swerve": SWERVE,
-        "wheel": dataset.robot.wheels[0],
-        "run": run,
-        "calibration": run.calibration,
-        "evaluation": omnibench.evaluate(run.calibration, dataset),
-        "inspection": omnibench.inspect_dataset(dataset),
-        "certified": omnibench.certify_optimum(run.calibration, dataset, gap=0.5),
-        "exported": omnibench.export_calibration(run.calibration, "c_header"),
-        "comparison": compared_here(shared_folder() / "shown"),
-        "discovery": omnibench.discover_effects(dataset),
-        "design": omnibench.design_experiment(prepare().data),
-        "compare config": omnibench.read_compare_config(CONFIGS / "apr02.yaml"),
-        "live config": omnibench.read_live_config(CONFIGS / "live.yaml"),
-        "simulation": omnibench.read_simulation(CONFIGS / "small.yaml"),
-        "simulated": omnibench.simulate_dataset(omnibench.read_simulation(CONFIGS / "small.yaml").config),
-        "budget": omnibench.Budget(),
-    }
+def result(name: str) -> Any:
+    """What a public function gives."""
+    return MAKERS[name]()
 
 
-NAMES = (
-    *("dataset", "trajectory", "robot", "swerve", "wheel", "run", "calibration", "evaluation", "inspection"),
-    *("certified", "exported", "comparison", "discovery", "design", "compare config", "live config", "simulation"),
-    *("simulated", "budget"),
-)
-SHOWN = [name for name in NAMES if name in ("dataset", "trajectory", "robot", "swerve", "run", "calibration")]
-SHOWN += ["evaluation", "comparison", "discovery"]
+MAKERS: dict[str, Callable[[], Any]] = {
+    "dataset": lambda: omnibench.load_dataset(prepare().data),
+    "trajectory": lambda: result("dataset").trajectories[0],
+    "robot": lambda: result("dataset").robot,
+    "swerve": lambda: SWERVE,
+    "wheel": lambda: result("dataset").robot.wheels[0],
+    "run": lambda: omnibench.calibrate(result("dataset")),
+    "calibration": lambda: result("run").calibration,
+    "evaluation": lambda: omnibench.evaluate(result("calibration"), result("dataset")),
+    "inspection": lambda: omnibench.inspect_dataset(result("dataset")),
+    "certified": lambda: omnibench.certify_optimum(result("calibration"), result("dataset"), gap=0.5),
+    "exported": lambda: omnibench.export_calibration(result("calibration"), "c_header"),
+    "comparison": lambda: compared_here(shared_folder() / "shown"),
+    "discovery": lambda: omnibench.discover_effects(result("dataset")),
+    "design": lambda: omnibench.design_experiment(prepare().data),
+    "compare config": lambda: omnibench.read_compare_config(CONFIGS / "apr02.yaml"),
+    "live config": lambda: omnibench.read_live_config(CONFIGS / "live.yaml"),
+    "simulation": lambda: omnibench.read_simulation(CONFIGS / "small.yaml"),
+    "simulated": lambda: omnibench.simulate_dataset(result("simulation").config),
+    "budget": lambda: omnibench.Budget(),
+}
+LONG = ("certified", "comparison", "discovery", "design")
+OBJECTS = [pytest.param(name, marks=pytest.mark.slow if name in LONG else ()) for name in MAKERS]
+SHOWN = ("dataset", "trajectory", "robot", "swerve", "run", "calibration", "evaluation", "comparison", "discovery")
 
 
 def with_parts(found: Any) -> list[Any]:
@@ -66,29 +67,21 @@ def with_parts(found: Any) -> list[Any]:
     return [found, *vars(found).values()] if isinstance(found, BaseModel) else [found]
 
 
-def test_there_is_an_object_of_every_kind() -> None:
-    assert set(results()) == set(NAMES)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_the_repr_of_a_public_object_is_a_screenful(name: str) -> None:
-    lines = repr(results()[name]).splitlines()
+@pytest.mark.parametrize("name", OBJECTS)
+def test_the_repr_of_a_public_object_and_of_what_it_holds_is_a_screenful(name: str) -> None:
+    lines = repr(result(name)).splitlines()
     assert 1 <= len(lines) <= 20
     assert max(map(len, lines)) <= 120
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_the_repr_of_an_object_that_a_public_one_holds_is_a_screenful(name: str) -> None:
-    for part in with_parts(results()[name]):
+    for part in with_parts(result(name)):
         if type(part).__module__.startswith("omnibench"):
             lines = repr(part).splitlines()
             assert len(lines) <= 20, type(part)
             assert max(map(len, lines)) <= 400, type(part)
 
 
-@pytest.mark.parametrize("name", SHOWN)
+@pytest.mark.parametrize("name", [each for each in OBJECTS if each.values[0] in SHOWN])
 def test_a_result_shows_a_text_a_table_and_a_figure(name: str) -> None:
-    found: Shown = results()[name]
+    found: Shown = result(name)
     html = found._repr_html_()
     assert len(html) < 20_000
     assert "<table" in html
@@ -100,27 +93,24 @@ def test_a_result_shows_a_text_a_table_and_a_figure(name: str) -> None:
 
 
 def test_a_calibration_draws_paths_before_and_after_on_a_data_set() -> None:
-    figure = results()["calibration"].plot(dataset=results()["dataset"])
+    figure = result("calibration").plot(dataset=result("dataset"))
     named = {trace.name for trace in figure.data if trace.showlegend}
     assert named == {"reference poses", "design values", "calibration"}
 
 
 def test_the_matrix_as_a_table_holds_values_and_intervals() -> None:
-    run = results()["run"]
+    run = result("run")
     frame = run.to_frame("matrix")
     assert frame["value"].to_list() == [value for row in run.calibration.matrix for value in row]
     assert (frame["low"] < frame["value"]).all()
     assert (frame["value"] < frame["high"]).all()
 
 
-def test_an_unknown_table_is_refused_with_those_that_there_are() -> None:
-    with pytest.raises(omnibench.OmnibenchError, match=r"unknown table 'pose'; did you mean 'poses'\?"):
-        results()["dataset"].to_frame("pose")
-
-
-def test_an_unknown_option_of_a_plot_is_refused() -> None:
-    with pytest.raises(omnibench.OmnibenchError, match=r"unknown option of plot 'data'; did you mean 'dataset'\?"):
-        results()["calibration"].plot(data=results()["dataset"])
+def test_an_unknown_table_or_option_of_a_plot_is_refused_with_the_nearest() -> None:
+    with pytest.raises(omnibench.OmnibenchError, match="'pose'; did you mean 'poses'"):
+        result("dataset").to_frame("pose")
+    with pytest.raises(omnibench.OmnibenchError, match="'data'; did you mean 'dataset'"):
+        result("calibration").plot(data=result("dataset"))
 
 
 @pytest.mark.parametrize("robot", [DIFF, TRICYCLE, CAR, SWERVE], ids=lambda robot: robot.name)
@@ -130,7 +120,7 @@ def test_every_kind_of_robot_is_drawn_and_described(robot: Robot) -> None:
 
 
 def test_a_data_set_is_the_same_after_it_was_made_of_its_own_tables() -> None:
-    dataset: Dataset = results()["dataset"]
+    dataset: Dataset = result("dataset")
     tables = {name: dataset.to_frame(name) for name in ("trajectories", "wheels", "poses")}
     again = omnibench.make_dataset(dataset.name, dataset.robot, dataset.sample_period, **tables, simulated=True)
     assert again.hash == dataset.hash
@@ -163,7 +153,33 @@ def test_an_evaluation_of_runs_without_poses_shows_the_errors_that_there_are() -
 
 
 def test_a_calibration_file_states_deviations_and_no_intervals_that_its_runs_do_not_bear() -> None:
-    run = results()["run"]
+    run = result("run")
     kept, told = run.calibration.to_frame(), run.to_frame()
     assert "low" not in kept.columns
     assert ((told["high"] - told["low"]) > 2 * 1.95 * kept["deviation"]).all()
+
+
+NOTEBOOKS = sorted((HANDBOOK / "notebooks").glob("*.ipynb"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("file", NOTEBOOKS, ids=lambda file: file.stem)
+def test_a_notebook_runs_and_finds_the_robot(file: Path, tmp_path: Path) -> None:
+    nbclient = pytest.importorskip("nbclient")
+    nbformat = pytest.importorskip("nbformat")
+    pytest.importorskip("ipykernel")
+    notebook: Any = nbformat.read(file, as_version=4)
+    nbclient.NotebookClient(notebook, timeout=int(PATIENCE), resources={"metadata": {"path": str(tmp_path)}}).execute()
+    shown = [set(output["data"]) for cell in notebook.cells for output in cell.get("outputs", ()) if "data" in output]
+    assert sum("application/vnd.plotly.v1+json" in kinds for kinds in shown) == 4
+    assert sum("text/html" in kinds for kinds in shown) >= 3
+    matrix = read_calibration(tmp_path / "cart.yaml").matrix_array
+    assert matrix[0, 0] == pytest.approx(0.0510 / 2, rel=0.01)
+    assert matrix[0, 1] == pytest.approx(0.0485 / 2, rel=0.01)
+
+
+@pytest.mark.parametrize("file", NOTEBOOKS, ids=lambda file: file.stem)
+def test_a_notebook_is_kept_without_outputs(file: Path) -> None:
+    content = json.loads(file.read_text(encoding="utf-8"))
+    assert len(file.read_bytes()) < 20_000
+    assert all(not cell.get("outputs") and cell.get("execution_count") is None for cell in content["cells"])

@@ -26,6 +26,7 @@ from omnibench.robot.model import OdometryModel
 from omnibench.testing import CalibratorConformance, load_plugin
 
 PLUGIN = Path(__file__).parents[2] / "plugins" / "learned.py"
+pytestmark = pytest.mark.slow
 SMALL = {"layers": (8,), "epochs": 60, "decays": (0.3,)}
 
 

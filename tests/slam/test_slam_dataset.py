@@ -1,28 +1,47 @@
-"""SLAM of whole data sets: what becomes of them, whatever the processes, and what is said of bad ones."""
+"""SLAM of whole data sets: what becomes of them, on import too, and what is said of bad ones."""
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
+from bag_samples import (
+    DRIVE,
+    EPOCH,
+    Sent,
+    header,
+    odometry_error,
+    pose,
+    read,
+    text,
+    write_mcap,
+    write_rosbag1,
+)
+from hypothesis import given
+from hypothesis import strategies as st
+from scan_samples import MOUNTED, SECONDS, without_poses
 from slam_study import ROBOT, drive, flower_command
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.scans import ScansInMemory, TrajectoryScans
 from omnibench.data.true_poses import TruePath
-from omnibench.errors import DataError
+from omnibench.errors import ConfigError, DataError
 from omnibench.progress import Progress
 from omnibench.robot.kinematics import published_matrix
 from omnibench.robot.model import OdometryModel
 from omnibench.simulate.floor_plan import RoomPlan, make_plan
 from omnibench.simulate.lidar import Lidar
+from omnibench.slam.import_dataset import import_dataset
 from omnibench.slam.pose_errors import FLOOR
 from omnibench.slam.slam_dataset import slam_dataset
 from omnibench.slam.slam_options import SlamOptions
-from omnibench.slam.slam_request import run_errors, slam_accuracy
+from omnibench.slam.slam_request import distances, run_errors, slam_accuracy
+from omnibench.testing.synthetic import synthetic_dataset
 
 LIDAR = Lidar()
 START = np.array([1.0, 2.0, 0.5])
@@ -64,8 +83,8 @@ def with_scans(dataset: Dataset, **changed: TrajectoryScans | None) -> Dataset:
 
 
 class TestPoses:
-    def test_are_found_from_the_start_pose_on_at_the_stamps_of_the_scans(self) -> None:
-        _, truth = recorded()
+    def test_are_found_from_the_start_pose_on_at_the_stamps_of_the_scans_and_all_else_stays(self) -> None:
+        dataset, truth = recorded()
         found = found_alone()
         for run in found.trajectories:
             np.testing.assert_array_equal(run.pose_times, truth[run.id].times)
@@ -73,18 +92,17 @@ class TestPoses:
             assert np.abs(run.poses - truth[run.id].poses).max() < 0.004
             assert run.pose_covariances is not None
             assert (np.linalg.eigvalsh(run.pose_covariances) > 0).all()
-
-    def test_all_else_stays(self) -> None:
-        dataset, _ = recorded()
-        found = found_alone()
         assert (found.name, found.robot, found.simulated, found.scans) == ("rooms", ROBOT, True, dataset.scans)
         for before, after in zip(dataset.trajectories, found.trajectories, strict=True):
             assert after.command == before.command
             np.testing.assert_array_equal(after.rates, before.rates)
+        assert found.warnings == ()
 
-    def test_do_not_depend_on_the_number_of_processes(self) -> None:
-        dataset, _ = recorded()
-        assert slam_dataset(dataset, SlamOptions(), workers=3).hash == found_alone().hash
+    def test_do_not_depend_on_the_number_of_processes_and_progress_is_told_run_by_run(self) -> None:
+        told: list[Progress] = []
+        found = slam_dataset(recorded()[0], SlamOptions(), workers=2, watch=told.append)
+        assert found.hash == found_alone().hash
+        assert told == [Progress("SLAM", done, 3, "run") for done in range(4)]
 
     def test_do_not_depend_on_the_odometry_that_the_search_starts_from(self) -> None:
         dataset, _ = recorded()
@@ -133,12 +151,6 @@ class TestPoses:
         run = slam_dataset(with_scans(dataset, run_1=early), SlamOptions(), workers=1).trajectories[1]
         np.testing.assert_array_equal(run.pose_times, scans.times)
 
-    def test_progress_is_told_run_by_run(self) -> None:
-        told: list[Progress] = []
-        dataset, _ = recorded()
-        slam_dataset(dataset, SlamOptions(), workers=2, watch=told.append)
-        assert told == [Progress("SLAM", done, 3, "run") for done in range(4)]
-
 
 class TestWhatIsSaid:
     def test_a_corridor_is_named_with_its_direction_and_runs(self) -> None:
@@ -150,33 +162,26 @@ class TestWhatIsSaid:
         )
         assert re.fullmatch(said, warning)
 
-    def test_a_furnished_room_is_fine(self) -> None:
-        assert slam_dataset(recorded()[0], SlamOptions(), workers=1).warnings == ()
-
-    def test_a_data_set_without_scans_is_one_line(self) -> None:
-        with pytest.raises(DataError, match=r"^data set rooms: it has no scans \(scans.parquet\), which SLAM needs$"):
-            slam_dataset(replace(recorded()[0], scans=None), SlamOptions())
-
-    def test_a_run_without_scans_is_one_line(self) -> None:
-        with pytest.raises(DataError, match="trajectory run-2 has no scans; leave it out"):
-            slam_dataset(with_scans(recorded()[0], run_2=None), SlamOptions())
-
-    @pytest.mark.parametrize("workers", [1, 2])
-    def test_an_empty_scan_names_the_run_whoever_found_it(self, workers: int) -> None:
+    @pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
+    def test_missing_and_empty_scans_name_the_run_whoever_found_it(self, workers: int) -> None:
         dataset, _ = recorded()
         assert dataset.scans is not None
         scans = dataset.scans.of("run-1")
         ranges = scans.ranges.copy()
         ranges[2] = np.inf
-        blind = with_scans(dataset, run_1=TrajectoryScans(scans.times, ranges))
-        with pytest.raises(DataError, match=r"^data set rooms: trajectory run-1: SLAM: the scan at .* is empty"):
-            slam_dataset(blind, SlamOptions(), workers=workers)
+        for changed, named in (
+            (replace(dataset, scans=None), r"scans\.parquet"),
+            (with_scans(dataset, run_2=None), "run-2 has no scans"),
+            (with_scans(dataset, run_1=TrajectoryScans(scans.times, ranges)), "run-1: SLAM: the scan at .* is empty"),
+        ):
+            with pytest.raises(DataError, match=f"data set rooms: .*{named}"):
+                slam_dataset(changed, SlamOptions(), workers=workers)
 
 
 class TestAccuracy:
     def test_is_that_of_the_poses(self) -> None:
-        dataset, truth = recorded()
-        found = slam_accuracy(slam_dataset(dataset, SlamOptions(), workers=1), truth)
+        _, truth = recorded()
+        found = slam_accuracy(found_alone(), truth)
         assert found.runs == 3
         assert found.distance_m == pytest.approx(3 * 0.4, rel=0.1)
         assert found.final.poses == 3
@@ -223,3 +228,116 @@ class TestAccuracy:
         others = {name: path for name, path in truth.items() if name != "run-1"}
         with pytest.raises(DataError, match="trajectory run-1 is not in the truth"):
             slam_accuracy(dataset, others)
+
+
+@pytest.fixture(scope="module")
+def blind(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of scans and wheels, without poses."""
+    return write_mcap(tmp_path_factory.mktemp("blind") / "drive", without_poses())
+
+
+@pytest.fixture(scope="module")
+def found(blind: Path) -> Dataset:
+    return read(blind)
+
+
+def test_without_poses_they_are_made_from_the_scans(found: Dataset) -> None:
+    data = found
+    assert "made from the scans by SLAM" in data.warnings[0]
+    assert len(data.trajectories) == 2
+    for run in data.trajectories:
+        np.testing.assert_array_equal(run.poses[0], 0.0)
+        assert run.pose_covariances is not None
+    assert odometry_error(data) < 0.005  # m and rad; the true odometry agrees with SLAM
+
+
+@pytest.mark.slow
+def test_the_poses_are_the_same_whatever_the_format_of_the_recording(found: Dataset, tmp_path: Path) -> None:
+    for own, other in zip(
+        found.trajectories, read(write_rosbag1(tmp_path / "drive", without_poses())).trajectories, strict=True
+    ):
+        np.testing.assert_allclose(other.poses, own.poses, atol=1e-6)
+
+
+def test_odometry_is_no_reference_where_scans_can_make_one(tmp_path: Path) -> None:
+    odometry = [
+        Sent(
+            "/robot/odom",
+            "nav_msgs/msg/Odometry",
+            {"header": header(int(stamp)), "pose": {"pose": pose(place)}},
+            int(stamp),
+        )
+        for stamp, place in zip(DRIVE.pose_stamps, DRIVE.poses * 1.1, strict=True)
+        if stamp < EPOCH + SECONDS * 1e9
+    ]
+    data = read(write_mcap(tmp_path / "drive", without_poses([MOUNTED, *odometry])))
+    assert "made from the scans by SLAM" in data.warnings[0]
+    assert odometry_error(data) < 0.005
+
+
+@pytest.mark.slow
+def test_runs_are_cut_by_a_topic_without_poses_too(tmp_path: Path) -> None:
+    words = [text(f"go{number}", EPOCH + int(begin * 1e9)) for number, begin in enumerate(DRIVE.begins[:2])]
+    data = read(
+        write_mcap(tmp_path / "drive", without_poses([MOUNTED, *words])), cut="topic", cut_topic="/robot/command"
+    )
+    assert [run.id for run in data.trajectories] == ["001-go0", "002-go1"]
+    assert odometry_error(data) < 0.005
+
+
+@pytest.mark.slow
+def test_the_options_under_slam_are_those_of_slam(blind: Path, found: Dataset) -> None:
+    other = read(blind, slam={"spacing": 0.3})
+    assert not np.array_equal(other.trajectories[0].poses, found.trajectories[0].poses)
+
+
+def test_wrong_options_of_slam_are_refused_before_the_recording_is_read(tmp_path: Path) -> None:
+    (tmp_path / "empty.mcap").touch()
+    for slam, named in (({"spacng": 0.3}, "slam: unknown key 'spacng'.*'spacing'"), (3, "slam")):
+        with pytest.raises(ConfigError, match=named):
+            read(tmp_path / "empty.mcap", slam=slam)
+    with pytest.raises(ConfigError, match="'csv': unknown key 'slam'"):
+        import_dataset("csv", tmp_path, {"slam": {}})
+
+
+DATA = synthetic_dataset()
+
+
+def moved(data: Dataset, by: tuple[float, float, float], turns: int = 0) -> Dataset:
+    """Every pose but the first of each run moved, and the headings of all by whole turns."""
+    whole = [0.0, 0.0, 2 * math.pi * turns]
+    runs = [
+        replace(run, poses=run.poses + np.where(run.pose_times[:, None] > 0, by, 0.0) + whole)
+        for run in data.trajectories
+    ]
+    return replace(data, trajectories=tuple(runs))
+
+
+def thinned(data: Dataset, kept: slice) -> Dataset:
+    runs = [replace(run, pose_times=run.pose_times[kept], poses=run.poses[kept]) for run in data.trajectories]
+    return replace(data, trajectories=tuple(runs))
+
+
+@given(st.floats(-1, 1), st.floats(-1, 1), st.floats(-9, 9), st.integers(-2, 2))
+def test_a_shift_is_found_whatever_turns_headings_begin_with(x: float, y: float, turn: float, turns: int) -> None:
+    found = distances(DATA, moved(DATA, (x, y, turn), turns))
+    assert found is not None
+    assert found.poses == sum(len(run.poses) - 1 for run in DATA.trajectories)
+    assert found.position_mean_m == pytest.approx(math.hypot(x, y), abs=1e-9)
+    assert found.position_p95_m == pytest.approx(math.hypot(x, y), abs=1e-9)
+    assert found.heading_mean_rad == pytest.approx(abs(turn), abs=1e-9)
+    assert found.heading_p95_rad == pytest.approx(abs(turn), abs=1e-9)
+
+
+def test_the_sparser_reference_says_where_they_are_compared() -> None:
+    sparse = moved(thinned(DATA, slice(None, None, 5)), (0.03, 0.04, 0.0))
+    expected = sum(len(run.poses) - 1 for run in sparse.trajectories)
+    for one, other in ((DATA, sparse), (sparse, DATA)):
+        found = distances(one, other)
+        assert found is not None
+        assert found.poses == expected
+        assert found.position_mean_m == pytest.approx(0.05)
+
+
+def test_what_has_no_times_in_common_is_not_compared() -> None:
+    assert distances(thinned(DATA, slice(0, 1)), DATA) is None

@@ -1,4 +1,4 @@
-"""What a node answers and which orders it takes, with real sessions."""
+"""What a node answers and which orders it takes, with real sessions, and requests made to exhaust it."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ import json
 import os
 import subprocess
 import sys
+import threading
+import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +16,9 @@ import numpy as np
 import pytest
 import zenoh
 from drives import ORIGIN, SECOND, calibration, drive
-from nodes import Command, as_text, asked, config_of, running, sent, sent_one_by_one, write_node
+from nodes import Command, as_text, asked, config_of, peak_memory, running, sent, sent_one_by_one, wheels_of, write_node
 from received_messages import ReceivedMessages
-from sessions import Loopback, raw_session, until
+from sessions import Loopback, free_port, raw_session, until
 from timing import PATIENCE
 
 from omnibench.errors import DataError
@@ -24,7 +27,7 @@ from omnibench.live.control.request_queue import MOST_WAITING, Request, RequestQ
 from omnibench.live.control.swap import swap_calibration
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.network.presence import alive_robots
-from omnibench.live.wire.messages import ODOMETRY
+from omnibench.live.wire.messages import JOINT_STATE, ODOMETRY
 from omnibench.robot.calibration import write_calibration
 
 EVERY_REPLY = zenoh.QueryConsolidation(zenoh.ConsolidationMode.NONE)
@@ -35,28 +38,19 @@ def driven(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """A node that has taken a drive of a second."""
     path = drive(1.0)
     with running(config_of(tmp_path_factory.mktemp("driven"))) as (node, session):
-        wheels = session.declare_publisher("apr/joint_states")
-        until(lambda: wheels.matching_status.matching, "the node's subscription")
+        wheels = wheels_of(session)
         sent(wheels, path.samples())
         until(lambda: node.health("apr").counts["samples"] == 101, "the samples")
         yield node, session, path
 
 
-def test_info_says_what_runs_and_where_its_topics_are(driven: Any) -> None:
-    answer = asked(driven[1], "omnibench/apr/info")
-    assert answer["calibration"] == "synthetic 1"
-    assert answer["topics"]["odom"] == "apr/odom"
-    assert answer["wheels"] == ["a", "b", "c"]
-
-
-def test_health_tells_the_counters(driven: Any) -> None:
-    answer = asked(driven[1], "omnibench/apr/health")
-    assert answer["counts"]["samples"] == 101
-    assert answer["status"] in ("degraded", "stale")
-
-
-def test_the_calibration_is_given_as_it_runs(driven: Any) -> None:
-    assert asked(driven[1], "omnibench/apr/calibration")["matrix"][0] == list(calibration().matrix[0])
+def test_info_health_and_calibration_say_what_runs(driven: Any) -> None:
+    info, health, given = (asked(driven[1], f"omnibench/apr/{each}") for each in ("info", "health", "calibration"))
+    assert (info["calibration"], info["wheels"]) == ("synthetic 1", ["a", "b", "c"])
+    assert info["topics"]["odom"] == "apr/odom"
+    assert health["counts"]["samples"] == 101
+    assert health["status"] in ("degraded", "stale")
+    assert given["matrix"][0] == list(calibration().matrix[0])
 
 
 @pytest.mark.parametrize("form", ["{0}.505", "{0}505000000"])
@@ -68,33 +62,32 @@ def test_the_pose_at_a_time_is_interpolated(driven: Any, form: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("selector", "payload", "message"),
+    ("selector", "payload", "named"),
     [
-        ("pose?at=yesterday", None, "at: 'yesterday' is not a time"),
+        ("pose?at=yesterday", None, "'yesterday' is not a time"),
         *((f"pose?at={number}", None, "is not a time") for number in ("1e400", "1e3000000", "1e19", "-1e19")),
         *((f"pose?at={number}", None, "is not a time") for number in ("nan", "snan", "-inf", "")),
         ("pose?at=" + "7" * 5000, None, "777...' is not a time"),
-        ("pose?at=12", None, "at: 12.000000 s is not within"),
-        ("set_pose", '{"x": 1}', "set_pose: keys 'y' and 'theta' are missing"),
-        ("set_pose", '{"x": 1, "y": 2, "theta": 3, "z": 4}', "set_pose: unknown key 'z'"),
-        ("set_pose", b"\xff\xfe", "the payload is not text"),
-        ("calibration", "format: something", "put it there, or ask omnibench/apr/swap"),
-        ("swap", "format: something", "format is 'something', expected 'omnibench-calibration/1'"),
+        ("pose?at=12", None, "at: 12.000000 s"),
+        ("set_pose", '{"x": 1}', "'y' and 'theta'"),
+        ("set_pose", '{"x": 1, "y": 2, "theta": 3, "z": 4}', "'z'"),
+        ("set_pose", b"\xff\xfe", "not text"),
+        ("calibration", "format: something", "omnibench/apr/swap"),
+        ("swap", "format: something", "'omnibench-calibration/1'"),
         ("swap", "{", "not valid YAML"),
-        ("swap", b"\xff\xfe", "not a text in UTF-8"),
-        ("swap", "[" * 50_000, "exceeded maximum nesting depth"),
+        ("swap", b"\xff\xfe", "UTF-8"),
+        ("swap", "[" * 50_000, "nesting"),
         ("swap", "- " * 30_000, "nested too deeply"),
-        ("swap", "a: [" + "1, " * 20_000 + "1]", "more than 5000 values"),
-        ("swap", "a: &a [1, 1]\nb: &b [*a, *a]\nc: [*b, *b]", "write out what *a stands for"),
-        ("swap", as_text(calibration()).replace("session: null", r'session: "\ud800"'), "invalid Unicode character"),
-        ("swap", "#" * 140_000, "140000 bytes are more than a request may have, 131072"),
-        ("swap", "#" * 10_000_000, "10000000 bytes are more than a request may have, 131072"),
-        ("health?" + "x" * 140_000, None, "140000 bytes are more than a request may have"),
+        ("swap", "a: [" + "1, " * 20_000 + "1]", "5000 values"),
+        ("swap", "a: &a [1, 1]\nb: &b [*a, *a]\nc: [*b, *b]", "*a"),
+        ("swap", as_text(calibration()).replace("session: null", r'session: "\ud800"'), "Unicode"),
+        ("swap", "#" * 140_000, "140000 bytes"),
+        ("swap", "#" * 10_000_000, "10000000 bytes"),
+        ("health?" + "x" * 140_000, None, "140000 bytes"),
     ],
 )
-def test_a_bad_order_is_refused_with_the_reason(driven: Any, selector: str, payload: Any, message: str) -> None:
-    answer = asked(driven[1], f"omnibench/apr/{selector}", payload)
-    assert message in answer["error"]
+def test_a_bad_order_is_refused_with_the_reason(driven: Any, selector: str, payload: Any, named: str) -> None:
+    assert named in asked(driven[1], f"omnibench/apr/{selector}", payload)["error"]
 
 
 def test_a_pose_can_be_set_and_reset(driven: Any) -> None:
@@ -115,18 +108,15 @@ def test_a_wildcard_orders_nobody(driven: Any, robot: str, order: str) -> None:
     assert node.health("apr").counts == before
 
 
-@pytest.mark.parametrize(
-    ("selector", "answers"), [("*/health", 10), ("*/*", 40), ("**", 40), ("r1/*", 4), ("r1/info", 1), ("*/reset", 0)]
-)
-def test_each_robot_and_service_that_a_question_is_for_answers_it_once(
-    tmp_path: Path, selector: str, answers: int
-) -> None:
+def test_each_robot_and_service_that_a_question_is_for_answers_it_once(tmp_path: Path) -> None:
     names = [f"r{number}" for number in range(10)]
+    answers = {"*/health": 10, "*/*": 40, "**": 40, "r1/*": 4, "r1/info": 1, "*/reset": 0}
     with running(config_of(tmp_path, *names, fusion="none")) as (_, session):
-        replies = list(session.get(f"omnibench/{selector}", consolidation=EVERY_REPLY, timeout=PATIENCE))
-    assert len(replies) == answers
-    keys = [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
-    assert len(set(keys)) == len(keys)
+        for selector, expected in answers.items():
+            replies = list(session.get(f"omnibench/{selector}", consolidation=EVERY_REPLY, timeout=PATIENCE))
+            keys = [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+            assert len(replies) == expected, selector
+            assert len(set(keys)) == len(keys)
 
 
 def test_a_failure_of_its_own_is_answered_in_one_line_and_logged(
@@ -150,8 +140,7 @@ def test_more_requests_than_the_server_holds_are_refused_and_the_stream_goes_on(
     path = drive(1.0)
     with running(config_of(tmp_path, "apr", "bob")) as (node, session):
         received = ReceivedMessages(session, bob__odom=ODOMETRY)
-        wheels = session.declare_publisher("bob/joint_states")
-        until(lambda: wheels.matching_status.matching, "the node's subscription")
+        wheels = wheels_of(session, "bob")
         with node.trackers["apr"]._state_lock:  # the query server is held up by the first
             waiting = [session.get("omnibench/apr/health", timeout=PATIENCE) for _ in range(200)]
             sent_one_by_one(wheels, path.samples(), received["bob__odom"])
@@ -175,6 +164,7 @@ while True:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flooded", ["health", "info"])
 def test_a_flood_of_questions_gets_its_share_and_others_get_answers_meanwhile(tmp_path: Path, flooded: str) -> None:
     with Command("live", write_node(tmp_path, "apr", "bob")) as node:
@@ -240,7 +230,7 @@ def test_a_closed_queue_gives_out_what_waits_and_takes_no_more() -> None:
 def test_a_file_that_is_no_calibration_by_its_size_is_not_sent(loopback: Loopback, tmp_path: Path) -> None:
     file = tmp_path / "recording.yaml"
     file.write_bytes(b"- 1\n" * 2_500_000)
-    with pytest.raises(DataError, match="has 10,000,000 bytes, more than the 131,072 that"):
+    with pytest.raises(DataError, match="10,000,000 bytes"):
         swap_calibration(loopback.client(), "apr", file)
 
 
@@ -250,7 +240,7 @@ def test_a_swap_that_nobody_answers_names_access_rights_as_a_possible_cause(loop
     write_calibration(calibration(), tmp_path / "calibration.yaml")
     session = loopback.client()
     until(lambda: alive_robots(session) == ("apr",), "the token")
-    with pytest.raises(DataError, match="the `access` of its router may not let us swap, which only operators may"):
+    with pytest.raises(DataError, match="`access`"):
         swap_calibration(session, "apr", tmp_path / "calibration.yaml", timeout=0.2)
     queryable.undeclare()
     token.undeclare()
@@ -260,8 +250,7 @@ def test_a_calibration_that_is_put_runs_from_the_next_sample_on_and_odom_does_no
     path, other = drive(1.0), calibration(scale=1.2)
     with running(config_of(tmp_path)) as (node, session):
         received = ReceivedMessages(session, apr__odom=ODOMETRY)
-        wheels = session.declare_publisher("apr/joint_states")
-        until(lambda: wheels.matching_status.matching, "the node's subscription")
+        wheels = wheels_of(session)
         sent_one_by_one(wheels, path.samples()[:51], received["apr__odom"])
         session.put("omnibench/apr/calibration", as_text(other))
         until(lambda: node.health("apr").counts["swaps"] == 1, "the swap")
@@ -273,31 +262,27 @@ def test_a_calibration_that_is_put_runs_from_the_next_sample_on_and_odom_does_no
     np.testing.assert_allclose(steps[50:], 1.2 * before[50:], rtol=1e-3)
 
 
-def test_a_bad_calibration_that_is_put_is_refused_and_stands_in_health(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("put", "named"),
+    [
+        (as_text(calibration(wheels=4)), "fl, fr, rl, rr"),
+        ("#" * 140_000, "140000 bytes"),
+        ("format: something", "format"),
+    ],
+    ids=["another robot", "too long", "no calibration"],
+)
+def test_bad_calibrations_that_are_put_are_refused_stand_in_health_and_do_not_flood_the_log(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, put: str, named: str
+) -> None:
     with running(config_of(tmp_path)) as (node, session):
-        session.put("omnibench/apr/calibration", as_text(calibration(wheels=4)))
-        until(lambda: node.health("apr").counts["swaps_refused"] == 1, "the refusal")
+        for _ in range(10):
+            session.put("omnibench/apr/calibration", put)
+        until(lambda: node.health("apr").counts["swaps_refused"] == 10, "the refusals")
         swap = asked(session, "omnibench/apr/health")["last_swap"]
         assert not swap["accepted"]
-        assert "is for wheels fl, fr, rl, rr, this robot has a, b, c" in swap["reason"]
+        assert named in swap["reason"]
         assert asked(session, "omnibench/apr/info")["calibration"] == "synthetic 1"
-
-
-def test_a_flood_of_bad_calibrations_does_not_flood_the_log(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    with running(config_of(tmp_path)) as (node, session):
-        for _ in range(20):
-            session.put("omnibench/apr/calibration", "format: something")
-        until(lambda: node.health("apr").counts["swaps_refused"] == 20, "the refusals")
-    assert caplog.text.count("apr: calibration refused, synthetic 1 runs on: ") == 1
-
-
-def test_a_calibration_too_long_to_be_put_is_refused_and_stands_in_health(tmp_path: Path) -> None:
-    with running(config_of(tmp_path)) as (node, session):
-        session.put("omnibench/apr/calibration", "#" * 140_000)
-        until(lambda: node.health("apr").counts["swaps_refused"] == 1, "the refusal")
-        swap = node.health("apr").last_swap
-    assert swap is not None
-    assert swap.reason == "omnibench/apr/calibration: 140000 bytes are more than a request may have, 131072"
+    assert len([each for each in caplog.messages if "refused" in each]) == 1
 
 
 def test_a_swap_is_kept_although_the_configs_file_went_elsewhere(tmp_path: Path) -> None:
@@ -312,22 +297,65 @@ def test_a_swap_is_kept_although_the_configs_file_went_elsewhere(tmp_path: Path)
         assert asked(session, "omnibench/apr/info")["calibration"] == "synthetic 1.1"
 
 
-def test_a_swap_that_the_disk_refuses_runs_and_says_that_it_is_not_kept(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize(("state", "named"), [("state", "apr.calibration.yaml"), (None, "no `state`")])
+def test_a_swap_that_cannot_be_kept_runs_and_says_so(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, state: str | None, named: str
 ) -> None:
-    with running(config_of(tmp_path, state="state")) as (node, session):
-        (tmp_path / "state" / "apr.calibration.yaml").mkdir()
+    with running(config_of(tmp_path, state=state)) as (node, session):
+        (tmp_path / "state" / "apr.calibration.yaml").mkdir(parents=True)
         answer = asked(session, "omnibench/apr/swap", as_text(calibration(scale=1.1)))
         assert node.trackers["apr"].calibration.name == "synthetic 1.1"
-    assert answer["accepted"]
-    assert not answer["kept"]
-    assert "apr.calibration.yaml: cannot be written: is a folder" in answer["reason"]
-    assert "apr: calibration 'synthetic 1.1' runs, but not after a restart: " in caplog.text
+    assert (answer["accepted"], answer["kept"]) == (True, False)
+    assert named in answer["reason"]
+    assert ("'synthetic 1.1' runs, but not after a restart" in caplog.text) == (state is not None)
 
 
-def test_without_a_state_a_swap_says_that_it_is_not_kept(tmp_path: Path) -> None:
-    with running(config_of(tmp_path)) as (_, session):
-        answer = asked(session, "omnibench/apr/swap", as_text(calibration(scale=1.1)))
-    assert answer["accepted"]
-    assert not answer["kept"]
-    assert "the node has no `state`" in answer["reason"]
+# Eight levels of aliases, nine values each, stand for 10^8; libyaml does not take this directive, Python's parser did.
+_LEVELS = " ".join(f"&a{level} [{', '.join([f'*a{level - 1}'] * 9)}]," for level in range(1, 9))
+BOMB = f"%YAML 1.3\n---\nx: [&a0 [1, 1, 1, 1, 1, 1, 1, 1, 1], {_LEVELS}]\ny: 0\ntheta: 0\n"
+_SECONDS = 1.0  # on a busy machine; such a request took 22 s and more
+
+
+@pytest.fixture(scope="module")
+def node(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[int, zenoh.Session, list[float]]]:
+    """The process of a node that takes samples at 100 Hz, a client's session, and when its odometry arrived."""
+    port, arrivals, over = free_port(), list[float](), threading.Event()
+    file = write_node(tmp_path_factory.mktemp("node"), "apr", port=port)
+    with Command("live", file) as command:
+        until(lambda: "apr" in command.said(), "the node's start")
+        session = raw_session("client", connect=[f"tcp/127.0.0.1:{port}"])
+        asked(session, "omnibench/apr/info")
+        subscriber = session.declare_subscriber("apr/odom", lambda _: arrivals.append(time.monotonic()))
+        publisher = session.declare_publisher("apr/joint_states")
+
+        def drives() -> None:
+            for sample in drive(60.0, period=0.01).samples():
+                publisher.put(JOINT_STATE.encode(sample))
+                if over.wait(0.01):
+                    return
+
+        driving = threading.Thread(target=drives)
+        driving.start()
+        until(lambda: len(arrivals) > 50, "odometry")
+        yield command.process.pid, session, arrivals
+        over.set()
+        driving.join()
+        subscriber.undeclare()
+        session.close()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="memory is read from /proc")
+@pytest.mark.parametrize("service", ["set_pose", "swap"])
+@pytest.mark.parametrize("payload", [BOMB, BOMB.partition("---\n")[2]], ids=["with a directive", "plain"])
+def test_a_node_refuses_a_bomb_and_goes_on(node: Any, service: str, payload: str) -> None:
+    process, session, arrivals = node
+    memory, count, began = peak_memory(process), len(arrivals), time.monotonic()
+    answer = asked(session, f"omnibench/apr/{service}", payload)
+    refused = time.monotonic()
+    until(lambda: len(arrivals) > count + 50, "odometry after the request")
+    assert "not valid YAML" in answer["error"]
+    assert refused - began < _SECONDS
+    gaps = np.diff(arrivals[count - 1 :])
+    assert max(gaps) < _SECONDS
+    assert peak_memory(process) - memory < 20

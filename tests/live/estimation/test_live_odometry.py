@@ -1,20 +1,43 @@
-"""Live odometry: the batch's numbers, with covariances that mean what they say."""
+"""Live odometry, with effects and learned corrections too: the numbers of the batch, honest covariances, swaps."""
 
 from __future__ import annotations
 
+import logging
+import re
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from drives import NOISE, calibration, drive
+from commands import Command as InProcess
+from commands import assert_refused, flower, write_config
+from drives import NOISE, ORIGIN, PERIOD, Drive, calibration, drive, fed, odometry, slam
 from hypothesis import given
 from hypothesis import strategies as st
+from learned_samples import a_learned_calibration
+from nodes import config_of, write_node
 
+from omnibench.config import to_yaml
+from omnibench.live.control.request_queue import LONGEST
 from omnibench.live.estimation.live_odometry import LiveOdometry
+from omnibench.live.estimation.tracker import RobotTracker
+from omnibench.live.fusion.pose_fusion import FusionSettings
+from omnibench.live.node import LiveNode
 from omnibench.live.wheels.wheel_input import WheelStep
-from omnibench.robot.calibration import Calibration, Noise, Provenance
-from omnibench.robot.kinematics import rotation
+from omnibench.live.wire.messages import JOINT_STATE
+from omnibench.robot.calibration import (
+    Calibration,
+    EffectTerm,
+    Noise,
+    Provenance,
+    covariance_rows,
+    parse_calibration,
+)
+from omnibench.robot.effects.effect import MOST_BYTES, encode_weights
+from omnibench.robot.kinematics import Array, relative, rotation
 from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog
+from omnibench.testing.synthetic import synthetic_robot
 
 
 def driven(odometry: LiveOdometry, angles: np.ndarray, durations: np.ndarray) -> LiveOdometry:
@@ -33,8 +56,7 @@ def test_poses_are_those_of_the_batch(seed: int, integration: Integration, wheel
 @pytest.mark.parametrize("integration", ["euler", "arc"])
 def test_the_covariance_of_the_matrix_spreads_as_the_batch_derivatives_say(integration: Integration) -> None:
     path = drive(4.0, using=calibration(integration=integration))
-    rates = np.diff(path.angles, axis=0) / 0.01
-    log = WheelLog(path.times, rates, np.zeros(3), path.times[-1:])
+    log = WheelLog(path.times, np.diff(path.angles, axis=0) / PERIOD, np.zeros(3), path.times[-1:])
     slopes = OdometryBatch([log], integration).jacobian(path.calibration.matrix_array)[0].reshape(3, 9)
     expected = slopes @ np.array(path.calibration.covariance) @ slopes.T
     quiet = path.calibration.model_copy(update={"noise": Noise(walk_position=1e-9, walk_heading=1e-9)})
@@ -80,16 +102,12 @@ def test_the_twist_is_the_matrix_times_the_rates_in_the_robots_frame() -> None:
     live = LiveOdometry(calibration())
     for _ in range(3):
         live.step(step(0.01, [0.01, -0.02, 0.005]))
-    np.testing.assert_allclose(live.twist, live_matrix(calibration()) @ [1.0, -2.0, 0.5], atol=1e-12)
+    np.testing.assert_allclose(live.twist, calibration().matrix_array @ [1.0, -2.0, 0.5], atol=1e-12)
     assert np.linalg.eigvalsh(live.twist_covariance)[0] > 0
 
 
 def step(duration: float, angles: list[float], blind: float = 0.0) -> WheelStep:
     return WheelStep(0, duration, np.array(angles), np.array(angles) / duration, blind)
-
-
-def live_matrix(of: Calibration) -> np.ndarray:
-    return of.matrix_array
 
 
 def test_noise_shrinks_while_no_wheel_turns() -> None:
@@ -108,19 +126,14 @@ def test_what_nobody_saw_makes_the_pose_less_certain() -> None:
     assert unseen.covariance[0, 0] > seen.covariance[0, 0] + 0.01
 
 
-def test_the_covariance_grows_while_nothing_comes() -> None:
-    live = LiveOdometry(calibration())
+@pytest.mark.parametrize("bare", [False, True])
+def test_the_covariance_is_regular_and_grows_while_nothing_comes(bare: bool) -> None:
+    live = LiveOdometry(calibration(deviation=None).model_copy(update={"noise": None}) if bare else calibration())
     live.step(step(0.01, [0.02, 0.01, -0.02]))
+    assert np.linalg.eigvalsh(live.covariance)[0] > 0
     traces = [float(np.trace(live.covariance_after_silence(seconds))) for seconds in (0.0, 0.5, 1.0, 5.0)]
     assert traces == sorted(traces)
     assert traces[-1] > 2 * traces[0]
-
-
-def test_a_calibration_without_noise_or_covariance_still_has_an_uncertain_pose() -> None:
-    bare = calibration(deviation=None).model_copy(update={"noise": None})
-    live = LiveOdometry(bare)
-    live.step(step(0.01, [0.02, 0.01, -0.02]))
-    assert np.linalg.eigvalsh(live.covariance)[0] > 0
 
 
 def test_a_calibration_with_numbers_on_a_bound_is_warned_of(caplog: pytest.LogCaptureFixture) -> None:
@@ -161,3 +174,297 @@ def test_held_steering_angles_make_a_way_as_doubtful_in_many_steps_as_in_one() -
     parts = [often.step(replace(step(0.1, [0.1, 0.1, 0.1], blind=0.1), held=True)) for _ in range(10)]
     for name in ("position_variance", "heading_variance"):
         assert sum(getattr(part, name) for part in parts) == pytest.approx(getattr(whole[0], name))
+
+
+ECCENTRIC = {f"{kind}_{wheel}": 0.02 for kind in "ab" for wheel in "abc"}
+EFFECTS: dict[str, dict[str, float]] = {
+    "wheel_eccentricity": ECCENTRIC,
+    "speed_dependent_radius": {"k": 0.01},
+    "thermal_radius_drift": {"k": 1e-4},
+    "acceleration_slip": {"k": 0.08},
+    "centripetal_slip": {"k": 0.05},
+    "start_transient": {"k": 0.2, "length": 0.1},
+    "heading_drift": {"b": 0.005},
+    "floor_drift": {"dx": 0.02, "dy": -0.01},
+    "sample_period_scale": {"s": 0.01},
+    "tyre_wear": {"radius_evening": 0.01},
+}
+
+
+def term(name: str, **parameters: float) -> EffectTerm:
+    return EffectTerm(name=name, parameters=parameters)
+
+
+def every_effect() -> list[EffectTerm]:
+    return [term(name, **values) for name, values in EFFECTS.items()]
+
+
+def with_effects(*terms: EffectTerm, plain: Calibration | None = None, **changes: Any) -> Calibration:
+    given_changes = {"effects": terms, "covariance": None, "session": "evening"}
+    return (plain or calibration()).model_copy(update=given_changes | changes)
+
+
+def batch(path: Drive, using: Calibration) -> Array:
+    """Batch odometry at every sample from the origin, with angles as the wheels count them."""
+    rates = np.diff(path.angles, axis=0) / np.diff(path.times, prepend=0.0)[:, None]
+    log = WheelLog(path.times, rates, np.zeros(3), path.times, path.angles[1:], 0.0, using.session)
+    return using.model.poses([log])[0]
+
+
+class TestAgreesWithTheBatch:
+    @given(
+        st.sets(st.sampled_from(sorted(EFFECTS)), min_size=1, max_size=4),
+        st.integers(0, 1000),
+        st.sampled_from(["euler", "arc"]),
+    )
+    def test_odom_with_any_effects_is_the_batch_odometry(
+        self, names: set[str], seed: int, integration: Integration
+    ) -> None:
+        plain = calibration(integration=integration)
+        using = with_effects(*(term(name, **EFFECTS[name]) for name in names), plain=plain)
+        path = drive(1.0, seed=seed, using=using)
+        updates = fed(RobotTracker("apr", using), path.payloads())
+        np.testing.assert_allclose(odometry(updates)[1:], batch(path, using), atol=1e-9)
+
+    def test_motions_lead_the_filter_along_odom_with_effects_too(self) -> None:
+        using = with_effects(*every_effect())
+        path = drive(2.0, using=using)
+        robot = RobotTracker("apr", using, fusion=FusionSettings())
+        robot.take_wheels(path.payloads()[0], 0.0)
+        robot.take_pose(slam(ORIGIN, [0.0, 0.0, 0.0]), 0.0)
+        updates = fed(robot, path.payloads()[1:])
+        for update in updates:
+            assert update.in_map is not None
+            np.testing.assert_allclose(update.in_map[0], update.pose, atol=1e-9)
+
+    def test_the_covariance_of_the_matrix_is_used_though_that_of_effects_follows_it(self) -> None:
+        plain, nothing = calibration(), term("heading_drift", b=0.0)
+        spread = np.diag([1e-8] * 9 + [1e-4])
+        using = with_effects(nothing, plain=plain, covariance=covariance_rows(spread))
+        path = drive(1.0)
+        last, last_with_effect = (fed(RobotTracker("apr", each), path.payloads())[-1] for each in (plain, using))
+        np.testing.assert_allclose(last_with_effect.covariance, last.covariance, rtol=1e-9)
+
+    def test_odom_fades_outside_the_training_domain_as_the_batch_does(self) -> None:
+        using = fading(term("heading_drift", b=0.05), deviation=0.02)
+        path = drive(1.0, using=using)
+        whole = using.model_copy(update={"plain": None})
+        np.testing.assert_allclose(
+            odometry(fed(RobotTracker("apr", using), path.payloads()))[1:], batch(path, using), atol=1e-9
+        )
+        assert np.abs(batch(path, using) - batch(path, whole)).max() > 1e-3
+
+    def test_the_covariance_grows_by_what_effects_extrapolate_and_only_there(self) -> None:
+        """A heading that drifts by an unsure rate displaces the robot sideways of its way by half of what it turns."""
+        using, speed, seconds = fading(term("heading_drift", b=0.05), deviation=0.02), 0.2, 2.0
+        known, new = (driven_for(using, seconds, twist).covariance for twist in ((speed, 0.0, 0.0), (0.0, speed, 0.0)))
+        assert np.abs(known).max() < 1e-12
+        assert new[2, 2] > (0.02 * seconds) ** 2
+        assert new[0, 2] == pytest.approx(-speed * seconds / 2 * new[2, 2], rel=0.02)
+        assert new[0, 0] == pytest.approx((speed * seconds / 2) ** 2 * new[2, 2], rel=0.04)
+
+
+def fading(effect: EffectTerm, deviation: float) -> Calibration:
+    """A calibration without other noise, fitted to driving forwards, whose effect has a value of this deviation."""
+    covariance = covariance_rows(np.diag([0.0] * 9 + [deviation**2]))
+    quiet = Noise(walk_position=1e-9, walk_heading=1e-9)
+    changes = {"covariance": covariance, "driven": ((0.2, 0.0, 0.0),), "plain": calibration().matrix, "noise": quiet}
+    return with_effects(effect).model_copy(update=changes)
+
+
+def driven_for(using: Calibration, seconds: float, twist: tuple[float, float, float]) -> LiveOdometry:
+    rates = np.linalg.solve(using.matrix_array, twist)
+    live = LiveOdometry(using)
+    for _ in range(round(seconds / PERIOD)):
+        live.step(WheelStep(0, PERIOD, PERIOD * rates, rates))
+    return live
+
+
+class TestSwaps:
+    @given(
+        st.sets(st.sampled_from(sorted(EFFECTS.keys() - {"floor_drift"})), max_size=3),
+        st.integers(0, 99),
+        st.booleans(),
+    )
+    def test_odom_goes_on_from_where_it_was_as_with_the_other_all_the_time(
+        self, names: set[str], place: int, there: bool
+    ) -> None:
+        path, both = drive(1.0), [calibration(), with_effects(*(term(name, **EFFECTS[name]) for name in names))]
+        first, second = both if there else both[::-1]
+        robot = RobotTracker("apr", first)
+        before = odometry(fed(robot, path.payloads()[: place + 1]))[-1]
+        robot.swap(second)
+        after = odometry(fed(robot, path.payloads()[place + 1 :]))[0]
+        all_the_time = odometry(fed(RobotTracker("apr", second), path.payloads()))
+        expected = relative(all_the_time[place], all_the_time[place + 1])
+        np.testing.assert_allclose(relative(before, after), expected, atol=1e-9)
+
+    def test_a_floor_that_carries_the_robot_does_not_move_it_at_once(self) -> None:
+        path, using = drive(1.0), with_effects(term("floor_drift", dx=0.02, dy=-0.01))
+        robot = RobotTracker("apr", calibration())
+        before = odometry(fed(robot, path.payloads()[:51]))[-1]
+        robot.swap(using)
+        moved = odometry(fed(robot, path.payloads()[51:]))[0] - before
+        plain = path.poses[51] - path.poses[50]
+        np.testing.assert_allclose(moved, plain, atol=0.03 * np.hypot(plain[0], plain[1]))
+
+    def test_a_swap_while_driving_is_not_taken_for_a_start_from_rest(self) -> None:
+        using = with_effects(term("acceleration_slip", k=0.1), term("start_transient", k=0.2, length=0.05))
+        step = np.array([0.05, -0.02, 0.01])
+        live = LiveOdometry(calibration())
+        for _ in range(300):
+            live.step(WheelStep(0, PERIOD, step, step / PERIOD))
+        swapped = live.continued(using)
+        for _ in range(10):
+            moved = swapped.step(WheelStep(0, PERIOD, step, step / PERIOD)).moved
+            np.testing.assert_allclose(moved, using.matrix_array @ step, atol=1e-6)
+        started = LiveOdometry(using).step(WheelStep(0, PERIOD, step, step / PERIOD)).moved
+        assert np.abs(started - using.matrix_array @ step).max() > 1e-3  # which the same effects would have made of one
+
+    @pytest.mark.parametrize("effect", ["wheel_eccentricity", "thermal_radius_drift"])
+    def test_counted_angles_and_the_sessions_time_go_on_over_a_swap(self, effect: str) -> None:
+        using = with_effects(term(effect, **EFFECTS[effect]))
+        path = drive(6.0, using=using)
+        live = LiveOdometry(using)
+        for number, turned in enumerate(np.diff(path.angles, axis=0)):
+            if number == 500:
+                live = live.continued(using)
+            live.step(WheelStep(0, PERIOD, turned, turned / PERIOD))
+        from_zero = replace(path, angles=path.angles - path.angles[0])
+        np.testing.assert_allclose(live.pose, batch(from_zero, using)[-1], atol=1e-9)
+
+
+class TestSessions:
+    def test_a_session_is_the_one_that_the_calibration_names(self) -> None:
+        worn, path = term("tyre_wear", radius_evening=0.01), drive(1.0)
+        turned = {
+            session: odometry(fed(RobotTracker("apr", with_effects(worn, session=session)), path.payloads()))[-1, 2]
+            for session in ("evening", "morning", None)
+        }
+        assert turned["evening"] == pytest.approx(1.01 * turned["morning"])
+        assert turned["morning"] == turned[None] == pytest.approx(path.poses[-1, 2])
+
+    def test_a_node_that_starts_again_goes_on_in_its_session(self, tmp_path: Path) -> None:
+        from omnibench.live.estimation.saved_state import RobotMemory
+
+        using = with_effects(term("thermal_radius_drift", k=1e-3))
+        path = drive(4.0, using=using)
+        memory = RobotMemory(tmp_path, "apr")
+        first = RobotTracker("apr", using, memory=memory)
+        fed(first, path.payloads()[:201])
+        first.close()
+        saved = RobotMemory(tmp_path, "apr").load()
+        assert saved is not None
+        assert saved.session_time == pytest.approx(2.0)
+        second = RobotTracker("apr", using)
+        second.resume(saved, 0.0, saved.wall)
+        updates = fed(second, path.payloads()[201:])
+        np.testing.assert_allclose(odometry(updates), batch(path, using)[200:], atol=1e-9)
+
+
+class TestAngles:
+    @pytest.mark.parametrize("effect", ["heading_drift", "wheel_eccentricity"])
+    @pytest.mark.parametrize("missing", [False, True])
+    def test_missing_angles_are_told_once_where_an_effect_needs_them(
+        self, effect: str, missing: bool, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        using = with_effects(term(effect, **EFFECTS[effect]))
+        samples = [replace(each, positions=None) if missing else each for each in drive(0.2, using=using).samples()]
+        with caplog.at_level(logging.WARNING, "omnibench.live"):
+            fed(RobotTracker("apr", using), [JOINT_STATE.encode(each) for each in samples])
+        told = [record.getMessage() for record in caplog.records]
+        assert len(told) == (missing and effect == "wheel_eccentricity")
+        assert all(message.startswith("apr: wheel_eccentricity ") for message in told)
+
+
+PLUGIN = '''
+import numpy as np
+from omnibench.registry import effects
+from omnibench.robot.effects.effect import MotionEffect, Parameter
+
+
+@effects.register("stretched_turns")
+class StretchedTurns(MotionEffect):
+    """Turns are longer than the wheels say."""
+
+    stage = "body"
+    physics = "The robot is wider than it seems."
+    source = "first principles"
+    shows_in = "command"
+
+    def parameters(self, robot, sessions=()):
+        return (Parameter("k", "1", -0.1, 0.1, "share that is added"),)
+
+    def correction(self, signals, values):
+        return values["k"] * signals.twists * [0.0, 0.0, 1.0]
+'''
+
+
+def test_live_takes_the_plugins_that_are_named_and_replays_to_the_batch_odometry(
+    command: InProcess, tmp_path: Path
+) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "stretched_turns.py").write_text(PLUGIN)
+    write_node(tmp_path, "apr", replay={"dataset": "small.yaml", "speed": "max"})
+    hidden = [{"name": "wheel_eccentricity", "parameters": {"a_b": 0.02}}]
+    simulated = flower(truth={"published": "palacin2023_eq8", "effects": hidden})
+    write_config(tmp_path, datasets={"flower": {"simulate": simulated}})
+    terms = (term("stretched_turns", k=0.1), term("wheel_eccentricity", **ECCENTRIC), term("acceleration_slip", k=0.05))
+    (tmp_path / "calibration.yaml").write_text(to_yaml(with_effects(*terms, session=None, sample_period=0.05)))
+    assert_refused(command("live", "node.yaml", "--replay"), "unknown effect 'stretched_turns'")
+    shown = command("live", "node.yaml", "--replay", "--plugins", "mine")
+    assert shown.returncode == 0, shown.stderr
+    difference = re.search(r"batch odometry: (\S+) \(m, rad\) at most; 0 messages of odom lost", shown.stdout)
+    assert difference is not None, shown.stdout
+    assert float(difference[1]) <= 1e-9
+
+
+def test_a_node_runs_effects_of_the_plugins_that_its_config_names(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "stretched_turns.py").write_text(PLUGIN)
+    config = config_of(tmp_path, "apr", plugins=["mine"])
+    (tmp_path / "calibration.yaml").write_text(to_yaml(with_effects(term("stretched_turns", k=0.1), session=None)))
+    path = drive(0.5)
+    with LiveNode(config) as node:
+        updates = fed(node.trackers["apr"], path.payloads())
+    np.testing.assert_allclose(odometry(updates)[:, 2], 1.1 * path.poses[:, 2], atol=1e-9)
+
+
+DRIVEN = [[20.0, 0.0, 0.0]]  # m/s, m/s, rad/s: so fast that all that is driven here is near to it
+
+
+def learned() -> Calibration:
+    return a_learned_calibration(synthetic_robot(3), DRIVEN, PERIOD).model_copy(update={"noise": NOISE})
+
+
+def test_odometry_of_the_node_is_that_of_the_batch() -> None:
+    path = drive(3.0, using=learned())
+    poses = np.array([update.pose for update in fed(RobotTracker("apr", learned()), path.payloads())])
+    np.testing.assert_allclose(poses, path.poses, rtol=0, atol=1e-9)  # stamps are whole nanoseconds
+    design = drive(3.0, using=learned().model_copy(update={"effects": (), "covariance": None, "plain": None}))
+    assert np.abs(poses - design.poses).max() > 1e-4
+
+
+def test_the_largest_weights_with_many_motions_fit_in_a_request() -> None:
+    """487 motions are driven in OptiOdom's circles of omni3, the most of all recordings here."""
+    motions = tuple((-0.123456789, 0.123456789, -0.123456789) for _ in range(600))
+    (term,) = learned().effects
+    weights = encode_weights(np.ones(MOST_BYTES // 4))
+    largest = learned().model_copy(
+        update={"driven": motions, "effects": (term.model_copy(update={"weights": weights}),)}
+    )
+    assert len(to_yaml(largest).encode()) < LONGEST
+
+
+def test_a_swap_to_a_learned_calibration_is_read_from_its_message_and_does_not_jump() -> None:
+    text = to_yaml(learned())
+    path, robot = drive(2.0), RobotTracker("apr", calibration())
+    payloads = path.payloads()
+    before = fed(robot, payloads[:100])
+    robot.swap(parse_calibration(text, "request"))
+    after = [
+        update for index, each in enumerate(payloads[100:], 100) for update in robot.take_wheels(each, 0.01 * index)
+    ]
+    assert np.abs(after[0].pose - before[-1].pose).max() < 0.1
+    stayed = fed(RobotTracker("apr", calibration()), payloads)
+    assert np.abs(after[-1].pose - stayed[-1].pose).max() > 1e-4

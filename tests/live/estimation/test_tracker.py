@@ -1,28 +1,31 @@
-"""One robot, message by message: what is published, what is refused, what is remembered."""
+"""One robot, message by message: what is published, what is refused, what is remembered and what its health says."""
 
 from __future__ import annotations
 
-import math
-import resource
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import replace
+import time
+from contextlib import closing
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from drives import NOISE, ORIGIN, SECOND, calibration, drive, slam
+from commands import disk_that_takes
+from drives import NOISE, ORIGIN, PERIOD, SECOND, calibration, drive, fed, odometry, slam
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from omnibench.errors import ConfigError, DataError
-from omnibench.live.estimation.saved_state import RobotMemory, SavedState
+from omnibench.live.estimation.counts import Counts, anomalies_in_words
+from omnibench.live.estimation.extrapolation_monitor import ExtrapolationMonitor
+from omnibench.live.estimation.health import diagnostic
+from omnibench.live.estimation.saved_state import RobotMemory
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.fusion.pose_fusion import FusionSettings
+from omnibench.live.wheels.wheel_input import WheelSettings, WheelStep
 from omnibench.live.wire.messages import JOINT_STATE, JointState
 from omnibench.live.wire.outputs import Update
-from omnibench.robot.calibration import EffectTerm, matrix_rows
+from omnibench.robot.calibration import Calibration, EffectTerm, matrix_rows
 from omnibench.robot.odometry import Integration
 
 
@@ -30,36 +33,17 @@ def tracker(**options: Any) -> RobotTracker:
     return RobotTracker("apr", calibration(), **{"fusion": FusionSettings(), **options})
 
 
-def fed(robot: RobotTracker, payloads: list[bytes], begin: float = 0.0) -> list[Update]:
-    return [
-        update for index, payload in enumerate(payloads) for update in robot.take_wheels(payload, begin + 0.01 * index)
-    ]
-
-
-def poses(updates: list[Update]) -> np.ndarray:
-    return np.array([update.pose for update in updates])
-
-
 @pytest.mark.parametrize("integration", ["euler", "arc"])
 @pytest.mark.parametrize("wheels", [3, 4])
-def test_odom_is_the_batch_odometry(integration: Integration, wheels: int) -> None:
+def test_odom_is_the_batch_odometry_until_it_is_closed(integration: Integration, wheels: int) -> None:
     path = drive(5.0, using=calibration(integration=integration, wheels=wheels))
     robot = RobotTracker("apr", path.calibration)
-    np.testing.assert_allclose(poses(fed(robot, path.payloads())), path.poses, atol=1e-9)
-
-
-def test_stamps_are_those_of_the_wheel_samples() -> None:
-    path = drive(0.2)
-    assert [update.stamp for update in fed(tracker(), path.payloads())] == path.stamps
-
-
-def test_there_are_no_updates_after_closing() -> None:
-    path = drive(0.2)
-    robot = tracker()
-    assert len(fed(robot, path.payloads()[:10])) == 10
+    updates = fed(robot, path.payloads()[:-1])
+    np.testing.assert_allclose(odometry(updates), path.poses[:-1], atol=1e-9)
+    assert [update.stamp for update in updates] == path.stamps[:-1]
     robot.close()
-    assert robot.take_wheels(path.payloads()[10], 0.1) == []
-    assert robot.counts.samples == 10
+    assert robot.take_wheels(path.payloads()[-1], 5.0) == []
+    assert robot.counts.samples == 500
 
 
 def test_covariances_come_from_the_calibration() -> None:
@@ -106,7 +90,7 @@ def test_odom_never_jumps_and_no_stamp_comes_twice_whatever_happens(data: st.Dat
     assert len(set(stamps)) == len(stamps)
     # No wheel turns faster than 3 rad/s: 0.3 m/s and 1.6 rad/s, times the largest scale, bound the robot's motion
     # in the time since the message before; 0.05 s for samples that wait until a clock's jump is confirmed.
-    moved = np.diff(poses(updates), axis=0) if len(updates) > 1 else np.zeros((0, 3))
+    moved = np.diff(odometry(updates), axis=0) if len(updates) > 1 else np.zeros((0, 3))
     elapsed = np.diff(arrivals) + 0.05 if len(updates) > 1 else np.zeros(0)
     assert (np.hypot(moved[:, 0], moved[:, 1]) < 0.3 * 1.3 * elapsed).all()
     assert (np.abs(moved[:, 2]) < 1.6 * 1.3 * elapsed).all()
@@ -135,88 +119,47 @@ def test_time_backwards_is_counted_and_the_stream_goes_on() -> None:
     assert robot.take_pose(slam(path.stamps[-1] - 100 * SECOND, path.poses[-1]), 1.0) == "located"
 
 
-@pytest.mark.parametrize("payload", [b"", b"garbage", b"\x00\x01\x00\x00", bytes(4000)])
-def test_garbage_is_counted_and_the_stream_goes_on(payload: bytes) -> None:
-    path = drive(0.1)
-    robot = tracker()
-    fed(robot, path.payloads()[:5])
-    assert robot.take_wheels(payload, 0.05) == []
-    assert robot.take_pose(payload, 0.05) is None
-    assert (robot.counts.undecodable, robot.counts.pose_undecodable) == (1, 1)
-    assert len(fed(robot, path.payloads()[5:], 0.05)) == 6
+def giant() -> Calibration:
+    """A calibration of a larger robot with the same wheels."""
+    robot = calibration().robot
+    wheels = tuple(each.model_copy(update={"radius": 5 * each.radius}) for each in robot.wheels)
+    robot = robot.model_copy(update={"wheels": wheels, "name": "giant"})
+    return calibration().model_copy(update={"robot": robot, "matrix": matrix_rows(robot.inverse_kinematic_matrix)})
 
 
-def test_a_pose_of_another_frame_or_without_sense_is_refused_with_the_reason() -> None:
-    path = drive(0.1)
-    robot = tracker()
-    fed(robot, path.payloads())
-    for payload, reason in (
-        (slam(path.stamps[5], [0, 0, 0], frame="odom"), "frame 'odom', not in 'map'"),
-        (slam(path.stamps[5], [math.nan, 0, 0]), "not finite"),
-    ):
-        assert robot.take_pose(payload, 0.1) is None
-        assert reason in robot.health(0.1).last_refusal
-    assert robot.counts.pose_invalid == 2
-
-
-def test_a_pose_without_covariance_takes_that_of_the_calibrations_noise() -> None:
-    path = drive(0.1)
-    robot = tracker()
-    fed(robot, path.payloads())
-    assert robot.take_pose(slam(path.stamps[-1], [1, 2, 3], np.zeros((3, 3))), 0.1) == "located"
-    in_map = robot.pose_at().in_map
-    assert in_map is not None
-    assert in_map[1][0, 0] == pytest.approx(NOISE.pose_position**2)
-
-
-def test_a_calibration_of_another_robot_is_refused_and_the_old_one_runs_on() -> None:
-    robot = tracker()
+@pytest.mark.parametrize(
+    ("other", "reason"),
+    [
+        (calibration(wheels=4), "wheels fl, fr, rl, rr, .* a, b, c"),
+        (calibration(scale=30.0), "off the design"),
+        (giant(), "off the design"),
+        (
+            calibration().model_copy(update={"effects": (EffectTerm(name="heading_drft", parameters={"b": 0.1}),)}),
+            "heading_drift",
+        ),
+    ],
+    ids=["another robot", "absurd", "giant", "unknown effect"],
+)
+def test_a_calibration_that_does_not_fit_is_refused_and_the_old_one_runs_on(other: Calibration, reason: str) -> None:
+    path, robot = drive(0.5), tracker()
     running = robot.calibration
-    for other, reason in (
-        (calibration(wheels=4), "is for wheels fl, fr, rl, rr, this robot has a, b, c"),
-        (calibration(scale=30.0), "off the design of robot"),
-    ):
-        with pytest.raises(DataError, match=reason):
-            robot.swap(other)
-        assert robot.calibration is running
+    with pytest.raises(DataError, match=reason):
+        robot.swap(other)
+    assert robot.calibration is running
     health = robot.health(0.0)
     assert health.last_swap is not None
-    assert not health.last_swap.accepted
-    assert robot.counts.swaps_refused == 2
-
-
-def test_a_calibration_of_a_larger_robot_with_the_same_wheels_is_refused() -> None:
-    robot = tracker()
-    larger = calibration().robot
-    wheels = tuple(each.model_copy(update={"radius": 5 * each.radius}) for each in larger.wheels)
-    larger = larger.model_copy(update={"wheels": wheels, "name": "giant"})
-    other = calibration().model_copy(
-        update={"robot": larger, "matrix": matrix_rows(larger.inverse_kinematic_matrix), "name": "giant"}
-    )
-    with pytest.raises(DataError, match="off the design of robot 'synthetic omni'"):
-        robot.swap(other)
-    assert robot.calibration.name == "synthetic 1"
-
-
-def test_a_calibration_with_an_effect_that_nobody_knows_is_refused() -> None:
-    robot = tracker()
-    other = calibration().model_copy(update={"effects": (EffectTerm(name="heading_drft", parameters={"b": 0.1}),)})
-    with pytest.raises(DataError, match=r"unknown effect 'heading_drft'; did you mean 'heading_drift'\?"):
-        robot.swap(other)
-    assert robot.counts.swaps_refused == 1
-    path = drive(0.5)
-    np.testing.assert_allclose(poses(fed(robot, path.payloads())), path.poses, atol=1e-9)
+    assert (health.last_swap.accepted, robot.counts.swaps_refused) == (False, 1)
+    np.testing.assert_allclose(odometry(fed(robot, path.payloads())), path.poses, atol=1e-9)
 
 
 def test_after_a_silence_of_a_sender_of_rates_the_twist_is_true_and_the_pose_uncertain() -> None:
     robot = tracker(fusion=None)
-    names = ("a", "b", "c")
     rates = np.array([2.0, -1.0, 0.5])
     times = [*np.arange(0, 1, 0.01), *np.arange(20, 20.05, 0.01)]
     updates = []
-    for time in times:
-        payload = JOINT_STATE.encode(JointState(ORIGIN + round(float(time) * SECOND), names, None, rates))
-        updates += robot.take_wheels(payload, float(time))
+    for at in times:
+        payload = JOINT_STATE.encode(JointState(ORIGIN + round(float(at) * SECOND), NAMES, None, rates))
+        updates += robot.take_wheels(payload, float(at))
     twist = calibration().matrix_array @ rates
     for update in updates[1:]:
         np.testing.assert_allclose(update.twist, twist, atol=1e-9)
@@ -225,25 +168,14 @@ def test_after_a_silence_of_a_sender_of_rates_the_twist_is_true_and_the_pose_unc
     assert np.sqrt(after[0, 0] - before[0, 0]) > 0.25 * driven
 
 
-@contextmanager
-def no_room_in_files() -> Iterator[None]:
-    """No file of this process can grow; /dev/full would be one file for all processes of the machine."""
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (0, limits[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-
-
 def test_a_full_disk_costs_the_state_and_no_odometry(tmp_path: Path) -> None:
     path = drive(1.0)
     robot = tracker(memory=RobotMemory(tmp_path, "apr"))
-    with no_room_in_files():
+    with disk_that_takes(0):
         updates = fed(robot, path.payloads())
     assert len(updates) == 101
     assert robot.counts.failures > 0
-    assert "the state could not be written: File too large" in robot.health(1.0).last_refusal
+    assert "File too large" in robot.health(1.0).last_refusal
 
 
 def test_poses_that_wait_and_are_then_rejected_are_told() -> None:
@@ -273,15 +205,85 @@ def test_every_pose_that_waits_in_vain_is_counted() -> None:
     assert counts.poses + counts.pose_rejected + counts.pose_ahead == 40
 
 
-@pytest.mark.parametrize("pose", [[1.7e308, 0.5e308, 0.1], [1e9, 0, 0]])
-def test_a_pose_beyond_the_world_is_refused(pose: list[float]) -> None:
-    path = drive(0.5)
-    robot = tracker()
+NAMES = ("a", "b", "c")
+TILTED = np.array([[1, 0.9, 0], [0.9, 1, 0], [0, 0, 1.0]])
+LAST = ORIGIN + SECOND  # of the drive that comes before nonsense
+NONSENSE: dict[str, tuple[str, bytes, str]] = {
+    "nan": ("wheels", JOINT_STATE.encode(JointState(LAST + 1, NAMES, np.array([np.nan, 0, 0]))), "not_finite"),
+    "infinity": ("wheels", JOINT_STATE.encode(JointState(LAST + 1, NAMES, np.array([0, np.inf, 0]))), "not_finite"),
+    "other joints": ("wheels", JOINT_STATE.encode(JointState(LAST + 1, ("x", "y", "z"), np.zeros(3))), "wrong_joints"),
+    "nothing to read": ("wheels", JOINT_STATE.encode(JointState(LAST + 1, NAMES)), "wrong_joints"),
+    "garbage": ("wheels", b"\xde\xad\xbe\xef" * 40, "undecodable"),
+    "zeros": ("wheels", bytes(4000), "undecodable"),
+    "a header alone": ("wheels", b"\x00\x01\x00\x00", "undecodable"),
+    "nothing at all": ("wheels", b"", "undecodable"),
+    "truncated": ("wheels", drive(0.1).payloads()[10][:-9], "undecodable"),
+    "another type": ("wheels", slam(LAST, [0, 0, 0]), "undecodable"),
+    "text": ("wheels", b'{"positions": [1, 2, 3]}', "undecodable"),
+    "a garbled pose": ("poses", b"\xde\xad\xbe\xef" * 40, "pose_undecodable"),
+    "no pose": ("poses", b"", "pose_undecodable"),
+    "a truncated pose": ("poses", slam(LAST, [0, 0, 0])[:100], "pose_undecodable"),
+    "a wheel message": ("poses", drive(0.1).payloads()[10], "pose_undecodable"),
+    "a pose of nan": ("poses", slam(LAST, [np.nan, 0, 0]), "pose_invalid"),
+    "a pose of another frame": ("poses", slam(LAST, [0, 0, 0], frame="odom"), "pose_invalid"),
+    "beyond the world": ("poses", slam(LAST, [1e9, 0, 0], TILTED), "pose_invalid"),
+    "almost infinite": ("poses", slam(LAST, [1.7e308, 0.5e308, 0.1], TILTED), "pose_invalid"),
+    "no covariance": ("poses", slam(LAST, [0, 0, 0], np.full((3, 3), np.nan)), "pose_default_covariance"),
+    "a kilometre away": ("poses", slam(LAST - 20_000_000, [1000, 0, 0]), "pose_rejected"),
+    "of an hour ago": ("poses", slam(LAST - 3600 * SECOND, [0, 0, 0]), "pose_too_late"),
+    "of tomorrow": ("poses", slam(LAST + 86400 * SECOND, [0, 0, 0]), "pose_ahead"),
+}
+
+
+@pytest.mark.parametrize("what", NONSENSE)
+def test_nonsense_is_counted_and_the_stream_goes_on(what: str) -> None:
+    path, robot = drive(1.1), tracker()
+    topic, payload, counter = NONSENSE[what]
+    fed(robot, path.payloads()[:101])
+    robot.take_pose(slam(path.stamps[90], [0, 0, 0]), 1.0)
+    if topic == "wheels":
+        assert robot.take_wheels(payload, 1.005) == []
+    else:
+        robot.take_pose(payload, 1.005)
+    assert getattr(robot.counts, counter) == 1
+    assert robot.counts.failures == 0
+    after = fed(robot, path.payloads()[101:], 1.01)
+    np.testing.assert_allclose(odometry(after), path.poses[101:], atol=1e-9)
+
+
+@pytest.mark.parametrize("variance", [1.797e308, 0.0, -1.0, np.nan, np.inf])
+def test_poses_of_unknown_covariance_are_fused_with_the_default_which_is_said_once(
+    variance: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    path, robot = drive(0.5), tracker(fusion=FusionSettings(pose_sigma=(0.2, 3.0)))
     fed(robot, path.payloads())
-    tilted = np.array([[1, 0.9, 0], [0.9, 1, 0], [0, 0, 1.0]])
-    robot.take_pose(slam(path.stamps[10], [0, 0, 0]), 0.5)
-    assert robot.take_pose(slam(path.stamps[20], pose, tilted), 0.5) is None
-    assert robot.counts.pose_invalid == 1
+    for stamp in path.stamps[-2:]:
+        robot.take_pose(slam(stamp, [1.0, 2.0, 0.5], np.diag([variance] * 3)), 0.5)
+    assert (robot.counts.poses, robot.counts.pose_default_covariance, robot.counts.pose_invalid) == (2, 2, 0)
+    assert 0.1 < robot.health(0.5).position_sigma_m <= 0.2
+    (line,) = [each.getMessage() for each in caplog.records if "covariance of a pose is unknown" in each.getMessage()]
+    assert "0.2 m and 3 deg" in line
+    assert "pose_sigma" in line
+
+
+def test_stamps_that_stand_still_are_said_and_arrival_takes_the_times_of_arrival() -> None:
+    still = JOINT_STATE.encode(JointState(0, NAMES, None, np.array([2.0, -1.0, -1.0])))
+    robot = tracker(fusion=None, stale_after=0.2)
+    assert len(fed(robot, [still] * 100)) == 1
+    assert robot.health(1.0).status == "stale"
+    assert "`wheels: {stamps: arrival}`" in robot.health(1.0).message
+    robot = tracker(fusion=None, wheels=WheelSettings(stamps="arrival"))
+    updates = fed(robot, [still] * 100, time.monotonic())
+    assert (len(updates), robot.counts.duplicates) == (100, 0)
+    assert abs(updates[-1].stamp / SECOND - time.time()) < 30
+    assert np.linalg.norm(updates[-1].pose[:2]) > 0
+
+
+def test_joints_called_like_the_wheels_are_found_as_in_a_bag() -> None:
+    robot, names = tracker(), ("b_wheel_joint", "base/A_wheel", "wheel_c")
+    samples = [replace(each, names=names) for each in drive(0.1).samples()]
+    assert len(fed(robot, [JOINT_STATE.encode(each) for each in samples])) == 11
+    assert robot.counts.anomalies() == {}
 
 
 def test_a_stale_stream_says_so_and_is_less_and_less_certain() -> None:
@@ -320,9 +322,9 @@ def test_poses_between_samples_are_at_constant_twist_and_others_are_refused() ->
 
 def test_without_fusion_there_is_no_pose_to_set() -> None:
     robot = tracker(fusion=None)
-    with pytest.raises(DataError, match="runs without fusion, and odom itself never jumps"):
+    with pytest.raises(DataError, match="without fusion"):
         robot.set_pose(np.zeros(3), np.eye(3))
-    with pytest.raises(DataError, match="reset: robot 'apr'"):
+    with pytest.raises(DataError, match="reset"):
         robot.reset()
 
 
@@ -348,32 +350,114 @@ def test_a_robot_goes_on_where_it_was_after_its_node_was_killed(tmp_path: Path) 
     memory.close()
 
 
-def test_a_state_torn_by_a_crash_leaves_the_one_before(tmp_path: Path) -> None:
-    memory = RobotMemory(tmp_path, "apr")
-    rows = {"positions": (0.0,) * 3, "pose": (0.0,) * 3, "covariance": tuple(np.eye(3).ravel())}
-    for stamp in (1, 2, 3):
-        memory.save(SavedState(stamp=stamp, wall=0.0, **rows))
-    file = tmp_path / "apr.state.json"
-    memory.close()
-    content = bytearray(file.read_bytes())
-    content[4096 + 20 : 4096 + 60] = b"\xff" * 40  # slot of the third
-    file.write_bytes(content)
-    memory = RobotMemory(tmp_path, "apr")
-    loaded = memory.load()
-    assert loaded is not None
-    assert loaded.stamp == 2
-    memory.close()
-
-
 def test_two_nodes_cannot_share_a_robots_memory(tmp_path: Path) -> None:
-    memory = RobotMemory(tmp_path, "apr")
-    with pytest.raises(ConfigError, match=r"apr\.state\.json: another node is using it for robot 'apr'"):
+    with closing(RobotMemory(tmp_path, "apr")), pytest.raises(ConfigError, match=r"apr\.state\.json: another node"):
         RobotMemory(tmp_path, "apr")
-    memory.close()
 
 
 def test_a_message_with_rates_alone_is_enough() -> None:
     path = drive(0.5)
     robot = tracker()
     payloads = [JOINT_STATE.encode(JointState(s.stamp, s.names, None, s.velocities)) for s in path.samples()]
-    np.testing.assert_allclose(poses(fed(robot, payloads)), path.poses, atol=1e-9)
+    np.testing.assert_allclose(odometry(fed(robot, payloads)), path.poses, atol=1e-9)
+
+
+def test_every_anomaly_is_told_in_words_that_agree_with_its_number() -> None:
+    every = Counts(**{field.name: 2 for field in fields(Counts)}).anomalies()
+    assert anomalies_in_words(every).count("2 ") == len(every)
+    assert anomalies_in_words({"missing": 1, "pose_invalid": 3}) == "1 wheel sample missing, 3 poses invalid"
+
+
+FORWARDS, SIDEWAYS, STANDING = (0.2, 0.0, 0.0), (0.0, 0.2, 0.0), (0.0, 0.0, 0.0)
+SLIP = EffectTerm(name="centripetal_slip", parameters={"k": 0.03})
+Twist = tuple[float, float, float]
+
+
+def fitted(**changes: Any) -> Calibration:
+    """Fitted to driving forwards, unless it is changed."""
+    return calibration().model_copy(update={"effects": (SLIP,), "covariance": None, "driven": (FORWARDS,)} | changes)
+
+
+def steps(twist: Twist, seconds: float, blind: float = 0.0) -> list[WheelStep]:
+    rates = np.linalg.solve(calibration().matrix_array, twist)
+    return [WheelStep(0, PERIOD, PERIOD * rates, rates, blind) for _ in range(round(seconds / PERIOD))]
+
+
+def watched(*driven: list[WheelStep], by: Calibration | None = None) -> ExtrapolationMonitor:
+    watch = ExtrapolationMonitor("apr", by or fitted())
+    for each in driven:
+        for step in each:
+            watch.take(step, step.angles)
+    return watch
+
+
+def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [record.getMessage() for record in caplog.records]
+
+
+def assert_warned_once(caplog: pytest.LogCaptureFixture) -> None:
+    (warning,) = warnings(caplog)
+    for part in ("apr: ", "'synthetic 1'", "driving straight at 0.20 m/s", "centripetal_slip"):
+        assert part in warning
+
+
+def test_a_new_motion_is_told_once_and_its_seconds_are_counted(caplog: pytest.LogCaptureFixture) -> None:
+    watch = watched(steps(FORWARDS, 2), steps(SIDEWAYS, 4), steps(FORWARDS, 2), steps(SIDEWAYS, 3))
+    assert_warned_once(caplog)
+    assert watch.seconds == pytest.approx(7.0, abs=0.1)
+
+
+def test_nothing_is_told_before_it_has_lasted_for_a_second(caplog: pytest.LogCaptureFixture) -> None:
+    watched(steps(SIDEWAYS, 0.9))
+    assert warnings(caplog) == []
+    watched(steps(SIDEWAYS, 1.6))
+    assert_warned_once(caplog)
+
+
+@pytest.mark.parametrize(
+    "driven",
+    [
+        [steps(FORWARDS, 5)],
+        [steps(STANDING, 5)],
+        [*[steps(FORWARDS, 1), steps(SIDEWAYS, 0.5)] * 5],
+        [steps(SIDEWAYS, 5, blind=PERIOD)],
+    ],
+    ids=["a known one", "standing", "in passing", "out of sight"],
+)
+def test_other_motions_do_not_count(driven: list[list[WheelStep]], caplog: pytest.LogCaptureFixture) -> None:
+    assert watched(*driven).seconds == 0.0
+    assert warnings(caplog) == []
+
+
+@pytest.mark.parametrize("changes", [{"driven": None}, {"driven": ()}, {"effects": ()}])
+def test_nothing_is_watched_where_nothing_is_at_stake(
+    changes: dict[str, Any], caplog: pytest.LogCaptureFixture
+) -> None:
+    assert watched(steps(SIDEWAYS, 5), by=fitted(**changes)).seconds is None
+    assert warnings(caplog) == []
+
+
+def feed(robot: RobotTracker, twist: Twist, seconds: float, begin: float) -> None:
+    """Wheel messages with counters that go on from rest at 0."""
+    rates = np.linalg.solve(calibration().matrix_array, twist)
+    for sample in range(round(seconds / PERIOD) + 1):
+        now = begin + sample * PERIOD
+        message = JointState(ORIGIN + round(now * SECOND), ("a", "b", "c"), now * rates, rates)
+        robot.take_wheels(JOINT_STATE.encode(message), now)
+
+
+def test_health_and_diagnostics_show_the_seconds_of_each_calibration_by_itself(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    robot = RobotTracker("apr", fitted())
+    feed(robot, SIDEWAYS, 3.0, 0.0)
+    health = robot.health(3.0)
+    assert health.unfitted_motion_s == pytest.approx(3.0, abs=0.1)
+    assert ("unfitted_motion_s", f"{health.unfitted_motion_s:.1f}") in diagnostic(health, "").values
+    robot.swap(fitted(name="second", driven=(FORWARDS, SIDEWAYS)))
+    feed(robot, SIDEWAYS, 3.0, 3.0 + PERIOD)
+    assert robot.health(6.0).unfitted_motion_s == 0.0
+    assert_warned_once(caplog)
+    robot.swap(calibration())
+    assert robot.health(6.0).unfitted_motion_s is None
+    assert "unfitted_motion_s" not in dict(diagnostic(robot.health(6.0), "").values)

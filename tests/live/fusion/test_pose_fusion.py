@@ -1,18 +1,61 @@
-"""Fusing SLAM poses at their own time, whenever they arrive."""
+"""Fusing SLAM poses at their own time, whenever they arrive, put where and when they were taken."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from drives import ORIGIN, SECOND, motion
+from drives import EXACT, ORIGIN, PERIOD, SECOND, calibration, drive, fed, motion, odometry, slam
 from hypothesis import given
 from hypothesis import strategies as st
 
 from omnibench.live.estimation.counts import Counts
 from omnibench.live.estimation.live_odometry import Motion
-from omnibench.live.fusion.pose_fusion import Fusion, FusionSettings
+from omnibench.live.estimation.tracker import RobotTracker
+from omnibench.live.fusion.pose_fusion import Fusion, FusionSettings, PoseFilter, innovation_of
 from omnibench.live.fusion.timeline import Entry, PoseMeasurement, Timeline
+from omnibench.robot.calibration import Calibration, EffectTerm
+from omnibench.robot.kinematics import Array, compose, moved_to
 from omnibench.robot.odometry import advance
+
+COVARIANCE = np.array([[0.04, 0.01, -0.02], [0.01, 0.09, 0.03], [-0.02, 0.03, 0.05]])
+VARIANCE = 1e-4
+
+
+@pytest.mark.parametrize("moved", [[0.8, -0.3, 0.4], [0.0, 0.5, 0.0], [0.6, 0.0, -1.0]])
+def test_the_predicted_covariance_is_that_of_finite_differences(moved: list[float]) -> None:
+    pose, step = np.array([1.0, -2.0, 0.7]), motion(0, np.array(moved), variance=VARIANCE)
+    shifts = 1e-6 * np.eye(3)
+    jacobian = np.column_stack(
+        [
+            (advance(pose + shift, step.moved, "arc") - advance(pose - shift, step.moved, "arc")) / 2e-6
+            for shift in shifts
+        ]
+    )
+    pose_filter = PoseFilter(pose, COVARIANCE)
+    pose_filter.predict(step)
+    expected = jacobian @ COVARIANCE @ jacobian.T + VARIANCE * np.eye(3)
+    np.testing.assert_allclose(pose_filter.covariance, expected, atol=1e-8)
+
+
+def test_the_normalised_error_of_sparse_poses_is_that_of_three_degrees_of_freedom() -> None:
+    """Mean NEES: its standard deviation is sqrt(6 / 300) = 0.14, so that 3.5 would be 3.5 of these away."""
+    rng = np.random.default_rng(4)
+    slam = np.diag([0.02, 0.02, 0.03]) ** 2
+    normalised = []
+    for _ in range(150):
+        true = rng.uniform(-3, 3, 3)
+        moved = np.array([0.06, rng.uniform(-0.03, 0.03), rng.uniform(-0.02, 0.02)])
+        pose_filter = PoseFilter(true + rng.multivariate_normal(np.zeros(3), slam), slam)
+        for _ in range(2):
+            for _ in range(50):  # 3 m from pose to pose
+                step = motion(0, moved, variance=1e-6)
+                true = advance(true, moved, "arc") + 1e-3 * rng.standard_normal(3)
+                pose_filter.predict(step)
+            error = innovation_of(true.copy(), pose_filter.pose)
+            normalised.append(error @ np.linalg.solve(pose_filter.covariance, error))
+            pose_filter.correct(true + rng.multivariate_normal(np.zeros(3), slam), slam)
+    assert np.mean(normalised) == pytest.approx(3.0, abs=0.5)
+
 
 R = np.diag([1e-4, 1e-4, 1e-4])
 
@@ -81,18 +124,12 @@ def test_the_first_pose_says_where_the_robot_is() -> None:
 
 
 def test_a_pose_older_than_the_history_is_counted_and_changes_nothing() -> None:
-    robot = Robot(history=2.0).drive(10)
-    robot.see(0.1)
-    robot.drive(990)
+    robot = Robot(history=2.0).drive(1000)
+    assert robot.see(8.0) == "located"
     before = robot.fusion.pose.copy()
     assert robot.see(0.15) == "too late"
     assert robot.counts.pose_too_late == 1
     np.testing.assert_array_equal(robot.fusion.pose, before)
-
-
-def test_poses_within_the_history_are_never_too_late() -> None:
-    robot = Robot(history=2.0).drive(1000)
-    assert robot.see(8.0) == "located"
     assert robot.see(8.01) == "fused"
 
 
@@ -143,25 +180,24 @@ def test_the_gate_rejects_true_poses_as_seldom_as_it_says() -> None:
     assert 0.08 < rejected / count < 0.13
 
 
-def test_after_so_many_rejections_slam_is_believed() -> None:
+@pytest.mark.parametrize(
+    ("seen", "outcomes"),
+    [
+        ([(0.2 + 0.1 * k, 5, 0) for k in range(4)], ["rejected"] * 3 + ["reacquired"]),
+        ([(0.2, 1000, 0)] * 20, ["rejected"] + ["duplicate"] * 19),
+        ([(0.2 + 0.01 * k, 100.0 * (k + 1), -50.0 * k) for k in range(20)], ["rejected"] * 20),
+        ([(0.2 + 0.1 * k, 5 * (k != 3), 0) for k in range(6)], ["rejected"] * 3 + ["fused"] + ["rejected"] * 2),
+    ],
+    ids=["that agree", "one repeated", "that contradict each other", "with a good one between"],
+)
+def test_of_rejected_poses_four_that_agree_are_believed_and_others_never(
+    seen: list[tuple[float, float, float]], outcomes: list[str]
+) -> None:
     robot = Robot(reacquire_after=4).drive(100)
     robot.see(0.1)
-    outcomes = [robot.see(0.2 + 0.1 * k, (5, 0, 0)) for k in range(4)]
-    assert outcomes == ["rejected", "rejected", "rejected", "reacquired"]
-    np.testing.assert_allclose(robot.fusion.pose, robot.truth[-1] + [5, 0, 0], atol=1e-9)
-
-
-def test_one_outlier_that_is_repeated_is_not_believed() -> None:
-    robot = Robot(reacquire_after=4).drive(100)
-    robot.see(0.1)
-    assert [robot.see(0.2, (1000, 0, 0)) for _ in range(20)] == ["rejected"] + ["duplicate"] * 19
-
-
-def test_outliers_that_contradict_each_other_are_not_believed() -> None:
-    robot = Robot(reacquire_after=4).drive(100)
-    robot.see(0.1)
-    outcomes = [robot.see(0.2 + 0.01 * k, (100.0 * (k + 1), -50.0 * k, 0)) for k in range(20)]
-    assert set(outcomes) == {"rejected"}
+    assert [robot.see(time, (x, y, 0)) for time, x, y in seen] == outcomes
+    away = [5, 0, 0] if outcomes[-1] == "reacquired" else [0, 0, 0]
+    np.testing.assert_allclose(robot.fusion.pose, robot.truth[-1] + away, atol=1e-9)
 
 
 def test_a_robot_that_was_carried_away_is_found_while_it_drives_on() -> None:
@@ -181,13 +217,6 @@ def test_a_sender_with_nonsense_for_stamps_does_not_fill_the_memory() -> None:
         moved = motion(ORIGIN + 1000 * number, np.zeros(3), 1e-6)
         timeline.append(Entry(moved.stamp, moved, np.zeros(3), np.zeros(3), R))
     assert len(timeline.entries) <= 8000
-
-
-def test_one_good_pose_ends_the_count_of_rejections() -> None:
-    robot = Robot(reacquire_after=3).drive(100)
-    robot.see(0.1)
-    outcomes = [robot.see(0.2 + 0.1 * k, (5 * (k != 2), 0, 0)) for k in range(5)]
-    assert outcomes == ["rejected", "rejected", "fused", "rejected", "rejected"]
 
 
 def test_a_pose_that_was_set_holds_against_poses_measured_before() -> None:
@@ -219,21 +248,14 @@ def test_a_heading_beyond_half_a_turn_is_the_same_heading() -> None:
 
 
 @given(st.floats(0.0, 0.5))
-def test_the_pose_at_a_time_lies_on_the_path(time: float) -> None:
-    robot = Robot().drive(50)
-    robot.see(0.1)
-    found = robot.fusion.at(stamp(time))
-    assert found is not None
-    np.testing.assert_allclose(found[0][:2], robot.at(time)[:2] if time >= 0.1 else found[0][:2], atol=1e-9)
-    odometry = robot.timeline.odometry_at(stamp(time))
-    np.testing.assert_allclose(odometry, robot.at(time), atol=1e-9)
-
-
-def test_asking_for_the_past_changes_nothing() -> None:
+def test_the_pose_at_a_time_lies_on_the_path_and_asking_changes_nothing(time: float) -> None:
     robot = Robot().drive(50)
     robot.see(0.1)
     before = robot.fusion.pose.copy()
-    robot.fusion.at(stamp(0.123))
+    found = robot.fusion.at(stamp(time))
+    assert found is not None
+    np.testing.assert_allclose(found[0][:2], robot.at(time)[:2] if time >= 0.1 else found[0][:2], atol=1e-9)
+    np.testing.assert_allclose(robot.timeline.odometry_at(stamp(time)), robot.at(time), atol=1e-9)
     np.testing.assert_array_equal(robot.fusion.pose, before)
 
 
@@ -258,3 +280,93 @@ def test_the_timeline_keeps_what_it_promises_and_little_more() -> None:
     robot = Robot(history=3.0).drive(5000)
     held = (robot.timeline.newest - robot.timeline.oldest) / SECOND
     assert 3.0 <= held <= 6.1
+
+
+LATE = EffectTerm(name="reference_time_offset", parameters={"tau": 0.12})
+
+
+def term(name: str, **parameters: float) -> EffectTerm:
+    return EffectTerm(name=name, parameters=parameters)
+
+
+def with_effects(*terms: EffectTerm) -> Calibration:
+    return calibration(deviation=None).model_copy(update={"effects": terms})
+
+
+def seen(using: Calibration, tau: tuple[float, float], arm: Array | None = None) -> tuple[Array, int]:
+    """What a node with a calibration makes of SLAM poses: the largest errors of fused ones (3,), and how many it took.
+
+    tau: by how much earlier positions and headings were taken than their stamps say, s. arm (2,): where the LIDAR is.
+    """
+    path = drive(6.0, using=calibration())
+    start = np.array([2.0, -1.0, 0.7])
+    truth = moved_to(start, path.poses)
+    robot = RobotTracker("apr", using, fusion=FusionSettings(gate=0.999999))
+    errors = []
+    for index, payload in enumerate(path.payloads()):
+        updates = robot.take_wheels(payload, 0.01 * index)
+        if index % 25 == 0:
+            taken, heading = (min(max(index - round(each / PERIOD), 0), 600) for each in tau)
+            pose = np.append(truth[taken, :2], truth[heading, 2])
+            if arm is not None:
+                for sign, angle in ((1, pose[2]), (-1, start[2])):
+                    pose[:2] += sign * compose(np.array([0, 0, angle]), np.append(arm, 0.0))[:2]
+            robot.take_pose(slam(path.stamps[index], pose, 1e-2 * EXACT), 0.01 * index)
+        if updates and updates[0].in_map is not None and index > 300:
+            errors.append(updates[0].in_map[0] - truth[index])
+    return np.abs(errors).max(axis=0), robot.health(6.0).counts["poses"]
+
+
+ARM = np.array([0.05, -0.03])
+TAKEN_OFF = term("lidar_lever_arm", x=0.05, y=-0.03)
+
+
+@pytest.mark.parametrize(
+    ("terms", "tau", "arm", "poses"),
+    [
+        ((LATE,), (0.12, 0.12), None, 24),  # the first was taken before there were wheel samples
+        ((term("reference_time_offset", tau=-0.1),), (-0.1, -0.1), None, 24),  # the last one's time has not come
+        ((term("heading_latency", tau=0.08),), (0.0, 0.08), None, 24),
+        ((term("heading_latency", tau=-0.08),), (0.0, -0.08), None, 24),
+        ((TAKEN_OFF,), (0.0, 0.0), ARM, 25),
+        ((LATE, term("heading_latency", tau=-0.05), TAKEN_OFF), (0.12, 0.07), ARM, 24),
+    ],
+    ids=["late", "early", "late heading", "early heading", "lever arm", "all together"],
+)
+def test_poses_are_put_where_and_when_they_were_taken(
+    terms: tuple[EffectTerm, ...], tau: tuple[float, float], arm: Array | None, poses: int
+) -> None:
+    uncorrected, _ = seen(calibration(), tau, arm)
+    corrected, taken = seen(with_effects(*terms), tau, arm)
+    assert uncorrected.max() > 0.01
+    assert corrected.max() < 1e-6
+    assert taken == poses
+
+
+def test_odom_does_not_know_of_them() -> None:
+    path = drive(1.0)
+    updates = fed(RobotTracker("apr", with_effects(LATE), fusion=FusionSettings()), path.payloads())
+    np.testing.assert_allclose(odometry(updates), path.poses, atol=1e-9)
+
+
+def test_a_swap_brings_its_own() -> None:
+    robot = RobotTracker("apr", calibration(), fusion=FusionSettings())
+    path = drive(1.0)
+    fed(robot, path.payloads()[:51])
+    assert robot.take_pose(slam(path.stamps[50], path.poses[50]), 0.5) == "located"
+    robot.swap(with_effects(LATE))
+    assert robot.take_pose(slam(path.stamps[50], path.poses[38]), 0.5) == "fused"  # another time: no duplicate
+
+
+def test_the_floor_carries_the_robot_along_the_axes_of_the_map() -> None:
+    using = with_effects(term("floor_drift", dx=0.02, dy=0.0))
+    path = drive(2.0, using=using)
+    robot = RobotTracker("apr", using, fusion=FusionSettings())
+    payloads = path.payloads()
+    fed(robot, payloads[:1])
+    robot.take_pose(slam(ORIGIN, [0.0, 0.0, 1.2]), 0.0)
+    carried = odometry(fed(robot, payloads[1:]))[-1]
+    plain = odometry(fed(RobotTracker("apr", calibration()), payloads))[-1]
+    along = compose(np.array([0.0, 0.0, 1.2]), carried - plain)
+    assert along[0] > 0.005
+    assert abs(along[1]) < 1e-6

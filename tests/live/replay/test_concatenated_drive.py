@@ -1,34 +1,49 @@
-"""Chained recordings: composed poses, continuous wheel angles, the truth behind them."""
+"""Chained recordings: which can be replayed, composed poses, continuous wheel angles, the truth behind them."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from recordings import MODEL, PERIOD, ROBOT, homogeneous, random_dataset, random_run, simulated_recording
 from timing import processor_time
 
+from omnibench.config import to_yaml
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.errors import ConfigError, DataError
+from omnibench.data.storage import save_dataset
+from omnibench.errors import ConfigError, DataError, OmnibenchError
 from omnibench.live.replay.concatenated_drive import (
     ConcatenatedDrive,
     Recording,
     concatenate_recording,
     concatenate_runs,
     concatenated_truth,
+    load_recording,
     true_start_poses,
 )
+from omnibench.robot.calibration import EffectTerm
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
-from omnibench.simulate.config import EncoderNoise
+from omnibench.simulate.commands import Commands
+from omnibench.simulate.config import EncoderNoise, FlowerConfig, Session, Truth
+from omnibench.simulate.simulate import simulate_dataset
 
 seeds = st.integers(0, 2**32 - 1)
 pauses = st.sampled_from([0.0, 0.1, 1.0])
+HIDDEN = (
+    EffectTerm(name="floor_drift", parameters={"dx": 0.02, "dy": 0.01}),
+    EffectTerm(name="motor_lag", parameters={"tau": 0.1}),
+    EffectTerm(name="wheel_eccentricity", parameters={"a_b": 0.02, "b_c": 0.02}),
+    EffectTerm(name="thermal_radius_drift", parameters={"k": 1e-4}),
+)
 
 
 def composed_by_hand(runs: tuple[Trajectory, ...]) -> list[Array]:
@@ -82,13 +97,13 @@ class TestPoses:
         turned = np.concatenate([np.diff(run.poses[:, 2]) for run in dataset.trajectories])
         np.testing.assert_allclose(np.diff(drive.slam_poses[:, 2]), turned, atol=1e-9)
 
-    def test_covariances_turn_with_their_runs(self) -> None:
+    def test_covariances_turn_with_their_runs_and_are_none_where_one_run_has_none(self) -> None:
         rng = np.random.default_rng(1)
-        runs = [random_run(f"{n}", rng) for n in range(3)]
-        halves = [rng.normal(size=(len(run.poses), 3, 3)) for run in runs]
+        plain = [random_run(f"{n}", rng) for n in range(3)]
+        halves = [rng.normal(size=(len(run.poses), 3, 3)) for run in plain]
         runs = [
             replace(run, pose_covariances=half @ np.swapaxes(half, 1, 2))
-            for run, half in zip(runs, halves, strict=True)
+            for run, half in zip(plain, halves, strict=True)
         ]
         drive = concatenate_runs(make_dataset("covariances", ROBOT, PERIOD, runs))
         assert drive.slam_covariances is not None
@@ -97,11 +112,8 @@ class TestPoses:
         assert last.pose_covariances is not None
         expected = turn @ last.pose_covariances[1:] @ turn.T
         np.testing.assert_allclose(drive.slam_covariances[drive.slam_run == 2], expected, atol=1e-12)
-
-    def test_covariances_that_one_run_lacks_are_those_of_none(self) -> None:
-        first, second = random_dataset(1, 2).trajectories
-        first = replace(first, pose_covariances=np.tile(np.eye(3), (len(first.poses), 1, 1)))
-        assert concatenate_runs(make_dataset("mixed", ROBOT, PERIOD, [first, second])).slam_covariances is None
+        mixed = make_dataset("mixed", ROBOT, PERIOD, [*runs[:2], plain[2]])
+        assert concatenate_runs(mixed).slam_covariances is None
 
     @given(seeds)
     def test_start_poses_can_be_given(self, seed: int) -> None:
@@ -168,7 +180,7 @@ class TestWheels:
         np.testing.assert_allclose(homogeneous(poses[-1]), at, atol=1e-9)
         np.testing.assert_array_equal(poses[0], drive.start_poses[0])
 
-    def test_the_robot_rests_between_runs_at_the_sample_period(self) -> None:
+    def test_the_robot_rests_between_runs_at_the_sample_period_and_not_after_the_last(self) -> None:
         drive = concatenate_runs(random_dataset(5, 2), pause=0.5)
         between = (drive.wheel_times > 0.8 + 1e-9) & (drive.wheel_times <= drive.start_times[1] + 1e-9)
         assert np.count_nonzero(between) == 25
@@ -177,10 +189,7 @@ class TestWheels:
         assert (np.ptp(drive.angles[between], axis=0) == 0).all()
         assert (drive.run[between] == 0).all()
         np.testing.assert_allclose(np.diff(drive.wheel_times), PERIOD, atol=1e-9)
-
-    def test_the_drive_ends_with_its_last_run(self) -> None:
-        drive = concatenate_runs(random_dataset(6, 2))
-        assert drive.duration == pytest.approx(0.8 + 1.0 + 0.8)
+        assert drive.duration == pytest.approx(0.8 + 0.5 + 0.8)
         assert drive.rates[-1].any()
 
     @given(seeds, st.integers(1, 24).map(lambda eighths: eighths / 8) | st.just(1 + 1e-5))
@@ -244,18 +253,14 @@ class TestOrder:
 
 
 class TestTruth:
-    def test_without_noise_the_reference_is_the_truth(self) -> None:
-        recording = simulated_recording()
+    @pytest.mark.parametrize("hidden", [(), HIDDEN], ids=["plain", "with hidden effects"])
+    def test_without_noise_the_reference_is_the_truth(self, hidden: tuple[EffectTerm, ...]) -> None:
+        recording = simulated_recording(effects=hidden)
         drive = concatenate_runs(recording.dataset)
         truth = concatenated_truth(drive, recording)
         at = np.searchsorted(drive.wheel_times, drive.slam_times - 1e-6)
         np.testing.assert_allclose(drive.slam_poses, truth[at], atol=1e-9)
-
-    def test_without_noise_the_true_start_poses_are_those_of_the_reference(self) -> None:
-        recording = simulated_recording()
-        np.testing.assert_allclose(
-            true_start_poses(recording), concatenate_runs(recording.dataset).start_poses, atol=1e-9
-        )
+        np.testing.assert_allclose(true_start_poses(recording), drive.start_poses, atol=1e-9)
 
     def test_with_true_start_poses_the_truth_goes_on_without_a_jump(self) -> None:
         recording = simulated_recording(EncoderNoise(bias_position=0.1, bias_heading=0.1, encoder=0.1))
@@ -305,33 +310,30 @@ class TestTruth:
 
     def test_a_recording_whose_truth_is_not_known_says_so(self) -> None:
         recording = Recording(random_dataset(1))
-        with pytest.raises(DataError, match="data set random: it has no truth; name a comparison's config"):
+        with pytest.raises(DataError, match="data set random: it has no truth"):
             true_start_poses(recording)
         with pytest.raises(DataError, match="it has no truth"):
             concatenated_truth(concatenate_recording(recording), recording)
 
 
-class TestMistakes:
-    def test_a_split_without_runs_is_named(self) -> None:
-        with pytest.raises(DataError, match="data set random: no run in split 'validation'"):
-            concatenate_runs(random_dataset(1), split="validation")
+def lonely() -> Dataset:
+    """A data set of a run with a single pose."""
+    run = random_run("lonely", np.random.default_rng(1))
+    return Dataset("one pose", ROBOT, PERIOD, (replace(run, pose_times=run.pose_times[:1], poses=run.poses[:1]),))
 
-    def test_a_run_with_a_single_pose_is_named(self) -> None:
-        run = random_run("lonely", np.random.default_rng(1))
-        lonely = replace(run, pose_times=run.pose_times[:1], poses=run.poses[:1])
-        dataset = Dataset("one pose", ROBOT, PERIOD, (lonely,))
-        with pytest.raises(DataError, match="data set one pose: run lonely has a single reference pose"):
-            concatenate_runs(dataset)
 
-    @pytest.mark.parametrize("start_poses", [np.zeros((2, 3)), np.zeros(3), np.full((3, 3), np.nan)])
-    def test_start_poses_of_another_shape_are_refused(self, start_poses: Array) -> None:
-        with pytest.raises(DataError, match=r"start poses have shape .*, expected \(3, 3\), finite"):
-            concatenate_runs(random_dataset(1), start_poses=start_poses)
-
-    @pytest.mark.parametrize("pause", [-1.0, np.nan, np.inf, 1e9])
-    def test_a_pause_that_cannot_be_is_refused(self, pause: float) -> None:
-        with pytest.raises(ConfigError, match=r"pause: .* s between runs; expected 0 to 3600 s"):
-            concatenate_runs(random_dataset(1), pause=pause)
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({"split": "validation"}, "'validation'"),
+        ({"dataset": lonely()}, "data set one pose: run lonely"),
+        *(({"start_poses": poses}, r"\(3, 3\)") for poses in (np.zeros((2, 3)), np.zeros(3), np.full((3, 3), np.nan))),
+        *(({"pause": pause}, "pause") for pause in (-1.0, np.nan, np.inf, 1e9)),
+    ],
+)
+def test_what_cannot_be_chained_is_named(options: dict[str, Any], named: str) -> None:
+    with pytest.raises((DataError, ConfigError), match=named):
+        concatenate_runs(options.pop("dataset", random_dataset(1)), **options)
 
 
 @pytest.fixture(scope="module")
@@ -355,3 +357,89 @@ class TestRealRecordings:
         known = {run.id: run for run in omni3.trajectories}
         by_hand = composed_by_hand(tuple(known[each] for each in drive.ids))
         np.testing.assert_allclose(homogeneous(drive.slam_poses[-1]), by_hand[-1][-1], atol=1e-8)
+
+
+FLOWER = FlowerConfig(
+    robot=ROBOT,
+    commands=Commands(directions_deg=(0, 90), turn_rates=(0.1,)),
+    repetitions=1,
+    truth=Truth(published="palacin2023_eq8"),
+    train=Session(seed=1, distance=0.1),
+)
+
+
+def config_with(tmp_path: Path, **datasets: object) -> Path:
+    """A comparison's config_with with these data sets."""
+    path = tmp_path / "compare.yaml"
+    path.write_text(to_yaml({"name": "mine", "description": "Two runs.", "datasets": datasets, "calibrators": ["crs"]}))
+    return path
+
+
+def simulated(**changes: object) -> dict[str, object]:
+    return {"simulate": FLOWER.model_dump(mode="json", exclude_none=True) | changes}
+
+
+def test_a_folder_is_a_recording_without_a_truth(tmp_path: Path) -> None:
+    dataset = random_dataset(1)
+    save_dataset(dataset, tmp_path / "random")
+    recording = load_recording(tmp_path / "random")
+    assert recording.dataset.hash == dataset.hash
+    assert recording.truth is None
+
+
+def test_a_simulated_data_set_of_a_config_comes_with_its_truth(tmp_path: Path) -> None:
+    recording = load_recording(config_with(tmp_path, flower=simulated()))
+    expected = simulate_dataset(FLOWER, "flower", "Two runs.")
+    assert recording.dataset.hash == expected.dataset.hash
+    assert (recording.dataset.name, recording.dataset.description) == ("flower", "Two runs.")
+    assert recording.truth == expected.truth
+
+
+def test_one_of_several_can_be_chosen(tmp_path: Path) -> None:
+    path = config_with(
+        tmp_path, short=simulated(), long=simulated(train={"seed": 1, "distance": 0.2}), other={"path": "x"}
+    )
+    longest = [load_recording(path, name).dataset.trajectories[0].times[-1] for name in ("short", "long")]
+    np.testing.assert_allclose(longest, [0.5, 1.0])
+
+
+@pytest.mark.slow
+def test_the_demonstrations_config_is_one() -> None:
+    recording = load_recording(Path(__file__).resolve().parents[3] / "configs" / "apr02.yaml")
+    assert len(recording.dataset.trajectories) == 360
+    assert recording.truth is not None
+
+
+@pytest.mark.parametrize(
+    ("datasets", "chosen", "named"),
+    [
+        ({"one": simulated(), "two": simulated()}, None, "--dataset: one, two"),
+        ({"flower": simulated(), "table": simulated()}, "flowr", "'flowr'; did you mean 'flower'"),
+        ({"flower": simulated(pose_perod=0.1)}, None, r"'datasets\.flower\.simulate\.pose_perod'.*'pose_period'"),
+        ({"flower": {"simulat": {}}}, None, r"'datasets\.flower\.simulat'.*'simulate'"),
+        ({"real": {"path": "recordings"}, "flower": simulated()}, "real", "'real' is not simulated"),
+        ({"real": {"path": "recordings"}}, None, "no simulated data set"),
+    ],
+)
+def test_a_data_set_that_a_config_does_not_simulate_is_named(
+    tmp_path: Path, datasets: dict[str, Any], chosen: str | None, named: str
+) -> None:
+    with pytest.raises(OmnibenchError, match=named):
+        load_recording(config_with(tmp_path, **datasets), chosen)
+
+
+@pytest.mark.parametrize(
+    ("content", "named"),
+    [
+        (None, "other.yaml: no such file or folder"),
+        *((content, "no data sets in it") for content in ("", "12", "[1, 2]", yaml.dump({"wheels": 3}))),
+        ("datasets: [", "other.yaml: not valid YAML"),
+    ],
+)
+def test_another_file_is_refused(tmp_path: Path, content: str | None, named: str) -> None:
+    if content is not None:
+        (tmp_path / "other.yaml").write_text(content)
+    with pytest.raises(OmnibenchError, match=named):
+        load_recording(tmp_path / "other.yaml")
+    with pytest.raises(OmnibenchError, match="--dataset"):
+        load_recording(tmp_path, "flower")  # a folder has no data sets to choose from

@@ -1,18 +1,26 @@
-"""Wheel messages as real senders send them: late, twice, missing, wrapped, restarted, by a clock that jumps."""
+"""Wheel messages and steering angles of real senders: late, twice, missing, wrapped, by a clock that jumps."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from drives import ORIGIN, PERIOD, SECOND, Drive, drive
 from hypothesis import given
 from hypothesis import strategies as st
+from steered import CAR, SWERVE, TRICYCLE, calibration, only
+from steered import drive as steered_drive
 
+from omnibench.errors import ConfigError
 from omnibench.live.estimation.counts import Counts
-from omnibench.live.wheels.wheel_input import WheelInput, WheelSettings, WheelStep
+from omnibench.live.estimation.robot_state import new_state
+from omnibench.live.wheels.wheel_input import WheelAngles, WheelInput, WheelSettings, WheelStep, joints_of
 from omnibench.live.wire.messages import JointState
+from omnibench.robot.kinematics import Robot
+from omnibench.testing import synthetic_robot
 
 NAMES = ("a", "b", "c")
 
@@ -51,12 +59,6 @@ def whole(path: Drive) -> np.ndarray:
     return path.angles[-1] - path.angles[0]
 
 
-def test_the_first_message_says_where_counting_begins() -> None:
-    (step,) = Receiver().take(at(0, 5.0, 6.0, 7.0))
-    assert step.angles.tolist() == [0, 0, 0]
-    assert step.duration == 0
-
-
 @given(st.data())
 def test_angles_hold_the_whole_motion_whatever_is_lost_or_comes_twice_or_in_another_order(data: st.DataObject) -> None:
     path = drive(0.5)
@@ -74,10 +76,11 @@ def test_angles_hold_the_whole_motion_whatever_is_lost_or_comes_twice_or_in_anot
     assert stamps == sorted(set(stamps))
 
 
-def test_a_sample_that_never_came_is_counted_by_the_stamps_of_the_others() -> None:
+def test_a_sample_that_never_came_is_counted_by_the_stamps_of_the_others_which_are_not_irregular() -> None:
     receiver = Receiver()
-    receiver.take(*[at(PERIOD * k, k, k, k) for k in range(50) if k not in (20, 31, 32)])
-    assert receiver.counts.missing == 3
+    first, *_ = receiver.take(*[at(PERIOD * k, 5.0 + k, k, k) for k in range(50) if k not in (20, 31, 32)])
+    assert (first.angles.tolist(), first.duration) == ([0, 0, 0], 0)  # counting begins there
+    assert (receiver.counts.missing, receiver.counts.irregular) == (3, 0)
 
 
 def test_a_duplicate_and_a_late_sample_make_no_step() -> None:
@@ -88,13 +91,16 @@ def test_a_duplicate_and_a_late_sample_make_no_step() -> None:
     assert (receiver.counts.duplicates, receiver.counts.late) == (1, 1)
 
 
-@pytest.mark.parametrize("low", [-math.pi, 0.0])
-def test_angles_within_one_turn_are_unwrapped_without_being_told(low: float) -> None:
-    path = drive(8.0)
-    receiver = Receiver()
+@pytest.mark.parametrize(
+    ("low", "length", "settings"), [(-math.pi, 2 * math.pi, {}), (0.0, 2 * math.pi, {}), (0.0, 1.7, {"wrap": 1.7})]
+)
+def test_angles_within_one_turn_or_a_length_that_is_told_are_unwrapped(
+    low: float, length: float, settings: dict[str, float]
+) -> None:
+    path, receiver = drive(8.0), Receiver(**settings)
     for sample in path.samples():
         assert sample.positions is not None
-        receiver.take(JointState(sample.stamp, NAMES, (sample.positions - low) % (2 * math.pi) + low, None))
+        receiver.take(JointState(sample.stamp, NAMES, (sample.positions - low) % length + low, None))
     np.testing.assert_allclose(receiver.driven, whole(path), atol=1e-9)
     assert receiver.counts.wraps > 0
     assert receiver.counts.counter_restarts == 0
@@ -112,15 +118,6 @@ def test_messages_that_arrive_at_once_add_no_turns_and_are_not_missing(every: in
     assert receiver.counts.missing == receiver.counts.counter_restarts == 0
 
 
-def test_a_counter_of_any_length_is_unwrapped_when_the_length_is_told() -> None:
-    path, length = drive(3.0), 1.7
-    receiver = Receiver(wrap=length)
-    for sample in path.samples():
-        assert sample.positions is not None
-        receiver.take(JointState(sample.stamp, NAMES, sample.positions % length, None))
-    np.testing.assert_allclose(receiver.driven, whole(path), atol=1e-9)
-
-
 def test_a_counter_that_starts_again_costs_one_sample_at_the_rate_before() -> None:
     receiver = Receiver()
     receiver.take(*[at(PERIOD * k, 500 + 0.02 * k, 0.02 * k, 0.02 * k) for k in range(10)])
@@ -133,26 +130,37 @@ def test_a_counter_that_starts_again_costs_one_sample_at_the_rate_before() -> No
     assert after.blind == 0
 
 
-def test_a_restarted_counter_is_bridged_by_the_rate_that_the_message_tells() -> None:
+def both(time: float, angle: float, rate: float) -> JointState:
+    """A message with the same angle and rate of all wheels."""
+    return JointState(ORIGIN + round(time * SECOND), NAMES, np.full(3, angle), np.full(3, rate))
+
+
+@pytest.mark.parametrize(
+    ("messages", "driven"),
+    [
+        ([(0, 9, True), (0.01, 1, True), (0.04, 1, True)], 0.04),
+        ([*((PERIOD * k, 2.0, True) for k in range(10)), *((PERIOD * k, 77 + 0.02 * k) for k in range(10, 20))], 0.38),
+        (
+            [
+                *((PERIOD * k, 0.02 * k) for k in range(10)),
+                (0.1, 2.0, True),
+                *((PERIOD * k, 0.02 * k) for k in range(11, 20)),
+            ],
+            0.38,
+        ),
+        ([(0, 1, True), (0.01, 1, True), both(0.02, 99.0, 1.0)], 0.02),
+        ([(0, 500.0), (0.01, 500.0), (0.02, 500.0), both(0.03, 0.0, 2.0)], 0.02),
+    ],
+    ids=["rates over the time", "rates and then angles", "rates between angles", "rates first", "a restarted counter"],
+)
+def test_angles_and_rates_of_one_sender_make_one_motion(messages: list[Any], driven: float) -> None:
     receiver = Receiver()
-    receiver.take(*[at(PERIOD * k, 500.0, 500.0, 500.0) for k in range(3)])
-    message = JointState(ORIGIN + round(0.03 * SECOND), NAMES, np.zeros(3), np.array([1.0, 2.0, 3.0]))
-    (step,) = receiver.take(message)
-    np.testing.assert_allclose(step.angles, [0.01, 0.02, 0.03])
-
-
-def test_rates_are_taken_over_the_time_since_the_sample_before() -> None:
-    receiver = Receiver()
-    receiver.take(at(0, 9, 9, 9, rates=True), at(0.01, 1, 2, 3, rates=True), at(0.04, 1, 2, 3, rates=True))
-    np.testing.assert_allclose(receiver.driven, [0.04, 0.08, 0.12])
-
-
-def test_a_sender_that_begins_with_rates_is_read_by_rates() -> None:
-    receiver = Receiver()
-    receiver.take(at(0, 1, 1, 1, rates=True), at(0.01, 1, 1, 1, rates=True))
-    both = JointState(ORIGIN + round(0.02 * SECOND), NAMES, np.array([99.0, 99.0, 99.0]), np.ones(3))
-    receiver.take(both)
-    np.testing.assert_allclose(receiver.driven, [0.02, 0.02, 0.02])
+    for message in messages:
+        receiver.take(
+            message if isinstance(message, JointState) else at(message[0], *[message[1]] * 3, rates=len(message) > 2)
+        )
+    np.testing.assert_allclose(receiver.driven, driven, atol=1e-9)
+    assert receiver.counts.wrong_joints == 0
 
 
 @pytest.mark.parametrize("jump", [-3600.0, -5.0, 5.0, 86400.0])
@@ -229,22 +237,6 @@ def test_lost_samples_do_not_lose_turns_at_a_steady_rate(rate: float, lost: floa
     np.testing.assert_allclose(receiver.driven, rate * times[-1], atol=1e-6)
 
 
-def test_a_message_without_angles_among_others_costs_nothing() -> None:
-    receiver = Receiver()
-    receiver.take(*[at(PERIOD * k, 0.02 * k, 0, 0) for k in range(10)])
-    receiver.take(at(0.10, 2.0, 0, 0, rates=True))
-    receiver.take(*[at(PERIOD * k, 0.02 * k, 0, 0) for k in range(11, 20)])
-    np.testing.assert_allclose(receiver.driven, [0.38, 0, 0], atol=1e-9)
-    assert receiver.counts.wrong_joints == 0
-
-
-def test_a_sender_of_rates_that_turns_to_angles_is_followed() -> None:
-    receiver = Receiver()
-    receiver.take(*[at(PERIOD * k, 2.0, 0, 0, rates=True) for k in range(10)])
-    receiver.take(*[at(PERIOD * k, 77 + 0.02 * k, 0, 0) for k in range(10, 20)])
-    np.testing.assert_allclose(receiver.driven, [0.38, 0, 0], atol=1e-9)
-
-
 @pytest.mark.parametrize("use", ["positions", "auto"])
 def test_a_state_without_angles_is_no_obstacle_to_a_sender_of_angles(use: str) -> None:
     receiver = Receiver(use=use)
@@ -283,17 +275,13 @@ def test_samples_lost_after_a_late_one_are_missing_and_no_way_is_lost_with_them(
     assert blind == pytest.approx([0.19])
 
 
-def test_samples_farther_apart_than_a_gap_are_taken_one_by_one() -> None:
-    receiver = Receiver(max_gap=1.0)
-    made = receiver.take(*[at(1.2 * k, 100 + 0.5 * k, 100, 100) for k in range(30)])
-    assert len(made) == 30
-
-
-def test_the_period_is_learnt_from_the_sender() -> None:
-    receiver = Receiver()  # told of 100 Hz
-    receiver.take(*[at(0.1 * k, 0.1 * k, 0, 0) for k in range(50)])
+@pytest.mark.parametrize(("period", "learnt"), [(0.1, 0.1), (1.2, PERIOD)])  # shorter and longer than a gap
+def test_the_period_is_learnt_from_the_sender(period: float, learnt: float) -> None:
+    receiver = Receiver(max_gap=1.0)  # told of 100 Hz
+    made = receiver.take(*[at(period * k, 100 + 0.1 * k, 100, 100) for k in range(50)])
+    assert len(made) == 50
     assert receiver.counts.missing == 0
-    assert receiver.input.period == pytest.approx(0.1)
+    assert receiver.input.period == pytest.approx(learnt)
 
 
 def test_a_replay_at_ten_times_the_speed_may_have_gaps() -> None:
@@ -330,18 +318,14 @@ def test_a_rate_beyond_the_limit_is_refused_with_both_told() -> None:
     assert "max_rate 20" in receiver.input.last_refusal
 
 
-def test_joints_are_found_by_name_in_any_order_and_among_others() -> None:
+def test_joints_are_found_by_name_in_any_order_and_among_others_and_a_missing_one_is_named() -> None:
     receiver = Receiver(joints=["left", "back", "right"])
     names = ("arm", "right", "left", "back")
     for time, values in ((0.0, [9.0, 0.0, 0.0, 0.0]), (0.01, [8.0, 3.0, 1.0, 2.0])):
         receiver.take(JointState(ORIGIN + round(time * SECOND), names, np.array(values) * 0.1, None))
     np.testing.assert_allclose(receiver.driven, [0.1, 0.2, 0.3])
-
-
-def test_a_missing_joint_is_named_with_those_that_are_there() -> None:
-    receiver = Receiver(joints=["a", "b", "z"])
-    assert receiver.take(at(0, 0, 0, 0)) == []
-    assert receiver.input.last_refusal == "no joint 'z' among a, b, c; set wheels.joints"
+    assert receiver.take(at(0.02, 0, 0, 0)) == []
+    assert receiver.input.last_refusal == "no joint 'left' among a, b, c; set wheels.joints"
 
 
 def test_irregular_periods_are_taken_as_they_are_stamped() -> None:
@@ -391,7 +375,204 @@ def test_numbered_samples_that_are_lost_from_a_burst_are_missing_and_no_clock_ha
     assert receiver.driven[0] == pytest.approx(1.99)
 
 
-def test_even_periods_are_not_irregular_whatever_is_missing() -> None:
-    receiver = Receiver()
-    receiver.take(*[at(PERIOD * k, k, k, k) for k in range(50) if k not in (20, 31, 32)])
-    assert receiver.counts.irregular == 0
+@pytest.mark.parametrize(("turned", "believed"), [(2.0, True), (4.0, False)])
+def test_a_slow_robot_may_have_turned_its_wheels_by_half_a_turn_in_a_silence(turned: float, believed: bool) -> None:
+    """At 0.1 rad/s so far, 1 s may hold 1.5 x 0.1 rad and half a turn to get going; more is a counter set anew."""
+    counts = Counts()
+    angles = WheelAngles(2, None, 50.0, counts)
+    angles.begin(np.array([20.0, 30.0]))
+    angles.turned(np.array([20.05, 30.05]), np.full(2, 0.1), 0.5)
+    unseen, whole = angles.turned_unseen(np.array([20.05, 30.05]) + turned, 1.0)
+    assert unseen == pytest.approx([turned * believed] * 2)
+    assert (whole, counts.counter_restarts) == (believed, int(not believed))
+
+
+class SteeringReceiver:
+    """The wheel input of a robot, fed with messages as soon as they are stamped."""
+
+    def __init__(self, robot: Robot = TRICYCLE, **settings: object) -> None:
+        state = new_state("robot", calibration(robot), WheelSettings.model_validate(settings), None)
+        self.counts, self.input = state.counts, state.wheel_input
+
+    def take(self, *messages: JointState) -> list[WheelStep]:
+        return [step for each in messages for step in self.input.take(each, (each.stamp - ORIGIN) / SECOND)]
+
+
+def at_joints(time: float, **joints: float) -> JointState:
+    """A message ``time`` s after the origin with positions of joints, rad."""
+    return JointState(ORIGIN + round(time * SECOND), tuple(joints), np.array(list(joints.values())))
+
+
+def steering(steps: list[WheelStep]) -> list[float]:
+    """Of each step the first steering angle at_joints its end."""
+    return [float(step.steering[0]) for step in steps if step.steering is not None]
+
+
+@pytest.mark.parametrize(
+    ("first", "reason"),
+    [
+        (at_joints(0.0, front=1.0), "no joint 'front_steering' among front; set wheels.steering_joints"),
+        (at_joints(0.0, front=1.0, front_steering=math.nan), "joint 'front_steering' tells no position"),
+        (JointState(ORIGIN, ("front", "front_steering"), None, np.ones(2)), "'front_steering' tells no position"),
+    ],
+)
+def test_samples_before_the_first_steering_angle_are_refused_with_the_reason(first: JointState, reason: str) -> None:
+    receiver = SteeringReceiver()
+    assert receiver.take(first) == []
+    assert receiver.counts.no_steering == 1
+    assert receiver.input.last_refusal.startswith("no steering angle yet: ")
+    assert receiver.input.last_refusal.endswith(reason)
+    assert len(receiver.take(at_joints(0.01, front=1.0, front_steering=0.1))) == 1
+
+
+def test_a_sample_steers_as_the_newest_angle_says_which_may_come_in_messages_of_its_own() -> None:
+    receiver = SteeringReceiver()
+    assert receiver.take(at_joints(0.0, front_steering=0.3)) == []
+    steps = receiver.take(
+        at_joints(0.005, front=0.0),
+        at_joints(0.015, front=0.1),
+        at_joints(0.02, front_steering=0.4),
+        at_joints(0.025, front=0.2),
+    )
+    assert steering(steps) == [0.3, 0.3, 0.4]
+    assert receiver.counts.anomalies() == {}
+    steps = receiver.take(at_joints(0.03, front=0.3, front_steering=0.1), at_joints(0.06, front_steering=0.5))
+    receiver.take(at_joints(0.05, front_steering=0.2))  # older than the one that is known
+    assert steering([*steps, *receiver.take(at_joints(0.07, front=0.4))]) == [0.1, 0.5]
+
+
+@given(st.lists(st.sets(st.sampled_from(["fl", "fr", "rl", "rr"])), min_size=20, max_size=20))
+def test_angles_are_those_of_whole_messages_however_the_joints_are_spread_over_several(apart: list[set[str]]) -> None:
+    whole, spread = SteeringReceiver(SWERVE), SteeringReceiver(SWERVE)
+    for sample, wheels in zip(steered_drive(0.19).samples(), apart, strict=True):
+        own = tuple(f"{wheel}_steering" for wheel in wheels)
+        beside = [name for name in sample.names if name not in own]
+        (expected,) = whole.take(sample)
+        (step,) = spread.take(*(only(sample, name) for name in own), only(sample, *beside))
+        assert step.steering is not None
+        np.testing.assert_array_equal(step.steering, expected.steering)
+        np.testing.assert_array_equal(step.angles, expected.angles)
+
+
+@pytest.mark.parametrize("jump", [-3600.0, 3600.0])
+def test_steering_is_followed_over_a_jump_of_the_clock(jump: float) -> None:
+    receiver = SteeringReceiver()
+    receiver.take(at_joints(0.0, front=0.0, front_steering=0.1))
+    steps = [
+        step
+        for k in range(1, 6)
+        for step in receiver.input.take(
+            at_joints(PERIOD * k + jump, front=0.02 * k, front_steering=0.1 + 0.01 * k), PERIOD * k
+        )
+    ]
+    np.testing.assert_allclose(steering(steps), [0.11, 0.12, 0.13, 0.14, 0.15])
+    assert receiver.counts.old_steering == 0
+
+
+def test_an_angle_that_misses_for_long_is_held_and_said_and_makes_the_path_unknown() -> None:
+    receiver = SteeringReceiver(max_steering_age=0.2)
+    receiver.take(at_joints(0.0, front=0.0, front_steering=0.1))
+    steps = receiver.take(*(at_joints(PERIOD * k, front=0.02 * k) for k in range(1, 31)))
+    assert steering(steps) == [0.1] * 30
+    assert [bool(step.blind) for step in steps] == [False] * 20 + [True] * 10
+    assert receiver.counts.old_steering == 10
+    assert receiver.input.old_steering == pytest.approx(0.3)
+    (again,) = receiver.take(at_joints(0.31, front=0.62, front_steering=0.5))
+    assert (again.blind, receiver.input.old_steering) == (0.0, 0.0)
+    several = SteeringReceiver(SWERVE)
+    first, *others = steered_drive(0.5).samples()
+    several.take(first, *(only(each, "fl", "fr", "rl", "rr", "fl_steering", "rr_steering") for each in others))
+    assert several.counts.old_steering == 30
+
+
+@pytest.mark.parametrize(("behind", "old"), [(1, 0), (10, 0), (30, 30)])
+def test_steering_that_arrives_behind_its_wheel_samples_counts_for_the_next_and_is_said_when_too_old(
+    behind: int, old: int
+) -> None:
+    """Messages of the steering that wait in a loaded network; every angle tells the number of its sample."""
+    receiver = SteeringReceiver(max_steering_age=0.2)
+    receiver.take(at_joints(0.0, front=0.0, front_steering=0.0))
+    steps = []
+    for k in range(1, 51):
+        now = PERIOD * k
+        steps += receiver.input.take(at_joints(now, front=0.02 * k), now)
+        if k >= behind:
+            receiver.input.take(at_joints(PERIOD * (k - behind), front_steering=1e-3 * (k - behind)), now)
+    np.testing.assert_allclose(steering(steps), [1e-3 * max(0, k - 1 - behind) for k in range(1, 51)], atol=1e-12)
+    assert sum(bool(step.blind) for step in steps) == receiver.counts.old_steering == old
+    assert receiver.counts.late == 0
+
+
+def test_an_angle_that_wraps_at_a_turn_goes_on_the_shorter_way() -> None:
+    angles = np.linspace(2.0, 9.0, 100)
+    receiver = SteeringReceiver()
+    wrapped = (angles + math.pi) % (2 * math.pi) - math.pi
+    steps = receiver.take(*(at_joints(PERIOD * k, front=0.0, front_steering=angle) for k, angle in enumerate(wrapped)))
+    np.testing.assert_allclose(steering(steps), angles, atol=1e-12)
+
+
+@pytest.mark.parametrize("angle", [30.0, -1.6])
+def test_a_car_that_steers_in_degrees_is_told(angle: float) -> None:
+    receiver, rear = SteeringReceiver(CAR), {"rear_left": 0.0, "rear_right": 0.0}
+    assert receiver.take(at_joints(0.0, **rear, front_left_steering=angle, front_right_steering=0.1)) == []
+    assert f"'front_left_steering' says {angle:g} rad" in receiver.input.last_refusal
+    assert "degrees" in receiver.input.last_refusal
+    steps = receiver.take(at_joints(0.01, **rear, front_left_steering=0.1, front_right_steering=0.1))
+    steps += receiver.take(at_joints(0.02, **rear, front_left_steering=angle, front_right_steering=0.2))
+    assert [step.steering.tolist() for step in steps if step.steering is not None] == [[0.1, 0.1], [0.1, 0.2]]
+    assert receiver.counts.bad_steering == 2
+
+
+def test_an_angle_that_no_wheel_reaches_one_wheel_without_an_angle_and_other_joints_are_refused() -> None:
+    receiver, swerve, sample = SteeringReceiver(), SteeringReceiver(SWERVE), steered_drive(0.1).samples()[0]
+    assert receiver.take(at_joints(0.0, front=0.0, front_steering=-1e308)) == []
+    receiver.take(at_joints(0.01, front=0.0, front_steering=0.1), at_joints(0.02, front=0.0, front_steering=1e308))
+    assert receiver.counts.bad_steering == 2
+    assert receiver.take(at_joints(0.03, shoulder=1.0, elbow=2.0)) == []
+    assert "'front' among shoulder, elbow" in receiver.input.last_refusal
+    assert sample.positions is not None
+    assert swerve.take(replace(sample, positions=np.where(np.arange(8) == 1, np.nan, sample.positions))) == []
+    assert swerve.counts.not_finite == 1
+
+
+def test_what_ros2_control_does_not_tell_is_nan_and_is_not_taken_for_a_reading() -> None:
+    """Wheels with a velocity interface alone, steering joints with a position alone, in one message."""
+    receiver, path = SteeringReceiver(SWERVE), steered_drive(0.3)
+    for sample in path.samples():
+        assert sample.positions is not None
+        positions = np.where([name.endswith("_steering") for name in sample.names], sample.positions, np.nan)
+        (step,) = receiver.take(replace(sample, positions=positions))
+        assert step.positions is None
+    assert receiver.counts.anomalies() == {}
+    assert step.steering is not None
+    np.testing.assert_allclose(step.angles, path.angles[-1] - path.angles[-2], atol=1e-12)
+
+
+def test_joints_are_called_like_the_wheels_unless_they_are_named() -> None:
+    assert joints_of(TRICYCLE).names == ("front", "front_steering")
+    assert joints_of(CAR).names == (
+        *("rear_left", "rear_right"),
+        *("front_left_steering", "front_right_steering"),
+    )
+    named = WheelSettings(joints=("traction",), steering_joints=("fork",))
+    assert joints_of(TRICYCLE, named).names == ("traction", "fork")
+    steps = SteeringReceiver(TRICYCLE, joints=["traction"], steering_joints=["fork"]).take(
+        at_joints(0.0, traction=0.0, fork=0.2)
+    )
+    assert steering(steps) == [0.2]
+
+
+@pytest.mark.parametrize(
+    ("robot", "joints", "named"),
+    [
+        (SWERVE, ("a", "b"), "a, b"),
+        (TRICYCLE, ("front",), "front"),
+        (TRICYCLE, (), "none"),
+        (synthetic_robot(), ("a",), "no wheel steers"),
+    ],
+)
+def test_steering_joints_that_are_not_one_for_each_wheel_are_refused(
+    robot: Robot, joints: tuple[str, ...], named: str
+) -> None:
+    with pytest.raises(ConfigError, match=rf"wheels\.steering_joints: .*{named}"):
+        joints_of(robot, WheelSettings(steering_joints=joints))

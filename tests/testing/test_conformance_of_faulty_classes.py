@@ -1,31 +1,54 @@
-"""The cases of calibrators pass what keeps the contract and fail, case by case, what does not."""
+"""The cases of calibrators, costs and importers pass what keeps the contract and fail, case by case, what does not."""
 
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-from conformance_suites import failures, suite
+from pydantic import Field
 
-from omnibench.data.dataset import make_dataset
-from omnibench.errors import ConfigError, NotApplicableError, PluginError
+from omnibench.data.dataset import Dataset, Trajectory, make_dataset
+from omnibench.data.importer import Importer
+from omnibench.data.storage import load_dataset, save_dataset
+from omnibench.errors import ConfigError, DataError, NotApplicableError, PluginError
 from omnibench.fit.calibrator import Calibrator, Solution
+from omnibench.fit.cost import Cost, SumOfNorms
 from omnibench.fit.problem import BudgetSpent, CalibrationProblem
 from omnibench.registry import Options
 from omnibench.robot.kinematics import Array, Robot, RobotClass, class_of
 from omnibench.testing import (
     CalibratorConformance,
+    CaseOutcome,
+    Conformance,
+    CostConformance,
+    ImporterConformance,
     Nonconformance,
-    load_plugin,
     run_cases,
     synthetic_problem,
     synthetic_robot,
     synthetic_trajectories,
 )
-from omnibench.testing.synthetic import PERIOD, synthetic_robots, synthetic_wheeled_robots, true_robot
+from omnibench.testing.synthetic import (
+    PERIOD,
+    synthetic_dataset,
+    synthetic_robots,
+    synthetic_wheeled_robots,
+    true_robot,
+)
+
+
+def suite(base: type[Conformance], cls: type, **attributes: Any) -> Conformance:
+    """The cases of ``base`` on instances of ``cls``, which need not be registered for that."""
+    return type("Suite", (base,), {"name": cls.__name__, "make": lambda _: cls(cls.Options()), **attributes})()
+
+
+def failures(base: type[Conformance], cls: type, **attributes: Any) -> dict[str, str]:
+    """The cases that instances of ``cls`` fail, and what is said of each."""
+    return {result.case: result.message for result in run_cases(suite(base, cls, **attributes)) if not result.passed}
 
 
 class Honest(Calibrator):
@@ -292,12 +315,9 @@ def test_a_calibrator_fails_the_case_it_breaks(cls: type[Calibrator], case: str,
 
 
 def test_a_claim_of_convergence_is_measured_by_the_share_that_the_author_sets() -> None:
-    case = "synthetic problem is solved or honestly reported"
-    assert case not in failures(CalibratorConformance, ClaimsTooMuch)
-    assert (
-        "at 1 of the start's cost, where 0.001 was expected"
-        in (failures(CalibratorConformance, ClaimsTooMuch, solved=1e-3)[case])
-    )
+    suite(CalibratorConformance, ClaimsTooMuch).test_synthetic_problem_is_solved_or_honestly_reported()
+    with pytest.raises(Nonconformance, match=r"at 1 of the start's cost, where 0\.001 was expected"):
+        suite(CalibratorConformance, ClaimsTooMuch, solved=1e-3).test_synthetic_problem_is_solved_or_honestly_reported()
 
 
 def test_an_answer_that_does_not_depend_on_the_box_need_not_keep_it() -> None:
@@ -310,6 +330,7 @@ def test_an_answer_that_does_not_depend_on_the_box_need_not_keep_it() -> None:
     assert failures(CalibratorConformance, Published) == {}
 
 
+@pytest.mark.slow
 def test_the_calibrators_own_parameterisation_is_used() -> None:
     class Geometric(Honest):
         """Searches the wheels."""
@@ -339,6 +360,19 @@ def test_the_synthetic_problem_can_be_solved_to_zero_within_its_box(parameterisa
     assert (problem.free.sum() < problem.size) == (fixed and (parameterisation, wheels) != ("matrix", 4))
 
 
+@pytest.mark.parametrize("robot", synthetic_wheeled_robots(), ids=lambda robot: robot.name)
+def test_the_problem_on_fixed_and_steered_wheels_can_be_solved_to_zero_within_its_box(robot: Robot) -> None:
+    problem = synthetic_problem(robot=robot)
+    vector = true_robot(robot).inverse_kinematic_matrix.ravel()
+    assert problem.inside(vector[None]).all()
+    assert problem.values(vector[None])[0] < 1e-12
+    assert problem.values(problem.start[None])[0] > 0.02
+    assert make_dataset("synthetic", robot, PERIOD, problem.trajectories).warnings == ()
+
+
+OTHER_CLASSES = ("mecanum", "differential", "skid", "car", "swerve")
+
+
 def only_for(kind: RobotClass) -> type[Honest]:
     class OnlyForOne(Honest):
         """Searches, for one class of robots."""
@@ -351,7 +385,7 @@ def only_for(kind: RobotClass) -> type[Honest]:
     return OnlyForOne
 
 
-@pytest.mark.parametrize("kind", ["mecanum", "differential", "skid", "tricycle", "car", "swerve"])
+@pytest.mark.parametrize("kind", ["tricycle", *(pytest.param(kind, marks=pytest.mark.slow) for kind in OTHER_CLASSES)])
 def test_a_calibrator_for_one_class_of_robots_is_tested_on_it(kind: RobotClass) -> None:
     tested = suite(CalibratorConformance, only_for(kind))
     assert class_of(tested.problem().robot) == kind
@@ -362,12 +396,7 @@ def test_a_calibrator_for_one_class_of_robots_is_tested_on_it(kind: RobotClass) 
     assert {case: skipped[case] for case in skipped if case == "four wheels work"} == expected
 
 
-def test_a_calibrator_for_no_synthetic_robot_fails_in_one_line() -> None:
-    found = failures(CalibratorConformance, only_for("mixed"))
-    assert "applies() is false for every synthetic robot (synthetic omni, " in found["budget is kept"]
-
-
-def test_a_calibrator_that_answers_on_no_synthetic_path_fails_one_case() -> None:
+def test_a_calibrator_for_no_synthetic_robot_or_path_fails_in_one_line() -> None:
     class ForSpirals(Honest):
         """Wants paths that are not there."""
 
@@ -377,16 +406,8 @@ def test_a_calibrator_that_answers_on_no_synthetic_path_fails_one_case() -> None
     (case,) = failures(CalibratorConformance, ForSpirals).items()
     assert case[0] == "synthetic problem is solved or honestly reported"
     assert "not applicable to the runs of synthetic omni (it is for spirals, and none was driven)" in case[1]
-
-
-@pytest.mark.parametrize("robot", synthetic_wheeled_robots(), ids=lambda robot: robot.name)
-def test_the_problem_on_fixed_and_steered_wheels_can_be_solved_to_zero_within_its_box(robot: Robot) -> None:
-    problem = synthetic_problem(robot=robot)
-    vector = true_robot(robot).inverse_kinematic_matrix.ravel()
-    assert problem.inside(vector[None]).all()
-    assert problem.values(vector[None])[0] < 1e-12
-    assert problem.values(problem.start[None])[0] > 0.02
-    assert make_dataset("synthetic", robot, PERIOD, problem.trajectories).warnings == ()
+    with pytest.raises(Nonconformance, match=r"false for every synthetic robot \(synthetic omni, "):
+        suite(CalibratorConformance, only_for("mixed")).test_budget_is_kept()
 
 
 def test_a_differential_drive_is_driven_along_lines_turns_and_squares_both_ways() -> None:
@@ -410,6 +431,184 @@ def test_a_class_that_cannot_be_made_fails_each_case_in_one_line() -> None:
     assert len(found) >= 12
 
 
-def test_loading_a_plugin_that_is_not_there_names_it(tmp_path: Path) -> None:
-    with pytest.raises(PluginError, match=r"nowhere\.py: no such file"):
-        load_plugin(tmp_path / "nowhere.py")
+class GoodCost(SumOfNorms):
+    """The norm of Eq. (6)."""
+
+
+class ScalarCost(GoodCost):
+    """One number for all candidates."""
+
+    def combine(self, errors: Array, trajectory: Array) -> Any:
+        return super().combine(errors, trajectory).mean()
+
+
+class NegativeCost(GoodCost):
+    """A logarithm."""
+
+    def combine(self, errors: Array, trajectory: Array) -> Array:
+        return np.log(super().combine(errors, trajectory) + 1e-300)
+
+
+class OffsetCost(GoodCost):
+    """Something for nothing."""
+
+    def combine(self, errors: Array, trajectory: Array) -> Array:
+        return super().combine(errors, trajectory) + 1
+
+
+class FreeCost(GoodCost):
+    """Nothing for anything."""
+
+    weights = (0.0, 0.0, 0.0)
+
+
+class IgnoresNan(GoodCost):
+    """Leaves out what it cannot add."""
+
+    def combine(self, errors: Array, trajectory: Array) -> Array:
+        return super().combine(np.nan_to_num(errors), trajectory)
+
+
+class RaisesOnNan(GoodCost):
+    """Insists."""
+
+    def combine(self, errors: Array, trajectory: Array) -> Array:
+        if np.isnan(errors).any():
+            raise ValueError("NaN")
+        return super().combine(errors, trajectory)
+
+
+class RelativeCost(GoodCost):
+    """Relative to the worst of the batch."""
+
+    def combine(self, errors: Array, trajectory: Array) -> Array:
+        values = super().combine(errors, trajectory)
+        return values / max(values.max(), 1e-300)
+
+
+class InPlaceCost(GoodCost):
+    """Squares where it stands."""
+
+    def combine(self, errors: Array, trajectory: Array) -> Array:
+        errors *= errors
+        return np.sqrt(errors.sum(axis=-1)) @ self.shares(trajectory)
+
+
+CASES_OF_COSTS = [
+    (ScalarCost, "every candidate has one cost", "shape ()"),
+    (NegativeCost, "costs are finite and not negative", "negative"),
+    (OffsetCost, "no error costs nothing", "errors of zero cost 1"),
+    (OffsetCost, "exact recordings cost nothing", "the true matrix costs 1"),
+    (FreeCost, "errors cost something", "cost nothing"),
+    (IgnoresNan, "nan stays with its candidate", "they must cost NaN"),
+    (RaisesOnNan, "nan stays with its candidate", "ValueError: NaN"),
+    (RelativeCost, "costs do not depend on the batch", "depends on the others"),
+    (RelativeCost, "nan stays with its candidate", "spoils another's cost"),
+    (InPlaceCost, "inputs are left unchanged", "combine changed its arguments"),
+]
+
+
+class GoodImporter(Importer):
+    """Reads the project's own data set folders."""
+
+    def read(self, source: Path) -> Dataset:
+        return load_dataset(source)
+
+
+class OpensAnything(GoodImporter):
+    """Lets the operating system complain."""
+
+    def read(self, source: Path) -> Dataset:
+        (source / "dataset.yaml").read_text()
+        return load_dataset(source)
+
+
+class AcceptsAnything(GoodImporter):
+    """Makes something of everything."""
+
+    def read(self, source: Path) -> Dataset:
+        try:
+            return load_dataset(source)
+        except DataError:
+            robot: Any = None  # on purpose: an importer that knows no robot
+            return Dataset("nothing", robot, 0.1, ())
+
+
+class Altered(GoodImporter):
+    """Changes trajectories after they were made."""
+
+    def read(self, source: Path) -> Dataset:
+        dataset = load_dataset(source)
+        return replace(dataset, trajectories=tuple(self.alter(run) for run in dataset.trajectories))
+
+    def alter(self, run: Trajectory) -> Trajectory:
+        return replace(run, times=run.times[::-1])
+
+
+class NumpyNumbers(Altered):
+    """A speed that is a NumPy number."""
+
+    def alter(self, run: Trajectory) -> Trajectory:
+        return replace(run, v=np.float64(0.25))
+
+
+class Jitters(Altered):
+    """Adds noise."""
+
+    def alter(self, run: Trajectory) -> Trajectory:
+        return replace(run, rates=run.rates + np.random.default_rng().normal(size=run.rates.shape))
+
+
+class TidiesUp(GoodImporter):
+    """Improves the files that it reads."""
+
+    def read(self, source: Path) -> Dataset:
+        dataset = load_dataset(source)
+        (source / "dataset.yaml").write_text((source / "dataset.yaml").read_text() + "# read\n")
+        return dataset
+
+
+CASES_OF_IMPORTERS = [
+    (OpensAnything, "missing source is refused", "it raised FileNotFoundError"),
+    (AcceptsAnything, "empty folder is refused", "read without complaint"),
+    (Altered, "sample is a valid data set", "trajectory 01: times must increase"),
+    (NumpyNumbers, "sample saves and loads back equal", "v of trajectory 01"),
+    (Jitters, "sample reads the same twice", "different data sets"),
+    (TidiesUp, "sample is left unchanged", "it changed the files"),
+]
+
+
+@pytest.fixture
+def sample(tmp_path: Path) -> Path:
+    save_dataset(synthetic_dataset(), tmp_path / "sample")
+    return tmp_path / "sample"
+
+
+def test_a_good_cost_and_a_good_importer_pass_every_case(sample: Path) -> None:
+    assert failures(CostConformance, GoodCost) == {}
+    assert failures(ImporterConformance, GoodImporter, source=sample) == {}
+
+
+@pytest.mark.parametrize(("cls", "case", "message"), [*CASES_OF_COSTS, *CASES_OF_IMPORTERS])
+def test_a_cost_or_importer_fails_the_case_it_breaks(
+    cls: type[Cost | Importer], case: str, message: str, sample: Path
+) -> None:
+    of_cost = issubclass(cls, Cost)
+    found = failures(CostConformance, cls) if of_cost else failures(ImporterConformance, cls, source=sample)
+    assert message in found[case]
+
+
+def test_an_importer_without_a_sample_is_tried_on_refusals_only() -> None:
+    outcomes = {result.case: result.outcome for result in run_cases(suite(ImporterConformance, GoodImporter))}
+    assert outcomes["empty file is refused"] is CaseOutcome.PASSED
+    assert outcomes["sample is a valid data set"] is CaseOutcome.SKIPPED
+
+
+def test_an_option_that_is_not_described_fails_an_importer() -> None:
+    class Bare(GoodImporter):
+        """Has an option."""
+
+        class Options(Options):
+            rate: float = Field(1.0, gt=0)
+
+    assert "rate" in failures(ImporterConformance, Bare)["class and options are documented"]
