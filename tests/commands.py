@@ -15,11 +15,12 @@ from typing import Any, NamedTuple
 
 import pytest
 import yaml
+from sample_robots import APR02
 from shared_results import made_once, shared_folder
 
 from omnibench import registry
 from omnibench.__main__ import main
-from omnibench.compare.config import CompareConfig
+from omnibench.compare.config import CompareConfig, read_compare_config
 from omnibench.compare.result import ComparisonResult
 from omnibench.compare.run import run_comparison
 
@@ -80,13 +81,8 @@ def assert_refused(run: Printed | subprocess.CompletedProcess[str], *parts: str)
 
 def flower(**changes: Any) -> dict[str, Any]:
     """Six short simulated runs to train and six to validate: what a config says under ``simulate``."""
-    angles = (1.0471975511965976, 3.141592653589793, 5.235987755982989)
-    wheels = [
-        {"name": name, "radius": 0.148, "distance": 0.195, "angle": angle}
-        for name, angle in zip("abc", angles, strict=True)
-    ]
     return {
-        "robot": {"name": "APR-02", "wheels": wheels},
+        "robot": APR02,
         "sample_period": 0.05,
         "commands": {"speeds": [0.2], "directions_deg": [0, 120, 240], "turn_rates": [-0.35, 0.35]},
         "repetitions": 1,
@@ -156,6 +152,14 @@ def summary(output: Path) -> dict[str, Any]:
 def without_seconds(output: Path) -> list[dict[str, Any]]:
     timed = ("seconds", "reference_seconds")
     return [{name: value for name, value in run.items() if name not in timed} for run in summary(output)["runs"]]
+
+
+@made_once
+def compared_once() -> ComparisonResult:
+    """A comparison of four calibrators with two seeds, its config beside it: all tests share it, change a copy."""
+    entries = ["theoretical", "closed_form", search(), {"name": "parametric", "label": "Eq. (3) [°]"}]
+    config = write_config(shared_folder() / "compared", calibrators=entries, seeds=[1, 2])
+    return run_comparison(read_compare_config(config), config.parent / "out")
 
 
 def files_of(folder: Path, pattern: str = "*") -> dict[str, tuple[int, bytes]]:

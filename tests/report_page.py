@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from html.parser import HTMLParser
+
+NUMBER = re.compile(r"\b[0-9a-f]{16,}\b|[-+−]?\d+([.,]\d+)*(e[-+]?\d+)?")
 
 
 class Page(HTMLParser):
@@ -54,3 +57,12 @@ class Page(HTMLParser):
     def row(self, caption: str, name: str) -> list[str]:
         """The row of a table whose first cell begins with ``name``."""
         return next(row for row in self.tables[caption] if row[0].split(" | ")[0] == name)
+
+    def words(self) -> str:
+        """The visible text by lines down to the machine and the config, numbers and hashes masked.
+
+        Two machines' digits may differ by rounding.
+        """
+        text = self.text.rsplit("How to reproduce", 1)[0]
+        lines = (" ".join(line.split()) for line in text.splitlines())
+        return "\n".join(NUMBER.sub("#", line) for line in lines if line)

@@ -15,6 +15,16 @@ APR_02 = Robot(
     ),
 )
 
+APR02 = APR_02.model_dump(mode="json")  # as a config has it
+# A mecanum base whose wheels are given by their lever arms, as a config has it.
+LEVER_MECANUM = {
+    "name": "mecanum",
+    "wheels": [
+        {"name": name, "radius": 0.05, "distance": 0.35, "angle": math.radians(90 * side), "roller_angle": roller}
+        for name, side, roller in (("fl", 1, 0.785), ("fr", -1, -0.785), ("rl", 1, -0.785), ("rr", -1, 0.785))
+    ],
+}
+
 
 def _robot(name: str, *wheels: dict[str, object], **more: object) -> Robot:
     return Robot.model_validate({"name": name, "wheels": wheels, **more})

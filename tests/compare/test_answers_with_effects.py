@@ -83,12 +83,12 @@ def test_an_effect_that_does_not_act_on_a_run_is_a_failed_row() -> None:
     config = effective_config(CompareConfig.model_validate(small(calibrators=["theoretical"])))
     datasets = load_datasets(config)
     (run,) = make_plan(config, datasets)
-    result = run_calibrator(calibrators.create("theoretical"), run.task.problem())
+    result = run_calibrator(calibrators.create("theoretical"), run.problem())
     robot = run.dataset.robot
     names = [parameter.name for parameter in effects.create("wheel_eccentricity").parameters(robot)]
     term = EffectTerm(name="wheel_eccentricity", parameters=dict.fromkeys(names, 0.01))
     bare = replace(run.dataset, trajectories=tuple(replace(each, angles=None) for each in run.training))
     extended = replace(result, extension=ModelExtension(effects=(term,)))
-    (scored,) = score([replace(run, dataset=bare)], [extended], datasets | {run.dataset_name: bare})
+    (scored,) = score(config, [replace(run, dataset=bare)], [extended], datasets | {run.dataset_name: bare})
     assert scored.record.outcome == Outcome.FAILED
     assert "effect 'wheel_eccentricity' needs" in scored.record.reason

@@ -8,13 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import CONFIGS, compared_here, registries_restored, small, summary, without_seconds
+from commands import CONFIGS, compared_here, compared_once, registries_restored, small, summary, without_seconds
 
 from omnibench.cli.terminal.comparison_tables import print_result
 from omnibench.cli.terminal.console import make_console
 from omnibench.compare.config import CompareConfig, read_compare_config
 from omnibench.compare.plan import load_datasets
-from omnibench.compare.result import ComparisonResult
 from omnibench.compare.run import run_comparison
 from omnibench.data.dataset import Dataset
 from omnibench.fit.calibrate import calibrate
@@ -25,18 +24,18 @@ from omnibench.jobs.job import Backend
 from omnibench.jobs.local_backends import InPlace, Processes
 
 
-@pytest.fixture(scope="module")
-def dask() -> Iterator[Backend]:
-    with open_backend(BackendChoice(name="dask", workers=2)) as backend:
-        yield backend
+def test_a_comparison_on_dask_is_equal_to_the_bit_and_goes_on_with_another_backend(tmp_path: Path) -> None:
+    compared_here(tmp_path, backend="dask", workers=1)
+    assert "backend: dask\n" in (tmp_path / "config.yaml").read_text()
+    matrices = {run["label"]: run["matrix"] for run in summary(tmp_path)["runs"]}
+    by_processes = {run["label"]: run["matrix"] for run in summary(compared_once().output)["runs"] if run["seed"] == 1}
+    assert matrices.items() <= by_processes.items()
+    times = {file.name: file.stat().st_mtime_ns for file in (tmp_path / "runs").iterdir()}
+    compared_here(tmp_path)
+    assert {file.name: file.stat().st_mtime_ns for file in (tmp_path / "runs").iterdir()} == times
 
 
-@pytest.fixture(scope="module")
-def flower() -> Dataset:
-    config = CompareConfig.model_validate(small())
-    return load_datasets(config)["flower"]
-
-
+@pytest.mark.slow
 def test_the_papers_comparison_on_dask_is_equal_to_the_bit(tmp_path: Path) -> None:
     whole = read_compare_config(CONFIGS / "apr02.yaml")
     short = {
@@ -50,63 +49,57 @@ def test_the_papers_comparison_on_dask_is_equal_to_the_bit(tmp_path: Path) -> No
         with registries_restored():
             run_comparison(whole.model_copy(update={**short, "backend": backend}), tmp_path / backend)
     assert without_seconds(tmp_path / "dask") == without_seconds(tmp_path / "processes")
-    assert "backend: dask\n" in (tmp_path / "dask" / "config.yaml").read_text()
 
 
-def test_a_comparison_goes_on_with_another_backend(tmp_path: Path) -> None:
-    compared_here(tmp_path, backend="dask")
-    before = {file.name: file.stat().st_mtime_ns for file in (tmp_path / "runs").iterdir()}
-    compared_here(tmp_path)
-    assert {file.name: file.stat().st_mtime_ns for file in (tmp_path / "runs").iterdir()} == before
+@pytest.mark.slow
+class TestFits:
+    @pytest.fixture(scope="class")
+    def dask(self) -> Iterator[Backend]:
+        with open_backend(BackendChoice(name="dask", workers=2)) as backend:
+            yield backend
+
+    @pytest.fixture(scope="class")
+    def flower(self) -> Dataset:
+        return load_datasets(CompareConfig.model_validate(small()))["flower"]
+
+    def test_resampled_intervals_are_the_same_by_any_backend(self, flower: Dataset, dask: Backend) -> None:
+        alone, *others = (
+            calibrate(flower, intervals=True, backend=backend).intervals for backend in (None, Processes(2), dask)
+        )
+        assert alone is not None
+        for each in others:
+            assert each is not None
+            np.testing.assert_array_equal(each.low, alone.low)
+            np.testing.assert_array_equal(each.high, alone.high)
+
+    def test_a_proof_by_jobs_is_the_same_by_any_backend(self, flower: Dataset, dask: Backend) -> None:
+        calibration = calibrate(flower).calibration
+        one, *others = (
+            certify_optimum(calibration, flower, seconds=600, parts=60, backend=backend).proof
+            for backend in (InPlace(), Processes(2), dask)
+        )
+        assert one.boxes >= 60
+        assert 0 < one.lower_bound <= one.best_cost
+        assert {(each.lower_bound, each.boxes) for each in others} == {(one.lower_bound, one.boxes)}
 
 
-def test_resampled_intervals_are_the_same_by_any_backend(flower: Dataset, dask: Backend) -> None:
-    alone, *others = (
-        calibrate(flower, intervals=True, backend=backend).intervals for backend in (None, Processes(2), dask)
-    )
-    assert alone is not None
-    for each in others:
-        assert each is not None
-        np.testing.assert_array_equal(each.low, alone.low)
-        np.testing.assert_array_equal(each.high, alone.high)
+def test_machines_that_differ_are_compared_by_the_ratio_to_their_reference(capsys: pytest.CaptureFixture[str]) -> None:
+    result = compared_once()
+    for run in summary(result.output)["runs"]:
+        assert 0 < run["reference_seconds"] < 1
+        assert run["machine"]
+    first, *rest = result.runs
+    other = replace(first, record=first.record.model_copy(update={"machine": "another"}))
+    print_result(make_console(), replace(result, runs=(other, *rest)))
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "of the start)" in printed
+    assert "since the machines differ" in printed
 
 
-def test_a_proof_by_jobs_is_the_same_by_any_backend(flower: Dataset, dask: Backend) -> None:
-    calibration = calibrate(flower).calibration
-    one, *others = (
-        certify_optimum(calibration, flower, seconds=600, parts=60, backend=backend).proof
-        for backend in (InPlace(), Processes(2), dask)
-    )
-    assert one.boxes >= 60
-    assert 0 < one.lower_bound <= one.best_cost
-    assert {(each.lower_bound, each.boxes) for each in others} == {(one.lower_bound, one.boxes)}
-
-
-@pytest.fixture(scope="module")
-def result(tmp_path_factory: pytest.TempPathFactory) -> ComparisonResult:
-    return compared_here(tmp_path_factory.mktemp("timed"))
-
-
-class TestFairTiming:
-    def test_a_run_has_the_reference_of_its_machine_beside_it(self, result: ComparisonResult) -> None:
-        for run in summary(result.output)["runs"]:
-            assert 0 < run["reference_seconds"] < 1
-            assert run["machine"]
-
-    def test_machines_that_differ_are_compared_by_the_ratio(
-        self, result: ComparisonResult, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        first, *rest = result.runs
-        other = replace(first, record=first.record.model_copy(update={"machine": "another"}))
-        print_result(make_console(), replace(result, runs=(other, *rest)))
-        printed = " ".join(capsys.readouterr().out.split())
-        assert "of the start)" in printed
-        assert "since the machines differ" in printed
-
-    def test_runs_that_are_not_timed_show_no_seconds(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        result = compared_here(tmp_path, timing=False)
-        assert {run["reference_seconds"] for run in summary(tmp_path)["runs"]} == {None}
-        print_result(make_console(), result)
-        printed = " ".join(capsys.readouterr().out.split())
-        assert "The runs were not timed." in printed
-        assert " ms)" not in printed
+def test_runs_that_are_not_timed_show_no_seconds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    result = compared_here(tmp_path, timing=False, calibrators=["theoretical"])
+    assert {run["reference_seconds"] for run in summary(tmp_path)["runs"]} == {None}
+    print_result(make_console(), result)
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "The runs were not timed." in printed
+    assert " ms)" not in printed

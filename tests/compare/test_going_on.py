@@ -6,22 +6,20 @@ import os
 import signal
 import subprocess
 import time
-from collections import Counter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import pytest
-import yaml
 from commands import (
     COMMAND,
     ENVIRONMENT,
     Command,
     assert_refused,
-    compared,
     compared_here,
     files_of,
     flower,
     omnibench,
+    run_here,
     search,
     summary,
     without_seconds,
@@ -31,6 +29,7 @@ from commands import (
 from timing import PATIENCE
 
 from omnibench.data.storage import save_dataset
+from omnibench.files import results_locked
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.simulate import simulate_dataset
 
@@ -64,21 +63,11 @@ def waiting(folder: Path) -> dict[str, Any]:
     return {"plugins": [str(plugins)], "calibrators": ENTRIES}
 
 
-class Stopped(NamedTuple):
-    """A comparison that Ctrl-C ended: what it printed, and the files that were there then."""
-
-    folder: Path
-    output: Path
-    returncode: int
-    stderr: str
-    group: int
-    files: dict[str, tuple[int, bytes]]
-
-
-def started(config: Path, output: Path, ended: int = 1) -> subprocess.Popen[str]:
-    """A comparison in a process group of its own, of which so many runs have ended."""
+def started(folder: Path, ended: int = 1, **changes: Any) -> subprocess.Popen[str]:
+    """A comparison in a process group of its own, of which so many of the four runs have ended."""
+    config = write_config(folder, **waiting(folder), **changes)
     process = subprocess.Popen(
-        [*COMMAND, "compare", str(config), "--output", str(output)],
+        [*COMMAND, "compare", str(config), "--output", str(folder / "out")],
         env=ENVIRONMENT,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -86,73 +75,52 @@ def started(config: Path, output: Path, ended: int = 1) -> subprocess.Popen[str]
         start_new_session=True,
     )
     assert process.stderr is not None
-    runs = len(yaml.safe_load(config.read_text())["calibrators"])
-    assert process.stderr.readline() == f"comparing: {runs} runs\n"
-    assert next(line for line in process.stderr if line.startswith(f"[{ended}/{runs}] flower "))
+    assert process.stderr.readline() == "comparing: 4 runs\n"
+    if ended:
+        assert next(line for line in process.stderr if line.startswith(f"[{ended}/4] flower "))
     return process
 
 
-def alive(group: int) -> list[str]:
-    """Commands of the processes of a session that have not ended."""
-    listed = subprocess.run(["ps", "-o", "stat=,args=", "-s", str(group)], capture_output=True, text=True, check=False)
-    return [line for line in listed.stdout.splitlines() if not line.startswith("Z")]
-
-
-def wait_until_gone(group: int) -> list[str]:
+def left_behind(group: int) -> list[str]:
+    """Commands of a session's processes that do not end."""
+    listing = ["ps", "-o", "stat=,args=", "-s", str(group)]
     deadline = time.monotonic() + PATIENCE
-    while (left := alive(group)) and time.monotonic() < deadline:
+    while time.monotonic() < deadline:
+        listed = subprocess.run(listing, capture_output=True, text=True, check=False).stdout.splitlines()
+        alive = [line for line in listed if not line.startswith("Z")]
+        if not alive:
+            return []
         time.sleep(0.05)
-    return left
+    return alive
 
 
-@pytest.fixture(scope="module")
-def stopped(tmp_path_factory: pytest.TempPathFactory) -> Stopped:
-    folder = tmp_path_factory.mktemp("stopped")
-    process = started(write_config(folder, **waiting(folder), workers=1), folder / "out")
+def test_ctrl_c_keeps_what_had_ended_and_going_on_gives_what_an_uninterrupted_comparison_gives(tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    process = started(tmp_path, workers=1)
     os.killpg(process.pid, signal.SIGINT)
     _, stderr = process.communicate(timeout=PATIENCE)
-    return Stopped(folder, folder / "out", process.returncode, stderr, process.pid, files_of(folder / "out"))
+    assert process.returncode == 130
+    line = f"interrupted; 1 of 4 runs are kept in {output}: run again with -o {output}"
+    assert [text for text in stderr.splitlines() if text] == [line]
+    assert left_behind(process.pid) == []
+    files = files_of(output)
+    assert {Path(name).suffix for name in files} == {".yaml", ".json"}
+    kept = {name: content for name, content in files.items() if name.startswith("runs/")}
+    assert len(kept) == 1
 
-
-def test_ctrl_c_exits_with_130(stopped: Stopped) -> None:
-    assert stopped.returncode == 130
-
-
-def test_ctrl_c_says_in_one_line_what_is_kept_and_how_to_go_on(stopped: Stopped) -> None:
-    line = f"interrupted; 1 of 4 runs are kept in {stopped.output}: run again with -o {stopped.output}"
-    assert [text for text in stopped.stderr.splitlines() if text] == [line]
-
-
-def test_ctrl_c_leaves_no_process_behind(stopped: Stopped) -> None:
-    assert wait_until_gone(stopped.group) == []
-
-
-def test_ctrl_c_leaves_whole_files_only(stopped: Stopped) -> None:
-    assert {Path(name).suffix for name in stopped.files} == {".yaml", ".json"}
-    assert sum(name.startswith("runs/") for name in stopped.files) == 1
-
-
-def test_going_on_keeps_what_had_ended_and_gives_what_an_uninterrupted_comparison_gives(
-    stopped: Stopped, tmp_path: Path
-) -> None:
-    (stopped.folder / "go").touch()
-    run = compared(stopped.folder / "small.yaml", stopped.output)
+    (tmp_path / "go").touch()
+    run = run_here("compare", tmp_path / "small.yaml", "--output", output, cwd=tmp_path)
     (line,) = (line for line in run.stderr.splitlines() if "kept from an earlier run" in line)
-    assert "theoretical seed 1: converged, cost 0.138732, 1 evaluation, " in line
-    after = files_of(stopped.output)
-    kept = {name: content for name, content in stopped.files.items() if name.startswith("runs/")}
+    assert "theoretical seed 1: converged" in line
+    after = files_of(output)
     assert kept == {name: after[name] for name in kept}
-    data = {"flower": {"path": str(whole_data(tmp_path))}}
-    compared_here(tmp_path / "whole", **waiting(stopped.folder), datasets=data)
-    assert without_seconds(stopped.output) == without_seconds(tmp_path / "whole")
+    save_dataset(simulate_dataset(FlowerConfig.model_validate(flower()), "flower").dataset, tmp_path / "data")
+    data = {"flower": {"path": str(tmp_path / "data")}}
+    compared_here(tmp_path / "whole", **waiting(tmp_path), datasets=data)
+    assert without_seconds(output) == without_seconds(tmp_path / "whole")
 
 
-def whole_data(folder: Path) -> Path:
-    """The small config's data as a folder: read from a disk, they are the same."""
-    save_dataset(simulate_dataset(FlowerConfig.model_validate(flower()), "flower").dataset, folder / "data")
-    return folder / "data"
-
-
+@pytest.mark.slow
 def test_ctrl_c_before_the_first_run_ends_in_one_line(tmp_path: Path) -> None:
     plugins = write_plugin(tmp_path / "plugins", "impatient", "import signal\nsignal.raise_signal(signal.SIGINT)\n")
     config = write_config(tmp_path, plugins=[str(plugins)])
@@ -161,36 +129,18 @@ def test_ctrl_c_before_the_first_run_ends_in_one_line(tmp_path: Path) -> None:
     assert [line.split(";")[0] for line in run.stderr.splitlines() if line] == ["interrupted"]
 
 
+@pytest.mark.slow
 def test_ctrl_c_while_the_workers_start_is_one_line(tmp_path: Path) -> None:
-    config = write_config(tmp_path, **waiting(tmp_path), workers=4)
     for attempt in range(3):
-        process = subprocess.Popen(
-            [*COMMAND, "compare", str(config), "--output", str(tmp_path / f"out{attempt}")],
-            env=ENVIRONMENT,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            start_new_session=True,
-        )
-        assert process.stderr is not None
-        assert process.stderr.readline() == "comparing: 4 runs\n"
+        process = started(tmp_path / str(attempt), ended=0, workers=4)
         os.killpg(process.pid, signal.SIGINT)
         _, said = process.communicate(timeout=PATIENCE)
         assert next(line for line in said.splitlines() if not line.startswith("[")).startswith("interrupted; ")
         assert "Traceback" not in said
-        assert wait_until_gone(process.pid) == []
+        assert left_behind(process.pid) == []
 
 
-def test_sigterm_says_what_is_kept_as_ctrl_c_does(tmp_path: Path) -> None:
-    process = started(write_config(tmp_path, **waiting(tmp_path), workers=1), tmp_path / "out")
-    process.terminate()
-    _, said = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 128 + signal.SIGTERM
-    assert said.splitlines()[-1] == (
-        f"interrupted; 1 of 4 runs are kept in {tmp_path / 'out'}: run again with -o {tmp_path / 'out'}"
-    )
-
-
+@pytest.mark.slow
 def test_a_reader_that_leaves_early_gets_no_more_and_the_report_is_written(tmp_path: Path) -> None:
     config = write_config(tmp_path)
     shell = f"{' '.join(COMMAND)} compare {config} -o {tmp_path / 'out'} 2>&1 | head -n 1"
@@ -202,33 +152,32 @@ def test_a_reader_that_leaves_early_gets_no_more_and_the_report_is_written(tmp_p
     assert (tmp_path / "out" / "report.html").is_file()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGKILL"])
-def test_the_runs_end_with_a_comparison_that_is_killed_which_then_goes_on(name: str, tmp_path: Path) -> None:
-    config = write_config(tmp_path, **waiting(tmp_path), workers=4)  # none starts later
-    process = started(config, tmp_path / "out")
+def test_the_runs_end_with_a_comparison_that_is_killed_which_then_goes_on(
+    name: str, command: Command, tmp_path: Path
+) -> None:
+    process = started(tmp_path, workers=4)  # none starts later
     process.send_signal(signal.Signals[name])
     _, stderr = process.communicate(timeout=PATIENCE)
     assert "Traceback" not in stderr
-    assert wait_until_gone(process.pid) == []
+    if name == "SIGTERM":
+        assert process.returncode == 128 + signal.SIGTERM
+        assert stderr.splitlines()[-1].endswith(f"run again with -o {tmp_path / 'out'}")
+    assert left_behind(process.pid) == []
     before = files_of(tmp_path / "out" / "runs", WHOLE)
     (tmp_path / "go").touch()
-    run = compared(config, tmp_path / "out")
+    run = command("compare", tmp_path / "small.yaml", "--output", tmp_path / "out")
     assert run.stderr.count("kept from an earlier run") == len(before) > 0
     assert before.items() <= files_of(tmp_path / "out" / "runs").items()
     outcomes = {run["label"]: run["outcome"] for run in summary(tmp_path / "out")["runs"]}
     assert outcomes == {"theoretical": "converged", "waiting": "budget", "second": "budget", "third": "budget"}
 
 
-def test_a_comparison_in_a_folder_in_which_another_writes_is_refused(tmp_path: Path) -> None:
-    process = started(write_config(tmp_path, **waiting(tmp_path)), tmp_path / "out")
-    second = omnibench("compare", write_config(tmp_path / "second"), "--output", tmp_path / "out")
-    (tmp_path / "go").touch()
-    process.communicate(timeout=PATIENCE)
-    assert process.returncode == 0
-    assert_refused(second, f"{tmp_path / 'out'}: another omnibench is writing results there", "--output")
-    entries = yaml.safe_load((tmp_path / "out" / "config.yaml").read_text())["calibrators"]
-    labels = [entry["label"] or entry["name"] for entry in entries]
-    assert labels == [run["label"] for run in summary(tmp_path / "out")["runs"]]
+def test_a_comparison_in_a_folder_in_which_another_writes_is_refused(command: Command, tmp_path: Path) -> None:
+    config = write_config(tmp_path)
+    with results_locked(tmp_path / "out"):
+        assert_refused(command("compare", config, "--output", tmp_path / "out"), str(tmp_path / "out"), "--output")
 
 
 MISBEHAVING = """
@@ -245,11 +194,6 @@ class is_killed(Misbehaving):
     def misbehave(self):
         os.kill(os.getpid(), 9)
 
-@calibrators.register("wants_memory")
-class wants_memory(Misbehaving):
-    def misbehave(self):
-        held = [bytes(10**5) for _ in range(10**9)]
-
 @calibrators.register("hangs")
 class hangs(Misbehaving):
     def misbehave(self):
@@ -257,49 +201,18 @@ class hangs(Misbehaving):
 """
 
 
-def test_a_killed_comparison_of_runs_that_are_killed_hang_or_want_memory_goes_on_and_has_all_rows(
+@pytest.mark.slow
+def test_what_was_killed_is_tried_again_when_a_comparison_goes_on_and_what_hung_is_not(
     command: Command, tmp_path: Path
 ) -> None:
     plugins = write_plugin(tmp_path / "plugins", "misbehaving", MISBEHAVING.format(folder=str(tmp_path)))
-    entries = ["theoretical", "is_killed", "wants_memory", "hangs"]
-    budget = {"evaluations": 500, "seconds": 0.5}
-    limits = {"budget": budget, "memory_mb": 1000, "workers": 2}
-    config = write_config(tmp_path, plugins=[str(plugins)], calibrators=entries, **limits)
-    process = started(config, tmp_path / "out", ended=2)  # what was killed is tried again when all others have ended
-    process.kill()
-    process.communicate(timeout=PATIENCE)
-    assert wait_until_gone(process.pid) == []
-    before, began = files_of(tmp_path / "out" / "runs", WHOLE), tries(tmp_path)
-    assert 0 < len(before) < len(entries)
-
-    run = omnibench("compare", config, "--output", tmp_path / "out")
-    assert (run.returncode, run.stderr.count("kept from an earlier run")) == (1, len(before)), run.stderr
-    assert "every search failed, the first: flower " in run.stderr
-    assert "flower hangs seed 1: time, no answer" in run.stderr
-    after = files_of(tmp_path / "out" / "runs")
-    assert before.items() <= after.items()
-    rows = {run["label"]: run for run in summary(tmp_path / "out")["runs"]}
-    assert rows.pop("theoretical")["outcome"] == "converged"
-    # Of other tests' processes some are killed for lack of memory, which the system counts for all.
-    reasons = {label: row["reason"].replace(": the system was out of memory", "") for label, row in rows.items()}
-    assert {label: (row["outcome"], reasons[label]) for label, row in rows.items()} == {
-        "is_killed": ("failed", "the process died without an answer (killed by SIGKILL) in each of 3 tries"),
-        "wants_memory": ("failed", "out of memory (limit 1000 MB)"),
-        "hangs": ("time", "ended by force: 0.5 s spent without an answer"),
-    }
-    assert {(row["train_cost"], row["matrix"]) for row in rows.values()} == {(None, None)}
-    now = tries(tmp_path)
-    assert {name: now[name] - began[name] for name in ("is_killed", "wants_memory")} == {
-        "is_killed": 3,
-        "wants_memory": 1,
-    }
-
-    again = command("compare", config, "--output", tmp_path / "out")
-    assert again.returncode == 1
-    assert again.stderr.count("kept from an earlier run") == 2  # who hung for all its time would do so again
-    assert files_of(tmp_path / "out" / "runs") == after
-
-
-def tries(folder: Path) -> Counter[str]:
-    """How many times each misbehaving run has begun."""
-    return Counter({file.stem: file.stat().st_size for file in folder.glob("*.tries")})
+    entries, budget = ["theoretical", "is_killed", "hangs"], {"evaluations": 500, "seconds": 0.5}
+    config = write_config(tmp_path, plugins=[str(plugins)], calibrators=entries, budget=budget)
+    for kept in (0, 2):
+        run = command("compare", config, "--output", tmp_path / "out")
+        assert (run.returncode, run.stderr.count("kept from an earlier run")) == (1, kept)
+        rows = {run["label"]: (run["outcome"], run["reason"]) for run in summary(tmp_path / "out")["runs"]}
+        assert rows["hangs"][0] == "time"
+        assert rows["is_killed"][0] == "failed"
+        assert rows["is_killed"][1].endswith("in each of 3 tries")
+    assert {file.stem: file.stat().st_size for file in tmp_path.glob("*.tries")} == {"is_killed": 6, "hangs": 1}

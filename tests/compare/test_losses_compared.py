@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import compared_here, prepare, small, summary
+from commands import compared_here, prepare, summary
 from contamination import with_jumps
 
 from omnibench.compare.result import ComparisonResult
@@ -18,67 +17,59 @@ from omnibench.fit.calibrate import calibrate
 _SHARE, _OFF = 0.1, 1.0  # of the poses; m
 
 
-def jumping(folder: Path) -> Dataset:
-    """The small recordings, a tenth of whose training poses are a metre off, written to a folder."""
+@pytest.fixture(scope="module")
+def jumping(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The small recordings, a tenth of whose training poses are a metre off, and comparisons of them beside them."""
+    folder = tmp_path_factory.mktemp("jumping")
     dataset = load_dataset(prepare().data)
     spoilt = with_jumps(dataset.split("train"), _SHARE, _OFF, np.random.default_rng(3))
     runs = [*spoilt, *dataset.split("validation")]
-    made = make_dataset("jumping", dataset.robot, dataset.sample_period, runs, simulated=True)
-    save_dataset(made, folder)
-    return made
+    save_dataset(make_dataset("jumping", dataset.robot, dataset.sample_period, runs, simulated=True), folder / "data")
+    return folder
 
 
-def compared(folder: Path, **changes: object) -> ComparisonResult:
-    config = small(datasets={"jumping": {"path": str(folder / "data")}}, calibrators=["theoretical", "closed_form"])
-    return compared_here(folder / str(changes.get("loss", "squares")), **(config | changes))
+def compared(data: Path, folder: Path, **changes: object) -> ComparisonResult:
+    sets, entries = {"jumping": {"path": str(data)}}, ["theoretical", "closed_form"]
+    return compared_here(folder / str(changes["loss"]), datasets=sets, calibrators=entries, **changes)
 
 
-def closed_form(result: ComparisonResult) -> float:
-    (run,) = [run for run in result.runs if run.record.label == "closed_form"]
-    assert run.record.validation_cost is not None
-    return run.record.validation_cost
+@pytest.fixture(scope="module")
+def squares(jumping: Path) -> ComparisonResult:
+    return compared(jumping / "data", jumping, loss="squares")
 
 
-def test_a_robust_loss_is_better_on_runs_without_jumps_and_is_said(tmp_path: Path) -> None:
-    jumping(tmp_path / "data")
-    squares = compared(tmp_path, cost="trajectory")
-    robust = compared(tmp_path, cost="trajectory", loss="huber")
-    assert closed_form(robust) < closed_form(squares)
+@pytest.fixture(scope="module")
+def huber(jumping: Path) -> ComparisonResult:
+    return compared(jumping / "data", jumping, loss="huber")
+
+
+def far_ends(result: ComparisonResult) -> list[str]:
+    """Warnings of runs whose ends were taken from other poses."""
+    return [warning for warning in result.warnings if "beside it say" in warning]
+
+
+def test_a_robust_loss_is_better_on_runs_without_jumps_and_is_said(
+    squares: ComparisonResult, huber: ComparisonResult
+) -> None:
+    robust, other = (result.runs[1].record.validation_cost for result in (huber, squares))
+    assert robust is not None
+    assert other is not None
+    assert robust < other
     assert "loss" not in summary(squares.output)
-    assert summary(robust.output)["loss"] == "huber"
-    assert robust.config.objective == "trajectory, loss huber"
+    assert summary(huber.output)["loss"] == "huber"
+    assert huber.config.objective == "final_pose, loss huber"
 
 
-def test_the_answer_is_that_of_calibrate(tmp_path: Path) -> None:
-    dataset = jumping(tmp_path / "data")
-    result = compared(tmp_path, loss="huber", integration="arc", box="row")
-    (run,) = [run for run in result.runs if run.record.label == "closed_form"]
+def test_answer_and_warning_are_those_of_calibrate(squares: ComparisonResult, huber: ComparisonResult) -> None:
+    dataset: Dataset = huber.datasets["jumping"]
     alone = calibrate(dataset, loss="huber", cost="final_pose", unidentified="keep")
-    assert run.record.matrix is not None
-    np.testing.assert_array_equal(run.record.matrix, alone.calibration.matrix)
+    np.testing.assert_array_equal(np.array(huber.runs[1].record.matrix), alone.calibration.matrix)
+    (of_calibrate,) = (warning for warning in alone.warnings if "beside it say" in warning)
+    assert far_ends(huber) == [f"data set jumping: {of_calibrate}"]
+    assert far_ends(squares) == []
 
 
-@pytest.mark.parametrize("loss", ["squares", "huber"])
-def test_runs_whose_ends_were_taken_from_other_poses_are_named(tmp_path: Path, loss: str) -> None:
-    dataset = jumping(tmp_path / "data")
-    result = compared(tmp_path, loss=loss)
-    told = [warning for warning in result.warnings if "is far from what the poses beside it say" in warning]
-    if loss == "squares":
-        assert told == []
-        return
-    (warning,) = told
-    alone = next(each for each in calibrate(dataset, loss="huber", cost="final_pose").warnings if "beside it" in each)
-    assert warning == f"data set jumping: {alone}"
-
-
-def test_nothing_is_proven_of_a_robust_loss(tmp_path: Path) -> None:
-    jumping(tmp_path / "data")
-    result = compared(tmp_path, loss="student_t", certificate={"gap": 0.5, "seconds": 5})
+def test_nothing_is_proven_of_a_robust_loss_and_without_jumps_no_end_is_moved(tmp_path: Path) -> None:
+    result = compared(prepare().data, tmp_path, loss="student_t", certificate={"gap": 0.5, "seconds": 5})
     assert result.certificates == ()
-
-
-def test_without_jumps_no_end_is_moved(tmp_path: Path) -> None:
-    dataset = load_dataset(prepare().data)
-    copy = replace(dataset, name="jumping")
-    save_dataset(copy, tmp_path / "data")
-    assert not [warning for warning in compared(tmp_path, loss="huber").warnings if "beside it say" in warning]
+    assert far_ends(result) == []

@@ -2,66 +2,78 @@
 
 from __future__ import annotations
 
+import json
 import shutil
+import tempfile
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
-from commands import files_of, flower, registries_restored, search, small, summary, without_seconds, write_plugin
+from commands import (
+    compared_once,
+    files_of,
+    flower,
+    registries_restored,
+    search,
+    small,
+    summary,
+    without_seconds,
+    write_plugin,
+)
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from omnibench.compare.config import CompareConfig, effective_config
+from omnibench.compare.config import CompareConfig, effective_config, read_compare_config
 from omnibench.compare.plan import load_datasets, make_plan
 from omnibench.compare.run import run_comparison
+from omnibench.errors import DataError
+from omnibench.fit.calibrator import Outcome, RunResult
+from omnibench.fit.problem import Improvement
+from omnibench.jobs.job import ResultStore
 from omnibench.progress import Progress
-
-
-class Watch:
-    """A reporter that notes which runs were run and which were there."""
-
-    def __init__(self) -> None:
-        self.ran: list[str] = []
-        self.kept: list[str] = []
-
-    def __call__(self, event: Progress) -> None:
-        if event.result:
-            run = event.task.removeprefix("flower ").replace(" seed", "")
-            (self.kept if "kept from an earlier run" in event.result else self.ran).append(run)
-
-
-def ran_and_kept(output: Path, **changes: Any) -> tuple[set[str], set[str]]:
-    """Compare a small config, changed, and say which runs were run and which were there."""
-    watch = Watch()
-    run_comparison(CompareConfig.model_validate(small(**changes)), output, watch)
-    return set(watch.ran), set(watch.kept)
-
 
 ALL = {"theoretical 1", "closed_form 1", "search 1"}
 
 
-@pytest.fixture(scope="module")
-def once(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    output = tmp_path_factory.mktemp("once") / "out"
-    ran_and_kept(output)
-    return output
+def ran_and_kept(output: Path, config: CompareConfig | None = None, **changes: Any) -> tuple[set[str], set[str]]:
+    """Compare a config, by default a small one, and say which runs were run and which were there."""
+    ran, kept = set(), set()
+
+    def watch(event: Progress) -> None:
+        if event.result:
+            run = event.task.removeprefix("flower ").replace(" seed", "")
+            (kept if "kept from an earlier run" in event.result else ran).add(run)
+
+    run_comparison(config or CompareConfig.model_validate(small(**changes)), output, watch)
+    return ran, kept
 
 
 @pytest.fixture
-def output(once: Path, tmp_path: Path) -> Path:
-    """Results of the small comparison."""
-    shutil.copytree(once, tmp_path / "out")
+def output(tmp_path: Path) -> Path:
+    """A copy of results of the small comparison."""
+    shutil.copytree(compared_once().output, tmp_path / "out")
     return tmp_path / "out"
 
 
 def test_nothing_is_run_again_when_nothing_changed(output: Path) -> None:
     before, rows = files_of(output / "runs"), summary(output)["runs"]
-    assert ran_and_kept(output) == (set(), ALL)
+    ran, kept = ran_and_kept(output, read_compare_config(output / "config.yaml"))
+    assert ran == set()
+    assert kept == {f"{row['label']} {row['seed']}" for row in rows}
     assert files_of(output / "runs") == before
     assert summary(output)["runs"] == rows
 
 
-def test_only_what_is_new_is_run(output: Path) -> None:
+def test_only_what_is_new_or_damaged_is_run(output: Path) -> None:
     entries = ["theoretical", {"name": "closed_form", "label": "another name"}, search(candidates=301)]
     assert ran_and_kept(output, calibrators=entries) == ({"search 1"}, {"theoretical 1", "another name 1"})
+    files = sorted((output / "runs").iterdir())
+    for number, file in enumerate(files):
+        file.write_bytes((b"", b"\xff\xfe", b'{"outcome": "converged"}')[number % 3])
+    assert ran_and_kept(output) == (ALL, set())
+    assert sorted((output / "runs").iterdir()) == files
+    assert sum(len(file.read_bytes()) > 100 for file in files) == 3
 
 
 @pytest.mark.parametrize(
@@ -70,7 +82,7 @@ def test_only_what_is_new_is_run(output: Path) -> None:
         ({"calibrators": ["theoretical", "closed_form", search(candidates=301)]}, {"search 1"}),
         ({"calibrators": ["theoretical", {"name": "closed_form", "box": "paper", "label": "c"}, search()]}, {"c 1"}),
         ({"calibrators": ["theoretical", "closed_form", search("another name")]}, set()),
-        ({"seeds": [1, 2]}, {"search 2"}),
+        ({"seeds": [1, 3]}, {"search 3"}),
         ({"budget": {"evaluations": 2001, "seconds": 60}}, ALL),
         ({"cost": "final_position"}, ALL),
         ({"integration": "euler"}, ALL),
@@ -79,20 +91,11 @@ def test_only_what_is_new_is_run(output: Path) -> None:
     ],
     ids=lambda value: ", ".join(sorted(value)) or "nothing",
 )
-def test_only_runs_that_a_change_touches_are_new(once: Path, changes: dict[str, Any], new: set[str]) -> None:
+def test_only_runs_that_a_change_touches_are_new(changes: dict[str, Any], new: set[str]) -> None:
     config = CompareConfig.model_validate(small(**changes))
     plan = make_plan(effective_config(config), load_datasets(config))
-    assert {f"{run.label} {run.seed}" for run in plan if not (once / "runs" / f"{run.key}.json").exists()} == new
-
-
-def test_damaged_runs_are_run_again(output: Path) -> None:
-    files = sorted((output / "runs").iterdir())
-    damages = (b"", b"\xff\xfe", b'{"outcome": "converged"}')
-    for file, damage in zip(files, damages, strict=True):
-        file.write_bytes(damage)
-    assert ran_and_kept(output) == (ALL, set())
-    assert sorted((output / "runs").iterdir()) == files
-    assert min(len(file.read_bytes()) for file in files) > 100
+    stored = compared_once().output / "runs"
+    assert {f"{run.label} {run.settings.seed}" for run in plan if not (stored / f"{run.key}.json").exists()} == new
 
 
 PLUGIN = """
@@ -109,9 +112,8 @@ def test_a_plugin_that_is_repaired_or_changed_is_run_again_and_the_others_are_no
     costs = []
     for factor, outcome in (("a_name_that_is_not_there", "failed"), ("1.0", "converged"), ("1.01", "converged")):
         plugins = write_plugin(tmp_path / "plugins", "mine", PLUGIN.format(factor=factor))
-        changes: dict[str, Any] = {"plugins": [str(plugins)], "calibrators": ["theoretical", "mine"]}
         with registries_restored():
-            ran, _ = ran_and_kept(tmp_path / "out", **changes)
+            ran, _ = ran_and_kept(tmp_path / "out", plugins=[str(plugins)], calibrators=["theoretical", "mine"])
         assert ran == ({"mine 1"} if costs else {"mine 1", "theoretical 1"})
         theoretical, mine = summary(tmp_path / "out")["runs"]
         assert (theoretical["outcome"], mine["outcome"]) == ("converged", outcome)
@@ -126,3 +128,66 @@ def test_the_same_seed_gives_the_same_results_with_any_number_of_workers(tmp_pat
         ran_and_kept(tmp_path / str(workers), calibrators=entries, seeds=[1, 7], workers=workers)
     assert without_seconds(tmp_path / "1") == without_seconds(tmp_path / "3")
     assert len(without_seconds(tmp_path / "1")) == 6
+
+
+FINITE = st.floats(allow_nan=False, allow_infinity=False)
+WORDS = st.text(st.characters(codec="utf-8", exclude_categories=("Cs",)), max_size=20)
+ANSWERS = st.lists(FINITE, min_size=9, max_size=9).map(np.array)
+
+
+@settings(max_examples=40)
+@given(
+    outcome=st.sampled_from(Outcome),
+    reason=WORDS,
+    vector=st.none() | ANSWERS,
+    history=st.lists(st.tuples(st.integers(1, 10**9), FINITE, FINITE), max_size=4),
+    at_bounds=st.lists(WORDS, max_size=3),
+)
+def test_a_result_comes_back_to_the_last_bit(
+    outcome: Outcome,
+    reason: str,
+    vector: np.ndarray | None,
+    history: list[tuple[int, float, float]],
+    at_bounds: list[str],
+) -> None:
+    matrix = None if vector is None else vector.reshape(3, 3)
+    cost = None if vector is None else float(vector[0])
+    steps = tuple(Improvement(*step) for step in history)
+    put = RunResult(outcome, reason, vector, matrix, cost, 17, 0.1, steps, tuple(at_bounds), ("m12",))
+    with tempfile.TemporaryDirectory() as folder:
+        ResultStore(Path(folder), RunResult).put("key", put)
+        got = ResultStore(Path(folder), RunResult).get("key")
+    assert got is not None
+    for name in ("outcome", "reason", "cost", "evaluations", "seconds", "history", "at_bounds", "held"):
+        assert getattr(got, name) == getattr(put, name)
+    for name in ("vector", "matrix"):
+        before, after = getattr(put, name), getattr(got, name)
+        assert (before is None and after is None) or np.array_equal(before, after)
+
+
+def test_a_run_that_is_not_there_is_none(tmp_path: Path) -> None:
+    assert ResultStore(tmp_path / "runs", RunResult).get("key") is None
+
+
+@pytest.mark.parametrize(
+    ("freedom", "stored"), [("33", 33.0), ("null", None), (None, None), ("[8.5, 9.0]", [8.5, 9.0])]
+)
+def test_results_are_read_whether_they_hold_one_number_of_degrees_of_freedom_several_or_none(
+    freedom: str | None, stored: float | list[float] | None, tmp_path: Path
+) -> None:
+    store = ResultStore(tmp_path, RunResult)
+    store.put("key", RunResult(Outcome.TIME, "", None, None, None, 0, 0.0, ()))
+    fields = json.loads(store.file("key").read_text())
+    del fields["degrees_of_freedom"]
+    if freedom is not None:
+        fields["degrees_of_freedom"] = json.loads(freedom)
+    store.file("key").write_text(json.dumps(fields))
+    result = store.get("key")
+    assert result is not None
+    assert (None if result.degrees_of_freedom is None else result.degrees_of_freedom.tolist()) == stored
+
+
+def test_a_folder_that_cannot_be_made_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "runs").write_text("a file")
+    with pytest.raises(DataError, match=r"runs/key\.json: cannot be written: .*runs is not a folder"):
+        ResultStore(tmp_path / "runs", RunResult).put("key", RunResult(Outcome.TIME, "", None, None, None, 0, 0.0, ()))

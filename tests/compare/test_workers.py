@@ -82,6 +82,7 @@ def test_validation_data_are_out_of_a_calibrators_reach(tmp_path: Path) -> None:
     assert found == "poses train, rates train"
 
 
+@pytest.mark.slow
 def test_a_script_needs_no_guard(tmp_path: Path) -> None:
     script = tmp_path / "script.py"
     script.write_text(
@@ -99,21 +100,17 @@ def test_a_script_needs_no_guard(tmp_path: Path) -> None:
     assert [run["outcome"] for run in summary(tmp_path / "out")["runs"]] == ["converged", "converged", "budget"]
 
 
-def test_a_comparison_leaves_the_process_as_it_was(tmp_path: Path) -> None:
+def test_a_comparison_runs_in_another_thread_than_the_main_one_and_leaves_the_process_as_it_was(tmp_path: Path) -> None:
     def state() -> tuple[Any, ...]:
         threads = {name: os.environ.get(name) for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
         return threads, signal.getsignal(signal.SIGINT), sys.modules["__main__"], multiprocessing.active_children()
 
     before = state()
-    compared_here(tmp_path / "out")
-    assert state() == before
-
-
-def test_a_comparison_runs_in_another_thread_than_the_main_one(tmp_path: Path) -> None:
     thread = threading.Thread(target=compared_here, args=(tmp_path / "out",))
     thread.start()
     thread.join(timeout=PATIENCE)
     assert [run["outcome"] for run in summary(tmp_path / "out")["runs"]] == ["converged", "converged", "budget"]
+    assert state() == before
 
 
 TELLS = """
@@ -130,6 +127,7 @@ class Tells(Calibrator):
 """
 
 
+@pytest.mark.slow
 def test_every_run_has_one_thread_and_leaves_ctrl_c_to_the_comparison(tmp_path: Path) -> None:
     plugins = write_plugin(tmp_path / "plugins", "tells", TELLS)
     config = write_config(tmp_path, plugins=[str(plugins)], calibrators=["tells"])

@@ -130,22 +130,13 @@ def test_after_an_exchange_no_single_swap_gains(seed: int, runs: int) -> None:
     )
 
 
-@settings(max_examples=40)
+@settings(max_examples=10)
 @given(seed=seeds, runs=st.integers(3, 6))
 def test_exact_designs_are_within_1_percent_of_the_best_of_all(seed: int, runs: int) -> None:
     candidates = Candidates(information(seed, candidates=4, parameters=2))
     *_, found = exact_designs(candidates, continuous_optimum(candidates), runs)
     best = max(candidates.criterion(counts) for counts in every_design(4, runs))
     assert candidates.criterion(found) >= 0.99 * best
-
-
-@given(seed=seeds, twice=st.integers(0, 4))
-def test_a_candidate_that_is_there_twice_changes_nothing(seed: int, twice: int) -> None:
-    own = information(seed)
-    one = continuous_optimum(Candidates(own))
-    both = continuous_optimum(Candidates(np.concatenate([own, own[twice : twice + 1]])))
-    assert both.criterion <= one.bound * (1 + 1e-9)
-    assert one.criterion <= both.bound * (1 + 1e-9)
 
 
 @given(seed=seeds)
@@ -158,12 +149,6 @@ def test_designs_do_not_depend_on_the_coordinates_of_the_parameters(seed: int) -
     assert continuous_optimum(there).bound == pytest.approx(scale * continuous_optimum(here).bound, rel=1e-4)
     for counts in ([1, 1, 1, 1, 1], [2, 0, 1, 1, 0], [0, 3, 1, 0, 2]):
         assert there.root(np.array(counts)) == pytest.approx(scale * here.root(np.array(counts)), rel=1e-6)
-
-
-@given(seed=seeds, scale=st.floats(1e-6, 1e6))
-def test_more_information_from_every_run_changes_no_choice(seed: int, scale: float) -> None:
-    one, other = Candidates(information(seed)), Candidates(scale * information(seed))
-    np.testing.assert_allclose(continuous_optimum(one).shares, continuous_optimum(other).shares, atol=1e-6)
 
 
 def test_covariance_is_the_inverse_of_the_information() -> None:
@@ -180,7 +165,7 @@ def test_cheap_runs_are_preferred_when_cost_counts() -> None:
     assert np.flatnonzero(rounded(Candidates(own, prices), np.full(10, 0.1), 8)).max() < 5
 
 
-@settings(max_examples=20)
+@settings(max_examples=8)
 @given(seed=seeds, most=st.integers(1, 3), runs=st.integers(1, 5))
 def test_no_candidate_is_driven_more_often_than_allowed(seed: int, most: int, runs: int) -> None:
     candidates = Candidates(information(seed), most=most)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Any
 
+from sample_robots import APR02
 from shared_results import made_once
 
 from omnibench.data.dataset import Dataset
@@ -21,13 +21,6 @@ from omnibench.discover.result import (
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.simulate import simulate_dataset
 
-APR02 = {
-    "name": "APR-02",
-    "wheels": [
-        {"name": name, "radius": 0.148, "distance": 0.195, "angle": math.radians(degrees)}
-        for name, degrees in zip("abc", (60, 180, 300), strict=True)
-    ],
-}
 Effects = tuple[dict[str, Any], ...]
 COUPLING: Effects = ({"name": "rotation_translation_coupling", "parameters": {"kx": 0.3, "ky": -0.2}},)
 ECCENTRICITY: Effects = ({"name": "wheel_eccentricity", "parameters": {"a_a": 0.02, "b_a": 0.0}},)

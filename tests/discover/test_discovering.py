@@ -1,22 +1,31 @@
-"""Discovering hidden effects in small simulations, and the missing one of a real robot."""
+"""Discovering hidden effects in small simulations, in odd recordings of them, and the missing one of a real robot."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from discovery_samples import COUPLING, lagging, nameless, nothing, repeated, simulated
+from discovery_samples import COUPLING, DELAY, lagging, named, nothing, repeated, shorn, simulated
 from page_figures import assert_printed, discovery_figures, plan_lines, printed_plan
 
-from omnibench.data.dataset import Dataset
+from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.splits import joined
+from omnibench.discover import discover
 from omnibench.discover.discover import discover_effects
+from omnibench.discover.fitting import fit_matrix
+from omnibench.discover.held_out import validation_runs
 from omnibench.discover.result import Discovery
-from omnibench.errors import UnknownNameError
+from omnibench.discover.selection.model_selection import Selection
+from omnibench.discover.selection.screening import Screening
+from omnibench.errors import DataError, UnknownNameError
 from omnibench.fit.evaluate import evaluate
+from omnibench.fit.trajectory_fit import Given, usable_runs
+from omnibench.progress import Progress
 from omnibench.robot.calibration import read_calibration, write_calibration
+from omnibench.robot.odometry import OdometryBatch
 from omnibench.simulate.simulation_request import simulate_like
 from omnibench.simulate.source import read_simulation
 
@@ -53,6 +62,7 @@ def test_the_extended_calibration_runs_what_was_found(tmp_path: Path) -> None:
     assert cost["extended"] < 0.7 * cost["plain"]
 
 
+@pytest.mark.slow
 def test_the_validation_split_changes_nothing_that_is_found() -> None:
     coupling = repeated()
     other = simulated(repetitions=4, validation={"seed": 77, "distance": 0.6, "noise_scale": 5.0})
@@ -70,6 +80,7 @@ def test_nothing_is_named_where_nothing_is_hidden_and_limits_are_told() -> None:
     assert all(each.limit > 0 for each in found.hidden)
 
 
+@pytest.mark.slow
 def test_neither_euler_steps_nor_arcs_are_taken_for_centripetal_slip() -> None:
     for integration in ("euler", "arc"):
         found = discover_effects(simulated((), validation=None, integration=integration, sample_period=0.01))
@@ -85,22 +96,20 @@ def test_absorbed_effects_are_listed_and_not_named() -> None:
     assert [each.name for each in found.measurements] == list(found.absorbed)
 
 
-def test_a_name_that_is_left_out_is_not_found_under_another_with_confidence() -> None:
-    found = nameless()
-    assert found.verdict in ("unknown", "class")
-    assert all(effect.weight < 0.95 for effect in found.effects)
-
-
-def test_an_unknown_name_among_those_to_leave_out_gets_the_nearest() -> None:
-    with pytest.raises(UnknownNameError, match="heading_drift"):
-        discover_effects(simulated(), without=["heading_drif"])
-
-
 def test_every_stage_that_was_recorded_is_looked_at() -> None:
     found = lagging()
     assert [(effect.name, effect.stage) for effect in found.effects] == [("motor_lag", "actuator")]
     (tau,) = found.effects[0].parameters
     assert tau.low < 0.15 < tau.high
+
+
+def test_what_cannot_be_is_refused_in_one_line() -> None:
+    with pytest.raises(UnknownNameError, match="heading_drift"):
+        discover_effects(simulated(), without=["heading_drif"])
+    with pytest.raises(DataError, match="wheels stand"):
+        discover_effects(with_runs(simulated(), lambda run: replace(run, rates=0 * run.rates)))
+    with pytest.raises(DataError, match="plain"):
+        discover_effects(simulated(), calibration=named().extended)
 
 
 @pytest.fixture(scope="module")
@@ -109,6 +118,7 @@ def recorded(omni3: Dataset) -> Discovery:
     return discover_effects(omni3)
 
 
+@pytest.mark.slow
 def test_what_a_real_robot_lacks_is_found_on_circles_and_holds_on_squares(recorded: Discovery) -> None:
     assert recorded.verdict in ("named", "class", "incomplete")
     names = {recorded.effects[0].name, *recorded.effects[0].confusable_with}
@@ -116,19 +126,18 @@ def test_what_a_real_robot_lacks_is_found_on_circles_and_holds_on_squares(record
     square = recorded.held_out[-1]
     assert square.position_m[1] <= 0.045
     assert np.degrees(square.heading_rad[1]) <= 1.8
+    assert recorded.extrapolations
+    assert all(each.after_m > square.position_m[1] for each in recorded.extrapolations)
+    assert any("turning on the spot" in each.description for each in recorded.extrapolations)
 
 
+@pytest.mark.slow
 def test_the_readme_and_the_page_on_discover_print_its_figures_and_its_driving_plan(recorded: Discovery) -> None:
     assert_printed("discovery", discovery_figures(recorded))
     assert printed_plan().group() == plan_lines(recorded)
 
 
-def test_squares_are_told_to_hold_motions_that_circles_had_not(recorded: Discovery) -> None:
-    assert recorded.extrapolations
-    assert all(each.after_m > recorded.held_out[-1].position_m[1] for each in recorded.extrapolations)
-    assert any("turning on the spot" in each.description for each in recorded.extrapolations)
-
-
+@pytest.mark.slow
 def test_the_runs_that_are_proposed_tell_the_class_apart_together_with_the_recorded_ones(
     recorded: Discovery, omni3: Dataset, tmp_path: Path
 ) -> None:
@@ -141,3 +150,210 @@ def test_the_runs_that_are_proposed_tell_the_class_apart_together_with_the_recor
     found = discover_effects(joined(simulate_like(circles, recorded.extended, noise_seed=1), [proposed]))
     assert found.effects[0].name == recorded.effects[0].name
     assert found.effects[0].weight >= 0.95
+
+
+SMALL: dict[str, Any] = {"commands": {"directions_deg": [0, 120, 240], "turn_rates": [-0.35, 0.35], "ramp": 0.3}}
+
+
+def test_steps_come_in_order_confirming_only_with_an_effect_and_what_concludes_fits_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    conclude = discover.conclude
+
+    def refuse(*_: Any) -> None:
+        raise AssertionError("fitted while concluding")
+
+    def conclude_without_fits(*args: Any) -> Discovery:
+        with monkeypatch.context() as patch:
+            patch.setattr(Given, "estimate", refuse)
+            patch.setattr(OdometryBatch, "jacobian", refuse)
+            return conclude(*args)
+
+    monkeypatch.setattr(discover, "conclude", conclude_without_fits)
+    with_effect: list[Progress] = []
+    without_effect: list[Progress] = []
+    assert discover.discover_effects(simulated(**SMALL), watch=with_effect.append).verdict == "named"
+    discover.discover_effects(simulated((), **SMALL), watch=without_effect.append)
+    confirming = "looking again, now that the noise is known better"
+    stages = [
+        "fitting the plain matrix",
+        "looking where it fails, and at the catalogue",
+        confirming,
+        "looking at the motors",
+        "comparing on runs that were held out",
+    ]
+    for events, begun in ((with_effect, stages), (without_effect, [stage for stage in stages if stage != confirming])):
+        assert events == [event for stage in begun for event in (Progress(stage), Progress(stage, result=""))]
+
+
+@pytest.mark.parametrize(
+    ("left_share", "names"),
+    [(1.0, ["rotation_translation_coupling"]), pytest.param(0.0, [], marks=pytest.mark.slow)],
+    ids=["most", "little"],
+)
+def test_an_effect_that_was_given_up_is_kept_if_fitted_in_full_it_explains_most_of_what_was_left(
+    left_share: float, names: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    select = discover.select_effects
+    given_up: list[Selection] = []
+
+    def giving_up_at_first(screening: Screening, rng: np.random.Generator) -> Selection:
+        selection = select(screening, rng)
+        if given_up:
+            return selection
+        tentative = selection.chosen
+        given_up.append(replace(selection, chosen=(), stand_ins=(), tentative=tentative, left_share=left_share))
+        return given_up[0]
+
+    monkeypatch.setattr(discover, "select_effects", giving_up_at_first)
+    assert [effect.name for effect in discover.discover_effects(simulated(**SMALL)).effects] == names
+
+
+def with_runs(dataset: Dataset, change) -> Dataset:
+    return replace(dataset, trajectories=tuple(change(run) for run in dataset.trajectories))
+
+
+def turned(run: Trajectory, angle: float) -> Trajectory:
+    """The run as a start heading that is off by an angle would report it."""
+    poses, (x, y) = run.poses.copy(), (run.poses[1:, :2] - run.poses[0, :2]).T
+    poses[1:, 0] = poses[0, 0] + np.cos(angle) * x - np.sin(angle) * y
+    poses[1:, 1] = poses[0, 1] + np.sin(angle) * x + np.cos(angle) * y
+    poses[1:, 2] += angle
+    return replace(run, poses=poses)
+
+
+@pytest.mark.slow
+def test_start_headings_that_scatter_are_not_taken_for_clocks_and_hide_no_delay() -> None:
+    rng = np.random.default_rng(6)
+    dataset = with_runs(simulated(DELAY, repetitions=4, validation=None), lambda run: turned(run, rng.normal(0, 0.03)))
+    runs = usable_runs(dataset.split("train"))
+    fit = fit_matrix(runs, dataset.robot, dataset.sample_period, dataset.robot.inverse_kinematic_matrix)
+    heading, offset, slope = fit.nuisances.deviations
+    assert 0.02 < heading < 0.04
+    assert offset < 0.01
+    assert slope < 0.005
+    assert [effect.name for effect in discover_effects(dataset).effects] == ["reference_time_offset"]
+
+
+@pytest.mark.slow
+def test_without_repetitions_no_gap_is_said_to_be_closed() -> None:
+    found = discover_effects(shorn(simulated(), command=None))
+    assert [effect.name for effect in found.effects] == ["rotation_translation_coupling"]
+    assert all(gap.closed is None for each in found.held_out for gap in (each.eq6, each.chi2))
+    assert any("Without repetitions" in note for note in found.notes)
+
+
+@pytest.mark.slow
+def test_results_do_not_depend_on_where_and_in_which_heading_runs_start() -> None:
+    rng = np.random.default_rng(7)
+
+    def moved(run: Trajectory) -> Trajectory:
+        angle, shift = rng.uniform(-np.pi, np.pi), rng.uniform(-2, 2, 2)
+        cosine, sine = np.cos(angle), np.sin(angle)
+        x, y, heading = run.poses.T
+        return replace(run, poses=np.column_stack([cosine * x - sine * y + shift[0], sine * x + cosine * y + shift[1],
+                                                   heading + angle]))  # fmt: skip
+
+    found = repeated()
+    elsewhere = discover_effects(with_runs(simulated(repetitions=4), moved))
+    assert elsewhere.noise.noise.model_dump() == pytest.approx(found.noise.noise.model_dump(), rel=1e-3, abs=1e-6)
+    assert elsewhere.gap.floor == pytest.approx(found.gap.floor, rel=1e-3)
+    ours, theirs = ([each.value for each in own.effects[0].parameters] for own in (found, elsewhere))
+    assert theirs == pytest.approx(ours, rel=1e-3)
+
+
+@pytest.mark.slow
+def test_errors_are_those_that_evaluate_finds() -> None:
+    rng = np.random.default_rng(8)
+    dataset = with_runs(simulated(), lambda run: turned(run, rng.normal(0, 0.02)))
+    found = discover_effects(dataset)
+    model = found.extended.model
+    finals = [run.final_pose - model.reported([run.final_log])[0][-1] for run in dataset.split("validation")]
+    assert found.held_out[-1].eq6.after == pytest.approx(float(np.mean(np.linalg.norm(finals, axis=1))), rel=1e-6)
+    assert found.extended.provenance is not None
+    assert found.extended.provenance.validation_cost == pytest.approx(found.held_out[-1].eq6.after, rel=1e-6)
+    assert evaluate(found.extended, dataset).held_out.runs == tuple(run.id for run in dataset.split("validation"))
+
+
+@pytest.mark.slow
+def test_a_warm_up_that_ends_is_not_carried_on_without_a_warning() -> None:
+    drift = ({"name": "thermal_radius_drift", "parameters": {"k": 2e-5}},)
+    dataset = simulated(drift, repetitions=6)
+    late = with_runs(
+        dataset,
+        lambda run: replace(run, started_at=run.started_at + 20_000) if run.split == "validation" else run,
+    )
+    found = discover_effects(late)
+    assert [effect.name for effect in found.effects] == ["thermal_radius_drift"]
+    assert "Beware" in found.headline
+    assert any("not known to hold" in note for note in found.notes)
+
+
+@pytest.mark.slow
+def test_final_poses_alone_are_enough_to_look_at() -> None:
+    def ends(run: Trajectory) -> Trajectory:
+        return replace(run, pose_times=run.pose_times[[0, -1]], poses=run.poses[[0, -1]])
+
+    found = discover_effects(with_runs(simulated(validation=None), ends))
+    assert [effect.name for effect in found.effects] == ["rotation_translation_coupling"]
+
+
+@pytest.mark.slow
+def test_validation_runs_that_lack_what_an_effect_needs_are_left_out() -> None:
+    wheel = ({"name": "wheel_eccentricity", "parameters": {"a_a": 0.03, "b_b": -0.03}},)
+    dataset = simulated(wheel)
+    found = discover_effects(
+        with_runs(dataset, lambda run: replace(run, angles=None) if run.split == "validation" else run)
+    )
+    assert [effect.name for effect in found.effects] == ["wheel_eccentricity"]
+    assert [each.data for each in found.held_out] == ["repetitions"]
+    assert any("left out" in note for note in found.notes)
+
+
+@pytest.mark.slow
+def test_targets_that_were_never_filled_switch_off_the_motors_only() -> None:
+    found = discover_effects(with_runs(simulated(validation=None), lambda run: replace(run, targets=0 * run.rates)))
+    assert [effect.stage for effect in found.effects] == ["body"]
+
+
+def thrown_at_the_end() -> Dataset:
+    """A recording whose reference jumps by 0.3 m at the end of every ninth run."""
+    dataset = simulated((), repetitions=4)
+    runs = []
+    for number, run in enumerate(dataset.trajectories):
+        poses = run.poses.copy()
+        poses[-1, 0] += 0.3 * (number % 9 == 0)
+        runs.append(replace(run, poses=poses))
+    return replace(dataset, trajectories=tuple(runs))
+
+
+def test_errors_before_are_what_evaluate_says_of_the_plain_calibration_outliers_or_not() -> None:
+    dataset = thrown_at_the_end()
+    discovery = discover_effects(dataset, unknown_term=False)
+    evaluation = evaluate(discovery.plain, dataset)
+    assert discovery.outliers >= 8
+    assert discovery.steps[0].eq6_train == pytest.approx(evaluation.splits["train"].cost, rel=1e-9)
+    repetitions, session = discovery.held_out
+    errors = evaluation.splits["validation"]
+    assert session.eq6.before == pytest.approx(errors.cost, rel=1e-9)
+    assert session.position_m[0] == pytest.approx(errors.position_mean_m, rel=1e-9)
+    assert session.heading_rad[0] == pytest.approx(errors.heading_mean_rad, rel=1e-9)
+    # Cross-validated: a little more than of the fit to all runs.
+    assert repetitions.eq6.before == pytest.approx(evaluation.splits["train"].cost, rel=0.03)
+    assert np.isfinite(repetitions.chi2.before)
+
+
+def test_validation_runs_that_all_stand_are_left_out_with_a_warning() -> None:
+    dataset = simulated((), repetitions=2)
+    robot = dataset.robot
+    fit = fit_matrix(usable_runs(dataset.split("train")), robot, dataset.sample_period, robot.inverse_kinematic_matrix)
+
+    def standing(run: Trajectory) -> Trajectory:
+        return replace(run, rates=0 * run.rates) if run.split == "validation" else run
+
+    validation = validation_runs(replace(dataset, trajectories=tuple(map(standing, dataset.trajectories))), fit)
+    assert validation.runs == ()
+    assert validation.warnings == (
+        "the wheels stand in all runs of the split validation; drive some, or check the columns omega_*; "
+        "nothing is compared on it.",
+    )

@@ -64,7 +64,10 @@ def recordings(
     return simulate_dataset(validate(FlowerConfig, changed, f"{name}.yaml")).dataset
 
 
-@pytest.mark.parametrize("case", HIDDEN)
+FIRST, *OTHERS = HIDDEN
+
+
+@pytest.mark.parametrize("case", [FIRST, *(pytest.param(case, marks=pytest.mark.slow) for case in OTHERS)])
 def test_an_effect_of_a_robots_class_is_named_with_its_size(case: str) -> None:
     robot, name, parameters, commands, share = HIDDEN[case]
     found = discover_effects(recordings(robot, [{"name": name, "parameters": parameters}], commands))
@@ -77,17 +80,20 @@ def test_an_effect_of_a_robots_class_is_named_with_its_size(case: str) -> None:
     assert estimates[sought] == pytest.approx(value, rel=share)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "car"])
 def test_nothing_is_named_on_a_robot_of_any_class_where_nothing_is_hidden(name: str) -> None:
     found = discover_effects(recordings(name, [], WEAVE))
     assert (found.verdict, found.effects) == ("none", ())
 
 
+@pytest.mark.slow
 def test_a_car_whose_axles_are_not_square_has_a_steering_offset_or_nothing() -> None:
     found = discover_effects(recordings("car", [], {}))
     assert {each.name for each in found.effects} <= {"steering_offset"}
 
 
+@pytest.mark.slow
 def test_only_effects_that_apply_are_tried_and_absorbed_ones_have_a_measurement() -> None:
     swerve, skid = (discover_effects(recordings(name, [], {})) for name in ("swerve", "skid"))
     tried = [{each.name for each in (*found.hidden, *found.measurements)} for found in (swerve, skid)]
@@ -100,6 +106,7 @@ def test_only_effects_that_apply_are_tried_and_absorbed_ones_have_a_measurement(
     assert all(each.measurement for each in (*swerve.measurements, *skid.measurements))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["tricycle", "car"])
 def test_the_extended_model_and_the_report_are_made_for_robots_that_steer(name: str) -> None:
     term = [{"name": "steering_play", "parameters": {"b": 0.02}}]
@@ -112,6 +119,7 @@ def test_the_extended_model_and_the_report_are_made_for_robots_that_steer(name: 
     assert "steering_play" in render(discovery_report(found, ""))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("recording", [tricyc, diff], ids=["tricyc", "diff"])
 def test_real_recordings_go_through_and_what_is_said_of_them_is_consistent(recording: Callable[[], Dataset]) -> None:
     # Fewer runs and poses, for time; tests/studies/wheeled_discovery.py takes all.

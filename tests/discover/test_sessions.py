@@ -7,7 +7,7 @@ from io import StringIO
 from pathlib import Path
 
 import pytest
-from discovery_samples import held_out, named, nothing, shorn, simulated
+from discovery_samples import held_out, named, nothing
 from hidden.session_sets import session_set
 from report_page import Page
 from rich.console import Console
@@ -39,12 +39,6 @@ def printed(found: Discovery) -> str:
     return output.getvalue()
 
 
-def with_few_runs(dataset: Dataset) -> Dataset:
-    command = dataset.trajectories[0].command
-    runs = [run for run in dataset.split("train") if run.command == command][:2]
-    return replace(dataset, trajectories=tuple(runs))
-
-
 def test_nothing_is_not_said_to_be_missing_where_the_held_out_session_has_other_wheels() -> None:
     found = worn()
     assert found.verdict == "none"
@@ -55,6 +49,7 @@ def test_nothing_is_not_said_to_be_missing_where_the_held_out_session_has_other_
     assert "residuals of the plain matrix are what the noise leaves" not in page(found).text
 
 
+@pytest.mark.slow
 def test_nothing_is_not_said_to_be_missing_where_sessions_cannot_be_compared() -> None:
     dataset = session_set("small", 3, change=0.02)
     found = discover_effects(
@@ -96,6 +91,7 @@ def halved(dataset: Dataset, *, validate: bool) -> Dataset:
     return replace(dataset, trajectories=tuple(kept))
 
 
+@pytest.mark.slow
 def test_sessions_that_train_on_one_run_a_command_each_give_tyre_wear_its_name() -> None:
     found = discover_effects(halved(session_set("small", 3, change=0.02, repetitions=2), validate=True))
     assert [effect.name for effect in found.effects] == ["tyre_wear"]
@@ -105,36 +101,12 @@ def test_sessions_that_train_on_one_run_a_command_each_give_tyre_wear_its_name()
     assert all(held.eq6.floor is None or held.eq6.floor <= held.eq6.after for held in found.held_out)
 
 
+@pytest.mark.slow
 def test_without_repetitions_in_a_session_the_runs_of_another_are_none() -> None:
     found = discover_effects(halved(session_set("small", 3, change=0.02, repetitions=2), validate=False))
     assert found.noise.source == "within runs"
     assert "no session repeats a command" in found.noise.description
     assert all(held.eq6.floor is None for held in found.held_out)
-
-
-def test_where_nothing_was_added_the_report_draws_no_two_models_and_offers_none() -> None:
-    found = nothing()
-    report, told = page(found), printed(found)
-    assert "verdict: none" in told
-    assert not found.extends
-    for words in (report.text, told):
-        assert "extended model" not in words
-        assert "extended calibration" not in words
-        assert "After" not in words
-    assert report.tables["On held-out runs"][0][1:3] == ["Plain matrix", "Floor"]
-
-
-def test_held_out_runs_are_a_session_only_where_sessions_are_known() -> None:
-    assert "held-out session" in page(nothing()).text
-    unknown = page(discover_effects(shorn(simulated(()), session=None))).text
-    assert "held-out session" not in unknown
-    assert "held-out runs" in unknown
-
-
-def test_of_two_runs_headline_and_verdict_say_that_they_show_hardly_anything() -> None:
-    found = discover_effects(with_few_runs(session_set("small", 3)))
-    assert "2 runs of 1 command can show hardly anything" in found.headline
-    assert "hardly anything" in verdict_in_words(found)
 
 
 def test_where_nothing_was_added_programs_are_offered_no_extended_calibration(tmp_path: Path) -> None:

@@ -54,6 +54,7 @@ def test_every_figure_is_written_as_svg_and_png_with_titles_and_legend(tmp_path:
     assert (tmp_path / "figures" / "wheels-more.png").read_bytes()[1:4] == b"PNG"
 
 
+@pytest.mark.slow
 def test_a_figure_of_a_megabyte_is_written(tmp_path: Path) -> None:
     try:
         browser()

@@ -111,12 +111,6 @@ def test_encoder_ticks_are_found_in_quantised_rates(made: Sample) -> None:
     assert rate_step(made.dataset.trajectories[0]) == pytest.approx(TICK)
 
 
-def test_rates_that_are_not_quantised_have_no_step(made: Sample) -> None:
-    run = made.dataset.trajectories[0]
-    noisy = run.rates + np.random.default_rng(2).normal(0, 1e-3, run.rates.shape)
-    assert rate_step(replace(run, rates=noisy)) is None
-
-
 def test_the_mean_over_100_ms_is_that_of_the_samples(made: Sample) -> None:
     run = made.dataset.trajectories[0]
     figure = wheel_rates(run, made.dataset.robot).figures[0].plot
@@ -131,10 +125,6 @@ def test_the_error_is_measured_minus_target(made: Sample) -> None:
     _, error = wheel_rates(slow, made.dataset.robot).figures
     assert error.title == "Measured − target: mean −0.25, RMS 0.25 rad/s"
     assert all(np.allclose(trace.y, -0.25) for trace in error.plot.data)
-
-
-def test_wheels_without_targets_have_no_error(made: Sample) -> None:
-    assert len(wheel_rates(replace(made.dataset.trajectories[0], targets=None), made.dataset.robot).figures) == 1
 
 
 def test_errors_do_not_depend_on_where_the_reference_has_its_origin(made: Sample) -> None:

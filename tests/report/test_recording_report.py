@@ -14,6 +14,7 @@ import pytest
 from browser import first_picture, opened
 from recording_samples import COMMANDS, PERIOD, TICK, Sample, sample
 from report_page import Page
+from syrupy.assertion import SnapshotAssertion
 
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.scans import ScansInMemory
@@ -62,22 +63,16 @@ def bare(dataset: Dataset) -> Dataset:
     return replace(dataset, trajectories=runs, scans=None)
 
 
+def test_the_report_reads_as_before(report: Page, snapshot: SnapshotAssertion) -> None:
+    assert report.words() == snapshot
+
+
 def test_every_link_of_table_1_has_its_number_and_rate(made: Sample, report: Page) -> None:
     samples = f"{sum(len(run.times) for run in made.dataset.trajectories):,} samples"
     scans = sum(len(run.pose_times) for run in made.dataset.trajectories)
-    assert report.row(CONTENTS, "Motion command")[1:3] == ["8 runs", "–"]
-    assert report.row(CONTENTS, "Target wheel rates")[1:3] == [samples, "10.0 ms"]
-    assert report.row(CONTENTS, "Measured wheel rates")[1:] == [
-        samples,
-        "10.0 ms",
-        f"by encoders, in steps of {TICK:.3f} rad/s",
-    ]
+    assert report.row(CONTENTS, "Measured wheel rates")[1:3] == [samples, "10.0 ms"]
+    assert f"{TICK:.3f} rad/s" in report.row(CONTENTS, "Measured wheel rates")[3]
     assert report.row(CONTENTS, "LIDAR scans")[1] == f"{scans} scans"
-    assert report.row(CONTENTS, "LIDAR scans")[3] == "Hokuyo UTM-30LX: 90 ranges over 267°, to 30 m"
-    assert report.row(CONTENTS, "Reference poses")[1::2] == [f"{scans} poses", "with covariances"]
-
-
-def test_scans_between_200_and_300_ms_are_told_so(report: Page) -> None:
     median, low, high = map(float, re.findall(r"\d+", report.row(CONTENTS, "LIDAR scans")[2]))
     assert 200 <= low < median < high <= 300
 
@@ -88,25 +83,15 @@ def test_what_was_not_recorded_is_told_so(made: Sample, tmp_path: Path) -> None:
         assert told.row(CONTENTS, name)[1] == "not recorded"
     assert told.row(CONTENTS, "Reference poses")[3] == "without covariances"
     assert told.row(CONTENTS, "Reference poses")[0].endswith("(x, y, θ)")  # no LIDAR made them
-
-
-def test_a_recording_without_scans_targets_and_commands_still_has_its_pictures(made: Sample, tmp_path: Path) -> None:
-    told = page(bare(made.dataset), tmp_path)
     assert {"room", "wheels", "player"} <= set(told.sections)
     assert all(run["scans"] == [] and run["targets"] is None for run in played(told).values())
 
 
-def test_simulated_data_wear_a_badge(report: Page) -> None:
-    assert "SIMULATED DATA" in report.text
-
-
-def test_recorded_data_wear_no_badge(made: Sample, tmp_path: Path) -> None:
-    assert "SIMULATED" not in page(replace(made.dataset, simulated=False), tmp_path).text
-
-
 def test_notes_and_warnings_are_told(made: Sample, report: Page, tmp_path: Path) -> None:
     assert "Made for a test." in report.text
-    assert "something odd" in page(replace(made.dataset, warnings=("something odd",)), tmp_path).text
+    told = page(replace(made.dataset, warnings=("something odd",), simulated=False), tmp_path).text
+    assert "something odd" in told
+    assert "SIMULATED" not in told
 
 
 def distance_to_walls(points: np.ndarray, outlines: list[list[list[float]]]) -> np.ndarray:
@@ -132,10 +117,6 @@ def test_the_floor_plan_lies_where_the_scans_see_walls(made: Sample, tmp_path: P
 def test_a_plan_drawn_from_the_mark_is_said_to_be_inexact(made: Sample, tmp_path: Path) -> None:
     told = page(made.dataset, tmp_path, plan=made.plan)
     assert "is drawn from the robot's mark" in told.text
-
-
-def test_a_plan_with_known_starts_is_exact(report: Page) -> None:
-    assert "is drawn from the robot's mark" not in report.text
 
 
 def test_frames_of_the_player_follow_reference_odometry_and_truth(made: Sample, report: Page) -> None:
@@ -184,11 +165,6 @@ def test_the_truth_of_other_runs_is_one_line(made: Sample, tmp_path: Path, with_
         page(made.dataset, tmp_path, truth={"another": made.truth["left-0"]}, accuracy=accuracy)
 
 
-def test_ellipses_say_how_much_larger_they_are_drawn(report: Page) -> None:
-    largest = math.sqrt(5.991) * 2  # mm
-    assert re.search(rf"drawn \d+ times as large; the largest half axis is {largest:.3g} mm", report.text)
-
-
 def test_broken_scans_are_one_line(made: Sample, tmp_path: Path) -> None:
     save_dataset(made.dataset, tmp_path / "data")
     dataset = load_dataset(tmp_path / "data")
@@ -197,12 +173,7 @@ def test_broken_scans_are_one_line(made: Sample, tmp_path: Path) -> None:
         page(dataset, tmp_path)
 
 
-def test_a_report_that_cannot_be_written_is_one_line(made: Sample, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("not a folder")
-    with pytest.raises(DataError, match="cannot be written"):
-        write_document(recording_document(made.dataset), tmp_path / "file" / "report.html")
-
-
+@pytest.mark.slow
 def test_long_runs_with_many_scans_stay_below_six_megabytes(tmp_path: Path) -> None:
     long = sample(repetitions=1, duration=30.0, rays=1080)
     many = tuple(replace(run, id=f"{run.id}-{number}") for number in range(100) for run in long.dataset.trajectories)
@@ -257,6 +228,7 @@ for (const select of document.querySelectorAll(".choice select")) {
 </script>"""
 
 
+@pytest.mark.slow
 def test_a_browser_draws_every_plot_and_plays_the_runs(made: Sample, tmp_path: Path) -> None:
     told = page(made.dataset, tmp_path, truth=made.truth, plan=made.plan, starts=made.starts)
     (tmp_path / "driven.html").write_text(told.html.replace("</body>", f"{DRIVE}</body>"), encoding="utf-8")
@@ -285,6 +257,7 @@ def test_singular_covariances_of_a_foreign_recording_are_left_out_of_the_nees(ma
     assert "NEES of all poses: mean" in page(some, tmp_path, truth=made.truth).text
 
 
+@pytest.mark.slow
 def test_the_paths_of_a_recording_stand_in_the_first_900_pixels(made: Sample, tmp_path: Path) -> None:
     page(made.dataset, tmp_path, truth=made.truth, plan=made.plan, starts=made.starts)
     bottom, width = first_picture(tmp_path / "report.html")

@@ -1,4 +1,4 @@
-"""A document as one HTML file."""
+"""A document as one HTML file, and the words that it explains where they first occur."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import plotly.graph_objects as go
 import pytest
+from report_page import Page
 
 from omnibench.errors import DataError
 from omnibench.report.blocks import (
@@ -31,6 +32,7 @@ from omnibench.report.blocks import (
     Section,
     Table,
 )
+from omnibench.report.glossary import Glossary
 from omnibench.report.render import render, write_document
 from omnibench.report.style import plot
 
@@ -127,11 +129,6 @@ def test_the_table_of_contents_leads_to_every_section() -> None:
     assert {attrs.get("id") for tag, attrs in reader.tags if tag == "section"} == {"outer", "inner"}
 
 
-def test_an_empty_callout_leaves_no_trace() -> None:
-    reader = Reader(render(document(Callout("Warnings", ()))))
-    assert "Warnings" not in reader.text
-
-
 def test_a_report_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("not a folder")
     with pytest.raises(DataError, match=r"report\.html: cannot be written"):
@@ -141,3 +138,39 @@ def test_a_report_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
 def test_a_written_report_is_what_was_rendered(tmp_path: Path) -> None:
     write_document(document(Paragraph("text")), tmp_path / "deep" / "report.html")
     assert (tmp_path / "deep" / "report.html").read_text(encoding="utf-8") == render(document(Paragraph("text")))
+
+
+def test_a_word_is_explained_where_it_first_occurs_and_only_there() -> None:
+    glossary = Glossary()
+    assert glossary.marked("the held-out error").startswith('the <dfn title="runs that the fit has not seen')
+    assert glossary.marked("held out again") == "held out again"
+    assert [word for word, _ in glossary.fresh()] == ["held out"]
+    assert glossary.fresh() == []
+
+
+def test_a_part_of_a_word_is_not_marked() -> None:
+    assert Glossary().marked("costly boxes, preference") == "costly boxes, preference"
+
+
+def test_hostile_words_stay_words() -> None:
+    marked = Glossary().marked("<b>cost</b> & <i>")
+    assert marked.startswith("&lt;b&gt;<dfn ")
+    assert marked.endswith("</dfn>&lt;/b&gt; &amp; &lt;i&gt;")
+
+
+def test_the_meanings_stand_below_the_section_that_first_uses_the_words() -> None:
+    sections = (
+        Section("a", "One", (Paragraph("The cost fell."),)),
+        Section("b", "Two", (Paragraph("The cost rose."),)),
+    )
+    html = render(Document("t", "s", sections))
+    assert html.count("<dfn ") == 1
+    told = Page(html).text
+    assert told.index("The cost fell.") < told.index("what a calibration makes small") < told.index("The cost rose.")
+
+
+def test_a_word_of_several_meanings_is_explained_where_it_has_the_one_that_is_listed() -> None:
+    glossary = Glossary()
+    assert "<dfn" not in glossary.marked("cannot fall below the bound; the weights of x and y")
+    glossary.marked("98 % of the bound that no design exceeds; weight of 95 %")
+    assert [word for word, _ in glossary.fresh()] == ["bound", "weight"]

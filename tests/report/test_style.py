@@ -1,4 +1,4 @@
-"""Colours and axes of plots."""
+"""Colours, axes and traces of plots, and numbers as a person reads them."""
 
 from __future__ import annotations
 
@@ -10,15 +10,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from omnibench.report.blocks import LegendItem
-from omnibench.report.figures import path
+from omnibench.report.figures import area, arrows, coordinates, joined, line, marks, path
+from omnibench.report.numbers import (
+    NOTHING,
+    decimals_for,
+    fixed,
+    listing,
+    power_of_ten,
+    round_down,
+    seconds,
+    significant,
+    typeset,
+    with_unit,
+)
 from omnibench.report.style import PALETTE, REFERENCE, THEORETICAL, colours, logarithmic, plan, plot, text, wrapped
+from omnibench.words import noun_for, plural
 
 
-def test_an_entry_gets_the_colour_that_it_wants() -> None:
-    assert colours({"crs": "#e69f00", "other": None})["crs"] == ("#e69f00", "solid")
-
-
-def test_the_second_to_want_a_colour_gets_another() -> None:
+def test_an_entry_gets_the_colour_that_it_wants_and_the_second_to_want_it_another() -> None:
     given_styles = colours({"first": "#0072b2", "second": "#0072b2"})
     assert given_styles["first"] == ("#0072b2", "solid")
     assert given_styles["second"] != given_styles["first"]
@@ -77,3 +86,126 @@ def test_long_labels_break_after_their_words_and_within_a_word_that_is_too_long(
 def test_a_path_near_the_origin_is_drawn_as_it_is() -> None:
     figure = plan(path(LegendItem("a", "a path", "#111111"), np.array([[90.0, 2.0], [91.0, 3.0]]), 2.0))
     assert (figure.data[0].x, figure.layout.xaxis.title.text) == ((90.0, 91.0), "x (m)")
+
+
+ITEM = LegendItem("key", "a <name>", "#0072b2", "dot", "square-open")
+
+
+def test_a_line_breaks_at_nan_and_between_joined_paths() -> None:
+    drawn = line(ITEM, 2.0, *joined([np.zeros((2, 2)), np.ones((1, 2))]).T)
+    assert drawn.x == (0.0, 0.0, None, 1.0)
+    assert coordinates([math.nan, 1.2345678, 3.0]) == [None, 1.2346, 3.0]
+
+
+def test_coordinates_are_as_fine_far_from_the_origin_as_near_it() -> None:
+    assert coordinates([500000.0, 500000.12345, 500005.0]) == [500000.0, 500000.12345, 500005.0]
+    assert coordinates([-500000.0, -500000.1, -500005.0]) == [-500000.0, -500000.1, -500005.0]
+    assert coordinates([1e-9, 1.23456789e-6, 1.0]) == [1e-9, 1.2346e-6, 1.0]  # of a logarithmic axis
+    assert coordinates([1234.5678] * 2) == [1234.5678] * 2
+
+
+def test_a_trace_has_the_style_of_its_item_and_is_switched_by_it() -> None:
+    drawn = line(ITEM, 2.0, [0.0], [1.0])
+    assert (drawn.line.color, drawn.line.dash, drawn.line.width) == ("#0072b2", "dot", 2.0)
+    assert marks(ITEM, 5, [0.0], [1.0]).marker.symbol == "square-open"
+    assert {trace.legendgroup for trace in (drawn, area("key", "red", [0.0], [1.0]))} == {"key"}
+
+
+def test_what_has_nothing_to_show_is_not_hovered_over() -> None:
+    assert line(ITEM, 2.0, [0.0], [1.0]).hoverinfo == "skip"
+    assert marks(ITEM, 5, [0.0], [1.0], hover="%{text}", words=["here"]).hovertemplate == "%{text}<extra></extra>"
+
+
+def test_names_of_categories_and_words_cannot_be_markup() -> None:
+    drawn = marks(ITEM, 5, [1.0], ["<b>"], hover="%{text}", words=["one\n<two>"])
+    assert drawn.y == ("&lt;b&gt;",)
+    assert drawn.text == ("one<br>&lt;two&gt;",)
+
+
+def test_arrows_point_from_start_to_tip() -> None:
+    starts = np.zeros((3, 2))
+    shafts, heads = arrows(ITEM, starts, np.array([[0.0, 1.0], [1.0, 0.0], [-1.0, 0.0]]), ["up", "right", "left"])
+    assert shafts.y == (0.0, 1.0, None, 0.0, 0.0, None, 0.0, 0.0)
+    assert heads.marker.angle == (0.0, 90.0, -90.0)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.12345, "0.1235"),
+        (-0.5, "−0.5000"),
+        (12345.0, "12,345.0000"),
+        (-1e-9, "0.0000"),
+        (None, NOTHING),
+        (math.nan, NOTHING),
+        (math.inf, "∞"),
+    ],
+)
+def test_a_fixed_number_has_its_decimals_and_a_true_minus(value: float | None, text: str) -> None:
+    assert fixed(value, 4) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.0, "0"),
+        (0.021434, "0.0214"),
+        (2.04e-8, "2.04 × 10⁻⁸"),
+        (9.996e-8, "1.00 × 10⁻⁷"),
+        (1234567.0, "1.23 × 10⁶"),
+        (637.0, "637"),
+    ],
+)
+def test_significant_digits_use_powers_of_ten_where_zeros_would_be_counted(value: float, text: str) -> None:
+    assert significant(value, 3) == text
+
+
+@given(st.floats(min_value=-1e12, max_value=1e12, allow_nan=False).filter(lambda value: abs(value) > 1e-300))
+def test_significant_digits_read_back_to_the_same_value(value: float) -> None:
+    words = significant(value, 4).replace("−", "-").replace(",", "")
+    if " × 10" in words:
+        mantissa, exponent = words.split(" × 10")
+        power = exponent.translate(str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789"))
+        words = f"{mantissa}e{power}"
+    assert float(words) == pytest.approx(value, rel=6e-4)
+
+
+@given(st.floats(min_value=1e-6, max_value=1e6))
+def test_decimals_show_the_digits_that_were_asked_for(value: float) -> None:
+    assert float(fixed(value, decimals_for(value, 3)).replace(",", "")) == pytest.approx(value, rel=6e-3)
+
+
+@pytest.mark.parametrize(("value", "text"), [(5e-5, "< 1 ms"), (0.0823, "82 ms"), (26.54, "26.5 s"), (637.2, "637 s")])
+def test_a_duration_has_a_unit_that_suits_it(value: float, text: str) -> None:
+    assert seconds(value) == text
+
+
+def test_a_listing_ends_with_and_and_counts_what_it_leaves_out() -> None:
+    assert listing(["a"]) == "a"
+    assert listing(["a", "b", "c"]) == "a, b and c"
+    assert listing(["a", "b", "c", "d"], limit=2) == "a, b and 2 more"
+    assert listing(["a", "b", "c"], last="or") == "a, b or c"
+
+
+def test_sentences_of_the_terminal_get_arrows_minus_and_degree_signs() -> None:
+    words = "held out: 52 mm -> 14 mm, 4.4 deg -> 1.0 deg (95 % interval -3.2 to 7.3 %); run-01, turn-360"
+    assert typeset(words) == "held out: 52 mm → 14 mm, 4.4° → 1.0° (95 % interval −3.2 to 7.3 %); run-01, turn-360"
+
+
+def test_the_degree_sign_alone_follows_without_a_space() -> None:
+    assert [with_unit("3", unit) for unit in ("mm", "°", "°/s", "")] == ["3 mm", "3°", "3°/s", "3"]
+
+
+def test_plurals_are_english() -> None:
+    assert [plural(1, "run"), plural(2, "run"), plural(180, "trajectory")] == ["1 run", "2 runs", "180 trajectories"]
+    assert [noun_for(1, "run"), noun_for(2000, "run")] == ["run", "runs"]
+    assert [plural(1, "simulated trajectory"), plural(0, "ray")] == ["1 simulated trajectory", "0 rays"]
+
+
+def test_powers_of_ten_are_set_as_such() -> None:
+    assert [power_of_ten(exponent) for exponent in (-10, -1, 0, 3, 4)] == ["10⁻¹⁰", "0.1", "1", "1,000", "10⁴"]
+
+
+@pytest.mark.parametrize(("value", "step"), [(7.3, 5), (5.0, 5), (1.0, 1), (0.37, 0.2), (99.0, 50)])
+def test_enlargements_are_round(value: float, step: float) -> None:
+    assert round_down(value) == pytest.approx(step)

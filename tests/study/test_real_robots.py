@@ -1,4 +1,4 @@
-"""configs/real_robots.yaml on the recordings, where they are at hand: a selection that takes seconds."""
+"""configs/real_robots.yaml on the recordings, and figures of the page on the paper that take minutes."""
 
 from __future__ import annotations
 
@@ -6,12 +6,15 @@ from pathlib import Path
 
 import pytest
 from commands import CONFIGS, RECORDINGS
+from page_figures import assert_printed, chain_figures, chain_results
 from shared_results import made_once, shared_folder
 
 from omnibench.study.config import StudyConfig, TrainingChoice
 from omnibench.study.study import read_study_config, run_study, study_table
 from omnibench.study.study_result import StudyResult
 from omnibench.study.trainings import divide
+
+pytestmark = pytest.mark.slow
 
 CONFIG = CONFIGS / "real_robots.yaml"
 METHODS = ("design", "posterior", "closed_form", "kallasi", "lin", "umbmark")
@@ -84,3 +87,7 @@ def test_every_robot_of_the_config_is_divided_as_it_says() -> None:
         trainings = divide(dataset, choice, choice.trainings or config.trainings, name)
         assert len(trainings) > 1
         assert all(fold.training and any(fold.judged.values()) for each in trainings for fold in each.folds)
+
+
+def test_the_page_on_the_paper_prints_the_costs_of_the_simulated_robots(tmp_path: Path) -> None:
+    assert_printed("chain", chain_figures(chain_results(tmp_path)))

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import polars as pl
 import pytest
-from commands import PLUGIN_IMPORTS, omnibench, summary
+from commands import Command, run_here, summary, write_plugin
 from studied import write_study
 
 METHOD = """
@@ -29,14 +30,13 @@ class Method(Calibrator):
 
 def with_plugins(config: dict[str, Any], folder: Path) -> None:
     """Methods that fail or are not for these robots beside those of the study, and a robot that is not there."""
-    plugins = folder / "plugins"
-    plugins.mkdir()
     bodies = {"fails": ("True", "raise ValueError('no luck')"), "on_rails": ("False", "return None")}
     for name, (applies, body) in bodies.items():
-        text = METHOD.format(name=name, applies=applies, body=body)
-        (plugins / f"{name}.py").write_text(PLUGIN_IMPORTS + text)
-    config["plugins"].append(str(plugins))
+        write_plugin(folder / "plugins", name, METHOD.format(name=name, applies=applies, body=body))
+    config["plugins"].append(str(folder / "plugins"))
     config["methods"] += [{"name": name, "family": "published"} for name in bodies]
+    config["trainings"] = ["kind"]
+    config["robots"]["two"]["trainings"] = ["kind", "session"]
     config["robots"]["lost"] = {"path": "lost"}
     config["regimes"] = {"noise": {"noise_position": 0.05, "trainings": ["arc", "line"]}}
 
@@ -57,7 +57,7 @@ class Studied:
 def studied(tmp_path_factory: pytest.TempPathFactory) -> Studied:
     folder = tmp_path_factory.mktemp("study")
     file = write_study(folder, lambda config: with_plugins(config, folder))
-    return Studied(omnibench("compare", file, "-o", folder / "out"), folder / "out")
+    return Studied(run_here("compare", file, "-o", folder / "out", cwd=folder), folder / "out")
 
 
 def test_every_method_is_fitted_to_the_same_runs_and_judged_on_the_same_others(studied: Studied) -> None:
@@ -72,14 +72,13 @@ def test_every_method_is_fitted_to_the_same_runs_and_judged_on_the_same_others(s
     assert of_cells["rows"].to_list() == [3] * len(of_cells)
 
 
-def test_a_calibration_on_arcs_is_better_than_the_design_on_lines(studied: Studied) -> None:
+def test_a_calibration_on_arcs_is_better_than_the_design_on_lines_and_the_design_is_one_times_itself(
+    studied: Studied,
+) -> None:
     (row,) = studied.rows(robot="two", training="arc", judged="line", method="default", regime="as recorded").to_dicts()
     assert row["ratio"] < 0.5
     assert row["family_high"] < 1
-
-
-def test_the_design_is_one_times_itself(studied: Studied) -> None:
-    assert studied.rows(method="design")["ratio"].to_list() == pytest.approx([1.0] * len(studied.rows(method="design")))
+    assert set(studied.rows(method="design")["ratio"].round(12)) == {1.0}
 
 
 def test_a_method_that_fails_and_one_for_other_robots_are_rows(studied: Studied) -> None:
@@ -127,7 +126,7 @@ def test_a_row_holds_the_matrix_that_its_errors_come_of(studied: Studied) -> Non
 
 def test_run_again_nothing_is_fitted_twice_and_the_table_is_the_same(studied: Studied) -> None:
     config = studied.output.parent / "study.yaml"
-    again = omnibench("compare", config, "-o", studied.output)
+    again = run_here("compare", config, "-o", studied.output, cwd=config.parent)
     assert again.returncode == 1
     fitted = [line for line in again.stderr.splitlines() if line.startswith("[") and "kept" not in line]
     assert not [line for line in fitted if "failed" not in line and "not applicable" not in line]
@@ -137,66 +136,60 @@ def test_run_again_nothing_is_fitted_twice_and_the_table_is_the_same(studied: St
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (
-            {"methods": ["closed_from"], "reference": None},
-            "unknown calibrator 'closed_from'; did you mean 'closed_form'?",
-        ),
-        ({"reference": "deafult"}, "reference: no method is called 'deafult'"),
-        ({"data": "nowhere"}, "the recordings are not at"),
+        ({"methods": ["closed_from"], "reference": None}, "'closed_from' 'closed_form'"),
+        ({"reference": "deafult"}, "reference: 'deafult'"),
+        ({"data": "nowhere"}, "nowhere"),
         ({"trainings": ["kinds"]}, "trainings.0.by"),
         ({"seeds": [-1]}, "seeds.0"),
-        ({"backend": "dusk"}, "unknown backend 'dusk'; did you mean 'dask'?"),
-        (
-            {"regimes": {"as recorded": {"noise_position": 1}}},
-            "'as recorded' is the name of the runs without any change",
-        ),
-        ({"methods": [{"name": "closed_form", "trainings": "lime"}], "reference": None}, "did you mean 'line'?"),
-        (
-            {"methods": [{"name": "closed_form", "trainings": ["arc", "lime"]}], "reference": None},
-            "none is called lime",
-        ),
-        ({"methods": [{"name": "closed_form", "cost": "final_pos"}], "reference": None}, "did you mean 'final_pose'?"),
-        ({"robots": {"one": {"format": "csv"}}}, "path is missing"),
+        ({"backend": "dusk"}, "'dusk' 'dask'"),
+        ({"regimes": {"as recorded": {"noise_position": 1}}}, "'as recorded'"),
+        ({"methods": [{"name": "closed_form", "trainings": "lime"}], "reference": None}, "'line'"),
+        ({"methods": [{"name": "closed_form", "trainings": ["arc", "lime"]}], "reference": None}, "lime"),
+        ({"methods": [{"name": "closed_form", "cost": "final_pos"}], "reference": None}, "'final_pose'"),
+        ({"robots": {"one": {"format": "csv"}}}, "path"),
     ],
 )
 def test_a_mistake_in_the_config_is_one_line_and_exit_code_2(
-    tmp_path: Path, change: dict[str, Any], words: str
+    change: dict[str, Any], words: str, command: Command, tmp_path: Path
 ) -> None:
-    run = omnibench("compare", write_study(tmp_path, lambda config: config.update(change)), "-o", tmp_path / "out")
+    run = command("compare", write_study(tmp_path, lambda config: config.update(change)), "-o", tmp_path / "out")
     assert run.returncode == 2
-    assert words in run.stderr
+    assert all(word in run.stderr for word in words.split())
     assert [line[:6] for line in run.stderr.splitlines() if "reading" not in line] == ["error:"]
     assert not (tmp_path / "out").exists()
 
 
-def test_a_pattern_of_a_robot_that_cannot_be_read_is_no_mistake(tmp_path: Path) -> None:
-    def change(config: dict[str, Any]) -> None:
-        config["robots"]["two"] |= {"path": "lost", "kinds": {"spiral": "spiral_*"}}
-        config["methods"][-1]["trainings"] = ["spiral"]
-
-    run = omnibench("compare", write_study(tmp_path, change), "-o", tmp_path / "out")
-    assert run.returncode == 1, run.stderr
-    assert "cannot be read: two" in run.stdout
+def lost_robot(config: dict[str, Any]) -> None:
+    config["robots"]["two"] |= {"path": "lost", "kinds": {"spiral": "spiral_*"}}
+    config["methods"][-1]["trainings"] = ["spiral"]
 
 
-def test_data_says_where_the_recordings_are(tmp_path: Path) -> None:
-    file = write_study(tmp_path, lambda config: config.update({"data": "elsewhere", "trainings": ["kind"]}))
-    run = omnibench("compare", file, "-o", tmp_path / "out", "--data", tmp_path / "recordings")
-    assert run.returncode == 0, run.stderr
+def elsewhere(config: dict[str, Any]) -> None:
+    config |= {"data": "elsewhere", "trainings": ["kind"]}
 
 
-def test_nothing_but_the_design_is_exit_code_1(tmp_path: Path) -> None:
-    plugins = tmp_path / "plugins"
-    plugins.mkdir()
-    (plugins / "fails.py").write_text(
-        PLUGIN_IMPORTS + METHOD.format(name="fails", applies="True", body="raise KeyError")
-    )
+def no_answer(config: dict[str, Any]) -> None:
+    config["methods"] = [{"name": "theoretical", "label": "design"}, {"name": "fails"}]
+    config |= {"plugins": ["plugins"], "reference": None, "trainings": ["kind"]}
 
-    def change(config: dict[str, Any]) -> None:
-        config["plugins"] = [str(plugins)]
-        config["methods"] = [{"name": "theoretical", "label": "design"}, {"name": "fails"}]
-        config["reference"], config["trainings"] = None, ["kind"]
 
-    run = omnibench("compare", write_study(tmp_path, change), "-o", tmp_path / "out")
-    assert run.returncode == 1
-    assert "no method gave an answer" in run.stdout + run.stderr
+@pytest.mark.parametrize(
+    ("change", "arguments", "code", "words"),
+    [
+        (lost_robot, [], 1, "cannot be read: two"),
+        (elsewhere, ["--data", "recordings"], 0, ""),
+        (no_answer, [], 1, "no method gave an answer"),
+    ],
+)
+def test_a_study_that_lacks_something_still_runs_and_its_exit_code_says_so(
+    change: Callable[[dict[str, Any]], None],
+    arguments: list[str],
+    code: int,
+    words: str,
+    command: Command,
+    tmp_path: Path,
+) -> None:
+    write_plugin(tmp_path / "plugins", "fails", METHOD.format(name="fails", applies="True", body="raise KeyError"))
+    run = command("compare", write_study(tmp_path, change), "-o", tmp_path / "out", *arguments)
+    assert run.returncode == code, run.stderr
+    assert words in run.stdout + run.stderr

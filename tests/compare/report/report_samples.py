@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from report_page import Page
+from sample_robots import APR02
 from shared_results import made_once
 
 from omnibench.compare.config import CompareConfig
@@ -22,14 +22,6 @@ from omnibench.environment import environment
 from omnibench.fit.calibrator import RunResult, run_calibrator
 from omnibench.registry import calibrators
 from omnibench.report.render import write_document
-
-APR02 = {
-    "name": "APR-02",
-    "wheels": [
-        {"name": name, "radius": 0.148, "distance": 0.195, "angle": math.radians(degrees)}
-        for name, degrees in zip("abc", (60, 180, 300), strict=True)
-    ],
-}
 
 
 def flower(**changes: Any) -> dict[str, Any]:
@@ -67,7 +59,9 @@ def run(chosen: CompareConfig, datasets: Mapping[str, Dataset] | None = None) ->
     """The comparison of a config, in this process; ``datasets`` in place of the config's own."""
     loaded = dict(datasets or load_datasets(chosen))
     plan = make_plan(chosen, loaded)
-    scored, certificates = certify(plan, score(plan, [solve(planned) for planned in plan], loaded))
+    scored, certificates = certify(
+        chosen.certificate, plan, score(chosen, plan, [solve(planned) for planned in plan], loaded)
+    )
     entries = entry_statistics(scored, chosen.bootstrap)
     return ComparisonResult(
         config=chosen,
@@ -92,7 +86,7 @@ def usual() -> ComparisonResult:
 
 def solve(planned: PlannedRun) -> RunResult:
     """One planned run, in this process."""
-    return run_calibrator(calibrators.create(planned.entry.name, planned.entry.options), planned.task.problem())
+    return run_calibrator(calibrators.create(planned.settings.calibrator, planned.settings.options), planned.problem())
 
 
 def page(result: ComparisonResult, folder: Path) -> Page:

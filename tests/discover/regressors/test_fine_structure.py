@@ -38,8 +38,8 @@ def found_beside(kind: str, seed: int) -> Significance:
     ("kind", "covariate", "term"),
     [
         ("heading_harmonic", "heading", "smooth_heading_wave"),
-        ("swinging_heading", "elapsed time", "smooth_time_wave"),
-        ("slow_wave", "order of runs", "smooth_session_wave"),
+        pytest.param("swinging_heading", "elapsed time", "smooth_time_wave", marks=pytest.mark.slow),
+        pytest.param("slow_wave", "order of runs", "smooth_session_wave", marks=pytest.mark.slow),
     ],
 )
 def test_what_happens_within_a_turn_a_run_or_a_session_is_seen_over_it(kind: str, covariate: str, term: str) -> None:
@@ -50,6 +50,7 @@ def test_what_happens_within_a_turn_a_run_or_a_session_is_seen_over_it(kind: str
     assert found.p_value(found.best) < CHANCE
 
 
+@pytest.mark.slow
 def test_joints_that_knock_the_robot_round_are_seen_in_the_direction_in_which_they_lie() -> None:
     found = found_beside("tiles", 1022)  # whose joints lie at 84.7 deg
     joints = [index for index, group in enumerate(found.groups) if group.basis and group.basis.term == "smooth_joint"]
@@ -61,6 +62,7 @@ def test_joints_that_knock_the_robot_round_are_seen_in_the_direction_in_which_th
     assert "turn the robot" in basis.detail
 
 
+@pytest.mark.slow
 def test_a_belt_is_seen_at_the_number_of_times_that_it_turns_with_its_wheel() -> None:
     found = found_beside("belt", 1030)  # which turns half as often
     basis = found.groups[found.best].basis
@@ -76,7 +78,9 @@ def test_without_absolute_angles_of_the_wheels_none_of_their_waves_are_looked_fo
     assert not any(group.name == "wheel angle" for group in groups)
 
 
-@pytest.mark.parametrize("commands", [3, 6, 12])
+@pytest.mark.parametrize(
+    "commands", [pytest.param(3, marks=pytest.mark.slow), 6, pytest.param(12, marks=pytest.mark.slow)]
+)
 def test_where_nothing_is_missing_no_fine_structure_is_surer_than_chance_however_few_runs(commands: int) -> None:
     dataset, _ = make_set("null", "", 0.0, 1003, design="small")
     kept = sorted({run.command or "" for run in dataset.trajectories})[:commands]

@@ -1,14 +1,15 @@
-"""A discovery's figures as people read them."""
+"""A discovery's figures as people read them, and the scale on which its panels are drawn."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from discovery_samples import held_out, named
 
+from omnibench.discover.report.residuals import PLAIN, Curve, Panel, drawn
 from omnibench.discover.report.tables import (
-    added,
     answer_in_words,
     chance,
     closed_in_words,
@@ -21,9 +22,7 @@ from omnibench.discover.report.tables import (
     value_and_interval,
     weight_in_words,
 )
-from omnibench.discover.result import EstimatedParameter, Extrapolation, Gap, Step
-from omnibench.report.numbers import noise_in_words
-from omnibench.robot.calibration import Noise
+from omnibench.discover.result import EstimatedParameter, Extrapolation, Gap
 
 
 @pytest.mark.parametrize(
@@ -72,14 +71,6 @@ def test_no_gap_is_not_a_gap_that_stayed_open() -> None:
     assert gap_in_words(Gap("eq6", 0.0412, 0.0213, 0.0205, 0.961, 0.001)) == "0.0412 → 0.0213 (floor 0.0205), 96.1 %"
 
 
-def test_a_step_names_the_effect_it_added() -> None:
-    assert added(Step("+ floor_drift", 1.0, None, 1.0, None)) == "floor_drift"
-
-
-def test_noise_that_is_not_there_is_not_told() -> None:
-    assert noise_in_words(Noise(pose_position=0.01)) == ("white 10 mm", "none")
-
-
 def test_a_bound_many_times_the_plain_matrix_s_is_not_given_as_a_figure() -> None:
     said, not_said = (Extrapolation("square", "turns", 0.158, after) for after in (0.3, 8.14))
     assert extrapolations_in_words((said,)) == (
@@ -105,3 +96,23 @@ def test_a_cause_that_is_not_sure_is_said_to_be_the_likeliest() -> None:
     doubtful = replace(found, effects=(replace(effect, class_weight=0.5),))
     assert not answer_in_words(found).startswith("Likeliest")
     assert answer_in_words(doubtful) == f"Likeliest, but not sure: {answer_in_words(found)}"
+
+
+def scale_of(values: list[float], half_width: list[float]) -> float:
+    curve = Curve(PLAIN, np.array(values), np.array(half_width))
+    panel = Panel("a panel", np.arange(float(len(values))), (curve,), "x", "y", "mm")
+    low, high = drawn([panel])[0].layout.yaxis.range
+    assert low == -high
+    return float(high)
+
+
+@pytest.mark.parametrize(
+    ("last", "half_width", "shown"),
+    [(50.0, 60.0, False), (50.0, 2.0, True), (50.0, 20.0, True), (np.nan, np.nan, False)],
+    ids=["within a wide band", "beyond the usual band", "beyond a wide band", "unknown"],
+)
+def test_a_value_sets_the_scale_unless_it_lies_within_a_band_wider_than_usual(
+    last: float, half_width: float, shown: bool
+) -> None:
+    scale = scale_of([1.0, -2.0, 1.5, 2.0, -1.0, last], [2.0, 2.0, 2.0, 2.0, 2.0, half_width])
+    assert scale == pytest.approx(1.1 * (50.0 if shown else 1.3 * 2.0))

@@ -37,10 +37,6 @@ def test_a_difference_no_larger_than_chance_makes_counts_against_its_columns() -
     assert below == -1.0
 
 
-def test_no_column_is_no_evidence() -> None:
-    assert log_evidence(np.zeros(1), np.zeros(1), 100.0)[0] == 0.0
-
-
 def test_beside_an_effect_ten_percent_off_its_form_differences_count_as_much_less_as_their_variance_is_larger() -> None:
     # 1 + 0.1^2 * 300 = 4: a difference of 40 counts as one of 10
     assert log_evidence(np.array([40.0]), np.array([2]), 300.0)[0] == pytest.approx(2.390562)
@@ -72,10 +68,6 @@ def test_where_little_noise_blurs_what_is_left_the_bayes_factor_is_the_ratio_of_
         assert bayes_factor(left, 1e-4 * energy, energy, usual) == pytest.approx(expected, rel=1e-3)
 
 
-def test_a_large_effect_that_leaves_nothing_is_as_credible_as_the_prior_of_its_share_says() -> None:
-    assert bayes_factor(0.0, 2.0, 1e9, 0.04) == pytest.approx(25.0, rel=1e-6)
-
-
 @pytest.mark.parametrize("left", [0.0, 5.0, 20.0, 40.0])
 def test_the_bayes_factor_is_near_that_of_non_central_chi_squares(left: float) -> None:
     freedom, energy, usual = 8, 800.0, 0.005
@@ -83,10 +75,6 @@ def test_the_bayes_factor_is_near_that_of_non_central_chi_squares(left: float) -
     density = ncx2.pdf(left + freedom, freedom, energy * shares / (1 - shares))
     exact = (density * np.exp(-shares / usual) / usual).sum() / density.sum()
     assert bayes_factor(left, 4.0, energy, usual) == pytest.approx(exact, rel=0.35)
-
-
-def test_noise_that_is_larger_than_any_share_says_nothing() -> None:
-    assert bayes_factor(0.0, 1e6, 1.0, 0.04) == pytest.approx(1.0, rel=0.05)
 
 
 def credibility(

@@ -1,17 +1,28 @@
-"""Model selection on screenings of a few columns, of which all that each explains is known."""
+"""Screening, selection, identifiability and dependences, on columns of which all that each explains is known."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from discovery_samples import shorn, simulated
 from screening_samples import FIRST, FOURTH, MATRIX, POSITIVE, SECOND, THIRD, screening
 
+from omnibench.discover.covariate_dependence import Dependences, covariate_dependences, weights_of_covariates
+from omnibench.discover.fitting import Extended, Fit, extend, fit_matrix
+from omnibench.discover.regressors.columns import Group
+from omnibench.discover.regressors.covariate_bases import Basis
+from omnibench.discover.regressors.significance import Family, Significance, together
+from omnibench.discover.selection.detectability import Detectability, detectability_of
+from omnibench.discover.selection.evidence import Missing
 from omnibench.discover.selection.model_selection import Selection, select_effects
-from omnibench.discover.selection.screening import Screening
+from omnibench.discover.selection.screening import Screening, screen_again, screen_extended, screen_plain
+from omnibench.fit.trajectory_fit import usable_runs
 
 DRIFT, BIAS, SLIP = "heading_drift", "body_velocity_bias", "rotation_translation_coupling"
+FLOOR, LATENCY = "floor_drift", "heading_latency"
 BASES = {"heading": (FIRST + SECOND) / np.sqrt(2), "place": THIRD, "elapsed time": FOURTH}
 
 
@@ -117,3 +128,144 @@ def test_the_same_seed_selects_the_same_with_the_same_weights() -> None:
     first, second = selected(given), selected(given)
     assert first.is_same_as(second)
     assert first.weights == second.weights
+
+
+LEFT_OUT = ("heading_drift",)
+
+
+@pytest.fixture(scope="module")
+def plain() -> Fit:
+    dataset = shorn(simulated(validation=None), session="first")
+    runs = usable_runs(dataset.split("train"))
+    return fit_matrix(runs, dataset.robot, dataset.sample_period, dataset.robot.inverse_kinematic_matrix)
+
+
+@pytest.fixture(scope="module")
+def screened(plain: Fit) -> Screening:
+    return screen_plain(plain, LEFT_OUT)
+
+
+@pytest.fixture(scope="module")
+def extended(plain: Fit, screened: Screening) -> Extended:
+    (coupling,) = (group for group in screened.groups.effects if group.name == "rotation_translation_coupling")
+    return extend(plain, [coupling])
+
+
+def test_an_extended_model_is_screened_with_its_effects_put_back(extended: Extended) -> None:
+    again = screen_extended(extended, LEFT_OUT)
+    (coupling,) = (group for group in again.groups.effects if group.name == "rotation_translation_coupling")
+    values, _ = again.beyond_matrix().estimate(coupling.index)
+    np.testing.assert_allclose(values, extended.values, rtol=0.05)
+    assert again.beyond_matrix().chi_square(coupling.index) > 10 * len(extended.values)
+
+
+def test_columns_are_made_once_for_both_screenings(screened: Screening, extended: Extended) -> None:
+    assert screen_again(extended, screened).groups is screened.groups
+    assert screen_extended(extended, LEFT_OUT).groups is not screened.groups
+
+
+def test_effects_that_need_a_second_session_are_absorbed_in_a_single_one(screened: Screening) -> None:
+    limits = detectability_of(screened, selected(screened))
+    of_sessions = {name for name, missing in limits.not_looked_for if missing is Missing.SECOND_SESSION}
+    assert of_sessions
+    assert of_sessions <= {effect.name for effect in limits.absorbed}
+
+
+def detectability(named: dict[str, np.ndarray], gains: tuple[float, ...] = (0, 0, 0, 0, 0)) -> Detectability:
+    given = screening(named, {"place": FOURTH}, gains)
+    return detectability_of(given, selected(given))
+
+
+def at(degrees: float) -> np.ndarray:
+    """A unit vector between the first and the second row."""
+    return np.cos(np.radians(degrees)) * FIRST + np.sin(np.radians(degrees)) * SECOND
+
+
+def test_an_effect_that_the_matrix_reproduces_is_absorbed_and_nothing_else_is_said_of_it() -> None:
+    found = detectability({DRIFT: MATRIX, BIAS: MATRIX + 0.02 * FIRST})
+    assert [each.name for each in found.absorbed] == [DRIFT]
+    assert [each.name for each in found.hidden] == [BIAS]
+
+
+def test_effects_of_which_one_makes_most_of_the_other_are_one_class() -> None:
+    assert detectability({DRIFT: at(0), BIAS: at(12)}).classes == ((BIAS, DRIFT),)  # cos^2 = 0.957
+    assert detectability({DRIFT: at(0), BIAS: at(14)}).classes == ()  # cos^2 = 0.941
+
+
+def test_the_part_that_the_matrix_absorbs_does_not_count_as_alike() -> None:
+    assert detectability({DRIFT: 5 * MATRIX + FIRST, BIAS: 5 * MATRIX + SECOND}).classes == ()
+
+
+def test_pairs_that_share_an_effect_are_one_class() -> None:
+    found = detectability({DRIFT: at(0), BIAS: at(12), FLOOR: at(24)})
+    assert found.classes == ((BIAS, FLOOR, DRIFT),)
+
+
+def test_an_effect_that_two_others_make_together_is_said_with_their_names() -> None:
+    found = detectability({DRIFT: at(45), BIAS: FIRST, FLOOR: SECOND, LATENCY: THIRD})
+    assert found.classes == ()
+    imitated = dict(found.sums)
+    assert set(imitated) == {DRIFT, BIAS, FLOOR}  # each of the three is made by the other two
+    assert set(imitated[DRIFT]) == {BIAS, FLOOR}
+
+
+def test_a_size_hides_within_its_interval_and_is_found_from_a_few_standard_errors_on() -> None:
+    (hidden,) = detectability({DRIFT: 4 * FIRST}).hidden  # an information of 16: a standard error of 1/4
+    assert hidden.limit == pytest.approx(1.96 / 4)
+    assert hidden.detectable == pytest.approx(5.5 / 4)
+    assert hidden.plausible == 0.1
+
+
+def test_an_effect_that_was_found_hides_no_longer() -> None:
+    found = detectability({DRIFT: FIRST, BIAS: SECOND}, (0, 20, 0, 0, 0))
+    assert [each.name for each in found.hidden] == [BIAS]
+
+
+def dependences(gains: Sequence[float], named: dict[str, np.ndarray], covariates: Sequence[str] = ()) -> Dependences:
+    """Dependences of residuals. covariates: of the bases in turn, by default their names."""
+    given = screening(named, {"heading": FIRST, "place": SECOND, "elapsed time": THIRD}, gains)
+    bases = tuple(replace(base, name=name) for base, name in zip(given.groups.bases, covariates, strict=False))
+    given = replace(given, groups=replace(given.groups, bases=bases or given.groups.bases))
+    return covariate_dependences(given, selected(given), None)
+
+
+def covariates(given: Dependences) -> tuple[list[str], list[str]]:
+    return [each.covariate for each in given.where], [each.covariate for each in given.left]
+
+
+def test_the_surest_covariate_comes_first_and_chance_is_not_mentioned() -> None:
+    assert covariates(dependences([0, 8, 20, 0, 0], {})) == (["place", "heading"], ["place", "heading"])
+
+
+def test_what_a_named_effect_explains_is_no_longer_left() -> None:
+    assert covariates(dependences([0, 20, 0, 0, 0], {DRIFT: FIRST})) == (["heading"], [])
+
+
+def test_of_several_bases_of_a_covariate_the_surest_stands_for_it() -> None:
+    (place,) = dependences([0, 8, 20, 0, 0], {}, ["place", "place", "elapsed time"]).where
+    assert place.description == "the residual depends on the place"
+    assert place.excess == pytest.approx(399)
+    assert place.degrees_of_freedom == 1
+
+
+def test_of_two_families_the_one_that_is_no_chance_stands_for_their_covariate() -> None:
+    calm, rough = family("a line", 4.0, 4, np.linspace(0, 1, 499)), family("tiles", 5.0, 140, np.linspace(0, 9, 499))
+    given = screening({}, {"place": FIRST}, [0, 0, 0, 0, 0])
+    selection = replace(selected(given), where=together(rough, calm))
+    (place,) = covariate_dependences(given, selection, None).where
+    assert place.description == "the residual depends on a line"
+
+
+def test_a_basis_of_many_functions_is_less_likely_than_one_of_few_that_stands_out_as_far_but_not_ruled_out() -> None:
+    few, many = (family(str(rank), 9.0, rank, np.zeros(499), chi_square=rank + 300.0) for rank in (4, 140))
+    renamed = replace(many, groups=(replace(many.groups[0], name="joints"),))
+    weights = weights_of_covariates(together(few, renamed))
+    assert 5e-4 < weights["joints"] < weights["place"]
+
+
+def family(words: str, evidence: float, rank: int, chance: np.ndarray, chi_square: float = 300.0) -> Significance:
+    """One basis over the place, by itself."""
+    basis, one = Basis("place", "body", words), np.ones(1)
+    group = Group("covariate", "place", (), basis=basis)
+    of_group = (chi_square * one, chi_square * one, rank * one, one, evidence * one)
+    return Significance((group,), *of_group, (Family(1, np.sort(chance)),), 0.0, 0)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from discovery_samples import simulated
+from discovery_samples import nothing, simulated
 from hidden.experiment import ROBOT
 from hidden.sets import Truth, make_set
 
@@ -26,6 +26,7 @@ from omnibench.registry import effects
 from omnibench.robot.calibration import Calibration, read_calibration, write_calibration
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from omnibench.data.dataset import Dataset
@@ -37,6 +38,10 @@ FOLDS = np.tile(np.arange(5), 12)  # of the 60 runs of a small set
 def recorded(kind: str) -> tuple[Dataset, Truth]:
     """60 + 60 runs with an effect that no catalogue has, of a non-centrality of 600."""
     return make_set("outside", kind, 600.0, 1000, design="small")
+
+
+def left_out() -> Discovery:
+    return discover_effects(simulated(), without=("rotation_translation_coupling",), unknown_term=False)
 
 
 @pytest.fixture(scope="module")
@@ -69,27 +74,20 @@ def error(calibration: Calibration, dataset: Dataset, truth: Truth, found: Disco
     )
 
 
-def test_most_of_the_gap_closes_on_a_session_that_was_held_out(grooved: tuple[Dataset, Truth, Discovery]) -> None:
+def test_most_of_the_gap_closes_on_a_held_out_session_by_a_step_without_a_name(
+    grooved: tuple[Dataset, Truth, Discovery],
+) -> None:
     dataset, truth, found = grooved
     before, after = (error(each, dataset, truth, found) for each in (found.plain, found.extended))
     assert after < 0.25 * before
-
-
-def test_it_is_no_name_and_the_verdict_stays_unknown(grooved: tuple[Dataset, Truth, Discovery]) -> None:
-    found = grooved[2]
-    assert found.verdict == "unknown"
-    assert found.effects == ()
+    assert (found.verdict, found.effects) == ("unknown", ())
     assert {term.name for term in found.extended.effects} <= {"smooth_heading", "smooth_course", "smooth_heading_wave"}
-
-
-def test_it_is_a_step_and_the_notes_tell_what_it_gains(grooved: tuple[Dataset, Truth, Discovery]) -> None:
-    found = grooved[2]
     assert [step.name for step in found.steps] == ["plain matrix", "+ unnamed, over heading"]
-    assert found.steps[1].held_out is not None
-    assert found.steps[0].held_out is not None
-    assert found.steps[1].held_out < found.steps[0].held_out
-    (told,) = [note for note in found.notes if "unnamed term" in note]
-    assert "on motions held out it gains" in told
+    first, last = (step.held_out for step in found.steps)
+    assert first is not None
+    assert last is not None
+    assert last < first
+    assert len([note for note in found.notes if "unnamed term" in note]) == 1
 
 
 def test_the_calibration_file_predicts_the_same(grooved: tuple[Dataset, Truth, Discovery], tmp_path: Path) -> None:
@@ -100,16 +98,10 @@ def test_the_calibration_file_predicts_the_same(grooved: tuple[Dataset, Truth, D
     np.testing.assert_array_equal(again, found.extended.model.reported([log])[0])
 
 
-def test_it_is_left_out_on_request() -> None:
-    found = discover_effects(simulated(), without=("rotation_translation_coupling",), unknown_term=False)
-    assert found.verdict == "unknown"
-    assert found.extended.effects == ()
-    assert not any("unnamed" in note for note in found.notes)
-
-
-def test_where_nothing_is_missing_none_is_tried() -> None:
-    found = discover_effects(simulated(()))
-    assert found.verdict == "none"
+@pytest.mark.parametrize("make", [left_out, nothing])
+def test_no_term_is_tried_where_it_is_not_wanted_or_nothing_is_missing(make: Callable[[], Discovery]) -> None:
+    found = make()
+    assert found.verdict == ("none" if make is nothing else "unknown")
     assert found.extended.effects == ()
     assert not any("unnamed" in note for note in found.notes)
 
@@ -129,10 +121,6 @@ def test_functions_that_are_not_chosen_are_zero(bare: Extended) -> None:
     assert found.shapes == dict.fromkeys(every - chosen, 0.0)
 
 
-def test_a_function_that_the_matrix_explains_is_not_chosen(bare: Extended) -> None:
-    assert chosen_functions(bare, [group("smooth_elapsed_time", duration=1e6)]) == []  # cosines of 0
-
-
 def test_functions_are_fitted_together_with_named_effects_and_stand_after_them(
     bare: Extended, screened: tuple[Screening, Selection]
 ) -> None:
@@ -148,6 +136,7 @@ def test_functions_are_fitted_together_with_named_effects_and_stand_after_them(
     assert calibrated["heading_drift"]["b"] == used.values[0]
 
 
+@pytest.mark.slow
 def test_runs_of_few_kinds_of_motion_get_no_term(grooved: tuple[Dataset, Truth, Discovery]) -> None:
     dataset = grooved[0]
     commands = sorted({run.command or "" for run in dataset.trajectories})[:9]
