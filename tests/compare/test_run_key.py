@@ -18,7 +18,7 @@ PACKAGE = Path(omnibench.__file__).parent
 # Imported by the code of runs, without a say in their results. What has one belongs to the key's files instead.
 NEUTRAL = {
     "config", "errors", "registry", "files", "environment", "processes", "progress", "words", "views",
-    "data.scans", "data.splits", "data.domain_check", "jobs.job_process", "jobs.job", 
+    "data.scans", "data.splits", "data.domain_check", "jobs.job_process", "jobs.job",
 }  # fmt: skip
 
 
