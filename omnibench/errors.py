@@ -231,7 +231,7 @@ def _known_keys(model: type[BaseModel] | None, location: Sequence[int | str]) ->
 
 def _models_in(annotation: Any) -> list[type[BaseModel]]:
     """The pydantic classes within an annotation, such as both of ``tuple[Wheel, ...] | Robot``."""
-    if hasattr(annotation, "model_fields"):
+    if isinstance(annotation, type) and hasattr(annotation, "model_fields"):
         return [annotation]
     return [model for argument in get_args(annotation) for model in _models_in(argument)]
 
