@@ -87,7 +87,7 @@ class DaskBackend:
 
     def data(self, name: str, value: bytes) -> Any:
         """The future of data, which go to the scheduler once, and from there to each worker that needs them."""
-        if name not in self._data:
+        if name not in self._data or self._data[name].status == "error":  # workers were killed that were to hold them
             self._data[name] = self.client.submit(content, value, key=f"omnibench-data-{name}-{uuid4().hex[:8]}")
         return self._data[name]
 

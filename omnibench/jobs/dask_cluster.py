@@ -40,6 +40,7 @@ _SETTINGS = {
     "distributed.admin.low-level-log-length": 10,  # copies of messages, which nobody reads
     "distributed.admin.tick.interval": "500 ms",
     "distributed.comm.timeouts.connect": f"{_ANSWER} s",
+    "distributed.deploy.lost-worker-timeout": f"{WAIT} s",  # a worker here that was killed is started again until then
 }
 
 
