@@ -188,7 +188,7 @@ def check_place(path: Path) -> None:
     target = resolved(path)
     if target.exists() and not target.is_file() and not target.is_dir():
         return
-    existing = target if target.is_dir() else next(each for each in target.parents if each.exists())
+    existing = target if target.is_dir() else next(folder for folder in target.parents if folder.exists())
     if not existing.is_dir():
         raise DataError(f"{path}: cannot be written: {existing} is not a folder; choose another place")
     if not os.access(existing, os.W_OK | os.X_OK):

@@ -96,9 +96,11 @@ class Registry(Generic[T]):
         """
 
         def decorate(cls: C) -> C:
-            taken = self._entries.get(name)
-            if taken is not None and taken.cls is not cls:
-                raise PluginError(f"{self.kind} {name!r} is registered already, by {taken.origin}; choose another name")
+            registered = self._entries.get(name)
+            if registered is not None and registered.cls is not cls:
+                raise PluginError(
+                    f"{self.kind} {name!r} is registered already, by {registered.origin}; choose another name"
+                )
             if self.contract not in cls.__mro__:
                 raise PluginError(f"{self.kind} {name!r}: the class must derive from {self.contract.__name__}")
             options = getattr(cls, "Options", Options)

@@ -243,7 +243,7 @@ def _follow(process: JobProcess, sender: _EventSender, number: int) -> JobEnd | 
         if latest is not None and (end or time.monotonic() - reported_at >= _PERIOD):
             sender.send(latest, at_once=end is None)
             reported_at, latest = time.monotonic(), None
-        if end or not sender.wanted:
+        if end or sender.cancelled:
             return end
 
 
@@ -260,10 +260,10 @@ class _EventSender:
         self._sent_at = time.monotonic()
 
     @property
-    def wanted(self) -> bool:
-        """False once the client has cancelled the parcel, or is gone."""
+    def cancelled(self) -> bool:
+        """True once the client has cancelled the parcel, or is gone."""
         task = self.worker.state.tasks.get(self._key)
-        return task is not None and task.state != "cancelled"
+        return task is None or task.state == "cancelled"
 
     def begin(self, events: Iterable[JobEvent]) -> None:
         """Send begins, and wait until the scheduler has them: one that died with its worker would not be counted."""

@@ -272,7 +272,7 @@ def gathered(
     expect_reading(len(arguments), "part")
     jobs = (Job(str(number), function, argument, shared=shared, own=True) for number, argument in enumerate(arguments))
     run_jobs(jobs, _InMemory[T](), backend, results)
-    return [results.found[number] for number in range(len(arguments))]
+    return [results.by_number[number] for number in range(len(arguments))]
 
 
 class _InMemory(Generic[T]):
@@ -311,11 +311,11 @@ class _Results(JobWatch[T]):
     """The results, by number. The first failure ends the work."""
 
     def __init__(self) -> None:
-        self.found: dict[int, T] = {}
+        self.by_number: dict[int, T] = {}
 
     def ended(self, number: int, ending: T | Failure, reused: bool) -> None:  # noqa: ARG002
         if not isinstance(ending, Failure):
-            self.found[number] = ending
+            self.by_number[number] = ending
             tell_reading(1, "part")
         elif ending.error is not None:
             raise ending.error
