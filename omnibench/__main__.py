@@ -1,43 +1,58 @@
 """``omnibench`` and ``python -m omnibench``: every mistake is one line on standard error and an exit code.
 
 Ctrl-C and SIGTERM are handled from the first line on; therefore nothing that takes time is imported before ``main``
-runs. The exit code is 128 and the signal's number.
+runs. The exit code is 128 and the signal's number, whatever a library has made of the KeyboardInterrupt.
 """
 
 from __future__ import annotations
 
 import _signal  # type: ignore[import-not-found]  # the core of ``signal``, which takes 10 ms to import
+import _thread
 import gc
 import os
 import sys
+import time
 
 TYPE_CHECKING = False  # that of ``typing`` would take its import
 if TYPE_CHECKING:
-    from types import FrameType
     from typing import Any, NoReturn
 
-_PACKAGE = os.path.dirname(__file__)
-_INTERRUPTED = 130  # exit code after Ctrl-C; of another signal once it has come
+_BEGINS_ANEW = "interrupted; the same command begins anew"  # where a command keeps nothing on the way
+_SEND_AGAIN = 0.05  # s after which an interrupt that Python ignored is sent again; chosen
 # Not imported by another program, nor by a process that this one starts for its jobs.
 _PROGRAM = __name__ == "__main__" or (
     os.path.basename(sys.argv[0]) == "omnibench" and sys.modules["__main__"].__name__ != "__mp_main__"
 )
+
 _at_work = False  # True while ``main`` runs
-_BEGINS_ANEW = "interrupted; the same command begins anew"  # where a command keeps nothing on the way
-_COMMANDS = os.path.join(_PACKAGE, "cli")
+_signalled = 0  # number of the signal that interrupts the command; 0: none has come
 
 
 def main() -> None:
-    """Run the command line."""
-    global _at_work
+    """Run the command line; ends in SystemExit."""
+    global _at_work, _signalled
     _handle_signals()
-    _at_work = True
+    _signalled = 0
+    report_ignored = sys.unraisablehook
+
+    def send_again(ignored: sys.UnraisableHookArgs) -> None:
+        """Send a Ctrl-C again that Python ignores, as it does in finalizers and callbacks of the garbage collector."""
+        if ignored.exc_type is KeyboardInterrupt:
+            _thread.start_new_thread(_interrupt_soon, ())
+        else:
+            report_ignored(ignored)
+
+    sys.unraisablehook = send_again
     try:
+        _at_work = True
         _run(_command_line())
-    except KeyboardInterrupt:
-        _fail("interrupted", _INTERRUPTED)
+    except (KeyboardInterrupt, Exception) as error:
+        if not _signalled and not isinstance(error, KeyboardInterrupt):
+            raise
+        _end("interrupted", _interrupted_code())
     finally:
         _at_work = False
+        sys.unraisablehook = report_ignored
 
 
 def _handle_signals() -> None:
@@ -45,9 +60,29 @@ def _handle_signals() -> None:
     for number, usual in ((_signal.SIGINT, _signal.default_int_handler), (_signal.SIGTERM, _signal.SIG_DFL)):
         if _signal.getsignal(number) == usual:
             try:
-                _signal.signal(number, _interrupted)
+                _signal.signal(number, _interrupt)
             except ValueError:  # not in the main thread
                 return
+
+
+def _interrupt(number: int, _: object) -> None:
+    """Raise KeyboardInterrupt; end at once before and after the work of the program."""
+    global _signalled
+    _signalled = number
+    if _PROGRAM and not _at_work:
+        os.write(2, b"interrupted\n")
+        os._exit(_interrupted_code())
+    raise KeyboardInterrupt
+
+
+def _interrupt_soon() -> None:
+    time.sleep(_SEND_AGAIN)
+    if _at_work:
+        os.kill(os.getpid(), _signalled or _signal.SIGINT)
+
+
+def _interrupted_code() -> int:
+    return 128 + int(_signalled or _signal.SIGINT)
 
 
 def _command_line() -> Any:
@@ -65,98 +100,53 @@ def _command_line() -> Any:
             gc.enable()
 
 
-def _interrupted(number: int, frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt; end at once before and after the work, and during a command's imports.
-
-    Libraries that are being imported make it errors of their own.
-    """
-    global _INTERRUPTED
-    _INTERRUPTED = 128 + number
-    if (_PROGRAM and not _at_work) or _imports_of_a_command(frame):
-        os.write(2, b"interrupted\n")
-        os._exit(_INTERRUPTED)
-    _signal.default_int_handler(number, frame)
-
-
-def _imports_of_a_command(frame: FrameType | None) -> bool:
-    """True while ``main`` or a function of the commands' folder imports something: no work is under way yet."""
-    importing = False
-    while frame is not None:
-        file = frame.f_code.co_filename
-        importing = importing or file.startswith("<frozen importlib")
-        if frame.f_code.co_name != "<module>" and file.startswith(_PACKAGE + os.sep):
-            return importing and (file == __file__ or os.path.dirname(file) == _COMMANDS)
-        frame = frame.f_back
-    return False
-
-
 def _run(command: Any) -> None:
-    from io import TextIOWrapper
-
+    """Run the command that was typed, and end with its exit code, after one line if it fails."""
     import typer
 
-    from omnibench.errors import Interrupted, OmnibenchError, not_computable
+    from omnibench.errors import Interrupted, explain
 
-    _replace_closed_streams()
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:  # closed before the start (``>&-``): what is printed goes nowhere
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 (until the process ends)
+        elif hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")  # a letter that the terminal lacks becomes a ?
     for argument in sys.argv:
         if not argument.isprintable() and any("\udc80" <= letter <= "\udcff" for letter in argument):
-            _fail(f"error: {argument}: this name is not in UTF-8; rename the file or folder")
+            _end(f"error: {argument}: this name is not in UTF-8; rename the file or folder", 2)
     usage_error: Any = typer.BadParameter.__mro__[1]  # click's UsageError, wherever this Typer keeps it
     try:
         code = command.main(prog_name="omnibench", standalone_mode=False)
     except usage_error as error:
-        if type(error).__name__ == "NoArgsIsHelpError":  # nothing was typed: the message is the whole help
-            _fail(error.format_message())
-        _fail(_usage(error))
+        message = error.format_message()
+        if type(error).__name__ != "NoArgsIsHelpError":  # nothing was typed: the message is the whole help
+            typed = error.ctx.command_path if error.ctx else "omnibench"
+            message = f"error: {' '.join(message.split()).replace('Value error, ', '')} (see {typed} --help)"
+        _end(message, 2)
     except Interrupted as error:
-        _fail(str(error), _INTERRUPTED)
-    except OmnibenchError as error:
-        _fail(_with_notes(f"error: {error}", error), error.exit_code)
+        _end(str(error), _interrupted_code())
     except typer.Abort:
-        _fail(_BEGINS_ANEW, _INTERRUPTED)
+        _end(_BEGINS_ANEW, _interrupted_code())
     except BrokenPipeError:
         sys.stderr.close()  # the program that read our output has ended
         sys.exit(1)
-    except UnicodeEncodeError as error:  # of a file's name that was found in a folder
-        _fail(f"error: {error.object[:200]}: there is a name in it that is not in UTF-8; rename that file or folder")
-    except MemoryError as error:
-        _fail(_with_notes("error: out of memory; make the data or the budget smaller", error))
-    except OSError as error:  # a disk or a terminal that failed unexpectedly
-        _fail(_with_notes(f"error: {error.filename or 'output'}: {error.strerror or error}", error))
     except Exception as error:
-        if (reason := not_computable(error)) is None:
+        message = None if _signalled else explain(error)  # after a signal ``main`` says so
+        if message is None:
             raise
-        _fail(_with_notes(f"error: {reason}", error))
-    else:
-        if code == 130:  # newer versions of Typer return this after Ctrl-C
-            _fail(_BEGINS_ANEW, _INTERRUPTED)
-        sys.exit(code if isinstance(code, int) else 0)
+        notes = getattr(error, "__notes__", ())  # such as the place of results that are kept
+        _end("; ".join([f"error: {message}", *notes]), getattr(error, "exit_code", 2))
+    if code == 130:  # newer versions of Typer return this after Ctrl-C
+        _end(_BEGINS_ANEW, _interrupted_code())
+    if _signalled:  # a library has caught the interrupt
+        _end("interrupted", _interrupted_code())
+    sys.exit(code if isinstance(code, int) else 0)
 
 
-def _replace_closed_streams() -> None:
-    """Send to nowhere what would be printed on a stream that was closed before the start (``>&-``)."""
-    if sys.stdout is None:
-        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 (open until the process ends)
-    if sys.stderr is None:
-        sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
-
-
-def _usage(error: Any) -> str:
-    message = " ".join(error.format_message().split()).replace("Value error, ", "")
-    context = error.ctx
-    command = context.command_path if context else "omnibench"
-    return f"error: {message} (see {command} --help)"
-
-
-def _with_notes(message: str, error: Exception) -> str:
-    """The message and what was noted with the error, such as the place of results that are kept."""
-    return "; ".join([message, *getattr(error, "__notes__", ())])
-
-
-def _fail(message: str, code: int = 2) -> NoReturn:
+def _end(message: str, code: int) -> NoReturn:
+    global _at_work
+    _at_work = False  # another Ctrl-C ends at once
     print(message, file=sys.stderr)  # noqa: T201 (the one place where errors are printed)
     sys.exit(code)
 

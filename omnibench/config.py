@@ -1,4 +1,4 @@
-"""Reading of YAML into pydantic models with one-line errors, and writing of effective copies."""
+"""Documents: YAML read into pydantic models, with errors of one line, and written as effective copies."""
 
 from __future__ import annotations
 
@@ -7,52 +7,40 @@ import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
+from typing import Annotated, Any, Final, TypeVar
 
 import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo
-from pydantic_core import ErrorDetails, to_jsonable_python
+from pydantic_core import to_jsonable_python
 
-from omnibench.errors import ConfigError, DataError, nearest, shown
+from omnibench.errors import ConfigError, DataError, explain, shown
 from omnibench.files import read_text
 from omnibench.views import brief
 
 M = TypeVar("M", bound=BaseModel)
 
+LONGEST_NAME = 200  # characters of a name in a file, of which tables and messages show the whole; chosen
+
+# Limits of a YAML document, far above what configs and calibrations need; chosen.
+_MOST_BYTES: Final = 1 << 22  # of a file
+MOST_VALUES: Final = 200_000
+_DEEPEST: Final = 32  # levels of nesting
+_LONGEST_NUMBER: Final = 400  # characters: what is longer is text, since long numbers take quadratic time
+
+_PARSER: Final = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the fast one in C if PyYAML has it
+_FLOAT: Final = re.compile(
+    r"^[-+]?(?:[0-9][0-9_]*\.[0-9_]*(?:[eE][-+]?[0-9]+)?|\.[0-9]+(?:[eE][-+]?[0-9]+)?|[0-9]+[eE][-+]?[0-9]+"
+    r"|\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
+)
+# A pattern of names on the command line, such as *_1 or [0-4]*, which has a meaning of its own in YAML, or none.
+_NAME_PATTERN: Final = re.compile(r"\s*([*!&@%`]|\[[^\]]*\].)")
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-LONGEST_NAME = 200  # characters of a name in a file, of which tables and messages show the whole; chosen
 Name = Annotated[str, Field(max_length=LONGEST_NAME)]
 
 
-def printable(text: str) -> str:
-    """The text. ValueError: it holds characters that no terminal shows."""
-    if not text.isprintable():
-        raise ValueError("contains characters that cannot be printed, such as tabs or no-break spaces")
-    return text
-
-
-CHOSEN = "@"  # marks a union member's tag in a pydantic location; what follows it is no key of the document
-
-
-if TYPE_CHECKING:
-    from pydantic._internal._model_construction import ModelMetaclass
-else:
-    ModelMetaclass = type(BaseModel)  # its name is private at run time
-
-
-class _OneLine(ModelMetaclass):
-    """Calls of a model in Python: what is wrong is a ConfigError of one line, as it is in files."""
-
-    def __call__(cls, *arguments: Any, **fields: Any) -> Any:  # noqa: N805 (of a metaclass)
-        try:
-            return super().__call__(*arguments, **fields)
-        except ValidationError as error:
-            raise ConfigError(f"{cls.__name__}: {_describe(cls, error)}") from None  # type: ignore[arg-type]
-
-
-class Model(BaseModel, metaclass=_OneLine):
+class Model(BaseModel):
     """Base of every document that omnibench reads: unknown keys are refused, instances are immutable.
 
     ConfigError in one line: an argument is missing, unknown or wrong.
@@ -60,11 +48,27 @@ class Model(BaseModel, metaclass=_OneLine):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    def __init__(self, **fields: Any) -> None:
+        try:
+            super().__init__(**fields)
+        except ValidationError as error:
+            raise ConfigError(f"{type(self).__name__}: {explain(error, type(self))}") from None
+
+    # As of BaseModel.__init__: pydantic then makes the models within a document itself, and collects their mistakes.
+    __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
+
     def __repr__(self) -> str:
         return brief(type(self).__name__, self.__repr_args__())
 
     def __str__(self) -> str:
         return repr(self)
+
+
+def printable(text: str) -> str:
+    """The text. ValueError: it holds characters that no terminal shows."""
+    if not text.isprintable():
+        raise ValueError("contains characters that cannot be printed, such as tabs or no-break spaces")
+    return text
 
 
 def folder_of(info: ValidationInfo) -> Path | None:
@@ -82,19 +86,13 @@ def _from_folder(path: Path, info: ValidationInfo) -> Path:
 RelativePath = Annotated[Path, AfterValidator(_from_folder)]
 
 
-_PATTERN = re.compile(r"\s*([*!&@%`]|\[[^\]]*\].)")
-
-
-_PARSER: Final = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the fast one in C if PyYAML has it
-# Limits of a YAML document, far above what configs and calibrations need; chosen.
-_MOST_BYTES: Final = 1 << 22  # of a file
-MOST_VALUES: Final = 200_000
-_DEEPEST: Final = 32  # levels of nesting
-_LONGEST_NUMBER: Final = 400  # characters: what is longer is text, since long numbers take quadratic time
-
-
 class _Scalars(yaml.SafeLoader):
     """YAML 1.1's values of plain scalars, of which ``1e-6`` is a number, too."""
+
+    yaml_implicit_resolvers = {
+        first: [(tag, pattern) for tag, pattern in resolvers if tag != "tag:yaml.org,2002:float"]
+        for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
 
     def value(self, event: yaml.ScalarEvent) -> Any:
         """The value of a scalar. ValueError: an impossible date, or text that is not Unicode (lone surrogates)."""
@@ -106,18 +104,13 @@ class _Scalars(yaml.SafeLoader):
         return text if construct is None else construct(self, yaml.ScalarNode(tag, text))
 
 
-_Scalars.yaml_implicit_resolvers = {
-    first: [(tag, pattern) for tag, pattern in resolvers if tag != "tag:yaml.org,2002:float"]
-    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
-}
-_Scalars.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(
-        r"^[-+]?(?:[0-9][0-9_]*\.[0-9_]*(?:[eE][-+]?[0-9]+)?|\.[0-9]+(?:[eE][-+]?[0-9]+)?|[0-9]+[eE][-+]?[0-9]+"
-        r"|\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
-    ),
-    list("-+0123456789."),
-)
+_Scalars.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+0123456789."))
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes what the loader would otherwise take for a number."""
+
+    yaml_implicit_resolvers = _Scalars.yaml_implicit_resolvers
 
 
 class _Document:
@@ -128,7 +121,8 @@ class _Document:
 
     def __init__(self, text: str, most: int) -> None:
         self._events: Iterator[Any] = yaml.parse(text, Loader=_PARSER)
-        self._most = self._left = most
+        self._most = most
+        self._values = 0
         self._scalars = _Scalars("")
 
     def content(self) -> Any:
@@ -142,21 +136,19 @@ class _Document:
         content = self._node(next(self._events), 1)
         next(self._events)  # the document's end
         if not isinstance(rest := next(self._events), yaml.StreamEndEvent):
-            raise yaml.YAMLError(f"line {_line(rest)}: a second document begins; keep one")
+            raise yaml.YAMLError(f"{_line(rest)}: a second document begins; keep one")
         return content
 
     def _node(self, event: Any, depth: int) -> Any:
-        self._left -= 1
-        if self._left < 0:
+        self._values += 1
+        if self._values > self._most:
             raise yaml.YAMLError(f"more than {self._most} values")
         if depth > _DEEPEST:
-            raise yaml.YAMLError(f"line {_line(event)}: nested too deeply")
+            raise yaml.YAMLError(f"{_line(event)}: nested too deeply")
         if isinstance(event, yaml.AliasEvent):
-            raise yaml.YAMLError(
-                f"line {_line(event)}: aliases are not read; write out what *{event.anchor} stands for"
-            )
+            raise yaml.YAMLError(f"{_line(event)}: aliases are not read; write out what *{event.anchor} stands for")
         if event.tag is not None:
-            raise yaml.YAMLError(f"line {_line(event)}: tags such as !!str are not read; leave it out")
+            raise yaml.YAMLError(f"{_line(event)}: tags such as !!str are not read; leave it out")
         if isinstance(event, yaml.ScalarEvent):
             return self._scalars.value(event)
         if isinstance(event, yaml.SequenceStartEvent):
@@ -168,25 +160,17 @@ class _Document:
         while not isinstance(event := next(self._events), yaml.MappingEndEvent):
             key = self._node(event, depth + 1)
             if isinstance(key, list | dict):
-                raise yaml.YAMLError(f"line {_line(event)}: a key is a {type(key).__name__}, expected a word")
+                raise yaml.YAMLError(f"{_line(event)}: a key is a {type(key).__name__}, expected a word")
             if key == "<<" and event.implicit[0]:
-                raise yaml.YAMLError(f"line {_line(event)}: merge keys (<<) are not read; write the keys out")
+                raise yaml.YAMLError(f"{_line(event)}: merge keys (<<) are not read; write the keys out")
             if key in mapping:
-                raise ConfigError(f"line {_line(event)}: key {shown(key)} is given twice")
+                raise ConfigError(f"{_line(event)}: key {shown(key)} is given twice")
             mapping[key] = self._node(next(self._events), depth + 1)
         return mapping
 
 
-def _line(event: Any) -> int:
-    line: int = event.start_mark.line
-    return line + 1
-
-
-class _Dumper(yaml.SafeDumper):
-    """Quotes what the loader would otherwise take for a number."""
-
-
-_Dumper.yaml_implicit_resolvers = _Scalars.yaml_implicit_resolvers
+def _line(event: Any) -> str:
+    return f"line {event.start_mark.line + 1}"
 
 
 def read_yaml(path: Path) -> Any:
@@ -220,22 +204,17 @@ def parse_settings(settings: Iterable[str] | None) -> dict[str, Any]:
     """
     options: dict[str, Any] = {}
     for setting in settings or ():
-        key, equals, value = setting.partition("=")
+        key, equals, text = setting.partition("=")
         if not equals or not key:
             raise ConfigError(f"--set {setting}: expected KEY=VALUE")
-        # a pattern of names such as *_1 or [0-4]* has a meaning of its own in YAML, or none
-        read = value if _PATTERN.match(value) else _parsed(value, setting)
+        try:
+            value = text if _NAME_PATTERN.match(text) else parse_yaml(text, f"--set {setting}")
+        except ConfigError as error:
+            quotes = "; put names that hold any of [ ] { } , : # in quotes, as {t: 'time [s]'}"
+            raise ConfigError(f"{error}{quotes if text.startswith('{') else ''}") from None
         before = options.get(key)
-        options[key] = {**before, **read} if isinstance(before, dict) and isinstance(read, dict) else read
+        options[key] = {**before, **value} if isinstance(before, dict) and isinstance(value, dict) else value
     return options
-
-
-def _parsed(value: str, setting: str) -> Any:
-    try:
-        return parse_yaml(value, f"--set {setting}")
-    except ConfigError as error:
-        way = "; put names that hold any of [ ] { } , : # in quotes, as {t: 'time [s]'}" if value[:1] == "{" else ""
-        raise ConfigError(f"{error}{way}") from None
 
 
 def read_model(model: type[M], path: Path) -> M:
@@ -256,80 +235,7 @@ def validate(model: type[M], data: Any, where: str, folder: Path | None = None) 
     try:
         return model.model_validate(data, context={"folder": folder})
     except ValidationError as error:
-        raise ConfigError(f"{where}: {'is empty: ' if empty else ''}{_describe(model, error)}") from None
-
-
-def _describe(model: type[BaseModel], error: ValidationError) -> str:
-    details = error.errors(include_url=False)
-    # An unknown key explains a missing one, so it comes first.
-    details.sort(key=lambda detail: detail["type"] != "extra_forbidden")
-    missing = [detail for detail in details if detail["type"] == "missing"]
-    if details[0]["type"] == "missing" and len(missing) > 1:
-        keys = [repr(_place(detail)) for detail in missing]
-        others = len(details) - len(missing)
-        rest = f" (and {others} more mistake{'s' if others > 1 else ''})" if others else ""
-        return f"keys {', '.join(keys[:-1])} and {keys[-1]} are missing{rest}"
-    more = len(details) - 1
-    rest = f" (and {more} more mistake{'s' if more > 1 else ''})" if more else ""
-    return _describe_one(model, details[0]) + rest
-
-
-def _place(detail: ErrorDetails) -> str:
-    """The key of a mistake, from the document's top."""
-    return ".".join(str(part) for part in detail["loc"] if not str(part).startswith(CHOSEN))
-
-
-def _describe_one(model: type[BaseModel], detail: ErrorDetails) -> str:
-    whole = detail["loc"]
-    location = tuple(part for part in whole if not str(part).startswith(CHOSEN))
-    place = _place(detail)
-    if detail["type"] == "extra_forbidden":
-        known = _keys_at(model, whole[:-1])
-        return f"unknown key {place!r}; {nearest(str(location[-1]), known)}known: {', '.join(known) or 'none'}"
-    if detail["type"] == "missing":
-        field = model.model_fields.get(place)  # of the document itself
-        meaning = f" ({field.description})" if field is not None and field.description else ""
-        return f"key {place!r} is missing{meaning}"
-    message = detail["msg"].removeprefix("Value error, ")
-    given = "" if detail["type"] == "value_error" else f" (given: {shown(detail['input'])})"
-    if detail["type"] == "literal_error" and isinstance(detail["input"], str):
-        hint = nearest(detail["input"], re.findall(r"'([^']*)'", detail["ctx"]["expected"]))
-        given += f"; {hint.strip()}" if hint else ""
-    return f"{place}: {message}{given}" if place else f"{message}{given}"
-
-
-def _keys_at(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
-    """The keys that the JSON schema of ``model`` allows at ``location``."""
-    schema = model.model_json_schema(by_alias=True)
-    definitions = schema.get("$defs", {})
-    nodes = [schema]
-    for part in location:
-        if str(part).startswith(CHOSEN):
-            nodes = [definitions[str(part).removeprefix(CHOSEN)]]
-            continue
-        reached = [child for node in _expand(nodes, definitions) for child in _children(node, part)]
-        if reached:  # a union member's name in the location is no key, and is skipped
-            nodes = reached
-    return sorted({key for node in _expand(nodes, definitions) for key in node.get("properties", {})})
-
-
-def _expand(nodes: list[dict[str, Any]], definitions: dict[str, Any]) -> list[dict[str, Any]]:
-    expanded: list[dict[str, Any]] = []
-    for node in nodes:
-        if "$ref" in node:
-            node = definitions[node["$ref"].rsplit("/", 1)[-1]]
-        expanded.append(node)
-        expanded.extend(_expand(node.get("anyOf", []) + node.get("oneOf", []) + node.get("allOf", []), definitions))
-    return expanded
-
-
-def _children(node: dict[str, Any], part: int | str) -> list[dict[str, Any]]:
-    if isinstance(part, int):
-        return [node["items"]] if isinstance(node.get("items"), dict) else []
-    if part in node.get("properties", {}):
-        return [node["properties"][part]]
-    extra = node.get("additionalProperties")
-    return [extra] if isinstance(extra, dict) else []
+        raise ConfigError(f"{where}: {'is empty: ' if empty else ''}{explain(error, model)}") from None
 
 
 def to_yaml(document: BaseModel | Mapping[str, Any]) -> str:

@@ -40,19 +40,17 @@ def package_versions() -> dict[str, str]:
 
 def environment() -> Environment:
     """The machine and the software, as far as the system tells."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:  # not Linux
+        processor = platform.processor() or platform.machine()
+    else:
+        names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+        processor = names[0] if names else platform.machine()
     return Environment(
         versions=package_versions(),
         python=platform.python_version(),
         platform=platform.platform(),
-        processor=_processor(),
+        processor=processor,
         processors=os.cpu_count() or 1,
     )
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return platform.processor() or platform.machine()
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.machine()

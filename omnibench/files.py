@@ -9,38 +9,27 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import datetime
-from errno import EACCES, EDQUOT, EFBIG, EIO, EISDIR, ENOSPC, EPERM, EROFS
+from errno import EACCES, EISDIR, ENOSPC, EROFS
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from omnibench.errors import ConfigError, DataError
+from omnibench.errors import ConfigError, DataError, not_written
 
 if TYPE_CHECKING:
     import polars as pl
 
-RESULTS = Path("results")  # the folder of results, where the user names none
 TableFormat = Literal["parquet", "csv"]
 # The bytes of a file, or a function that writes it to a path and raises OSError when the disk refuses.
 FileContent = bytes | Callable[[Path], None]
 
-_IS_A_FOLDER = "is a folder; name a file"
-_MORE_SPACE = "free space or choose another place"
-_MORE_RIGHTS = "get permission to write there or choose another place"
-_FORMULA = r"^'*[=+\-@\t\r]"
-_NO_TEXT = "cannot be read: it is not a text file in UTF-8; save it so (CSV UTF-8), or leave it out"
-_LEAST_SPACE = 1 << 16  # bytes: a calibration or the tables of a small comparison
-_WAYS_OUT = {
-    ENOSPC: _MORE_SPACE,
-    EDQUOT: _MORE_SPACE,
-    EFBIG: _MORE_SPACE,
-    EIO: _MORE_SPACE,  # polars reports a full disk as an error of input or output
-    EACCES: _MORE_RIGHTS,
-    EPERM: _MORE_RIGHTS,
-}
-
+RESULTS = Path("results")  # the folder of results, where the user names none
 MOST_TEXT = 1 << 30  # bytes of a text that is read whole, as tables are; chosen
+
+_LEAST_SPACE = 1 << 16  # bytes: a calibration or the tables of a small comparison
 _SPECIAL = {stat.S_IFIFO: "pipe", stat.S_IFCHR: "device", stat.S_IFBLK: "device", stat.S_IFSOCK: "socket"}
+_NO_TEXT = "cannot be read: it is not a text file in UTF-8; save it so (CSV UTF-8), or leave it out"
+_FORMULA = r"^'*[=+\-@\t\r]"
 
 
 def check_file(path: Path, most: int | None = None, *, text: bool = False) -> None:
@@ -106,22 +95,14 @@ def replacing(path: Path) -> Iterator[Path]:
     DataError names the path when its folder cannot be made or the disk refuses (full, read-only, no permission).
     """
     path = resolved(path)  # a link goes on pointing to the file
-    if path.exists() and not path.is_file():  # a device or a pipe is written to, never replaced
-        try:
-            yield path
-        except OSError as error:
-            raise _refused(path, error) from None
-        return
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    special = path.exists() and not path.is_file()  # a device or a pipe is written to, never replaced
+    partial = path if special else path.with_name(f".{path.name}.{os.getpid()}.partial")
     made = [folder for folder in path.parents if not folder.exists()]
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError):
-        raise DataError(f"{path}: cannot be written: {path.parent} is not a folder; choose another place") from None
-    except OSError as error:
-        raise _refused(path, error) from None
-    try:
         yield partial
+        if special:
+            return
         replaced = path.exists()
         if replaced:
             _to_disk(partial)
@@ -130,10 +111,11 @@ def replacing(path: Path) -> Iterator[Path]:
             with suppress(OSError):  # a file system that cannot, or a folder that cannot be read
                 _to_disk(path.parent)
     except OSError as error:
-        raise _refused(path, error) from None
+        raise not_written(path, error) from None
     finally:
         with suppress(OSError):
-            partial.unlink(missing_ok=True)
+            if not special:
+                partial.unlink(missing_ok=True)
             for folder in made:  # they stay unless empty
                 folder.rmdir()
 
@@ -164,7 +146,7 @@ def results_locked(folder: Path) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(folder, os.O_RDONLY)
     except OSError as error:
-        raise _refused(folder, error) from None
+        raise not_written(folder, error) from None
     try:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -194,7 +176,7 @@ def refuse_existing(*paths: Path | None, force: bool, folders: bool = False) -> 
         if path is None:
             continue
         if resolved(path).is_dir() and not folders:
-            raise DataError(f"{path}: cannot be written: {_IS_A_FOLDER}")
+            raise not_written(path, OSError(EISDIR, ""))
         if _holds_something(path) and not force:
             other = "folder" if folders else "file"
             raise ConfigError(f"{path} is there already; choose another {other}, or --force to replace it")
@@ -206,15 +188,15 @@ def check_place(path: Path) -> None:
     target = resolved(path)
     if target.exists() and not target.is_file() and not target.is_dir():
         return
-    existing = target if target.is_dir() else next(each for each in target.parents if each.exists())
+    existing = target if target.is_dir() else next(folder for folder in target.parents if folder.exists())
     if not existing.is_dir():
         raise DataError(f"{path}: cannot be written: {existing} is not a folder; choose another place")
     if not os.access(existing, os.W_OK | os.X_OK):
         code = EROFS if os.statvfs(existing).f_flag & os.ST_RDONLY else EACCES
-        raise _refused(path, OSError(code, os.strerror(code)))
+        raise not_written(path, OSError(code, os.strerror(code)))
     disk = shutil.disk_usage(existing)
     if disk.total and disk.free < _LEAST_SPACE:  # a total of 0: a file system that does not count
-        raise _refused(path, OSError(ENOSPC, os.strerror(ENOSPC)))
+        raise not_written(path, OSError(ENOSPC, os.strerror(ENOSPC)))
 
 
 def resolved(path: Path) -> Path:
@@ -231,13 +213,6 @@ def _holds_something(path: Path) -> bool:
         return any(path.iterdir()) if path.is_dir() else path.is_file() and path.stat().st_size > 0
     except OSError:
         return False  # whoever writes there says what is wrong
-
-
-def _refused(path: Path, error: OSError) -> DataError:
-    if error.errno == EISDIR:
-        return DataError(f"{path}: cannot be written: {_IS_A_FOLDER}")
-    way_out = _WAYS_OUT.get(error.errno or 0, "choose another place")
-    return DataError(f"{path}: cannot be written: {error.strerror or error}; {way_out}")
 
 
 def write_text(path: Path, text: str) -> None:
@@ -322,17 +297,17 @@ def check_results_folder(folder: Path, mark: str, kind: str, *, force: bool = Fa
 def new_results_folder(parent: Path) -> Path:
     """Make a folder in ``parent`` that is named by the time; runs of the same second get folders of their own."""
     name = datetime.now().strftime("%Y-%m-%dT%H-%M-%S")
-    count = 1
+    number = 1
     while True:
-        folder = parent / (name if count == 1 else f"{name}-{count}")
+        folder = parent / (name if number == 1 else f"{name}-{number}")
         try:
             folder.mkdir(parents=True)
         except FileExistsError:
-            count += 1
+            number += 1
+            continue
         except OSError:
-            return folder  # the first file that is written there reports what is wrong
-        else:
-            return folder
+            pass  # the first file that is written there reports what is wrong
+        return folder
 
 
 def link_latest(folder: Path) -> None:

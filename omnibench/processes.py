@@ -52,13 +52,13 @@ def interrupts_not_in_callbacks() -> Iterator[None]:
 
     CVXPY imports JAX where it is there. What is raised in such a callback is printed and forgotten, Ctrl-C among it.
     """
-    taken = [each for each in gc.callbacks if getattr(each, "__name__", "") == "_xla_gc_callback"]
-    for each in taken:
-        gc.callbacks.remove(each)
+    callbacks = [callback for callback in gc.callbacks if getattr(callback, "__name__", "") == "_xla_gc_callback"]
+    for callback in callbacks:
+        gc.callbacks.remove(callback)
     try:
         yield
     finally:
-        gc.callbacks.extend(taken)
+        gc.callbacks.extend(callbacks)
 
 
 @contextmanager

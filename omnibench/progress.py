@@ -38,6 +38,8 @@ class Progress:
 
 Reporter = Callable[[Progress], None]
 
+_PERIOD = 0.2  # s between two reports of reading, at least; chosen
+
 
 def no_progress(event: Progress) -> None:
     """Ignore the progress."""
@@ -52,9 +54,6 @@ def _report_as(report: Reporter, task: str, event: Progress) -> None:
     report(replace(event, task=task))
 
 
-_PERIOD = 0.2  # s between two reports of reading, at least; chosen
-
-
 class _Reading:
     """Counts of the samples, or of the parts by workers, that were read of data sets that do not fit in memory.
 
@@ -65,7 +64,7 @@ class _Reading:
         self.report = report
         self.done: dict[str, int] = {}
         self.expected: dict[str, int] = {}
-        self.told = time.monotonic()
+        self.reported_at = time.monotonic()
 
 
 _READING: ContextVar[_Reading | None] = ContextVar("reading", default=None)
@@ -96,8 +95,8 @@ def tell_reading(count: int, unit: str) -> None:
     if reading is None or unit not in reading.expected:
         return
     reading.done[unit] += count
-    if time.monotonic() - reading.told > _PERIOD:
-        reading.told = time.monotonic()
+    if time.monotonic() - reading.reported_at > _PERIOD:
+        reading.reported_at = time.monotonic()
         passes, done = divmod(reading.done[unit], reading.expected[unit])
         note = f"pass {passes + 1}" if passes and done else ""
         reading.report(Progress(f"reading {unit}s", done, reading.expected[unit], unit, note=note))

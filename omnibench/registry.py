@@ -30,6 +30,8 @@ from omnibench.files import check_file
 _MOST_BYTES = 1 << 24  # of a plug-in file; chosen
 _IMPORT_SECONDS = 60.0  # in which a plug-in file must be imported, whatever command loads it; chosen: JAX takes 10 s
 
+_FILE_MODULE = "omnibench_plugin_"  # begins the names of modules that are plug-in files
+
 T = TypeVar("T")
 C = TypeVar("C", bound=type[Any])
 
@@ -94,16 +96,24 @@ class Registry(Generic[T]):
         """
 
         def decorate(cls: C) -> C:
-            taken = self._entries.get(name)
-            if taken is not None and taken.cls is not cls:
-                raise PluginError(f"{self.kind} {name!r} is registered already, by {taken.origin}; choose another name")
+            registered = self._entries.get(name)
+            if registered is not None and registered.cls is not cls:
+                raise PluginError(
+                    f"{self.kind} {name!r} is registered already, by {registered.origin}; choose another name"
+                )
             if self.contract not in cls.__mro__:
                 raise PluginError(f"{self.kind} {name!r}: the class must derive from {self.contract.__name__}")
             options = getattr(cls, "Options", Options)
             if not (isinstance(options, type) and issubclass(options, BaseModel)):
                 raise PluginError(f"{self.kind} {name!r}: Options must be a class derived from omnibench's Options")
+            origin = cls.__module__
+            file = getattr(sys.modules.get(origin), "__file__", None)
+            if origin.startswith("omnibench."):
+                origin = "built in"
+            elif file and origin.startswith(_FILE_MODULE):
+                origin = str(Path(file).resolve())
             cls.name = name
-            self._entries[name] = Entry(name, cls, _origin(cls))
+            self._entries[name] = Entry(name, cls, origin)
             return cls
 
         return decorate
@@ -157,9 +167,13 @@ def load_plugins(folders: Path | str | Iterable[Path | str] = (), installed: boo
 
     A plug-in that fails is returned with its error and the others are loaded. PluginError: a folder is missing.
     """
-    listed = [folders] if isinstance(folders, str | Path) else folders
-    failures = [failure for folder in listed for failure in _load_folder(Path(folder))]
-    return failures + (_load_entry_points() if installed else [])
+    failures: list[PluginFailure | None] = []
+    for folder in map(Path, [folders] if isinstance(folders, str | Path) else folders):
+        failures += [load_plugin_file(path) for path in _files_in(folder)]
+    if installed:
+        points = [point for registry in REGISTRIES for point in entry_points(group=registry.group)]
+        failures += [_attempt(f"{point.group}: {point.value}", point.load) for point in points]
+    return [failure for failure in failures if failure is not None]
 
 
 def load_plugin_file(path: Path) -> PluginFailure | None:
@@ -196,21 +210,15 @@ def registered_from(path: Path) -> list[tuple[Registry[Any], Entry[Any]]]:
     return [(registry, entry) for registry in REGISTRIES for entry in registry.entries() if entry.origin == origin]
 
 
-def _load_folder(folder: Path) -> list[PluginFailure]:
+def _files_in(folder: Path) -> list[Path]:
+    """The plug-in files of a folder; of one that another machine has, those that it sent."""
     if copied := [path for path in _copies if path.parent in (folder, folder.resolve())]:
-        return [failure for path in sorted(copied) if (failure := load_plugin_file(path)) is not None]
+        return sorted(copied)
     if folder.is_file():
         raise PluginError(f"plug-in folder {folder} is a file; name the folder that it lies in with --plugins")
     if not folder.is_dir():
         raise PluginError(f"plug-in folder {folder} does not exist; make it or name another with --plugins")
-    files = [path for path in sorted(folder.glob("*.py")) if not path.name.startswith(("test_", "_", "conftest"))]
-    return [failure for path in files if (failure := load_plugin_file(path)) is not None]
-
-
-def _load_entry_points() -> list[PluginFailure]:
-    points = [point for registry in REGISTRIES for point in entry_points(group=registry.group)]
-    attempts = (_attempt(f"{point.group}: {point.value}", point.load) for point in points)
-    return [failure for failure in attempts if failure is not None]
+    return [path for path in sorted(folder.glob("*.py")) if not path.name.startswith(("test_", "_", "conftest"))]
 
 
 def _attempt(origin: str, load: Callable[[], object]) -> PluginFailure | None:
@@ -229,7 +237,7 @@ def _attempt(origin: str, load: Callable[[], object]) -> PluginFailure | None:
 def _import_file(path: Path) -> None:
     check_file(_copies.get(path, path), _MOST_BYTES, text=True)
     digest = hashlib.sha256(str(path).encode()).hexdigest()[:8]
-    name = f"omnibench_plugin_{path.stem}_{digest}"
+    name = f"{_FILE_MODULE}{path.stem}_{digest}"
     spec = importlib.util.spec_from_file_location(name, _copies.get(path, path))
     if spec is None or spec.loader is None:
         raise PluginError(f"{path} is not a Python file")
@@ -258,13 +266,3 @@ def _limited_time(path: Path) -> Iterator[None]:
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
-
-
-def _origin(cls: type) -> str:
-    if cls.__module__.startswith("omnibench."):
-        return "built in"
-    module = sys.modules.get(cls.__module__)
-    file = getattr(module, "__file__", None)
-    if file and cls.__module__.startswith("omnibench_plugin_"):
-        return str(Path(file).resolve())
-    return cls.__module__

@@ -13,6 +13,8 @@ from importlib import import_module
 from inspect import signature
 from typing import TYPE_CHECKING, Any
 
+from omnibench.errors import UnknownNameError
+
 if TYPE_CHECKING:
     import plotly.graph_objects as go
     import polars as pl
@@ -88,8 +90,6 @@ class Shown:
         tables = _view(self).tables()
         name = next(iter(tables)) if table is None else table
         if name not in tables:
-            from omnibench.errors import UnknownNameError
-
             raise UnknownNameError("table", name, tables)
         return tables[name]()
 
@@ -103,10 +103,9 @@ class Shown:
         after.
         """
         view = _view(self)
-        if unknown := options.keys() - signature(view.figure).parameters.keys():
-            from omnibench.errors import UnknownNameError
-
-            raise UnknownNameError("option of plot", min(unknown), signature(view.figure).parameters)
+        parameters = signature(view.figure).parameters
+        if unknown := options.keys() - parameters.keys():
+            raise UnknownNameError("option of plot", min(unknown), parameters)
         return view.figure(**options)
 
     def _lines(self) -> list[str]:
@@ -115,21 +114,21 @@ class Shown:
 
 def brief(name: str, values: Iterable[tuple[str | None, Any]]) -> str:
     """An object in at most twenty lines: its class and its fields, with what is long shortened."""
-    shown = [f"{field}={_shortened(value)}" if field else _shortened(value) for field, value in values]
-    line = f"{name}({', '.join(shown)})"
+    fields_shown = [f"{field}={_shortened(value)}" if field else _shortened(value) for field, value in values]
+    line = f"{name}({', '.join(fields_shown)})"
     if len(line) <= _WIDTH:
         return line
-    return "\n".join(screenful([f"{name}(", *(f"  {each}," for each in shown)], ")"))
+    return "\n".join(screenful([f"{name}(", *(f"  {shown}," for shown in fields_shown)], ")"))
 
 
 def screenful(lines: Iterable[str], end: str = "") -> list[str]:
-    """At most twenty lines of at most 120 characters."""
-    kept = [line if len(line) <= _WIDTH else f"{line[: _WIDTH - 4]} ..." for line in lines]
+    """At most twenty lines of at most 120 characters, the last of which is ``end`` if it is given."""
+    cut = [line if len(line) <= _WIDTH else f"{line[: _WIDTH - 4]} ..." for line in lines]
     last = [end] if end else []
-    if len(kept) + len(last) > _LINES:
-        room = _LINES - 1 - len(last)
-        kept = [*kept[:room], f"  ... {len(kept) - room} more lines"]
-    return [*kept, *last]
+    room = _LINES - len(last)
+    if len(cut) > room:
+        cut = [*cut[: room - 1], f"  ... {len(cut) - room + 1} more lines"]
+    return [*cut, *last]
 
 
 def _shortened(value: Any) -> str:

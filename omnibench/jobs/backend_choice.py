@@ -32,7 +32,12 @@ class BackendChoice(Model):
 def name_flaw(name: str) -> str:
     """What is wrong with the name of a backend; empty if nothing is."""
     scheme, _, place = name.partition("://")
-    if name in _NAMES or (scheme in _SCHEMES and _has_host_and_port(place)):
+    try:
+        address = urlsplit(f"//{place}")
+        is_address = scheme in _SCHEMES and bool(address.hostname) and address.port is not None
+    except ValueError:  # a port that is no number, or too large a one
+        is_address = False
+    if name in _NAMES or is_address:
         return ""
     return f"unknown backend {name!r}; {nearest(name, _NAMES)}known: processes, dask, tcp://HOST:PORT, tls://HOST:PORT"
 
@@ -41,15 +46,24 @@ def check_backend(name: str, tls: TlsFiles | None = None) -> None:
     """ConfigError in one line: no such backend, Dask is not installed, or files of TLS are missing or of no use."""
     if flaw := name_flaw(name):
         raise ConfigError(flaw)
-    scheme = name.partition("://")[0]
-    if (scheme == "tls") != (tls is not None):
-        raise ConfigError(
-            f"backend {name}: name the files of TLS, ca, cert and key (--tls-ca, --tls-cert, --tls-key)"
-            if tls is None
-            else f"backend {name}: files of TLS are for a scheduler at tls://HOST:PORT; leave them out"
-        )
+    with_tls = name.startswith("tls:")
+    if with_tls and tls is None:
+        raise ConfigError(f"backend {name}: name the files of TLS, ca, cert and key (--tls-ca, --tls-cert, --tls-key)")
     if tls is not None:
-        _check_files(name, tls)
+        if not with_tls:
+            raise ConfigError(f"backend {name}: files of TLS are for a scheduler at tls://HOST:PORT; leave them out")
+        for what, file in (("ca", tls.ca), ("cert", tls.cert), ("key", tls.key)):
+            if not file.is_file():
+                flaw = "is a folder" if file.is_dir() else "no such file"
+                raise ConfigError(f"backend {name}: {what}: {file}: {flaw}")
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        what = f"ca: {tls.ca}: holds no certificate in PEM"
+        try:
+            context.load_verify_locations(tls.ca)
+            what = f"cert and key: {tls.cert}, {tls.key}: are no certificate in PEM with its key"
+            context.load_cert_chain(tls.cert, tls.key)
+        except OSError as error:  # ssl.SSLError is one
+            raise ConfigError(f"backend {name}: {what} ({error})") from None
     if name != "processes" and find_spec("distributed") is None:
         raise ConfigError(f'backend {name}: Dask is not installed; pip install "omnibench[dask]"')
 
@@ -77,34 +91,8 @@ def open_backend(
     with dask_client(address, choice.workers, choice.tls, report) as client:
         backend = DaskBackend(client, checked_requirements(client, preload), report)
         if choice.name.startswith("tcp:"):
-            way = "with tls://HOST:PORT it asks for certificates (omnibench guide scale)"
-            report(
-                Progress(
-                    "tcp", result=f"warning: whoever reaches {choice.name} runs code on its workers and here; {way}"
-                )
-            )
+            risk = f"whoever reaches {choice.name} runs code on its workers and here"
+            way_out = "with tls://HOST:PORT it asks for certificates (omnibench guide scale)"
+            report(Progress("tcp", result=f"warning: {risk}; {way_out}"))
         say_cluster(client, report)
         yield backend
-
-
-def _has_host_and_port(place: str) -> bool:
-    address = urlsplit(f"//{place}")
-    try:
-        return bool(address.hostname) and address.port is not None
-    except ValueError:  # a port that is no number, or too large a one
-        return False
-
-
-def _check_files(name: str, tls: TlsFiles) -> None:
-    """ConfigError names the file of TLS that is missing, or holds no certificate or key."""
-    for what, file in (("ca", tls.ca), ("cert", tls.cert), ("key", tls.key)):
-        if not file.is_file():
-            raise ConfigError(f"backend {name}: {what}: {file}: {'is a folder' if file.is_dir() else 'no such file'}")
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    what = f"ca: {tls.ca}: holds no certificate in PEM"
-    try:
-        context.load_verify_locations(tls.ca)
-        what = f"cert and key: {tls.cert}, {tls.key}: are no certificate in PEM with its key"
-        context.load_cert_chain(tls.cert, tls.key)
-    except OSError as error:  # ssl.SSLError is one
-        raise ConfigError(f"backend {name}: {what} ({error})") from None

@@ -24,9 +24,9 @@ from distributed.client import FutureCancelledError
 
 from omnibench.errors import DataError, OmnibenchError, one_line
 from omnibench.jobs.dask_cluster import WAIT, ClusterLostError, count_slots, lost, lost_if_closed
-from omnibench.jobs.dask_worker import JobEvent, JobOutcome, Order, Parcel, carry_out, content, read_events
+from omnibench.jobs.dask_worker import JobEvent, JobOutcome, Parcel, carry_out, content, read_events
 from omnibench.jobs.job import TRIES, BackendError, Ended, Failure, Job, JobWatch, Store
-from omnibench.jobs.job_process import JobEnd, Packer, run_packed
+from omnibench.jobs.job_process import JobEnd, Packer
 from omnibench.progress import Progress, Reporter, no_progress
 
 T = TypeVar("T")
@@ -60,10 +60,10 @@ class DaskBackend:
     client: Any
     requirements: bytes
     report: Reporter = no_progress
-    _packer: Packer = field(default_factory=Packer)
-    _data: dict[str, Any] = field(default_factory=dict)
+    packer: Packer = field(default_factory=Packer)
     topic: str = field(default_factory=lambda: f"omnibench-{uuid4().hex[:12]}")
     events: SimpleQueue[object] = field(default_factory=SimpleQueue)
+    _data: dict[str, Any] = field(default_factory=dict)
     _runs: Iterator[int] = field(default_factory=count)
 
     def __post_init__(self) -> None:
@@ -85,14 +85,9 @@ class DaskBackend:
             finally:
                 run.close()
 
-    def order(self, number: int, job: Job[Any]) -> tuple[Order, dict[str, bytes]]:
-        """A job as it travels, and by their names the data that it shares with others."""
-        packed, shared = self._packer.pack(job)
-        return Order(number, replace(job, function=run_packed, argument=None, shared=()), packed, tuple(shared)), shared
-
     def data(self, name: str, value: bytes) -> Any:
         """The future of data, which go to the scheduler once, and from there to each worker that needs them."""
-        if name not in self._data:
+        if name not in self._data or self._data[name].status == "error":  # workers were killed that were to hold them
             self._data[name] = self.client.submit(content, value, key=f"omnibench-data-{name}-{uuid4().hex[:8]}")
         return self._data[name]
 
@@ -123,27 +118,25 @@ class _Run:
 
     def submit(self, items: Sequence[_Pending]) -> None:
         """Give jobs to the cluster, in one parcel."""
-        orders: list[Order] = []
+        jobs: list[tuple[int, Job[Any]]] = []
         shared: dict[str, bytes] = {}
-        for item in items:
-            order, data = self._backend.order(item.number, item.job)
-            orders.append(order)
-            shared |= data
         key = f"{self._backend.topic}-{uuid4().hex[:12]}"
-        futures = [self._backend.data(name, value) for name, value in shared.items()]
-        self._futures[key] = self._client.submit(
-            carry_out,
-            Parcel(self._backend.topic, self._number, self._store, tuple(orders), tuple(shared)),
-            self._backend.data("requirements", self._backend.requirements),
-            *futures,
-            key=key,
-            pure=False,
-        )
-        self._numbers[key] = {item.number for item in items}
         for item in items:
+            job = self._backend.packer.portable(item.job)
+            shared |= job.argument.shared
+            jobs.append((item.number, replace(job, argument=replace(job.argument, shared={}))))
             item.parcel = key
             item.submissions += 1
             self.pending[item.number] = item
+        self._numbers[key] = {item.number for item in items}
+        self._futures[key] = self._client.submit(
+            carry_out,
+            Parcel(self._backend.topic, self._number, self._store, tuple(jobs), tuple(shared)),
+            self._backend.data("requirements", self._backend.requirements),
+            *(self._backend.data(name, value) for name, value in shared.items()),
+            key=key,
+            pure=False,
+        )
 
     def ends(self) -> Iterator[Ended]:
         """Wait a moment for events, which are passed on; the jobs that have ended."""
@@ -155,7 +148,8 @@ class _Run:
         for text in texts:
             number, events = read_events(text)
             for event in events if number == self._number else ():  # others are of a call that was interrupted
-                yield from self._heard(event)
+                if (item := self.pending.get(event.number)) is not None:
+                    yield from self._heard(item, event)
         if time.monotonic() - self._looked >= _LOOK:
             self._look()
             for key in [*self._futures]:
@@ -167,10 +161,7 @@ class _Run:
             with suppress(OSError):  # a scheduler that does not answer in time
                 self._client.cancel([*self._futures.values()], force=True)
 
-    def _heard(self, event: JobEvent) -> Iterator[Ended]:
-        item = self.pending.get(event.number)
-        if item is None:
-            return
+    def _heard(self, item: _Pending, event: JobEvent) -> Iterator[Ended]:
         if event.progress is not None:
             self._watch.moved(item.number, event.progress)
         if event.fetch:
@@ -180,8 +171,8 @@ class _Run:
                 except FutureCancelledError:
                     raise lost(self._client) from None
                 for outcome in outcomes:
-                    if (item := self.pending.get(outcome.number)) is not None:
-                        yield self._ended(item, outcome)
+                    if (fetched := self.pending.get(outcome.number)) is not None:
+                        yield self._ended(fetched, outcome)
         elif event.answer is not None:
             yield self._ended(item, JobOutcome(item.number, JobEnd(event.answer), event.seconds))
         elif event.progress is None:
@@ -213,14 +204,15 @@ class _Run:
     def _forget(self, item: _Pending) -> None:
         """The job is with the cluster no more; nor is its parcel, if it was the last."""
         del self.pending[item.number]
-        self._numbers[item.parcel].discard(item.number)
-        if not self._numbers[item.parcel]:
+        numbers = self._numbers.get(item.parcel, set())  # none: the parcel is lost
+        numbers.discard(item.number)
+        if not numbers:
             self._close_parcel(item.parcel)
 
     def _close_parcel(self, key: str) -> None:
-        del self._numbers[key]
-        future = self._futures.pop(key)
-        if not future.done():  # it would go on with what was given up
+        self._numbers.pop(key, None)
+        future = self._futures.pop(key, None)
+        if future is not None and not future.done():  # it would go on with what was given up
             future.cancel()
 
     def _lost(self, key: str) -> Iterator[Ended]:
@@ -239,8 +231,6 @@ class _Run:
         self._close_parcel(key)
         for item in items:
             if item.begins >= TRIES or item.submissions >= _SUBMISSIONS:
-                self._numbers[item.parcel] = {item.number}
-                self._futures[item.parcel] = future
                 yield self._given_up(item)
             else:
                 self.submit([item])

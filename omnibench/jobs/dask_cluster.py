@@ -20,7 +20,7 @@ from distributed.comm.core import CommClosedError, connect
 from distributed.core import send_recv
 
 from omnibench.errors import ConfigError, one_line
-from omnibench.jobs.dask_worker import Requirements, UnfitWorkerError, prepare, software
+from omnibench.jobs.dask_worker import Requirements, UnfitWorkerError, differences, prepare, software
 from omnibench.jobs.job import BackendError, TlsFiles
 from omnibench.processes import interrupts_blocked, main_module_hidden
 from omnibench.progress import Progress, Reporter
@@ -40,6 +40,7 @@ _SETTINGS = {
     "distributed.admin.low-level-log-length": 10,  # copies of messages, which nobody reads
     "distributed.admin.tick.interval": "500 ms",
     "distributed.comm.timeouts.connect": f"{_ANSWER} s",
+    "distributed.deploy.lost-worker-timeout": f"{WAIT} s",  # a worker here that was killed is started again until then
 }
 
 
@@ -106,17 +107,8 @@ def dask_client(address: str | None, workers: int, tls: TlsFiles | None, report:
         logging.getLogger(name).setLevel(logging.CRITICAL + 1)  # each has a level of its own
     with warnings.catch_warnings(), dask.config.set(_SETTINGS):
         warnings.filterwarnings("ignore", module="distributed")
-        if address is None:
-            with (
-                _local_cluster(workers) as cluster,
-                _closing(_Client(cluster, set_as_default=False), _CLIENT_CLOSED) as client,
-            ):
-                yield client
-        else:
-            with _closing(_joined(address, tls), _CLIENT_CLOSED) as client, lost_if_closed(client):
-                _check_scheduler(client, address)
-                _wait_for_worker(client, address, report)
-                yield client
+        with _local_client(workers) if address is None else _joined_client(address, tls, report) as client:
+            yield client
 
 
 @contextmanager
@@ -130,8 +122,8 @@ def _closing(opened: Any, seconds: float) -> Iterator[Any]:
 
 
 @contextmanager
-def _local_cluster(workers: int) -> Iterator[Any]:
-    """A cluster of this machine's processes, which leave Ctrl-C to this one."""
+def _local_client(workers: int) -> Iterator[Any]:
+    """A client of a cluster of this machine's processes, which leave Ctrl-C to this one."""
     resource_tracker.ensure_running()  # the first worker would start it, and unblock what is blocked
     with main_module_hidden():  # a worker that died is started again at any time
         with interrupts_blocked():
@@ -143,11 +135,16 @@ def _local_cluster(workers: int) -> Iterator[Any]:
                 dashboard_address="127.0.0.1:8787",
                 silence_logs=logging.CRITICAL,
             )
-        with _closing(cluster, _CLUSTER_CLOSED):
-            yield cluster
+        with (
+            _closing(cluster, _CLUSTER_CLOSED),
+            _closing(_Client(cluster, set_as_default=False), _CLIENT_CLOSED) as client,
+        ):
+            yield client
 
 
-def _joined(address: str, tls: TlsFiles | None) -> Any:
+@contextmanager
+def _joined_client(address: str, tls: TlsFiles | None, report: Reporter) -> Iterator[Any]:
+    """A client of a scheduler that runs already, once it has a worker."""
     security = None
     if tls is not None:
         security = distributed.Security(
@@ -156,7 +153,7 @@ def _joined(address: str, tls: TlsFiles | None) -> Any:
     try:
         with ThreadPoolExecutor(1) as thread:  # a notebook has a loop of its own in this one
             thread.submit(asyncio.run, _ask(address, security)).result()
-        return _Client(address, timeout=_ANSWER, set_as_default=False, security=security)
+        joined = _Client(address, timeout=_ANSWER, set_as_default=False, security=security)
     except ConfigError:
         raise
     except Exception as error:  # sockets, TLS and the protocol of another version raise what they like
@@ -164,6 +161,24 @@ def _joined(address: str, tls: TlsFiles | None) -> Any:
         raise ConfigError(
             f"no Dask scheduler answers at {address} ({reason}); start one (dask scheduler), or correct the address"
         ) from None
+    with _closing(joined, _CLIENT_CLOSED) as client, lost_if_closed(client):
+        packages = client.get_versions()["scheduler"]["packages"]
+        there, here = (
+            {name: versions[name] for name in ("dask", "distributed") if name in versions}
+            for versions in (packages, software())
+        )
+        if wrong := differences(there, here):
+            raise ConfigError(f"scheduler {address} has {', '.join(wrong)}; install the same on both sides")
+        if not client.nthreads():
+            report(Progress("waiting for a worker"))
+            try:
+                client.wait_for_workers(1, timeout=WAIT)
+            except TimeoutError:
+                raise ConfigError(
+                    f"no worker has joined the scheduler {address} for {WAIT:g} s; start some (dask worker {address})"
+                ) from None
+            report(Progress("waiting for a worker", result=""))
+        yield client
 
 
 async def _ask(address: str, security: Any) -> None:
@@ -181,31 +196,6 @@ async def _ask(address: str, security: Any) -> None:
         comm.abort()
     if (kind := identity["type"]) != "Scheduler":
         raise ConfigError(f"{address} is a {kind.lower()} of Dask; give the address of its scheduler")
-
-
-def _check_scheduler(client: Any, address: str) -> None:
-    """ConfigError: the scheduler has another version of Dask."""
-    there = client.get_versions()["scheduler"]["packages"]
-    here = software()
-    if wrong := [
-        f"{name} {there.get(name, 'missing')} (here: {here[name]})"
-        for name in ("dask", "distributed")
-        if there.get(name) != here[name]
-    ]:
-        raise ConfigError(f"scheduler {address} has {', '.join(wrong)}; install the same on both sides")
-
-
-def _wait_for_worker(client: Any, address: str, report: Reporter) -> None:
-    if client.nthreads():
-        return
-    report(Progress("waiting for a worker"))
-    try:
-        client.wait_for_workers(1, timeout=WAIT)
-    except TimeoutError:
-        raise ConfigError(
-            f"no worker has joined the scheduler {address} for {WAIT:g} s; start some (dask worker {address})"
-        ) from None
-    report(Progress("waiting for a worker", result=""))
 
 
 def say_cluster(client: Any, report: Reporter) -> None:

@@ -31,7 +31,7 @@ from omnibench.config import NonNegative
 from omnibench.errors import DataError
 from omnibench.files import write_text
 from omnibench.jobs.job import BackendError, Job, Store, code_digest
-from omnibench.jobs.job_process import PRELOAD, JobEnd, JobProcess, PackedJob, process_for
+from omnibench.jobs.job_process import PRELOAD, JobEnd, JobProcess, process_for, release
 from omnibench.processes import one_thread_processes
 from omnibench.progress import Progress, Reporter
 from omnibench.registry import REGISTRIES, PluginFailure, import_copies
@@ -41,6 +41,16 @@ _PACKAGES = (
     *("dask", "distributed"),
 )
 _PACKAGE = Path(__file__).parents[1]
+_PERIOD = 0.2  # s between two reports of a job, and two looks whether it is still wanted; chosen
+_TOGETHER, _MOST_TOGETHER = 0.1, 50  # s and ends that wait for each other; chosen
+_LARGEST = 50_000  # bytes of an event, about: the scheduler keeps a thousand of them, and a run's result has 2 to 20 kB
+_PROBE = 1_000_000  # bytes that a worker must be able to write: a plug-in's file and what a job notes down (chosen)
+
+_preparing = threading.Lock()
+_slot_freed = threading.Condition()
+_busy_slots = 0  # of this worker
+_idle: dict[bytes, list[JobProcess]] = {}  # processes that wait, by the requirements of the clients that they serve
+_lasting = ExitStack()  # what is open for as long as this worker lives
 
 
 @cache
@@ -64,12 +74,6 @@ def differences(there: Mapping[str, str], here: Mapping[str, str]) -> list[str]:
     ]
 
 
-_PERIOD = 0.2  # s between two reports of a job, and two looks whether it is still wanted; chosen
-_TOGETHER, _MOST_TOGETHER = 0.1, 50  # s and ends that wait for each other; chosen
-_LARGEST = 50_000  # bytes of an event, about: the scheduler keeps a thousand of them, and a run's result has 2 to 20 kB
-_PROBE = 1_000_000  # bytes that a worker must be able to write: a plug-in's file and what a job notes down (chosen)
-
-
 class UnfitWorkerError(BackendError):
     """A worker on which results could differ from the client's, or that cannot run jobs."""
 
@@ -85,23 +89,16 @@ class Requirements:
 
 
 @dataclass(frozen=True)
-class Order:
-    """A job as it travels. content: see ``Packer``; names: of what it shares with others."""
-
-    number: int
-    job: Job[Any]
-    content: bytes
-    names: tuple[str, ...]
-
-
-@dataclass(frozen=True)
 class Parcel:
-    """Jobs that travel together, quick ones. names: of what they share. topic: of events, texts of ``events_text``."""
+    """Jobs that travel together, by their numbers: quick ones, each with a PackedJob without what it shares.
+
+    names: of what they share. topic: of events, texts of ``events_text``.
+    """
 
     topic: str
     run: int
     store: Store[Any]
-    orders: tuple[Order, ...]
+    jobs: tuple[tuple[int, Job[Any]], ...]
     names: tuple[str, ...]
 
 
@@ -157,32 +154,29 @@ def carry_out(parcel: Parcel, requirements: bytes, *shared: bytes) -> list[JobOu
     """
     worker = distributed.get_worker()
     plugins, preload = prepare(requirements, worker), pickle.loads(requirements).preload
-    teller = _Teller(worker, parcel)
+    sender = _EventSender(worker, parcel)
     idle = _idle.setdefault(requirements, [])
     data = dict(zip(parcel.names, shared, strict=True))
-    timed = any(order.job.timed for order in parcel.orders)
+    timed = any(job.timed for _, job in parcel.jobs)
     with _slots(worker.state.nthreads if timed else 1, worker.state.nthreads):
-        teller.begins([JobEvent(order.number, worker.address) for order in parcel.orders])
-        for order in parcel.orders:
-            held = {name: data[name] for name in order.names}
-            packed = PackedJob(order.content, held, plugins, kept=order.job.own)
-            job, began = replace(order.job, argument=packed), time.monotonic()
+        sender.begin([JobEvent(number, worker.address) for number, _ in parcel.jobs])
+        for number, job in parcel.jobs:
+            needed = {name: data[name] for name in job.argument.names}
+            complete = replace(job, argument=replace(job.argument, shared=needed, plugins=plugins))
+            began = time.monotonic()
             process = process_for(job, idle, _context(preload))
             try:
-                process.give(job, parcel.store.content)
-                end = _follow(process, teller, order.number)
+                process.give(complete, parcel.store.content)
+                end = _follow(process, sender, number)
             except BaseException:
                 process.end()
                 raise
             if end is None:  # wanted no more
                 process.end()
                 break
-            if end.reusable:
-                idle.append(process)
-            else:
-                process.end()
-            teller.ended(JobOutcome(order.number, end, time.monotonic() - began))
-    return teller.close()
+            release(process, end, idle)
+            sender.end(JobOutcome(number, end, time.monotonic() - began))
+    return sender.close()
 
 
 def prepare(requirements: bytes, dask_worker: Any) -> dict[Path, Path]:
@@ -191,53 +185,40 @@ def prepare(requirements: bytes, dask_worker: Any) -> dict[Path, Path]:
         return _prepared(requirements, dask_worker.address, Path(dask_worker.local_directory))
 
 
-_preparing = threading.Lock()
-_free = threading.Condition()
-_taken = 0  # slots of this worker
-_idle: dict[bytes, list[JobProcess]] = {}  # processes that wait, by the requirements of the clients that they serve
-_open = ExitStack()
-
-
 @cache
 def _prepared(requirements: bytes, address: str, folder: Path) -> dict[Path, Path]:
-    wanted: Requirements = pickle.loads(requirements)
-    if wrong := differences(software(), wanted.software):
+    client: Requirements = pickle.loads(requirements)
+    if wrong := differences(software(), client.software):
         raise UnfitWorkerError(
             f"worker {address} has {', '.join(wrong)}: results could differ; install the same on the worker, or work "
             "with workers that have it"
         )
     copies = folder / f"omnibench-{hashlib.sha256(requirements).hexdigest()[:10]}"
-    plugins = {path: copies / str(number) / path.name for number, path in enumerate(wanted.plugins)}
+    plugins = {path: copies / str(number) / path.name for number, path in enumerate(client.plugins)}
     try:
         write_text(copies / "probe", " " * _PROBE)
         (copies / "probe").unlink()
         for path, copy in plugins.items():
-            write_text(copy, wanted.plugins[path])
+            write_text(copy, client.plugins[path])
     except (OSError, DataError) as error:
         raise UnfitWorkerError(f"worker {address}: {error}") from None
     if plugins:
-        failures = _failures(plugins, address, wanted.preload)
-        for failure in failures:
-            if failure.origin not in wanted.failing:
+        # A process of jobs imports them, as it may crash.
+        process, job = JobProcess(_context(client.preload)), Job("plug-ins", _import_all, plugins)
+        process.give(job, _as_it_is)
+        wait(process.signs)
+        end = process.receive()
+        process.end()
+        assert isinstance(end, JobEnd)
+        if (lost := end.failure(job)) is not None:
+            raise UnfitWorkerError(f"worker {address}: its plug-ins cannot be imported there: {lost.reason}")
+        for failure in end.answer:
+            if failure.origin not in client.failing:
                 raise UnfitWorkerError(
                     f"worker {address}: plug-in {failure.origin} cannot be imported there: {failure.error}; install "
                     "on the worker what it needs"
                 )
     return plugins
-
-
-def _failures(plugins: Mapping[Path, Path], address: str, preload: tuple[str, ...]) -> list[PluginFailure]:
-    """Plug-ins that cannot be imported here, by a process of jobs."""
-    process, job = JobProcess(_context(preload)), Job("plug-ins", _import_all, plugins)
-    process.give(job, _as_it_is)
-    wait(process.signs)
-    end = process.receive()
-    process.end()
-    assert isinstance(end, JobEnd)
-    if (failure := end.failure(job)) is not None:
-        raise UnfitWorkerError(f"worker {address}: its plug-ins cannot be imported there: {failure.reason}")
-    failures: list[PluginFailure] = end.answer
-    return failures
 
 
 def _import_all(plugins: Mapping[Path, Path], _: Reporter) -> list[PluginFailure]:
@@ -248,9 +229,9 @@ def _as_it_is(_: str, result: Any) -> Any:
     return result
 
 
-def _follow(process: JobProcess, teller: _Teller, number: int) -> JobEnd | None:
+def _follow(process: JobProcess, sender: _EventSender, number: int) -> JobEnd | None:
     """Wait for a job's end, and report; None if it is wanted no more."""
-    told, last = time.monotonic(), None
+    reported_at, latest = time.monotonic(), None
     while True:
         wait(process.signs, timeout=_PERIOD)
         end = None
@@ -258,15 +239,15 @@ def _follow(process: JobProcess, teller: _Teller, number: int) -> JobEnd | None:
             if isinstance(event, JobEnd):
                 end = event
                 break
-            last = JobEvent(number, progress=event)
-        if last is not None and (end or time.monotonic() - told >= _PERIOD):
-            teller.tell(last, at_once=end is None)
-            told, last = time.monotonic(), None
-        if end or not teller.wanted:
+            latest = JobEvent(number, progress=event)
+        if latest is not None and (end or time.monotonic() - reported_at >= _PERIOD):
+            sender.send(latest, at_once=end is None)
+            reported_at, latest = time.monotonic(), None
+        if end or sender.cancelled:
             return end
 
 
-class _Teller:
+class _EventSender:
     """Tells the client of a parcel's jobs by events, which go by way of the scheduler."""
 
     def __init__(self, worker: Any, parcel: Parcel) -> None:
@@ -275,64 +256,64 @@ class _Teller:
         self._key = worker.get_current_task()
         self._waiting: list[JobEvent] = []
         self._size = 0  # bytes of those that wait
-        self._fetched: list[JobOutcome] = []
-        self._told = time.monotonic()
+        self._to_fetch: list[JobOutcome] = []
+        self._sent_at = time.monotonic()
 
     @property
-    def wanted(self) -> bool:
-        """False once the client has cancelled the parcel, or is gone."""
+    def cancelled(self) -> bool:
+        """True once the client has cancelled the parcel, or is gone."""
         task = self.worker.state.tasks.get(self._key)
-        return task is not None and task.state != "cancelled"
+        return task is None or task.state == "cancelled"
 
-    def begins(self, events: Iterable[JobEvent]) -> None:
+    def begin(self, events: Iterable[JobEvent]) -> None:
         """Send begins, and wait until the scheduler has them: one that died with its worker would not be counted."""
         log_event = self.worker.scheduler.log_event
         distributed.utils.sync(self.worker.loop, log_event, topic=self._topic, msg=events_text(self._run, events))
 
-    def tell(self, event: JobEvent, *, at_once: bool = False) -> None:
+    def send(self, event: JobEvent, *, at_once: bool = False) -> None:
         """Send an event, with others that wait unless ``at_once``."""
         size = len(event.answer or "")
         if self._size + size > _LARGEST:
-            self._send()
+            self._flush()
         self._waiting.append(event)
         self._size += size
-        if at_once or time.monotonic() - self._told > _TOGETHER or len(self._waiting) >= _MOST_TOGETHER:
-            self._send()
+        if at_once or time.monotonic() - self._sent_at > _TOGETHER or len(self._waiting) >= _MOST_TOGETHER:
+            self._flush()
 
-    def ended(self, outcome: JobOutcome) -> None:
+    def end(self, outcome: JobOutcome) -> None:
         """Send an end soon, if it is a result in text that is not too large for an event."""
         answer = outcome.end.answer
         if isinstance(answer, str) and len(answer) <= _LARGEST:
-            self.tell(JobEvent(outcome.number, answer=answer, seconds=outcome.seconds))
+            self.send(JobEvent(outcome.number, answer=answer, seconds=outcome.seconds))
         else:
-            self._fetched.append(outcome)
+            self._to_fetch.append(outcome)
 
     def close(self) -> list[JobOutcome]:
         """Send what is left; the ends that are no events."""
-        for outcome in self._fetched:
-            self.tell(JobEvent(outcome.number, fetch=True))
-        self._send()
-        return self._fetched
+        for outcome in self._to_fetch:
+            self.send(JobEvent(outcome.number, fetch=True))
+        self._flush()
+        return self._to_fetch
 
-    def _send(self) -> None:
+    def _flush(self) -> None:
         if self._waiting:
             self.worker.log_event(self._topic, events_text(self._run, self._waiting))
-        self._waiting, self._size, self._told = [], 0, time.monotonic()
+        self._waiting, self._size, self._sent_at = [], 0, time.monotonic()
 
 
 @contextmanager
-def _slots(wanted: int, all_slots: int) -> Iterator[None]:
+def _slots(needed: int, all_slots: int) -> Iterator[None]:
     """Wait for free slots of this worker, all of them for a job that is timed, and take them."""
-    global _taken
-    with _free:
-        _free.wait_for(lambda: _taken + wanted <= all_slots)
-        _taken += wanted
+    global _busy_slots
+    with _slot_freed:
+        _slot_freed.wait_for(lambda: _busy_slots + needed <= all_slots)
+        _busy_slots += needed
     try:
         yield
     finally:
-        with _free:
-            _taken -= wanted
-            _free.notify_all()
+        with _slot_freed:
+            _busy_slots -= needed
+            _slot_freed.notify_all()
 
 
 @cache
@@ -340,4 +321,4 @@ def _context(preload: tuple[str, ...]) -> Any:
     """The context of processes of jobs, for as long as this worker lives."""
     os.environ.pop("MALLOC_TRIM_THRESHOLD_", None)  # a nanny's: with it arrays take half as long again as at home
     multiprocessing.current_process().daemon = False  # a nanny's workers may not start processes otherwise
-    return _open.enter_context(one_thread_processes((*PRELOAD, __name__, *preload)))
+    return _lasting.enter_context(one_thread_processes((*PRELOAD, __name__, *preload)))

@@ -26,6 +26,8 @@ from omnibench.progress import Progress, Reporter, expect_reading, no_progress, 
 
 T = TypeVar("T")
 
+TRIES = 3  # how often a job whose worker is killed is begun: two chances that memory is free again; chosen
+
 
 class TlsFiles(Model):
     """Files in PEM for a scheduler at tls://: the authority's certificate, and this client's with its key."""
@@ -136,9 +138,6 @@ def _adapter(store: ResultStore[T]) -> TypeAdapter[T]:
     return TypeAdapter(store.kind)
 
 
-TRIES = 3  # how often a job whose worker is killed is begun: two chances that memory is free again; chosen
-
-
 @dataclass(frozen=True)
 class Job(Generic[T]):
     """Specification of a job, which can be pickled.
@@ -159,6 +158,11 @@ class Job(Generic[T]):
     timed: bool = False
     shared: tuple[Any, ...] = ()
     own: bool = False
+
+    @property
+    def limited(self) -> bool:
+        """True for a job with a limit, which needs a process of its own."""
+        return self.seconds is not None or self.memory_mb is not None
 
     def run(self, store: Store[T], report: Reporter) -> None:
         """Do the work here and write the result's file."""
@@ -234,7 +238,9 @@ def run_jobs(jobs: Iterable[Job[T]], store: Store[T], backend: Backend, watch: J
             elif failure.killed and tried < TRIES:
                 killed.append((number, job))
             else:
-                watch.ended(number, _after(failure, tried), reused=False)
+                if tried > 1:
+                    failure = replace(failure, reason=f"{failure.reason} in each of {tried} tries")
+                watch.ended(number, failure, reused=False)
         if not killed:
             return
         waiting = iter(killed)
@@ -248,10 +254,6 @@ def _not_stored(jobs: Iterable[Job[T]], store: Store[T], watch: JobWatch[T]) -> 
             yield number, job
         else:
             watch.ended(number, result, reused=True)
-
-
-def _after(failure: Failure, tries: int) -> Failure:
-    return failure if tries == 1 else replace(failure, reason=f"{failure.reason} in each of {tries} tries")
 
 
 def gathered(
@@ -270,7 +272,7 @@ def gathered(
     expect_reading(len(arguments), "part")
     jobs = (Job(str(number), function, argument, shared=shared, own=True) for number, argument in enumerate(arguments))
     run_jobs(jobs, _InMemory[T](), backend, results)
-    return [results.found[number] for number in range(len(arguments))]
+    return [results.by_number[number] for number in range(len(arguments))]
 
 
 class _InMemory(Generic[T]):
@@ -309,11 +311,11 @@ class _Results(JobWatch[T]):
     """The results, by number. The first failure ends the work."""
 
     def __init__(self) -> None:
-        self.found: dict[int, T] = {}
+        self.by_number: dict[int, T] = {}
 
     def ended(self, number: int, ending: T | Failure, reused: bool) -> None:  # noqa: ARG002
         if not isinstance(ending, Failure):
-            self.found[number] = ending
+            self.by_number[number] = ending
             tell_reading(1, "part")
         elif ending.error is not None:
             raise ending.error

@@ -10,9 +10,9 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from io import BytesIO
 from itertools import islice
 from multiprocessing.connection import Connection
@@ -27,6 +27,18 @@ from omnibench.progress import Progress, Reporter
 from omnibench.registry import import_copies
 
 _MEGABYTE = 1_000_000  # bytes
+# s after its start in which a process takes further jobs: to start one costs 20 ms (tests/studies/job_overhead.py),
+# 2 % of that; what jobs leave behind in it (memory, caches) is that of a second.
+_YOUNG = 1.0
+_OWN = 60.0  # s, for jobs of our own code, which leave nothing behind but what they share: data need not go again
+# What every process of jobs needs; pydantic imports these when a result is first written, which takes 60 ms.
+PRELOAD = (__name__, "pydantic.fields", "pydantic.dataclasses")
+_AT_ONCE = 100  # events of a process that are heard before those of others; chosen
+_CLOSED = 1.0  # s in which a process dies whose end of the connection is closed; chosen
+_FROM_OUTSIDE = (SIGKILL, SIGTERM, SIGHUP, SIGINT)  # signals by which people and the system end processes
+
+_KEPT: dict[str, Any] = {}  # objects that the last job of this process shared, by their names
+_in_job = False  # True in a process of jobs
 
 
 @contextmanager
@@ -63,75 +75,45 @@ def oom_kills() -> int:
     return sum(int(line.split()[1]) for line in counts if line.startswith("oom_kill "))
 
 
-class Packer:
-    """Pickles jobs. Objects that they share are kept, so that each is pickled once."""
-
-    def __init__(self) -> None:
-        self._known: dict[int, tuple[Any, str, bytes]] = {}
-
-    def pack(self, job: Job[Any]) -> tuple[bytes, dict[str, bytes]]:
-        """The job's function and argument without what it shares, and that by the hash of its content."""
-        shared = {id(value): self._content(value) for value in job.shared}
-        stream = BytesIO()
-        _Pickler(stream, {key: name for key, (_, name, _) in shared.items()}).dump((job.function, job.argument))
-        return stream.getvalue(), {name: content for _, name, content in shared.values()}
-
-    def packed(self, job: Job[Any]) -> Job[Any]:
-        """A job of our own code packed for a process of this machine, to which what jobs share goes once; any other."""
-        if not (job.own and job.shared):
-            return job
-        content, shared = self.pack(job)
-        return replace(job, function=run_packed, argument=PackedJob(content, shared, {}, kept=True), shared=())
-
-    def _content(self, value: Any) -> tuple[Any, str, bytes]:
-        if id(value) not in self._known:
-            content = pickle.dumps(value, pickle.HIGHEST_PROTOCOL)
-            self._known[id(value)] = value, hashlib.sha256(content).hexdigest()[:20], content
-        return self._known[id(value)]
-
-
-class _Pickler(pickle.Pickler):
-    """names: of the objects that are left out, by their ids."""
-
-    def __init__(self, stream: BytesIO, names: Mapping[int, str]) -> None:
-        super().__init__(stream, pickle.HIGHEST_PROTOCOL)
-        self._names = names
-
-    def persistent_id(self, value: Any) -> str | None:
-        return self._names.get(id(value))
-
-
-class _Unpickler(pickle.Unpickler):
-    """shared: the objects that were left out, by their names."""
-
-    def __init__(self, content: bytes, shared: Mapping[str, Any]) -> None:
-        super().__init__(BytesIO(content))
-        self._shared = shared
-
-    def persistent_load(self, name: str) -> Any:
-        return self._shared[name]
-
-
 @dataclass(frozen=True)
 class PackedJob:
-    """A job's function and argument as bytes. plugins: copies of plug-in files here, by their paths at home.
+    """A job's function and argument as bytes, without the objects that it shares with other jobs.
 
-    kept: what the job shares with others, its ``names``, is kept in its process for the next job.
+    shared: those objects as bytes, by their names; names: all of them, also those that its process has kept already.
+    kept: the process keeps them for the next job. plugins: copies of plug-in files here, by their paths at home.
     """
 
     content: bytes
     shared: Mapping[str, bytes]
-    plugins: Mapping[Path, Path]
-    kept: bool = False
-    names: tuple[str, ...] = ()
-
-    def without(self, sent: Collection[str]) -> PackedJob:
-        """The job for a process that has kept what was sent, by its names."""
-        left = {name: value for name, value in self.shared.items() if name not in sent}
-        return replace(self, shared=left, names=tuple(self.shared))
+    names: tuple[str, ...]
+    kept: bool
+    plugins: Mapping[Path, Path] = field(default_factory=dict)
 
 
-_KEPT: dict[str, Any] = {}  # objects that the last job of this process shared, by their names
+class Packer:
+    """Pickles jobs. Objects that they share are pickled once, and named by the hash of their content."""
+
+    def __init__(self) -> None:
+        self._pickled: dict[int, tuple[Any, str, bytes]] = {}  # by id: the object, its name and its content
+
+    def pack(self, job: Job[Any]) -> tuple[bytes, dict[str, bytes]]:
+        """The job's function and argument without what it shares, and that by its names."""
+        for value in job.shared:
+            if id(value) not in self._pickled:
+                content = pickle.dumps(value, pickle.HIGHEST_PROTOCOL)
+                self._pickled[id(value)] = value, hashlib.sha256(content).hexdigest()[:20], content
+        shared = {id(value): self._pickled[id(value)] for value in job.shared}
+        names = {key: name for key, (_, name, _) in shared.items()}
+        stream = BytesIO()
+        pickler = pickle.Pickler(stream, pickle.HIGHEST_PROTOCOL)
+        pickler.persistent_id = lambda value: names.get(id(value))  # type: ignore[method-assign]
+        pickler.dump((job.function, job.argument))
+        return stream.getvalue(), {name: content for _, name, content in shared.values()}
+
+    def portable(self, job: Job[Any]) -> Job[Any]:
+        """The job as another process unpacks it: its argument is a PackedJob."""
+        content, shared = self.pack(job)
+        return replace(job, function=run_packed, argument=PackedJob(content, shared, tuple(shared), job.own), shared=())
 
 
 def run_packed(packed: PackedJob, report: Reporter) -> Any:
@@ -142,21 +124,10 @@ def run_packed(packed: PackedJob, report: Reporter) -> Any:
         shared |= {name: _KEPT[name] for name in packed.names if name not in shared}
         _KEPT.clear()
         _KEPT.update(shared)
-    function, argument = _Unpickler(packed.content, shared).load()
+    unpickler = pickle.Unpickler(BytesIO(packed.content))
+    unpickler.persistent_load = shared.__getitem__  # type: ignore[method-assign]
+    function, argument = unpickler.load()
     return function(argument, report)
-
-
-# s after its start in which a process takes further jobs: to start one costs 20 ms (tests/studies/job_overhead.py),
-# 2 % of that; what jobs leave behind in it (memory, caches) is that of a second.
-_YOUNG = 1.0
-_OWN = 60.0  # s, for jobs of our own code, which leave nothing behind but what they share: data need not go again
-# What every process of jobs needs; pydantic imports these when a result is first written, which takes 60 ms.
-PRELOAD = (__name__, "pydantic.fields", "pydantic.dataclasses")
-_AT_ONCE = 100  # events of a process that are heard before those of others; chosen
-_CLOSED = 1.0  # s in which a process dies whose end of the connection is closed; chosen
-_FROM_OUTSIDE = (SIGKILL, SIGTERM, SIGHUP, SIGINT)  # signals by which people and the system end processes
-
-_in_job = False  # True in a process of jobs
 
 
 def in_job() -> bool:
@@ -168,25 +139,18 @@ def in_job() -> bool:
 class JobEnd:
     """The end of a job, in parts that any process can read.
 
-    answer: what ``keep`` returned. error: what the job raised, pickled. exit_code: of a process that died without an
-    answer, as of multiprocessing (minus the signal). out_of_memory: the system killed a process meanwhile for lack of
-    memory. over_time: it was ended at its limit. reusable: the process is as it was before the job.
+    answer: what ``keep`` returned. error: what the job raised, pickled. lost: why it has neither, as its process died
+    or was ended. reusable: the process is as it was before the job.
     """
 
     answer: Any = None
     error: bytes | None = None
-    exit_code: int | None = None
-    out_of_memory: bool = False
-    over_time: bool = False
+    lost: Failure | None = None
     reusable: bool = False
 
     def failure(self, job: Job[Any]) -> Failure | None:
         """Why the job has no result; None where it has ended well."""
-        if self.over_time:
-            return Failure(f"over time (limit {job.seconds:g} s)", over_time=True)
-        if self.exit_code is not None:
-            return _death(job, self.exit_code, self.out_of_memory)
-        return None if self.error is None else raised(job, pickle.loads(self.error))
+        return self.lost if self.error is None else raised(job, pickle.loads(self.error))
 
 
 class JobProcess:
@@ -203,8 +167,8 @@ class JobProcess:
         far.close()
         self._since = time.monotonic()
         self._kills = 0
-        self._fresh = True
         self._sent: set[str] = set()
+        self._job: Job[Any] | None = None  # the last one, without its argument
         self.deadline: float | None = None  # of the job, by time.monotonic
 
     @property
@@ -214,17 +178,17 @@ class JobProcess:
 
     def takes(self, job: Job[Any]) -> bool:
         """True if it may do the job: a job with a limit gets a fresh process, others one that is young."""
-        if self._fresh:
+        if self._job is None:
             return True
         young = time.monotonic() - self._since <= (_OWN if job.own else _YOUNG)
-        return young and not _alone(job) and self._process.is_alive()
+        return young and not job.limited and self._process.is_alive()
 
     def give(self, job: Job[Any], keep: Callable[[str, Any], Any]) -> None:
         """Begin a job. keep: called there with the key and the result; what it returns is the end's ``answer``."""
-        self._fresh, self._kills = False, oom_kills()
-        if isinstance(job.argument, PackedJob) and job.argument.kept:
-            packed, self._sent = job.argument.without(self._sent), {*job.argument.shared}
-            job = replace(job, argument=packed)
+        self._job, self._kills = replace(job, argument=None, shared=()), oom_kills()
+        if isinstance(packed := job.argument, PackedJob) and packed.kept:
+            missing = {name: content for name, content in packed.shared.items() if name not in self._sent}
+            job, self._sent = replace(job, argument=replace(packed, shared=missing)), {*packed.names}
         self.deadline = None if job.seconds is None else time.monotonic() + job.seconds
         with suppress(BrokenPipeError, ConnectionResetError):  # it died: ``receive`` tells how
             self.connection.send((job, keep))
@@ -236,30 +200,34 @@ class JobProcess:
     def receive(self) -> Progress | JobEnd | None:
         """A report or the end of the job, None if there is none yet. After an end by force the process is gone."""
         over = self.deadline is not None and time.monotonic() >= self.deadline
+        dead = not self._process.is_alive()  # asked before what it sent is read, so that nothing is left when it died
         try:
             if self.connection.poll():
                 message: Progress | JobEnd = self.connection.recv()
-                if isinstance(message, JobEnd) or not over:
+                if isinstance(message, JobEnd) or dead or not over:
                     return message
         except (EOFError, OSError):  # it is about to die, or a plug-in has closed its end
             self._process.join(_CLOSED)
-            return self._death()
-        if not self._process.is_alive():
-            with suppress(EOFError, OSError):  # what it sent before it died
-                if self.connection.poll():
-                    last: Progress | JobEnd = self.connection.recv()
-                    return last
+            dead = True
+        if dead:
             return self._death()
         if over:
+            assert self._job is not None
             self.end()
-            return JobEnd(over_time=True)
+            return JobEnd(lost=Failure(f"over time (limit {self._job.seconds:g} s)", over_time=True))
         return None
 
     def _death(self) -> JobEnd:
         """The end of a job whose process has died; of one that cannot be heard any more, too, which is ended."""
         code = 1 if self._process.is_alive() else self._process.exitcode or 0
         self.end()
-        return JobEnd(exit_code=code, out_of_memory=code == -SIGKILL and oom_kills() > self._kills)
+        how = f"exit code {code}" if code >= 0 else f"killed by {Signals(-code).name}"
+        if code == -SIGKILL and oom_kills() > self._kills:
+            how += ": the system was out of memory"
+        elif code in (-SIGABRT, -SIGSEGV) and self._job is not None and self._job.memory_mb is not None:
+            how += f"; its memory was limited to {self._job.memory_mb:g} MB"  # compiled code may end so without memory
+        reason = f"the process died without an answer ({how})"
+        return JobEnd(lost=Failure(reason, killed=-code in _FROM_OUTSIDE))
 
     def end(self) -> None:
         """End the process and all that its jobs started."""
@@ -280,8 +248,12 @@ def process_for(job: Job[Any], idle: list[JobProcess], context: Any) -> JobProce
     return JobProcess(context)
 
 
-def _alone(job: Job[Any]) -> bool:
-    return job.seconds is not None or job.memory_mb is not None
+def release(process: JobProcess, end: JobEnd, idle: list[JobProcess]) -> None:
+    """Keep a process whose job has ended for the next one, or end it if the job has left something behind."""
+    if end.reusable:
+        idle.append(process)
+    else:
+        process.end()
 
 
 def _serve(connection: Connection) -> None:
@@ -304,21 +276,19 @@ def _serve(connection: Connection) -> None:
             except Exception as error:  # whatever unpickling raises: a module that is missing here
                 connection.send(JobEnd(error=_sendable(error)))
                 return
-            answer, error_sent = _do(job, keep, connection, process)
-            reusable = error_sent is None and not _alone(job) and _condition() == before and not _has_children()
+            end = _do(job, keep, connection, process)
+            reusable = end.error is None and not job.limited and _condition() == before
             for stream in (sys.stdout, sys.stderr):
                 with suppress(OSError, ValueError):  # closed by a plug-in
                     stream.flush()
             try:
-                connection.send(JobEnd(answer, error_sent, reusable=reusable))
+                connection.send(replace(end, reusable=reusable))
             except OSError:  # a plug-in has closed it
                 os._exit(1)
 
 
-def _do(
-    job: Job[Any], keep: Callable[[str, Any], Any], connection: Connection, process: int
-) -> tuple[Any, bytes | None]:
-    """The answer to a job, or the error that it raised."""
+def _do(job: Job[Any], keep: Callable[[str, Any], Any], connection: Connection, process: int) -> JobEnd:
+    """Run a job: its answer, or the error that it raised. process: the id of this one."""
 
     def report(event: Progress) -> None:
         with suppress(OSError):  # a plug-in may have closed it
@@ -329,11 +299,11 @@ def _do(
             result = job.function(job.argument, report)
             if os.getpid() != process:  # a plug-in forked: its copy of this process has no answer to give
                 os._exit(0)
-            return keep(job.key, result), None
+            return JobEnd(keep(job.key, result))
     except BaseException as error:
         if os.getpid() != process:
             os._exit(1)
-        return None, _sendable(error)
+        return JobEnd(error=_sendable(error))
 
 
 def _condition() -> tuple[Any, ...]:
@@ -342,16 +312,13 @@ def _condition() -> tuple[Any, ...]:
         folder = os.getcwd()
     except OSError:  # it has been removed
         folder = ""
-    handlers = [signal.getsignal(number) for number in signal.valid_signals()]
-    return folder, dict(os.environ), handlers, threading.active_count(), list(sys.path)
-
-
-def _has_children() -> bool:
     try:
         os.waitpid(-1, os.WNOHANG)
+        has_children = True
     except ChildProcessError:
-        return False
-    return True
+        has_children = False
+    handlers = [signal.getsignal(number) for number in signal.valid_signals()]
+    return folder, has_children, dict(os.environ), handlers, threading.active_count(), list(sys.path)
 
 
 class _InWordsError(Exception):
@@ -378,13 +345,3 @@ def raised(job: Job[Any], error: BaseException) -> Failure:
 
 def _in_words(error: BaseException) -> str:
     return one_line(f"{type(error).__name__}: {error}")
-
-
-def _death(job: Job[Any], code: int, out_of_memory: bool) -> Failure:
-    """A process died: by exit code, by a signal of a crash, or by one that came from outside."""
-    how = f"exit code {code}" if code >= 0 else f"killed by {Signals(-code).name}"
-    if out_of_memory:
-        how += ": the system was out of memory"
-    elif code in (-SIGABRT, -SIGSEGV) and job.memory_mb is not None:  # compiled code may end so without memory
-        how += f"; its memory was limited to {job.memory_mb:g} MB"
-    return Failure(f"the process died without an answer ({how})", killed=-code in _FROM_OUTSIDE)

@@ -10,7 +10,7 @@ from multiprocessing.connection import wait
 from typing import Any, TypeVar
 
 from omnibench.jobs.job import Backend, Ended, Job, JobWatch, Store
-from omnibench.jobs.job_process import PRELOAD, JobEnd, JobProcess, Packer, in_job, process_for, raised
+from omnibench.jobs.job_process import PRELOAD, JobEnd, JobProcess, Packer, in_job, process_for, raised, release
 from omnibench.processes import one_thread, one_thread_processes
 
 T = TypeVar("T")
@@ -68,20 +68,18 @@ class Processes:
             try:
                 while True:
                     while len(active) < self.workers and (item := next(waiting, None)) is not None:
-                        process = process_for(item[1], idle, context)
+                        number, job = item
+                        process = process_for(job, idle, context)
                         active[process] = item
-                        process.give(packer.packed(item[1]), store.keep)
-                        watch.began(item[0])
+                        process.give(packer.portable(job) if job.own and job.shared else job, store.keep)
+                        watch.began(number)
                     if not active:
                         return
                     for process, end in _ends(active, watch):
                         number, job = active.pop(process)
                         if end.answer is not None:
                             store.put_content(job.key, end.answer)
-                        if end.reusable:
-                            idle.append(process)
-                        else:
-                            process.end()
+                        release(process, end, idle)
                         yield Ended(number, job, end.failure(job))
             finally:
                 for process in active:

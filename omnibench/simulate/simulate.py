@@ -7,8 +7,7 @@ from typing import Annotated, Any
 
 from pydantic import Discriminator, Tag
 
-from omnibench.config import CHOSEN
-from omnibench.errors import require_type
+from omnibench.errors import CHOSEN, require_type
 from omnibench.progress import Reporter, no_progress
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.flower import simulate_flower

@@ -141,3 +141,31 @@ def test_from_python_it_is_one_of_the_errors_that_are_told(name: str) -> None:
 def test_other_mistakes_of_the_program_stay_visible() -> None:
     with pytest.raises(ValueError, match="broadcast"):
         _run(SimpleNamespace(main=lambda **_: np.zeros(2) + np.zeros(3)))
+
+
+# Stands for a Ctrl-C that comes while a finalizer or a callback of the garbage collector runs.
+IGNORED = """
+import signal, sys, time
+
+class Finalized:
+    def __del__(self):
+        signal.raise_signal(signal.SIGINT)
+
+class Slow:
+    def find_spec(self, name, path=None, target=None):
+        if name == "pydantic":
+            Finalized()
+            time.sleep(60)
+
+sys.meta_path.insert(0, Slow())
+sys.argv = ["omnibench", "list"]
+from omnibench.__main__ import main
+main()
+"""
+
+
+def test_ctrl_c_where_python_ignores_exceptions_ends_the_command_soon_after() -> None:
+    command = [sys.executable, "-c", IGNORED]
+    run = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
+    assert (run.returncode, run.stdout) == (130, "")
+    assert run.stderr.split() == ["interrupted;", "the", "same", "command", "begins", "anew"]
