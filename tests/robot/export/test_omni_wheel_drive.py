@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 from omnibench.errors import ConfigError
-from omnibench.robot.calibration import Calibration, Noise
-from omnibench.robot.export.formats import EXPORT_FORMATS, Export, export_calibration
-from omnibench.robot.export.ros2_controllers import OmniWheelDrive, closest_omni_wheel_drive, remaining_error
+from omnibench.robot.calibration import Calibration
+from omnibench.robot.export.formats import Export, export_calibration
+from omnibench.robot.export.ros2_controllers import OmniWheelDrive, closest_omni_wheel_drive
 from omnibench.robot.kinematics import Array, Robot, Wheel, published_matrix
 
 
@@ -68,15 +68,6 @@ class TestRos2Controllers:
         np.testing.assert_allclose(twist, [0.3, -0.2, 0.7], atol=1e-10)
         assert (values["robot_radius"], values["wheel_radius"]) == pytest.approx((0.195, 0.148), abs=1e-11)
 
-    def test_wheels_are_named_counter_clockwise_from_the_first(self) -> None:
-        values = parameters(export_calibration(calibration(robot(60, 300, 180)), "ros2_controllers"))
-        assert values["wheel_names"] == ["wheel_a_joint", "wheel_c_joint", "wheel_b_joint"]
-        assert values["wheel_offset"] == pytest.approx(math.pi / 3)
-
-    def test_numbers_are_doubles_for_every_yaml_reader(self) -> None:
-        text = export_calibration(calibration(robot(0, 120, 240)), "ros2_controllers").text
-        assert "wheel_offset: 0.000000000000 " in text or "wheel_offset: -0.000000000000 " in text
-
     def test_no_other_parameters_are_closer_to_a_calibrated_matrix(self) -> None:
         matrix = published_matrix("palacin2023_eq8")
         fitted = closest_omni_wheel_drive(APR_02, matrix)
@@ -89,31 +80,6 @@ class TestRos2Controllers:
         found = (fitted.robot_radius, fitted.wheel_radius, fitted.wheel_offset)
         np.testing.assert_allclose(found, search.x, atol=1e-6)
         assert distance(np.array(found)) <= search.fun + 1e-15
-
-    def test_the_warning_tells_what_is_lost(self) -> None:
-        matrix = published_matrix("palacin2023_eq8")
-        export = export_calibration(calibration(matrix=matrix), "ros2_controllers")
-        values = parameters(export)
-        used = OmniWheelDrive((0, 1, 2), values["robot_radius"], values["wheel_radius"], values["wheel_offset"]).matrix
-        first = 100 * (used - matrix)[0, 0] / np.abs(matrix[0]).max()
-        assert f"({first:+.2f}, " in export.warnings[0]
-        assert "one wheel radius, one distance and equal spacing" in export.warnings[0]
-        assert str(remaining_error(APR_02, used, matrix)).split(" mm")[0] in export.warnings[1]
-        assert any("clockwise" in warning for warning in export.warnings)
-        assert all(f"# - {warning}" in export.text for warning in export.warnings)
-
-    def test_what_remains_is_less_than_with_the_design_values(self) -> None:
-        matrix = published_matrix("palacin2023_eq8")
-        fitted = remaining_error(APR_02, closest_omni_wheel_drive(APR_02, matrix).matrix, matrix)
-        design = remaining_error(APR_02, APR_02.inverse_kinematic_matrix, matrix)
-        assert fitted.straight_position < design.straight_position / 2
-        assert fitted.turn_heading < design.turn_heading / 10
-
-    def test_euler_steps_and_effects_are_warned_of(self) -> None:
-        document = calibration(integration="euler", effects=[{"name": "slip", "parameters": {"k": 0.1}}])
-        warnings = export_calibration(document, "ros2_controllers").warnings
-        assert any("Euler" in warning for warning in warnings)
-        assert any("left out" in warning and "slip (k 0.1)" in warning for warning in warnings)
 
     def test_unequal_spacing_is_refused(self) -> None:
         with pytest.raises(
@@ -161,8 +127,3 @@ def test_an_unknown_format_is_refused_with_the_nearest_and_all() -> None:
     known = "c_header, robot_localization, ros2_controllers"
     with pytest.raises(ConfigError, match=rf"'c_heder'; did you mean 'c_header'\? known: {known}"):
         export_calibration(calibration(), "c_heder")
-
-
-@pytest.mark.parametrize("name", sorted(EXPORT_FORMATS))
-def test_every_format_suggests_a_file_name(name: str) -> None:
-    assert export_calibration(calibration(noise=Noise()), name).file_name.startswith("apr02_")
