@@ -107,11 +107,11 @@ def parameters(export: Export, node: str) -> dict[str, Any]:
 
 
 def in_brief(export: Export) -> str:
-    """Name, warnings and text of an export with numbers of four digits: further ones depend on the machine."""
+    """Name, warnings and text of an export without its date; numbers have the four digits of any machine."""
 
     def rounded(found: re.Match[str]) -> str:
         value = float(found[0])
         return f"{value:.4g}" if abs(value) > 1e-9 else "0"
 
     text = "\n".join([export.file_name, *export.warnings, export.text])
-    return re.sub(r"-?\d+\.\d+(e[-+]?\d+)?", rounded, text)
+    return re.sub(r"\d{4}-\d\d-\d\d", "DATE", re.sub(r"-?\d+\.\d+(e[-+]?\d+)?", rounded, text))

@@ -12,13 +12,12 @@ import numpy as np
 import polars as pl
 import pytest
 import yaml
-from config_robots import NAMES, QUIET, experiment, robot, settings
+from config_robots import NAMES, QUIET, experiment, robot
 
 from omnibench.config import validate
 from omnibench.data.dataset import Dataset, Split
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import ConfigError
-from omnibench.fit.calibrate import calibrate
 from omnibench.fit.evaluate import ModelErrors
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import MotionEffect, Parameter, Values
@@ -143,15 +142,6 @@ def test_another_seed_gives_other_noise_and_the_same_commands_and_validation_has
         assert one.command == other.command
         assert (one.rates != other.rates).all()
         assert (one.poses[1:] != other.poses[1:]).all()
-
-
-@pytest.mark.parametrize("integration", ["euler", "arc"])
-def test_without_noise_the_truth_scores_nothing(integration: Any) -> None:
-    simulation = simulate_dataset(small(noise=QUIET, integration=integration))
-    truth = OdometryModel(simulation.dataset.robot, np.array(simulation.truth.matrix), simulation.truth.integration)
-    assert ModelErrors.of(truth, simulation.dataset.trajectories).on(simulation.dataset.trajectories).cost < 1e-14
-    design = OdometryModel.of_design(simulation.dataset.robot, integration)
-    assert ModelErrors.of(design, simulation.dataset.trajectories).on(simulation.dataset.trajectories).cost > 0.02
 
 
 def test_the_truth_record_holds_eq_8_and_how_it_was_driven() -> None:
@@ -442,16 +432,3 @@ def test_what_a_robot_cannot_do_is_refused_in_one_line(case: str) -> None:
         experiment(name, **changes)
     assert words in str(refusal.value)
     assert "\n" not in str(refusal.value)
-
-
-@pytest.mark.parametrize(
-    "name", ["diff", *(pytest.param(name, marks=pytest.mark.slow) for name in ("skid", "tricycle", "car", "swerve"))]
-)
-def test_what_a_config_simulates_is_calibrated_and_holds_on_the_other_session(name: str) -> None:
-    dataset = simulate_dataset(validate(FlowerConfig, settings(name), name)).dataset
-    calibrated = calibrate(dataset, "closed_form").calibration.model
-    design, found = (
-        ModelErrors.of(model, dataset.split("validation")).on(dataset.split("validation")).cost
-        for model in (OdometryModel.of_design(dataset.robot, "arc"), calibrated)
-    )
-    assert found < 0.35 * design

@@ -19,7 +19,6 @@ from omnibench.data.dataset import Dataset
 from omnibench.data.importers.tum import write_tum
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import ConfigError, DataError
-from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import WheelLog
 from omnibench.slam.import_dataset import import_dataset
 
@@ -53,12 +52,6 @@ def both(seed: int) -> pl.DataFrame:
 
 def _stamped(frame: pl.DataFrame) -> pl.DataFrame:
     return frame.with_columns(pl.col("t").round(6))
-
-
-def quarter_ticks(seed: int, turn: int = 1000) -> Array:
-    """Counts of both wheels at the ends of the samples."""
-    of = drive(seed)
-    return np.floor(np.cumsum(of.rates * PERIOD, axis=0) / (2 * np.pi) * turn)
 
 
 def ids(data: Dataset) -> list[str]:
@@ -363,42 +356,12 @@ def test_a_table_of_runs_must_list_every_run_and_its_misspelt_columns_are_said(t
     assert "runs.csv: column 'comand' is not read; did you mean 'command'?" in warning
 
 
-def test_any_column_is_named_by_a_mapping(tmp_path: Path) -> None:
-    made = both(1).rename({"t": "clock", "omega_left": "l", "omega_right": "r", "x": "px", "y": "py", "theta": "h"})
-    made.write_csv(tmp_path / "log.csv")
-    columns = {"t": "clock", "omega_left": "l", "right": "r", "x": "px", "y": "py", "theta": "h"}
-    assert odometry_error(read(tmp_path / "log.csv", columns=columns)) < FITS
-
-
-def test_ticks_millimetres_degrees_and_milliseconds_are_units(tmp_path: Path) -> None:
-    counts = quarter_ticks(1)
-    frame = wheels(1).with_columns(ticks_left=counts[:, 0], ticks_right=counts[:, 1], t=pl.col("t") * 1e3 + 1.7e12)
-    frame.write_csv(tmp_path / "a_wheels.csv")
-    poses(1).select(
-        t=pl.col("t") * 1e6 + 1.7e15, x=pl.col("x") * 1e3, y=pl.col("y") * 1e3, yaw=pl.col("theta").degrees()
-    ).write_csv(tmp_path / "a_poses.csv")
-    units = {"wheel_unit": "ticks", "ticks_per_turn": 1000, "wheel_time_unit": "ms", "pose_time_unit": "us"}
-    assert odometry_error(read(tmp_path, position_unit="mm", heading_unit="deg", **units)) < FITS
-
-
 def test_semicolons_decimal_commas_marks_and_line_ends_of_spreadsheets_are_read(tmp_path: Path) -> None:
     text = both(1).write_csv(separator=";").replace(".", ",").replace("\n", "\r\n")
     (tmp_path / "log.csv").write_bytes(b"\xef\xbb\xbf" + text.encode())
     with pytest.raises(DataError, match=r"expected a number; of decimal commas say --set decimal=comma"):
         read(tmp_path)
     assert odometry_error(read(tmp_path, decimal="comma")) < FITS
-
-
-def test_all_missing_columns_are_named_with_what_to_type(tmp_path: Path) -> None:
-    names = {"t": "time_ms", "omega_left": "rpm_l", "omega_right": "rpm_r", "x": "px_mm", "theta": "yaw_deg"}
-    both(1).rename(names).write_csv(tmp_path / "log.csv")
-    with pytest.raises(DataError) as caught:
-        read(tmp_path)
-    assert "'t', 'omega_left', 'omega_right', 'x' and 'theta' are missing; found: time_ms, " in str(caught.value)
-    for part in ("t: time_ms", "omega_left: rpm_l", "omega_right: rpm_r", "theta: yaw_deg", "x: px_mm"):
-        assert part in str(caught.value)
-    units = "--set wheel_time_unit=ms --set wheel_unit=rpm --set position_unit=mm --set heading_unit=deg?"
-    assert str(caught.value).endswith(units)
 
 
 def test_missing_columns_of_both_files_and_blank_cells_of_a_stream_are_named(tmp_path: Path) -> None:

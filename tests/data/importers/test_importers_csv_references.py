@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from drive_samples import DIFF
 
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.importers.csv_tables.csv import Csv
@@ -18,13 +19,6 @@ from omnibench.data.importers.runs.recording_runs import in_seconds
 from omnibench.data.storage import save_dataset
 from omnibench.errors import DataError
 
-ROBOT = {
-    "name": "cart",
-    "wheels": [
-        {"name": "left", "type": "fixed", "radius": 0.05, "x": 0, "y": 0.15},
-        {"name": "right", "type": "fixed", "radius": 0.05, "x": 0, "y": -0.15},
-    ],
-}
 TAPE = "kind,value,sigma\ndistance,1.01,0.003\n"
 
 
@@ -43,7 +37,7 @@ def write(folder: Path, **tables: str) -> Path:
 
 
 def read(source: Path, **options: Any) -> Dataset:
-    return Csv(CsvOptions(robot=ROBOT, **options)).read(source)
+    return Csv(CsvOptions(robot=DIFF, **options)).read(source)
 
 
 def the_run(source: Path, **options: Any) -> Trajectory:

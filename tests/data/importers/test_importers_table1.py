@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import sample_robots
 
 from omnibench.data.dataset import Trajectory
 from omnibench.data.importers.table1 import APR_02, UTM_30LX
@@ -129,15 +130,9 @@ def test_the_robot_is_the_apr_02_unless_another_is_given(tmp_path: Path) -> None
     assert (other.name, other.wheels[2].radius) == ("other", 0.15)
 
 
-def test_eq_7_follows_from_the_default_robot() -> None:
+def test_the_default_robot_is_that_of_the_articles() -> None:
     np.testing.assert_allclose(
-        APR_02.inverse_kinematic_matrix,
-        [
-            [-0.0854478398400646, 0, 0.0854478398400646],
-            [0.04933333333333333, -0.09866666666666667, 0.04933333333333333],
-            [0.2529914529914529] * 3,
-        ],
-        atol=1e-15,
+        APR_02.inverse_kinematic_matrix, sample_robots.APR_02.inverse_kinematic_matrix, atol=1e-15
     )
 
 

@@ -265,13 +265,6 @@ def test_every_run_starts_from_rest_whatever_came_before_and_has_its_true_angles
     assert alone.rates.shape == alone.angles.shape == alone.voltages.shape == told.shape
 
 
-def test_a_session_is_the_same_to_the_bit_when_driven_again() -> None:
-    one, other = (session(petals(3), np.zeros(3)) for _ in range(2))
-    for first, second in zip(one, other, strict=True):
-        assert first.wheel_angles.tobytes() == second.wheel_angles.tobytes()
-        assert first.rates.tobytes() == second.rates.tobytes()
-
-
 @given(st.floats(0.05, 4), st.floats(-math.pi, math.pi), st.floats(-5, 5))
 def test_the_speed_that_is_proposed_fits_and_little_more_does_not(
     speed: float, direction: float, turn_rate: float

@@ -15,7 +15,6 @@ from commands import CONFIGS, Command, assert_refused, flower
 from config_robots import settings
 
 from omnibench.config import validate
-from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.data.true_poses import read_true_poses
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrate import calibrate
@@ -119,18 +118,6 @@ class TestWhatIsRecorded:
             np.testing.assert_array_equal(validity[:-1], 0.5)
             # At 0.2 m/s, reached and left at 0.5 m/s2: the set point covers v times the time of validity.
             assert 0.2 * (times[-1] + validity[-1]) == pytest.approx(0.4, abs=0.01)
-
-    def test_it_survives_the_disk_in_both_formats(self, simulation: Simulation, tmp_path: Path) -> None:
-        for table_format in ("parquet", "csv"):
-            save_dataset(simulation.dataset, tmp_path / table_format, table_format)
-            read = load_dataset(tmp_path / table_format)
-            assert read.hash == simulation.dataset.hash
-            for run, recorded in zip(read.trajectories, simulation.dataset.trajectories, strict=True):
-                np.testing.assert_array_equal(run.odometry, recorded.odometry)
-                np.testing.assert_array_equal(run.sent, recorded.sent)
-            assert read.scans.scanner == simulation.dataset.scans.scanner
-            for name, scans in simulation.dataset.scans:
-                np.testing.assert_array_equal(read.scans.of(name).ranges, scans.ranges)
 
     def test_the_same_seed_gives_the_same_recordings(self) -> None:
         few = {"commands": {"directions_deg": [0], "turn_rates": [0.35]}, "repetitions": 1}
