@@ -236,8 +236,6 @@ def test_the_epoch_of_the_clock_does_not_matter(epoch: float, first: float, peri
     stamps = np.arange(first, 1.2, period)
     here = align(0.0, WHEELS, stamps, poses_at(stamps))
     there = align(epoch, WHEELS + epoch, stamps + epoch, poses_at(stamps))
-    assert here is not None
-    assert there is not None
     assert there.zero - epoch == pytest.approx(here.zero, abs=1e-8)
     np.testing.assert_allclose(there.pose_times, here.pose_times, atol=1e-8)
 
@@ -246,7 +244,6 @@ def test_the_epoch_of_the_clock_does_not_matter(epoch: float, first: float, peri
 def test_the_start_pose_is_interpolated_through_the_heading_s_wrap(first: float, period: float) -> None:
     stamps = np.arange(first, 1.0, period)
     aligned = align(0.0, WHEELS, stamps, poses_at(stamps))
-    assert aligned is not None
     assert aligned.zero == 0.0
     np.testing.assert_allclose(aligned.poses[0, :2], [0, 0], atol=1e-9)
     assert math.remainder(aligned.poses[0, 2] - 3.0, 2 * math.pi) == pytest.approx(0, abs=1e-9)
@@ -255,7 +252,6 @@ def test_the_start_pose_is_interpolated_through_the_heading_s_wrap(first: float,
 def test_a_pose_at_the_wheels_begin_is_taken_as_it_is() -> None:
     stamps = np.array([-0.1, 0.0, 0.5])
     aligned = align(0.0, WHEELS, stamps, poses_at(stamps))
-    assert aligned is not None
     assert aligned.poses[0].tolist() == poses_at(stamps)[1].tolist()
     assert aligned.pose_times.tolist() == [0.0, 0.5]
 

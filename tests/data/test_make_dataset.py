@@ -13,7 +13,7 @@ from wheeled_samples import DIFF, TRICYCLE, driven
 
 import omnibench
 from omnibench.data.dataset import Trajectory
-from omnibench.data.splits import complete, divided, division_in_words
+from omnibench.data.splits import divided, division_in_words
 from omnibench.errors import DataError
 
 T = np.arange(1, 101) * 0.02
@@ -155,12 +155,6 @@ def test_patterns_may_be_of_other_names_and_go_before_the_splits_given() -> None
     assert [each.split for each in divided(RUNS, ("y",), (), "group", names=groups)].count("train") == 2
     assert {each.split for each in divided(RUNS, (), (), otherwise=["validation"] * 4)} == {"validation"}
     assert {each.split for each in divided(RUNS, ("*",), (), otherwise=["validation"] * 4)} == {"train"}
-
-
-def test_what_only_some_runs_hold_is_left_out() -> None:
-    with_angles = [replace(each, angles=np.ones((1, 3))) for each in RUNS]
-    assert all(each.angles is not None for each in complete(with_angles))
-    assert all(each.angles is None for each in complete([*with_angles, RUNS[0]]))
 
 
 def test_a_division_says_how_many_runs_and_commands_each_side_has_and_by_what() -> None:

@@ -66,7 +66,6 @@ def assert_same(found: TrajectoryScans, expected: TrajectoryScans) -> None:
 
 def test_scans_come_back_to_the_bit_with_their_scanner(folder: Path) -> None:
     made, found = scanned().scans, scans_of(folder)
-    assert made is not None
     assert found.scanner == SCANNER
     assert found.trajectories == ("run-1", "run-2")
     for trajectory in found.trajectories:
@@ -136,7 +135,6 @@ class Broken(ScansInMemory):
 def test_a_save_that_breaks_off_leaves_the_folder_as_it_was_and_no_new_one(folder: Path, tmp_path: Path) -> None:
     before = {file.name: file.read_bytes() for file in folder.iterdir()}
     made = scanned()
-    assert made.scans is not None
     broken = replace(made, scans=Broken(SCANNER, dict(made.scans)))
     for place in (folder, tmp_path / "a" / "b"):
         with pytest.raises(KeyboardInterrupt):

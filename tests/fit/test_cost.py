@@ -20,15 +20,7 @@ from scipy.stats import chi
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
 from omnibench.fit.cost import Cost, SumOfNorms
-from omnibench.fit.loss import (
-    CORNERS,
-    DEGREES_OF_FREEDOM,
-    LEAST_SCALE,
-    Huber,
-    Loss,
-    StudentT,
-    with_ends_from_others,
-)
+from omnibench.fit.loss import CORNERS, DEGREES_OF_FREEDOM, LEAST_SCALE, Huber, Loss, StudentT, with_ends_from_others
 from omnibench.fit.sum_of_norms import SolverError, SumOfNormsProgram
 from omnibench.registry import costs
 from omnibench.robot.kinematics import Array

@@ -17,12 +17,7 @@ from omnibench.errors import DataError
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.evaluate import ModelErrors, evaluate, final_errors, judge, verdict_on
 from omnibench.fit.problem import Budget
-from omnibench.robot.calibration import (
-    Calibration,
-    EffectTerm,
-    HeldOutVerdict,
-    matrix_rows,
-)
+from omnibench.robot.calibration import Calibration, EffectTerm, HeldOutVerdict, matrix_rows
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, WheelLog

@@ -109,7 +109,6 @@ def at_every_sample(log: WheelLog) -> WheelLog:
 
 def streamed(stream: OdometryStream, log: WheelLog) -> np.ndarray:
     """Poses (F, 3) after every sample."""
-    assert log.wheel_angles is not None
     durations = np.diff(log.times, prepend=0.0)
     steering = [None] * len(log.rates) if log.steering is None else log.steering
     samples = zip(log.rates, durations, log.wheel_angles, steering, strict=True)

@@ -23,7 +23,6 @@ from omnibench.robot.kinematics import (
     class_of,
     inverse_kinematic_matrices,
     inverse_kinematic_matrix,
-    published_matrix,
     wheel_equations,
 )
 from omnibench.robot.model import OdometryModel
@@ -56,14 +55,6 @@ def wheels_of(count: int, roller_angle: st.SearchStrategy[float]) -> st.SearchSt
 
 three_omni_wheels = wheels_of(3, st.just(0.0))
 many_wheels = st.integers(4, 8).flatmap(lambda count: wheels_of(count, st.floats(-1.0, 1.0)))
-
-
-def geometry_of(matrix: Array) -> tuple[Array, Array, Array]:
-    """Radii, distances (m) and angles in [0, 2 pi) (rad) of the three omni wheels whose M^-1 this is."""
-    equations = np.linalg.inv(matrix)
-    radius = 1 / np.hypot(equations[:, 0], equations[:, 1])
-    angle = np.arctan2(-equations[:, 0], equations[:, 1]) % (2 * math.pi)
-    return radius, equations[:, 2] * radius, angle
 
 
 def condition(equations: Array) -> float:
@@ -156,15 +147,6 @@ def test_a_geometry_without_a_matrix_spoils_no_other(wheels: int, value: float) 
         bad, good = inverse_kinematic_matrices(radius[::-1], distance[::-1], angle)
     assert not np.isfinite(bad).all()
     assert np.isfinite(good).all()
-
-
-def test_eq_8_inverted_is_the_geometry_that_is_known_and_gives_eq_8_back() -> None:
-    radius, distance, angle = geometry_of(published_matrix("palacin2023_eq8"))
-    np.testing.assert_allclose(100 * (radius / 0.148 - 1), [3.4, 3.6, 3.3], atol=0.05)
-    np.testing.assert_allclose(100 * (distance / 0.195 - 1), [7.6, 14.6, 11.5], atol=0.05)
-    np.testing.assert_allclose(100 * (np.degrees(angle) / [60, 180, 300] - 1), [0.98, 0.26, -0.02], atol=0.005)
-    matrix = inverse_kinematic_matrices(radius[None], distance[None], angle[None])[0]
-    np.testing.assert_allclose(matrix, published_matrix("palacin2023_eq8"), atol=1e-15)
 
 
 PLACES = {"fl": (0.2, 0.15), "fr": (0.2, -0.15), "rl": (-0.2, 0.15), "rr": (-0.2, -0.15)}

@@ -5,35 +5,26 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import yaml
+from config_robots import QUIET, apr02
 from hypothesis import given
 from hypothesis import strategies as st
 
-from omnibench.config import validate
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import ConfigError, DataError, OmnibenchError
 from omnibench.fit.evaluate import final_errors
 from omnibench.robot.calibration import EffectTerm
 from omnibench.robot.kinematics import moved_to, published_matrix, wheel_equations
 from omnibench.simulate.commands import Command
-from omnibench.simulate.config import EncoderNoise, FlowerConfig
+from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.flower import commanded_rates
 from omnibench.simulate.simulate import simulate_dataset
 
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 PUBLISHED = "palacin2023_eq8"
-QUIET = dict.fromkeys(EncoderNoise.model_fields, 0.0)
 BENCHMARK = [540843.680886297, 18067279.735240657, 11605.562333690346]  # rad/s, rad, m and rad
-
-
-def apr02(**changes: Any) -> FlowerConfig:
-    content = yaml.safe_load((CONFIGS / "apr02.yaml").read_text())["datasets"]["flower"]["simulate"]
-    return validate(FlowerConfig, {**content, **changes}, "flower.yaml")
 
 
 def few(effects: Mapping[str, Mapping[str, float]] | None = None, **changes: Any) -> FlowerConfig:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -245,14 +244,6 @@ def test_measured_rates_are_whole_ticks_and_sum_to_the_measured_angles(seed: int
         assert np.abs(ticks - np.round(ticks)).max() < 1e-6
         assert np.abs(seen + np.cumsum(run.rates, axis=0) * PERIOD - run.angles).max() < 1e-8
         seen = run.angles[-1]
-
-
-@given(st.integers(0, 1000), starts)
-def test_wheel_angles_are_continuous_in_a_session(seed: int, start: float) -> None:
-    runs = session(petals(seed), np.full(3, start))
-    assert (runs[0].wheel_angles[0] == start).all()
-    for before, after in pairwise(runs):
-        assert np.array_equal(before.wheel_angles[-1], after.wheel_angles[0])
 
 
 def test_every_run_starts_from_rest_whatever_came_before_and_has_its_true_angles_at_every_millisecond() -> None:

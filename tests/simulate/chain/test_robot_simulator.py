@@ -137,16 +137,6 @@ class TestTheTruth:
             assert np.hypot(*(end - truth)[:2]) < 2e-3  # ticks of 2 mrad, 0.148 m
             assert abs(end - truth)[2] < 2e-3
 
-    def test_an_effect_bends_the_true_path_and_not_the_encoders(self) -> None:
-        drift = [{"name": "heading_drift", "parameters": {"b": 0.02}}]
-        plain, bent = made(**ONE_RUN), made(**ONE_RUN, truth=TOLERANCES | {"effects": drift})
-        (run,), (other,) = plain.dataset.trajectories, bent.dataset.trajectories
-        np.testing.assert_array_equal(run.rates, other.rates)
-        end = run.times[-1:]
-        turned = bent.paths[run.id].at(end)[0, 2] - plain.paths[run.id].at(end)[0, 2]
-        assert turned == pytest.approx(0.02 * 2.4, rel=0.25)  # s in motion
-        assert other.final_pose[2] - run.final_pose[2] == pytest.approx(turned, abs=2e-3)  # and SLAM sees it
-
     @pytest.mark.parametrize(
         ("effect", "parameters"),
         [
