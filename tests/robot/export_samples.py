@@ -114,4 +114,4 @@ def in_brief(export: Export) -> str:
         return f"{value:.4g}" if abs(value) > 1e-9 else "0"
 
     text = "\n".join([export.file_name, *export.warnings, export.text])
-    return re.sub(r"\d{4}-\d\d-\d\d", "DATE", re.sub(r"-?\d+\.\d+(e[-+]?\d+)?", rounded, text))
+    return re.sub(r"\d{4}-\d\d-\d\d(T[\d:]+)?", "DATE", re.sub(r"-?\d+\.\d+(e[-+]?\d+)?", rounded, text))

@@ -292,9 +292,8 @@ def test_a_robot_that_no_controller_holds_is_refused(robot: Robot, named: str) -
         export_calibration(calibration(robot), "ros2_controllers")
 
 
-@pytest.mark.parametrize("name", ["diff", "mecanum", "tricycle", "car"])
-def test_a_matrix_that_drives_the_wrong_way_is_refused(name: str) -> None:
-    robot = ROBOTS[name][0]
+@pytest.mark.parametrize("robot", [APR_02, DIFF, MECANUM, TRICYCLE, CAR], ids=lambda robot: robot.name)
+def test_a_matrix_that_drives_the_wrong_way_is_refused(robot: Robot) -> None:
     with pytest.raises(ConfigError, match="counter-clockwise"):
         export_calibration(calibration(robot, -robot.inverse_kinematic_matrix), "ros2_controllers")
 
