@@ -22,7 +22,6 @@ from omnibench.robot.kinematics import Array, Mount, Robot, inverse_kinematic_ma
 from omnibench.testing.synthetic import synthetic_robot
 
 DESIGN = APR_02.inverse_kinematic_matrix
-NO_NULL = np.zeros((0, 3))
 
 
 def elements(box: Box, robot: Robot = APR_02) -> MatrixElements:

@@ -31,7 +31,6 @@ from omnibench.simulate.source import read_simulation
 from omnibench.simulate.truth import Simulation, true_matrix
 
 TOLERANCES = {"tolerances": {"radius": 0.02, "distance": 0.05, "angle_deg": 1.0, "seed": 249}}
-BLIND = {"plan": "corridor"}
 ONE_RUN: dict[str, Any] = {"commands": {"directions_deg": [0], "turn_rates": [0.0]}, "repetitions": 1}
 
 
