@@ -21,6 +21,16 @@ def settings(name: str) -> dict[str, Any]:
     return content
 
 
+def apr02_settings(**changes: Any) -> dict[str, Any]:
+    """What the config of the articles' benchmark says under ``simulate``, changed."""
+    content: dict[str, Any] = yaml.safe_load((CONFIGS / "apr02.yaml").read_text())
+    return {**content["datasets"]["flower"]["simulate"], **changes}
+
+
+def apr02(**changes: Any) -> FlowerConfig:
+    return validate(FlowerConfig, apr02_settings(**changes), "flower.yaml")
+
+
 def robot(name: str, **changes: Any) -> Robot:
     return Robot.model_validate(settings(name)["robot"] | changes)
 

@@ -19,7 +19,6 @@ from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import ConfigError, DataError, OmnibenchError
 from omnibench.fit.calibrate import calibrate
 from omnibench.live.replay.concatenated_drive import concatenate_runs
-from omnibench.progress import Progress
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.simulate import simulate_dataset
 
@@ -98,15 +97,6 @@ def test_standstill_between_runs_is_bounded(folder: Path) -> None:
     runs = [replace(run, id=str(number)) for number, run in enumerate(dataset.trajectories * 40)]
     with pytest.raises(ConfigError, match=r"more than 10000000"):
         concatenate_runs(replace(dataset, trajectories=tuple(runs)), pause=3600.0)
-
-
-def test_simulating_many_runs_tells_of_every_run() -> None:
-    events: list[Progress] = []
-    config = validate(FlowerConfig, flower(), "config")
-    simulation = simulate_dataset(config, watch=events.append)
-    assert [event.done for event in events[:-1]] == list(range(1, len(simulation.dataset.trajectories) + 1))
-    assert {event.total for event in events[:-1]} == {len(simulation.dataset.trajectories)}
-    assert events[-1].over
 
 
 @pytest.mark.parametrize("shift", [10.0, *(pytest.param(far, marks=pytest.mark.slow) for far in (1e3, 1e4))])

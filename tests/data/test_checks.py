@@ -238,9 +238,3 @@ def test_real_recordings_give_no_warning(recorded: str, request: pytest.FixtureR
     dataset = request.getfixturevalue(recorded)
     few = replace(dataset, trajectories=dataset.trajectories[::4])
     assert warnings_of(few) == ""
-
-
-@pytest.mark.parametrize("mistake", MISTAKES)
-def test_wrong_units_of_a_real_robot_are_named(mistake: str, omni3: Dataset) -> None:
-    change, warning = MISTAKES[mistake]
-    assert warnings_of(replace(omni3, trajectories=omni3.trajectories[::8]), change) == warning

@@ -209,11 +209,6 @@ def test_whole_turns_in_a_recording_change_nothing(seed: int, gap: float) -> Non
     np.testing.assert_allclose(found - found[0], headings - headings[0], atol=1e-9)
 
 
-def test_the_start_heading_stays_as_recorded() -> None:
-    log = driven(np.full(50, 1.0), np.arange(0, 5, 0.5), start=-2.0)
-    assert unwrapped(log, wrapped(true_headings(log)))[0] == wrapped(true_headings(log))[0]
-
-
 def test_a_data_set_holds_unwrapped_headings_and_warns_of_doubtful_ones() -> None:
     stamps = np.array([0.0, 10.0])
     log = driven(np.full(100, 1.5), stamps)
@@ -241,8 +236,6 @@ def test_the_epoch_of_the_clock_does_not_matter(epoch: float, first: float, peri
     stamps = np.arange(first, 1.2, period)
     here = align(0.0, WHEELS, stamps, poses_at(stamps))
     there = align(epoch, WHEELS + epoch, stamps + epoch, poses_at(stamps))
-    assert here is not None
-    assert there is not None
     assert there.zero - epoch == pytest.approx(here.zero, abs=1e-8)
     np.testing.assert_allclose(there.pose_times, here.pose_times, atol=1e-8)
 
@@ -251,7 +244,6 @@ def test_the_epoch_of_the_clock_does_not_matter(epoch: float, first: float, peri
 def test_the_start_pose_is_interpolated_through_the_heading_s_wrap(first: float, period: float) -> None:
     stamps = np.arange(first, 1.0, period)
     aligned = align(0.0, WHEELS, stamps, poses_at(stamps))
-    assert aligned is not None
     assert aligned.zero == 0.0
     np.testing.assert_allclose(aligned.poses[0, :2], [0, 0], atol=1e-9)
     assert math.remainder(aligned.poses[0, 2] - 3.0, 2 * math.pi) == pytest.approx(0, abs=1e-9)
@@ -260,7 +252,6 @@ def test_the_start_pose_is_interpolated_through_the_heading_s_wrap(first: float,
 def test_a_pose_at_the_wheels_begin_is_taken_as_it_is() -> None:
     stamps = np.array([-0.1, 0.0, 0.5])
     aligned = align(0.0, WHEELS, stamps, poses_at(stamps))
-    assert aligned is not None
     assert aligned.poses[0].tolist() == poses_at(stamps)[1].tolist()
     assert aligned.pose_times.tolist() == [0.0, 0.5]
 
@@ -269,13 +260,6 @@ def test_a_pose_at_the_wheels_begin_is_taken_as_it_is() -> None:
 def test_streams_that_share_no_two_poses_are_told(stamps: list[float]) -> None:
     times = np.array(stamps)
     assert align(0.0, WHEELS, times, poses_at(times)) is None
-
-
-def test_the_inputs_stay_as_they_are() -> None:
-    stamps = np.array([-0.1, 0.4, 0.5])
-    poses = poses_at(stamps)
-    align(0.0, WHEELS, stamps, poses)
-    assert poses.tolist() == poses_at(stamps).tolist()
 
 
 def test_the_median_period_ignores_gaps_and_rounding() -> None:

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 import polars as pl
 import pytest
+from storage_samples import a_trajectory
 from wheeled_samples import DIFF, TRICYCLE, driven
 
 import omnibench
 from omnibench.data.dataset import Trajectory
-from omnibench.data.splits import complete, divided, division_in_words
+from omnibench.data.splits import divided, division_in_words
 from omnibench.errors import DataError
 
 T = np.arange(1, 101) * 0.02
@@ -156,12 +157,6 @@ def test_patterns_may_be_of_other_names_and_go_before_the_splits_given() -> None
     assert {each.split for each in divided(RUNS, ("*",), (), otherwise=["validation"] * 4)} == {"train"}
 
 
-def test_what_only_some_runs_hold_is_left_out() -> None:
-    with_angles = [replace(each, angles=np.ones((1, 3))) for each in RUNS]
-    assert all(each.angles is not None for each in complete(with_angles))
-    assert all(each.angles is None for each in complete([*with_angles, RUNS[0]]))
-
-
 def test_a_division_says_how_many_runs_and_commands_each_side_has_and_by_what() -> None:
     words = division_in_words(divided(RUNS, (), ()), {})
     assert words.startswith("training 3 runs of 2 commands, validation 1 run of 1 command, every second run")
@@ -171,17 +166,7 @@ def test_a_division_says_how_many_runs_and_commands_each_side_has_and_by_what() 
     assert own == "training 0 runs, validation 4 runs of 2 commands, by the importer's own rule"
 
 
-RUN = Trajectory(
-    id="1",
-    split="train",
-    times=np.array([0.1, 0.2]),
-    rates=np.ones((2, 3)),
-    pose_times=np.array([0.0, 0.1, 0.2]),
-    poses=np.arange(9.0).reshape(3, 3),
-    session="morning",
-    started_at=60.0,
-    angles=np.array([[0.1] * 3, [0.2] * 3]),
-)
+RUN = a_trajectory("1", 0.5, session="morning", started_at=60.0, angles=np.ones((4, 3)))
 
 
 def test_a_log_has_all_that_effects_need() -> None:
@@ -190,12 +175,12 @@ def test_a_log_has_all_that_effects_need() -> None:
     assert log.rates is RUN.rates
     assert log.wheel_angles is RUN.angles
     assert (log.started_at, log.session) == (60.0, "morning")
-    np.testing.assert_array_equal(log.start, [0.0, 1.0, 2.0])
+    np.testing.assert_array_equal(log.start, RUN.poses[0])
     np.testing.assert_array_equal(log.stamps, [0.15])
 
 
 def test_logs_up_to_the_reference_have_it_too() -> None:
-    for log, stamps in ((RUN.final_log, [0.2]), (RUN.reference_log, [0.1, 0.2])):
+    for log, stamps in ((RUN.final_log, [0.4]), (RUN.reference_log, [0.2, 0.4])):
         assert log.wheel_angles is RUN.angles
         np.testing.assert_array_equal(log.stamps, stamps)
 

@@ -41,7 +41,6 @@ def a_set(*runs: Trajectory) -> Dataset:
 @pytest.mark.parametrize("fmt", FORMATS)
 def test_references_come_back_from_disk_as_they_were(tmp_path: Path, fmt: Format) -> None:
     turns = measured("run-3", Reference("turn", 0.2, 0.1))
-    assert turns.references is not None
     turns = replace(turns, references=replace(turns.references, rate_sigma=0.01))  # the offset that turns share
     dataset = a_set(measured(), a_trajectory("run-2", 0.1), turns)
     save_dataset(dataset, tmp_path / "tape", fmt)
@@ -49,7 +48,6 @@ def test_references_come_back_from_disk_as_they_were(tmp_path: Path, fmt: Format
     assert again.hash == dataset.hash
     assert [run.fingerprint for run in again.trajectories] == [run.fingerprint for run in dataset.trajectories]
     assert [run.start_known for run in again.trajectories] == [False, True, False]
-    assert again.trajectories[2].references is not None
     assert again.trajectories[2].references.rate_sigma == 0.01
 
 
@@ -76,7 +74,6 @@ def test_a_table_may_say_a_sigma_for_both_axes_and_leave_out_the_times_of_the_wh
     frame = pl.DataFrame(rows | {"value_x": [0.08, None], "value_y": [0.04, None], "sigma": [0.002, 0.001]})
     frame.write_parquet(tmp_path / "tape" / "references.parquet")
     references = load_dataset(tmp_path / "tape").trajectories[0].references
-    assert references is not None
     assert references.t0.tolist() == [0.0, 0.0]
     assert references.t1.tolist() == [0.4, 0.4]
     np.testing.assert_array_equal(references.sigmas, [[0.002, 0.002], [0.001, np.nan]])
@@ -146,7 +143,6 @@ def test_wrapped_headings_of_a_compass_become_continuous() -> None:
     given = [Reference("heading", float(value), 0.1, t1=float(at)) for at, value in zip(times, wrapped, strict=True)]
     still = replace(run, times=times, rates=rates, pose_times=np.zeros(1), poses=np.zeros((1, 3)))
     (read,) = a_set(replace(still, references=References.of(given, 40.0))).trajectories
-    assert read.references is not None
     np.testing.assert_allclose(np.diff(read.references.values[:, 0]), np.diff(true), atol=1e-9)
 
 

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import math
 import random
-import resource
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +14,6 @@ import polars as pl
 import pytest
 import yaml
 from storage_samples import FORMATS, Format, everything_known, read_frame, table_file, write_frame
-from timing import PATIENCE
 
 from omnibench.data.dataset import Dataset
 from omnibench.data.scans import Mount, Scanner, ScansInMemory, TrajectoryScans
@@ -70,7 +66,6 @@ def assert_same(found: TrajectoryScans, expected: TrajectoryScans) -> None:
 
 def test_scans_come_back_to_the_bit_with_their_scanner(folder: Path) -> None:
     made, found = scanned().scans, scans_of(folder)
-    assert made is not None
     assert found.scanner == SCANNER
     assert found.trajectories == ("run-1", "run-2")
     for trajectory in found.trajectories:
@@ -140,7 +135,6 @@ class Broken(ScansInMemory):
 def test_a_save_that_breaks_off_leaves_the_folder_as_it_was_and_no_new_one(folder: Path, tmp_path: Path) -> None:
     before = {file.name: file.read_bytes() for file in folder.iterdir()}
     made = scanned()
-    assert made.scans is not None
     broken = replace(made, scans=Broken(SCANNER, dict(made.scans)))
     for place in (folder, tmp_path / "a" / "b"):
         with pytest.raises(KeyboardInterrupt):
@@ -281,37 +275,3 @@ def test_damage_never_shows_as_a_traceback(folder: Path) -> None:
         except OmnibenchError:
             refused += 1
     assert refused > 5
-
-
-_LONG = """
-import resource, sys
-from dataclasses import replace
-import numpy as np
-from omnibench.data.scans import Scanner, Scans, TrajectoryScans
-from omnibench.data.storage import load_dataset, save_dataset
-from omnibench.testing.synthetic import synthetic_dataset
-
-class Made(Scans):
-    scanner = Scanner(rays=1080, angle_min=-2.356, angle_increment=0.00436, range_max=30.0)
-    trajectories = tuple(run.id for run in synthetic_dataset().trajectories)
-    def of(self, trajectory):
-        ranges = np.random.default_rng(0).uniform(0.1, 30, (1500, 1080)).astype(np.float32)
-        return TrajectoryScans(0.025 * np.arange(1500), ranges)
-
-before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-save_dataset(replace(synthetic_dataset(), scans=Made()), sys.argv[1])
-scans = load_dataset(sys.argv[1]).scans
-total = sum(found.ranges.nbytes for _, found in scans)
-print(total // 1000, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not hasattr(resource, "RUSAGE_SELF"), reason="the system does not tell a process's memory")
-def test_scans_are_saved_and_read_without_being_in_memory_at_once(tmp_path: Path) -> None:
-    ended = subprocess.run(
-        [sys.executable, "-c", _LONG, str(tmp_path)], capture_output=True, text=True, check=True, timeout=PATIENCE
-    )
-    total, grown = map(int, ended.stdout.split())  # kB
-    assert total > 60_000
-    assert grown < 0.5 * total + 60_000

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from motions import FLOWER, RING, driven
 from sample_robots import WHEELED
+from syrupy.assertion import SnapshotAssertion
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.tables import make_dataset as dataset_of_tables
@@ -65,22 +67,28 @@ def found() -> Inspection:
     return inspect_dataset(dataset(commanded()))
 
 
-def test_the_header_counts_and_periods_are_those_of_the_data_set(found: Inspection) -> None:
-    assert (found.dataset, found.description, found.source, found.licence) == ("synthetic", "d", "s", "l")
-    assert (found.simulated, found.robot, found.wheels) == (True, "synthetic omni", ("a", "b", "c"))
-    runs = noisy_trajectories()
-    assert found.trajectories == 12
-    assert found.wheel_samples == sum(len(run.times) for run in runs)
-    assert found.reference_poses == sum(len(run.poses) for run in runs)
-    assert found.sample_period_s == 0.2
-    np.testing.assert_allclose(found.sample_period_range_s, [0.2, 0.2], rtol=1e-9)
-    assert found.pose_period_s == pytest.approx(0.8)
-    assert (found.has_angles, found.has_targets) == (True, False)
-    assert (found.findings, found.warnings, found.undriven, found.driven_directions) == ((), (), (), 3)
-    document = found.model_dump(mode="json")["identifiability"]
-    assert [each["state"] for each in document["directions"]] == ["driven"] * 3
-    assert len(document["parameters"]) == 9
-    assert document["sentences"] == []
+def rounded(value: Any) -> Any:
+    """A document with numbers of three digits: further ones depend on the machine."""
+    if isinstance(value, dict):
+        return {key: rounded(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [rounded(each) for each in value]
+    return float(f"{value:.3g}") if isinstance(value, float) else value
+
+
+def test_the_document_of_an_inspection_is_what_its_schema_says(found: Inspection, snapshot: SnapshotAssertion) -> None:
+    # Noise is what a search for the likeliest finds, and the sign of a direction the machine's linear algebra.
+    uncertain = {"directions": {"__all__": {"deviations", "direction"}}, "parameters": {"__all__": {"deviation"}}}
+    kept = found.model_dump(mode="json", exclude={"identifiability": {"noise": True, **uncertain}})
+    assert rounded(kept) == snapshot
+
+
+def test_durations_ways_and_turns_are_those_of_the_runs(found: Inspection) -> None:
+    runs, validation = commanded()[8:], found.splits["validation"]
+    paths = [np.linalg.norm(np.diff(run.poses[:, :2], axis=0), axis=1).sum() for run in runs]
+    turns = [abs(run.poses[-1, 2] - run.poses[0, 2]) for run in runs]
+    expected = (sum(run.times[-1] for run in runs), sum(paths), sum(turns))
+    assert (validation.duration_s, validation.distance_m, validation.turned_rad) == pytest.approx(expected)
 
 
 def test_irregular_periods_are_shown_with_their_range_and_angles_only_where_every_run_has_them() -> None:
@@ -89,18 +97,6 @@ def test_irregular_periods_are_shown_with_their_range_and_angles_only_where_ever
     inspection = inspect_dataset(dataset([irregular, *rest]))
     assert inspection.sample_period_range_s == pytest.approx((0.15, 0.25))
     assert not inspection.has_angles
-
-
-def test_commands_repetitions_sessions_lengths_and_turns_are_counted_by_split(found: Inspection) -> None:
-    train, validation = found.splits["train"], found.splits["validation"]
-    assert (train.trajectories, train.commands, train.repetitions_min, train.repetitions_max) == (8, 3, 2, 3)
-    assert (validation.trajectories, validation.commands, validation.repetitions_max) == (4, 1, 4)
-    assert (train.sessions, validation.sessions) == (2, 1)
-    runs = commanded()[8:]
-    assert validation.duration_s == pytest.approx(sum(run.times[-1] for run in runs))
-    paths = [np.linalg.norm(np.diff(run.poses[:, :2], axis=0), axis=1).sum() for run in runs]
-    assert validation.distance_m == pytest.approx(sum(paths))
-    assert validation.turned_rad == pytest.approx(sum(abs(run.poses[-1, 2] - run.poses[0, 2]) for run in runs))
 
 
 def test_the_direction_that_mecanum_wheels_cannot_drive_is_named_as_expected() -> None:
@@ -215,15 +211,6 @@ def test_wheels_that_never_turn_drive_nothing_and_no_trajectories_are_refused() 
     assert (span.driven.shape, span.null.shape) == ((0, 3), (3, 3))
     with pytest.raises(DataError, match="no trajectories"):
         driven_span([])
-
-
-def test_hundreds_of_thousands_of_poses_are_no_burden() -> None:
-    samples = 300_000
-    rates = np.random.default_rng(0).normal(size=(samples, 3))
-    times = 0.01 * np.arange(1, samples + 1)
-    stamps = np.append(0.0, times)
-    span = driven_span([Trajectory("long", "train", times, rates, stamps, np.zeros((samples + 1, 3)))])
-    assert span.driven.shape == (3, 3)
 
 
 ROBOT = synthetic_robot()

@@ -22,7 +22,6 @@ from omnibench.robot.kinematics import Array, Mount, Robot, inverse_kinematic_ma
 from omnibench.testing.synthetic import synthetic_robot
 
 DESIGN = APR_02.inverse_kinematic_matrix
-NO_NULL = np.zeros((0, 3))
 
 
 def elements(box: Box, robot: Robot = APR_02) -> MatrixElements:
@@ -127,13 +126,6 @@ class TestGeometry:
             found = end.reshape(3, 3)
             np.testing.assert_allclose(found[:2], [[of_radius * 0.148] * 3, [of_distance * 0.195] * 3], rtol=1e-12)
             np.testing.assert_allclose(found[2], np.radians(np.array([60, 180, 300]) + degrees), rtol=1e-12)
-
-    def test_parameters_are_named_by_wheel(self) -> None:
-        assert WheelGeometry(APR_02).names == (
-            *("radius_a", "radius_b", "radius_c"),
-            *("distance_a", "distance_b", "distance_c"),
-            *("angle_a", "angle_b", "angle_c"),
-        )
 
     @pytest.mark.parametrize("wheels", [3, 4])
     def test_vectors_mean_the_matrix_of_a_robot_built_like_that(self, wheels: Any) -> None:
@@ -251,11 +243,6 @@ def test_a_longer_wheelbase_turns_a_car_less() -> None:
 
 def none_kept(robot: Robot) -> Array:
     return np.zeros((0, len(robot.drive.names)))
-
-
-@pytest.mark.parametrize("robot", [DIFFERENTIAL, CAR], ids=lambda robot: robot.name)
-def test_a_matrix_tells_the_geometry_of_a_robot_whose_tracked_point_is_known(robot: Robot) -> None:
-    assert all(identified_parameters(WheelGeometry(robot), none_kept(robot)))
 
 
 def test_the_side_of_a_tracked_point_is_not_told_apart_from_that_of_the_wheels() -> None:

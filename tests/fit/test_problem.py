@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import pickle
 from collections.abc import Iterator
 from dataclasses import replace
 from types import BuiltinFunctionType, FunctionType, MethodDescriptorType, ModuleType
@@ -283,14 +282,6 @@ class TestValidationData:
         for shown in arrays_of(training):
             assert any(holds(array, shown) for array in arrays)
         assert {run.id for run in items if isinstance(run, Trajectory)} == {run.id for run in training}
-
-    def test_a_pickled_problem_does_not_hold_a_validation_run(self, seen: Any) -> None:
-        problem, training, validation = seen
-        content = pickle.dumps(problem)
-        assert all(np.ascontiguousarray(run.poses).tobytes() in content for run in training)
-        for run in validation:
-            for hidden in (run.id.encode(), *(np.ascontiguousarray(each).tobytes() for each in (run.poses, run.rates))):
-                assert hidden not in content
 
 
 def test_elements_that_the_cost_does_not_see_keep_their_start_values() -> None:

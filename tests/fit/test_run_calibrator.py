@@ -13,7 +13,7 @@ from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import Calibrator, Outcome, RunResult, Solution, run_calibrator, unloadable
 from omnibench.fit.cost import Cost
 from omnibench.fit.problem import CalibrationProblem
-from omnibench.registry import PluginFailure, calibrators, costs
+from omnibench.registry import PluginFailure, costs
 from omnibench.robot.kinematics import Array
 
 RUNS = noisy_trajectories()
@@ -207,21 +207,6 @@ def test_the_answer_is_a_copy() -> None:
     before = kept[0].copy()
     kept[0][:] = 0.0
     np.testing.assert_array_equal(result.vector, before)
-
-
-def test_the_history_shows_every_improvement() -> None:
-    problem = make_problem(RUNS)
-    optimum = run_calibrator(calibrators.create("closed_form"), make_problem(RUNS)).vector
-
-    def script(given: CalibrationProblem) -> Solution:
-        for share in (0.0, 0.0, 0.3, 0.0, 1.0):
-            given.cost(given.start + share * (optimum - given.start))
-        return Solution(given.best_vector, "done")
-
-    result = run_calibrator(Scripted(script), problem)
-    assert [step.evaluations for step in result.history] == [1, 3, 5]
-    assert result.evaluations == 5
-    assert result.history[-1].cost == pytest.approx(result.cost, rel=1e-12)
 
 
 def test_a_reason_of_several_lines_becomes_one() -> None:

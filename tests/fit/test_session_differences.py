@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -167,19 +166,9 @@ def test_evaluate_and_compare_say_after_their_verdict_that_the_sessions_differ(c
     lines = command("evaluate", data.parent / "design.yaml", data).stdout.splitlines()
     assert lines[-3].startswith("held out (")
     assert lines[-1].startswith(WORDS)
-    document = json.loads(command("evaluate", data.parent / "design.yaml", data, "--json").stdout)
-    assert [sentence.startswith(WORDS) for sentence in document["sessions"]] == [True]
-    config = {
-        "name": "sessions",
-        "datasets": {"robot": {"path": str(data)}},
-        "cost": "final_pose",
-        "calibrators": ["theoretical", "closed_form"],
-        "certificate": None,
-    }
-    (data.parent / "compare.yaml").write_text(yaml.safe_dump(config))
-    output = data.parent / "results"
-    told = command("compare", data.parent / "compare.yaml", "-o", output)
-    assert told.returncode == 0, told.stderr
-    assert WORDS in told.stdout
-    assert json.loads((output / "summary.json").read_text())["sessions"]["robot"][0].startswith(WORDS)
-    assert WORDS in (output / "report.html").read_text()
+    sets, calibrators = {"robot": {"path": str(data)}}, ["theoretical", "closed_form"]
+    config = {"name": "sessions", "datasets": sets, "cost": "final_pose", "calibrators": calibrators}
+    Path("compare.yaml").write_text(yaml.safe_dump(config | {"certificate": None}))
+    told = command("compare", "compare.yaml", "-o", "results")
+    assert WORDS in told.stdout, told.stderr
+    assert WORDS in Path("results/report.html").read_text()

@@ -106,18 +106,6 @@ def test_a_real_robot_errs_less_than_by_published_methods(
         assert (mean_errors(matrix, dataset.robot, of_group(dataset, judged).trajectories) <= limits).all()
 
 
-@pytest.mark.slow
-def test_sessions_that_were_left_out_of_the_fit_err_little_more(omni4: Dataset) -> None:
-    errors, counts = [], []
-    for session in sorted({str(run.session) for run in omni4.trajectories}):
-        others = tuple(replace(run, split="train") for run in omni4.trajectories if run.session != session)
-        left_out = [run for run in omni4.trajectories if run.session == session]
-        matrix = calibrate(replace(omni4, trajectories=others)).calibration.matrix_array
-        errors.append(mean_errors(matrix, omni4.robot, left_out))
-        counts.append(len(left_out))
-    assert (np.average(errors, axis=0, weights=counts) <= (0.035, 3.7)).all()
-
-
 def misread(robot: Robot, gain: float = 1.0, zero: float = 0.0) -> Dataset:
     """Simulated runs whose true steering angle is gain times the measured one plus a zero, rad."""
     exact = recorded(robot, robot.inverse_kinematic_matrix, np.random.default_rng(3), 0.1)

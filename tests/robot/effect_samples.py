@@ -46,6 +46,12 @@ def that_apply(names: Sequence[str], robot: Robot) -> list[str]:
 # Effects of the APR-02, and of any robot; with each, the robots to which it applies.
 MOTION, REFERENCE = that_apply(built_in(MotionEffect), APR_02), built_in(ReferenceEffect)
 EVERY_MOTION = built_in(MotionEffect)
+# Functions without a name: not in the catalogue, nor learned, with weights.
+SMOOTH_MOTION = [
+    entry.name
+    for entry in effects.entries()
+    if not (entry.cls.in_catalogue or entry.cls.weighted) and issubclass(entry.cls, MotionEffect)
+]
 APPLIED = [(name, robot) for robot in EVERY for name in that_apply(EVERY_MOTION, EVERY[robot])]
 
 
@@ -103,7 +109,6 @@ def at_every_sample(log: WheelLog) -> WheelLog:
 
 def streamed(stream: OdometryStream, log: WheelLog) -> np.ndarray:
     """Poses (F, 3) after every sample."""
-    assert log.wheel_angles is not None
     durations = np.diff(log.times, prepend=0.0)
     steering = [None] * len(log.rates) if log.steering is None else log.steering
     samples = zip(log.rates, durations, log.wheel_angles, steering, strict=True)

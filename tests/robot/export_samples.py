@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import Any
 
 import numpy as np
@@ -103,3 +104,14 @@ def parameters(export: Export, node: str) -> dict[str, Any]:
 
     flatten(content, "")
     return found
+
+
+def in_brief(export: Export) -> str:
+    """Name, warnings and text of an export without its date; numbers have the four digits of any machine."""
+
+    def rounded(found: re.Match[str]) -> str:
+        value = float(found[0])
+        return f"{value:.4g}" if abs(value) > 1e-9 else "0"
+
+    text = "\n".join([export.file_name, *export.warnings, export.text])
+    return re.sub(r"\d{4}-\d\d-\d\d(T[\d:]+)?", "DATE", re.sub(r"-?\d+\.\d+(e[-+]?\d+)?", rounded, text))

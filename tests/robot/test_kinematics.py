@@ -3,24 +3,18 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import config_robots
 import numpy as np
 import pytest
 import yaml
-from commands import Command
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from sample_robots import APR_02, CAR, DIFFERENTIAL, SKID, SWERVE, TRICYCLE, WHEELED
 
-from omnibench.config import to_yaml, validate
-from omnibench.data.storage import save_dataset
+from omnibench.config import read_model, to_yaml, validate
 from omnibench.errors import ConfigError
-from omnibench.fit.calibrate import calibrate
-from omnibench.fit.geometry import WheelGeometry
-from omnibench.robot.export.formats import export_calibration
 from omnibench.robot.kinematics import (
     Array,
     Mount,
@@ -29,13 +23,10 @@ from omnibench.robot.kinematics import (
     class_of,
     inverse_kinematic_matrices,
     inverse_kinematic_matrix,
-    published_matrix,
     wheel_equations,
 )
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, WheelLog
-from omnibench.simulate.config import FlowerConfig
-from omnibench.simulate.simulate import simulate_dataset
 
 # Eq. (7) of the article, as printed.
 EQ_7 = np.array(
@@ -66,14 +57,6 @@ three_omni_wheels = wheels_of(3, st.just(0.0))
 many_wheels = st.integers(4, 8).flatmap(lambda count: wheels_of(count, st.floats(-1.0, 1.0)))
 
 
-def geometry_of(matrix: Array) -> tuple[Array, Array, Array]:
-    """Radii, distances (m) and angles in [0, 2 pi) (rad) of the three omni wheels whose M^-1 this is."""
-    equations = np.linalg.inv(matrix)
-    radius = 1 / np.hypot(equations[:, 0], equations[:, 1])
-    angle = np.arctan2(-equations[:, 0], equations[:, 1]) % (2 * math.pi)
-    return radius, equations[:, 2] * radius, angle
-
-
 def condition(equations: Array) -> float:
     return float(np.linalg.cond(equations))
 
@@ -99,13 +82,6 @@ def test_the_matrix_of_any_number_of_wheels_gives_the_twist_back(wheels: tuple[W
     assume(condition(equations) < 1e4)
     product = inverse_kinematic_matrix(wheels) @ equations
     np.testing.assert_allclose(product, np.eye(3), atol=1e-13 * condition(equations))
-
-
-def test_four_omni_wheels_share_the_work() -> None:
-    r, R = 0.05, 0.2
-    wheels = tuple(Wheel(name=f"w{i}", radius=r, distance=R, angle=i * math.pi / 2) for i in range(4))
-    expected = np.array([[0, -r / 2, 0, r / 2], [r / 2, 0, -r / 2, 0], [r / (4 * R)] * 4])
-    np.testing.assert_allclose(inverse_kinematic_matrix(wheels), expected, atol=1e-16)
 
 
 def test_mecanum_wheels_give_the_matrix_of_the_textbooks() -> None:
@@ -173,54 +149,6 @@ def test_a_geometry_without_a_matrix_spoils_no_other(wheels: int, value: float) 
     assert np.isfinite(good).all()
 
 
-def test_eq_8_inverted_is_the_geometry_that_is_known_and_gives_eq_8_back() -> None:
-    radius, distance, angle = geometry_of(published_matrix("palacin2023_eq8"))
-    np.testing.assert_allclose(100 * (radius / 0.148 - 1), [3.4, 3.6, 3.3], atol=0.05)
-    np.testing.assert_allclose(100 * (distance / 0.195 - 1), [7.6, 14.6, 11.5], atol=0.05)
-    np.testing.assert_allclose(100 * (np.degrees(angle) / [60, 180, 300] - 1), [0.98, 0.26, -0.02], atol=0.005)
-    matrix = inverse_kinematic_matrices(radius[None], distance[None], angle[None])[0]
-    np.testing.assert_allclose(matrix, published_matrix("palacin2023_eq8"), atol=1e-15)
-
-
-def robot(*wheels: dict[str, Any]) -> Robot:
-    defaults: dict[str, Any] = {"radius": 0.05, "distance": 0.2, "angle": 0.0}
-    named = [{"name": f"w{index}", **defaults, **wheel} for index, wheel in enumerate(wheels)]
-    return validate(Robot, {"name": "robot", "wheels": named}, "robot.yaml")
-
-
-def omni(*angles: float) -> list[dict[str, Any]]:
-    return [{"angle": angle} for angle in angles]
-
-
-REFUSED = {
-    "parallel axles": (omni(0, 0, math.pi), "every direction"),
-    "rollers that all slip the same way": (
-        [{"angle": side * math.pi / 2, "roller_angle": side * math.pi / 4} for side in (1, -1, 1, -1)],
-        "every direction",
-    ),
-    "two wheels": (omni(0, math.pi / 2), "wheels"),
-    "angles in degrees": (omni(60, 180, 300), "60 cannot be an angle in rad; is it in degrees?"),
-    "a roller angle in degrees": ([{"angle": a, "roller_angle": 45} for a in (0, 2, 4)], "wheels.0.roller_angle"),
-    "the same name twice": ([{"name": "a", "angle": 2.0 * i} for i in range(3)], "names must differ: a, a, a"),
-    "a name that makes no column": ([{"name": "front left", "angle": 2.0 * i} for i in range(3)], "wheels.0.name"),
-    "no radius": ([{"radius": 0, "angle": 2.0 * i} for i in range(3)], "wheels.0.radius"),
-    "a negative distance": ([{"distance": -0.2, "angle": 2.0 * i} for i in range(3)], "wheels.0.distance"),
-    "a radius that is not a number": ([{"radius": math.nan, "angle": 2.0 * i} for i in range(3)], "wheels.0.radius"),
-    "an infinite angle": ([{"angle": math.inf} for _ in range(3)], "wheels.0.angle"),
-    "a misspelt key": ([{"angel": 1.0} for _ in range(3)], "did you mean 'angle'?"),
-}
-
-
-@pytest.mark.parametrize("case", REFUSED)
-def test_a_robot_that_cannot_be_is_refused_in_one_line(case: str) -> None:
-    wheels, words = REFUSED[case]
-    with pytest.raises(ConfigError) as refusal:
-        robot(*wheels)
-    assert str(refusal.value).startswith("robot.yaml: ")
-    assert words in str(refusal.value)
-    assert "\n" not in str(refusal.value)
-
-
 PLACES = {"fl": (0.2, 0.15), "fr": (0.2, -0.15), "rl": (-0.2, 0.15), "rr": (-0.2, -0.15)}
 BY_PLACES = Robot(
     name="mecanum", wheels=[Wheel(name=n, type="mecanum", radius=0.05, x=x, y=y) for n, (x, y) in PLACES.items()]
@@ -242,26 +170,6 @@ def test_rollers_that_are_given_stay_and_a_wheel_on_an_axis_has_to_say_them() ->
     assert Wheel(name="a", radius=0.05, x=0.2, y=0.15, angle=0.3).kind == "omni"
     with pytest.raises(ConfigError, match="roller_angle"):
         Wheel(name="ahead", type="mecanum", radius=0.05, x=0.2, y=0.0)
-
-
-@pytest.mark.slow
-def test_such_a_robot_is_simulated_calibrated_designed_for_and_exported(command: Command, tmp_path: Path) -> None:
-    content = config_robots.settings("mecanum") | {"robot": BY_PLACES.model_dump(mode="json")}
-    truth = {"truth": {"tolerances": {"radius": 0.01, "position": 0.003, "angle_deg": 0.3, "seed": 7}}}
-    dataset = simulate_dataset(validate(FlowerConfig, content | truth, "mecanum"), "mecanum").dataset
-    run = calibrate(dataset)
-    assert run.calibration.provenance.held_out.verdict == "better"
-    exported = export_calibration(run.calibration, "ros2_controllers").text
-    (line,) = [line for line in exported.splitlines() if line.strip().startswith("sum_of_robot")]
-    assert float(line.split(":")[1].split("#")[0]) == pytest.approx(0.35, rel=0.03)
-    assert export_calibration(run.calibration, "c_header").text
-    assert WheelGeometry(BY_PLACES).names[:4] == ("radius_fl", "radius_fr", "radius_rl", "radius_rr")
-    save_dataset(dataset, tmp_path / "data")
-    assert command("inspect", tmp_path / "data").returncode == 0
-    wheels = [{"name": n, "type": "mecanum", "radius": 0.05, "x": x, "y": y} for n, (x, y) in PLACES.items()]
-    Path("robot.yaml").write_text(yaml.safe_dump({"robot": {"name": "m", "wheels": wheels}}))
-    designed = command("design", "--robot", "robot.yaml")
-    assert designed.returncode == 0, designed.stderr
 
 
 EVERY = [pytest.param(robot, id=robot.name) for robot in (APR_02, *WHEELED)]
@@ -370,8 +278,6 @@ def test_the_class_of_a_robot_is_that_of_its_measured_wheels() -> None:
 
 @pytest.mark.parametrize("robot", EVERY)
 def test_a_document_of_a_robot_is_read_back(robot: Robot, tmp_path: Any) -> None:
-    from omnibench.config import read_model
-
     (tmp_path / "robot.yaml").write_text(to_yaml(robot))
     assert read_model(Robot, tmp_path / "robot.yaml") == robot
 
@@ -391,11 +297,34 @@ def test_degrees_may_be_given_under_keys_that_say_so() -> None:
     assert a_robot(*wheels).wheels[1].angle == pytest.approx(math.pi)
 
 
+def omni(*angles: float, **more: Any) -> list[dict[str, Any]]:
+    shared = {"radius": 0.05, "distance": 0.2, **more}
+    return [{"name": f"w{index}", "angle": angle, **shared} for index, angle in enumerate(angles)]
+
+
+def rolling(side: int, name: str) -> dict[str, Any]:
+    """A mecanum wheel on the left (1) or right (-1) whose rollers slip ahead."""
+    (wheel,) = omni(side * math.pi / 2, roller_angle=side * math.pi / 4)
+    return wheel | {"name": name}
+
+
 FOUR = [fixed("a", 0.2, 0.2), fixed("b", 0.2, -0.2), fixed("c", -0.2, 0.2), fixed("d", -0.2, -0.2)]
 
 
 LEFT, RIGHT = fixed("a", 0, 0.1), fixed("b", 0, -0.1)
 CANNOT_BE: list[tuple[list[dict[str, Any]], str]] = [
+    (omni(0, 0, math.pi), "every direction"),
+    ([rolling(side, name) for side, name in zip((1, -1, 1, -1), "abcd", strict=True)], "every direction"),
+    (omni(0, math.pi / 2), "wheels"),
+    (omni(60, 180, 300), "60 cannot be an angle in rad; is it in degrees?"),
+    (omni(0, 2, 4, roller_angle=45), "wheels.0.roller_angle"),
+    (omni(0, 2, 4, name="a"), "names must differ: a, a, a"),
+    (omni(0, 2, 4, name="front left"), "wheels.0.name"),
+    (omni(0, 2, 4, radius=0), "wheels.0.radius"),
+    (omni(0, 2, 4, radius=math.nan), "wheels.0.radius"),
+    (omni(0, 2, 4, distance=-0.2), "wheels.0.distance"),
+    (omni(math.inf, 2, 4), "wheels.0.angle"),
+    (omni(0, 2, 4, angel=1.0), "did you mean 'angle'?"),
     ([LEFT], "measured: a"),
     (FOUR, "fixed wheels a, b, c, d would have to slide"),
     ([LEFT, RIGHT, fixed("c", -0.2, 0, measured=False)], "fixed wheel c would have to slide"),
@@ -420,6 +349,7 @@ CANNOT_BE: list[tuple[list[dict[str, Any]], str]] = [
 def test_a_robot_that_cannot_be_is_refused_by_name(wheels: list[dict[str, Any]], words: str) -> None:
     with pytest.raises(ConfigError) as refused:
         a_robot(*wheels)
+    assert str(refused.value).startswith("robot.yaml: ")
     assert words in str(refused.value)
     assert "\n" not in str(refused.value)
 

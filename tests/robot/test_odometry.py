@@ -142,33 +142,6 @@ def test_arcs_pass_smoothly_from_turning_to_straight() -> None:
     np.testing.assert_allclose(poses, np.tile(poses[0], (4, 1)), rtol=0, atol=1e-9)
 
 
-def test_euler_comes_to_the_arc_at_first_order_in_the_period() -> None:
-    twist, stamps, start = np.array([0.2, 0.1, 0.35]), np.array([6.0]), np.zeros(3)
-    errors = []
-    for samples in (300, 600, 1200, 2400):
-        times = np.arange(1, samples + 1) * (6.0 / samples)
-        poses = OdometryBatch([constant_twist(twist, times, times[-1:])], "euler").poses(MATRIX[None])[0]
-        errors.append(np.linalg.norm(poses - on_the_circle(twist, stamps, start)))
-    np.testing.assert_allclose(np.divide(errors[1:], errors[:-1]), 0.5, atol=2e-3)
-
-
-def test_euler_and_arc_agree_on_the_heading() -> None:
-    logs = [a_log(seed) for seed in range(3)]
-    euler, arc = (OdometryBatch(logs, each).poses(MATRIX[None])[0, :, 2] for each in BOTH)
-    np.testing.assert_array_equal(euler, arc)
-
-
-@pytest.mark.parametrize("integration", BOTH)
-@given(angle=st.floats(-10, 10), seed=st.integers(0, 2**16))
-def test_rotating_the_start_pose_rotates_the_path(integration: Integration, angle: float, seed: int) -> None:
-    log = a_log(seed, samples=10)
-    rotation = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-    turned = replace(log, start=np.append(rotation @ log.start[:2], log.start[2] + angle))
-    plain, rotated = (OdometryBatch([each], integration).poses(MATRIX[None])[0] for each in (log, turned))
-    np.testing.assert_allclose(rotated[:, :2], plain[:, :2] @ rotation.T, rtol=0, atol=1e-11)
-    np.testing.assert_allclose(rotated[:, 2], plain[:, 2] + angle, rtol=0, atol=1e-11)
-
-
 @pytest.mark.parametrize("integration", BOTH)
 @pytest.mark.parametrize("final_only", [True, False])
 def test_trajectories_of_any_lengths_share_a_batch(integration: Integration, final_only: bool) -> None:
@@ -220,13 +193,6 @@ def test_a_stamp_at_zero_has_the_start_pose_and_driven_angles_add_up_to_each_sta
 
 
 @pytest.mark.parametrize("integration", BOTH)
-def test_headings_are_not_wrapped(integration: Integration) -> None:
-    times = np.arange(0.1, 60.05, 0.1)
-    log = constant_twist(np.array([0.0, 0.0, 1.0]), times, times[-1:])
-    assert OdometryBatch([log], integration).poses(MATRIX[None])[0, 0, 2] == pytest.approx(60.0, abs=1e-9)
-
-
-@pytest.mark.parametrize("integration", BOTH)
 @pytest.mark.parametrize("final_only", [True, False])
 @pytest.mark.parametrize("wheels", [3, 4])
 def test_the_jacobian_equals_central_differences(integration: Integration, final_only: bool, wheels: int) -> None:
@@ -264,13 +230,6 @@ def test_positions_are_linear_in_rows_1_and_2_once_the_headings_are_known() -> N
     starts = np.array([log.start for log in logs])[batch.trajectory]
     positions = starts[:, :2] + np.column_stack([path.real, path.imag])
     np.testing.assert_allclose(positions, batch.poses(MATRIX[None])[0, :, :2], rtol=0, atol=1e-12)
-
-
-def test_a_model_gives_the_poses_of_each_log_by_itself() -> None:
-    logs = [a_log(1, stamps=4), a_log(2, stamps=9)]
-    model = OdometryModel(APR_02, MATRIX, "arc")
-    for log, poses in zip(logs, model.poses(logs), strict=True):
-        np.testing.assert_allclose(poses, streamed(log, MATRIX, "arc"), rtol=0, atol=1e-12)
 
 
 def test_a_models_stream_starts_at_the_origin_unless_told_and_does_not_change_the_start() -> None:

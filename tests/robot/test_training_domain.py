@@ -142,7 +142,6 @@ def test_it_is_told_what_is_not_known() -> None:
     assert "a, b are not known to hold there, fade" in extrapolation_consequence(["a", "b", "a"], fading=True)
 
 
-FORWARDS, SIDEWAYS = np.array([0.2, 0.0, 0.0]), np.array([0.0, 0.2, 0.0])
 GROWN = term("speed_dependent_radius", k=0.01)
 PLAIN = 0.9 * APR_02.inverse_kinematic_matrix
 

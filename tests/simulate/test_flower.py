@@ -11,14 +11,11 @@ from typing import Any
 import numpy as np
 import polars as pl
 import pytest
-import yaml
-from config_robots import NAMES, QUIET, experiment, robot, settings
+from config_robots import NAMES, QUIET, apr02, apr02_settings, experiment, robot
 
-from omnibench.config import validate
 from omnibench.data.dataset import Dataset, Split
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import ConfigError
-from omnibench.fit.calibrate import calibrate
 from omnibench.fit.evaluate import ModelErrors
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import MotionEffect, Parameter, Values
@@ -30,29 +27,17 @@ from omnibench.simulate.flower import true_steering
 from omnibench.simulate.simulate import simulate_dataset
 from omnibench.simulate.truth import Simulation, true_matrix
 
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
-
-
-def apr02_settings(**changes: Any) -> dict[str, Any]:
-    """The benchmark's own apr02_settings, changed."""
-    content = yaml.safe_load((CONFIGS / "apr02.yaml").read_text())
-    return {**content["datasets"]["flower"]["simulate"], **changes}
-
-
-def config(**changes: Any) -> FlowerConfig:
-    return validate(FlowerConfig, apr02_settings(**changes), "flower.yaml")
-
 
 def small(**changes: Any) -> FlowerConfig:
     """A few short runs, in one session."""
     commands = {"speeds": [0.2], "directions_deg": [0, 120, 240], "turn_rates": [-0.35, 0.0, 0.35]}
     given = {"commands": commands, "repetitions": 2, "train": {"seed": 1, "distance": 0.3}, "validation": None}
-    return config(**(given | changes))
+    return apr02(**(given | changes))
 
 
 @cache
 def benchmark() -> Simulation:
-    return simulate_dataset(config())
+    return simulate_dataset(apr02())
 
 
 def noise_of(repetitions: int, **noise: float) -> tuple[list[Array], Dataset]:
@@ -80,7 +65,7 @@ def test_each_session_has_36_commands_five_times_one_after_the_other(split: Spli
 
 
 def test_the_commands_are_12_directions_with_3_rates_at_one_speed() -> None:
-    found = {(round(math.degrees(c.direction)), c.turn_rate, c.speed) for c in config().driven}
+    found = {(round(math.degrees(c.direction)), c.turn_rate, c.speed) for c in apr02().driven}
     assert found == {(30 * i, rate, 0.2) for i in range(12) for rate in (-0.35, 0.0, 0.35)}
 
 
@@ -145,19 +130,10 @@ def test_another_seed_gives_other_noise_and_the_same_commands_and_validation_has
         assert (one.poses[1:] != other.poses[1:]).all()
 
 
-@pytest.mark.parametrize("integration", ["euler", "arc"])
-def test_without_noise_the_truth_scores_nothing(integration: Any) -> None:
-    simulation = simulate_dataset(small(noise=QUIET, integration=integration))
-    truth = OdometryModel(simulation.dataset.robot, np.array(simulation.truth.matrix), simulation.truth.integration)
-    assert ModelErrors.of(truth, simulation.dataset.trajectories).on(simulation.dataset.trajectories).cost < 1e-14
-    design = OdometryModel.of_design(simulation.dataset.robot, integration)
-    assert ModelErrors.of(design, simulation.dataset.trajectories).on(simulation.dataset.trajectories).cost > 0.02
-
-
 def test_the_truth_record_holds_eq_8_and_how_it_was_driven() -> None:
     truth = benchmark().truth
     np.testing.assert_array_equal(truth.matrix, published_matrix("palacin2023_eq8"))
-    assert (truth.dataset, truth.integration, truth.noise) == ("flower", "arc", config().noise)
+    assert (truth.dataset, truth.integration, truth.noise) == ("flower", "arc", apr02().noise)
 
 
 @pytest.mark.parametrize("table_format", ["csv", "parquet"])
@@ -256,17 +232,17 @@ def test_listed_commands_are_driven_as_long_as_often_and_from_where_each_says() 
 
 def test_tolerances_draw_a_robot_about_its_design() -> None:
     tolerances = {"radius": 0.02, "distance": 0.03, "angle_deg": 0.5, "seed": 7}
-    given = config(truth={"tolerances": tolerances})
+    given = apr02(truth={"tolerances": tolerances})
     truth, design = true_matrix(given.truth, given.robot), given.robot.inverse_kinematic_matrix
     deviation = np.abs(truth - design).max() / np.abs(design).max()
     assert 1e-3 < deviation < 0.2
-    other = config(truth={"tolerances": {**tolerances, "seed": 8}})
+    other = apr02(truth={"tolerances": {**tolerances, "seed": 8}})
     assert not np.array_equal(true_matrix(other.truth, other.robot), truth)
 
 
 def test_a_matrix_may_be_the_truth() -> None:
     rows = [[-0.09, 0.0, 0.09], [0.05, -0.1, 0.05], [0.25, 0.25, 0.25]]
-    given = config(truth={"matrix": rows})
+    given = apr02(truth={"matrix": rows})
     np.testing.assert_array_equal(true_matrix(given.truth, given.robot), rows)
 
 
@@ -311,7 +287,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
 def test_a_config_that_is_wrong_is_refused_in_one_line(case: str) -> None:
     changes, words = REFUSED[case]
     with pytest.raises(ConfigError) as refusal:
-        config(**changes)
+        apr02(**changes)
     message = str(refusal.value)
     assert words in message
     assert message.startswith("flower.yaml: ")
@@ -442,16 +418,3 @@ def test_what_a_robot_cannot_do_is_refused_in_one_line(case: str) -> None:
         experiment(name, **changes)
     assert words in str(refusal.value)
     assert "\n" not in str(refusal.value)
-
-
-@pytest.mark.parametrize(
-    "name", ["diff", *(pytest.param(name, marks=pytest.mark.slow) for name in ("skid", "tricycle", "car", "swerve"))]
-)
-def test_what_a_config_simulates_is_calibrated_and_holds_on_the_other_session(name: str) -> None:
-    dataset = simulate_dataset(validate(FlowerConfig, settings(name), name)).dataset
-    calibrated = calibrate(dataset, "closed_form").calibration.model
-    design, found = (
-        ModelErrors.of(model, dataset.split("validation")).on(dataset.split("validation")).cost
-        for model in (OdometryModel.of_design(dataset.robot, "arc"), calibrated)
-    )
-    assert found < 0.35 * design

@@ -12,7 +12,7 @@ import yaml
 from commands import CONFIGS, Command, Prepared, assert_refused, flower, small
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.data.storage import load_dataset, save_dataset
+from omnibench.data.storage import load_dataset
 from omnibench.errors import ConfigError, DataError, OmnibenchError
 from omnibench.robot.calibration import Calibration, EffectTerm, Noise, matrix_rows
 from omnibench.simulate.simulation_request import simulate_like
@@ -184,16 +184,6 @@ class TestTheCommand:
         assert load_dataset(prepared.data).hash == before
 
 
-@pytest.mark.slow
-def test_the_hidden_effect_of_the_readme_is_in_its_truth(command: Command, tmp_path: Path) -> None:
-    config = CONFIGS / "hidden_effect.yaml"
-    made = command("simulate", config, "-o", tmp_path / "data", "--truth", tmp_path / "truth")
-    assert made.stdout.endswith(f"360 simulated trajectories: {tmp_path / 'data'}\n"), made.stderr
-    truth = yaml.safe_load((tmp_path / "truth" / "truth.yaml").read_text())
-    assert len(truth["effects"]) == 1
-    assert truth["effects"][0]["name"] not in (tmp_path / "data" / "dataset.yaml").read_text()
-
-
 ROBOT = synthetic_robot()
 NOISE = Noise(pose_position=0.02, pose_heading=0.01, bias_position=0.03)
 
@@ -255,16 +245,6 @@ def test_it_is_said_to_be_simulated_like_what_and_by_which_model() -> None:
     for part in ("like recorded", "calibration mine", "wheel_eccentricity", "without noise", "A robot drove."):
         assert part in simulated.description
     assert "recorded (here)" in simulated.source
-
-
-def test_the_model_of_what_was_simulated_explains_it_in_full(tmp_path: Path) -> None:
-    given = calibration(eccentric())
-    save_dataset(simulate_like(recording(), given), tmp_path / "like")
-    loaded = load_dataset(tmp_path / "like")
-    for run, poses in zip(
-        loaded.trajectories, given.model.reported([run.reference_log for run in loaded.trajectories]), strict=True
-    ):
-        np.testing.assert_allclose(run.poses[1:], poses, atol=1e-9)
 
 
 def test_a_run_with_its_start_pose_alone_keeps_it() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import shlex
 from pathlib import Path
@@ -19,7 +18,6 @@ from omnibench.data.dataset import Dataset
 from omnibench.data.importers.tum import write_tum
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import ConfigError, DataError
-from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import WheelLog
 from omnibench.slam.import_dataset import import_dataset
 
@@ -55,21 +53,8 @@ def _stamped(frame: pl.DataFrame) -> pl.DataFrame:
     return frame.with_columns(pl.col("t").round(6))
 
 
-def quarter_ticks(seed: int, turn: int = 1000) -> Array:
-    """Counts of both wheels at the ends of the samples."""
-    of = drive(seed)
-    return np.floor(np.cumsum(of.rates * PERIOD, axis=0) / (2 * np.pi) * turn)
-
-
 def ids(data: Dataset) -> list[str]:
     return [run.id for run in data.trajectories]
-
-
-def write_pair(folder: Path, seed: int, turning: float = 0.0) -> None:
-    """A run's two tables, with wheels that turn by so much, rad/s, all the time."""
-    of = wheels(seed).with_columns(pl.col("omega_left", "omega_right") + turning)
-    of.write_csv(folder / f"run{seed}_wheels.csv")
-    poses(seed).write_csv(folder / f"run{seed}_poses.csv")
 
 
 def later(frame: pl.DataFrame, seconds: float) -> pl.DataFrame:
@@ -99,16 +84,6 @@ def test_rates_and_poses_in_si_by_any_epoch_need_nothing_but_a_robot(tmp_path: P
     assert odometry_error(data) < 1e-6
 
 
-def test_poses_that_begin_earlier_are_interpolated_at_the_wheels_begin(tmp_path: Path) -> None:
-    write_exact(tmp_path)
-    exact = poses(1, noise=0.0)
-    moved = pl.DataFrame({"t": [-0.05, 0.05], "x": [0.48, 0.52], "y": [-0.29, -0.31], "theta": [0.37, 0.43]})
-    pl.concat([moved, exact[1:]]).write_csv(tmp_path / "run1_poses.csv")
-    run = read(tmp_path).trajectories[0]
-    assert run.pose_times[:2].tolist() == pytest.approx([0.0, 0.05])
-    np.testing.assert_allclose(run.start, [0.5, -0.3, 0.4], atol=1e-9)
-
-
 def test_a_run_starts_with_its_first_pose_within_a_sample_and_ends_with_its_last_sample(tmp_path: Path) -> None:
     of = drive(1, noise=0.0)
     stamps = np.arange(3.007, 19.9, 0.1)
@@ -122,40 +97,6 @@ def test_a_run_starts_with_its_first_pose_within_a_sample_and_ends_with_its_last
     assert data.trajectories[0].pose_times[-1] == pytest.approx(stamps[-1] - 3.007)
     assert odometry_error(data) < 1e-9
     assert not any("left out" in warning for warning in data.warnings)
-
-
-DEGREES, TICKS = 180 / math.pi, 4096 / (2 * math.pi)
-
-
-@pytest.mark.parametrize(
-    ("unit", "per_radian", "prefix", "options"),
-    [
-        ("rad", 1.0, "phi", {}),
-        ("deg", DEGREES, "phi", {}),
-        ("deg", DEGREES, "phi", {"wraps_at": 360}),
-        ("ticks", TICKS, "ticks", {"ticks_per_turn": 4096}),
-        ("rpm", 30 / math.pi, "omega", {}),
-        ("deg/s", DEGREES, "omega", {}),
-        ("ticks/sample", PERIOD * TICKS, "ticks", {"ticks_per_turn": 4096}),
-    ],
-)
-def test_positions_rates_and_increments_have_any_unit_and_positions_are_kept(
-    tmp_path: Path, unit: str, per_radian: float, prefix: str, options: dict[str, Any]
-) -> None:
-    of = drive(1, noise=0.0)
-    angles = 0.3 + np.vstack([np.zeros(2), np.cumsum(of.rates * PERIOD, axis=0)])
-    positions = unit in ("rad", "deg", "ticks")
-    shown = per_radian * (angles if positions else np.vstack([np.zeros(2), of.rates]))
-    left, right = (shown % 360 if "wraps_at" in options else shown).T
-    frame = pl.DataFrame({"t": np.append(0.0, of.times), f"{prefix}_left": left, f"{prefix}_right": right})
-    write_exact(tmp_path)
-    frame.write_csv(tmp_path / "run1_wheels.csv")
-    data = read(tmp_path, wheel_unit=unit, **options)
-    assert odometry_error(data) < 1e-8
-    kept = data.trajectories[0].angles
-    assert (kept is not None) == positions
-    if kept is not None:
-        np.testing.assert_allclose(kept, angles[1:], atol=1e-9)
 
 
 def test_columns_signs_units_and_separator_can_be_named(tmp_path: Path) -> None:
@@ -292,18 +233,6 @@ def test_wrong_options_are_refused_in_one_line(tmp_path: Path, options: dict[str
     assert "\n" not in str(caught.value)
 
 
-def test_runs_that_never_rest_are_left_out_where_runs_begin_at_rest(tmp_path: Path) -> None:
-    write_pair(tmp_path, 1, turning=1.0)
-    with pytest.raises(DataError, match="start_at_rest leaves none"):
-        read(tmp_path, start_at_rest=True)
-    write_pair(tmp_path, 2)
-    data = read(tmp_path, start_at_rest=True)
-    assert ids(data) == ["run2"]
-    assert any(warning.startswith("run1: left out") for warning in data.warnings)
-    with pytest.raises(ConfigError, match=r"robot: .*robot=robot\.yaml"):
-        read(tmp_path, robot=None)
-
-
 def test_a_table_a_run_is_told_by_its_header(tmp_path: Path) -> None:
     for seed in (1, 2):
         both(seed).write_csv(tmp_path / f"drive{seed}.csv")
@@ -363,42 +292,12 @@ def test_a_table_of_runs_must_list_every_run_and_its_misspelt_columns_are_said(t
     assert "runs.csv: column 'comand' is not read; did you mean 'command'?" in warning
 
 
-def test_any_column_is_named_by_a_mapping(tmp_path: Path) -> None:
-    made = both(1).rename({"t": "clock", "omega_left": "l", "omega_right": "r", "x": "px", "y": "py", "theta": "h"})
-    made.write_csv(tmp_path / "log.csv")
-    columns = {"t": "clock", "omega_left": "l", "right": "r", "x": "px", "y": "py", "theta": "h"}
-    assert odometry_error(read(tmp_path / "log.csv", columns=columns)) < FITS
-
-
-def test_ticks_millimetres_degrees_and_milliseconds_are_units(tmp_path: Path) -> None:
-    counts = quarter_ticks(1)
-    frame = wheels(1).with_columns(ticks_left=counts[:, 0], ticks_right=counts[:, 1], t=pl.col("t") * 1e3 + 1.7e12)
-    frame.write_csv(tmp_path / "a_wheels.csv")
-    poses(1).select(
-        t=pl.col("t") * 1e6 + 1.7e15, x=pl.col("x") * 1e3, y=pl.col("y") * 1e3, yaw=pl.col("theta").degrees()
-    ).write_csv(tmp_path / "a_poses.csv")
-    units = {"wheel_unit": "ticks", "ticks_per_turn": 1000, "wheel_time_unit": "ms", "pose_time_unit": "us"}
-    assert odometry_error(read(tmp_path, position_unit="mm", heading_unit="deg", **units)) < FITS
-
-
 def test_semicolons_decimal_commas_marks_and_line_ends_of_spreadsheets_are_read(tmp_path: Path) -> None:
     text = both(1).write_csv(separator=";").replace(".", ",").replace("\n", "\r\n")
     (tmp_path / "log.csv").write_bytes(b"\xef\xbb\xbf" + text.encode())
     with pytest.raises(DataError, match=r"expected a number; of decimal commas say --set decimal=comma"):
         read(tmp_path)
     assert odometry_error(read(tmp_path, decimal="comma")) < FITS
-
-
-def test_all_missing_columns_are_named_with_what_to_type(tmp_path: Path) -> None:
-    names = {"t": "time_ms", "omega_left": "rpm_l", "omega_right": "rpm_r", "x": "px_mm", "theta": "yaw_deg"}
-    both(1).rename(names).write_csv(tmp_path / "log.csv")
-    with pytest.raises(DataError) as caught:
-        read(tmp_path)
-    assert "'t', 'omega_left', 'omega_right', 'x' and 'theta' are missing; found: time_ms, " in str(caught.value)
-    for part in ("t: time_ms", "omega_left: rpm_l", "omega_right: rpm_r", "theta: yaw_deg", "x: px_mm"):
-        assert part in str(caught.value)
-    units = "--set wheel_time_unit=ms --set wheel_unit=rpm --set position_unit=mm --set heading_unit=deg?"
-    assert str(caught.value).endswith(units)
 
 
 def test_missing_columns_of_both_files_and_blank_cells_of_a_stream_are_named(tmp_path: Path) -> None:
@@ -469,7 +368,7 @@ def test_dates_in_parquet_files_are_seconds(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("table", ["wheels", "poses"])
 def test_a_table_of_one_row_is_said_to_be_one(tmp_path: Path, table: str) -> None:
-    write_pair(tmp_path, 1)
+    write_exact(tmp_path)
     file = tmp_path / f"run1_{table}.csv"
     pl.read_csv(file).head(1).write_csv(file)
     assert f"{table}: has one row" in refusal(tmp_path)

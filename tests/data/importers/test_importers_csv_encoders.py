@@ -67,18 +67,26 @@ TURN = 2 * math.pi
     ("angle", "options"),
     [
         (DRIVE["angle"] / TURN, {"wheel_unit": "rev"}),
+        (np.degrees(DRIVE["angle"]) % 360, {"wheel_unit": "deg", "wraps_at": 360}),
         (DRIVE["angle"] * 30 * 180 / math.pi, {"wheel_unit": "deg", "gear_ratio": 30}),
         (DRIVE["angle"] * 30 * 2048 / TURN, {"wheel_unit": "ticks", "ticks_per_turn": 2048, "gear_ratio": [30]}),
         (DRIVE["angle"] * 61440 / TURN, {"wheel_unit": "ticks", "ticks_per_turn": 61440}),
         (-DRIVE["angle"], {"wheel_signs": -1}),
         (INCREMENTS / PERIOD * 30 * 60 / TURN, {"wheel_unit": "rpm", "gear_ratio": 30}),
+        (np.degrees(INCREMENTS) / PERIOD, {"wheel_unit": "deg/s"}),
         (INCREMENTS / TURN, {"wheel_unit": "rev/sample"}),
+        (INCREMENTS * 4096 / TURN, {"wheel_unit": "ticks/sample", "ticks_per_turn": 4096}),
     ],
 )
-def test_positions_rates_and_increments_of_wheel_or_motor_in_any_unit_are_the_same(
+def test_positions_rates_and_increments_of_wheel_or_motor_in_any_unit_are_the_same_and_positions_are_kept(
     tmp_path: Path, angle: Array, options: dict[str, Any]
 ) -> None:
-    assert odometry_error(read(log(tmp_path, angle=angle), **options)) < 1e-8
+    data = read(log(tmp_path, angle=angle), **options)
+    assert odometry_error(data) < 1e-8
+    kept, positions = data.trajectories[0].angles, options.get("wheel_unit") in ("rev", "deg", "ticks", None)
+    assert (kept is not None) == positions
+    if positions:
+        np.testing.assert_allclose(np.diff(kept[:, 0]), np.diff(DRIVE["angle"][1:]), atol=1e-9)
 
 
 @pytest.mark.parametrize(("bits", "signed", "option"), [(16, False, "auto"), (16, True, "2^16"), (32, True, "auto")])
@@ -142,7 +150,6 @@ def test_rows_that_repeat_a_time_or_the_wheels_while_they_turned_are_left_out_an
 def test_steering_angles_in_any_unit_are_the_same(tmp_path: Path, shown: Array, options: dict[str, Any]) -> None:
     data = read(log(tmp_path, phi=shown), **options)
     steering = data.trajectories[0].steering
-    assert steering is not None
     np.testing.assert_allclose(steering[:, 0], DRIVE["phi"][1:], atol=2e-4)
 
 

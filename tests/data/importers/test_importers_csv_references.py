@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from drive_samples import DIFF
 
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.importers.csv_tables.csv import Csv
@@ -18,13 +19,6 @@ from omnibench.data.importers.runs.recording_runs import in_seconds
 from omnibench.data.storage import save_dataset
 from omnibench.errors import DataError
 
-ROBOT = {
-    "name": "cart",
-    "wheels": [
-        {"name": "left", "type": "fixed", "radius": 0.05, "x": 0, "y": 0.15},
-        {"name": "right", "type": "fixed", "radius": 0.05, "x": 0, "y": -0.15},
-    ],
-}
 TAPE = "kind,value,sigma\ndistance,1.01,0.003\n"
 
 
@@ -43,7 +37,7 @@ def write(folder: Path, **tables: str) -> Path:
 
 
 def read(source: Path, **options: Any) -> Dataset:
-    return Csv(CsvOptions(robot=ROBOT, **options)).read(source)
+    return Csv(CsvOptions(robot=DIFF, **options)).read(source)
 
 
 def the_run(source: Path, **options: Any) -> Trajectory:
@@ -105,7 +99,6 @@ def test_references_are_read_in_the_units_and_senses_of_the_options(tmp_path: Pa
     )
     options = {"position_unit": "mm", "heading_unit": "deg", "pose_signs": (1, -1, -1), "heading_offset_deg": 90}
     references = the_run(write(tmp_path, a_wheels=wheels(), a_references=table), **options).references
-    assert references is not None
     values = dict(zip(references.kinds.tolist(), references.values.tolist(), strict=True))
     assert values["distance"][0] == pytest.approx(1.01)
     assert values["turn"][0] == pytest.approx(-np.pi / 2)
@@ -224,7 +217,6 @@ def test_a_data_set_with_times_in_ms_has_its_references_in_seconds_too(tmp_path:
     rows = [f"{0.05 * k:.3f},4,4" for k in range(1, 101)]
     source = write(tmp_path / "log", a_wheels="\n".join(["t,omega_left,omega_right", *rows]), a_references=table)
     run = the_run(source, pose_time_unit="ms")
-    assert run.references is not None
     slow = replace(run, references=replace(run.references, t0=run.references.t0 * 1e3, t1=run.references.t1 * 1e3))
     mended = in_seconds(replace(slow, times=run.times * 1e3), 1e-3, 1e-3)
     assert measured(mended) == [(kind, pytest.approx(t0), pytest.approx(t1), v) for kind, t0, t1, v in measured(run)]

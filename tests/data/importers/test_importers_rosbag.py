@@ -64,8 +64,6 @@ def test_every_format_gives_back_wheels_and_poses_exactly(
     assert data.warnings == ()
     assert data.sample_period == PERIOD / 1e9
     for run in data.trajectories:
-        assert run.started_at is not None
-        assert run.angles is not None
         first = round((run.started_at + run.times[0]) * 1e9) // PERIOD
         rows = slice(first, first + len(run.times))
         np.testing.assert_allclose(run.started_at + run.times, (DRIVE.stamps[rows] - EPOCH) / 1e9, rtol=0, atol=1e-9)
@@ -126,7 +124,6 @@ def test_positions_that_begin_again_are_unwrapped(tmp_path: Path) -> None:
 
 def test_covariances_of_the_plane_are_kept(bag: Path) -> None:
     covariances = read(bag).trajectories[0].pose_covariances
-    assert covariances is not None
     expected = [[1e-4, 0, 1e-5], [0, 2e-4, 0], [1e-5, 0, 3e-4]]
     np.testing.assert_array_equal(covariances, np.broadcast_to(expected, covariances.shape))
 
@@ -224,30 +221,23 @@ def test_several_candidates_are_listed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "names",
+    ("names", "where"),
     [
-        ["wheel_a", "wheel_b", "wheel_c"],
-        ["a_wheel_joint", "b_wheel_joint", "c_wheel_joint"],
-        ["apr02/A", "apr02/B", "apr02/C"],
-        ["joint-c", "joint-a", "joint-b"],
-        ["gripper", "c", "b", "a", "a_steering"],
+        (["wheel_a", "wheel_b", "wheel_c"], [0, 1, 2]),
+        (["a_wheel_joint", "b_wheel_joint", "c_wheel_joint"], [0, 1, 2]),
+        (["apr02/A", "apr02/B", "apr02/C"], [0, 1, 2]),
+        (["joint-c", "joint-a", "joint-b"], [2, 0, 1]),
+        (["gripper", "c", "b", "a", "a_steering"], [None, 2, 1, 0, None]),
     ],
 )
-def test_joints_are_recognised_by_usual_names_in_any_order(tmp_path: Path, names: list[str]) -> None:
-    where = [next((i for i, wheel in enumerate("abc") if wheel == core(name)), None) for name in names]
-
+def test_joints_are_recognised_by_usual_names_in_any_order(
+    tmp_path: Path, names: list[str], where: list[int | None]
+) -> None:
     def renamed(each: Sent) -> Sent:
         angles = each.content["position"]
         return changed(each, name=names, position=[7.0 if i is None else angles[i] for i in where])
 
     assert odometry_error(read(write_mcap(tmp_path / "drive", edited(part(12.4), WHEELS, renamed)))) < 1e-9
-
-
-def core(name: str) -> str:
-    """The wheel that a joint of the test above means."""
-    for word in ("wheel", "joint", "apr02", "_", "-", "/"):
-        name = name.replace(word, "")
-    return name.lower()
 
 
 def test_joints_can_be_named(tmp_path: Path) -> None:
@@ -292,7 +282,6 @@ def test_wrong_options_are_refused_in_one_line(bag: Path, options: dict[str, Any
 
 def test_runs_keep_a_little_rest_with_a_reference_pose_at_both_ends(bag: Path) -> None:
     for run, begin in zip(read(bag).trajectories, DRIVE.begins, strict=True):
-        assert run.started_at is not None
         assert 0.25 <= begin - run.started_at <= 0.75
         assert 0.25 <= run.started_at + run.pose_times[-1] - (begin + RUN) <= 0.75
         assert (run.rates[0] == 0).all()
@@ -322,7 +311,6 @@ def test_the_messages_of_a_topic_begin_runs_and_name_their_commands(tmp_path: Pa
     assert [run.split for run in data.trajectories][:4] == ["train", "train", "validation", "validation"]
     assert odometry_error(data) < 1e-9
     for run, begin in zip(data.trajectories, DRIVE.begins, strict=True):
-        assert run.started_at is not None
         assert 0 <= begin - run.started_at <= 0.35  # the pose at rest before the command
         assert run.pose_times[-1] > RUN
 

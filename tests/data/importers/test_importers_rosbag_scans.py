@@ -62,7 +62,6 @@ def with_scans(extra: Sequence[Sent] = (MOUNTED,), **options: Any) -> list[Sent]
 
 
 def scanner_of(data: Dataset) -> Scanner:
-    assert data.scans is not None
     return data.scans.scanner
 
 
@@ -72,12 +71,10 @@ def test_scans_come_with_the_runs_from_every_format(
 ) -> None:
     data = read(write(tmp_path / "drive", with_scans(noise=0.0)))
     assert data.warnings == ()
-    assert data.scans is not None
     assert data.scans.trajectories == ("001", "002")
     for run in data.trajectories:
         found = data.scans.of(run.id)
         np.testing.assert_array_equal(found.times, data.scans.times(run.id))
-        assert run.started_at is not None
         stamps = EPOCH + np.round((run.started_at + found.times) * 1e9).astype(np.int64)
         assert set(stamps.tolist()) <= {each.logged - 30_000_000 for each in scans(SECONDS)}
         assert 0 <= found.times[0] < 0.2
@@ -103,7 +100,6 @@ def test_what_is_no_measurement_becomes_nothing_seen(tmp_path: Path) -> None:
     odd = [math.nan, 0.0, math.inf, -1.0, 0.05, 31.0, -math.inf]
     sent = edited(with_scans(), SCAN, lambda each: changed(each, ranges=[*odd, *each.content["ranges"][len(odd) :]]))
     data = read(write_mcap(tmp_path / "drive", sent))
-    assert data.scans is not None
     ranges = data.scans.of("001").ranges
     assert np.isposinf(ranges[:, : len(odd)]).all()
     assert np.isfinite(ranges[:, len(odd) :]).all()
@@ -115,7 +111,6 @@ def test_empty_scans_are_left_out_and_counted(tmp_path: Path) -> None:
     data = read(write_mcap(tmp_path / "drive", sent))
     count = len(scans(SECONDS))
     assert f"topic {SCAN}: {count // 5} of {count} messages left out: {count // 5} without a range" in data.warnings[0]
-    assert data.scans is not None
     assert all(np.isfinite(found.ranges).any(axis=1).all() for _, found in data.scans)
 
 
@@ -127,8 +122,6 @@ def test_scans_are_saved_and_loaded_with_the_data_set_and_change_neither_wheels_
     assert data.referenced
     save_dataset(data, tmp_path / "data")
     loaded = load_dataset(tmp_path / "data")
-    assert data.scans is not None
-    assert loaded.scans is not None
     assert loaded.scans.scanner == data.scans.scanner
     for run, expected in data.scans:
         np.testing.assert_array_equal(loaded.scans.of(run).times, expected.times)
@@ -153,8 +146,6 @@ def test_messages_that_are_recorded_late_or_twice_come_in_order(tmp_path: Path) 
     plain = read(write_mcap(tmp_path / "plain", sent))
     assert f"topic {SCAN}: 3 of {len(scans(SECONDS)) + 3} messages left out" in data.warnings[0]
     assert "were recorded late" in data.warnings[1]
-    assert data.scans is not None
-    assert plain.scans is not None
     for run, expected in plain.scans:
         np.testing.assert_array_equal(data.scans.of(run).ranges, expected.ranges)
 
@@ -244,8 +235,6 @@ def test_a_scanner_that_hangs_upside_down_counts_its_rays_the_other_way(tmp_path
         with_scans(extra=[hanging], noise=0.0), SCAN, lambda each: changed(each, ranges=each.content["ranges"][::-1])
     )
     data = read(write_mcap(tmp_path / "hanging", flipped))
-    assert data.scans is not None
-    assert upright.scans is not None
     assert data.scans.scanner.mount.yaw == pytest.approx(MOUNT[2])
     np.testing.assert_allclose(data.scans.scanner.angles[::-1], upright.scans.scanner.angles, atol=1e-5)
     np.testing.assert_array_equal(data.scans.of("001").ranges[:, ::-1], upright.scans.of("001").ranges)
@@ -282,7 +271,6 @@ def test_bags_of_one_scanner_make_one_data_set(tmp_path: Path) -> None:
     write_mcap(tmp_path / "days" / "one", with_scans())
     write_mcap(tmp_path / "days" / "two", with_scans())
     data = read(tmp_path / "days")
-    assert data.scans is not None
     assert data.scans.trajectories == ("one/001", "one/002", "two/001", "two/002")
     np.testing.assert_array_equal(data.scans.of("one/002").ranges, data.scans.of("two/002").ranges)
     moved = tf_static(transform("base_link", "laser", 0.5, 0.0, 0.0))
@@ -294,7 +282,6 @@ def test_bags_of_one_scanner_make_one_data_set(tmp_path: Path) -> None:
 def test_a_bag_that_is_gone_when_its_scans_are_wanted_is_told(tmp_path: Path) -> None:
     source = write_mcap(tmp_path / "drive", with_scans())
     data = read(source)
-    assert data.scans is not None
     write_mcap(tmp_path / "drive", [*part(SECONDS), *scans(2.0), MOUNTED])
     with pytest.raises(DataError, match=r"the bag has changed"):
         data.scans.of("002")
@@ -332,7 +319,6 @@ def test_bags_with_and_without_poses_are_imported_apart(tmp_path: Path) -> None:
 
 def test_wheels_and_scans_of_the_whole_drive_are_read_one_run_at_a_time(tmp_path: Path) -> None:
     data = read(write_mcap(tmp_path / "drive", [*messages(DRIVE), *scans(1e6), MOUNTED]))
-    assert data.scans is not None
     assert len(data.scans.trajectories) == len(DRIVE.begins)
     assert sum(len(found.times) for _, found in data.scans) > 20 * len(DRIVE.begins)
 
@@ -411,8 +397,6 @@ def compass(**content: Any) -> list[Sent]:
 
 def at(run: Trajectory) -> Array:
     """The true poses (R, 3) at the times of a run's references."""
-    assert run.references is not None
-    assert run.started_at is not None
     times = (DRIVE.pose_stamps - EPOCH) / 1e9
     return np.column_stack([np.interp(run.references.t1 + run.started_at, times, row) for row in DRIVE.poses.T])
 
@@ -422,7 +406,6 @@ def test_fixes_are_positions_east_and_north_of_the_first(tmp_path: Path) -> None
     assert len(data.trajectories) == 12
     for run in data.trajectories:
         assert not run.has_poses
-        assert run.references is not None
         assert set(run.references.kinds) == {"position"}
         assert np.abs(run.references.values - (at(run) - DRIVE.poses[0])[:, :2]).max() < 1e-3
         assert run.references.sigmas == pytest.approx(np.tile([0.02, 0.03], (len(run.references), 1)))
@@ -431,8 +414,6 @@ def test_fixes_are_positions_east_and_north_of_the_first(tmp_path: Path) -> None
 def test_one_fix_a_period_is_taken(tmp_path: Path) -> None:
     source = write_mcap(tmp_path / "drive", WHEELS_ONLY + fixes())
     each, every = (read(source, reference_period=period).trajectories[0].references for period in (1.0, 0.25))
-    assert each is not None
-    assert every is not None
     assert (np.diff(each.t1) > 0.7).all()
     assert len(every) > 3 * len(each)
 
@@ -459,14 +440,12 @@ def test_sensors_without_a_covariance_need_the_option(
     with pytest.raises(DataError, match=asked):
         read(source)
     references = read(source, **option).trajectories[0].references
-    assert references is not None
     assert references.sigmas[:, 0] == pytest.approx(sigma)
 
 
 def test_an_orientation_is_a_heading_with_its_covariance(tmp_path: Path) -> None:
     data = read(write_mcap(tmp_path / "drive", WHEELS_ONLY + compass()))
     for run in data.trajectories:
-        assert run.references is not None
         assert set(run.references.kinds) == {"heading"}
         assert run.references.fixed_frame.all()
         turned = run.references.values[:, 0] - at(run)[:, 2]
@@ -479,9 +458,7 @@ def test_a_gyro_gives_turned_angles_without_its_offset_at_rest(tmp_path: Path, o
     data = read(write_rosbag2(tmp_path / "drive", WHEELS_ONLY + gyro(offset)), gyro_noise_deg=0.2)
     times = (DRIVE.pose_stamps - EPOCH) / 1e9
     for run in data.trajectories:
-        assert run.references is not None
         assert set(run.references.kinds) == {"turn"}
-        assert run.started_at is not None
         begin, end = run.started_at + run.references.t0[0], run.started_at + run.references.t1[-1]
         truth = np.interp([begin, end], times, DRIVE.poses[:, 2])
         assert run.references.values[:, 0].sum() == pytest.approx(truth[1] - truth[0], abs=2e-3)
@@ -499,7 +476,6 @@ def test_a_gyro_that_never_rests_needs_the_size_of_its_offset(tmp_path: Path) ->
     with pytest.raises(DataError, match=r"never rests.*--set gyro_offset_deg=0\.5"):
         read(source, **options)
     (run,) = read(source, gyro_offset_deg=0.5, **options).trajectories
-    assert run.references is not None
     assert run.references.rate_sigma == pytest.approx(math.radians(0.5))
 
 
@@ -507,8 +483,6 @@ def test_a_sensor_mounted_upside_down_is_turned_by_the_signs(tmp_path: Path) -> 
     source = write_mcap(tmp_path / "drive", part(20.0, WHEELS_ONLY + gyro(0.0)))
     upright, turned = (read(source, **options).trajectories for options in ({}, {"pose_signs": (1, 1, -1)}))
     for one, other in zip(upright, turned, strict=True):
-        assert one.references is not None
-        assert other.references is not None
         assert (one.references.values[:, 0] == -other.references.values[:, 0]).all()
 
 
@@ -517,7 +491,6 @@ def test_sensors_count_beside_poses_only_where_they_are_named(tmp_path: Path) ->
     assert all(run.references is None for run in read(source).trajectories)
     named = read(source, references=(FIX,)).trajectories[0]
     assert named.has_poses
-    assert named.references is not None
     assert set(named.references.kinds) == {"position"}
 
 

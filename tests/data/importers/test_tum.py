@@ -99,12 +99,6 @@ def test_poses_that_no_tum_file_can_hold_are_refused(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_a_track_of_many_poses_is_shown_in_a_line(tmp_path: Path) -> None:
-    lines = [f"{0.1 * row:.1f} {row} 0 0 0 0 0 1" for row in range(300)]
-    (tmp_path / "long.tum").write_text("\n".join(lines), encoding="utf-8")
-    assert repr(read_tum(tmp_path / "long.tum")) == "PoseTrack(times=<array (300,)>, poses=<array (300, 3)>)"
-
-
 @given(
     heading=st.floats(-math.pi + 1e-9, math.pi - 1e-9), length=st.floats(0.991, 1.009), sign=st.sampled_from([-1, 1])
 )

@@ -183,7 +183,6 @@ def test_costs_of_candidates_whose_poses_are_held_in_parts_are_the_same(
     whole = problem.values(candidates)
     monkeypatch.setattr("omnibench.fit.problem._MOST_POSES", 3 * len(problem.odometry.trajectory))
     assert problem.values(candidates) == pytest.approx(whole, rel=1e-14)
-    assert [len(part) for part in problem._parts(candidates)] == [3, 3, 1]
 
 
 def test_a_long_run_among_short_ones_is_put_with_few(monkeypatch: pytest.MonkeyPatch) -> None:

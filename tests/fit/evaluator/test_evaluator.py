@@ -24,7 +24,7 @@ from omnibench.fit.evaluator import (
 )
 from omnibench.fit.geometry import GeometryLimits
 from omnibench.fit.problem import CalibrationProblem
-from omnibench.registry import calibrators, costs
+from omnibench.registry import calibrators
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog
 from omnibench.testing.synthetic import synthetic_robot
@@ -188,11 +188,3 @@ def test_arcs_by_quadrature_are_right_to_the_bound(seed: int, tolerance: float) 
         steps = (angles @ (matrix[0] + 1j * matrix[1])) * np.exp(1j * (about @ matrix[2] + log.start[2]))
         x, y = OdometryBatch([log], "arc").poses(matrix[None])[0, -1, :2] - log.start[:2]
         assert abs(steps.sum() - (x + 1j * y)) <= tolerance + 1e-13
-
-
-def test_every_cost_offers_its_logs() -> None:
-    runs = noisy_trajectories()
-    for name in COSTS:
-        cost = costs.create(name)
-        stamps = sum(len(log.stamps) for log in cost.logs(runs))
-        assert stamps == len(cost.reference(runs))

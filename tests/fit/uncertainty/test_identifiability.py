@@ -25,7 +25,6 @@ from omnibench.fit.identifiability import (
     identified_parameters,
     inseparable_in_words,
     inseparable_parameters,
-    known_slopes,
     warnings_of_calibration,
 )
 from omnibench.fit.inspect import inspect_dataset
@@ -73,16 +72,6 @@ class TestSmallMatrices:
         np.testing.assert_allclose(deviations[0], 0.5, rtol=1e-12)
         assert (deviations[1] > 1e6).all()
         assert np.isfinite(deviations).all()
-
-    def test_a_wheel_of_twice_the_radius_moves_the_robot_twice_as_far(self) -> None:
-        """A matrix column is proportional to its wheel's radius, so that its derivative is the column itself."""
-        matrix, slopes = (
-            ROBOT.inverse_kinematic_matrix,
-            known_slopes(WheelGeometry(ROBOT), np.zeros((0, 3))).reshape(3, 3, 9),
-        )
-        for wheel in range(3):
-            column = np.where(np.arange(3) == wheel, matrix, 0.0)
-            np.testing.assert_allclose(slopes[:, :, wheel], column, rtol=1e-8, atol=1e-11)
 
     def test_each_parameter_needs_the_directions_in_which_it_shows(self) -> None:
         """Equal steps of all three wheels turn the robot: only the distances change with what it then does."""

@@ -120,25 +120,6 @@ class TestCovariance:
         assert hits[:, :9].sum() >= 29
         assert hits[:, 9:].sum() >= 29
 
-    @pytest.mark.slow
-    def test_the_standard_deviations_are_those_of_many_calibrations(self) -> None:
-        matrices, said = [], []
-        for seed in range(20):
-            problem = make_problem(driven(FLOWER, seed=seed, noise=0.01))
-            result = solved(problem)
-            matrices.append(result.matrix)
-            said.append(uncertainty_of(problem, result).standard_deviations)
-        seen = np.sqrt(np.mean(np.square(np.array(matrices) - TRUTH), axis=0))
-        # Of 20 values a standard deviation is uncertain by 16 %, of nine less.
-        assert np.mean(np.sqrt(np.mean(np.square(said), axis=0)) / seen) == pytest.approx(1, abs=0.25)
-
-    @pytest.mark.slow
-    def test_four_times_the_repetitions_halve_it(self) -> None:
-        few, many = (
-            np.mean([shares(found(driven(FLOWER, repetitions=n, seed=seed))) for seed in range(4)]) for n in (3, 12)
-        )
-        assert many == pytest.approx(few / 2, rel=0.2)
-
     @pytest.mark.parametrize("cost", ["final_pose", "final_position", "trajectory"])
     def test_every_cost_that_is_a_sum_of_norms_has_one(self, cost: str) -> None:
         deviations = shares(found(driven(FLOWER), cost=cost))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -56,12 +55,6 @@ def test_a_stream_gives_the_poses_of_the_batch(robot: str, driven: list[list[flo
     assert np.abs(together - plain).max() > 1e-5
 
 
-def test_samples_do_not_know_later_ones() -> None:
-    model, log = model_of(APR_02, NEAR), at_every_sample(a_drive(2, 60))
-    changed = replace(log, rates=np.where(np.arange(60)[:, None] < 30, log.rates, 9.0))
-    np.testing.assert_allclose(model.poses([changed])[0][:30], model.poses([log])[0][:30], rtol=0, atol=1e-12)
-
-
 @pytest.mark.parametrize("alone", [False, True])
 def test_a_robot_that_stands_stays_exactly_where_it_is(alone: bool) -> None:
     model = model_of(APR_02, NEAR, alone=alone, sizes=(16, 16))
@@ -84,11 +77,6 @@ def test_the_network_is_its_equation() -> None:
     hidden = np.tanh(first @ (u / network.inputs) + bias) - np.tanh(bias)
     expected = network.outputs * (network.last @ (np.tanh(second @ hidden + other) - np.tanh(other)))
     np.testing.assert_allclose(network.twists(u[None])[0], expected, rtol=1e-12)
-
-
-def test_within_the_training_domain_the_whole_network_acts() -> None:
-    unfaded, faded = model_of(APR_02, None), model_of(APR_02, NEAR)
-    np.testing.assert_allclose(driven_to(faded, NEAR[0]), driven_to(unfaded, NEAR[0]), rtol=0, atol=1e-12)
 
 
 def test_far_from_the_training_domain_the_matrix_alone_is_left() -> None:

@@ -4,29 +4,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from effect_samples import PERIOD, ROBOTS, SESSIONS, a_drive, a_term, at_every_sample, model, streamed
+from effect_samples import PERIOD, SESSIONS, a_drive, a_term, at_every_sample, model, streamed
 from hypothesis import given
 from hypothesis import strategies as st
 from sample_robots import APR_02
 
 from omnibench.registry import effects
-from omnibench.robot.calibration import Calibration, EffectTerm, matrix_rows, read_calibration, write_calibration
 from omnibench.robot.effects.effect import make_term
 from omnibench.robot.kinematics import Array
-from omnibench.robot.odometry import Integration, advance
+from omnibench.robot.odometry import advance
 from omnibench.robot.signals import Signals, signals_of
 
-MOTION = (
-    *("smooth_elapsed_time", "smooth_heading", "smooth_course", "smooth_place", "smooth_patch", "smooth_command"),
-    *("smooth_order_of_runs", "smooth_wheel_rate", "smooth_common_rate", "smooth_wheel_angle", "smooth_acceleration"),
-    *("smooth_heading_wave", "smooth_place_wave", "smooth_time_wave", "smooth_session_wave"),
-    *("smooth_edge", "smooth_joint"),
-)
-REFERENCE = ("smooth_map", "smooth_map_patch", "smooth_stamps", "smooth_stamp_wave")
 seeds = st.integers(0, 2**32 - 1)
 
 
@@ -49,24 +40,6 @@ def at(x: float, y: float, heading: float = 0.0) -> Array:
     return np.array([[x, y, heading]])
 
 
-def test_all_that_is_no_name_is_tested_here() -> None:
-    """Learned effects, whose terms have weights, are tested elsewhere."""
-    nameless = {entry.name for entry in effects.entries() if not (entry.cls.in_catalogue or entry.cls.weighted)}
-    assert nameless == {*MOTION, *REFERENCE}
-
-
-@pytest.mark.parametrize("integration", ["euler", "arc"])
-@pytest.mark.parametrize("name", MOTION)
-@given(seed=seeds, robot=st.sampled_from(sorted(ROBOTS)), samples=st.integers(1, 60))
-def test_a_stream_equals_a_batch_with_every_smooth_term(
-    name: str, integration: Integration, seed: int, robot: str, samples: int
-) -> None:
-    log = at_every_sample(a_drive(seed, samples, ROBOTS[robot]))
-    chosen = model(a_term(name, ROBOTS[robot], seed), robot=ROBOTS[robot], integration=integration)
-    stream = chosen.stream(log.start, log.session, log.started_at or 0.0)
-    np.testing.assert_allclose(streamed(stream, log), chosen.poses([log])[0], rtol=0, atol=1e-12)
-
-
 @given(seed=seeds, samples=st.integers(1, 60))
 def test_poses_are_those_of_the_uncorrected_path_in_the_middle_of_the_samples(seed: int, samples: int) -> None:
     log, pose = a_drive(seed, samples), np.zeros(3)
@@ -76,10 +49,6 @@ def test_poses_are_those_of_the_uncorrected_path_in_the_middle_of_the_samples(se
         after = advance(pose, twist * duration, "arc")
         np.testing.assert_allclose((pose + after) / 2, expected, rtol=0, atol=1e-12)
         pose = after
-
-
-def test_poses_are_not_computed_for_those_who_do_not_ask() -> None:
-    assert signals_of(a_drive(1), APR_02, APR_02.inverse_kinematic_matrix, PERIOD).poses is None
 
 
 def test_a_stream_that_is_put_elsewhere_has_its_poses_from_there_on() -> None:
@@ -263,21 +232,3 @@ def test_delays_alternate_grow_and_swing_with_the_stamps() -> None:
     position, heading = wave.delays(stamps, {"cos": 0.0, "sin": 0.01, "frequency": 1.0})
     np.testing.assert_allclose(position, [0.01, 0.0, 0.0], atol=1e-15)
     np.testing.assert_array_equal(position, heading)
-
-
-@pytest.mark.parametrize("name", [*MOTION, *REFERENCE])
-def test_a_calibration_file_holds_all_that_a_smooth_term_needs(name: str, tmp_path: Path) -> None:
-    chosen = a_term(name, APR_02, 5)
-    written = Calibration(
-        name="smooth",
-        robot=APR_02,
-        sample_period=PERIOD,
-        matrix=matrix_rows(APR_02.inverse_kinematic_matrix),
-        integration="arc",
-        effects=(EffectTerm(name=name, parameters=dict(chosen.values)),),
-    )
-    write_calibration(written, tmp_path / "smooth.yaml")
-    log = replace(a_drive(5), start=np.zeros(3))
-    found = read_calibration(tmp_path / "smooth.yaml").model.reported([log])[0]
-    np.testing.assert_array_equal(found, model(chosen).reported([log])[0])
-    assert np.abs(found - model().reported([log])[0]).max() > 1e-6

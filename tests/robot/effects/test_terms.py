@@ -41,13 +41,6 @@ from omnibench.robot.odometry import WheelLog
 from omnibench.robot.signals import Signals, signals_of
 
 
-def test_a_term_keeps_its_parameters_in_the_given_order_whatever_becomes_of_the_mapping() -> None:
-    given = dict.fromkeys(("b_c", "a_a", "a_b", "b_a", "a_c", "b_b"), 0.01)
-    term = make_term("wheel_eccentricity", given, APR_02)
-    given["b_c"] = 0.0
-    assert list(term.values.items()) == [(name, 0.01) for name in ("b_c", "a_a", "a_b", "b_a", "a_c", "b_b")]
-
-
 @pytest.mark.parametrize("value", [1, np.float64(1.0), np.int64(1)])
 def test_any_real_number_is_a_parameter(value: float) -> None:
     found = make_term("heading_drift", {"b": value}, APR_02).values["b"]

@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from export_samples import CAR, DIFF, ORIGIN, SWERVE, TRICYCLE, calibration, disturbed, mounted
+from export_samples import CAR, DIFF, ORIGIN, SWERVE, TRICYCLE, calibration, disturbed, in_brief, mounted
 from sample_robots import APR_02
+from syrupy.assertion import SnapshotAssertion
 
 from omnibench.robot.calibration import Provenance, matrix_rows
 from omnibench.robot.export.formats import Export, export_calibration
@@ -115,13 +116,15 @@ def test_steered_wheels_drive_as_in_the_stream(
     assert "left out" not in " ".join((export.text, *export.warnings))
 
 
-def test_signs_provenance_wheels_and_period_are_told() -> None:
+def test_a_header_says_where_its_matrix_comes_from_and_what_it_leaves_out(snapshot: SnapshotAssertion) -> None:
     origin = Provenance(**ORIGIN | {"dataset_hash": "f00", "training_cost": 0.0215}, simulated=True)
-    export = export_calibration(calibration(APR_02, provenance=origin), "c_header")
-    parts = ("flower (simulated)", "f00", "genetic", "seed 1", "training cost 0.0215", "converged", "counter-clockwise")
-    for part in (*parts, '#define APR_02_WHEEL_NAMES { "a", "b", "c" }', "#define APR_02_SAMPLE_PERIOD 0.02 /* s */"):
-        assert part in export.text
-    assert "direction of rolling" in export_calibration(calibration(DIFF), "c_header").text
+    slip = [{"name": "slip", "parameters": {"k": 0.1}}]
+    exported = (
+        calibration(APR_02, published_matrix("palacin2023_eq8"), provenance=origin, effects=slip),
+        calibration(mounted(DIFF)),
+    )
+    assert "\n".join(in_brief(export_calibration(each, "c_header")) for each in exported) == snapshot
+    assert export_calibration(calibration(APR_02), "c_header").warnings == ()
 
 
 @needs_compiler
@@ -134,23 +137,6 @@ def test_any_number_of_wheels_and_any_name_compiles(tmp_path: Path) -> None:
     poses = run_header(export, tmp_path, "robot_4_wheeler_gr_e_1", np.array([[1.0, 2, 3, 4, 0.5]]), 4)
     stream = OdometryStream(mecanum.inverse_kinematic_matrix, "arc", START)
     np.testing.assert_allclose(poses[0], stream.drive(np.array([0.5, 1, 1.5, 2])), rtol=0, atol=1e-12)
-
-
-def test_the_matrix_reads_back_to_the_bit() -> None:
-    matrix = published_matrix("palacin2023_eq8")
-    text = export_calibration(calibration(APR_02, matrix), "c_header").text
-    rows = text.split("= {\n")[1].split("\n};")[0].splitlines()
-    read = [[float(value) for value in row.strip(" {},").split(", ")] for row in rows]
-    assert read == matrix.tolist()
-
-
-def test_what_a_header_cannot_hold_is_warned_of() -> None:
-    export = export_calibration(calibration(APR_02, effects=[{"name": "slip", "parameters": {"k": 0.1}}]), "c_header")
-    assert "slip" in export.warnings[0]
-    assert "left out: effects slip (k 0.1)" in export.text
-    tracked = export_calibration(calibration(mounted(DIFF)), "c_header")
-    assert all("tracked point" in text for text in (tracked.text, tracked.warnings[0]))
-    assert export_calibration(calibration(APR_02), "c_header").warnings == ()
 
 
 def test_without_its_effects_the_matrix_is_the_one_that_was_fitted_without_them() -> None:

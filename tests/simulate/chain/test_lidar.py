@@ -13,12 +13,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from shapely.geometry import LineString, Point
 
-from omnibench.config import parse_yaml, validate
+from omnibench.config import validate
 from omnibench.data.scans import Mount, TrajectoryScans
 from omnibench.data.true_poses import TruePath
 from omnibench.errors import ConfigError, DataError, UnknownNameError
 from omnibench.robot.kinematics import Array
-from omnibench.simulate import floor_plan
 from omnibench.simulate.floor_plan import PLANS, FloorPlan, RoomPlan, make_plan
 from omnibench.simulate.lidar import Lidar, LidarMount, measure_scans, scan_stamps
 from omnibench.simulate.ray_casting import cast_rays
@@ -322,12 +321,6 @@ def test_a_drawn_room_has_its_walls_and_start() -> None:
     assert plan.segments.shape == (8, 4)
     assert plan.owners.tolist() == [-1, -1, -1, -1, 0, 0, 0, 0]
     assert np.hypot(*(plan.segments[:, 2:] - plan.segments[:, :2]).T).sum() == pytest.approx(18 + 4)
-
-
-def test_the_yaml_in_the_documentation_is_a_room() -> None:
-    one, drawn = parse_yaml(floor_plan.__doc__.split("\n\n", 2)[2].replace("    room:", "- room:"), "documentation")
-    assert make_plan(validate(RoomPlan, one["room"], "room"), "room").name == "furnished_room"
-    assert len(make_plan(validate(RoomPlan, drawn["room"], "room"), "room").obstacles) == 2
 
 
 def test_corners_that_are_repeated_make_no_walls_and_obstacles_may_touch_each_other() -> None:

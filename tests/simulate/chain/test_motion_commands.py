@@ -117,7 +117,7 @@ def test_a_trapezoid_rises_with_the_limit_of_what_is_slower_and_an_s_curve_takes
     st.one_of(st.just(math.inf), st.floats(1, 500)),
     st.lists(st.floats(1e-3, 0.5), min_size=1, max_size=12),
 )
-def test_a_set_point_sent_to_and_fro_stays_between_rest_and_full_speed(
+def test_phases_of_a_set_point_sent_to_and_fro_join_and_stay_between_rest_and_full_speed(
     slope: float, jerk: float, pauses: list[float]
 ) -> None:
     course, time = SetPoint(SlewLimits(slope, jerk)), 0.0
@@ -130,18 +130,11 @@ def test_a_set_point_sent_to_and_fro_stays_between_rest_and_full_speed(
     assert scales.min() >= -1e-9
     assert scales.max() <= 1 + 1e-9
     assert np.abs(slopes).max() <= slope * (1 + 1e-9)
-
-
-@given(st.floats(0.2, 20), st.floats(1, 500), st.lists(st.floats(1e-3, 0.5), min_size=1, max_size=12))
-def test_phases_of_a_set_point_join(slope: float, jerk: float, pauses: list[float]) -> None:
-    course, time = SetPoint(SlewLimits(slope, jerk)), 0.0
-    for number, pause in enumerate(pauses):
-        course = course.towards((number + 1) % 2, time)
-        time += pause
     for before, after in pairwise(course.phases):
         end = before.at(after.start)
         assert (end.way, end.scale) == pytest.approx((after.way, after.scale), abs=1e-9)
-        assert end.slope == pytest.approx(after.slope, abs=1e-6 * slope)
+        if math.isfinite(jerk):
+            assert end.slope == pytest.approx(after.slope, abs=1e-6 * slope)
 
 
 def _instants(course: SetPoint) -> list[tuple[Phase, float]]:

@@ -15,7 +15,6 @@ from commands import CONFIGS, Command, assert_refused, flower
 from config_robots import settings
 
 from omnibench.config import validate
-from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.data.true_poses import read_true_poses
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrate import calibrate
@@ -32,7 +31,6 @@ from omnibench.simulate.source import read_simulation
 from omnibench.simulate.truth import Simulation, true_matrix
 
 TOLERANCES = {"tolerances": {"radius": 0.02, "distance": 0.05, "angle_deg": 1.0, "seed": 249}}
-BLIND = {"plan": "corridor"}
 ONE_RUN: dict[str, Any] = {"commands": {"directions_deg": [0], "turn_rates": [0.0]}, "repetitions": 1}
 
 
@@ -120,18 +118,6 @@ class TestWhatIsRecorded:
             # At 0.2 m/s, reached and left at 0.5 m/s2: the set point covers v times the time of validity.
             assert 0.2 * (times[-1] + validity[-1]) == pytest.approx(0.4, abs=0.01)
 
-    def test_it_survives_the_disk_in_both_formats(self, simulation: Simulation, tmp_path: Path) -> None:
-        for table_format in ("parquet", "csv"):
-            save_dataset(simulation.dataset, tmp_path / table_format, table_format)
-            read = load_dataset(tmp_path / table_format)
-            assert read.hash == simulation.dataset.hash
-            for run, recorded in zip(read.trajectories, simulation.dataset.trajectories, strict=True):
-                np.testing.assert_array_equal(run.odometry, recorded.odometry)
-                np.testing.assert_array_equal(run.sent, recorded.sent)
-            assert read.scans.scanner == simulation.dataset.scans.scanner
-            for name, scans in simulation.dataset.scans:
-                np.testing.assert_array_equal(read.scans.of(name).ranges, scans.ranges)
-
     def test_the_same_seed_gives_the_same_recordings(self) -> None:
         few = {"commands": {"directions_deg": [0], "turn_rates": [0.35]}, "repetitions": 1}
         first, again = made(**few).dataset, made(**few).dataset
@@ -149,16 +135,6 @@ class TestTheTruth:
             truth = simulation.paths[run.id].at(run.times[-1:])[0]
             assert np.hypot(*(end - truth)[:2]) < 2e-3  # ticks of 2 mrad, 0.148 m
             assert abs(end - truth)[2] < 2e-3
-
-    def test_an_effect_bends_the_true_path_and_not_the_encoders(self) -> None:
-        drift = [{"name": "heading_drift", "parameters": {"b": 0.02}}]
-        plain, bent = made(**ONE_RUN), made(**ONE_RUN, truth=TOLERANCES | {"effects": drift})
-        (run,), (other,) = plain.dataset.trajectories, bent.dataset.trajectories
-        np.testing.assert_array_equal(run.rates, other.rates)
-        end = run.times[-1:]
-        turned = bent.paths[run.id].at(end)[0, 2] - plain.paths[run.id].at(end)[0, 2]
-        assert turned == pytest.approx(0.02 * 2.4, rel=0.25)  # s in motion
-        assert other.final_pose[2] - run.final_pose[2] == pytest.approx(turned, abs=2e-3)  # and SLAM sees it
 
     @pytest.mark.parametrize(
         ("effect", "parameters"),
