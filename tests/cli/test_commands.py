@@ -280,10 +280,7 @@ def test_a_data_set_has_the_name_of_its_folder_unless_another_is_given(command: 
 @pytest.mark.slow
 def test_a_new_plugin_is_checked_and_compared(command: Command, tmp_path: Path) -> None:
     new = command("plugin", "new", "my_search")
-    assert new.stdout.splitlines() == [
-        "written: plugins/my_search.py",
-        "written: plugins/test_my_search.py",
-    ]
+    assert new.stdout.splitlines() == ["written: plugins/my_search.py", "written: plugins/test_my_search.py"]
     check = command("plugin", "check", "plugins/my_search.py")
     assert check.returncode == 0, check.stdout
     assert " passed" in check.stdout.splitlines()[-1]

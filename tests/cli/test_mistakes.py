@@ -12,15 +12,7 @@ from pathlib import Path
 import polars as pl
 import pytest
 import yaml
-from commands import (
-    COMMAND,
-    ENVIRONMENT,
-    Command,
-    Prepared,
-    assert_refused,
-    disk_that_takes,
-    omnibench,
-)
+from commands import COMMAND, ENVIRONMENT, Command, Prepared, assert_refused, disk_that_takes, omnibench
 
 from omnibench.data.storage import load_dataset, save_dataset
 

@@ -12,14 +12,7 @@ from pathlib import Path
 import pytest
 
 from omnibench.errors import DataError, one_line, visible
-from omnibench.files import (
-    check_results_folder,
-    link_latest,
-    new_results_folder,
-    replacing,
-    results_locked,
-    write_text,
-)
+from omnibench.files import check_results_folder, link_latest, new_results_folder, replacing, results_locked, write_text
 
 
 def test_a_link_goes_on_pointing_to_the_file_that_is_written(tmp_path: Path) -> None:

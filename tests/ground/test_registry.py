@@ -152,12 +152,7 @@ def test_two_plugins_of_one_name_name_the_first_one(folder: Path) -> None:
 
 
 def test_an_installed_package_is_found_by_its_entry_point(installed: Path) -> None:
-    install(
-        installed,
-        "calmly",
-        PLUGIN.format(name="calm"),
-        "[omnibench.calibrators]\ncalm = calmly.search:Still\n",
-    )
+    install(installed, "calmly", PLUGIN.format(name="calm"), "[omnibench.calibrators]\ncalm = calmly.search:Still\n")
     assert load_plugins() == []
     entry = calibrators.entry("calm")
     assert entry.origin == "calmly.search"

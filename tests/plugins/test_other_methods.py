@@ -164,10 +164,7 @@ def test_a_search_that_is_cut_short_does_not_claim_to_have_converged(limit: dict
     ],
 )
 def test_the_figures_of_the_authors_of_optiodom_are_reached(
-    calibrator: str,
-    dataset: Callable[[], Dataset],
-    circles: tuple[float, float],
-    squares: tuple[float, float] | None,
+    calibrator: str, dataset: Callable[[], Dataset], circles: tuple[float, float], squares: tuple[float, float] | None
 ) -> None:
     data = dataset()
     matrix = fit(calibrator, data.robot, of_kind(data, "circular")).matrix

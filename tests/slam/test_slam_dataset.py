@@ -10,18 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_samples import (
-    DRIVE,
-    EPOCH,
-    Sent,
-    header,
-    odometry_error,
-    pose,
-    read,
-    text,
-    write_mcap,
-    write_rosbag1,
-)
+from bag_samples import DRIVE, EPOCH, Sent, header, odometry_error, pose, read, text, write_mcap, write_rosbag1
 from hypothesis import given
 from hypothesis import strategies as st
 from scan_samples import MOUNTED, SECONDS, without_poses

@@ -26,14 +26,7 @@ from omnibench.live.fusion.pose_fusion import FusionSettings
 from omnibench.live.node import LiveNode
 from omnibench.live.wheels.wheel_input import WheelStep
 from omnibench.live.wire.messages import JOINT_STATE
-from omnibench.robot.calibration import (
-    Calibration,
-    EffectTerm,
-    Noise,
-    Provenance,
-    covariance_rows,
-    parse_calibration,
-)
+from omnibench.robot.calibration import Calibration, EffectTerm, Noise, Provenance, covariance_rows, parse_calibration
 from omnibench.robot.effects.effect import MOST_BYTES, encode_weights
 from omnibench.robot.kinematics import Array, relative, rotation
 from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog

@@ -550,10 +550,7 @@ def test_what_ros2_control_does_not_tell_is_nan_and_is_not_taken_for_a_reading()
 
 def test_joints_are_called_like_the_wheels_unless_they_are_named() -> None:
     assert joints_of(TRICYCLE).names == ("front", "front_steering")
-    assert joints_of(CAR).names == (
-        *("rear_left", "rear_right"),
-        *("front_left_steering", "front_right_steering"),
-    )
+    assert joints_of(CAR).names == (*("rear_left", "rear_right"), *("front_left_steering", "front_right_steering"))
     named = WheelSettings(joints=("traction",), steering_joints=("fork",))
     assert joints_of(TRICYCLE, named).names == ("traction", "fork")
     steps = SteeringReceiver(TRICYCLE, joints=["traction"], steering_joints=["fork"]).take(
