@@ -55,8 +55,7 @@ class Told(NamedTuple):
 
     @property
     def document(self) -> dict[str, Any]:
-        content: dict[str, Any] = json.loads(self.run.stdout)
-        return content
+        return json.loads(self.run.stdout)
 
 
 def small() -> Dataset:
@@ -176,7 +175,6 @@ def test_ctrl_c_leaves_nothing_half_written(data: Path, tmp_path: Path) -> None:
         [*COMMAND, "discover", str(data)], cwd=tmp_path, env=ENVIRONMENT, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE,
     )  # fmt: skip
-    assert process.stderr is not None
     try:
         assert process.stderr.readline() == "fitting the plain matrix\n"
         os.kill(process.pid, signal.SIGINT)
@@ -191,7 +189,6 @@ def test_ctrl_c_leaves_nothing_half_written(data: Path, tmp_path: Path) -> None:
 def printed(found: Discovery, width: int = 80) -> str:
     console = Console(file=StringIO(), width=width, markup=False, emoji=False, highlight=False)
     print_discovery(console, found, Path("results/flower/now"))
-    assert isinstance(console.file, StringIO)
     return console.file.getvalue()
 
 

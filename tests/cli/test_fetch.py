@@ -125,7 +125,6 @@ class TestKnownRecording:
         assert ended.stderr.splitlines()[-1] == "  omnibench check data/diff"
         dataset = load_dataset("data/diff")
         assert (dataset.name, dataset.source, dataset.licence) == ("diff", source, "MIT")
-        assert dataset.imported is not None
         assert dataset.imported.options == {"name": "diff", "source": source}
         assert Path("data/diff/LICENSE").read_text(encoding="utf-8") == LICENCE
         assert command("check", "data/diff").returncode == 0
@@ -204,7 +203,6 @@ class TestKnownRecording:
         assert command("fetch", "corelli").returncode == 0
         dataset = load_dataset("data/corelli")
         assert (dataset.robot.name, dataset.licence) == ("corelli", "Apache-2.0")
-        assert dataset.imported is not None
         assert dataset.imported.options["steering_scale"] == 0.1
 
 

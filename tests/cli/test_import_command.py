@@ -155,7 +155,6 @@ def test_a_data_set_keeps_what_was_typed_and_import_ends_with_what_came_out(comm
     done = command("import", "csv", filled_in, "-o", data, "--set", "longest_gap=2")
     assert done.returncode == 0
     imported = load_dataset(data).imported
-    assert imported is not None
     assert (imported.importer, imported.source, imported.options) == ("csv", str(filled_in), {"longest_gap": 2})
     ended = done.stderr.splitlines()
     assert ended[-3].startswith("check: data ")
@@ -274,7 +273,6 @@ def test_the_picture_of_paths_leaves_runs_without_poses_out(tmp_path: Path) -> N
     models = [(DESIGN_ITEM, OdometryModel.of_design(posed.robot, "arc"))] * 2
     bare = [replace(run, id=f"tape-{run.id}") for run in tape.trajectories]
     grid = paths_before_after([*posed.trajectories, *bare], models, "held-out")
-    assert grid is not None
     assert any(figure.title.startswith("Ends of all 6 held-out runs") for figure in grid.figures)
     assert paths_before_after(bare, models, "held-out") is None
 

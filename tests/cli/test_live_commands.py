@@ -226,7 +226,6 @@ def test_a_robot_of_a_fleet_cannot_write_for_another(command: InProcess, workpla
         written_for_another = omnibench("replay", workplace / "data", "--robot", "apr03", *settings, "--set", "wait=0")
         assert "Traceback" not in written_for_another.stderr
         with Command("listen", "--config", tmp_path / "live_fleet.yaml", "--json") as listener:
-            assert listener.process.stdout is not None
             states: dict[str, str] = {}
             while len(states) < 2:
                 news = json.loads(listener.process.stdout.readline())
@@ -285,6 +284,4 @@ def wait_for(address: str) -> zenoh.Session:
 
 def ask(session: zenoh.Session, key: str) -> dict[str, object]:
     (reply,) = list(session.get(key, timeout=PATIENCE))
-    assert reply.ok is not None
-    answer: dict[str, object] = json.loads(reply.ok.payload.to_bytes())
-    return answer
+    return json.loads(reply.ok.payload.to_bytes())

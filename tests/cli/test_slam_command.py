@@ -89,15 +89,12 @@ def document(driven: Driven, tmp_path_factory: pytest.TempPathFactory) -> dict[s
     folder = tmp_path_factory.mktemp("json")
     run = run_here("slam", driven.data, "--json", "--truth", driven.truth, cwd=folder)
     assert not list(folder.iterdir())
-    content: dict[str, Any] = json.loads(run.stdout)
-    return content
+    return json.loads(run.stdout)
 
 
 def test_the_poses_are_those_of_the_truth_and_the_rest_is_as_it_was(found: Found, driven: Driven) -> None:
     assert found.run.returncode == 0, found.run.stderr
     before, after = load_dataset(driven.data), load_dataset(found.data)
-    assert before.scans is not None
-    assert after.scans is not None
     assert (after.name, after.simulated, after.scans.scanner) == ("driven", True, before.scans.scanner)
     true = pl.read_parquet(driven.truth / "poses.parquet")
     for old, new in zip(before.trajectories, after.trajectories, strict=True):
@@ -150,7 +147,6 @@ def test_a_calibration_can_give_the_odometry(command: Command, driven: Driven, f
     run = command("slam", driven.data, "-o", "second", "--model", "calibration.yaml")
     assert run.returncode == 0, run.stderr
     apart = distances(load_dataset(found.data), load_dataset("second"))
-    assert apart is not None
     assert apart.position_p95_m < 0.001
 
 
@@ -228,7 +224,6 @@ def _placed(argument: str, places: dict[str, Path]) -> str:
 def places(driven: Driven, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Data sets with one thing wrong in each, and other things that are none."""
     folder, data = tmp_path_factory.mktemp("places"), load_dataset(driven.data)
-    assert data.scans is not None
     places = {name: folder / name.lower() for name in ("BARE", "PART", "EMPTY", "OTHER", "PLUGINS")}
     save_dataset(replace(data, scans=None), places["BARE"])
     one = ScansInMemory(data.scans.scanner, {"01": data.scans.of("01")})
@@ -249,14 +244,12 @@ def places(driven: Driven, tmp_path_factory: pytest.TempPathFactory) -> dict[str
 def first_scans(driven: Driven) -> TrajectoryScans:
     """The scans of the first run that was driven."""
     data = load_dataset(driven.data)
-    assert data.scans is not None
     return data.scans.of(data.trajectories[0].id)
 
 
 def save_runs(driven: Driven, folder: Path, scans: dict[str, TrajectoryScans]) -> None:
     """Save the first run that was driven once under each name, with these scans."""
     data = load_dataset(driven.data)
-    assert data.scans is not None
     runs = tuple(replace(data.trajectories[0], id=name) for name in scans)
     save_dataset(replace(data, trajectories=runs, scans=ScansInMemory(data.scans.scanner, scans)), folder)
 
@@ -275,7 +268,6 @@ def test_after_ctrl_c_the_command_goes_on(
         stderr=subprocess.PIPE,
         text=True,
     )
-    assert process.stderr is not None
     while not (kept := len(list((tmp_path / "found.slam-paths").glob("*.json")))):
         assert process.poll() is None
         time.sleep(0.01)
@@ -333,7 +325,6 @@ def test_inspect_says_what_scans_there_are(command: Command, driven: Driven) -> 
     assert "540 rays over 270 deg up to 30 m, of which 100% measured something" in run.stdout
     document = json.loads(command("inspect", driven.data, "--json").stdout)["scans"]
     scans = load_dataset(driven.data).scans
-    assert scans is not None
     assert document["scans"] == sum(len(scans.times(name)) for name in scans.trajectories)
     assert (document["trajectories"], document["rays"]) == (3, 540)
     assert 0.2 <= document["scan_period_s"] <= 0.3

@@ -181,7 +181,6 @@ def kills_its_worker(order: tuple[Path, int], _: Reporter) -> Answer:
     count = tried(folder, "kills")
     if count <= times:
         parent = parent_process()
-        assert parent is not None
         os.kill(parent.pid, signal.SIGKILL)
         time.sleep(60)
     return Answer(count)

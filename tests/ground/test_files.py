@@ -109,7 +109,6 @@ def test_a_folder_of_results_is_free_again_when_the_process_that_wrote_there_is_
         "with results_locked(Path(sys.argv[1])):\n    print(flush=True)\n    time.sleep(600)"
     )
     with subprocess.Popen([sys.executable, "-c", writes, str(folder)], stdout=subprocess.PIPE) as process:
-        assert process.stdout is not None
         process.stdout.readline()
         refusal = f"^{folder}: another omnibench is writing results there; name another folder"
         with pytest.raises(DataError, match=refusal), results_locked(folder):

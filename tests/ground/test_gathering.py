@@ -122,7 +122,6 @@ class TestStore:
         store = ResultStore(tmp_path, Table)
         store.put("key", Table(values))
         table = store.get("key")
-        assert table is not None
         assert table.values.tobytes() == values.tobytes()
         assert table.empty is None
 

@@ -113,7 +113,6 @@ def asked(session: zenoh.Session, selector: str, payload: str | bytes | None = N
     until(answered, f"an answer to {selector}")
     (reply,) = replies
     answer = reply.ok if reply.ok is not None else reply.err
-    assert answer is not None
     return json.loads(answer.payload.to_bytes())
 
 

@@ -51,7 +51,6 @@ def frozen_subscriber(endpoint: str) -> Iterator[None]:
     """Another process that subscribes to all of the robot and reads nothing."""
     frozen = subprocess.Popen([sys.executable, "-c", _FROZEN, endpoint], stdout=subprocess.PIPE, text=True)
     try:
-        assert frozen.stdout is not None
         assert frozen.stdout.readline() == "subscribed\n"
         os.kill(frozen.pid, signal.SIGSTOP)
         yield

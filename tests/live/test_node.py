@@ -135,7 +135,6 @@ def test_ros_2_finds_topics_under_its_own_keys(tmp_path: Path, profile: str) -> 
         sent(wheels, path.samples())
         until(lambda: len(heard) == 11, "the odometry")
         attachment = heard[1].attachment
-        assert attachment is not None
         content = attachment.to_bytes()
         assert len(content) == 33
         assert int.from_bytes(content[:8], "little") == 2  # counted from 1
@@ -276,8 +275,6 @@ def recorded(file: Path) -> dict[str, int]:
     """Messages in a complete recording, by ROS topic."""
     with file.open("rb") as stream:
         summary = make_reader(stream).get_summary()
-    assert summary is not None
-    assert summary.statistics is not None
     counts = summary.statistics.channel_message_counts
     return {channel.topic: counts[number] for number, channel in summary.channels.items()}
 

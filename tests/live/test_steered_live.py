@@ -53,7 +53,6 @@ def centre_of(tracked: Array) -> Array:
 
 def retracked(one: Calibration, robot: Robot) -> Array:
     """The matrix by which another point of a robot, its tracked one or the centre, moves as in a calibration."""
-    assert one.robot.mount is not None
     centred: Array = np.linalg.inv(one.robot.mount.twist) @ one.matrix_array
     return centred if robot.mount is None else robot.mount.twist @ centred
 
@@ -156,7 +155,6 @@ class TestRestarts:
         before = fed(first, path.payloads()[:51])
         first.close()
         saved = RobotMemory(tmp_path, "base").load()
-        assert saved is not None
         second = RobotTracker("base", path.using)
         second.resume(saved, 0.5, saved.wall)
         found = odometry(before + fed(second, path.payloads()[51:], 0.51))
@@ -273,7 +271,6 @@ class TestCentre:
             if number % 25 == 20:
                 seen = slam(path.samples()[number].stamp, tracked[number - behind], 1e-2 * EXACT)
                 robot.take_pose(seen, PERIOD * number)
-        assert updates[-1].in_map is not None
         np.testing.assert_allclose(updates[-1].in_map[0], centre_of(tracked[-1]), atol=1e-6)
         assert robot.counts.anomalies() == {}
 
@@ -313,7 +310,6 @@ def test_every_run_of_a_drive_with_pauses_is_driven_as_it_was_alone() -> None:
 def test_a_run_that_is_cut_at_its_last_pose_steers_as_it_did() -> None:
     using = calibration()
     drive = concatenate_recording(recording(using=using, runs=1, pose_every=13))
-    assert drive.steering is not None
     assert len(drive.steering) == len(drive.wheel_times) == 40
     (poses,) = using.model.poses([drive.log(drive.slam_times)])
     np.testing.assert_allclose(poses, drive.slam_poses, atol=1e-12)
@@ -324,8 +320,6 @@ def test_messages_hold_the_steering_angles_whatever_they_hold_of_the_wheels(use:
     drive = concatenate_recording(recording())
     for row, message in enumerate(played(drive, wheels={"use": use})):
         assert message.names == ("fl", "fr", "rl", "rr", *(f"{each}_steering" for each in ("fl", "fr", "rl", "rr")))
-        assert drive.steering is not None
-        assert message.positions is not None
         np.testing.assert_array_equal(message.positions[4:], drive.steering[row])
         velocities = np.full(8, math.nan) if message.velocities is None else message.velocities
         assert tuple(int(np.isfinite(each[:4]).all()) for each in (message.positions, velocities)) == told
@@ -380,7 +374,6 @@ def test_a_replay_shows_the_batch_odometry_of_the_tracked_point_and_is_recorded(
     shown = demonstrate(made, recording(using=using))
     assert shown.batch_difference < 1e-12
     assert shown.calibrated.final_position < 1e-9 < 1e-4 < shown.theoretical.final_position
-    assert shown.fused is not None
     assert shown.fused.final_position < 0.05
     assert len(messages_of(tmp_path / "run.mcap")["/base/joint_states"]) == shown.report.sent["joint_states"]
 
@@ -400,7 +393,6 @@ def test_a_replay_counts_every_turn_by_which_the_odometry_is_off(tmp_path: Path)
     assert shown.theoretical.heading == pytest.approx(float(np.sqrt(np.mean((0.6 * headings) ** 2))), rel=1e-6)
     assert shown.calibrated.heading < 1e-9
     assert shown.batch_difference < 1e-9
-    assert shown.fused is not None
     assert shown.fused.heading < 0.05
 
 

@@ -93,7 +93,6 @@ def test_the_costs_of_the_file_are_those_that_evaluate_finds(tmp_path: Path) -> 
     calibration = fitted().calibration
     write_calibration(calibration, tmp_path / "c.yaml")
     found = evaluate(read_calibration(tmp_path / "c.yaml"), dataset())
-    assert calibration.provenance is not None
     assert calibration.provenance.training_cost == pytest.approx(found.splits["train"].cost, rel=1e-12)
     assert calibration.provenance.validation_cost == pytest.approx(found.splits["validation"].cost, rel=1e-12)
     assert fitted().result.cost == pytest.approx(found.splits["train"].cost, rel=1e-12)

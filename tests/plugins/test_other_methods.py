@@ -111,8 +111,7 @@ def test_derivatives_are_those_of_finite_differences(name: str, integration: Int
     at = geometry.start + 1e-3
 
     def cost(parameters: Array) -> float:
-        value: float = segments.cost(geometry.matrix(parameters)[0])[0]
-        return value
+        return segments.cost(geometry.matrix(parameters)[0])[0]
 
     matrix, slopes = geometry.matrix(at)
     derivatives = np.tensordot(slopes, segments.cost(matrix)[1], 2)

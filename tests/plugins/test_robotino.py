@@ -45,9 +45,6 @@ class TestRecordings:
 
     def test_set_speeds_obey_the_wheel_equation_of_the_design(self, robotino: Dataset) -> None:
         for run in robotino.trajectories:
-            assert run.targets is not None
-            assert run.v is not None
-            assert run.alpha is not None
             twist = run.v * np.cos(run.alpha), run.v * np.sin(run.alpha), 0.0
             expected = wheel_equations(robotino.robot.wheels) @ twist
             np.testing.assert_allclose(np.median(run.targets, axis=0), expected, atol=1e-4)

@@ -419,8 +419,7 @@ def mirrored(run: Run) -> Run:
 
 
 def since_start(headings: Array) -> Array:
-    turned: Array = headings - headings[0]
-    return turned
+    return headings - headings[0]
 
 
 ROUND = [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -435,76 +436,42 @@ class GoodCost(SumOfNorms):
     """The norm of Eq. (6)."""
 
 
-class ScalarCost(GoodCost):
-    """One number for all candidates."""
-
-    def combine(self, errors: Array, trajectory: Array) -> Any:
-        return super().combine(errors, trajectory).mean()
+def costing(combine: Callable[[Cost, Array, Array], Any]) -> type[Cost]:
+    return type("FaultyCost", (GoodCost,), {"__doc__": "Faulty.", "combine": combine})
 
 
-class NegativeCost(GoodCost):
-    """A logarithm."""
-
-    def combine(self, errors: Array, trajectory: Array) -> Array:
-        return np.log(super().combine(errors, trajectory) + 1e-300)
+norms = GoodCost.combine
 
 
-class OffsetCost(GoodCost):
-    """Something for nothing."""
-
-    def combine(self, errors: Array, trajectory: Array) -> Array:
-        return super().combine(errors, trajectory) + 1
-
-
-class FreeCost(GoodCost):
-    """Nothing for anything."""
-
-    weights = (0.0, 0.0, 0.0)
+def raises_on_nan(cost: Cost, errors: Array, trajectory: Array) -> Any:
+    if np.isnan(errors).any():
+        raise ValueError("NaN")
+    return norms(cost, errors, trajectory)
 
 
-class IgnoresNan(GoodCost):
-    """Leaves out what it cannot add."""
-
-    def combine(self, errors: Array, trajectory: Array) -> Array:
-        return super().combine(np.nan_to_num(errors), trajectory)
+def relative_to_the_worst(*arguments: Any) -> Any:
+    values = norms(*arguments)
+    return values / max(values.max(), 1e-300)
 
 
-class RaisesOnNan(GoodCost):
-    """Insists."""
-
-    def combine(self, errors: Array, trajectory: Array) -> Array:
-        if np.isnan(errors).any():
-            raise ValueError("NaN")
-        return super().combine(errors, trajectory)
+def squares_in_place(cost: Cost, errors: Array, trajectory: Array) -> Any:
+    errors *= errors
+    return np.sqrt(errors.sum(axis=-1)) @ cost.shares(trajectory)
 
 
-class RelativeCost(GoodCost):
-    """Relative to the worst of the batch."""
-
-    def combine(self, errors: Array, trajectory: Array) -> Array:
-        values = super().combine(errors, trajectory)
-        return values / max(values.max(), 1e-300)
-
-
-class InPlaceCost(GoodCost):
-    """Squares where it stands."""
-
-    def combine(self, errors: Array, trajectory: Array) -> Array:
-        errors *= errors
-        return np.sqrt(errors.sum(axis=-1)) @ self.shares(trajectory)
-
-
+OFFSET, RELATIVE = costing(lambda *arguments: norms(*arguments) + 1), costing(relative_to_the_worst)
+NAN_STAYS = "nan stays with its candidate"
 CASES_OF_COSTS = [
-    (ScalarCost, "every candidate has one cost", "shape ()"),
-    (NegativeCost, "costs are finite and not negative", "negative"),
-    (OffsetCost, "no error costs nothing", "errors of zero cost 1"),
-    (OffsetCost, "exact recordings cost nothing", "the true matrix costs 1"),
-    (FreeCost, "errors cost something", "cost nothing"),
-    (IgnoresNan, "nan stays with its candidate", "they must cost NaN"),
-    (RaisesOnNan, "nan stays with its candidate", "ValueError: NaN"),
-    (RelativeCost, "costs do not depend on the batch", "depends on the others"),
-    (RelativeCost, "nan stays with its candidate", "spoils another's cost"),
-    (InPlaceCost, "inputs are left unchanged", "combine changed its arguments"),
+    (costing(lambda *arguments: norms(*arguments).mean()), "every candidate has one cost", "shape ()"),
+    (costing(lambda *arguments: np.log(norms(*arguments) + 1e-300)), "costs are finite and not negative", "negative"),
+    (OFFSET, "no error costs nothing", "errors of zero cost 1"),
+    (OFFSET, "exact recordings cost nothing", "the true matrix costs 1"),
+    (type("FreeCost", (GoodCost,), {"weights": (0.0, 0.0, 0.0)}), "errors cost something", "cost nothing"),
+    (costing(lambda cost, errors, run: norms(cost, np.nan_to_num(errors), run)), NAN_STAYS, "they must cost NaN"),
+    (costing(raises_on_nan), NAN_STAYS, "ValueError: NaN"),
+    (RELATIVE, "costs do not depend on the batch", "depends on the others"),
+    (RELATIVE, NAN_STAYS, "spoils another's cost"),
+    (costing(squares_in_place), "inputs are left unchanged", "combine changed its arguments"),
 ]
 
 

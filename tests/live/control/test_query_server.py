@@ -178,7 +178,6 @@ def test_a_flood_of_questions_gets_its_share_and_others_get_answers_meanwhile(tm
         )
         session = raw_session("client", connect=[endpoint])
         try:
-            assert flooder.stdout is not None
             assert flooder.stdout.readline() == "answered\n"
             until(lambda: "requests refused so far" in node.said(), "so many questions that some are refused")
             for _ in range(30):

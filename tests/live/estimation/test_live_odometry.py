@@ -227,7 +227,6 @@ class TestAgreesWithTheBatch:
         robot.take_pose(slam(ORIGIN, [0.0, 0.0, 0.0]), 0.0)
         updates = fed(robot, path.payloads()[1:])
         for update in updates:
-            assert update.in_map is not None
             np.testing.assert_allclose(update.in_map[0], update.pose, atol=1e-9)
 
     def test_the_covariance_of_the_matrix_is_used_though_that_of_effects_follows_it(self) -> None:
@@ -347,7 +346,6 @@ class TestSessions:
         fed(first, path.payloads()[:201])
         first.close()
         saved = RobotMemory(tmp_path, "apr").load()
-        assert saved is not None
         assert saved.session_time == pytest.approx(2.0)
         second = RobotTracker("apr", using)
         second.resume(saved, 0.0, saved.wall)

@@ -261,7 +261,6 @@ class TestMutualTls:
             settings.insert_json5(f"transport/link/tls/{side}_certificate", json.dumps(str(keys / "apr02.pem")))
             settings.insert_json5(f"transport/link/tls/{side}_private_key", json.dumps(str(keys / "apr02.key")))
         victim = member(fleet, keys, "apr03").model_copy(update={"connect": (config["listen"],)})
-        assert victim.tls is not None
         with zenoh.open(settings):
             for verify_name in (True, False):
                 tls = victim.tls.model_copy(update={"verify_name": verify_name})
@@ -328,7 +327,6 @@ def test_zenohs_log_names_who_was_refused_what_if_the_guides_line_asks_for_it(
     keys: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, asked: bool
 ) -> None:
     line = re.search(r"RUST_LOG=(\S+)", find_topic("live").text)
-    assert line is not None
     monkeypatch.setitem(ENVIRONMENT, "RUST_LOG", line[1] if asked else "off")  # here Zenoh would log for ever
     config = mutual(keys)
     with Command("live", write_node(tmp_path, *ROBOTS, zenoh=config)) as node:

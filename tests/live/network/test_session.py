@@ -261,8 +261,6 @@ def test_paths_start_from_the_config_files_folder_and_no_password_is_written_out
     given = {"tls": files, "users_file": "users.txt", "user": {"name": "me", "password_file": "me.password"}}
     (tmp_path / "session.yaml").write_text(json.dumps(given))
     there = read_model(SessionConfig, tmp_path / "session.yaml")
-    assert there.tls is not None
-    assert there.user is not None
     assert (there.tls.ca, there.tls.certificate) == (tmp_path / "keys/ca.pem", Path("/etc/node.pem"))
     assert (there.users_file, there.user.password_file) == (tmp_path / "users.txt", tmp_path / "me.password")
     assert "tops3cret" not in to_yaml(config(user={"name": "me", "password": "tops3cret"}))

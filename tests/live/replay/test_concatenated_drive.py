@@ -106,10 +106,8 @@ class TestPoses:
             for run, half in zip(plain, halves, strict=True)
         ]
         drive = concatenate_runs(make_dataset("covariances", ROBOT, PERIOD, runs))
-        assert drive.slam_covariances is not None
         last = runs[2]
         turn = homogeneous(np.array([0.0, 0.0, drive.start_poses[2, 2] - last.poses[0, 2]]))
-        assert last.pose_covariances is not None
         expected = turn @ last.pose_covariances[1:] @ turn.T
         np.testing.assert_allclose(drive.slam_covariances[drive.slam_run == 2], expected, atol=1e-12)
         mixed = make_dataset("mixed", ROBOT, PERIOD, [*runs[:2], plain[2]])
@@ -156,7 +154,6 @@ class TestWheels:
             runs.append(replace(run, angles=5.0 + tick * np.round(driven / tick)))
         drive = concatenate_runs(make_dataset("ticks", ROBOT, PERIOD, runs), pause=0.0)
         for index, run in enumerate(runs):
-            assert run.angles is not None
             found = drive.angles[drive.run == index][-len(run.times) :]
             np.testing.assert_allclose(np.diff(found, axis=0), np.diff(run.angles, axis=0), atol=1e-12)
 
@@ -272,7 +269,6 @@ class TestTruth:
     def test_with_true_start_poses_the_truth_is_what_the_robots_own_matrix_drives(self) -> None:
         recording = simulated_recording(EncoderNoise(bias_position=0.1, bias_heading=0.1))
         drive = concatenate_recording(recording)  # without noise of the encoders their rates are the targets
-        assert recording.truth is not None
         model = OdometryModel(ROBOT, np.array(recording.truth.matrix), recording.truth.integration)
         (poses,) = model.poses([drive.log()])
         np.testing.assert_allclose(concatenated_truth(drive, recording), poses, atol=1e-9)
@@ -292,10 +288,8 @@ class TestTruth:
         recording = simulated_recording(EncoderNoise(bias_position=0.1, bias_heading=0.1))
         drive = concatenate_runs(recording.dataset, pause=0.0)
         truth = concatenated_truth(drive, recording)
-        assert recording.truth is not None
         model = OdometryModel(ROBOT, np.array(recording.truth.matrix), recording.truth.integration)
         for index, run in enumerate(recording.dataset.trajectories):
-            assert run.targets is not None
             log = WheelLog(run.times, run.targets, drive.start_poses[index], run.times)
             found = truth[drive.run == index][-len(run.times) :]
             np.testing.assert_allclose(found, model.poses([log])[0], atol=1e-9)

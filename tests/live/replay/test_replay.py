@@ -390,7 +390,6 @@ class TestStopping:
 
     def test_it_stops_at_once_at_ctrl_c(self, loopback: Loopback, node: Listener) -> None:
         main = threading.main_thread().ident
-        assert main is not None
 
         def interrupt_once_it_plays() -> None:
             until(lambda: node.count > 3, "a few messages")

@@ -116,8 +116,7 @@ def network() -> Iterator[Loopback]:
 
 @pytest.fixture(scope="module", params=PROFILES)
 def profile(request: pytest.FixtureRequest) -> Profile:
-    found: Profile = request.param
-    return found
+    return request.param
 
 
 @pytest.fixture(scope="module")
@@ -212,8 +211,7 @@ def type_hash(topic: str) -> str:
     """As zenoh-ros2-sdk computes it."""
     utils = pytest.importorskip("zenoh_ros2_sdk.utils")
     own, within = definitions(topic)
-    found: str = utils.get_type_hash(TOPICS[topic].name, own, within)
-    return found
+    return utils.get_type_hash(TOPICS[topic].name, own, within)
 
 
 @pytest.mark.usefixtures("rmw_node")
@@ -281,7 +279,6 @@ def test_each_message_says_who_sent_it_when_and_which_one_it_is(
         for _ in range(2):
             rmw_node[topic].put(sample(topic))
             attachment = next_sample().attachment
-            assert attachment is not None
             attachments.append(package.Attachment.from_bytes(attachment.to_bytes()))
     first, second = attachments
     assert second.sequence_id == first.sequence_id + 1
