@@ -12,7 +12,7 @@ import pytest
 import typer
 from commands import Command, Prepared, flower, run_here, write_config
 from shared_results import made_once, shared_folder
-from typed_commands import parse
+from typed_pages import parse
 
 from omnibench.cli.app import FAMILIES, app
 from omnibench.cli.examples import bundled_folder

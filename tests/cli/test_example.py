@@ -12,7 +12,7 @@ import yaml
 from commands import CONFIGS, Command, assert_refused
 from real_recordings import OPTIODOM
 from rich.console import Console
-from typed_commands import parse
+from typed_pages import parse
 
 import omnibench
 from omnibench.cli import examples

@@ -14,7 +14,7 @@ from commands import ROOT, Command, Prepared, assert_refused
 from newcomer import ELSEWHERE, lines_of, typed_here
 from newcomer import PAGES as TYPED_PAGES
 from pydantic import TypeAdapter
-from typed_commands import commands_in, parse
+from typed_pages import commands_in, parse
 
 import omnibench
 from omnibench.cli.handbook_topics import HANDBOOK, topics

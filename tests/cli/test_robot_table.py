@@ -18,12 +18,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from announced_robot import AnnouncedRobot
 from commands import COMMAND, ENVIRONMENT, omnibench
 from mcap.reader import make_reader
-from mcap_recordings import disk_with_room_for, messages_of, publishers
 from rich.console import Console
-from samples import odometry, sample
+from samples import AnnouncedRobot, disk_with_room_for, messages_of, odometry, publishers, sample
 from sessions import Loopback, until
 from timing import PATIENCE
 

@@ -5,11 +5,15 @@ from __future__ import annotations
 import gc
 import json
 import math
+import os
+import signal
 import socket
 import sys
+import threading
 import time
 from contextlib import closing
 from importlib.util import find_spec
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +22,7 @@ import pytest
 import zenoh
 from drives import SECOND, drive, slam
 from mcap.reader import make_reader
-from nodes import asked, config_of, running, sent, sent_one_by_one, wheels_of
-from received_messages import ReceivedMessages
+from nodes import ReceivedMessages, asked, config_of, running, sent, sent_one_by_one, wheels_of
 from recordings import random_dataset
 from sessions import free_port, until
 from timing import PATIENCE
@@ -31,7 +34,7 @@ from omnibench.live.network.presence import alive_robots
 from omnibench.live.node import LiveNode
 from omnibench.live.replay.concatenated_drive import ReplayConfig, concatenate_runs
 from omnibench.live.replay.replay_player import Player
-from omnibench.live.stopping import RateLimiter
+from omnibench.live.stopping import RateLimiter, stop_on_signals, ticks
 from omnibench.live.wire.messages import DIAGNOSTICS, JOINT_STATE, ODOMETRY, TRANSFORMS, Odometry, packed
 from omnibench.live.wire.recorder import Recorder
 from omnibench.live.wire.topics import TOPICS, GraphNode, KeySpace
@@ -445,3 +448,43 @@ def test_messages_that_wait_are_bounded(tmp_path: Path, payload: bytes, sent: in
         until(lambda: node.health("apr").counts[counter] == sent - overflow, "the messages that had")
         wheels.put(JOINT_STATE.encode(drive(1.0).samples()[0]))  # and there is room again
         until(lambda: node.health("apr").counts["samples"] == 1, "a sample")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_sets_the_event_and_acts_as_before_when_it_is_over(number: signal.Signals) -> None:
+    before = signal.getsignal(number)
+    with stop_on_signals() as stop:
+        os.kill(os.getpid(), number)
+        assert stop.wait(PATIENCE)
+    assert signal.getsignal(number) == before
+
+
+def interrupted_twice() -> None:
+    with stop_on_signals() as stop:
+        os.kill(os.getpid(), signal.SIGINT)
+        assert stop.wait(PATIENCE)
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(60)
+
+
+def test_a_second_ctrl_c_interrupts() -> None:
+    with pytest.raises(KeyboardInterrupt):
+        interrupted_twice()
+
+
+def test_ticks_come_at_once_and_then_every_period_until_the_time_is_over() -> None:
+    began = time.monotonic()
+    passed = list(ticks(threading.Event(), 0.1, 0.35))
+    assert passed[0] == 0.0
+    assert 1 <= len(passed) <= 4  # fewer when the machine is busy
+    assert all(later - earlier >= 0.1 for earlier, later in pairwise(passed))
+    assert passed[-1] < 0.35 <= time.monotonic() - began
+
+
+def test_ticks_end_when_stopped() -> None:
+    stop, seen = threading.Event(), []
+    for passed in ticks(stop, 0.01):
+        seen.append(passed)
+        if len(seen) == 3:
+            stop.set()
+    assert len(seen) == 3

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 import zenoh
 from drives import EXACT, ORIGIN, PERIOD, fed, odometry, slam
-from mcap_recordings import messages_of
-from nodes import asked, config_of, running, sent_one_by_one, wheels_of
-from received_messages import ReceivedMessages
+from nodes import ReceivedMessages, asked, config_of, running, sent_one_by_one, wheels_of
+from samples import messages_of
 from steered import CAR, DIFFERENTIAL, SKID, SWERVE, TRICYCLE, calibration, drive, only, recording
 
 from omnibench.config import validate

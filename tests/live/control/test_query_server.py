@@ -16,8 +16,19 @@ import numpy as np
 import pytest
 import zenoh
 from drives import ORIGIN, SECOND, calibration, drive
-from nodes import Command, as_text, asked, config_of, peak_memory, running, sent, sent_one_by_one, wheels_of, write_node
-from received_messages import ReceivedMessages
+from nodes import (
+    Command,
+    ReceivedMessages,
+    as_text,
+    asked,
+    config_of,
+    peak_memory,
+    running,
+    sent,
+    sent_one_by_one,
+    wheels_of,
+    write_node,
+)
 from sessions import Loopback, free_port, raw_session, until
 from timing import PATIENCE
 

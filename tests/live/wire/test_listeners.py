@@ -22,11 +22,20 @@ from typing import Any
 import numpy as np
 import pytest
 import zenoh
-from announced_robot import AnnouncedRobot
 from mcap.reader import make_reader
-from mcap_recordings import disk_with_room_for, messages_of, publishers, wait_for_subscribers
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from samples import COVARIANCE, PERIOD, STAMP, odometry, sample
+from samples import (
+    COVARIANCE,
+    PERIOD,
+    STAMP,
+    AnnouncedRobot,
+    disk_with_room_for,
+    messages_of,
+    odometry,
+    publishers,
+    sample,
+    wait_for_subscribers,
+)
 from sessions import Loopback, free_port, until
 from timing import PATIENCE
 
