@@ -8,7 +8,6 @@ import re
 import shutil
 import signal
 import subprocess
-from collections.abc import Callable
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
@@ -186,47 +185,34 @@ def test_ctrl_c_leaves_nothing_half_written(data: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "results").exists()
 
 
-def printed(found: Discovery, width: int = 80) -> str:
-    console = Console(file=StringIO(), width=width, markup=False, emoji=False, highlight=False)
-    print_discovery(console, found, Path("results/flower/now"))
-    return console.file.getvalue()
+def in_doubt() -> Discovery:
+    doubtful = replace(named().effects[0], confusable_with=("load_transfer",), in_doubt="few turns")
+    return replace(named(), verdict="class", effects=(doubtful,))
 
 
-@pytest.mark.parametrize("make", [named, nothing, nameless, incomplete])
-def test_eighty_columns_are_enough_and_nothing_is_cut(make: Callable[[], Discovery]) -> None:
-    told = printed(make())
-    assert max(len(line.rstrip()) for line in told.splitlines()) <= 80
-    assert "…" not in told
+def many_notes() -> Discovery:
+    return replace(nothing(), notes=tuple(f"note {n}" for n in range(9)))
 
 
-def test_verdict_effect_places_gap_and_files_are_told_on_a_screen() -> None:
-    told = printed(named())
-    assert len(told.splitlines()) < 60
-    assert "flower (simulated data): 36 training runs" in told
-    assert "verdict: named" in told
-    assert re.search(r"rotation_translation_coupling \(body\), weight 9[5-9]\.\d %", told)
-    assert "held-out session: 36 runs" in told
-    assert "results/flower/now/report.html" in told
-    assert "results/flower/now/model.yaml" in told
+DRIVE = ("acceleration_slip", "turning left on the spot at 1 rad/s 12.5 4", "Drive 4 runs, 1.8 minutes")
+LEFT_OVER = ("wheel rate (2 × 10⁻¹¹)", "warning: not driven in training: v0.4_a90_w1", "experiment-1.yaml")
+SHOWN: dict[Callable[[], Discovery], tuple[str, ...]] = {
+    named: ("(simulated data): 36 training runs", "verdict: named", "held-out session: 36 runs", "now/model.yaml"),
+    nameless: ("verdict: unknown",),
+    incomplete: DRIVE + LEFT_OVER,
+    in_doubt: ("load_transfer", "few turns"),
+    many_notes: ("verdict: none", "- note 2 6 more notes", "report: results/flower/now/report.html"),
+}
 
 
-@pytest.mark.parametrize(
-    ("make", "parts"),
-    [
-        (lambda: replace(named(), verdict="class", effects=(DOUBTFUL,)), ("load_transfer", "few turns")),
-        (incomplete, ("acceleration_slip", "turning left on the spot at 1 rad/s 12.5 4", "Drive 4 runs, 1.8 minutes")),
-        (incomplete, ("wheel rate (2 × 10⁻¹¹)", "warning: not driven in training: v0.4_a90_w1", "experiment-1.yaml")),
-        (lambda: replace(nothing(), notes=tuple(f"note {n}" for n in range(9))), ("- note 2", "6 more notes")),
-    ],
-    ids=["doubts", "what to drive", "left over", "many notes"],
-)
-def test_what_is_in_doubt_left_over_and_to_be_driven_is_told(
-    make: Callable[[], Discovery], parts: tuple[str, ...]
-) -> None:
-    told = " ".join(printed(make()).split())
-    for part in parts:
-        assert part in told
-    assert "- note 3" not in told
-
-
-DOUBTFUL = replace(named().effects[0], confusable_with=("load_transfer",), in_doubt="few turns")
+@pytest.mark.parametrize("make", SHOWN)
+def test_what_is_found_is_told_on_a_screen_of_eighty_columns(make: Callable[[], Discovery]) -> None:
+    console = Console(file=StringIO(), width=80, markup=False, emoji=False, highlight=False)
+    print_discovery(console, make(), Path("results/flower/now"))
+    lines = console.file.getvalue().splitlines()
+    assert max(len(line.rstrip()) for line in lines) <= 80
+    text = " ".join(" ".join(lines).split())
+    assert "…" not in text
+    for part in SHOWN[make]:
+        assert part in text
+    assert make != named or re.search(r"rotation_translation_coupling \(body\), weight 9[5-9]\.\d %", text)

@@ -15,11 +15,10 @@ import zenoh
 from commands import CONFIGS, assert_refused, flower, omnibench, prepare, write_config
 from commands import Command as InProcess
 from drives import calibration
-from nodes import Command, write_node
-from sessions import Loopback, free_port, raw_session, until
-from timing import PATIENCE, load
+from nodes import Command, asked, connected, write_node
+from sessions import Loopback, free_port, until
+from timing import load
 
-import omnibench as package
 from omnibench.data.storage import load_dataset
 from omnibench.live.wire.messages import JOINT_STATE, ODOMETRY, JointState
 from omnibench.robot.calibration import read_calibration, write_calibration
@@ -43,6 +42,11 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def endpoint(config: Path) -> str:
     return str(yaml.safe_load(config.read_text())["zenoh"]["listen"])
+
+
+def client_of(config: Path) -> zenoh.Session:
+    """A client of a node, once it is up."""
+    return connected(int(endpoint(config).rpartition(":")[2]))
 
 
 @pytest.mark.parametrize("loops", [0, pytest.param(2, marks=pytest.mark.slow)])
@@ -79,7 +83,7 @@ def test_a_replay_can_name_another_recording_and_without_samples_shows_no_errors
 def test_a_demonstration_to_which_another_sender_writes_is_one_line_and_no_table(workplace: Path) -> None:
     config = workplace / "node.yaml"
     with Command("live", config, "--replay", "--speed", "20") as demonstration:
-        session = wait_for(endpoint(config))
+        session = client_of(config)
         wheels, came = session.declare_publisher("apr/joint_states"), list[zenoh.Sample]()
         _subscriber = session.declare_subscriber("apr/odom", came.append)
         until(lambda: came and wheels.matching_status.matching, "odometry of the replay")
@@ -100,7 +104,7 @@ def test_a_demonstration_to_which_another_sender_writes_is_one_line_and_no_table
 def test_ctrl_c_ends_a_replay_with_what_it_has_shown(workplace: Path) -> None:
     config = workplace / "node.yaml"
     with Command("live", config, "--replay", "--speed", "1") as demonstration:
-        session, samples = wait_for(endpoint(config)), list[zenoh.Sample]()
+        session, samples = client_of(config), list[zenoh.Sample]()
         _subscriber = session.declare_subscriber("apr/odom", samples.append)
         until(lambda: samples, "odometry of the replay")
         session.close()
@@ -134,7 +138,7 @@ def test_a_recording_goes_out_and_comes_back_as_a_calibration_that_is_swapped_in
     """record -> import -> calibrate -> swap, with the real commands."""
     config, mcap = workplace / "node.yaml", workplace / "drive.mcap"
     with Command("live", config) as node:
-        session = wait_for(endpoint(config))
+        session = client_of(config)
         with Command("record", config, "-o", mcap) as recorder:
             until(mcap.exists, "the recorder")
             played = omnibench(
@@ -159,7 +163,7 @@ def test_a_recording_goes_out_and_comes_back_as_a_calibration_that_is_swapped_in
         assert swapped.returncode == 0, swapped.stderr
         assert f"apr runs {again.name} now; next, " in swapped.stderr
         assert "begins with the old calibration" in swapped.stderr  # the config has no state
-        assert ask(session, "omnibench/apr/info")["calibration"] == again.name
+        assert asked(session, "omnibench/apr/info")["calibration"] == again.name
         for name, file, reason in (
             ("apr", CONFIGS / "live.yaml", "is this a calibration file?"),
             ("apz", workplace / "again.yaml", "did you mean 'apr'?"),
@@ -173,40 +177,6 @@ def test_a_node_ends_with_a_sentence_that_says_how_to_start_it_again(command: In
     ended = command("live", workplace / "node.yaml", "--seconds", "0")
     assert ended.returncode == 0, ended.stderr
     assert re.search(r"^node \w+ has ended, .*:\n  omnibench live ", ended.stderr, re.MULTILINE)
-
-
-@pytest.mark.slow
-def test_listen_prints_a_line_a_second_when_piped(command: InProcess, workplace: Path) -> None:
-    config = workplace / "node.yaml"
-    with Command("live", config):
-        wait_for(endpoint(config)).close()
-        with Command("replay", workplace / "data", "--robot", "apr", "--connect", endpoint(config)):
-            run = command("listen", "apr", "--config", config, "--seconds", "2", "--json")
-    assert run.returncode == 0, run.stderr
-    documents = [json.loads(line) for line in run.stdout.splitlines()]
-    assert 1 <= len(documents) <= 3  # fewer when the machine is busy
-    assert documents[-1]["robot"] == "apr"
-
-
-@pytest.mark.slow
-def test_a_subscription_is_three_lines_of_python(workplace: Path) -> None:
-    config = workplace / "node.yaml"
-    with Command("live", config):
-        wait_for(endpoint(config)).close()
-        with Command("replay", workplace / "data", "--robot", "apr", "--connect", endpoint(config)):
-            stamps = []
-            with package.subscribe("apr", connect=endpoint(config)) as odometry:
-                for message in odometry:
-                    stamps.append(message.stamp)
-                    if len(stamps) == 20:
-                        break
-    assert stamps == sorted(set(stamps))
-
-
-def test_keys_for_a_fleet_are_one_command(command: InProcess, tmp_path: Path) -> None:
-    made = command("keys", tmp_path / "keys", "node", "apr02")
-    assert made.returncode == 0, made.stderr
-    assert {file.name for file in (tmp_path / "keys").iterdir()} >= {"ca.pem", "node.pem", "node.key", "apr02.key"}
 
 
 @pytest.mark.slow
@@ -265,23 +235,3 @@ def test_other_wheels_are_refused_before_anything_is_played(command: InProcess, 
     assert_refused(refused, "'synthetic 1'", "fl, fr, rl, rr", "flower", "'apr'", "a, b, c")
     write_node(tmp_path, robots=[{"name": "apr", "calibration": "calibration.yaml", "wheels": {"joints": ["a", "b"]}}])
     assert_refused(command("live", "node.yaml"), "'apr'", "wheels.joints: a, b", "a, b, c")
-
-
-def wait_for(address: str) -> zenoh.Session:
-    """A client, once the node is up."""
-    sessions: list[zenoh.Session] = []
-
-    def connected() -> bool:
-        try:
-            sessions.append(raw_session("client", connect=[address]))
-        except zenoh.ZError:
-            return False
-        return True
-
-    until(connected, "a node")
-    return sessions[0]
-
-
-def ask(session: zenoh.Session, key: str) -> dict[str, object]:
-    (reply,) = list(session.get(key, timeout=PATIENCE))
-    return json.loads(reply.ok.payload.to_bytes())
