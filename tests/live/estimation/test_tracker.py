@@ -349,13 +349,6 @@ def test_two_nodes_cannot_share_a_robots_memory(tmp_path: Path) -> None:
         RobotMemory(tmp_path, "apr")
 
 
-def test_a_message_with_rates_alone_is_enough() -> None:
-    path = drive(0.5)
-    robot = tracker()
-    payloads = [JOINT_STATE.encode(JointState(s.stamp, s.names, None, s.velocities)) for s in path.samples()]
-    np.testing.assert_allclose(odometry(fed(robot, payloads)), path.poses, atol=1e-9)
-
-
 def test_every_anomaly_is_told_in_words_that_agree_with_its_number() -> None:
     every = Counts(**{field.name: 2 for field in fields(Counts)}).anomalies()
     assert anomalies_in_words(every).count("2 ") == len(every)

@@ -385,47 +385,34 @@ def test_an_authority_without_its_key_can_sign_nobody(tmp_path: Path) -> None:
         make_keys(tmp_path, ["apr02"])
 
 
-def other_files(folder: Path, change: str) -> Tls:
-    """The files of ``node`` after a change."""
-    files = tls(folder, "node")
-    if change == "missing":
-        (folder / "node.pem").unlink()
-    elif change == "a folder":
-        return files.model_copy(update={"ca": folder})
-    elif change == "no certificate":
-        (folder / "node.pem").write_text("garbage")
-    elif change == "no key":
-        return tls(folder, "node", "node.pem")
-    elif change == "another's key":
-        return tls(folder, "node", "apr02.key")
-    elif change == "encrypted":
-        command = ["openssl", "pkey", "-in", "node.key", "-aes256", "-passout", "pass:secret", "-out", "locked.key"]
-        subprocess.run(command, cwd=folder, check=True)
-        return tls(folder, "node", "locked.key")
-    elif change == "expired":
-        expire(folder, "node", datetime(2020, 1, 1, tzinfo=UTC))
-    else:
-        expire(folder, "node", datetime.now(UTC) + timedelta(days=2))
-    return files
+def encrypt(folder: Path) -> None:
+    command = ["openssl", "pkey", "-in", "node.key", "-aes256", "-passout", "pass:secret", "-out", "locked.key"]
+    subprocess.run(command, cwd=folder, check=True)
 
 
 @pytest.mark.parametrize(
-    ("change", "named"),
+    ("change", "key", "named"),
     [
-        ("missing", "node.pem: no such file"),
-        ("a folder", "is a folder"),
-        ("no certificate", "node.pem holds no certificate"),
-        ("no key", "node.pem holds no private key"),
-        ("another's key", "apr02.key is not the key of"),
-        ("encrypted", "locked.key is encrypted"),
-        ("expired", "node.pem expired on 2020-01-02"),
-        ("of the future", "clock"),
+        (lambda folder: (folder / "node.pem").unlink(), None, "node.pem: no such file"),
+        (lambda folder: (folder / "ca.pem").unlink() or (folder / "ca.pem").mkdir(), None, "is a folder"),
+        (lambda folder: (folder / "node.pem").write_text("garbage"), None, "node.pem holds no certificate"),
+        (Path.resolve, "node.pem", "node.pem holds no private key"),
+        (Path.resolve, "apr02.key", "apr02.key is not the key of"),
+        (encrypt, "locked.key", "locked.key is encrypted"),
+        (
+            lambda folder: expire(folder, "node", datetime(2020, 1, 1, tzinfo=UTC)),
+            None,
+            "node.pem expired on 2020",
+        ),
+        (lambda folder: expire(folder, "node", datetime.now(UTC) + timedelta(days=2)), None, "clock"),
     ],
+    ids=["missing", "a folder", "garbage", "no key", "another's key", "encrypted", "expired", "of the future"],
 )
-def test_files_that_cannot_be_used_are_named(tmp_path: Path, change: str, named: str) -> None:
+def test_files_that_cannot_be_used_are_named(tmp_path: Path, change: Any, key: str | None, named: str) -> None:
     make_keys(tmp_path, ["node", "apr02"])
+    change(tmp_path)
     with pytest.raises(ConfigError, match=named):
-        check_files(other_files(tmp_path, change))
+        check_files(tls(tmp_path, "node", key))
 
 
 def test_only_the_routers_certificate_listens_and_one_that_expires_soon_is_logged(

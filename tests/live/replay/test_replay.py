@@ -332,14 +332,6 @@ class TestPlayer:
         until(lambda: node.count == reports[0].total, "all messages")
         assert min(message.stamp for message in node.messages("joint_states")) == ORIGIN
 
-    def test_a_node_without_fusion_is_enough(self, loopback: Loopback) -> None:
-        node = GraphNode(loopback.client(), KeySpace(), "wheels only")
-        samples: list[Any] = []
-        subscriber = node.subscribe("apr02", "joint_states", samples.append)
-        report = player(loopback, speed="max").play()
-        until(lambda: len(samples) == report.sent["joint_states"], "all wheel samples")
-        subscriber.undeclare()
-
     def test_nobody_who_subscribes_is_one_line_unless_nobody_is_waited_for(self, loopback: Loopback) -> None:
         begin = time.perf_counter()
         with pytest.raises(ConfigError, match=r"apr02/joint_states after 0\.3 s"):
