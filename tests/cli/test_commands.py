@@ -84,9 +84,7 @@ def test_calibrate_and_evaluate_end_with_what_held_out_runs_say(command: Command
     assert calibrated[-2:] == [found["sentence"], found["detail"]]
 
 
-def test_what_only_a_live_node_can_run_is_not_said_to_be_exported(
-    command: Command, prepared: Prepared, tmp_path: Path
-) -> None:
+def test_what_only_a_live_node_can_run_is_not_exported(command: Command, prepared: Prepared, tmp_path: Path) -> None:
     plain = read_calibration(prepared.calibration)
     term = EffectTerm(name="wheel_dead_zone", parameters={"c": -0.001})
     write_calibration(plain.model_copy(update={"effects": (term,), "covariance": None}), tmp_path / "effects.yaml")
@@ -115,9 +113,7 @@ def test_settings_reach_the_calibrator_and_infinity_is_null_in_json(command: Com
 
 
 @pytest.mark.parametrize("name", ["raises", "says_nan"])
-def test_a_calibrator_without_an_answer_is_one_line(
-    name: str, command: Command, prepared: Prepared, tmp_path: Path
-) -> None:
+def test_a_missing_answer_is_one_line(name: str, command: Command, prepared: Prepared, tmp_path: Path) -> None:
     body = {"raises": "raise ValueError('oh')", "says_nan": "return Solution(np.full(problem.size, np.nan), 'x')"}[name]
     text = f"@calibrators.register('{name}')\nclass A(Calibrator):\n    def calibrate(self, problem):\n        {body}\n"
     plugins = write_plugin(tmp_path / "p", name, text)
@@ -201,7 +197,7 @@ def test_list_takes_the_plugins_of_the_folder_one_is_in(command: Command, tmp_pa
 
 
 @pytest.mark.parametrize("by_variable", [False, True])
-def test_no_plugins_are_loaded_where_none_are_wanted(
+def test_unwanted_plugins_are_not_loaded(
     command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, by_variable: bool
 ) -> None:
     write_plugin(tmp_path / "plugins", "unwanted", "raise SystemExit('it ran')\n")
@@ -322,9 +318,7 @@ def test_design_prints_one_document_and_writes_its_report(command: Command, tmp_
 
 
 @pytest.mark.slow
-def test_a_motion_that_was_hardly_driven_keeps_the_design_unless_it_is_to_be_fitted(
-    command: Command, tmp_path: Path
-) -> None:
+def test_a_motion_hardly_driven_keeps_the_design_unless_it_is_to_be_fitted(command: Command, tmp_path: Path) -> None:
     recordings = RECORDINGS / "robotino"
     if not recordings.is_dir():
         pytest.skip(f"{recordings} is not there")
@@ -359,9 +353,7 @@ LONG = (
 @pytest.mark.parametrize(
     "typed", [QUICK, *(pytest.param(typed, marks=pytest.mark.slow) for typed in LONG)], ids=lambda typed: typed[0]
 )
-def test_every_figure_of_the_report_is_written_as_svg_and_png(
-    command: Command, prepared: Prepared, typed: tuple[str, ...]
-) -> None:
+def test_every_figure_is_written_as_svg_and_png(command: Command, prepared: Prepared, typed: tuple[str, ...]) -> None:
     try:
         browser()
     except DataError:

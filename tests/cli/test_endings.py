@@ -117,9 +117,7 @@ def test_with_json_no_sentence_is_printed(command: Command, prepared: Prepared, 
     assert "; next, " not in printed.stdout + printed.stderr
 
 
-def test_a_calibration_that_was_only_shown_names_the_command_that_writes_it(
-    command: Command, prepared: Prepared, tmp_path: Path
-) -> None:
+def test_a_shown_calibration_says_what_writes_it(command: Command, prepared: Prepared, tmp_path: Path) -> None:
     shown = command("calibrate", prepared.data, "--cost", "trajectory")
     again = shown.stderr.splitlines()[-1].split()
     assert again == ["omnibench", "calibrate", str(prepared.data), "--cost", "trajectory", "-o", "calibration.yaml"]
@@ -150,9 +148,7 @@ def test_the_help_lists_every_command_under_a_heading(command: Command) -> None:
         assert f"\n  {name} " in shown
 
 
-def test_the_help_of_no_command_is_cut_in_a_terminal_of_eighty_columns(
-    command: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_help_of_no_command_is_cut_in_eighty_columns(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     shown = command("--help").stdout
     assert shown.startswith("Usage: omnibench")

@@ -148,17 +148,13 @@ class TestKnownRecording:
         commit = github.publish(OPTIODOM, {"README.md": "newest\n"})
         assert commit in command("fetch", "diff", "--force", "--commit", commit[:10]).stdout
 
-    def test_a_clone_copied_from_elsewhere_needs_no_network(
-        self, command: Command, github: GitHub, optiodom: str
-    ) -> None:
+    def test_a_clone_from_elsewhere_needs_no_network(self, command: Command, github: GitHub, optiodom: str) -> None:
         CLONE.parent.mkdir(parents=True)
         github.git(Path(), "clone", "-q", f"https://github.com/{OPTIODOM}", CLONE)
         shutil.rmtree(github.folder)
         assert optiodom in command("fetch", "diff").stdout
 
-    def test_a_data_set_that_is_there_is_refused_before_anything_is_cloned(
-        self, command: Command, optiodom: str
-    ) -> None:
+    def test_a_data_set_that_is_there_is_refused_before_a_clone(self, command: Command, optiodom: str) -> None:
         assert optiodom
         Path("data/diff").mkdir(parents=True)
         Path("data/diff/dataset.yaml").write_text("mine\n", encoding="utf-8")
@@ -207,9 +203,7 @@ class TestKnownRecording:
 
 
 class TestAnyRepository:
-    def test_a_format_that_is_recognised_is_imported(
-        self, command: Command, github: GitHub, prepared: Prepared
-    ) -> None:
+    def test_a_recognised_format_is_imported(self, command: Command, github: GitHub, prepared: Prepared) -> None:
         files: dict[str, str | Path] = {file.name: file for file in prepared.data.iterdir()}
         commit = github.publish("somebody/runs", {**files, "LICENCE.txt": "\nCC-BY-4.0\nall of it\n"})
         ended = command("fetch", "somebody/runs")
@@ -234,9 +228,7 @@ class TestAnyRepository:
         assert ended.returncode == 0
         assert "no recording is recognised there" in ended.stderr
 
-    def test_units_that_cannot_be_right_are_not_imported(
-        self, command: Command, github: GitHub, prepared: Prepared
-    ) -> None:
+    def test_impossible_units_are_not_imported(self, command: Command, github: GitHub, prepared: Prepared) -> None:
         (table,) = Path(shutil.copytree(prepared.data, "degrees")).glob("poses.parquet")
         pl.read_parquet(table).with_columns(pl.col("theta").degrees()).write_parquet(table)
         files: dict[str, str | Path] = {file.name: file for file in Path("degrees").iterdir()}
@@ -255,9 +247,7 @@ class TestMistakes:
             ("nobody/nothing", ("nobody/nothing: GitHub",)),
         ],
     )
-    def test_a_recording_or_repository_that_is_not_there_is_named(
-        self, command: Command, github: GitHub, name: str, parts: tuple[str, ...]
-    ) -> None:
+    def test_a_missing_one_is_named(self, command: Command, github: GitHub, name: str, parts: tuple[str, ...]) -> None:
         assert github
         assert_failed(command("fetch", "--", name), *parts)
         assert not Path("clones").exists()
@@ -299,9 +289,7 @@ class TestMistakes:
         assert_failed(command("fetch", "diff", "--force"), "1_run-01.csv is not as in the repository", "move it away")
         assert run.read_text(encoding="utf-8") == "mine\n"
 
-    def test_a_folder_that_holds_something_else_is_refused(
-        self, command: Command, github: GitHub, optiodom: str
-    ) -> None:
+    def test_a_folder_with_something_else_is_refused(self, command: Command, github: GitHub, optiodom: str) -> None:
         assert optiodom
         CLONE.mkdir(parents=True)
         (CLONE / "mine.txt").write_text("mine\n", encoding="utf-8")

@@ -54,9 +54,7 @@ def test_every_page_of_the_handbook_is_listed_once() -> None:
 
 
 @pytest.mark.parametrize("name", BY_NAME)
-def test_a_topic_is_plain_markdown_where_it_is_piped_and_its_code_fits_a_narrow_terminal(
-    command: Command, name: str
-) -> None:
+def test_a_topic_is_plain_markdown_when_piped_and_its_code_fits_a_narrow_terminal(command: Command, name: str) -> None:
     printed = command("guide", name)
     assert printed.returncode == 0
     assert printed.stdout.startswith("# ")
@@ -115,9 +113,7 @@ def test_every_link_every_file_and_every_public_name_of_a_page_exists(page: Path
 @pytest.mark.parametrize(
     "page", [ROOT / "README.md", pytest.param(BY_NAME["python"].file, marks=pytest.mark.slow)], ids=relative
 )
-def test_the_first_python_that_is_shown_runs(
-    page: Path, prepared: Prepared, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_first_python_runs(page: Path, prepared: Prepared, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for name, target in {"data/robot": prepared.data, "configs/apr02.yaml": prepared.config}.items():
         link = tmp_path / name

@@ -50,9 +50,7 @@ def filled_in(command: Command, tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("name", ["csv", "dataset", "optiodom", "rosbag", "table1"])
-def test_the_help_of_an_importer_lists_every_option_at_80_columns(
-    command: Command, monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
+def test_an_importers_help_lists_every_option(command: Command, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     shown = command("import", name, "--help")
     assert shown.returncode == 0
@@ -122,9 +120,7 @@ def test_units_that_cannot_be_right_are_refused_with_the_option_to_type(command:
     assert (again.returncode, "warning" in again.stderr) == (0, False)
 
 
-def test_counts_since_the_row_before_that_are_read_as_counters_are_refused_with_the_unit_to_type(
-    command: Command, filled_in: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_counts_a_row_are_refused(command: Command, filled_in: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The template's rates times its period are angles since the row before; as counters no matrix explains them."""
     for file in filled_in.glob("*_wheels.csv"):
         head, *rows = file.read_text().splitlines()
@@ -184,9 +180,7 @@ def typed_on(line: str, machine: Machine) -> list[str]:
 
 
 @pytest.mark.parametrize("robot", ["diff", pytest.param("mecanum", marks=pytest.mark.slow)])
-def test_four_commands_lead_from_a_strange_log_to_the_true_calibration(
-    command: Command, robot: str, tmp_path: Path
-) -> None:
+def test_four_commands_lead_from_a_strange_log_to_the_truth(command: Command, robot: str, tmp_path: Path) -> None:
     machine = log_of(robot, tmp_path)
     first = ["import", "csv", "logs", "-o", "data", "--set", "robot=robot.yaml"]
     refused = command(*first)

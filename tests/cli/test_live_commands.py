@@ -50,9 +50,7 @@ def client_of(config: Path) -> zenoh.Session:
 
 
 @pytest.mark.parametrize("loops", [0, pytest.param(2, marks=pytest.mark.slow)])
-def test_a_replay_to_a_node_is_one_command_and_shows_that_odom_is_the_batch_odometry(
-    command: InProcess, workplace: Path, loops: int
-) -> None:
+def test_a_replay_is_one_command_and_shows_the_batch_odometry(command: InProcess, workplace: Path, loops: int) -> None:
     with load(loops):
         run = command("live", workplace / "node.yaml", "--replay")
     assert run.returncode == 0, run.stderr
@@ -66,9 +64,7 @@ def test_a_replay_to_a_node_is_one_command_and_shows_that_odom_is_the_batch_odom
     assert calibrated < theoretical
 
 
-def test_a_replay_can_name_another_recording_and_without_samples_shows_no_errors(
-    command: InProcess, workplace: Path
-) -> None:
+def test_a_replay_can_name_another_recording_and_may_have_no_samples(command: InProcess, workplace: Path) -> None:
     run = command("live", workplace / "node.yaml", "--replay", workplace / "data")
     assert run.returncode == 0, run.stderr
     assert "against the reference poses of the recording" in run.stdout  # a data set's folder has no truth beside it
@@ -132,9 +128,7 @@ def test_what_a_node_answers_to_a_swap_is_printed_without_its_control_characters
     assert run.stderr.replace("\n", "").isprintable()
 
 
-def test_a_recording_goes_out_and_comes_back_as_a_calibration_that_is_swapped_in(
-    command: InProcess, workplace: Path
-) -> None:
+def test_a_recording_goes_out_and_a_calibration_is_swapped_in(command: InProcess, workplace: Path) -> None:
     """record -> import -> calibrate -> swap, with the real commands."""
     config, mcap = workplace / "node.yaml", workplace / "drive.mcap"
     with Command("live", config) as node:

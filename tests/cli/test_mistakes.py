@@ -57,9 +57,7 @@ from omnibench.data.storage import load_dataset, save_dataset
     ],
     ids=lambda value: " ".join(value)[:50],
 )
-def test_a_mistake_is_one_line_and_exit_code_2(
-    arguments: list[str], parts: list[str], command: Command, prepared: Prepared
-) -> None:
+def test_a_mistake_is_one_line(arguments: list[str], parts: list[str], command: Command, prepared: Prepared) -> None:
     places = {"CONFIG": prepared.config, "DATA": prepared.data, "CALIBRATION": prepared.calibration}
 
     def placed(argument: str) -> str:
@@ -136,9 +134,7 @@ def test_a_full_disk_is_one_line_and_leaves_no_half_file(prepared: Prepared, tmp
 
 
 @pytest.mark.parametrize("arguments", [["calibrate", "DATA", "-o", "new/c.yaml"], ["plugin", "new", "mine"]])
-def test_a_file_that_the_disk_does_not_take_is_not_there(
-    arguments: list[str], command: Command, prepared: Prepared
-) -> None:
+def test_a_file_too_large_for_the_disk_is_not_there(arguments: list[str], command: Command, prepared: Prepared) -> None:
     with disk_that_takes(600):  # the line on standard error
         run = command(*(str(prepared.data) if argument == "DATA" else argument for argument in arguments))
     assert_refused(run, FULL)
@@ -152,9 +148,7 @@ def test_a_calibration_that_cannot_be_written_in_the_end_is_one_line(command: Co
 
 
 @pytest.mark.parametrize("name", ["robot", "data set", "session"])
-def test_a_name_of_many_letters_is_one_short_line(
-    name: str, command: Command, prepared: Prepared, tmp_path: Path
-) -> None:
+def test_a_very_long_name_is_one_short_line(name: str, command: Command, prepared: Prepared, tmp_path: Path) -> None:
     long, data, file = "x" * 100_000, tmp_path / "data", tmp_path / "calibration.yaml"
     shutil.copytree(prepared.data, data)
     calibration, header = (yaml.safe_load(each.read_text()) for each in (prepared.calibration, data / "dataset.yaml"))
@@ -183,9 +177,7 @@ def test_a_disk_that_is_full_is_said_before_the_work(prepared: Prepared, tmp_pat
     assert_refused(run, f"{tmp_path}/c.yaml: cannot be written: No space left on device")
 
 
-def test_a_data_set_that_does_not_fit_leaves_the_one_that_was_there(
-    command: Command, prepared: Prepared, tmp_path: Path
-) -> None:
+def test_a_data_set_too_large_leaves_the_one_before(command: Command, prepared: Prepared, tmp_path: Path) -> None:
     data = shutil.copytree(prepared.data, tmp_path / "data")
     with disk_that_takes(600):
         run = command("simulate", prepared.config, "-o", data, "--format", "csv", "--force")
@@ -273,9 +265,7 @@ def test_it_is_written_over_by_force(command: Command, here: Path, arguments: st
     assert contents(here)[written] != before[written]
 
 
-def test_an_empty_file_and_an_empty_folder_are_no_loss_and_other_files_are_even_by_force(
-    command: Command, here: Path
-) -> None:
+def test_empty_files_and_folders_are_no_loss_and_other_files_are_even_by_force(command: Command, here: Path) -> None:
     Path("empty.yaml").touch()
     Path("empty").mkdir()
     assert command("calibrate", "data", "-o", "empty.yaml").returncode == 0

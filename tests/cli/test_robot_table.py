@@ -224,9 +224,7 @@ def recording_process(loopback: Loopback, path: Path) -> Iterator[subprocess.Pop
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
-def test_a_recording_that_is_told_to_stop_is_complete(
-    loopback: Loopback, tmp_path: Path, number: signal.Signals
-) -> None:
+def test_a_recording_that_is_stopped_is_complete(loopback: Loopback, tmp_path: Path, number: signal.Signals) -> None:
     path = tmp_path / "run.mcap"
     with recording_process(loopback, path) as process:
         process.send_signal(number)

@@ -126,9 +126,7 @@ def test_json_holds_the_same_figures(document: dict[str, Any]) -> None:
 
 
 @pytest.mark.slow
-def test_the_search_can_start_from_the_last_pose_and_leave_scans_distorted(
-    command: Command, driven: Driven, document: dict[str, Any]
-) -> None:
+def test_the_search_can_start_from_the_last_pose(command: Command, driven: Driven, document: dict[str, Any]) -> None:
     figures = {"odometry": document["accuracy"]["every"]["position_mean_m"]}
     for name, arguments in {
         "last": ["--start", "last_pose"],
@@ -165,9 +163,7 @@ def test_an_effect_of_a_plug_in_works_in_the_calibration(command: Command, drive
     assert len(load_dataset("found").trajectories) == 3
 
 
-def test_with_the_truth_there_are_errors_bias_and_drift_and_csv_and_a_report_are_written(
-    command: Command, driven: Driven, found: Found
-) -> None:
+def test_the_truth_gives_errors_bias_and_drift_and_a_report(command: Command, driven: Driven, found: Found) -> None:
     run = command(
         *("slam", driven.data, "-o", "csv", "--format", "csv"), *("--report", "slam.html", "--truth", driven.truth)
     )
@@ -255,7 +251,7 @@ def save_runs(driven: Driven, folder: Path, scans: dict[str, TrajectoryScans]) -
 
 
 @pytest.mark.slow
-def test_after_ctrl_c_the_command_goes_on(
+def test_ctrl_c_loses_no_path(
     command: Command, driven: Driven, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scans = first_scans(driven)

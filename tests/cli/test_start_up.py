@@ -120,9 +120,7 @@ UNKNOWN = np.full((3, 3), np.nan)
     ],
     ids=["eigenvalues", "singular values", "inverse", "Cholesky factor", "SciPy", "LAPACK"],
 )
-def test_a_failure_of_linear_algebra_is_one_line(
-    compute: Callable[[], object], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_failing_linear_algebra_is_one_line(compute: Callable[[], object], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         _run(SimpleNamespace(main=lambda **_: compute()))
     assert ended.value.code == 2

@@ -65,9 +65,7 @@ def printed(table: Table, width: int) -> str:
 
 
 @pytest.mark.parametrize("width", [48, 60, 80, 160])
-def test_numbers_stay_whole_notes_find_their_place_and_what_is_left_out_is_named(
-    width: int, snapshot: SnapshotAssertion
-) -> None:
+def test_numbers_stay_whole_and_what_is_left_out_is_named(width: int, snapshot: SnapshotAssertion) -> None:
     text = printed(TABLE, width)
     assert text == snapshot
     assert max(map(len, text.splitlines())) <= width
@@ -126,9 +124,7 @@ def compared_text(result: ComparisonResult, width: int = 160) -> str:
     return stream.getvalue()
 
 
-def test_all_entries_are_in_every_table_in_millimetres_and_degrees_and_practically_equal_ones_are_marked(
-    result: ComparisonResult, snapshot: SnapshotAssertion
-) -> None:
+def test_all_entries_are_in_every_table_in_usual_units(result: ComparisonResult, snapshot: SnapshotAssertion) -> None:
     # Times, evaluations until convergence, and digits of rounding differ between machines.
     text = re.sub(r"[\d.,]+ (ms|s|× 10[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+)", "...", compared_text(result, 240))
     text = re.sub(r"\d+ \((< )?\.\.\.\)", "n (...)", text)

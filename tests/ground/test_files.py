@@ -71,9 +71,7 @@ def test_a_text_from_anywhere_becomes_one_line_that_can_be_written_and_controls_
     write_text(tmp_path / "reason", line)
 
 
-def test_folders_made_in_the_same_second_have_names_of_their_own_and_the_link_points_to_the_newest(
-    tmp_path: Path,
-) -> None:
+def test_folders_of_the_same_second_have_names_of_their_own_and_the_newest_is_linked(tmp_path: Path) -> None:
     folders = [new_results_folder(tmp_path) for _ in range(4)]
     assert len(set(folders)) == 4
     for folder in folders:
@@ -118,9 +116,7 @@ def test_a_folder_of_results_is_free_again_when_the_process_that_wrote_there_is_
         assert list(folder.iterdir()) == []
 
 
-def test_a_file_that_replaces_another_is_on_the_disk_before_it_does(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_is_on_the_disk_before_it_replaces_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[tuple[str, str]] = []
 
     def sync(descriptor: int) -> None:

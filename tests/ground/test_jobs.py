@@ -141,9 +141,7 @@ class TestEveryBackend:
         assert (failure.reason, failure.over_time, failure.killed) == ("DataError: two is wrong", False, False)
         assert notes.answers() == {0: 0, 1: 1, 3: 3}
 
-    def test_says_what_a_job_raised_where_no_other_process_could_raise_it_again_and_when_it_waited_in_vain(
-        self, backend: Backend, tmp_path: Path
-    ) -> None:
+    def test_says_what_cannot_be_raised_again_and_who_waited_in_vain(self, backend: Backend, tmp_path: Path) -> None:
         jobs = [Job("two", wrong_in_two_parts, 0), Job("time", out_of_its_own_time, 0, seconds=60.0)]
         notes = run(tmp_path, jobs, backend)
         assert notes.reason(0) == "TwoPartError: one and another"
@@ -177,9 +175,7 @@ class TestEveryBackend:
         assert len(taken) <= 3
         assert not multiprocessing.active_children()
 
-    def test_leaves_the_environment_of_this_process(
-        self, backend: Backend, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_leaves_the_environment(self, backend: Backend, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv("OMP_NUM_THREADS", "7")
         monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
         assert run(tmp_path, [], backend).endings == {}
@@ -263,9 +259,7 @@ def leaves_behind(what: str, _: Reporter) -> Answer:
 
 
 @pytest.mark.parametrize("what", ["variable", "handler", "thread", "child", "folder", "error", "nothing"])
-def test_a_job_that_leaves_something_behind_shares_its_process_with_no_later_one(
-    what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_a_job_leaves_ends_its_process(what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(job_process, "_YOUNG", PATIENCE)
     first = Job("first", leaves_behind, what)
     processes = processes_of(run(tmp_path, [Job("before", squared, 1), first, Job("after", squared, 2)], Processes(1)))

@@ -138,9 +138,7 @@ def test_the_version_is_that_of_the_installed_package() -> None:
 
 
 @pytest.mark.parametrize("name", omnibench.__all__)
-def test_the_examples_of_a_public_name_give_what_they_show(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_examples_of_a_name_give_what_they_show(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     found = getattr(omnibench, name)
     names = vars(sys.modules[found.__module__]) | {each: getattr(omnibench, each) for each in omnibench.__all__}

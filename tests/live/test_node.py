@@ -172,9 +172,7 @@ def test_a_robot_that_another_node_runs_already_is_refused(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("joints", [["a", "b"], ["a", "b", "c", "d"], ["a", "b", "a"], []])
-def test_joints_that_are_not_one_for_each_wheel_and_a_missing_calibration_are_named(
-    tmp_path: Path, joints: list[str]
-) -> None:
+def test_joints_other_than_one_a_wheel_and_a_missing_calibration_are_named(tmp_path: Path, joints: list[str]) -> None:
     robot = {"name": "apr", "calibration": "calibration.yaml", "wheels": {"joints": joints}}
     config = config_of(tmp_path, robots=[robot])
     with pytest.raises(ConfigError, match=rf"'apr': wheels\.joints: {', '.join(joints) or 'none'};"):
@@ -244,7 +242,7 @@ def test_a_reason_of_refusals_is_logged_again_only_with_new_ones(
 @pytest.mark.parametrize(
     ("frames", "fusion", "told"), [(None, "ekf", True), ("prefixed", "ekf", False), (None, "none", False)]
 )
-def test_a_node_whose_frames_meet_those_of_another_is_warned(
+def test_frames_of_two_nodes_that_meet_are_told(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, frames: str | None, fusion: str, told: bool
 ) -> None:
     router = {"mode": "router", "listen": config_of(tmp_path).zenoh.listening}
@@ -302,9 +300,7 @@ def test_a_config_with_record_writes_the_mcap_file_beside_one_that_exists_alread
     assert recorded(second)["/apr/odom"] == 21
 
 
-def test_a_recording_or_foxglove_server_that_cannot_begin_is_named_and_nothing_stays_open(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_recorder_or_server_that_cannot_begin_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("not a folder")
     with closing(socket.socket()) as taken:
         taken.bind(("127.0.0.1", 0))
@@ -323,9 +319,7 @@ def test_a_recording_or_foxglove_server_that_cannot_begin_is_named_and_nothing_s
         LiveNode(config_of(tmp_path, foxglove=True))
 
 
-def test_what_has_started_is_closed_in_reverse_order_when_a_later_step_fails(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_has_started_is_closed_when_a_later_step_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     port = free_port()
     foxglove = port if find_spec("foxglove") else False
     config = config_of(tmp_path, record="run.mcap", foxglove=foxglove, state="state")
@@ -344,9 +338,7 @@ def test_what_has_started_is_closed_in_reverse_order_when_a_later_step_fails(
     assert_nothing_is_open(config)
 
 
-def test_a_replay_that_waits_for_a_subscriber_finds_the_node_before_its_recorder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_waiting_replay_finds_the_node_before_its_recorder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     alive: list[tuple[str, ...]] = []
 
     class LateRecorder(Recorder):

@@ -157,9 +157,7 @@ def test_jung_chung_finds_the_wheelbase_exactly_where_the_wheels_are_equal(longe
 @pytest.mark.parametrize(("method", "share", "second_order"), [("jung_chung", 0.5, 2.0), ("umbmark", 0.0, 8.0)])
 @settings(max_examples=15)
 @given(longer=st.floats(-0.02, 0.02), unequal=st.floats(-0.02, 0.02))
-def test_squares_tell_wheelbase_and_wheels_to_first_order(
-    method: str, share: float, second_order: float, longer: float, unequal: float
-) -> None:
+def test_squares_tell_geometry(method: str, share: float, second_order: float, longer: float, unequal: float) -> None:
     """jung_chung takes half of what the wheels differ by for a longer wheelbase."""
     unequal *= 1.0 if method == "jung_chung" else 0.5
     true = worn(ROBOT, 1 - unequal / 2, 1 + unequal / 2, 1 + longer)
@@ -276,9 +274,7 @@ def test_real_recordings_of_another_kind_are_refused(method: str, kind: str, fou
 @pytest.mark.parametrize(
     ("label", "tolerance"), [("censi", 0.04), ("ivanjko", 0.02), ("umbmark", 0.02), ("jung_chung, divided twice", 0.02)]
 )
-def test_the_figures_that_are_known_on_real_recordings_come_out(
-    label: str, tolerance: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_figures_of_real_recordings_come_out(label: str, tolerance: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """Those of jung_chung are of a program that divides the mean heading errors once more than the plug-in."""
     dataset = diff()
     monkeypatch.setattr(published_methods, "recordings", lambda robot: dataset)  # noqa: ARG005

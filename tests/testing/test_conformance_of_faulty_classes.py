@@ -557,9 +557,7 @@ def test_a_good_cost_and_a_good_importer_pass_every_case(sample: Path) -> None:
 
 
 @pytest.mark.parametrize(("cls", "case", "message"), [*CASES_OF_COSTS, *CASES_OF_IMPORTERS])
-def test_a_cost_or_importer_fails_the_case_it_breaks(
-    cls: type[Cost | Importer], case: str, message: str, sample: Path
-) -> None:
+def test_a_cost_or_importer_fails_its_case(cls: type[Cost | Importer], case: str, message: str, sample: Path) -> None:
     of_cost = issubclass(cls, Cost)
     found = failures(CostConformance, cls) if of_cost else failures(ImporterConformance, cls, source=sample)
     assert message in found[case]

@@ -94,9 +94,7 @@ def test_evaluate_warns_of_runs_that_the_effect_was_not_fitted_to(command: Comma
     assert again.stderr.startswith(f"warning: {warning}\n")
 
 
-def test_a_calibration_whose_plugin_is_not_there_is_refused_in_one_line(
-    command: Command, work: Path, extended: Path
-) -> None:
+def test_a_calibration_without_its_plugin_is_refused_in_one_line(command: Command, work: Path, extended: Path) -> None:
     for arguments in (
         ("evaluate", extended, work / "data"),
         ("certify", extended, work / "data"),
@@ -106,9 +104,7 @@ def test_a_calibration_whose_plugin_is_not_there_is_refused_in_one_line(
         assert_refused(command(*arguments), "unknown effect 'drag'")
 
 
-def test_export_certify_and_swap_know_the_effect_and_say_what_becomes_of_it(
-    command: Command, work: Path, extended: Path
-) -> None:
+def test_export_certify_and_swap_say_what_becomes_of_the_effect(command: Command, work: Path, extended: Path) -> None:
     known = ("--plugins", work / "plugins")
     exported = told(command("export", extended, "--to", "c_header", *known))
     assert "effects of the calibration are left out: drag" in exported.stderr

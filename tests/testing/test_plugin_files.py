@@ -101,9 +101,7 @@ def test_a_new_plugin_whose_class_would_hide_an_import_is_called_otherwise(kind:
         ("mine", "calibrator", "test_mine.py", "cannot be written"),
     ],
 )
-def test_what_cannot_be_written_is_named_and_nothing_is_written(
-    name: str, kind: str, folder: str, named: str, tmp_path: Path
-) -> None:
+def test_what_cannot_be_written_is_named(name: str, kind: str, folder: str, named: str, tmp_path: Path) -> None:
     (tmp_path / "test_mine.py").write_text("mine")
     with pytest.raises((ConfigError, DataError), match=named):
         new_plugin(name, kind, tmp_path / folder)

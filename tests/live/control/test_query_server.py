@@ -130,9 +130,7 @@ def test_each_robot_and_service_that_a_question_is_for_answers_it_once(tmp_path:
             assert len(set(keys)) == len(keys)
 
 
-def test_a_failure_of_its_own_is_answered_in_one_line_and_logged(
-    loopback: Loopback, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_failure_of_its_own_is_one_line_and_logged(loopback: Loopback, caplog: pytest.LogCaptureFixture) -> None:
     def failing(_: RobotTracker) -> dict[str, Any]:
         raise RuntimeError("a bug\nof two lines")
 
@@ -308,9 +306,7 @@ def test_a_swap_is_kept_although_the_configs_file_went_elsewhere(tmp_path: Path)
 
 
 @pytest.mark.parametrize(("state", "named"), [("state", "apr.calibration.yaml"), (None, "no `state`")])
-def test_a_swap_that_cannot_be_kept_runs_and_says_so(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, state: str | None, named: str
-) -> None:
+def test_a_lost_swap_says_so(tmp_path: Path, caplog: pytest.LogCaptureFixture, state: str | None, named: str) -> None:
     with running(config_of(tmp_path, state=state)) as (node, session):
         (tmp_path / "state" / "apr.calibration.yaml").mkdir(parents=True)
         answer = asked(session, "omnibench/apr/swap", as_text(calibration(scale=1.1)))

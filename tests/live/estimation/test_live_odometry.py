@@ -210,9 +210,7 @@ class TestAgreesWithTheBatch:
         st.integers(0, 1000),
         st.sampled_from(["euler", "arc"]),
     )
-    def test_odom_with_any_effects_is_the_batch_odometry(
-        self, names: set[str], seed: int, integration: Integration
-    ) -> None:
+    def test_odom_with_effects_is_that_of_the_batch(self, names: set[str], seed: int, integration: Integration) -> None:
         plain = calibration(integration=integration)
         using = with_effects(*(term(name, **EFFECTS[name]) for name in names), plain=plain)
         path = drive(1.0, seed=seed, using=using)
@@ -278,9 +276,7 @@ class TestSwaps:
         st.integers(0, 99),
         st.booleans(),
     )
-    def test_odom_goes_on_from_where_it_was_as_with_the_other_all_the_time(
-        self, names: set[str], place: int, there: bool
-    ) -> None:
+    def test_odom_goes_on_from_where_it_was_as_with_the_other(self, names: set[str], place: int, there: bool) -> None:
         path, both = drive(1.0), [calibration(), with_effects(*(term(name, **EFFECTS[name]) for name in names))]
         first, second = both if there else both[::-1]
         robot = RobotTracker("apr", first)
@@ -356,9 +352,7 @@ class TestSessions:
 class TestAngles:
     @pytest.mark.parametrize("effect", ["heading_drift", "wheel_eccentricity"])
     @pytest.mark.parametrize("missing", [False, True])
-    def test_missing_angles_are_told_once_where_an_effect_needs_them(
-        self, effect: str, missing: bool, caplog: pytest.LogCaptureFixture
-    ) -> None:
+    def test_missing_angles_are_told(self, effect: str, missing: bool, caplog: pytest.LogCaptureFixture) -> None:
         using = with_effects(term(effect, **EFFECTS[effect]))
         samples = [replace(each, positions=None) if missing else each for each in drive(0.2, using=using).samples()]
         with caplog.at_level(logging.WARNING, "omnibench.live"):
@@ -391,9 +385,7 @@ class StretchedTurns(MotionEffect):
 '''
 
 
-def test_live_takes_the_plugins_that_are_named_and_replays_to_the_batch_odometry(
-    command: InProcess, tmp_path: Path
-) -> None:
+def test_live_takes_the_named_plugins_and_replays_to_the_batch_odometry(command: InProcess, tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "stretched_turns.py").write_text(PLUGIN)
     write_node(tmp_path, "apr", replay={"dataset": "small.yaml", "speed": "max"})

@@ -248,9 +248,7 @@ def test_nonsense_is_counted_and_the_stream_goes_on(what: str) -> None:
 
 
 @pytest.mark.parametrize("variance", [1.797e308, 0.0, -1.0, np.nan, np.inf])
-def test_poses_of_unknown_covariance_are_fused_with_the_default_which_is_said_once(
-    variance: float, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_poses_without_covariance_get_the_default(variance: float, caplog: pytest.LogCaptureFixture) -> None:
     path, robot = drive(0.5), tracker(fusion=FusionSettings(pose_sigma=(0.2, 3.0)))
     fed(robot, path.payloads())
     for stamp in path.stamps[-2:]:
@@ -417,9 +415,7 @@ def test_other_motions_do_not_count(driven: list[list[WheelStep]], caplog: pytes
 
 
 @pytest.mark.parametrize("changes", [{"driven": None}, {"driven": ()}, {"effects": ()}])
-def test_nothing_is_watched_where_nothing_is_at_stake(
-    changes: dict[str, Any], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_nothing_is_watched_without_a_stake(changes: dict[str, Any], caplog: pytest.LogCaptureFixture) -> None:
     assert watched(steps(SIDEWAYS, 5), by=fitted(**changes)).seconds is None
     assert warnings(caplog) == []
 
@@ -433,9 +429,7 @@ def feed(robot: RobotTracker, twist: Twist, seconds: float, begin: float) -> Non
         robot.take_wheels(JOINT_STATE.encode(message), now)
 
 
-def test_health_and_diagnostics_show_the_seconds_of_each_calibration_by_itself(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_health_and_diagnostics_show_the_seconds_of_each_calibration(caplog: pytest.LogCaptureFixture) -> None:
     robot = RobotTracker("apr", fitted())
     feed(robot, SIDEWAYS, 3.0, 0.0)
     health = robot.health(3.0)

@@ -168,9 +168,7 @@ def test_the_gate_rejects_true_poses_as_seldom_as_it_says() -> None:
     ],
     ids=["that agree", "one repeated", "that contradict each other", "with a good one between"],
 )
-def test_of_rejected_poses_four_that_agree_are_believed_and_others_never(
-    seen: list[tuple[float, float, float]], outcomes: list[str]
-) -> None:
+def test_four_poses_that_agree_are_believed(seen: list[tuple[float, float, float]], outcomes: list[str]) -> None:
     robot = Robot(reacquire_after=4).drive(100)
     robot.see(0.1)
     assert [robot.see(time, (x, y, 0)) for time, x, y in seen] == outcomes
@@ -310,7 +308,7 @@ TAKEN_OFF = term("lidar_lever_arm", x=0.05, y=-0.03)
     ],
     ids=["late", "early", "late heading", "early heading", "lever arm", "all together"],
 )
-def test_poses_are_put_where_and_when_they_were_taken(
+def test_poses_are_right(
     terms: tuple[EffectTerm, ...], tau: tuple[float, float], arm: Array | None, poses: int
 ) -> None:
     uncorrected, _ = seen(calibration(), tau, arm)

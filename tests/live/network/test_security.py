@@ -255,18 +255,14 @@ class TestMutualTls:
                 assert not session.info.routers_zid()
         assert fleet.got("apr03/joint_states") == 0
 
-    def test_a_router_that_is_refused_elsewhere_does_not_open(
-        self, fleet: Router, keys: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_a_refused_router_does_not_open(self, fleet: Router, keys: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr("omnibench.live.network.session._CONNECT_TIMEOUT", 0.5)
         refused = foreign(fleet, keys)
         upstream = SessionConfig(listen=(f"tls/127.0.0.1:{free_port()}",), connect=refused.connect, tls=refused.tls)
         assert "our certificate is not from its authority" in refusal(upstream)
 
     @pytest.mark.parametrize("declared", [False, pytest.param(True, marks=pytest.mark.slow)])
-    def test_a_rightful_member_works_beside_intruders_and_forges_nothing(
-        self, fleet: Router, keys: Path, declared: bool
-    ) -> None:
+    def test_a_member_works_beside_intruders_without_forging(self, fleet: Router, keys: Path, declared: bool) -> None:
         with open_session(member(fleet, keys, "apr02"), "apr02") as session:
             works(session, fleet)
             refusal(foreign(fleet, keys))
@@ -281,9 +277,7 @@ class TestMutualTls:
 
 
 class TestUsers:
-    def test_a_rightful_user_works_and_has_no_others_rights(
-        self, users: Router, keys: Path, caplog: pytest.LogCaptureFixture
-    ) -> None:
+    def test_a_user_has_no_others_rights(self, users: Router, keys: Path, caplog: pytest.LogCaptureFixture) -> None:
         with open_session(user(users, keys, "apr02"), "apr02") as session:
             session.put("apr03/joint_states", b"forged")
             works(session, users)
@@ -365,9 +359,7 @@ def test_a_user_logs_in_soon_beside_150_idle_connections(users: Router, keys: Pa
 
 
 @pytest.mark.parametrize("by", ["with a certificate of", "with a password of", "who reaches it"])
-def test_a_router_without_access_rules_says_in_one_line_that_no_roles_hold(
-    by: str, keys: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_router_without_access_rules_says_so(by: str, keys: Path, caplog: pytest.LogCaptureFixture) -> None:
     config = mutual(keys)
     if by == "with a password of":
         config = {"listen": f"tcp/127.0.0.1:{free_port()}", "users_file": str(keys / "users.txt"), "access": ACCESS}
@@ -519,9 +511,7 @@ def test_every_role_has_the_rights_that_the_handbook_says_and_no_others(role: st
 
 
 @pytest.mark.slow
-def test_replays_with_the_robots_own_certificate_and_to_a_node_elsewhere_are_acknowledged(
-    router: str, keys: Path, tmp_path: Path
-) -> None:
+def test_replays_by_a_robot_and_to_a_node_elsewhere_are_acknowledged(router: str, keys: Path, tmp_path: Path) -> None:
     drive = concatenate_runs(random_dataset(1))
     tls = {"ca": str(keys / "ca.pem"), "certificate": str(keys / "remote.pem"), "key": str(keys / "remote.key")}
     elsewhere = {"mode": "client", "connect": router, "tls": tls}

@@ -309,9 +309,7 @@ def purposes(folder: Path, name: str) -> list[str]:
     ("names", "router", "server"),
     [(["node", "apr02"], None, "node"), (["base", "node"], "base", "base"), (["apr02", "screen"], None, None)],
 )
-def test_only_the_routers_certificate_may_serve_and_carries_hosts(
-    tmp_path: Path, names: list[str], router: str | None, server: str | None
-) -> None:
+def test_only_the_router_may_serve(tmp_path: Path, names: list[str], router: str | None, server: str | None) -> None:
     make_keys(tmp_path, names, router=router)
     for name in names:
         assert purposes(tmp_path, name) == (["sslserver", "sslclient"] if name == server else ["sslclient"])
@@ -370,9 +368,7 @@ def test_a_certificate_does_not_outlive_its_authority(tmp_path: Path) -> None:
         (["node"], {"hosts": ["x" * 64]}, ""),
     ],
 )
-def test_names_routers_and_hosts_that_cannot_be_are_refused(
-    tmp_path: Path, names: list[str], options: dict[str, Any], named: str
-) -> None:
+def test_impossible_names_are_refused(tmp_path: Path, names: list[str], options: dict[str, Any], named: str) -> None:
     with pytest.raises(ConfigError, match=re.escape(named) or None):
         make_keys(tmp_path, names, **options)
     assert not list(tmp_path.iterdir())
@@ -399,11 +395,7 @@ def encrypt(folder: Path) -> None:
         (Path.resolve, "node.pem", "node.pem holds no private key"),
         (Path.resolve, "apr02.key", "apr02.key is not the key of"),
         (encrypt, "locked.key", "locked.key is encrypted"),
-        (
-            lambda folder: expire(folder, "node", datetime(2020, 1, 1, tzinfo=UTC)),
-            None,
-            "node.pem expired on 2020",
-        ),
+        (lambda folder: expire(folder, "node", datetime(2020, 1, 1, tzinfo=UTC)), None, "node.pem expired on 2020"),
         (lambda folder: expire(folder, "node", datetime.now(UTC) + timedelta(days=2)), None, "clock"),
     ],
     ids=["missing", "a folder", "garbage", "no key", "another's key", "encrypted", "expired", "of the future"],
@@ -415,9 +407,7 @@ def test_files_that_cannot_be_used_are_named(tmp_path: Path, change: Any, key: s
         check_files(tls(tmp_path, "node", key))
 
 
-def test_only_the_routers_certificate_listens_and_one_that_expires_soon_is_logged(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_clients_certificate_and_one_that_expires_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     make_keys(tmp_path, ["node", "apr02"])
     check_files(tls(tmp_path, "node"), listening=True)
     with pytest.raises(ConfigError, match=r"apr02\.pem is a client's"):

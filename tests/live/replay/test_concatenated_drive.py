@@ -415,9 +415,7 @@ def test_the_demonstrations_config_is_one() -> None:
         ({"real": {"path": "recordings"}}, None, "no simulated data set"),
     ],
 )
-def test_a_data_set_that_a_config_does_not_simulate_is_named(
-    tmp_path: Path, datasets: dict[str, Any], chosen: str | None, named: str
-) -> None:
+def test_other_data_sets_are_named(tmp_path: Path, datasets: dict[str, Any], chosen: str | None, named: str) -> None:
     with pytest.raises(OmnibenchError, match=named):
         load_recording(config_with(tmp_path, **datasets), chosen)
 

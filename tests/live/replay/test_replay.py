@@ -354,9 +354,7 @@ class TestStopping:
         return Listener(loopback)
 
     @pytest.mark.usefixtures("node")
-    def test_progress_tells_messages_and_seconds_of_the_recording(
-        self, loopback: Loopback, clock: Clock, progress: list[Progress]
-    ) -> None:
+    def test_progress_tells_messages_and_time(self, loopback: Loopback, clock: Clock, progress: list[Progress]) -> None:
         report = player(loopback, speed=4).play(clock, watch=progress.append)
         assert len(progress) >= 5
         done = [each.done for each in progress]
@@ -366,9 +364,7 @@ class TestStopping:
         times = [float(each.note.split()[0]) for each in progress]
         assert times == sorted(times)
 
-    def test_it_stops_at_once_when_asked(
-        self, loopback: Loopback, clock: Clock, node: Listener, progress: list[Progress]
-    ) -> None:
+    def test_it_is_stopped(self, loopback: Loopback, clock: Clock, node: Listener, progress: list[Progress]) -> None:
         def stop_after_half_a_second(now: Progress) -> None:
             progress.append(now)
             if len(progress) == 5:  # they come ten times a second

@@ -94,9 +94,7 @@ def test_a_duplicate_and_a_late_sample_make_no_step() -> None:
 @pytest.mark.parametrize(
     ("low", "length", "settings"), [(-math.pi, 2 * math.pi, {}), (0.0, 2 * math.pi, {}), (0.0, 1.7, {"wrap": 1.7})]
 )
-def test_angles_within_one_turn_or_a_length_that_is_told_are_unwrapped(
-    low: float, length: float, settings: dict[str, float]
-) -> None:
+def test_angles_within_a_turn_or_a_length_are_unwrapped(low: float, length: float, settings: dict[str, float]) -> None:
     path, receiver = drive(8.0), Receiver(**settings)
     for sample in path.samples():
         receiver.take(JointState(sample.stamp, NAMES, (sample.positions - low) % length + low, None))
@@ -484,9 +482,7 @@ def test_an_angle_that_misses_for_long_is_held_and_said_and_makes_the_path_unkno
 
 
 @pytest.mark.parametrize(("behind", "old"), [(1, 0), (10, 0), (30, 30)])
-def test_steering_that_arrives_behind_its_wheel_samples_counts_for_the_next_and_is_said_when_too_old(
-    behind: int, old: int
-) -> None:
+def test_steering_behind_its_wheel_samples_counts_for_the_next_until_too_old(behind: int, old: int) -> None:
     """Messages of the steering that wait in a loaded network; every angle tells the number of its sample."""
     receiver = SteeringReceiver(max_steering_age=0.2)
     receiver.take(at_joints(0.0, front=0.0, front_steering=0.0))
@@ -563,8 +559,6 @@ def test_joints_are_called_like_the_wheels_unless_they_are_named() -> None:
         (synthetic_robot(), ("a",), "no wheel steers"),
     ],
 )
-def test_steering_joints_that_are_not_one_for_each_wheel_are_refused(
-    robot: Robot, joints: tuple[str, ...], named: str
-) -> None:
+def test_steering_joints_other_than_one_a_wheel_are_refused(robot: Robot, joints: tuple[str, ...], named: str) -> None:
     with pytest.raises(ConfigError, match=rf"wheels\.steering_joints: .*{named}"):
         joints_of(robot, WheelSettings(steering_joints=joints))

@@ -225,7 +225,7 @@ def test_another_ros_client_lists_the_topics_with_their_types(sdk: Any, network:
 
 
 @pytest.mark.parametrize("topic", TOPICS)
-def test_another_ros_client_knows_publisher_type_hash_and_qos(
+def test_a_ros_client_knows_the_qos(
     sdk: Any, network: Loopback, rmw_node: dict[str, Publisher[Any]], topic: str
 ) -> None:
     assert rmw_node
@@ -240,9 +240,7 @@ def test_another_ros_client_knows_publisher_type_hash_and_qos(
 
 
 @pytest.mark.parametrize("topic", TOPICS)
-def test_another_ros_client_reads_the_content(
-    sdk: Any, network: Loopback, rmw_node: dict[str, Publisher[Any]], topic: str
-) -> None:
+def test_a_ros_client_reads_all(sdk: Any, network: Loopback, rmw_node: dict[str, Publisher[Any]], topic: str) -> None:
     came, contents = threading.Event(), []
 
     def callback(content: Any) -> None:
@@ -270,9 +268,7 @@ def test_another_ros_client_reads_the_content(
 
 
 @pytest.mark.parametrize("topic", TOPICS)
-def test_each_message_says_who_sent_it_when_and_which_one_it_is(
-    network: Loopback, rmw_node: dict[str, Publisher[Any]], topic: str
-) -> None:
+def test_each_message_says_who_sent_it(network: Loopback, rmw_node: dict[str, Publisher[Any]], topic: str) -> None:
     package = pytest.importorskip("zenoh_ros2_sdk.attachment", reason="zenoh-ros2-sdk is not installed")
     with samples_of(network, rmw_node[topic]) as next_sample:
         attachments = []
