@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import pytest
 import yaml
 from shared_results import made_once, shared_folder
+from timing import PATIENCE
 
 from omnibench import registry
 from omnibench.__main__ import main
@@ -52,6 +53,12 @@ def omnibench(
         check=False,
         **others,
     )
+
+
+def python(program: str, *arguments: object, **others: Any) -> subprocess.CompletedProcess[str]:
+    """Run a Python program to its end; what it printed."""
+    command = [sys.executable, "-c", program, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False, **others)
 
 
 def compared(config: Path, output: Path, *arguments: object) -> subprocess.CompletedProcess[str]:

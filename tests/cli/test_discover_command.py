@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
-import signal
-import subprocess
 from collections.abc import Callable
 from dataclasses import replace
 from io import StringIO
@@ -16,10 +13,11 @@ from typing import Any, NamedTuple
 
 import polars as pl
 import pytest
-from commands import COMMAND, ENVIRONMENT, Command, Printed, assert_refused, run_here
+from commands import Command, Printed, assert_refused, run_here
 from discovery_samples import EXPERIMENT, incomplete, named, nameless, nothing, simulated
+from nodes import Command as CommandProcess
 from rich.console import Console
-from timing import PATIENCE
+from sessions import until
 
 from omnibench.cli.terminal.discovery_summary import print_discovery
 from omnibench.config import parse_yaml
@@ -171,17 +169,10 @@ def test_names_of_data_sets_become_folders_that_can_be(tmp_path: Path, monkeypat
 
 @pytest.mark.slow
 def test_ctrl_c_leaves_nothing_half_written(data: Path, tmp_path: Path) -> None:
-    process = subprocess.Popen(
-        [*COMMAND, "discover", str(data)], cwd=tmp_path, env=ENVIRONMENT, text=True,
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-    )  # fmt: skip
-    try:
-        assert process.stderr.readline() == "fitting the plain matrix\n"
-        os.kill(process.pid, signal.SIGINT)
-        _, told = process.communicate(timeout=PATIENCE)
-    finally:
-        process.kill()
-    assert process.returncode == 130
+    with CommandProcess("discover", data, cwd=tmp_path) as discover:
+        until(lambda: "fitting the plain matrix\n" in discover.said(), "the work to begin")
+        _, told = discover.stop()
+    assert discover.process.returncode == 130
     assert told.splitlines()[-1] == "interrupted; the same command begins anew"
     assert not (tmp_path / "results").exists()
 

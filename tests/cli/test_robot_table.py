@@ -6,7 +6,6 @@ import json
 import math
 import re
 import signal
-import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -18,8 +17,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import COMMAND, ENVIRONMENT, omnibench
+from commands import omnibench
 from mcap.reader import make_reader
+from nodes import Command
 from rich.console import Console
 from samples import AnnouncedRobot, disk_with_room_for, messages_of, odometry, publishers, sample
 from sessions import Loopback, until
@@ -199,37 +199,26 @@ def test_the_command_says_when_nothing_comes_from_a_robot_and_who_is_there(loopb
 
 
 @contextmanager
-def recording_process(loopback: Loopback, path: Path) -> Iterator[subprocess.Popen[str]]:
+def recording_process(loopback: Loopback, path: Path) -> Iterator[Command]:
     """Another process that records to ``path``, from which messages come already."""
     joints = publishers(loopback)["joint_states"]
-    process = subprocess.Popen(
-        [*COMMAND, "record", "apr02", "-o", str(path), "--connect", loopback.address],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=ENVIRONMENT,
-    )
+    with Command("record", "apr02", "-o", path, "--connect", loopback.address) as recorder:
 
-    def some_are_written() -> bool:
-        joints.put(sample("joint_states"))
-        assert process.poll() is None, process.communicate()[1]
-        return path.exists() and path.stat().st_size > 1000
+        def some_are_written() -> bool:
+            joints.put(sample("joint_states"))
+            assert recorder.process.poll() is None, recorder.said()
+            return path.exists() and path.stat().st_size > 1000
 
-    try:
         until(some_are_written, "the other process to have written something")
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
+        yield recorder
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_a_recording_that_is_stopped_is_complete(loopback: Loopback, tmp_path: Path, number: signal.Signals) -> None:
     path = tmp_path / "run.mcap"
-    with recording_process(loopback, path) as process:
-        process.send_signal(number)
-        output, errors = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 0, errors
+    with recording_process(loopback, path) as recorder:
+        output, errors = recorder.stop(number)
+    assert recorder.process.returncode == 0, errors
     assert "Traceback" not in errors
     with path.open("rb") as file:
         summary = make_reader(file).get_summary()
@@ -239,9 +228,8 @@ def test_a_recording_that_is_stopped_is_complete(loopback: Loopback, tmp_path: P
 @pytest.mark.slow
 def test_a_killed_recorder_leaves_a_file_that_rosbags_and_mcap_read(loopback: Loopback, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    with recording_process(loopback, path) as process:
-        process.kill()
-        process.communicate()
+    with recording_process(loopback, path) as recorder:
+        recorder.kill()
     recorded = messages_of(path)["/apr02/joint_states"]
     assert len(recorded) > 10
     with path.open("rb") as file:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import math
 import re
-import signal
-import subprocess
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -16,9 +14,9 @@ import numpy as np
 import polars as pl
 import pytest
 import yaml
-from commands import COMMAND, ENVIRONMENT, Command, Printed, assert_refused, run_here
+from commands import ENVIRONMENT, Command, Printed, assert_refused, python, run_here
 from drives import calibration
-from timing import PATIENCE
+from nodes import Command as CommandProcess
 
 from omnibench.data.dataset import make_dataset
 from omnibench.data.scans import ScansInMemory, TrajectoryScans
@@ -256,20 +254,12 @@ def test_ctrl_c_loses_no_path(
 ) -> None:
     scans = first_scans(driven)
     save_runs(driven, tmp_path / "many", {f"{number:04d}": scans for number in range(16)})
-    process = subprocess.Popen(
-        [*COMMAND, "slam", "many", "-o", "found"],
-        cwd=tmp_path,
-        env=ENVIRONMENT,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    while not (kept := len(list((tmp_path / "found.slam-paths").glob("*.json")))):
-        assert process.poll() is None
-        time.sleep(0.01)
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=PATIENCE)
-    assert (process.returncode, out) == (130, "")
+    with CommandProcess("slam", "many", "-o", "found", cwd=tmp_path) as slam:
+        while not (kept := len(list((tmp_path / "found.slam-paths").glob("*.json")))):
+            assert slam.process.poll() is None
+            time.sleep(0.01)
+        out, err = slam.stop()
+    assert (slam.process.returncode, out) == (130, "")
     files = {file: file.stat().st_mtime_ns for file in (tmp_path / "found.slam-paths").iterdir()}
     assert kept <= len(files) < 16
     (line,) = [line for line in err.splitlines() if not line.startswith("SLAM: ")]
@@ -302,15 +292,7 @@ def test_ctrl_c_before_the_first_path_leaves_nothing(driven: Driven, tmp_path: P
     program = "import os, signal, sys, threading; sys.argv[0] = 'omnibench'; "
     program += "from omnibench.__main__ import main; import omnibench.cli.app, omnibench.slam.slam_request; "
     program += "threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGINT)).start(); main()"
-    run = subprocess.run(
-        [COMMAND[0], "-c", program, "slam", str(driven.data), "-o", "found"],
-        cwd=tmp_path,
-        env=ENVIRONMENT,
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-        check=False,
-    )
+    run = python(program, "slam", driven.data, "-o", "found", cwd=tmp_path, env=ENVIRONMENT)
     assert run.returncode == 130
     assert [line for line in run.stderr.splitlines() if line][-1].startswith("interrupted")  # by imports, or later
     assert list(tmp_path.iterdir()) == []

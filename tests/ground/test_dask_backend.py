@@ -7,8 +7,6 @@ import http.server
 import os
 import pickle
 import signal
-import subprocess
-import sys
 import threading
 import time
 import weakref
@@ -20,7 +18,7 @@ from typing import Any
 import distributed
 import numpy as np
 import pytest
-from commands import ENVIRONMENT, Command, assert_refused, write_config
+from commands import ENVIRONMENT, Command, assert_refused, python, write_config
 from dask_samples import certificates, refusal
 from distributed.protocol import Serialize
 from job_samples import Answer, Notes, jobs_of, squared, tried, wait_for
@@ -238,8 +236,7 @@ def test_a_process_without_the_certificate_reaches_no_part_of_a_cluster_of_this_
     workers = dask.client.scheduler_info(n_workers=-1)["workers"]
     addresses = [dask.client.scheduler.address, *workers, *(worker["nanny"] for worker in workers.values())]
     places = [address.partition("://")[2] for address in addresses]
-    second = subprocess.run([sys.executable, "-c", SECOND_USER, *places], capture_output=True, text=True, check=True)
-    answers = second.stdout.splitlines()
+    answers = python(SECOND_USER, *places).stdout.splitlines()
     assert len(answers) == 2 * len(places) == 10
     assert set(answers) <= {"OSError", "CommClosedError", "TimeoutError"}
 
@@ -293,15 +290,13 @@ def test_a_scheduler_that_nobody_started_is_one_line(command: Command, tmp_path:
 
 def test_without_dask_one_line_names_the_extra(tmp_path: Path) -> None:
     without = "import sys; sys.modules['distributed'] = None; from omnibench.__main__ import main; main()"
-    command = [sys.executable, "-c", without, "compare", str(write_config(tmp_path)), "--backend", "dask"]
-    run = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, check=False, cwd=tmp_path)
+    run = python(without, "compare", write_config(tmp_path), "--backend", "dask", env=ENVIRONMENT, cwd=tmp_path)
     assert_refused(run, 'pip install "omnibench[dask]"')
 
 
 def test_dask_is_imported_only_where_it_is_asked_for() -> None:
     program = "import sys, omnibench.compare.run, omnibench.cli.app; print('distributed' in sys.modules)"
-    run = subprocess.run([sys.executable, "-c", program], env=ENVIRONMENT, capture_output=True, text=True, check=True)
-    assert run.stdout == "False\n"
+    assert python(program, env=ENVIRONMENT).stdout == "False\n"
 
 
 def test_a_web_server_is_no_scheduler() -> None:

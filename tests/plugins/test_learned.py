@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -11,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from commands import python
 from slipping_robot import PERIOD, slipping
 
 from omnibench.data.dataset import Dataset, make_dataset
@@ -169,7 +168,7 @@ try:
 except Exception as error:
     print(error)
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = python(code)
     assert 'needs JAX and optax; pip install "omnibench[learned]"' in done.stdout
     assert done.stdout.count("\n") == 1
 
