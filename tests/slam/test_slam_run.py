@@ -112,11 +112,6 @@ class TestFurnishedRoom:
         with_it, without = (errors(located(run, SlamOptions(deskew=on)), run)[moving] for on in (True, False))
         assert np.abs(with_it[:, 2]).mean() < 0.2 * np.abs(without[:, 2]).mean()
 
-    @pytest.mark.slow
-    def test_without_deskewing_the_covariance_holds_what_the_motion_does(self) -> None:
-        runs = [driven("furnished_room", number) for number in range(4)]
-        assert np.mean([nees(located(run, SlamOptions(deskew=False)), run).mean() for run in runs]) < 5
-
     def test_the_poses_are_the_robots_wherever_the_scanner_sits(self) -> None:
         lidar = Lidar(mount=LidarMount(x=-0.2, y=0.15, yaw_deg=70.0))
         run = driven("furnished_room", 2, lidar)
@@ -155,11 +150,6 @@ class TestSlowScanner:
         assert position.mean() < 1.5 * MM
         assert 1 < np.mean([nees(path, run).mean() for path, run in zip(paths, runs, strict=True)]) < 5
 
-    @pytest.mark.slow
-    def test_covariances_hold_what_the_last_poses_do_not_tell_of_the_motion(self) -> None:
-        runs = [driven("furnished_room", number, self.SLOW) for number in range(4)]
-        assert 1 < np.mean([nees(located(run, LAST_POSE, self.SLOW), run).mean() for run in runs]) < 6
-
 
 @pytest.mark.slow
 @pytest.mark.parametrize("turn_time", [0.025, 0.2])
@@ -193,21 +183,29 @@ class TestCorridor:
         (problem,) = problems(path)  # the robot stands along it, within some degrees
         assert re.fullmatch(r"scans tell too little along ([0-6]|17\d) deg of the run's frame", problem)
 
-    @pytest.mark.parametrize(
-        "options", [DEFAULT, pytest.param(LAST_POSE, marks=pytest.mark.slow)], ids=["odometry", "last_pose"]
-    )
-    def test_stated_covariances_hold_the_errors(self, options: SlamOptions) -> None:
-        runs = [driven("corridor", number) for number in range(6)]
-        assert 1 < np.mean([nees(located(run, options), run).mean() for run in runs]) < 5
+
+@pytest.mark.parametrize(
+    ("name", "count", "options", "lidar", "least", "most"),
+    [
+        ("corridor", 6, DEFAULT, LIDAR, 1, 5),
+        pytest.param("corridor", 6, LAST_POSE, LIDAR, 1, 5, marks=pytest.mark.slow),
+        pytest.param("hall", 4, DEFAULT, LIDAR, 1.5, 5, marks=pytest.mark.slow),
+        pytest.param("furnished_room", 4, SlamOptions(deskew=False), LIDAR, 0, 5, marks=pytest.mark.slow),
+        pytest.param("furnished_room", 4, LAST_POSE, TestSlowScanner.SLOW, 1, 6, marks=pytest.mark.slow),
+    ],
+    ids=["corridor", "corridor from the last pose", "hall", "not deskewed", "slow scanner from the last pose"],
+)
+def test_stated_covariances_hold_the_errors(
+    name: str, count: int, options: SlamOptions, lidar: Lidar, least: float, most: float
+) -> None:
+    runs = [driven(name, number, lidar) for number in range(count)]
+    assert least < np.mean([nees(located(run, options, lidar), run).mean() for run in runs]) < most
 
 
 @pytest.mark.slow
-def test_in_a_hall_poses_are_accurate_and_covariances_honest() -> None:
-    runs = [driven("hall", number) for number in range(4)]
-    paths = [located(run) for run in runs]
-    final = np.array([errors(path, run)[-1] for path, run in zip(paths, runs, strict=True)])
+def test_in_a_hall_poses_are_accurate() -> None:
+    final = np.array([errors(located(run), run)[-1] for run in (driven("hall", number) for number in range(4))])
     assert np.hypot(final[:, 0], final[:, 1]).mean() < 3 * MM
-    assert 1.5 < np.mean([nees(path, run).mean() for path, run in zip(paths, runs, strict=True)]) < 5
 
 
 class TestImperfectScans:

@@ -87,13 +87,6 @@ class AnswersOutside(Honest):
         return Solution(2 * problem.upper - problem.lower, "outside")
 
 
-class MovesFixedElements(Honest):
-    """Forgets that an element may have no width."""
-
-    def step(self, problem: CalibrationProblem, normal: Array) -> None:
-        problem.cost(problem.start + 1e-6 * normal[:, :1] * np.ones(problem.size))
-
-
 class ScalesTrajectories(Honest):
     """Works in place on what others share."""
 
@@ -109,33 +102,6 @@ class ShiftsReference(Honest):
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         problem.reference = problem.reference + 0.1
         return super().calibrate(problem)
-
-
-class Unseeded(Honest):
-    """Random numbers of its own."""
-
-    def normal(self, problem: CalibrationProblem, shape: tuple[int, int]) -> Array:  # noqa: ARG002
-        return np.random.default_rng().normal(size=shape)
-
-
-class LegacyGenerator(Honest):
-    """NumPy's global generator."""
-
-    def normal(self, problem: CalibrationProblem, shape: tuple[int, int]) -> Array:  # noqa: ARG002
-        return np.random.normal(size=shape)  # noqa: NPY002 (the fault that is to be found)
-
-
-class PlainRandom(Honest):
-    """Python's global generator."""
-
-    def normal(self, problem: CalibrationProblem, shape: tuple[int, int]) -> Array:  # noqa: ARG002
-        return np.array([[random.gauss() for _ in range(shape[1])] for _ in range(shape[0])])
-
-
-class CallsItselfDeterministic(Honest):
-    """Draws, and denies it."""
-
-    stochastic = False
 
 
 class Remembers(Honest):
@@ -241,20 +207,6 @@ class LeavesFiles(Honest):
         super().step(problem, normal)
 
 
-class ReturnsVector(Honest):
-    """Returns what should be in a Solution."""
-
-    def calibrate(self, problem: CalibrationProblem) -> Any:
-        return problem.start
-
-
-class NoReason(Honest):
-    """Does not say why it stopped."""
-
-    def calibrate(self, problem: CalibrationProblem) -> Solution:
-        return Solution(problem.start, " ", converged=False)
-
-
 class AlwaysRefuses(Honest):
     """Needs a package that is not there."""
 
@@ -269,21 +221,34 @@ class Undescribed(Honest):
         count: int = 3
 
 
-class Undocumented(Honest):
-    __doc__ = None
+def faulty(**changes: Any) -> type[Calibrator]:
+    return type("Faulty", (Honest,), {"__doc__": "Faulty.", **changes})
 
 
+def legacy_normal(_: Calibrator, __: CalibrationProblem, shape: tuple[int, int]) -> Array:
+    return np.random.normal(size=shape)  # noqa: NPY002 (the fault that is to be found)
+
+
+def plain_normal(_: Calibrator, __: CalibrationProblem, shape: tuple[int, int]) -> Array:
+    return np.array([[random.gauss() for _ in range(shape[1])] for _ in range(shape[0])])
+
+
+MOVES_FIXED_ELEMENTS = faulty(step=lambda _, problem, normal: problem.cost(problem.start[None] + 1e-6 * normal[:, :1]))
+UNSEEDED = faulty(normal=lambda _, __, shape: np.random.default_rng().normal(size=shape))
+LEGACY, PLAIN = faulty(normal=legacy_normal), faulty(normal=plain_normal)
+RETURNS_A_VECTOR = faulty(calibrate=lambda _, problem: problem.start)
+NO_REASON = faulty(calibrate=lambda _, problem: Solution(problem.start, " ", converged=False))
 CASES_OF_CALIBRATORS = [
     (IgnoresBounds, "bounds are kept", "candidates outside the box, e.g. m"),
     (AnswersOutside, "bounds are kept", "the answer is outside the box (m11, m12"),
-    (MovesFixedElements, "bounds are kept", "candidates outside the box, e.g. m12"),
+    (MOVES_FIXED_ELEMENTS, "bounds are kept", "candidates outside the box, e.g. m12"),
     (ScalesTrajectories, "inputs are left unchanged", "it changed rates of trajectory 01"),
     (ShiftsReference, "inputs are left unchanged", "it changed reference"),
-    (Unseeded, "same seed twice gives the same answer", "different answers; draw all random numbers from problem.rng"),
-    (LegacyGenerator, "same seed twice gives the same answer", "different answers"),
-    (LegacyGenerator, "global random state is left alone", "global generator"),
-    (PlainRandom, "global random state is left alone", "global generator"),
-    (CallsItselfDeterministic, "seed makes no difference where it says so", "depends on the seed"),
+    (UNSEEDED, "same seed twice gives the same answer", "different answers; draw all random numbers from problem.rng"),
+    (LEGACY, "same seed twice gives the same answer", "different answers"),
+    (LEGACY, "global random state is left alone", "global generator"),
+    (PLAIN, "global random state is left alone", "global generator"),
+    (faulty(stochastic=False), "seed makes no difference where it says so", "depends on the seed"),
     (Remembers, "same seed twice gives the same answer", "two runs with seed 0"),
     (WorseThanStart, "synthetic problem is solved or honestly reported", "times the cost of the start"),
     (SearchesUncounted, "budget is kept", "200 by problem.values"),
@@ -295,11 +260,11 @@ CASES_OF_CALIBRATORS = [
     (CountsOnNine, "four wheels work", "calibrate raised ValueError"),
     (Prints, "it works in silence", "it printed 'generation"),
     (LeavesFiles, "it works in silence", "search.log"),
-    (ReturnsVector, "bounds are kept", "calibrate returned ndarray, expected a Solution"),
-    (NoReason, "synthetic problem is solved or honestly reported", "reason is empty"),
+    (RETURNS_A_VECTOR, "bounds are kept", "calibrate returned ndarray, expected a Solution"),
+    (NO_REASON, "synthetic problem is solved or honestly reported", "reason is empty"),
     (AlwaysRefuses, "synthetic problem is solved or honestly reported", "pip install nowhere"),
     (Undescribed, "class and options are documented", "options without a description: count"),
-    (Undocumented, "class and options are documented", "Undocumented has no docstring"),
+    (faulty(__doc__=None), "class and options are documented", "Faulty has no docstring"),
 ]
 
 

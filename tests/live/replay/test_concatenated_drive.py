@@ -20,7 +20,6 @@ from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.storage import save_dataset
 from omnibench.errors import ConfigError, DataError, OmnibenchError
 from omnibench.live.replay.concatenated_drive import (
-    ConcatenatedDrive,
     Recording,
     concatenate_recording,
     concatenate_runs,
@@ -330,27 +329,15 @@ def test_what_cannot_be_chained_is_named(options: dict[str, Any], named: str) ->
         concatenate_runs(options.pop("dataset", random_dataset(1)), **options)
 
 
-@pytest.fixture(scope="module")
-def drive(omni3: Dataset) -> ConcatenatedDrive:
-    return concatenate_runs(omni3)
-
-
-class TestRealRecordings:
-    def test_all_runs_are_concatenated_session_by_session(self, omni3: Dataset, drive: ConcatenatedDrive) -> None:
-        sessions = {run.id: run.session for run in omni3.trajectories}
-        order = [sessions[each] for each in drive.ids]
-        assert len(order) == 67
-        assert sum(before != after for before, after in pairwise(order)) == len(set(order)) - 1
-
-    def test_wheel_angles_and_rates_tell_the_same_motion(self, drive: ConcatenatedDrive) -> None:
-        driven = drive.rates[1:] * np.diff(drive.wheel_times)[:, None]
-        np.testing.assert_allclose(np.diff(drive.angles, axis=0), driven, atol=1e-9)
-        assert (np.diff(drive.wheel_times) > 0).all()
-
-    def test_reference_poses_are_those_composed_by_hand(self, omni3: Dataset, drive: ConcatenatedDrive) -> None:
-        known = {run.id: run for run in omni3.trajectories}
-        by_hand = composed_by_hand(tuple(known[each] for each in drive.ids))
-        np.testing.assert_allclose(homogeneous(drive.slam_poses[-1]), by_hand[-1][-1], atol=1e-8)
+def test_all_runs_of_real_recordings_are_concatenated_session_by_session(omni3: Dataset) -> None:
+    drive, known = concatenate_runs(omni3), {run.id: run for run in omni3.trajectories}
+    runs = tuple(known[each] for each in drive.ids)
+    assert len(runs) == 67
+    assert sum(one.session != other.session for one, other in pairwise(runs)) == len({run.session for run in runs}) - 1
+    driven = drive.rates[1:] * np.diff(drive.wheel_times)[:, None]
+    np.testing.assert_allclose(np.diff(drive.angles, axis=0), driven, atol=1e-9)
+    assert (np.diff(drive.wheel_times) > 0).all()
+    np.testing.assert_allclose(homogeneous(drive.slam_poses[-1]), composed_by_hand(runs)[-1][-1], atol=1e-8)
 
 
 FLOWER = FlowerConfig(

@@ -163,17 +163,12 @@ def recording(
 
 
 @pytest.mark.parametrize("topic", TOPICS)
-def test_rosbags_reads_the_recording(recording: Path, topic: str) -> None:
+def test_rosbags_and_mcap_ros2_support_read_the_recording(recording: Path, topic: str) -> None:
     with AnyReader([recording]) as reader:
         (connection,) = [each for each in reader.connections if each.topic == ros_name(topic)]
         ((_, _, payload),) = reader.messages([connection])
-        content = reader.deserialize(payload, connection.msgtype)
-    assert connection.msgtype == TOPICS[topic].name
-    assert read(topic, content) == EXPECTED[topic]
-
-
-@pytest.mark.parametrize("topic", TOPICS)
-def test_mcap_ros2_support_reads_the_recording(recording: Path, topic: str) -> None:
+        assert connection.msgtype == TOPICS[topic].name
+        assert read(topic, reader.deserialize(payload, connection.msgtype)) == EXPECTED[topic]
     decoder = pytest.importorskip("mcap_ros2.decoder", reason="mcap-ros2-support is not installed")
     mcap = pytest.importorskip("mcap.reader")
     with recording.open("rb") as file:
@@ -200,18 +195,12 @@ def rmw_node(network: Loopback) -> Iterator[dict[str, Publisher[Any]]]:
     graph.session.close()
 
 
-def definitions(topic: str) -> tuple[str, dict[str, str]]:
-    """The definition of a topic's type, and those of the types within it by name."""
+def type_hash(topic: str) -> str:
+    """As zenoh-ros2-sdk computes it from the definition of a topic's type and those of the types within it."""
+    utils = pytest.importorskip("zenoh_ros2_sdk.utils")
     own, *others = TOPICS[topic].definition.split("=" * 80 + "\n")
     within = dict(text.removeprefix("MSG: ").split("\n", 1) for text in others)
-    return own, {"/msg/".join(name.split("/")): text for name, text in within.items()}
-
-
-def type_hash(topic: str) -> str:
-    """As zenoh-ros2-sdk computes it."""
-    utils = pytest.importorskip("zenoh_ros2_sdk.utils")
-    own, within = definitions(topic)
-    return utils.get_type_hash(TOPICS[topic].name, own, within)
+    return utils.get_type_hash(TOPICS[topic].name, own, {name.replace("/", "/msg/"): within[name] for name in within})
 
 
 @pytest.mark.usefixtures("rmw_node")

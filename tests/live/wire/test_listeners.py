@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import os
 import signal
 import struct
@@ -13,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
@@ -57,17 +56,22 @@ def odom(loopback: Loopback) -> Publisher[Odometry]:
     return odom_publisher(loopback)
 
 
-@pytest.fixture
-def subscription(loopback: Loopback, odom: Publisher[Odometry]) -> Iterator[Subscription]:
-    with subscribe("apr02", connect=loopback.address) as opened:
+@contextmanager
+def subscribed(loopback: Loopback, odom: Publisher[Odometry], **options: Any) -> Iterator[Subscription]:
+    with subscribe("apr02", connect=loopback.address, **options) as opened:
         until(lambda: odom.matched, "the subscription")
         yield opened
 
 
 @pytest.fixture
+def subscription(loopback: Loopback, odom: Publisher[Odometry]) -> Iterator[Subscription]:
+    with subscribed(loopback, odom) as opened:
+        yield opened
+
+
+@pytest.fixture
 def lossless(loopback: Loopback, odom: Publisher[Odometry]) -> Iterator[Subscription]:
-    with subscribe("apr02", connect=loopback.address, lossless=True) as opened:
-        until(lambda: odom.matched, "the subscription")
+    with subscribed(loopback, odom, lossless=True) as opened:
         yield opened
 
 
@@ -156,20 +160,14 @@ def test_a_callback_gets_every_message_and_one_that_raises_is_counted_logged_onc
         if len(calls) > 10:
             raise KeyError("x") if len(calls) % 2 else ZeroDivisionError("y")
 
-    with (
-        caplog.at_level(logging.ERROR),
-        subscribe("apr02", connect=loopback.address, lossless=True, callback=callback) as subscription,
-    ):
-        until(lambda: odom.matched, "the subscription")
+    with subscribed(loopback, odom, lossless=True, callback=callback) as subscription:
         for k in range(20):
             odom.put(odometry(k))
         until(lambda: subscription.callback_errors == 10, "all messages")
         assert subscription.received == 20
     assert calls == [odometry(k).stamp for k in range(20)]
-    assert [("KeyError" in each, "ZeroDivisionError" in each) for each in caplog.messages] == [
-        (True, False),
-        (False, True),
-    ]
+    first, second = caplog.messages
+    assert ("KeyError" in first, "ZeroDivisionError" in second) == (True, True)
 
 
 @pytest.mark.parametrize("wait", [list, lambda each: each.latest(120.0) or []], ids=["iterating", "for the latest"])
@@ -323,13 +321,8 @@ def test_payloads_that_cannot_be_decoded_are_counted_and_left_out(loopback: Loop
     odom = publishers(loopback)["odom"]
     wait_for_subscribers(odom)
     whole = TOPICS["odom"].encode(sample("odom"))
-    for broken in (
-        b"",
-        b"garbage",
-        whole[:100],
-        whole + b"more",
-        TOPICS["joint_states"].encode(sample("joint_states")),
-    ):
+    joints = TOPICS["joint_states"].encode(sample("joint_states"))
+    for broken in (b"", b"garbage", whole[:100], whole + b"more", joints):
         odom.put_encoded(broken)
     odom.put_encoded(whole)
     until(lambda: recorder.messages, "the message that can")
@@ -591,13 +584,9 @@ def test_the_newest_odometry_of_both_topics_is_known(monitor: RobotMonitor, apr0
     for k in range(20):
         apr02.odom.put(odometry(k))
         apr02.filtered.put(odometry(k, "map"))
-    until(
-        lambda: (
-            (status := status_of(monitor, "apr02")) and status.odom and status.odom.message.stamp == odometry(19).stamp
-        ),
-        "19",
-    )
-    status = until_status(monitor, "apr02", "fused odometry", filtered=..., presence="alive")
+    status = until_status(monitor, "apr02", "odometry", filtered=..., odom=..., presence="alive")
+    until(lambda: status_of(monitor, "apr02").odom.message.stamp == odometry(19).stamp, "the last odometry")
+    status = status_of(monitor, "apr02")
     np.testing.assert_allclose(status.odom.message.pose, odometry(19).pose, atol=1e-15)
     assert status.filtered.message.frame == "map"
 
