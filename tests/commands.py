@@ -85,6 +85,12 @@ def assert_refused(run: Printed | subprocess.CompletedProcess[str], *parts: str)
         assert part in run.stderr
 
 
+def succeeded(run: Any) -> Any:
+    """What a command printed that must have ended well."""
+    assert run.returncode == 0, run.stderr
+    return run
+
+
 def flower(**changes: Any) -> dict[str, Any]:
     """Six short simulated runs to train and six to validate: what a config says under ``simulate``."""
     angles = (1.0471975511965976, 3.141592653589793, 5.235987755982989)

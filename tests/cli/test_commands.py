@@ -21,6 +21,7 @@ from commands import (
     Prepared,
     Printed,
     assert_refused,
+    succeeded,
     write_config,
     write_plugin,
 )
@@ -166,8 +167,7 @@ def test_a_terminal_without_a_letter_shows_another(prepared: Prepared, tmp_path:
 def test_inspect_warns_of_units_that_cannot_be_right(command: Command, prepared: Prepared, tmp_path: Path) -> None:
     file = shutil.copytree(prepared.data, tmp_path / "data") / "poses.parquet"
     pl.read_parquet(file).with_columns(pl.col("x", "y") * 1000).write_parquet(file)
-    printed = command("inspect", tmp_path / "data")
-    assert printed.returncode == 0
+    printed = succeeded(command("inspect", tmp_path / "data"))
     assert "warning: positions look like mm" in printed.stderr
 
 
@@ -220,8 +220,7 @@ def test_list_goes_on_past_a_plugin_that_cannot_be_imported(command: Command, tm
 
 
 def test_export_writes_to_standard_output_or_to_a_file(command: Command, prepared: Prepared, tmp_path: Path) -> None:
-    shown = command("export", prepared.calibration, "--to", "c_header")
-    assert shown.returncode == 0
+    shown = succeeded(command("export", prepared.calibration, "--to", "c_header"))
     written = command("export", prepared.calibration, "--to", "c_header", "-o", tmp_path / "m.h")
     assert (tmp_path / "m.h").read_text() == shown.stdout
     assert written.stdout == ""
@@ -251,8 +250,7 @@ def test_import_turns_recordings_into_a_data_set(command: Command, tmp_path: Pat
     if not source.is_dir():
         pytest.skip(f"the recordings are not there: {source}")
     split = ("--set", "train=circular", "--set", "validation=square")
-    printed = command("import", "optiodom", source, "-o", tmp_path / "data", *split)
-    assert printed.returncode == 0, printed.stderr
+    printed = succeeded(command("import", "optiodom", source, "-o", tmp_path / "data", *split))
     assert printed.stdout == f"67 trajectories: {tmp_path / 'data'}\n"
     division = "training 44 runs of 20 commands, validation 23 runs of 5 commands, by train=circular, validation=square"
     assert division in printed.stderr
@@ -283,8 +281,7 @@ def test_a_new_plugin_is_checked_and_compared(command: Command, tmp_path: Path) 
     assert " passed" in check.stdout.splitlines()[-1]
     assert "failed" not in check.stdout
     config = write_config(tmp_path / "c", calibrators=["closed_form", "my_search"])
-    compared = command("compare", config, "--plugins", "plugins", "--output", tmp_path / "out")
-    assert compared.returncode == 0
+    compared = succeeded(command("compare", config, "--plugins", "plugins", "--output", tmp_path / "out"))
     assert "flower my_search seed 1: budget, cost 0.0" in compared.stderr
 
 
@@ -361,8 +358,7 @@ def test_every_figure_is_written_as_svg_and_png(command: Command, prepared: Prep
     if "scans" in typed:
         save_dataset(sample(repetitions=1, rays=360).dataset, Path("scans"))
     Path("out").mkdir()
-    printed = command(*(word.format_map(prepared._asdict()) for word in typed), "--figures", "pictures")
-    assert printed.returncode == 0, printed.stderr
+    printed = succeeded(command(*(word.format_map(prepared._asdict()) for word in typed), "--figures", "pictures"))
     drawn = Path("out/report.html").read_text(encoding="utf-8").count('<div class="figures">')
     assert f"figures: pictures ({drawn}, each as SVG and PNG" in printed.stderr
     pictures = list(Path("pictures").iterdir())

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import polars as pl
 import pytest
-from commands import Command, Printed, assert_refused, run_here
+from commands import Command, Printed, assert_refused, run_here, succeeded
 from discovery_samples import EXPERIMENT, incomplete, named, nameless, nothing, simulated
 from nodes import Command as CommandProcess
 from rich.console import Console
@@ -91,8 +91,7 @@ def test_the_hidden_effect_is_named_and_the_extended_calibration_is_better(told:
 
 @pytest.mark.slow
 def test_the_default_folder_has_the_name_of_the_data_and_the_newest_is_linked(command: Command, data: Path) -> None:
-    run = command("discover", data, "--without", "rotation_translation_coupling", "--seed", 3)
-    assert run.returncode == 0
+    run = succeeded(command("discover", data, "--without", "rotation_translation_coupling", "--seed", 3))
     assert "added: rotation_translation_coupling" not in run.stdout
     latest = Path("results/flower/latest")
     assert latest.is_symlink()

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 import typer
-from commands import Command, Prepared, flower, run_here, write_config
+from commands import Command, Prepared, flower, run_here, succeeded, write_config
 from shared_results import made_once, shared_folder
 from typed_pages import parse
 
@@ -56,8 +56,7 @@ _LONG = (
 def swerve() -> Path:
     """Simulated recordings of a robot whose matrix has eight columns."""
     folder = shared_folder() / "swerve"
-    run = run_here("simulate", bundled_folder() / "configs/swerve.yaml", "-o", folder, cwd=shared_folder())
-    assert run.returncode == 0, run.stderr
+    succeeded(run_here("simulate", bundled_folder() / "configs/swerve.yaml", "-o", folder, cwd=shared_folder()))
     return folder
 
 
@@ -81,8 +80,7 @@ def words(text: str) -> set[str]:
 
 @pytest.mark.parametrize("typed", _WITHOUT_TABLES, ids=" ".join)
 def test_a_command_ends_with_a_sentence(command: Command, prepared: Prepared, typed: tuple[str, ...]) -> None:
-    printed = command(*filled_in(typed, prepared))
-    assert printed.returncode == 0, printed.stderr
+    printed = succeeded(command(*filled_in(typed, prepared)))
     assert_ends_with_a_sentence(printed.stderr)
     assert "; next, " not in printed.stdout
 
@@ -97,8 +95,7 @@ def test_a_command_with_tables_ends_with_a_sentence_and_cuts_no_word_on_a_narrow
     shown = {}
     for columns in (80, 60, 500):
         monkeypatch.setenv("COLUMNS", str(columns))
-        printed = command(*filled_in(typed, prepared), *(["--force"] if "-o" in typed else []))
-        assert printed.returncode == 0, printed.stderr
+        printed = succeeded(command(*filled_in(typed, prepared), *(["--force"] if "-o" in typed else [])))
         assert "; next, " not in printed.stdout
         shown[columns] = re.sub(r"\x1b\[[^m]*m", "", printed.stdout)
     if typed[0] != "discover":  # which ends with its verdict
@@ -112,8 +109,7 @@ def test_a_command_with_tables_ends_with_a_sentence_and_cuts_no_word_on_a_narrow
 
 @pytest.mark.parametrize("typed", [("list",), ("calibrate", "{data}"), ("evaluate", "{calibration}", "{data}")])
 def test_with_json_no_sentence_is_printed(command: Command, prepared: Prepared, typed: tuple[str, ...]) -> None:
-    printed = command(*(word.format_map(prepared._asdict()) for word in typed), "--json")
-    assert printed.returncode == 0
+    printed = succeeded(command(*(word.format_map(prepared._asdict()) for word in typed), "--json"))
     assert "; next, " not in printed.stdout + printed.stderr
 
 

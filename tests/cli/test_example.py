@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 import pytest
 import yaml
-from commands import CONFIGS, Command, assert_refused
+from commands import CONFIGS, Command, assert_refused, succeeded
 from real_recordings import OPTIODOM
 from rich.console import Console
 from typed_pages import parse
@@ -69,8 +69,7 @@ def test_an_example_says_what_to_type_next_and_is_as_good_as_written_where_it_is
     assert printed[-2:] == ["  cd demo", "  omnibench compare configs/apr02.yaml"]
     assert any(line.startswith("written: demo/plugins (") for line in printed)
     assert command("example", "live", "-o", "demo").stdout.startswith("written: demo/configs/live.yaml\n")
-    again = command("example", "apr02", "-o", "demo")
-    assert again.returncode == 0
+    again = succeeded(command("example", "apr02", "-o", "demo"))
     assert again.stdout.startswith("nothing is written")
 
 

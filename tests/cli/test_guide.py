@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from commands import ROOT, Command, Prepared, assert_refused
+from commands import ROOT, Command, Prepared, assert_refused, succeeded
 from newcomer import ELSEWHERE, lines_of, typed_here
 from newcomer import PAGES as TYPED_PAGES
 from pydantic import TypeAdapter
@@ -55,8 +55,7 @@ def test_every_page_of_the_handbook_is_listed_once() -> None:
 
 @pytest.mark.parametrize("name", BY_NAME)
 def test_a_topic_is_plain_markdown_when_piped_and_its_code_fits_a_narrow_terminal(command: Command, name: str) -> None:
-    printed = command("guide", name)
-    assert printed.returncode == 0
+    printed = succeeded(command("guide", name))
     assert printed.stdout.startswith("# ")
     assert ".md" not in printed.stdout  # links to topics are commands there
     assert [line for block in blocks(BY_NAME[name].file) for line in block.splitlines() if len(line) > 76] == []

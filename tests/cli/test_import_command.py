@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from commands import Command, assert_refused
+from commands import Command, assert_refused, succeeded
 from newcomer_log import Machine, write_logs
 
 from omnibench.data.dataset import Dataset
@@ -52,8 +52,7 @@ def filled_in(command: Command, tmp_path: Path) -> Path:
 @pytest.mark.parametrize("name", ["csv", "dataset", "optiodom", "rosbag", "table1"])
 def test_an_importers_help_lists_every_option(command: Command, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     monkeypatch.setenv("COLUMNS", "80")
-    shown = command("import", name, "--help")
-    assert shown.returncode == 0
+    shown = succeeded(command("import", name, "--help"))
     assert max(map(len, shown.stdout.splitlines())) <= 80
     for key, field in importers.entry(name).options.model_fields.items():
         assert f"\n  {key}  " in shown.stdout
@@ -82,11 +81,9 @@ def test_the_help_of_import_says_where_the_options_are(command: Command) -> None
     ],
 )
 def test_a_template_imports_as_it_is_written(command: Command, tmp_path: Path, robot: str) -> None:
-    made = command("import", "csv", "--template", tmp_path / "log", "--robot-type", robot)
-    assert made.returncode == 0
+    succeeded(command("import", "csv", "--template", tmp_path / "log", "--robot-type", robot))
     assert max(map(len, (tmp_path / "log" / "robot.yaml").read_text().splitlines())) <= 80
-    imported = command("import", "csv", tmp_path / "log", "-o", tmp_path / "data")
-    assert imported.returncode == 0, imported.stderr
+    imported = succeeded(command("import", "csv", tmp_path / "log", "-o", tmp_path / "data"))
     assert "warning" not in imported.stderr
     runs = load_dataset(tmp_path / "data").trajectories
     assert [(run.id, run.command, run.repetition) for run in runs[:2]] == [("left_1", "left", 1), ("left_2", "left", 2)]
@@ -114,8 +111,7 @@ def test_units_that_cannot_be_right_are_refused_with_the_option_to_type(command:
     assert not data.exists()
     mended = command("import", "csv", filled_in, "-o", data, "--set", "heading_unit=deg")
     assert (mended.returncode, "warning" in mended.stderr) == (0, False)
-    accepted = command("import", "csv", filled_in, "-o", filled_in.parent / "raw", "--accept-units")
-    assert accepted.returncode == 0
+    succeeded(command("import", "csv", filled_in, "-o", filled_in.parent / "raw", "--accept-units"))
     again = command("import", "dataset", filled_in.parent / "raw", "-o", data, "--force", "--set", "heading_unit=deg")
     assert (again.returncode, "warning" in again.stderr) == (0, False)
 
@@ -138,8 +134,7 @@ def test_counts_a_row_are_refused(command: Command, filled_in: Path, monkeypatch
 
 def test_a_data_set_keeps_what_was_typed_and_import_ends_with_what_came_out(command: Command, filled_in: Path) -> None:
     data = filled_in.parent / "data"
-    done = command("import", "csv", filled_in, "-o", data, "--set", "longest_gap=2")
-    assert done.returncode == 0
+    done = succeeded(command("import", "csv", filled_in, "-o", data, "--set", "longest_gap=2"))
     imported = load_dataset(data).imported
     assert (imported.importer, imported.source, imported.options) == ("csv", str(filled_in), {"longest_gap": 2})
     ended = done.stderr.splitlines()
@@ -190,11 +185,9 @@ def test_four_commands_lead_from_a_strange_log_to_the_truth(command: Command, ro
     assert_refused(command(*named), "heading_unit=deg", "position_unit=mm")
 
     units = ["heading_unit=deg", "position_unit=mm", "wheel_time_unit=ms", "command_pattern=^(.*)_"]
-    whole = command(*named, *(word for unit in units for word in ("--set", unit)))
-    assert whole.returncode == 0, whole.stderr
+    succeeded(command(*named, *(word for unit in units for word in ("--set", unit))))
 
-    calibrated = command("calibrate", "data", "-o", "calibration.yaml", "--json")
-    assert calibrated.returncode == 0, calibrated.stderr
+    calibrated = succeeded(command("calibrate", "data", "-o", "calibration.yaml", "--json"))
     content = json.loads(calibrated.stdout)
     assert content["provenance"]["held_out"]["verdict"] == "better"
     assert_holds(content, machine)
@@ -240,8 +233,7 @@ def test_other_commands_take_references_and_check_names_what_they_leave_open(com
         "calibrate taped --calibrator closed_form --intervals --unidentified keep",
         "simulate --like taped --model c.yaml -o like",
     ):
-        done = command(*typed.split())
-        assert done.returncode == 0, done.stderr
+        done = succeeded(command(*typed.split()))
         assert ('"references_leave_open"' in done.stdout) == ("--json" in typed)
 
 

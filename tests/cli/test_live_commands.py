@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 import zenoh
-from commands import CONFIGS, assert_refused, flower, omnibench, prepare, write_config
+from commands import CONFIGS, assert_refused, flower, omnibench, prepare, succeeded, write_config
 from commands import Command as InProcess
 from drives import calibration
 from nodes import Command, asked, connected, write_node
@@ -65,12 +65,10 @@ def test_a_replay_is_one_command_and_shows_the_batch_odometry(command: InProcess
 
 
 def test_a_replay_can_name_another_recording_and_may_have_no_samples(command: InProcess, workplace: Path) -> None:
-    run = command("live", workplace / "node.yaml", "--replay", workplace / "data")
-    assert run.returncode == 0, run.stderr
+    run = succeeded(command("live", workplace / "node.yaml", "--replay", workplace / "data"))
     assert "against the reference poses of the recording" in run.stdout  # a data set's folder has no truth beside it
     assert "simulated" in run.stdout
-    run = command("live", workplace / "node.yaml", "--replay", "--seconds", "0")
-    assert run.returncode == 0, run.stderr
+    run = succeeded(command("live", workplace / "node.yaml", "--replay", "--seconds", "0"))
     assert "0 wheel samples" in run.stdout
     assert "nan" not in run.stdout
 
@@ -147,14 +145,12 @@ def test_a_recording_goes_out_and_a_calibration_is_swapped_in(command: InProcess
         )
         assert imported.returncode == 0, imported.stderr
         assert len(load_dataset(workplace / "back").trajectories) == 12
-        fitted = command("calibrate", workplace / "back", "-o", workplace / "again.yaml")
-        assert fitted.returncode == 0, fitted.stderr
+        succeeded(command("calibrate", workplace / "back", "-o", workplace / "again.yaml"))
         again = read_calibration(workplace / "again.yaml")
         np.testing.assert_allclose(
             again.matrix_array, read_calibration(workplace / "calibration.yaml").matrix_array, atol=0.004
         )
-        swapped = command("swap", "apr", workplace / "again.yaml", "--connect", endpoint(config))
-        assert swapped.returncode == 0, swapped.stderr
+        swapped = succeeded(command("swap", "apr", workplace / "again.yaml", "--connect", endpoint(config)))
         assert f"apr runs {again.name} now; next, " in swapped.stderr
         assert "begins with the old calibration" in swapped.stderr  # the config has no state
         assert asked(session, "omnibench/apr/info")["calibration"] == again.name
@@ -168,8 +164,7 @@ def test_a_recording_goes_out_and_a_calibration_is_swapped_in(command: InProcess
 
 
 def test_a_node_ends_with_a_sentence_that_says_how_to_start_it_again(command: InProcess, workplace: Path) -> None:
-    ended = command("live", workplace / "node.yaml", "--seconds", "0")
-    assert ended.returncode == 0, ended.stderr
+    ended = succeeded(command("live", workplace / "node.yaml", "--seconds", "0"))
     assert re.search(r"^node \w+ has ended, .*:\n  omnibench live ", ended.stderr, re.MULTILINE)
 
 
@@ -177,8 +172,7 @@ def test_a_node_ends_with_a_sentence_that_says_how_to_start_it_again(command: In
 def test_a_robot_of_a_fleet_cannot_write_for_another(command: InProcess, workplace: Path, tmp_path: Path) -> None:
     """The project's own configs, on loopback: certificates, node, rightful robot, intruder."""
     port = free_port()
-    made = command("keys", tmp_path / "keys", "node", "apr02", "apr03", "screen", "lab")
-    assert made.returncode == 0, made.stderr
+    succeeded(command("keys", tmp_path / "keys", "node", "apr02", "apr03", "screen", "lab"))
     for name in ("live_fleet.yaml", "live_fleet_client.yaml"):
         text = (CONFIGS / name).read_text().replace("0.0.0.0:7447", f"127.0.0.1:{port}")
         (tmp_path / name).write_text(text.replace("localhost:7447", f"127.0.0.1:{port}").replace("screen.", "apr02."))

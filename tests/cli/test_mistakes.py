@@ -12,7 +12,7 @@ from pathlib import Path
 import polars as pl
 import pytest
 import yaml
-from commands import COMMAND, ENVIRONMENT, Command, Prepared, assert_refused, disk_that_takes, omnibench
+from commands import COMMAND, ENVIRONMENT, Command, Prepared, assert_refused, disk_that_takes, omnibench, succeeded
 
 from omnibench.data.storage import load_dataset, save_dataset
 
@@ -109,8 +109,7 @@ def test_a_reader_that_has_gone_is_no_error(prepared: Prepared) -> None:
 
 @pytest.mark.parametrize("closed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_stream_that_was_closed_before_the_start_is_no_traceback(closed: int) -> None:
-    run = omnibench("list", preexec_fn=lambda: os.close(closed))
-    assert run.returncode == 0
+    run = succeeded(omnibench("list", preexec_fn=lambda: os.close(closed)))
     assert "Traceback" not in run.stderr
     assert ("closed_form" in run.stdout) == (closed == 2)
 
@@ -260,8 +259,7 @@ def test_what_is_there_is_not_written_over_and_force_is_named(command: Command, 
 )
 def test_it_is_written_over_by_force(command: Command, here: Path, arguments: str, written: str) -> None:
     before = contents(here)
-    run = command(*arguments.split(), "--force")
-    assert run.returncode == 0, run.stderr
+    succeeded(command(*arguments.split(), "--force"))
     assert contents(here)[written] != before[written]
 
 

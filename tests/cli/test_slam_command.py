@@ -14,7 +14,7 @@ import numpy as np
 import polars as pl
 import pytest
 import yaml
-from commands import ENVIRONMENT, Command, Printed, assert_refused, python, run_here
+from commands import ENVIRONMENT, Command, Printed, assert_refused, python, run_here, succeeded
 from drives import calibration
 from nodes import Command as CommandProcess
 
@@ -140,8 +140,7 @@ def test_the_search_can_start_from_the_last_pose(command: Command, driven: Drive
 
 def test_a_calibration_can_give_the_odometry(command: Command, driven: Driven, found: Found) -> None:
     assert command("calibrate", found.data, "-o", "calibration.yaml").returncode == 0
-    run = command("slam", driven.data, "-o", "second", "--model", "calibration.yaml")
-    assert run.returncode == 0, run.stderr
+    succeeded(command("slam", driven.data, "-o", "second", "--model", "calibration.yaml"))
     apart = distances(load_dataset(found.data), load_dataset("second"))
     assert apart.position_p95_m < 0.001
 
@@ -156,8 +155,7 @@ def test_an_effect_of_a_plug_in_works_in_the_calibration(command: Command, drive
     parameters = effects.entry("swerve", "test").cls().parameters(ROBOT)
     fitted["effects"] = [{"name": "swerve", "parameters": {parameter.name: 0.0 for parameter in parameters}}]
     Path("calibration.yaml").write_text(yaml.safe_dump(fitted))
-    run = command("slam", driven.data, "-o", "found", "--model", "calibration.yaml", "--plugins", "plugins")
-    assert run.returncode == 0, run.stderr
+    succeeded(command("slam", driven.data, "-o", "found", "--model", "calibration.yaml", "--plugins", "plugins"))
     assert len(load_dataset("found").trajectories) == 3
 
 
@@ -266,8 +264,7 @@ def test_ctrl_c_loses_no_path(
     assert "found.slam-paths" in line
     assert {file.name for file in tmp_path.iterdir()} == {"many", "found.slam-paths"}
     monkeypatch.chdir(tmp_path)
-    run = command("slam", "many", "-o", "found")
-    assert run.returncode == 0, run.stderr
+    succeeded(command("slam", "many", "-o", "found"))
     assert {file.name for file in tmp_path.iterdir()} == {"many", "found"}
     poses = {trajectory.poses.tobytes() for trajectory in load_dataset("found").trajectories}
     assert len(poses) == 1  # of one run, whoever found its path

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import pty
 import re
@@ -14,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import COMMAND, ENVIRONMENT, Command, compared_here, search, write_config
+from commands import COMMAND, ENVIRONMENT, Command, compared_here, search, succeeded, write_config
 from export_samples import TRICYCLE
 from report_page import Page
 from rich.console import Console
@@ -119,7 +118,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> ComparisonResult:
 
 
 def compared_text(result: ComparisonResult, width: int = 160) -> str:
-    stream = io.StringIO()
+    stream = StringIO()
     print_result(Console(file=stream, width=width, markup=False, emoji=False, highlight=False), result)
     return stream.getvalue()
 
@@ -150,8 +149,7 @@ def test_forty_columns_keep_the_calibrated_costs_and_the_improvement(result: Com
 
 
 def test_a_pipe_gets_one_plain_line_for_each_run_and_the_tables(command: Command, tmp_path: Path) -> None:
-    run = command("compare", write_config(tmp_path, workers=1), "--output", tmp_path / "out")
-    assert run.returncode == 0, run.stderr
+    run = succeeded(command("compare", write_config(tmp_path, workers=1), "--output", tmp_path / "out"))
     # On a busy machine also how far the simulation or a run is.
     lines = [line for line in run.stderr.splitlines() if " of 2,000" not in line and not line.startswith("simulating")]
     assert [line.split(":")[0] for line in lines] == [
@@ -221,33 +219,36 @@ def a_dataset() -> Dataset:
     return make_dataset("curves", TRICYCLE, 0.1, runs)
 
 
-def test_a_matrix_has_a_column_for_each_drive_signal() -> None:
-    dataset, console = a_dataset(), Console(file=io.StringIO(), width=120)
-    print_calibration(console, calibrate(dataset))
+def calibration_lines(dataset: Dataset, *arguments: Any, **options: Any) -> list[str]:
+    """What is printed of a data set and its calibration."""
+    console = Console(file=StringIO(), width=160)
+    print_calibration(console, calibrate(dataset, *arguments, **options))
     print_inspection(console, inspect_dataset(dataset))
-    lines = console.file.getvalue().splitlines()
+    return console.file.getvalue().splitlines()
+
+
+def test_a_matrix_has_a_column_for_each_drive_signal() -> None:
+    lines = calibration_lines(a_dataset())
     assert any(line.split() == ["front_cos", "front_sin"] for line in lines)
     assert any(line.startswith("directions of drive signals driven: 2 of 2") for line in lines)
     assert not any("wheel front" in line for line in lines)
 
 
 def test_the_geometry_of_a_tricycle_is_shown_with_the_place_of_its_tracked_point() -> None:
-    console = Console(file=io.StringIO(), width=160)
-    searched = calibrate(a_dataset(), "crs", parameterisation="geometry", budget=Budget(evaluations=200))
-    print_calibration(console, searched)
-    assert any(line.startswith("mount_x") for line in console.file.getvalue().splitlines())
+    lines = calibration_lines(a_dataset(), "crs", parameterisation="geometry", budget=Budget(evaluations=200))
+    assert any(line.startswith("mount_x") for line in lines)
 
 
 def test_an_element_that_is_0_but_for_rounding_has_no_share_of_the_design() -> None:
     wheels = (Wheel(name=f"{n}", radius=0.05, distance=0.2, angle=n * 2 * np.pi / 3) for n in range(3))
-    robot, console = Robot(name="omni", wheels=tuple(wheels)), Console(file=io.StringIO(), width=160)
+    robot = Robot(name="omni", wheels=tuple(wheels))
     assert 0 < abs(robot.inverse_kinematic_matrix[0, 0]) < 1e-15
     dataset = make_dataset("omni", robot, PERIOD, synthetic_trajectories(robot))
-    print_calibration(console, calibrate(dataset, "random_search", budget=Budget(evaluations=200)))
-    shares = re.findall(r"([+-][\d.]+) %\)", console.file.getvalue())
+    text = "\n".join(calibration_lines(dataset, "random_search", budget=Budget(evaluations=200)))
+    shares = re.findall(r"([+-][\d.]+) %\)", text)
     assert len(shares) == 8
     assert max(abs(float(share)) for share in shares) < 100
-    assert console.file.getvalue().count("(design 0)") == 1
+    assert text.count("(design 0)") == 1
 
 
 ALWAYS, NEVER = 0.0, 1e9  # s between two lines of a task that goes on

@@ -121,6 +121,14 @@ def with_jobs_of_its_own(folder: Path, _: Reporter) -> Answer:
     return Answer(len(notes.endings), process, str(os.getpid()))
 
 
+class Interrupts(Notes):
+    """Interrupts when the first job has ended."""
+
+    def ended(self, number: int, ending: Answer | Failure, reused: bool) -> None:
+        super().ended(number, ending, reused)
+        raise KeyboardInterrupt
+
+
 BACKENDS = [InPlace(), Processes(2)]
 
 
@@ -158,11 +166,6 @@ class TestEveryBackend:
         assert (again.reused, sorted(again.began_numbers)) == ({0, 2}, [1, 3])
 
     def test_takes_jobs_as_they_are_needed(self, backend: Backend, tmp_path: Path) -> None:
-        class Impatient(Notes):
-            def ended(self, number: int, ending: Answer | Failure, reused: bool) -> None:
-                super().ended(number, ending, reused)
-                raise KeyboardInterrupt
-
         taken = []
 
         def jobs() -> Iterator[Job[Answer]]:
@@ -171,7 +174,7 @@ class TestEveryBackend:
                 yield job
 
         with pytest.raises(KeyboardInterrupt):
-            run_jobs(jobs(), ResultStore(tmp_path, Answer), backend, Impatient())
+            run_jobs(jobs(), ResultStore(tmp_path, Answer), backend, Interrupts())
         assert len(taken) <= 3
         assert not multiprocessing.active_children()
 
@@ -323,11 +326,6 @@ def test_within_a_job_there_are_no_further_processes(tmp_path: Path) -> None:
 
 
 def test_whatever_the_watch_raises_ends_the_workers(tmp_path: Path) -> None:
-    class Interrupts(Notes):
-        def ended(self, number: int, ending: Answer | Failure, reused: bool) -> None:
-            super().ended(number, ending, reused)
-            raise KeyboardInterrupt
-
     store, notes = ResultStore(tmp_path, Answer), Interrupts()
     with pytest.raises(KeyboardInterrupt):
         run_jobs([*jobs_of(asleep, [None]), Job("quick", squared, 3)], store, Processes(2), notes)

@@ -146,6 +146,11 @@ def test_what_is_driven_by_old_angles_makes_the_pose_as_uncertain_as_the_way_is_
 
 
 class TestRestarts:
+    @staticmethod
+    def saved(**state: Any) -> SavedState:
+        covariance = (1e-4 * np.eye(3)).ravel().tolist()
+        return SavedState(sequence=5, stamp=ORIGIN, wall=1.8e9, pose=[1.0, 2.0, 0.3], covariance=covariance, **state)
+
     @pytest.mark.parametrize("robot", [SWERVE, mounted(CAR)], ids=["swerve", "car with a mount"])
     def test_a_node_that_starts_again_goes_on_exactly(self, tmp_path: Path, robot: Robot) -> None:
         path = drive(using=calibration(robot))
@@ -162,10 +167,8 @@ class TestRestarts:
 
     def test_a_robot_whose_saved_state_has_no_steering_waits_for_it(self) -> None:
         path = drive(0.1)
-        state = {"sequence": 5, "stamp": ORIGIN, "wall": 1.8e9, "positions": path.angles[0].tolist()}
-        state |= {"pose": [1.0, 2.0, 0.3], "covariance": (1e-4 * np.eye(3)).ravel().tolist()}
         robot = RobotTracker("base", path.using)
-        robot.resume(SavedState(**state), 0.0, 1.8e9)
+        robot.resume(self.saved(positions=path.angles[0].tolist()), 0.0, 1.8e9)
         bare = path.samples()[1]
         assert robot.take_wheels(JOINT_STATE.encode(only(bare, *bare.names[:4])), PERIOD) == []
         updates = fed(robot, path.payloads()[2:], 2 * PERIOD)
@@ -173,10 +176,8 @@ class TestRestarts:
         np.testing.assert_allclose(odometry(updates)[-1], compose(np.array([1.0, 2.0, 0.3]), held.poses[-1]), atol=1e-9)
 
     def test_a_state_of_a_robot_with_other_steered_wheels_is_refused(self) -> None:
-        state = {"sequence": 5, "stamp": ORIGIN, "wall": 1.8e9, "positions": [0.0] * 2, "steering": [0.1]}
-        state |= {"pose": [1.0, 2.0, 0.3], "covariance": (1e-4 * np.eye(3)).ravel().tolist()}
         with pytest.raises(DataError, match="1 steered wheel"):
-            RobotTracker("base", calibration(CAR)).resume(SavedState(**state), 0.0, 1.8e9)
+            RobotTracker("base", calibration(CAR)).resume(self.saved(positions=[0.0] * 2, steering=[0.1]), 0.0, 1.8e9)
 
 
 class TestSwaps:
@@ -332,12 +333,8 @@ def test_joints_are_called_as_a_node_expects_them() -> None:
     assert len(replayed_odometry(robot, played(drive, names=("traction", "fork")))) == len(drive.wheel_times)
 
 
-SLIPPING = (
-    EffectTerm(name="acceleration_slip", parameters={"k": 0.08}),
-    EffectTerm(name="centripetal_slip", parameters={"k": 0.05}),
-    EffectTerm(name="floor_drift", parameters={"dx": 0.02, "dy": -0.01}),
-)
-MOUNTED = SWERVE.model_copy(update={"mount": Mount(x=0.3, y=-0.1, yaw=0.4)})
+SLIPPING = EFFECTS[1:4]
+MOUNTED = mounted(SWERVE)
 
 
 def config(folder: Path, using: Calibration, **changes: object) -> LiveConfig:

@@ -16,7 +16,6 @@ from omnibench.fit.calibrate import CalibrationRun, calibrate
 from omnibench.fit.calibrator import Outcome
 from omnibench.fit.evaluate import evaluate
 from omnibench.fit.problem import Budget
-from omnibench.progress import Progress
 from omnibench.robot.calibration import read_calibration, write_calibration
 from omnibench.testing import load_plugin
 
@@ -71,15 +70,6 @@ def test_spent_seconds_leave_the_matrix_alone() -> None:
     assert run.result.outcome is Outcome.TIME
     assert "s spent while" in run.result.reason
     assert not run.calibration.effects
-
-
-@pytest.mark.slow
-def test_its_progress_is_told_in_steps() -> None:
-    events: list[Progress] = []
-    calibrate(simulated(()), calibrator="discovered", watch=events.append)
-    told = [event for event in events if event.unit == "step"]
-    assert told
-    assert all(event.total is not None and event.done <= event.total for event in told)
 
 
 def test_euler_steps_are_not_for_it() -> None:

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-from commands import Command, assert_refused
+from commands import Command, assert_refused, succeeded
 
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import ActuatorEffect, Effect, MotionEffect, Parameter, ReferenceEffect, Values
@@ -224,8 +224,7 @@ class Broken(MotionEffect):
 def test_an_effect_is_made_checked_and_listed_on_the_command_line(command: Command) -> None:
     assert command("plugin", "new", "first_slip", "--effect").returncode == 0
     assert command("plugin", "new", "second_slip", "--kind", "effect").returncode == 0
-    checked = command("plugin", "check", "plugins/first_slip.py")
-    assert checked.returncode == 0
+    checked = succeeded(command("plugin", "check", "plugins/first_slip.py"))
     assert "passed  effect first_slip: it is linear in its parameters" in checked.stdout
     assert_refused(command("plugin", "new", "slip", "--effect", "--kind", "cost"), "--effect", "--kind cost")
     listed = command("list").stdout
