@@ -144,13 +144,6 @@ def test_what_a_plugin_prints_does_not_spoil_the_document(command: Command, prep
     assert "while it works" in printed.stderr
 
 
-def test_inspect_prints_one_document(command: Command, prepared: Prepared) -> None:
-    found = document(command("inspect", prepared.data, "--json"))
-    assert (found["dataset"], found["trajectories"], found["simulated"]) == ("flower", 12, True)
-    assert found["splits"]["train"]["trajectories"] == 6
-    assert found["undriven"] == found["warnings"] == []
-
-
 @pytest.mark.slow
 def test_a_terminal_without_a_letter_shows_another(prepared: Prepared, tmp_path: Path) -> None:
     data = shutil.copytree(prepared.data, tmp_path / "data")

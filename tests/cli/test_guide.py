@@ -160,7 +160,3 @@ def test_wheels_count_as_the_page_of_robots_says(name: str, pushed: list[int], t
 def test_robots_that_steer_are_taken_as_the_page_of_robots_writes_them() -> None:
     for name in ("tricycle", "car", "swerve"):
         assert TypeAdapter(RobotOption).validate_python(ROBOTS[name]).drive.steered
-
-
-def test_the_readme_is_short() -> None:
-    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 140

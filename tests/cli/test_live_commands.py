@@ -115,9 +115,7 @@ def test_ctrl_c_ends_a_replay_with_what_it_has_shown(workplace: Path) -> None:
         ("x" * 100_000, "apr': cannot read its node's answer; is it an"),
     ],
 )
-def test_what_a_node_answers_to_a_swap_is_printed_without_its_control_characters_and_not_without_end(
-    command: InProcess, loopback: Loopback, name: str, words: str
-) -> None:
+def test_a_nodes_answer_is_printed_safely(command: InProcess, loopback: Loopback, name: str, words: str) -> None:
     key, answer = "omnibench/apr/swap", json.dumps({"accepted": True, "calibration": name})
     _node = loopback.router.declare_queryable(key, lambda query: query.reply(key, answer))
     run = command("swap", "apr", prepare().calibration, "--connect", loopback.address)

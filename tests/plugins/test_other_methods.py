@@ -285,7 +285,7 @@ def with_radii(shares: list[float]) -> tuple[Trajectory, ...]:
 
 
 def maddahi(
-    runs: tuple[Trajectory, ...], parameterisation: ParameterisationName = "matrix", **changes: bool
+    runs: Sequence[Trajectory], parameterisation: ParameterisationName = "matrix", **changes: bool
 ) -> RunResult:
     problem = synthetic_problem(parameterisation, trajectories=runs, evaluations=20_000, **changes)
     return run_calibrator(calibrators.create("maddahi"), problem)

@@ -129,12 +129,6 @@ class TestFurnishedRoom:
         way = (run.true[-1, 0] + 1j * run.true[-1, 1]) * np.exp(2j)
         assert path.poses[-1, :2] == pytest.approx([5.0 + way.real, -3.0 + way.imag], abs=4 * MM)
 
-    def test_the_same_scans_give_the_same_poses_to_the_bit(self) -> None:
-        run = driven("furnished_room", 1)
-        first, second = located(run), located.__wrapped__(run)
-        np.testing.assert_array_equal(first.poses, second.poses)
-        np.testing.assert_array_equal(first.covariances, second.covariances)
-
 
 class TestSlowScanner:
     """The robot drives on while it scans: 4 cm or more in a scan, and none when it has stopped."""

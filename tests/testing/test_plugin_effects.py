@@ -59,7 +59,7 @@ def test_it_is_found_by_name_where_it_was_hidden(work: Path) -> None:
     assert abs(found_k["value"] - TRUE_K) < 3 * standard_error  # one 95 % interval in twenty misses
 
 
-def test_evaluate_takes_the_plugins_that_are_named_and_those_of_the_folder_one_is_in(
+def test_evaluate_takes_the_plugins(
     command: Command, work: Path, extended: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = succeeded(command("evaluate", extended, work / "data", "--json", "--plugins", work / "plugins"))

@@ -279,9 +279,7 @@ def test_a_calibration_that_is_put_runs_from_the_next_sample_on_and_odom_does_no
     ],
     ids=["another robot", "too long", "no calibration"],
 )
-def test_bad_calibrations_that_are_put_are_refused_stand_in_health_and_do_not_flood_the_log(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, put: str, named: str
-) -> None:
+def test_refused_swaps_stand_in_health(tmp_path: Path, caplog: pytest.LogCaptureFixture, put: str, named: str) -> None:
     with running(config_of(tmp_path)) as (node, session):
         for _ in range(10):
             session.put("omnibench/apr/calibration", put)

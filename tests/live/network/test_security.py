@@ -293,9 +293,7 @@ class TestUsers:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("asked", [True, False])
-def test_zenohs_log_names_who_was_refused_what_if_the_guides_line_asks_for_it(
-    keys: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, asked: bool
-) -> None:
+def test_zenohs_log_names_the_refused(keys: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, asked: bool) -> None:
     line = re.search(r"RUST_LOG=(\S+)", find_topic("live").text)
     monkeypatch.setitem(ENVIRONMENT, "RUST_LOG", line[1] if asked else "off")  # here Zenoh would log for ever
     config = mutual(keys)

@@ -279,15 +279,6 @@ def tls(folder: Path, name: str, key: str | None = None) -> Tls:
     return Tls(ca=folder / "ca.pem", certificate=folder / f"{name}.pem", key=folder / (key or f"{name}.key"))
 
 
-def test_it_writes_an_authority_and_a_certificate_and_key_for_every_name(tmp_path: Path) -> None:
-    written = make_keys(tmp_path / "keys", ["node", "apr02"])
-    names = ["ca.pem", "ca.key", "node.pem", "node.key", "apr02.pem", "apr02.key"]
-    assert written == [tmp_path / "keys" / name for name in names]
-    assert sorted(path.name for path in (tmp_path / "keys").iterdir()) == sorted(names)
-    for name in ("node", "apr02"):
-        check_files(tls(tmp_path / "keys", name))
-
-
 def test_a_certificate_carries_its_name_and_its_hosts(tmp_path: Path) -> None:
     make_keys(tmp_path, ["node"], hosts=["base.local", "192.168.0.2"])
     certificate = read_certificate(tmp_path / "node.pem")

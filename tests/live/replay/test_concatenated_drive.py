@@ -384,13 +384,6 @@ def test_one_of_several_can_be_chosen(tmp_path: Path) -> None:
     np.testing.assert_allclose(longest, [0.5, 1.0])
 
 
-@pytest.mark.slow
-def test_the_demonstrations_config_is_one() -> None:
-    recording = load_recording(Path(__file__).resolve().parents[3] / "configs" / "apr02.yaml")
-    assert len(recording.dataset.trajectories) == 360
-    assert recording.truth is not None
-
-
 @pytest.mark.parametrize(
     ("datasets", "chosen", "named"),
     [

@@ -231,9 +231,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 class Listener:
     """Takes down what arrives on a robot's inputs, in a session of its own, as a node would."""
 
-    def __init__(
-        self, loopback: Loopback, profile: Profile = "plain", *, work: float = 0.0, stall: float = 0.0
-    ) -> None:
+    def __init__(self, loopback: Loopback, profile: Profile = "plain", *, work: float = 0, stall: float = 0) -> None:
         self._work = work  # s that it takes for a message
         self._stall = stall  # s more for the first one
         self._payloads: dict[str, list[bytes]] = {topic: [] for topic in TOPICS}

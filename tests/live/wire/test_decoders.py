@@ -214,9 +214,7 @@ def test_another_ros_client_lists_the_topics_with_their_types(sdk: Any, network:
 
 
 @pytest.mark.parametrize("topic", TOPICS)
-def test_a_ros_client_knows_the_qos(
-    sdk: Any, network: Loopback, rmw_node: dict[str, Publisher[Any]], topic: str
-) -> None:
+def test_ros_clients_know_the_qos(sdk: Any, network: Loopback, rmw_node: dict[str, Publisher[Any]], topic: str) -> None:
     assert rmw_node
     info = sdk.get_topic_info(ros_name(topic), 42, "127.0.0.1", network.port, verbose=True)
     (publisher,) = info.publishers
