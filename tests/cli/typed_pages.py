@@ -1,4 +1,4 @@
-"""Pages of the README and the handbook, whose commands are typed one after the other, as a reader types them."""
+"""Commands of the README and the handbook: parsed, and typed one after the other as a reader types them."""
 
 from __future__ import annotations
 

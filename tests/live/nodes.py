@@ -1,4 +1,4 @@
-"""Nodes for tests: in this process, or as the command that a user runs."""
+"""Nodes for tests, in this process or as the command that a user runs, and what comes on keys of a session."""
 
 from __future__ import annotations
 

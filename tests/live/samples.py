@@ -1,4 +1,4 @@
-"""Messages with numbers that no default has, one for each topic."""
+"""Messages with numbers that no default has, robots that publish them, and recordings of them."""
 
 from __future__ import annotations
 
