@@ -17,6 +17,7 @@ import pytest
 import yaml
 from sample_robots import APR02
 from shared_results import made_once, shared_folder
+from timing import PATIENCE
 
 from omnibench import registry
 from omnibench.__main__ import main
@@ -55,6 +56,12 @@ def omnibench(
     )
 
 
+def python(program: str, *arguments: object, **others: Any) -> subprocess.CompletedProcess[str]:
+    """Run a Python program to its end; what it printed."""
+    command = [sys.executable, "-c", program, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False, **others)
+
+
 def compared(config: Path, output: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
     """Run a comparison that must succeed."""
     run = omnibench("compare", config, "--output", output, *arguments)
@@ -77,6 +84,12 @@ def assert_refused(run: Printed | subprocess.CompletedProcess[str], *parts: str)
     assert run.stderr.count("\n") == 1, run.stderr
     for part in parts:
         assert part in run.stderr
+
+
+def succeeded(run: Any) -> Any:
+    """What a command printed that must have ended well."""
+    assert run.returncode == 0, run.stderr
+    return run
 
 
 def flower(**changes: Any) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -63,6 +64,16 @@ def command(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, 
     """Commands, in an empty folder."""
     monkeypatch.chdir(tmp_path)
     return commands_of_this_process(capfd, monkeypatch)
+
+
+@pytest.fixture
+def loopback() -> Iterator[Any]:
+    """A router on a free port of loopback, and clients of it."""
+    from sessions import open_loopback  # which loads Zenoh
+
+    opened = open_loopback()
+    yield opened
+    opened.close()
 
 
 @pytest.fixture(scope="session")

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
-import signal
-import subprocess
 from collections.abc import Callable
 from dataclasses import replace
 from io import StringIO
@@ -16,10 +13,11 @@ from typing import Any, NamedTuple
 
 import polars as pl
 import pytest
-from commands import COMMAND, ENVIRONMENT, Command, Printed, assert_refused, run_here
+from commands import Command, Printed, assert_refused, run_here, succeeded
 from discovery_samples import EXPERIMENT, incomplete, named, nameless, nothing, simulated
+from nodes import Command as CommandProcess
 from rich.console import Console
-from timing import PATIENCE
+from sessions import until
 
 from omnibench.cli.terminal.discovery_summary import print_discovery
 from omnibench.config import parse_yaml
@@ -55,8 +53,7 @@ class Told(NamedTuple):
 
     @property
     def document(self) -> dict[str, Any]:
-        content: dict[str, Any] = json.loads(self.run.stdout)
-        return content
+        return json.loads(self.run.stdout)
 
 
 def small() -> Dataset:
@@ -94,8 +91,7 @@ def test_the_hidden_effect_is_named_and_the_extended_calibration_is_better(told:
 
 @pytest.mark.slow
 def test_the_default_folder_has_the_name_of_the_data_and_the_newest_is_linked(command: Command, data: Path) -> None:
-    run = command("discover", data, "--without", "rotation_translation_coupling", "--seed", 3)
-    assert run.returncode == 0
+    run = succeeded(command("discover", data, "--without", "rotation_translation_coupling", "--seed", 3))
     assert "added: rotation_translation_coupling" not in run.stdout
     latest = Path("results/flower/latest")
     assert latest.is_symlink()
@@ -172,64 +168,42 @@ def test_names_of_data_sets_become_folders_that_can_be(tmp_path: Path, monkeypat
 
 @pytest.mark.slow
 def test_ctrl_c_leaves_nothing_half_written(data: Path, tmp_path: Path) -> None:
-    process = subprocess.Popen(
-        [*COMMAND, "discover", str(data)], cwd=tmp_path, env=ENVIRONMENT, text=True,
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-    )  # fmt: skip
-    assert process.stderr is not None
-    try:
-        assert process.stderr.readline() == "fitting the plain matrix\n"
-        os.kill(process.pid, signal.SIGINT)
-        _, told = process.communicate(timeout=PATIENCE)
-    finally:
-        process.kill()
-    assert process.returncode == 130
+    with CommandProcess("discover", data, cwd=tmp_path) as discover:
+        until(lambda: "fitting the plain matrix\n" in discover.said(), "the work to begin")
+        _, told = discover.stop()
+    assert discover.process.returncode == 130
     assert told.splitlines()[-1] == "interrupted; the same command begins anew"
     assert not (tmp_path / "results").exists()
 
 
-def printed(found: Discovery, width: int = 80) -> str:
-    console = Console(file=StringIO(), width=width, markup=False, emoji=False, highlight=False)
-    print_discovery(console, found, Path("results/flower/now"))
-    assert isinstance(console.file, StringIO)
-    return console.file.getvalue()
+def in_doubt() -> Discovery:
+    doubtful = replace(named().effects[0], confusable_with=("load_transfer",), in_doubt="few turns")
+    return replace(named(), verdict="class", effects=(doubtful,))
 
 
-@pytest.mark.parametrize("make", [named, nothing, nameless, incomplete])
-def test_eighty_columns_are_enough_and_nothing_is_cut(make: Callable[[], Discovery]) -> None:
-    told = printed(make())
-    assert max(len(line.rstrip()) for line in told.splitlines()) <= 80
-    assert "…" not in told
+def many_notes() -> Discovery:
+    return replace(nothing(), notes=tuple(f"note {n}" for n in range(9)))
 
 
-def test_verdict_effect_places_gap_and_files_are_told_on_a_screen() -> None:
-    told = printed(named())
-    assert len(told.splitlines()) < 60
-    assert "flower (simulated data): 36 training runs" in told
-    assert "verdict: named" in told
-    assert re.search(r"rotation_translation_coupling \(body\), weight 9[5-9]\.\d %", told)
-    assert "held-out session: 36 runs" in told
-    assert "results/flower/now/report.html" in told
-    assert "results/flower/now/model.yaml" in told
+DRIVE = ("acceleration_slip", "turning left on the spot at 1 rad/s 12.5 4", "Drive 4 runs, 1.8 minutes")
+LEFT_OVER = ("wheel rate (2 × 10⁻¹¹)", "warning: not driven in training: v0.4_a90_w1", "experiment-1.yaml")
+SHOWN: dict[Callable[[], Discovery], tuple[str, ...]] = {
+    named: ("(simulated data): 36 training runs", "verdict: named", "held-out session: 36 runs", "now/model.yaml"),
+    nameless: ("verdict: unknown",),
+    incomplete: DRIVE + LEFT_OVER,
+    in_doubt: ("load_transfer", "few turns"),
+    many_notes: ("verdict: none", "- note 2 6 more notes", "report: results/flower/now/report.html"),
+}
 
 
-@pytest.mark.parametrize(
-    ("make", "parts"),
-    [
-        (lambda: replace(named(), verdict="class", effects=(DOUBTFUL,)), ("load_transfer", "few turns")),
-        (incomplete, ("acceleration_slip", "turning left on the spot at 1 rad/s 12.5 4", "Drive 4 runs, 1.8 minutes")),
-        (incomplete, ("wheel rate (2 × 10⁻¹¹)", "warning: not driven in training: v0.4_a90_w1", "experiment-1.yaml")),
-        (lambda: replace(nothing(), notes=tuple(f"note {n}" for n in range(9))), ("- note 2", "6 more notes")),
-    ],
-    ids=["doubts", "what to drive", "left over", "many notes"],
-)
-def test_what_is_in_doubt_left_over_and_to_be_driven_is_told(
-    make: Callable[[], Discovery], parts: tuple[str, ...]
-) -> None:
-    told = " ".join(printed(make()).split())
-    for part in parts:
-        assert part in told
-    assert "- note 3" not in told
-
-
-DOUBTFUL = replace(named().effects[0], confusable_with=("load_transfer",), in_doubt="few turns")
+@pytest.mark.parametrize("make", SHOWN)
+def test_what_is_found_is_told_on_a_screen_of_eighty_columns(make: Callable[[], Discovery]) -> None:
+    console = Console(file=StringIO(), width=80, markup=False, emoji=False, highlight=False)
+    print_discovery(console, make(), Path("results/flower/now"))
+    lines = console.file.getvalue().splitlines()
+    assert max(len(line.rstrip()) for line in lines) <= 80
+    text = " ".join(" ".join(lines).split())
+    assert "…" not in text
+    for part in SHOWN[make]:
+        assert part in text
+    assert make != named or re.search(r"rotation_translation_coupling \(body\), weight 9[5-9]\.\d %", text)

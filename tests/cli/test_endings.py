@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 import typer
-from commands import Command, Prepared, flower, run_here, write_config
+from commands import Command, Prepared, flower, run_here, succeeded, write_config
 from shared_results import made_once, shared_folder
-from typed_commands import parse
+from typed_pages import parse
 
 from omnibench.cli.app import FAMILIES, app
 from omnibench.cli.examples import bundled_folder
@@ -56,8 +56,7 @@ _LONG = (
 def swerve() -> Path:
     """Simulated recordings of a robot whose matrix has eight columns."""
     folder = shared_folder() / "swerve"
-    run = run_here("simulate", bundled_folder() / "configs/swerve.yaml", "-o", folder, cwd=shared_folder())
-    assert run.returncode == 0, run.stderr
+    succeeded(run_here("simulate", bundled_folder() / "configs/swerve.yaml", "-o", folder, cwd=shared_folder()))
     return folder
 
 
@@ -81,8 +80,7 @@ def words(text: str) -> set[str]:
 
 @pytest.mark.parametrize("typed", _WITHOUT_TABLES, ids=" ".join)
 def test_a_command_ends_with_a_sentence(command: Command, prepared: Prepared, typed: tuple[str, ...]) -> None:
-    printed = command(*filled_in(typed, prepared))
-    assert printed.returncode == 0, printed.stderr
+    printed = succeeded(command(*filled_in(typed, prepared)))
     assert_ends_with_a_sentence(printed.stderr)
     assert "; next, " not in printed.stdout
 
@@ -97,8 +95,7 @@ def test_a_command_with_tables_ends_with_a_sentence_and_cuts_no_word_on_a_narrow
     shown = {}
     for columns in (80, 60, 500):
         monkeypatch.setenv("COLUMNS", str(columns))
-        printed = command(*filled_in(typed, prepared), *(["--force"] if "-o" in typed else []))
-        assert printed.returncode == 0, printed.stderr
+        printed = succeeded(command(*filled_in(typed, prepared), *(["--force"] if "-o" in typed else [])))
         assert "; next, " not in printed.stdout
         shown[columns] = re.sub(r"\x1b\[[^m]*m", "", printed.stdout)
     if typed[0] != "discover":  # which ends with its verdict
@@ -112,14 +109,11 @@ def test_a_command_with_tables_ends_with_a_sentence_and_cuts_no_word_on_a_narrow
 
 @pytest.mark.parametrize("typed", [("list",), ("calibrate", "{data}"), ("evaluate", "{calibration}", "{data}")])
 def test_with_json_no_sentence_is_printed(command: Command, prepared: Prepared, typed: tuple[str, ...]) -> None:
-    printed = command(*(word.format_map(prepared._asdict()) for word in typed), "--json")
-    assert printed.returncode == 0
+    printed = succeeded(command(*(word.format_map(prepared._asdict()) for word in typed), "--json"))
     assert "; next, " not in printed.stdout + printed.stderr
 
 
-def test_a_calibration_that_was_only_shown_names_the_command_that_writes_it(
-    command: Command, prepared: Prepared, tmp_path: Path
-) -> None:
+def test_a_shown_calibration_says_what_writes_it(command: Command, prepared: Prepared, tmp_path: Path) -> None:
     shown = command("calibrate", prepared.data, "--cost", "trajectory")
     again = shown.stderr.splitlines()[-1].split()
     assert again == ["omnibench", "calibrate", str(prepared.data), "--cost", "trajectory", "-o", "calibration.yaml"]
@@ -150,9 +144,7 @@ def test_the_help_lists_every_command_under_a_heading(command: Command) -> None:
         assert f"\n  {name} " in shown
 
 
-def test_the_help_of_no_command_is_cut_in_a_terminal_of_eighty_columns(
-    command: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_help_of_no_command_is_cut_in_eighty_columns(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     shown = command("--help").stdout
     assert shown.startswith("Usage: omnibench")

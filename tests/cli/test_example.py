@@ -5,12 +5,14 @@ from __future__ import annotations
 import io
 from pathlib import Path
 
+import numpy as np
 import polars as pl
 import pytest
 import yaml
-from commands import CONFIGS, Command, assert_refused
+from commands import CONFIGS, Command, assert_refused, succeeded
+from real_recordings import OPTIODOM
 from rich.console import Console
-from typed_commands import parse
+from typed_pages import parse
 
 import omnibench
 from omnibench.cli import examples
@@ -67,8 +69,7 @@ def test_an_example_says_what_to_type_next_and_is_as_good_as_written_where_it_is
     assert printed[-2:] == ["  cd demo", "  omnibench compare configs/apr02.yaml"]
     assert any(line.startswith("written: demo/plugins (") for line in printed)
     assert command("example", "live", "-o", "demo").stdout.startswith("written: demo/configs/live.yaml\n")
-    again = command("example", "apr02", "-o", "demo")
-    assert again.returncode == 0
+    again = succeeded(command("example", "apr02", "-o", "demo"))
     assert again.stdout.startswith("nothing is written")
 
 
@@ -99,8 +100,17 @@ def test_an_installed_package_has_its_own_copies(monkeypatch: pytest.MonkeyPatch
 
 
 ROBOT = SAMPLES / "robot"
-COMMANDS = ("circle_right", "circle_left", "straight", "turn_right", "turn_left", "square_right", "square_left")
-RUNS = [(f"{command}_{repetition}", command) for command in COMMANDS for repetition in (1, 2, 3)]
+# Session of each kind of path, and its first run of each command.
+SOURCES = {
+    "circle_right": ("circular/231220200134", 1),
+    "circle_left": ("circular/231220200134", 4),
+    "straight": ("ivanjko/231220200102", 1),
+    "turn_right": ("ivanjko/231220200102", 4),
+    "turn_left": ("ivanjko/231220200102", 7),
+    "square_right": ("square/231220200029", 1),
+    "square_left": ("square/231220200029", 4),
+}
+RUNS = [(f"{command}_{repetition}", command) for command in SOURCES for repetition in (1, 2, 3)]
 
 
 def test_the_sample_is_small_and_brings_its_licence() -> None:
@@ -112,12 +122,26 @@ def test_the_sample_is_small_and_brings_its_licence() -> None:
     assert {file.stem for file in files if file.suffix == ".csv"} == {"runs", *(run for run, _ in runs)}
 
 
+@pytest.mark.skipif(not OPTIODOM.is_dir(), reason=f"{OPTIODOM} is absent: the recordings that the sample is made of")
+@pytest.mark.parametrize("command", SOURCES)
+def test_the_sample_holds_every_second_row_of_its_source(command: str) -> None:
+    session, first = SOURCES[command]
+    folder = OPTIODOM / "diff" / session
+    for repetition in (1, 2, 3):
+        sample = pl.read_csv(ROBOT / "log" / f"{command}_{repetition}.csv")
+        file = folder / f"{folder.name}_run-{first + repetition - 1:02d}.csv"
+        source = np.genfromtxt(file, delimiter=",", usecols=(0, 4, 5))  # t, ticks of the right and of the left wheel
+        rows = slice(0, 2 * len(sample) - 1, 2)
+        np.testing.assert_allclose(sample["t"], source[rows, 0], rtol=0, atol=0.006)
+        ticks = sample.select("ticks_right", "ticks_left").to_numpy()
+        np.testing.assert_array_equal(ticks.cumsum(axis=0), (source[:, 1:].cumsum(axis=0) - source[0, 1:])[rows])
+
+
 def test_a_row_that_is_zero_by_design_is_called_so_and_warned_of_nowhere() -> None:
     options = {"wheel_unit": "ticks/sample", "ticks_per_turn": 2796.8}
     run = omnibench.calibrate(omnibench.import_dataset("csv", ROBOT / "log", options))
     console = Console(file=io.StringIO(), width=100)
     print_calibration(console, run)
-    assert isinstance(console.file, io.StringIO)
     assert console.file.getvalue().count("by design") == 2
     assert run.result.held == ("m21", "m22")
     assert run.untouched == ()

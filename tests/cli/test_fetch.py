@@ -11,7 +11,7 @@ from pathlib import Path
 
 import polars as pl
 import pytest
-from commands import COMMAND, ENVIRONMENT, RECORDINGS, ROOT, Command, Prepared, Printed
+from commands import COMMAND, ENVIRONMENT, RECORDINGS, ROOT, Command, Prepared, Printed, succeeded
 from corelli import CORELLI
 from newcomer import PAGES, lines_of
 from real_recordings import OMNI3, ROBOTINO
@@ -111,8 +111,7 @@ def assert_failed(run: Printed, *parts: str) -> None:
 
 class TestKnownRecording:
     def test_it_is_cloned_at_the_tested_commit_and_imported(self, command: Command, optiodom: str) -> None:
-        ended = command("fetch", "diff")
-        assert ended.returncode == 0, ended.stderr
+        ended = succeeded(command("fetch", "diff"))
         said = ended.stdout.splitlines()
         source = f"public GitHub repository {OPTIODOM}, commit {optiodom}"
         assert said[:3] == [
@@ -125,7 +124,6 @@ class TestKnownRecording:
         assert ended.stderr.splitlines()[-1] == "  omnibench check data/diff"
         dataset = load_dataset("data/diff")
         assert (dataset.name, dataset.source, dataset.licence) == ("diff", source, "MIT")
-        assert dataset.imported is not None
         assert dataset.imported.options == {"name": "diff", "source": source}
         assert Path("data/diff/LICENSE").read_text(encoding="utf-8") == LICENCE
         assert command("check", "data/diff").returncode == 0
@@ -134,32 +132,26 @@ class TestKnownRecording:
         assert command("fetch", "optiodom/diff").returncode == 0
         shutil.rmtree(github.folder)  # the network is gone
         before = (CLONE / ".git" / "HEAD").stat().st_mtime_ns
-        again = command("fetch", "diff", "-o", "again")
-        assert again.returncode == 0, again.stderr
+        again = succeeded(command("fetch", "diff", "-o", "again"))
         assert "git" not in again.stderr
         assert (CLONE / ".git" / "HEAD").stat().st_mtime_ns == before
         assert optiodom in load_dataset("again").source
 
     def test_another_commit_is_checked_out_in_it(self, command: Command, github: GitHub, optiodom: str) -> None:
-        newest = command("fetch", "diff", "--commit", "HEAD")
-        assert newest.returncode == 0, newest.stderr
+        newest = succeeded(command("fetch", "diff", "--commit", "HEAD"))
         assert optiodom not in newest.stdout
         assert github.git(CLONE, "rev-list", "--count", "HEAD") == "1"  # without its history
         assert optiodom in command("fetch", "diff", "--force").stdout  # which is then fetched
         commit = github.publish(OPTIODOM, {"README.md": "newest\n"})
         assert commit in command("fetch", "diff", "--force", "--commit", commit[:10]).stdout
 
-    def test_a_clone_copied_from_elsewhere_needs_no_network(
-        self, command: Command, github: GitHub, optiodom: str
-    ) -> None:
+    def test_a_clone_from_elsewhere_needs_no_network(self, command: Command, github: GitHub, optiodom: str) -> None:
         CLONE.parent.mkdir(parents=True)
         github.git(Path(), "clone", "-q", f"https://github.com/{OPTIODOM}", CLONE)
         shutil.rmtree(github.folder)
         assert optiodom in command("fetch", "diff").stdout
 
-    def test_a_data_set_that_is_there_is_refused_before_anything_is_cloned(
-        self, command: Command, optiodom: str
-    ) -> None:
+    def test_a_data_set_that_is_there_is_refused_before_a_clone(self, command: Command, optiodom: str) -> None:
         assert optiodom
         Path("data/diff").mkdir(parents=True)
         Path("data/diff/dataset.yaml").write_text("mine\n", encoding="utf-8")
@@ -177,8 +169,7 @@ class TestKnownRecording:
         sessions = ("diff/circular/231220200121", "tricyc/square", "omni3/square", "omni4/circular/231220200453")
         files: dict[str, str | Path] = {f"data/{each}": RECORDINGS / "optiodom" / each for each in sessions}
         github.tested(optiodom=github.publish(OPTIODOM, {"LICENSE": LICENCE, **files}))
-        ended = command("fetch", "optiodom", "-o", "robots")
-        assert ended.returncode == 0, ended.stderr
+        ended = succeeded(command("fetch", "optiodom", "-o", "robots"))
         listed = [line.split(": ")[1] for line in ended.stdout.splitlines()[:4]]
         assert listed == [f"robots/{name}" for name in ("diff", "tricyc", "omni3", "omni4")]
         assert load_dataset("robots/omni3").licence == "MIT"
@@ -191,8 +182,7 @@ class TestKnownRecording:
         files: dict[str, str | Path] = {f"{robotino.path}/exp0{k}.csv": runs / f"exp0{k}.csv" for k in range(4)}
         commit = github.publish("BrOleg5/research-wheel-slippage", files)
         github.tested(robotino=commit)
-        ended = command("fetch", "https://github.com/BrOleg5/Research-Wheel-Slippage.git")
-        assert ended.returncode == 0, ended.stderr
+        ended = succeeded(command("fetch", "https://github.com/BrOleg5/Research-Wheel-Slippage.git"))
         assert "licence: Apache-2.0\n" in ended.stdout  # the repository here holds no text of it
         assert "cite: https://github.com/BrOleg5/research-wheel-slippage\n" in ended.stdout
         assert commit in load_dataset("data/robotino").source
@@ -204,18 +194,14 @@ class TestKnownRecording:
         assert command("fetch", "corelli").returncode == 0
         dataset = load_dataset("data/corelli")
         assert (dataset.robot.name, dataset.licence) == ("corelli", "Apache-2.0")
-        assert dataset.imported is not None
         assert dataset.imported.options["steering_scale"] == 0.1
 
 
 class TestAnyRepository:
-    def test_a_format_that_is_recognised_is_imported(
-        self, command: Command, github: GitHub, prepared: Prepared
-    ) -> None:
+    def test_a_recognised_format_is_imported(self, command: Command, github: GitHub, prepared: Prepared) -> None:
         files: dict[str, str | Path] = {file.name: file for file in prepared.data.iterdir()}
         commit = github.publish("somebody/runs", {**files, "LICENCE.txt": "\nCC-BY-4.0\nall of it\n"})
-        ended = command("fetch", "somebody/runs")
-        assert ended.returncode == 0, ended.stderr
+        ended = succeeded(command("fetch", "somebody/runs"))
         assert "licence: CC-BY-4.0 (data/runs/LICENCE.txt)\n" in ended.stdout
         dataset = load_dataset("data/runs")
         assert dataset.licence == "CC-BY-4.0"
@@ -223,8 +209,7 @@ class TestAnyRepository:
 
     def test_what_cannot_be_imported_is_cloned_and_the_next_step_said(self, command: Command, github: GitHub) -> None:
         github.publish("somebody/log", {"log.csv": "t,ticks_left,ticks_right\n0.1,1,2\n"})
-        ended = command("fetch", "somebody/log")
-        assert ended.returncode == 0, ended.stderr
+        ended = succeeded(command("fetch", "somebody/log"))
         assert Path("clones/somebody/log/log.csv").is_file()
         assert not Path("data").exists()
         assert "licence: the repository states none; ask its authors" in ended.stdout
@@ -232,13 +217,10 @@ class TestAnyRepository:
         assert "robot" in ended.stderr
         assert ended.stderr.splitlines()[-1] == "  omnibench import csv --help"
         github.publish("somebody/words", {"README.md": "words\n"})
-        ended = command("fetch", "somebody/words")
-        assert ended.returncode == 0
+        ended = succeeded(command("fetch", "somebody/words"))
         assert "no recording is recognised there" in ended.stderr
 
-    def test_units_that_cannot_be_right_are_not_imported(
-        self, command: Command, github: GitHub, prepared: Prepared
-    ) -> None:
+    def test_impossible_units_are_not_imported(self, command: Command, github: GitHub, prepared: Prepared) -> None:
         (table,) = Path(shutil.copytree(prepared.data, "degrees")).glob("poses.parquet")
         pl.read_parquet(table).with_columns(pl.col("theta").degrees()).write_parquet(table)
         files: dict[str, str | Path] = {file.name: file for file in Path("degrees").iterdir()}
@@ -257,9 +239,7 @@ class TestMistakes:
             ("nobody/nothing", ("nobody/nothing: GitHub",)),
         ],
     )
-    def test_a_recording_or_repository_that_is_not_there_is_named(
-        self, command: Command, github: GitHub, name: str, parts: tuple[str, ...]
-    ) -> None:
+    def test_a_missing_one_is_named(self, command: Command, github: GitHub, name: str, parts: tuple[str, ...]) -> None:
         assert github
         assert_failed(command("fetch", "--", name), *parts)
         assert not Path("clones").exists()
@@ -301,9 +281,7 @@ class TestMistakes:
         assert_failed(command("fetch", "diff", "--force"), "1_run-01.csv is not as in the repository", "move it away")
         assert run.read_text(encoding="utf-8") == "mine\n"
 
-    def test_a_folder_that_holds_something_else_is_refused(
-        self, command: Command, github: GitHub, optiodom: str
-    ) -> None:
+    def test_a_folder_with_something_else_is_refused(self, command: Command, github: GitHub, optiodom: str) -> None:
         assert optiodom
         CLONE.mkdir(parents=True)
         (CLONE / "mine.txt").write_text("mine\n", encoding="utf-8")

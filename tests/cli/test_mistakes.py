@@ -12,15 +12,7 @@ from pathlib import Path
 import polars as pl
 import pytest
 import yaml
-from commands import (
-    COMMAND,
-    ENVIRONMENT,
-    Command,
-    Prepared,
-    assert_refused,
-    disk_that_takes,
-    omnibench,
-)
+from commands import COMMAND, ENVIRONMENT, Command, Prepared, assert_refused, disk_that_takes, omnibench, succeeded
 
 from omnibench.data.storage import load_dataset, save_dataset
 
@@ -65,9 +57,7 @@ from omnibench.data.storage import load_dataset, save_dataset
     ],
     ids=lambda value: " ".join(value)[:50],
 )
-def test_a_mistake_is_one_line_and_exit_code_2(
-    arguments: list[str], parts: list[str], command: Command, prepared: Prepared
-) -> None:
+def test_a_mistake_is_one_line(arguments: list[str], parts: list[str], command: Command, prepared: Prepared) -> None:
     places = {"CONFIG": prepared.config, "DATA": prepared.data, "CALIBRATION": prepared.calibration}
 
     def placed(argument: str) -> str:
@@ -119,8 +109,7 @@ def test_a_reader_that_has_gone_is_no_error(prepared: Prepared) -> None:
 
 @pytest.mark.parametrize("closed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_stream_that_was_closed_before_the_start_is_no_traceback(closed: int) -> None:
-    run = omnibench("list", preexec_fn=lambda: os.close(closed))
-    assert run.returncode == 0
+    run = succeeded(omnibench("list", preexec_fn=lambda: os.close(closed)))
     assert "Traceback" not in run.stderr
     assert ("closed_form" in run.stdout) == (closed == 2)
 
@@ -144,9 +133,7 @@ def test_a_full_disk_is_one_line_and_leaves_no_half_file(prepared: Prepared, tmp
 
 
 @pytest.mark.parametrize("arguments", [["calibrate", "DATA", "-o", "new/c.yaml"], ["plugin", "new", "mine"]])
-def test_a_file_that_the_disk_does_not_take_is_not_there(
-    arguments: list[str], command: Command, prepared: Prepared
-) -> None:
+def test_a_file_too_large_for_the_disk_is_not_there(arguments: list[str], command: Command, prepared: Prepared) -> None:
     with disk_that_takes(600):  # the line on standard error
         run = command(*(str(prepared.data) if argument == "DATA" else argument for argument in arguments))
     assert_refused(run, FULL)
@@ -160,9 +147,7 @@ def test_a_calibration_that_cannot_be_written_in_the_end_is_one_line(command: Co
 
 
 @pytest.mark.parametrize("name", ["robot", "data set", "session"])
-def test_a_name_of_many_letters_is_one_short_line(
-    name: str, command: Command, prepared: Prepared, tmp_path: Path
-) -> None:
+def test_a_very_long_name_is_one_short_line(name: str, command: Command, prepared: Prepared, tmp_path: Path) -> None:
     long, data, file = "x" * 100_000, tmp_path / "data", tmp_path / "calibration.yaml"
     shutil.copytree(prepared.data, data)
     calibration, header = (yaml.safe_load(each.read_text()) for each in (prepared.calibration, data / "dataset.yaml"))
@@ -191,11 +176,115 @@ def test_a_disk_that_is_full_is_said_before_the_work(prepared: Prepared, tmp_pat
     assert_refused(run, f"{tmp_path}/c.yaml: cannot be written: No space left on device")
 
 
-def test_a_data_set_that_does_not_fit_leaves_the_one_that_was_there(
-    command: Command, prepared: Prepared, tmp_path: Path
-) -> None:
+def test_a_data_set_too_large_leaves_the_one_before(command: Command, prepared: Prepared, tmp_path: Path) -> None:
     data = shutil.copytree(prepared.data, tmp_path / "data")
     with disk_that_takes(600):
         run = command("simulate", prepared.config, "-o", data, "--format", "csv", "--force")
     assert_refused(run, FULL)
     assert load_dataset(data).hash == load_dataset(prepared.data).hash
+
+
+MINE = "written: by hand\n"
+OPTIONS = "# The effective options of a discovery; the results beside it were made with them.\ndataset: another\n"
+COMPARISON = "# The effective config of a comparison; the results beside it were made with it.\nname: another\n"
+
+
+@pytest.fixture
+def here(command: Command, prepared: Prepared, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder that ``command`` runs in: a config, a data set, a calibration, and files of the user's own."""
+    assert command  # changes the folder, too
+    folder = tmp_path / "here"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    shutil.copy(prepared.config, "config.yaml")
+    shutil.copy(prepared.calibration, "model.yaml")
+    for copy in ("data", "other"):
+        shutil.copytree(prepared.data, copy)
+    mine = ("mine.yaml", "mine.html", "mine.py", "mine.mcap", "truth/truth.yaml", "keys/node.pem", "configs/apr02.yaml")
+    for name in (*mine, "results/report.html"):
+        Path(name).parent.mkdir(exist_ok=True)
+        Path(name).write_text(MINE, encoding="utf-8")
+    for name, text in (("discovery", OPTIONS), ("comparison", COMPARISON)):
+        Path(name).mkdir()
+        Path(name, "config.yaml").write_text(text, encoding="utf-8")
+    return folder
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "calibrate data -o mine.yaml",
+        "export model.yaml --to c_header -o mine.yaml",
+        "simulate config.yaml -o data",
+        "simulate config.yaml -o new --report mine.html",
+        "simulate config.yaml -o new --truth truth",
+        "simulate --like data --model model.yaml -o other",
+        "import csv nowhere -o data",
+        "slam data -o other",
+        "slam data --json --report mine.html",
+        "design data -o results",
+        "discover data -o discovery",
+        "discover data -o data",
+        "compare config.yaml -o comparison",
+        "compare config.yaml -o data",
+        "keys keys node",
+        "record apr02 -o mine.mcap",
+        "example apr02 -o .",
+        "plugin new mine -o .",
+    ],
+)
+def test_what_is_there_is_not_written_over_and_force_is_named(command: Command, here: Path, arguments: str) -> None:
+    before = contents(here)
+    assert_refused(command(*arguments.split()), "--force")
+    assert contents(here) == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "written"),
+    [
+        ("calibrate data -o mine.yaml", "mine.yaml"),
+        ("export model.yaml --to c_header -o mine.yaml", "mine.yaml"),
+        ("simulate config.yaml -o data --format csv --truth truth --report mine.html", "mine.html"),
+        ("simulate --like data --model model.yaml -o other", "other/poses.parquet"),
+        pytest.param("design data -o results", "results/report.html", marks=pytest.mark.slow),
+        pytest.param("compare config.yaml -o comparison", "comparison/config.yaml", marks=pytest.mark.slow),
+        ("keys keys node", "keys/node.pem"),
+        ("example apr02 -o .", "configs/apr02.yaml"),
+        ("plugin new mine -o .", "mine.py"),
+    ],
+)
+def test_it_is_written_over_by_force(command: Command, here: Path, arguments: str, written: str) -> None:
+    before = contents(here)
+    succeeded(command(*arguments.split(), "--force"))
+    assert contents(here)[written] != before[written]
+
+
+def test_empty_files_and_folders_are_no_loss_and_other_files_are_even_by_force(command: Command, here: Path) -> None:
+    Path("empty.yaml").touch()
+    Path("empty").mkdir()
+    assert command("calibrate", "data", "-o", "empty.yaml").returncode == 0
+    assert command("simulate", "config.yaml", "-o", "empty").returncode == 0
+    before = contents(here)
+    assert_refused(command("simulate", "config.yaml", "-o", "truth", "--force"), "holds other files")
+    assert contents(here) == before
+
+
+@pytest.mark.usefixtures("here")
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "calibrate data -o loop",
+        "simulate config.yaml -o loop",
+        "simulate --like data --model model.yaml -o loop",
+        "design data -o loop",
+        "compare config.yaml -o loop",
+        "example apr02 -o loop",
+    ],
+)
+def test_a_link_that_leads_to_itself_is_one_line(command: Command, arguments: str) -> None:
+    Path("loop").symlink_to("loop")
+    assert_refused(command(*arguments.split()), "loop", "link")

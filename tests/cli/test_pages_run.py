@@ -73,9 +73,7 @@ def test_the_papers_calibrations_improve_as_much_as_in_the_paper(paper: dict[str
         assert paper[label]["validation_improvement"] >= 0.81
 
 
-def test_nothing_is_below_the_exact_optimum_which_takes_a_handful_of_evaluations(
-    paper: dict[str, dict[str, Any]],
-) -> None:
+def test_nothing_is_below_the_exact_optimum_which_takes_few_evaluations(paper: dict[str, dict[str, Any]]) -> None:
     assert paper["crs"]["box"] == paper["closed_form"]["box"] == "paper"
     assert paper["crs"]["train_cost"] >= paper["closed_form"]["train_cost"] - 1e-9
     assert -1e-9 <= paper["crs"]["gap"] < 1e-5
@@ -92,9 +90,7 @@ def test_the_page_on_the_paper_prints_what_the_comparison_says(paper: dict[str, 
         assert 0.8 * least <= paper[label]["evaluations"] <= 1.2 * most, label
 
 
-def test_a_real_robot_is_calibrated_as_well_as_was_measured_and_as_the_readme_prints(
-    ended: dict[str, Path], omni3: Dataset
-) -> None:
+def test_a_real_robot_is_calibrated_as_well_as_the_readme_prints(ended: dict[str, Path], omni3: Dataset) -> None:
     if "compare" not in ended:
         pytest.skip("the page on comparisons ended before the real robot's")
     results = ended["compare"] / "results" / "omni3" / "latest"

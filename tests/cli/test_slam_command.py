@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import math
 import re
-import signal
-import subprocess
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -16,9 +14,9 @@ import numpy as np
 import polars as pl
 import pytest
 import yaml
-from commands import COMMAND, ENVIRONMENT, Command, Printed, assert_refused, run_here
+from commands import ENVIRONMENT, Command, Printed, assert_refused, python, run_here, succeeded
 from drives import calibration
-from timing import PATIENCE
+from nodes import Command as CommandProcess
 
 from omnibench.data.dataset import make_dataset
 from omnibench.data.scans import ScansInMemory, TrajectoryScans
@@ -89,15 +87,12 @@ def document(driven: Driven, tmp_path_factory: pytest.TempPathFactory) -> dict[s
     folder = tmp_path_factory.mktemp("json")
     run = run_here("slam", driven.data, "--json", "--truth", driven.truth, cwd=folder)
     assert not list(folder.iterdir())
-    content: dict[str, Any] = json.loads(run.stdout)
-    return content
+    return json.loads(run.stdout)
 
 
 def test_the_poses_are_those_of_the_truth_and_the_rest_is_as_it_was(found: Found, driven: Driven) -> None:
     assert found.run.returncode == 0, found.run.stderr
     before, after = load_dataset(driven.data), load_dataset(found.data)
-    assert before.scans is not None
-    assert after.scans is not None
     assert (after.name, after.simulated, after.scans.scanner) == ("driven", True, before.scans.scanner)
     true = pl.read_parquet(driven.truth / "poses.parquet")
     for old, new in zip(before.trajectories, after.trajectories, strict=True):
@@ -129,9 +124,7 @@ def test_json_holds_the_same_figures(document: dict[str, Any]) -> None:
 
 
 @pytest.mark.slow
-def test_the_search_can_start_from_the_last_pose_and_leave_scans_distorted(
-    command: Command, driven: Driven, document: dict[str, Any]
-) -> None:
+def test_the_search_can_start_from_the_last_pose(command: Command, driven: Driven, document: dict[str, Any]) -> None:
     figures = {"odometry": document["accuracy"]["every"]["position_mean_m"]}
     for name, arguments in {
         "last": ["--start", "last_pose"],
@@ -147,10 +140,8 @@ def test_the_search_can_start_from_the_last_pose_and_leave_scans_distorted(
 
 def test_a_calibration_can_give_the_odometry(command: Command, driven: Driven, found: Found) -> None:
     assert command("calibrate", found.data, "-o", "calibration.yaml").returncode == 0
-    run = command("slam", driven.data, "-o", "second", "--model", "calibration.yaml")
-    assert run.returncode == 0, run.stderr
+    succeeded(command("slam", driven.data, "-o", "second", "--model", "calibration.yaml"))
     apart = distances(load_dataset(found.data), load_dataset("second"))
-    assert apart is not None
     assert apart.position_p95_m < 0.001
 
 
@@ -164,14 +155,11 @@ def test_an_effect_of_a_plug_in_works_in_the_calibration(command: Command, drive
     parameters = effects.entry("swerve", "test").cls().parameters(ROBOT)
     fitted["effects"] = [{"name": "swerve", "parameters": {parameter.name: 0.0 for parameter in parameters}}]
     Path("calibration.yaml").write_text(yaml.safe_dump(fitted))
-    run = command("slam", driven.data, "-o", "found", "--model", "calibration.yaml", "--plugins", "plugins")
-    assert run.returncode == 0, run.stderr
+    succeeded(command("slam", driven.data, "-o", "found", "--model", "calibration.yaml", "--plugins", "plugins"))
     assert len(load_dataset("found").trajectories) == 3
 
 
-def test_with_the_truth_there_are_errors_bias_and_drift_and_csv_and_a_report_are_written(
-    command: Command, driven: Driven, found: Found
-) -> None:
+def test_the_truth_gives_errors_bias_and_drift_and_a_report(command: Command, driven: Driven, found: Found) -> None:
     run = command(
         *("slam", driven.data, "-o", "csv", "--format", "csv"), *("--report", "slam.html", "--truth", driven.truth)
     )
@@ -228,7 +216,6 @@ def _placed(argument: str, places: dict[str, Path]) -> str:
 def places(driven: Driven, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Data sets with one thing wrong in each, and other things that are none."""
     folder, data = tmp_path_factory.mktemp("places"), load_dataset(driven.data)
-    assert data.scans is not None
     places = {name: folder / name.lower() for name in ("BARE", "PART", "EMPTY", "OTHER", "PLUGINS")}
     save_dataset(replace(data, scans=None), places["BARE"])
     one = ScansInMemory(data.scans.scanner, {"01": data.scans.of("01")})
@@ -249,53 +236,39 @@ def places(driven: Driven, tmp_path_factory: pytest.TempPathFactory) -> dict[str
 def first_scans(driven: Driven) -> TrajectoryScans:
     """The scans of the first run that was driven."""
     data = load_dataset(driven.data)
-    assert data.scans is not None
     return data.scans.of(data.trajectories[0].id)
 
 
 def save_runs(driven: Driven, folder: Path, scans: dict[str, TrajectoryScans]) -> None:
     """Save the first run that was driven once under each name, with these scans."""
     data = load_dataset(driven.data)
-    assert data.scans is not None
     runs = tuple(replace(data.trajectories[0], id=name) for name in scans)
     save_dataset(replace(data, trajectories=runs, scans=ScansInMemory(data.scans.scanner, scans)), folder)
 
 
 @pytest.mark.slow
-def test_after_ctrl_c_the_command_goes_on(
-    command: Command, driven: Driven, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ctrl_c_keeps_paths(command: Command, driven: Driven, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scans = first_scans(driven)
     save_runs(driven, tmp_path / "many", {f"{number:04d}": scans for number in range(16)})
-    process = subprocess.Popen(
-        [*COMMAND, "slam", "many", "-o", "found"],
-        cwd=tmp_path,
-        env=ENVIRONMENT,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    assert process.stderr is not None
-    while not (kept := len(list((tmp_path / "found.slam-paths").glob("*.json")))):
-        assert process.poll() is None
-        time.sleep(0.01)
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=PATIENCE)
-    assert (process.returncode, out) == (130, "")
+    with CommandProcess("slam", "many", "-o", "found", cwd=tmp_path) as slam:
+        while not (kept := len(list((tmp_path / "found.slam-paths").glob("*.json")))):
+            assert slam.process.poll() is None
+            time.sleep(0.01)
+        out, err = slam.stop()
+    assert (slam.process.returncode, out) == (130, "")
     files = {file: file.stat().st_mtime_ns for file in (tmp_path / "found.slam-paths").iterdir()}
     assert kept <= len(files) < 16
     (line,) = [line for line in err.splitlines() if not line.startswith("SLAM: ")]
     assert "found.slam-paths" in line
     assert {file.name for file in tmp_path.iterdir()} == {"many", "found.slam-paths"}
     monkeypatch.chdir(tmp_path)
-    run = command("slam", "many", "-o", "found")
-    assert run.returncode == 0, run.stderr
+    succeeded(command("slam", "many", "-o", "found"))
     assert {file.name for file in tmp_path.iterdir()} == {"many", "found"}
     poses = {trajectory.poses.tobytes() for trajectory in load_dataset("found").trajectories}
     assert len(poses) == 1  # of one run, whoever found its path
 
 
-def test_an_error_says_where_the_paths_found_before_it_are_kept(
+def test_an_error_keeps_paths(
     command: Command, driven: Driven, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scans = first_scans(driven)
@@ -314,15 +287,7 @@ def test_ctrl_c_before_the_first_path_leaves_nothing(driven: Driven, tmp_path: P
     program = "import os, signal, sys, threading; sys.argv[0] = 'omnibench'; "
     program += "from omnibench.__main__ import main; import omnibench.cli.app, omnibench.slam.slam_request; "
     program += "threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGINT)).start(); main()"
-    run = subprocess.run(
-        [COMMAND[0], "-c", program, "slam", str(driven.data), "-o", "found"],
-        cwd=tmp_path,
-        env=ENVIRONMENT,
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-        check=False,
-    )
+    run = python(program, "slam", driven.data, "-o", "found", cwd=tmp_path, env=ENVIRONMENT)
     assert run.returncode == 130
     assert [line for line in run.stderr.splitlines() if line][-1].startswith("interrupted")  # by imports, or later
     assert list(tmp_path.iterdir()) == []
@@ -333,7 +298,6 @@ def test_inspect_says_what_scans_there_are(command: Command, driven: Driven) -> 
     assert "540 rays over 270 deg up to 30 m, of which 100% measured something" in run.stdout
     document = json.loads(command("inspect", driven.data, "--json").stdout)["scans"]
     scans = load_dataset(driven.data).scans
-    assert scans is not None
     assert document["scans"] == sum(len(scans.times(name)) for name in scans.trajectories)
     assert (document["trajectories"], document["rays"]) == (3, 540)
     assert 0.2 <= document["scan_period_s"] <= 0.3

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import scipy.linalg
+from commands import python
 from scipy.linalg.lapack import dtbtrs
-from timing import PATIENCE
 
 import omnibench
 from omnibench.__main__ import _run
@@ -29,14 +27,7 @@ finally:
 
 def packages(statements: str) -> set[str]:
     """Names of the packages outside the standard library that the statements import."""
-    run = subprocess.run(
-        [sys.executable, "-c", LOADED.format(statements=statements)],
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-        check=True,
-    )
-    return set(run.stderr.split())
+    return set(python(LOADED.format(statements=statements)).stderr.split())
 
 
 def test_the_help_imports_typer_and_nothing_else() -> None:
@@ -78,14 +69,13 @@ finally:
 
 @pytest.mark.parametrize("before", ["signal.raise_signal(signal.SIGINT)", ""], ids=["before", "after"])
 def test_ctrl_c_before_and_after_the_work_of_the_program_is_one_line(before: str) -> None:
-    program = PROGRAM.format(name="/usr/bin/omnibench", before=before)
-    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=PATIENCE, check=False)
+    run = python(PROGRAM.format(name="/usr/bin/omnibench", before=before))
     assert (run.returncode, run.stderr) == (130, "interrupted\n")
 
 
 def test_the_program_takes_ctrl_c_over_before_it_imports_anything_that_takes_time() -> None:
     listed = "import sys; before = {*sys.modules}; from omnibench.__main__ import main; print(*{*sys.modules} - before)"
-    run = subprocess.run([sys.executable, "-c", listed], capture_output=True, text=True, timeout=PATIENCE, check=True)
+    run = python(listed)
     assert set(run.stdout.split()) == {"__future__", "gc", "omnibench", "omnibench.__main__"}
 
 
@@ -100,8 +90,7 @@ def test_the_program_takes_ctrl_c_over_before_it_imports_anything_that_takes_tim
     ],
 )
 def test_ctrl_c_during_the_imports_of_a_command_is_one_line(module: str, arguments: list[str]) -> None:
-    program = INTERRUPTED.format(module=module, arguments=arguments)
-    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=PATIENCE, check=False)
+    run = python(INTERRUPTED.format(module=module, arguments=arguments))
     assert (run.returncode, run.stdout, run.stderr) == (130, "", "interrupted\n")
 
 
@@ -120,9 +109,7 @@ UNKNOWN = np.full((3, 3), np.nan)
     ],
     ids=["eigenvalues", "singular values", "inverse", "Cholesky factor", "SciPy", "LAPACK"],
 )
-def test_a_failure_of_linear_algebra_is_one_line(
-    compute: Callable[[], object], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_failing_linear_algebra_is_one_line(compute: Callable[[], object], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         _run(SimpleNamespace(main=lambda **_: compute()))
     assert ended.value.code == 2

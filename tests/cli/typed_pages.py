@@ -1,9 +1,10 @@
-"""Pages of the README and the handbook, whose commands are typed one after the other, as a reader types them."""
+"""Commands of the README and the handbook: parsed, and typed one after the other as a reader types them."""
 
 from __future__ import annotations
 
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -13,7 +14,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
+
+import typer
+
+from omnibench.cli.app import app
 
 LONGEST = 900  # s, of one command
 ENOUGH = 8.0  # s: how long a reader watches a command that runs until Ctrl-C, once it works
@@ -132,3 +137,27 @@ def _works(printed: str) -> bool:
 def _assert_fine(command: str, process: subprocess.Popen[bytes], printed: str) -> None:
     assert process.returncode == 0, f"{command}\nexit {process.returncode}\n{printed}"
     assert "Traceback" not in printed, f"{command}\n{printed}"
+
+
+_APP: Any = typer.main.get_command(app)
+_INLINE = re.compile(r"`(omnibench [^`]+)`")
+
+
+def commands_in(markdown: str) -> list[str]:
+    """Every ``omnibench ...`` of the code blocks and of the code within lines."""
+    joined = re.sub(r"\\\n +", "", markdown)  # a backslash goes on in the next line
+    blocks = [line.strip() for line in joined.splitlines() if line.startswith("    ")]
+    typed = [part.strip() for line in [*blocks, *_INLINE.findall(markdown)] for part in line.split("&&")]
+    return [line for line in typed if line.startswith("omnibench ")]
+
+
+def parse(command: str) -> None:
+    """Parse a command. Click's UsageError when a command, an option or an argument of it does not exist."""
+    _, *arguments = shlex.split(command, comments=True)
+    if len(arguments) == 1 and any(arguments[0] in option.opts for option in _APP.params):
+        return  # --version
+    group, name, context = _APP, "omnibench", None
+    while hasattr(group, "commands"):
+        context = group.context_class(group, info_name=name, parent=context)
+        name, group, arguments = group.resolve_command(context, arguments)
+    group.make_context(name, [argument for argument in arguments if argument != "--help"], parent=context)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import gc
+import http.server
 import os
 import pickle
 import signal
-import subprocess
-import sys
 import threading
 import time
 import weakref
@@ -19,6 +18,8 @@ from typing import Any
 import distributed
 import numpy as np
 import pytest
+from commands import ENVIRONMENT, Command, assert_refused, python, write_config
+from dask_samples import certificates, refusal
 from distributed.protocol import Serialize
 from job_samples import Answer, Notes, jobs_of, squared, tried, wait_for
 from test_jobs import (
@@ -31,10 +32,10 @@ from test_jobs import (
     wrong_in_two_parts,
 )
 
-from omnibench.errors import DataError
-from omnibench.jobs.backend_choice import BackendChoice, open_backend
+from omnibench.errors import ConfigError, DataError
+from omnibench.jobs.backend_choice import BackendChoice, check_backend, open_backend
 from omnibench.jobs.dask_backend import DaskBackend
-from omnibench.jobs.job import Failure, Job, ResultStore, gathered, run_jobs
+from omnibench.jobs.job import Failure, Job, ResultStore, TlsFiles, gathered, run_jobs
 from omnibench.jobs.job_process import Packer
 from omnibench.progress import Progress, Reporter
 
@@ -181,7 +182,6 @@ def kills_its_worker(order: tuple[Path, int], _: Reporter) -> Answer:
     count = tried(folder, "kills")
     if count <= times:
         parent = parent_process()
-        assert parent is not None
         os.kill(parent.pid, signal.SIGKILL)
         time.sleep(60)
     return Answer(count)
@@ -236,8 +236,7 @@ def test_a_process_without_the_certificate_reaches_no_part_of_a_cluster_of_this_
     workers = dask.client.scheduler_info(n_workers=-1)["workers"]
     addresses = [dask.client.scheduler.address, *workers, *(worker["nanny"] for worker in workers.values())]
     places = [address.partition("://")[2] for address in addresses]
-    second = subprocess.run([sys.executable, "-c", SECOND_USER, *places], capture_output=True, text=True, check=True)
-    answers = second.stdout.splitlines()
+    answers = python(SECOND_USER, *places).stdout.splitlines()
     assert len(answers) == 2 * len(places) == 10
     assert set(answers) <= {"OSError", "CommClosedError", "TimeoutError"}
 
@@ -267,3 +266,57 @@ def test_ctrl_c_ends_what_is_at_work_and_what_waits(dask: DaskBackend, tmp_path:
         time.sleep(0.05)
     assert len(list(notes.iterdir())) == 2
     assert run(tmp_path, jobs_of(squared, range(3)), dask).answers() == {0: 0, 1: 1, 2: 4}
+
+
+@pytest.mark.parametrize(
+    ("name", "parts"),
+    [
+        ("dusk", ("'dusk'", "did you mean 'dask'?", "processes, dask, tcp://HOST:PORT, tls://HOST:PORT")),
+        ("tcp://127.0.0.1", ("unknown backend 'tcp://127.0.0.1'",)),
+        ("tcp://:8786", ("unknown backend 'tcp://:8786'",)),
+        ("tls://127.0.0.1:8786", ("--tls-ca, --tls-cert, --tls-key",)),
+    ],
+)
+def test_a_wrong_backend_is_named(name: str, parts: tuple[str, ...]) -> None:
+    with pytest.raises(ConfigError) as refused:
+        check_backend(name)
+    assert all(part in str(refused.value) for part in parts)
+
+
+def test_a_scheduler_that_nobody_started_is_one_line(command: Command, tmp_path: Path) -> None:
+    run = command("compare", write_config(tmp_path), "-o", tmp_path / "out", "--backend", "tcp://127.0.0.1:9")
+    assert_refused(run, "tcp://127.0.0.1:9", "dask scheduler")
+
+
+def test_without_dask_one_line_names_the_extra(tmp_path: Path) -> None:
+    without = "import sys; sys.modules['distributed'] = None; from omnibench.__main__ import main; main()"
+    run = python(without, "compare", write_config(tmp_path), "--backend", "dask", env=ENVIRONMENT, cwd=tmp_path)
+    assert_refused(run, 'pip install "omnibench[dask]"')
+
+
+def test_dask_is_imported_only_where_it_is_asked_for() -> None:
+    program = "import sys, omnibench.compare.run, omnibench.cli.app; print('distributed' in sys.modules)"
+    assert python(program, env=ENVIRONMENT).stdout == "False\n"
+
+
+def test_a_web_server_is_no_scheduler() -> None:
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), http.server.SimpleHTTPRequestHandler)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    place = f"tcp://127.0.0.1:{server.server_port}"
+    try:
+        assert refusal(place).startswith(f"no Dask scheduler answers at {place}")
+    finally:
+        server.shutdown()
+
+
+def test_a_file_of_tls_that_is_none_is_named(tmp_path: Path) -> None:
+    ca, cert, key = certificates(tmp_path)
+    text = tmp_path / "text"
+    text.write_text("no certificate")
+    place = "tls://127.0.0.1:1"
+    for files, line in (
+        (TlsFiles(ca=text, cert=cert, key=key), f"ca: {text}: "),
+        (TlsFiles(ca=ca, cert=cert, key=text), f"cert and key: {cert}, {text}: "),
+        (TlsFiles(ca=ca, cert=tmp_path, key=key), f"cert: {tmp_path}: is a folder"),
+    ):
+        assert refusal(place, tls=files).startswith(f"backend {place}: {line}")

@@ -46,9 +46,7 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         yield place
 
 
-def test_a_scheduler_without_tls_is_joined_with_a_line_that_says_who_runs_code_there(
-    address: str, tmp_path: Path
-) -> None:
+def test_a_scheduler_without_tls_is_joined_with_a_warning_who_runs_code_there(address: str, tmp_path: Path) -> None:
     said: list[Progress] = []
     choice = BackendChoice(name=address)
     with worker(address, tmp_path / "worker"), open_backend(choice, report=said.append) as backend:
@@ -122,17 +120,13 @@ class TestPlugins:
         plugins = write_plugin(tmp_path / "plugins", "needs", NEEDS)
         return write_config(tmp_path, plugins=[str(plugins)], calibrators=["theoretical", "needs"])
 
-    def test_a_package_that_a_worker_lacks_is_named_before_the_first_job(
-        self, config: Path, address: str, tmp_path: Path
-    ) -> None:
+    def test_a_package_that_a_worker_lacks_is_named_first(self, config: Path, address: str, tmp_path: Path) -> None:
         with worker(address, tmp_path / "worker"):
             run = omnibench("compare", config, "-o", tmp_path / "out", "--backend", address)
         assert_refused(run, "needs.py cannot be imported there: ModuleNotFoundError: No module named 'only_here'")
         assert not list((tmp_path / "out").glob("runs/*"))
 
-    def test_a_plugin_file_travels_to_a_machine_that_does_not_have_it(
-        self, config: Path, address: str, tmp_path: Path
-    ) -> None:
+    def test_a_plugin_file_travels_to_a_machine_without_it(self, config: Path, address: str, tmp_path: Path) -> None:
         hidden = tmp_path / "elsewhere"
         with worker(address, tmp_path / "worker", environment=searched_first(tmp_path / "packages")):
             process = subprocess.Popen(
@@ -252,9 +246,7 @@ class Freezing(JobWatch[Answer]):
         self._process.send_signal(signal.SIGSTOP)
 
 
-def test_where_no_worker_is_left_it_is_said_and_ends(
-    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_that_no_worker_is_left_is_said(address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dask_backend, "WAIT", 3.0)
     said: list[Progress] = []
     store = ResultStore(tmp_path / "results", Answer)

@@ -12,14 +12,7 @@ from pathlib import Path
 import pytest
 
 from omnibench.errors import DataError, one_line, visible
-from omnibench.files import (
-    check_results_folder,
-    link_latest,
-    new_results_folder,
-    replacing,
-    results_locked,
-    write_text,
-)
+from omnibench.files import check_results_folder, link_latest, new_results_folder, replacing, results_locked, write_text
 
 
 def test_a_link_goes_on_pointing_to_the_file_that_is_written(tmp_path: Path) -> None:
@@ -78,9 +71,7 @@ def test_a_text_from_anywhere_becomes_one_line_that_can_be_written_and_controls_
     write_text(tmp_path / "reason", line)
 
 
-def test_folders_made_in_the_same_second_have_names_of_their_own_and_the_link_points_to_the_newest(
-    tmp_path: Path,
-) -> None:
+def test_folders_of_the_same_second_have_names_of_their_own_and_the_newest_is_linked(tmp_path: Path) -> None:
     folders = [new_results_folder(tmp_path) for _ in range(4)]
     assert len(set(folders)) == 4
     for folder in folders:
@@ -116,7 +107,6 @@ def test_a_folder_of_results_is_free_again_when_the_process_that_wrote_there_is_
         "with results_locked(Path(sys.argv[1])):\n    print(flush=True)\n    time.sleep(600)"
     )
     with subprocess.Popen([sys.executable, "-c", writes, str(folder)], stdout=subprocess.PIPE) as process:
-        assert process.stdout is not None
         process.stdout.readline()
         refusal = f"^{folder}: another omnibench is writing results there; name another folder"
         with pytest.raises(DataError, match=refusal), results_locked(folder):
@@ -126,9 +116,7 @@ def test_a_folder_of_results_is_free_again_when_the_process_that_wrote_there_is_
         assert list(folder.iterdir()) == []
 
 
-def test_a_file_that_replaces_another_is_on_the_disk_before_it_does(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_is_on_the_disk_before_it_replaces_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[tuple[str, str]] = []
 
     def sync(descriptor: int) -> None:

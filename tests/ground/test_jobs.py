@@ -6,22 +6,29 @@ import multiprocessing
 import os
 import signal
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
+from multiprocessing import forkserver
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
-from job_samples import Answer, Notes, jobs_of, run, squared, tried
+from job_samples import IMPORTING_THIS, Answer, Notes, jobs_of, run, squared, tried, wait_for
 from timing import PATIENCE
 
 import omnibench.jobs.job_process as job_process
 from omnibench.errors import DataError
-from omnibench.jobs.job import Backend, Failure, Job, ResultStore, run_jobs
+from omnibench.jobs.backend_choice import BackendChoice, open_backend
+from omnibench.jobs.job import Backend, Failure, Job, JobWatch, ResultStore, content_key, gathered, run_jobs
 from omnibench.jobs.local_backends import InPlace, Processes, local_backend
+from omnibench.processes import one_thread_processes
 from omnibench.progress import Progress, Reporter
+from omnibench.robot.kinematics import JsonArray
 
 
 def two_is_wrong(number: int, _: Reporter) -> Answer:
@@ -114,6 +121,14 @@ def with_jobs_of_its_own(folder: Path, _: Reporter) -> Answer:
     return Answer(len(notes.endings), process, str(os.getpid()))
 
 
+class Interrupts(Notes):
+    """Interrupts when the first job has ended."""
+
+    def ended(self, number: int, ending: Answer | Failure, reused: bool) -> None:
+        super().ended(number, ending, reused)
+        raise KeyboardInterrupt
+
+
 BACKENDS = [InPlace(), Processes(2)]
 
 
@@ -134,9 +149,7 @@ class TestEveryBackend:
         assert (failure.reason, failure.over_time, failure.killed) == ("DataError: two is wrong", False, False)
         assert notes.answers() == {0: 0, 1: 1, 3: 3}
 
-    def test_says_what_a_job_raised_where_no_other_process_could_raise_it_again_and_when_it_waited_in_vain(
-        self, backend: Backend, tmp_path: Path
-    ) -> None:
+    def test_says_what_cannot_be_raised_again_and_who_waited_in_vain(self, backend: Backend, tmp_path: Path) -> None:
         jobs = [Job("two", wrong_in_two_parts, 0), Job("time", out_of_its_own_time, 0, seconds=60.0)]
         notes = run(tmp_path, jobs, backend)
         assert notes.reason(0) == "TwoPartError: one and another"
@@ -153,11 +166,6 @@ class TestEveryBackend:
         assert (again.reused, sorted(again.began_numbers)) == ({0, 2}, [1, 3])
 
     def test_takes_jobs_as_they_are_needed(self, backend: Backend, tmp_path: Path) -> None:
-        class Impatient(Notes):
-            def ended(self, number: int, ending: Answer | Failure, reused: bool) -> None:
-                super().ended(number, ending, reused)
-                raise KeyboardInterrupt
-
         taken = []
 
         def jobs() -> Iterator[Job[Answer]]:
@@ -166,13 +174,11 @@ class TestEveryBackend:
                 yield job
 
         with pytest.raises(KeyboardInterrupt):
-            run_jobs(jobs(), ResultStore(tmp_path, Answer), backend, Impatient())
+            run_jobs(jobs(), ResultStore(tmp_path, Answer), backend, Interrupts())
         assert len(taken) <= 3
         assert not multiprocessing.active_children()
 
-    def test_leaves_the_environment_of_this_process(
-        self, backend: Backend, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_leaves_the_environment(self, backend: Backend, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv("OMP_NUM_THREADS", "7")
         monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
         assert run(tmp_path, [], backend).endings == {}
@@ -256,9 +262,7 @@ def leaves_behind(what: str, _: Reporter) -> Answer:
 
 
 @pytest.mark.parametrize("what", ["variable", "handler", "thread", "child", "folder", "error", "nothing"])
-def test_a_job_that_leaves_something_behind_shares_its_process_with_no_later_one(
-    what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_a_job_leaves_ends_its_process(what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(job_process, "_YOUNG", PATIENCE)
     first = Job("first", leaves_behind, what)
     processes = processes_of(run(tmp_path, [Job("before", squared, 1), first, Job("after", squared, 2)], Processes(1)))
@@ -322,13 +326,239 @@ def test_within_a_job_there_are_no_further_processes(tmp_path: Path) -> None:
 
 
 def test_whatever_the_watch_raises_ends_the_workers(tmp_path: Path) -> None:
-    class Interrupts(Notes):
-        def ended(self, number: int, ending: Answer | Failure, reused: bool) -> None:
-            super().ended(number, ending, reused)
-            raise KeyboardInterrupt
-
     store, notes = ResultStore(tmp_path, Answer), Interrupts()
     with pytest.raises(KeyboardInterrupt):
         run_jobs([*jobs_of(asleep, [None]), Job("quick", squared, 3)], store, Processes(2), notes)
     assert not multiprocessing.active_children()
     assert notes.endings[1] == store.get("quick")
+
+
+@pytest.fixture
+def one_process() -> Iterator[Backend]:
+    with open_backend(BackendChoice(workers=1)) as backend:
+        yield backend
+    assert not multiprocessing.active_children()
+
+
+def total(order: tuple[int, np.ndarray], _: Reporter) -> tuple[float, int, int]:
+    number, shared = order
+    return number + float(shared.sum()), os.getpid(), len(job_process._KEPT)
+
+
+def test_results_are_those_of_the_function_in_their_order(one_process: Backend) -> None:
+    data = np.arange(5.0)
+    orders = [(number, data) for number in range(7)]
+    by_jobs = gathered(one_process, total, orders, shared=(data,))
+    assert [result for result, *_ in by_jobs] == [result for result, *_ in gathered(None, total, orders)]
+
+
+def test_calls_share_a_process_which_keeps_no_more_than_the_last_jobs_share(one_process: Backend) -> None:
+    found = []
+    for size in range(1, 5):
+        data = np.ones(size)
+        found += gathered(one_process, total, [(0, data), (1, data)], shared=(data,))
+    assert [result for result, *_ in found] == [1, 2, 2, 3, 3, 4, 4, 5]
+    assert {kept for *_, kept in found} == {1}
+    assert len({process for _, process, _ in found}) == 1
+
+
+def nothing_of_it(number: int, _: Reporter) -> int:
+    return number
+
+
+def test_what_no_argument_holds_may_be_shared(one_process: Backend) -> None:
+    other = np.ones(3)
+    found = gathered(one_process, total, [(0, other), (1, np.zeros(2)), (2, other)], shared=(other,))
+    assert [result for result, *_ in found] == [3, 1, 5]
+    assert gathered(one_process, nothing_of_it, [4, 5], shared=(other,)) == [4, 5]
+
+
+def test_a_waiting_process_that_is_killed_costs_no_job_a_try(one_process: Backend) -> None:
+    data = np.ones(3)
+    ((_, process, _),) = gathered(one_process, total, [(0, data)], shared=(data,))
+    os.kill(process, signal.SIGKILL)
+    wait_for(lambda: not psutil.pid_exists(process) or psutil.Process(process).status() == psutil.STATUS_ZOMBIE)
+    ((result, other, _),) = gathered(one_process, total, [(1, data)], shared=(data,))
+    assert result == 4
+    assert other != process
+
+
+def wrong(number: int, _: Reporter) -> int:
+    raise DataError(f"{number} is wrong")
+
+
+def test_the_error_of_a_job_is_raised(one_process: Backend) -> None:
+    with pytest.raises(DataError, match=r"^3 is wrong$"):
+        gathered(one_process, wrong, [3])
+
+
+def reporting_without_pause(_: object, report: Reporter) -> int:
+    began = time.monotonic()
+    while time.monotonic() - began < 30:
+        report(Progress("flood"))
+    return 0
+
+
+class Ending(JobWatch[int]):
+    ending: int | Failure | None = None
+
+    def ended(self, number: int, ending: int | Failure, reused: bool) -> None:  # noqa: ARG002
+        self.ending = ending
+
+
+def test_a_job_that_reports_without_pause_ends_at_its_limit(one_process: Backend, tmp_path: Path) -> None:
+    watch, began = Ending(), time.monotonic()
+    job = Job("flood", reporting_without_pause, None, seconds=0.5)
+    run_jobs([job], ResultStore(tmp_path, int), one_process, watch)
+    assert watch.ending == Failure("over time (limit 0.5 s)", over_time=True)
+    assert time.monotonic() - began < 15
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """A result with arrays."""
+
+    values: JsonArray
+    empty: JsonArray | None = None
+
+
+class TestStore:
+    def test_gives_arrays_back_to_the_last_bit(self, tmp_path: Path) -> None:
+        values = np.random.default_rng(5).normal(size=(4, 3, 3)) * 10.0 ** np.arange(-150, 150, 100)
+        values[0, 0] = [np.nan, np.inf, -0.0]
+        store = ResultStore(tmp_path, Table)
+        store.put("key", Table(values))
+        table = store.get("key")
+        assert table.values.tobytes() == values.tobytes()
+        assert table.empty is None
+
+    def test_refuses_what_it_could_not_give_back(self, tmp_path: Path) -> None:
+        store = ResultStore(tmp_path, Answer)
+        three: Any = "three"  # on purpose not the whole number that an answer takes
+        with pytest.raises(ValueError, match="number"):
+            store.put("key", Answer(three))
+        assert list(tmp_path.iterdir()) == []
+
+    def test_removes_its_files_and_no_others(self, tmp_path: Path) -> None:
+        store = ResultStore(tmp_path / "results", Answer)
+        store.put("key", Answer(1))
+        (tmp_path / "results" / "notes.txt").touch()
+        store.remove()
+        assert [file.name for file in (tmp_path / "results").iterdir()] == ["notes.txt"]
+
+    def test_a_key_changes_with_every_bit_of_what_it_is_made_of(self) -> None:
+        values = np.arange(6.0)
+        keys = [
+            content_key({"table": Table(values), "number": 1}),
+            content_key({"table": Table(np.nextafter(values, 9.0)), "number": 1}),
+            content_key({"table": Table(values.reshape(2, 3)), "number": 1}),
+            content_key({"table": Table(values, values), "number": 1}),
+            content_key({"table": Table(values), "number": 2}),
+        ]
+        assert len(set(keys)) == len(keys)
+        assert keys[0] == content_key({"number": 1, "table": Table(values.copy())})
+
+
+def test_ctrl_c_while_the_fork_server_starts_is_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    started = []
+
+    def interrupted() -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        started.append(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ()))
+
+    monkeypatch.setattr(forkserver, "ensure_running", interrupted)
+    with pytest.raises(KeyboardInterrupt), one_thread_processes(()):
+        pytest.fail("the interrupt was lost")
+    assert started == [True]
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
+
+
+def test_processes_of_the_fork_server_leave_ctrl_c_to_their_parent() -> None:
+    with one_thread_processes(()) as context, context.Pool(1) as pool:
+        blocked = pool.apply(signal.pthread_sigmask, (signal.SIG_BLOCK, ()))
+    assert signal.SIGINT in blocked
+
+
+OUT_OF_MEMORY = """
+import os, sys
+from pathlib import Path
+from job_samples import jobs_of, run, squared
+from test_jobs import fills_memory
+from omnibench.jobs.job import Job
+from omnibench.jobs.local_backends import Processes
+Path(sys.argv[2], "cgroup.procs").write_text(str(os.getpid()))
+jobs = [*jobs_of(fills_memory, [None]), Job("other", squared, 3)]
+print(run(Path(sys.argv[1]), jobs, Processes(1)).reason(), flush=True)
+"""
+
+
+def fills_memory(_: object, __: Reporter) -> Answer:
+    return Answer(sum(len(block) for block in [b"x" * 10**7 for _ in range(1000)]))
+
+
+@pytest.fixture
+def little_memory_group() -> Iterator[Path]:
+    """A control group of 500 MB for processes."""
+    group, limit = Path("/sys/fs/cgroup/memory/omnibench-test"), "memory.limit_in_bytes"
+    try:
+        group.mkdir(exist_ok=True)
+        (group / limit).write_text(str(500 * 10**6))
+    except OSError:
+        pytest.skip("needs the right to make a control group (version 1)")
+    yield group
+    wait_for(lambda: not (group / "cgroup.procs").read_text())
+    group.rmdir()
+
+
+@pytest.mark.slow
+def test_a_job_that_the_system_kills_for_lack_of_memory_says_so(tmp_path: Path, little_memory_group: Path) -> None:
+    command = [sys.executable, "-c", OUT_OF_MEMORY, str(tmp_path), str(little_memory_group)]
+    done = subprocess.run(command, env=IMPORTING_THIS, capture_output=True, text=True, check=True)
+    how = "killed by SIGKILL: the system was out of memory"
+    assert done.stdout == f"the process died without an answer ({how}) in each of 3 tries\n"
+    assert (tmp_path / "other.json").exists()
+
+
+PROGRAM = """
+import sys
+from pathlib import Path
+from job_samples import run, squared
+from test_jobs import until_told
+from omnibench.jobs.job import Job
+from omnibench.jobs.local_backends import Processes
+folder = Path(sys.argv[1])
+jobs = [Job("first", squared, 2), Job("second", squared, 3), Job("waits", until_told, folder), Job("third", squared, 4)]
+print(run(folder / "results", jobs, Processes(2)).answers(), flush=True)
+"""
+
+
+def until_told(folder: Path, _: Reporter) -> Answer:
+    count = tried(folder, "waits")
+    while not (folder / "go_on").exists():
+        time.sleep(0.05)
+    return Answer(count)
+
+
+def alive(session: int) -> list[str]:
+    """Commands of the processes of a session that have not ended."""
+    listed = subprocess.run(
+        ["ps", "-o", "stat=,args=", "-s", str(session)], capture_output=True, text=True, check=False
+    )
+    return [line for line in listed.stdout.splitlines() if not line.startswith("Z")]
+
+
+@pytest.mark.slow
+def test_when_the_parent_is_killed_no_worker_is_left_and_nothing_that_ended_is_run_again(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", PROGRAM, str(tmp_path)]
+    parent = subprocess.Popen(command, env=IMPORTING_THIS, start_new_session=True)
+    results = tmp_path / "results"
+    wait_for(lambda: len(list(results.glob("*.json"))) == 3 and (tmp_path / "waits").exists())
+    parent.kill()
+    parent.wait()
+    wait_for(lambda: not alive(parent.pid))
+    before = {file.name: file.stat().st_mtime_ns for file in results.iterdir()}
+    assert set(before) == {"first.json", "second.json", "third.json"}
+    (tmp_path / "go_on").touch()
+    again = subprocess.run(command, env=IMPORTING_THIS, capture_output=True, text=True, check=True)
+    assert again.stdout == "{0: 4, 1: 9, 2: 2, 3: 16}\n"  # the job that waited is in its second try
+    assert before.items() <= {file.name: file.stat().st_mtime_ns for file in results.iterdir()}.items()

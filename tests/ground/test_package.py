@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import doctest
-import subprocess
 import sys
 from collections import defaultdict
 from collections.abc import Callable
@@ -15,9 +14,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import ROOT
+from commands import ROOT, python
 from start_up import NUMPY, PACKAGE, ratio
-from timing import PATIENCE
 
 import omnibench
 
@@ -121,8 +119,7 @@ def test_one_folder_of_plug_ins_is_not_taken_for_a_list_of_letters() -> None:
 
 def test_importing_the_package_loads_no_heavy_library() -> None:
     program = "import sys, omnibench; print(sorted({'numpy', 'polars', 'plotly', 'cvxpy'} & set(sys.modules)))"
-    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=PATIENCE, check=True)
-    assert run.stdout == "[]\n"
+    assert python(program).stdout == "[]\n"
 
 
 def test_importing_the_package_takes_at_most_twice_as_long_as_importing_numpy() -> None:
@@ -130,17 +127,8 @@ def test_importing_the_package_takes_at_most_twice_as_long_as_importing_numpy() 
     assert processor <= 2
 
 
-def test_the_version_is_that_of_the_installed_package() -> None:
-    shown = subprocess.run(
-        [sys.executable, "-m", "omnibench", "--version"], capture_output=True, text=True, timeout=PATIENCE, check=True
-    )
-    assert omnibench.__version__ in shown.stdout
-
-
 @pytest.mark.parametrize("name", omnibench.__all__)
-def test_the_examples_of_a_public_name_give_what_they_show(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_examples_of_a_name_give_what_they_show(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     found = getattr(omnibench, name)
     names = vars(sys.modules[found.__module__]) | {each: getattr(omnibench, each) for each in omnibench.__all__}

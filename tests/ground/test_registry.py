@@ -80,10 +80,6 @@ def test_an_unknown_option_and_one_of_the_wrong_size_are_named() -> None:
         calibrators.create("random_search", {"candidates": 0})
 
 
-def test_options_reach_the_class_validated() -> None:
-    assert calibrators.create("random_search", {"candidates": 7}).options.candidates == 7
-
-
 def test_a_name_that_is_taken_is_refused() -> None:
     with pytest.raises(PluginError, match="calibrator 'theoretical' is registered already, by built in"):
 
@@ -152,12 +148,7 @@ def test_two_plugins_of_one_name_name_the_first_one(folder: Path) -> None:
 
 
 def test_an_installed_package_is_found_by_its_entry_point(installed: Path) -> None:
-    install(
-        installed,
-        "calmly",
-        PLUGIN.format(name="calm"),
-        "[omnibench.calibrators]\ncalm = calmly.search:Still\n",
-    )
+    install(installed, "calmly", PLUGIN.format(name="calm"), "[omnibench.calibrators]\ncalm = calmly.search:Still\n")
     assert load_plugins() == []
     entry = calibrators.entry("calm")
     assert entry.origin == "calmly.search"

@@ -1,4 +1,4 @@
-"""Nodes for tests: in this process, or as the command that a user runs."""
+"""Nodes for tests, in this process or as the command that a user runs, and what comes on keys of a session."""
 
 from __future__ import annotations
 
@@ -113,7 +113,6 @@ def asked(session: zenoh.Session, selector: str, payload: str | bytes | None = N
     until(answered, f"an answer to {selector}")
     (reply,) = replies
     answer = reply.ok if reply.ok is not None else reply.err
-    assert answer is not None
     return json.loads(answer.payload.to_bytes())
 
 
@@ -167,3 +166,19 @@ def wheels_of(session: zenoh.Session, robot: str = "apr", topic: str = "joint_st
     publisher = session.declare_publisher(f"{robot}/{topic}", congestion_control=zenoh.CongestionControl.BLOCK)
     until(lambda: publisher.matching_status.matching, "the node's subscription")
     return publisher
+
+
+class ReceivedMessages:
+    """Everything that comes on some keys, decoded."""
+
+    def __init__(self, session: zenoh.Session, **kinds: Any) -> None:
+        self.messages: dict[str, list[Any]] = {key: [] for key in kinds}
+        self._subscribers = [
+            session.declare_subscriber(key.replace("__", "/"), self._taker(key, kind)) for key, kind in kinds.items()
+        ]
+
+    def _taker(self, key: str, kind: Any) -> Any:
+        return lambda sample: self.messages[key].append(kind.decode(sample.payload.to_bytes()))
+
+    def __getitem__(self, key: str) -> list[Any]:
+        return self.messages[key]

@@ -1,12 +1,22 @@
-"""Messages with numbers that no default has, one for each topic."""
+"""Messages with numbers that no default has, robots that publish them, and recordings of them."""
 
 from __future__ import annotations
 
+import json
+import resource
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import zenoh
+from rosbags.highlevel import AnyReader
+from sessions import Loopback, until
 
+from omnibench.live.estimation.counts import Counts
 from omnibench.live.wire.messages import Diagnostic, Diagnostics, JointState, Odometry, PoseEstimate, Transform
+from omnibench.live.wire.topics import TOPICS, GraphNode, KeySpace, Profile, Publisher
 
 STAMP = 1_700_000_000_123_456_789
 PERIOD = 10_000_000  # ns
@@ -45,3 +55,58 @@ def sample(topic: str, k: int = 0) -> Any:
         ),
     }
     return messages[topic]
+
+
+class AnnouncedRobot:
+    """A robot's liveliness token, its topics and its answer to queries for its health."""
+
+    def __init__(self, session: zenoh.Session, name: str, profile: Profile = "plain") -> None:
+        node = GraphNode(session, KeySpace(profile), f"node_of_{name}")
+        self.name = name
+        self.odom = node.publisher(name, "odom", lossless=True)
+        self.filtered = node.publisher(name, "odometry/filtered", lossless=True)
+        self.diagnostics = node.publisher(name, "diagnostics")
+        self.token = session.liveliness().declare_token(f"omnibench/{name}/alive")
+        self._session = session
+
+    def answer_health(self, status: str, message: str, **counts: int) -> None:
+        document = json.dumps(
+            {"robot": self.name, "status": status, "message": message, "counts": Counts(**counts).as_dict()}
+        )
+        self._queryable = self._session.declare_queryable(
+            f"omnibench/{self.name}/health", lambda query: query.reply(f"omnibench/{self.name}/health", document)
+        )
+
+    def wait_for_subscribers(self) -> None:
+        until(lambda: self.odom.matched and self.filtered.matched, "the monitor's subscriptions")
+
+
+def publishers(loopback: Loopback, robot: str = "apr02") -> dict[str, Publisher[Any]]:
+    """A publisher for each topic of a robot; bursts lose nothing."""
+    node = GraphNode(loopback.router, KeySpace(), "node")
+    return {topic: node.publisher(robot, topic, lossless=True) for topic in TOPICS}
+
+
+def wait_for_subscribers(*publishers: Publisher[Any]) -> None:
+    """Wait until each publisher has a subscriber."""
+    until(lambda: all(publisher.matched for publisher in publishers), "the recorder's subscriptions")
+
+
+def messages_of(path: Path) -> dict[str, list[bytes]]:
+    """The payloads in a file, as rosbags reads them, by ROS topic."""
+    payloads: dict[str, list[bytes]] = {}
+    with AnyReader([path]) as reader:
+        for connection, _, payload in reader.messages():
+            payloads.setdefault(connection.topic, []).append(bytes(payload))
+    return payloads
+
+
+@contextmanager
+def disk_with_room_for(size: int) -> Iterator[None]:
+    """Files of this process cannot grow beyond ``size`` bytes: writing more fails, as on a full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))

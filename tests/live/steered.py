@@ -66,8 +66,7 @@ class SteeredDrive:
 
     @property
     def times(self) -> Array:
-        times: Array = PERIOD * np.arange(1, len(self.angles))
-        return times
+        return PERIOD * np.arange(1, len(self.angles))
 
     @property
     def log(self) -> WheelLog:
@@ -114,8 +113,6 @@ def drive(seconds: float = 1.0, *, seed: int = 1, using: Calibration | None = No
 def only(sample: JointState, *names: str) -> JointState:
     """Some joints of a message."""
     places = [sample.names.index(name) for name in names]
-    assert sample.positions is not None
-    assert sample.velocities is not None
     return replace(sample, names=names, positions=sample.positions[places], velocities=sample.velocities[places])
 
 

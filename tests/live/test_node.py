@@ -5,11 +5,15 @@ from __future__ import annotations
 import gc
 import json
 import math
+import os
+import signal
 import socket
 import sys
+import threading
 import time
 from contextlib import closing
 from importlib.util import find_spec
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,20 +22,19 @@ import pytest
 import zenoh
 from drives import SECOND, drive, slam
 from mcap.reader import make_reader
-from nodes import asked, config_of, running, sent, sent_one_by_one, wheels_of
-from received_messages import ReceivedMessages
+from nodes import ReceivedMessages, asked, config_of, running, sent, sent_one_by_one, wheels_of
 from recordings import random_dataset
 from sessions import free_port, until
 from timing import PATIENCE
 
 from omnibench.errors import ConfigError, DataError
-from omnibench.live.config import LiveConfig, read_live_config
+from omnibench.live.config import LiveConfig
 from omnibench.live.estimation.health import Health
 from omnibench.live.network.presence import alive_robots
 from omnibench.live.node import LiveNode
 from omnibench.live.replay.concatenated_drive import ReplayConfig, concatenate_runs
 from omnibench.live.replay.replay_player import Player
-from omnibench.live.stopping import RateLimiter
+from omnibench.live.stopping import RateLimiter, stop_on_signals, ticks
 from omnibench.live.wire.messages import DIAGNOSTICS, JOINT_STATE, ODOMETRY, TRANSFORMS, Odometry, packed
 from omnibench.live.wire.recorder import Recorder
 from omnibench.live.wire.topics import TOPICS, GraphNode, KeySpace
@@ -135,7 +138,6 @@ def test_ros_2_finds_topics_under_its_own_keys(tmp_path: Path, profile: str) -> 
         sent(wheels, path.samples())
         until(lambda: len(heard) == 11, "the odometry")
         attachment = heard[1].attachment
-        assert attachment is not None
         content = attachment.to_bytes()
         assert len(content) == 33
         assert int.from_bytes(content[:8], "little") == 2  # counted from 1
@@ -170,9 +172,7 @@ def test_a_robot_that_another_node_runs_already_is_refused(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("joints", [["a", "b"], ["a", "b", "c", "d"], ["a", "b", "a"], []])
-def test_joints_that_are_not_one_for_each_wheel_and_a_missing_calibration_are_named(
-    tmp_path: Path, joints: list[str]
-) -> None:
+def test_joints_other_than_one_a_wheel_and_a_missing_calibration_are_named(tmp_path: Path, joints: list[str]) -> None:
     robot = {"name": "apr", "calibration": "calibration.yaml", "wheels": {"joints": joints}}
     config = config_of(tmp_path, robots=[robot])
     with pytest.raises(ConfigError, match=rf"'apr': wheels\.joints: {', '.join(joints) or 'none'};"):
@@ -195,7 +195,7 @@ def test_the_interpreter_is_the_streams_until_the_last_node_of_a_process_has_gon
     assert sys.getswitchinterval() == usual
 
 
-def test_a_robot_whose_diagnostics_fail_does_not_end_those_of_the_others(
+def test_diagnostics_may_fail(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     with running(config_of(tmp_path, "apr", "bob")) as (node, session):
@@ -224,9 +224,7 @@ def test_a_sample_on_its_way_while_the_node_closes_is_no_failure(tmp_path: Path)
     assert node.health("apr").counts["samples"] == taken
 
 
-def test_a_reason_of_refusals_is_logged_again_only_with_new_ones(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_reasons_come_once(tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
     with running(config_of(tmp_path)) as (node, _):
         service, tracker = node._services[0], node._services[0].tracker
         monkeypatch.setattr(service, "_rate_limiter", RateLimiter(0.0))
@@ -242,7 +240,7 @@ def test_a_reason_of_refusals_is_logged_again_only_with_new_ones(
 @pytest.mark.parametrize(
     ("frames", "fusion", "told"), [(None, "ekf", True), ("prefixed", "ekf", False), (None, "none", False)]
 )
-def test_a_node_whose_frames_meet_those_of_another_is_warned(
+def test_frames_of_two_nodes_that_meet_are_told(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, frames: str | None, fusion: str, told: bool
 ) -> None:
     router = {"mode": "router", "listen": config_of(tmp_path).zenoh.listening}
@@ -253,14 +251,6 @@ def test_a_node_whose_frames_meet_those_of_another_is_warned(
         with LiveNode(config_of(tmp_path, robots=robots, zenoh=other, fusion=fusion)):
             pass
     assert ("robot bob publishes tf between map, odom and base_link" in caplog.text) == told
-
-
-def test_the_configs_of_the_project_are_valid() -> None:
-    folder = Path(__file__).resolve().parents[2] / "configs"
-    for file in (folder / "live.yaml", folder / "live_fleet.yaml"):
-        config: LiveConfig = read_live_config(file)
-        for robot in config.robots:
-            assert robot.calibration.is_file()
 
 
 def driven(config: LiveConfig, seconds: float = 0.5) -> None:
@@ -276,8 +266,6 @@ def recorded(file: Path) -> dict[str, int]:
     """Messages in a complete recording, by ROS topic."""
     with file.open("rb") as stream:
         summary = make_reader(stream).get_summary()
-    assert summary is not None
-    assert summary.statistics is not None
     counts = summary.statistics.channel_message_counts
     return {channel.topic: counts[number] for number, channel in summary.channels.items()}
 
@@ -302,9 +290,7 @@ def test_a_config_with_record_writes_the_mcap_file_beside_one_that_exists_alread
     assert recorded(second)["/apr/odom"] == 21
 
 
-def test_a_recording_or_foxglove_server_that_cannot_begin_is_named_and_nothing_stays_open(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_recorder_or_server_that_cannot_begin_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("not a folder")
     with closing(socket.socket()) as taken:
         taken.bind(("127.0.0.1", 0))
@@ -323,9 +309,7 @@ def test_a_recording_or_foxglove_server_that_cannot_begin_is_named_and_nothing_s
         LiveNode(config_of(tmp_path, foxglove=True))
 
 
-def test_what_has_started_is_closed_in_reverse_order_when_a_later_step_fails(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_has_started_is_closed_when_a_later_step_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     port = free_port()
     foxglove = port if find_spec("foxglove") else False
     config = config_of(tmp_path, record="run.mcap", foxglove=foxglove, state="state")
@@ -344,9 +328,7 @@ def test_what_has_started_is_closed_in_reverse_order_when_a_later_step_fails(
     assert_nothing_is_open(config)
 
 
-def test_a_replay_that_waits_for_a_subscriber_finds_the_node_before_its_recorder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_waiting_replay_finds_the_node_before_its_recorder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     alive: list[tuple[str, ...]] = []
 
     class LateRecorder(Recorder):
@@ -424,27 +406,61 @@ FLOW = [packed(number + 1, bytes(16), (1, number, 0, False)) for number in range
 
 
 @pytest.mark.parametrize(("attachments", "period"), [([None] * 180, 0.0), (FLOW, 0.01)], ids=["replay", "who waits"])
-def test_samples_of_a_replay_or_whose_sender_waits_are_all_published_however_late(
-    tmp_path: Path, attachments: list[bytes | None], period: float
-) -> None:
+def test_samples_of_replays_are_all_published(tmp_path: Path, attachments: list[bytes | None], period: float) -> None:
     odometry, _, health = sent_while_the_intake_waits(tmp_path, attachments, period)
     assert len(odometry) == len(attachments)
     assert health.counts["unpublished"] == 0
     assert health.behind_s == 0.0 or attachments is not FLOW  # no backlog
 
 
-@pytest.mark.parametrize(
-    ("payload", "sent", "overflow", "counter"),
-    [(bytes(500_000), 100, 36, "undecodable"), (bytes(4), 20_100, 100, "undecodable")],
-    ids=["in bytes", "in number"],
-)
-def test_messages_that_wait_are_bounded(tmp_path: Path, payload: bytes, sent: int, overflow: int, counter: str) -> None:
+@pytest.mark.parametrize(("size", "sent", "overflow"), [(500_000, 100, 36), (4, 20_100, 100)])
+def test_messages_that_wait_are_bounded(tmp_path: Path, size: int, sent: int, overflow: int) -> None:
     with running(config_of(tmp_path)) as (node, session):
         service, wheels = node._services[0], wheels_of(session)
         with service._working:
             for _ in range(sent):
-                wheels.put(payload)
+                wheels.put(bytes(size))
             until(lambda: node.health("apr").counts["overflow"] == overflow, "the messages that had no place")
-        until(lambda: node.health("apr").counts[counter] == sent - overflow, "the messages that had")
+        until(lambda: node.health("apr").counts["undecodable"] == sent - overflow, "the messages that had")
         wheels.put(JOINT_STATE.encode(drive(1.0).samples()[0]))  # and there is room again
         until(lambda: node.health("apr").counts["samples"] == 1, "a sample")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_sets_the_event_and_acts_as_before_when_it_is_over(number: signal.Signals) -> None:
+    before = signal.getsignal(number)
+    with stop_on_signals() as stop:
+        os.kill(os.getpid(), number)
+        assert stop.wait(PATIENCE)
+    assert signal.getsignal(number) == before
+
+
+def interrupted_twice() -> None:
+    with stop_on_signals() as stop:
+        os.kill(os.getpid(), signal.SIGINT)
+        assert stop.wait(PATIENCE)
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(60)
+
+
+def test_a_second_ctrl_c_interrupts() -> None:
+    with pytest.raises(KeyboardInterrupt):
+        interrupted_twice()
+
+
+def test_ticks_come_at_once_and_then_every_period_until_the_time_is_over() -> None:
+    began = time.monotonic()
+    passed = list(ticks(threading.Event(), 0.1, 0.35))
+    assert passed[0] == 0.0
+    assert 1 <= len(passed) <= 4  # fewer when the machine is busy
+    assert all(later - earlier >= 0.1 for earlier, later in pairwise(passed))
+    assert passed[-1] < 0.35 <= time.monotonic() - began
+
+
+def test_ticks_end_when_stopped() -> None:
+    stop, seen = threading.Event(), []
+    for passed in ticks(stop, 0.01):
+        seen.append(passed)
+        if len(seen) == 3:
+            stop.set()
+    assert len(seen) == 3

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 import zenoh
 from drives import EXACT, ORIGIN, PERIOD, fed, odometry, slam
-from mcap_recordings import messages_of
-from nodes import asked, config_of, running, sent_one_by_one, wheels_of
-from received_messages import ReceivedMessages
+from nodes import ReceivedMessages, asked, config_of, running, sent_one_by_one, wheels_of
+from samples import messages_of
 from steered import CAR, DIFFERENTIAL, SKID, SWERVE, TRICYCLE, calibration, drive, only, recording
 
 from omnibench.config import validate
@@ -53,7 +52,6 @@ def centre_of(tracked: Array) -> Array:
 
 def retracked(one: Calibration, robot: Robot) -> Array:
     """The matrix by which another point of a robot, its tracked one or the centre, moves as in a calibration."""
-    assert one.robot.mount is not None
     centred: Array = np.linalg.inv(one.robot.mount.twist) @ one.matrix_array
     return centred if robot.mount is None else robot.mount.twist @ centred
 
@@ -148,6 +146,11 @@ def test_what_is_driven_by_old_angles_makes_the_pose_as_uncertain_as_the_way_is_
 
 
 class TestRestarts:
+    @staticmethod
+    def saved(**state: Any) -> SavedState:
+        covariance = (1e-4 * np.eye(3)).ravel().tolist()
+        return SavedState(sequence=5, stamp=ORIGIN, wall=1.8e9, pose=[1.0, 2.0, 0.3], covariance=covariance, **state)
+
     @pytest.mark.parametrize("robot", [SWERVE, mounted(CAR)], ids=["swerve", "car with a mount"])
     def test_a_node_that_starts_again_goes_on_exactly(self, tmp_path: Path, robot: Robot) -> None:
         path = drive(using=calibration(robot))
@@ -156,7 +159,6 @@ class TestRestarts:
         before = fed(first, path.payloads()[:51])
         first.close()
         saved = RobotMemory(tmp_path, "base").load()
-        assert saved is not None
         second = RobotTracker("base", path.using)
         second.resume(saved, 0.5, saved.wall)
         found = odometry(before + fed(second, path.payloads()[51:], 0.51))
@@ -165,10 +167,8 @@ class TestRestarts:
 
     def test_a_robot_whose_saved_state_has_no_steering_waits_for_it(self) -> None:
         path = drive(0.1)
-        state = {"sequence": 5, "stamp": ORIGIN, "wall": 1.8e9, "positions": path.angles[0].tolist()}
-        state |= {"pose": [1.0, 2.0, 0.3], "covariance": (1e-4 * np.eye(3)).ravel().tolist()}
         robot = RobotTracker("base", path.using)
-        robot.resume(SavedState(**state), 0.0, 1.8e9)
+        robot.resume(self.saved(positions=path.angles[0].tolist()), 0.0, 1.8e9)
         bare = path.samples()[1]
         assert robot.take_wheels(JOINT_STATE.encode(only(bare, *bare.names[:4])), PERIOD) == []
         updates = fed(robot, path.payloads()[2:], 2 * PERIOD)
@@ -176,10 +176,8 @@ class TestRestarts:
         np.testing.assert_allclose(odometry(updates)[-1], compose(np.array([1.0, 2.0, 0.3]), held.poses[-1]), atol=1e-9)
 
     def test_a_state_of_a_robot_with_other_steered_wheels_is_refused(self) -> None:
-        state = {"sequence": 5, "stamp": ORIGIN, "wall": 1.8e9, "positions": [0.0] * 2, "steering": [0.1]}
-        state |= {"pose": [1.0, 2.0, 0.3], "covariance": (1e-4 * np.eye(3)).ravel().tolist()}
         with pytest.raises(DataError, match="1 steered wheel"):
-            RobotTracker("base", calibration(CAR)).resume(SavedState(**state), 0.0, 1.8e9)
+            RobotTracker("base", calibration(CAR)).resume(self.saved(positions=[0.0] * 2, steering=[0.1]), 0.0, 1.8e9)
 
 
 class TestSwaps:
@@ -273,7 +271,6 @@ class TestCentre:
             if number % 25 == 20:
                 seen = slam(path.samples()[number].stamp, tracked[number - behind], 1e-2 * EXACT)
                 robot.take_pose(seen, PERIOD * number)
-        assert updates[-1].in_map is not None
         np.testing.assert_allclose(updates[-1].in_map[0], centre_of(tracked[-1]), atol=1e-6)
         assert robot.counts.anomalies() == {}
 
@@ -313,7 +310,6 @@ def test_every_run_of_a_drive_with_pauses_is_driven_as_it_was_alone() -> None:
 def test_a_run_that_is_cut_at_its_last_pose_steers_as_it_did() -> None:
     using = calibration()
     drive = concatenate_recording(recording(using=using, runs=1, pose_every=13))
-    assert drive.steering is not None
     assert len(drive.steering) == len(drive.wheel_times) == 40
     (poses,) = using.model.poses([drive.log(drive.slam_times)])
     np.testing.assert_allclose(poses, drive.slam_poses, atol=1e-12)
@@ -324,8 +320,6 @@ def test_messages_hold_the_steering_angles_whatever_they_hold_of_the_wheels(use:
     drive = concatenate_recording(recording())
     for row, message in enumerate(played(drive, wheels={"use": use})):
         assert message.names == ("fl", "fr", "rl", "rr", *(f"{each}_steering" for each in ("fl", "fr", "rl", "rr")))
-        assert drive.steering is not None
-        assert message.positions is not None
         np.testing.assert_array_equal(message.positions[4:], drive.steering[row])
         velocities = np.full(8, math.nan) if message.velocities is None else message.velocities
         assert tuple(int(np.isfinite(each[:4]).all()) for each in (message.positions, velocities)) == told
@@ -339,12 +333,8 @@ def test_joints_are_called_as_a_node_expects_them() -> None:
     assert len(replayed_odometry(robot, played(drive, names=("traction", "fork")))) == len(drive.wheel_times)
 
 
-SLIPPING = (
-    EffectTerm(name="acceleration_slip", parameters={"k": 0.08}),
-    EffectTerm(name="centripetal_slip", parameters={"k": 0.05}),
-    EffectTerm(name="floor_drift", parameters={"dx": 0.02, "dy": -0.01}),
-)
-MOUNTED = SWERVE.model_copy(update={"mount": Mount(x=0.3, y=-0.1, yaw=0.4)})
+SLIPPING = EFFECTS[1:4]
+MOUNTED = mounted(SWERVE)
 
 
 def config(folder: Path, using: Calibration, **changes: object) -> LiveConfig:
@@ -380,7 +370,6 @@ def test_a_replay_shows_the_batch_odometry_of_the_tracked_point_and_is_recorded(
     shown = demonstrate(made, recording(using=using))
     assert shown.batch_difference < 1e-12
     assert shown.calibrated.final_position < 1e-9 < 1e-4 < shown.theoretical.final_position
-    assert shown.fused is not None
     assert shown.fused.final_position < 0.05
     assert len(messages_of(tmp_path / "run.mcap")["/base/joint_states"]) == shown.report.sent["joint_states"]
 
@@ -400,7 +389,6 @@ def test_a_replay_counts_every_turn_by_which_the_odometry_is_off(tmp_path: Path)
     assert shown.theoretical.heading == pytest.approx(float(np.sqrt(np.mean((0.6 * headings) ** 2))), rel=1e-6)
     assert shown.calibrated.heading < 1e-9
     assert shown.batch_difference < 1e-9
-    assert shown.fused is not None
     assert shown.fused.heading < 0.05
 
 

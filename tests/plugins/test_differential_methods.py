@@ -2,20 +2,85 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import published_methods
 import pytest
-from differential_runs import MOVED, OMNI, ROBOT, in_sessions, ratios, runs_of, solved, solved_on, worn
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from real_recordings import diff
 
-from omnibench.fit.calibrator import Outcome, RunResult
-from omnibench.robot.kinematics import Mount
-from omnibench.testing import CalibratorConformance, load_plugin, synthetic_problem
+from omnibench.data.dataset import Trajectory
+from omnibench.fit.calibrator import Outcome, RunResult, run_calibrator
+from omnibench.fit.problem import CalibrationProblem
+from omnibench.registry import calibrators
+from omnibench.robot.kinematics import Array, Mount, Robot, Wheel
+from omnibench.robot.model import OdometryModel
+from omnibench.testing import CalibratorConformance, load_plugin, synthetic_problem, synthetic_trajectories
+from omnibench.testing.synthetic import synthetic_robots
+
+LEFT, RIGHT, OMNI = synthetic_robots()[2].wheels[0], synthetic_robots()[2].wheels[1], synthetic_robots()[0]
+ROBOT = Robot(name="plain", wheels=(LEFT, RIGHT))
+# The same axle with its wheels in the other order, one of them the other way round, and its middle neither the robot's
+# centre nor the tracked point.
+MOVED = Robot(
+    name="moved",
+    wheels=(
+        Wheel(name="right", type="fixed", radius=0.08, x=0.1, y=-0.15, angle=np.pi),
+        Wheel(name="left", type="fixed", radius=0.08, x=0.1, y=0.25),
+    ),
+    mount=Mount(x=0.2, y=-0.1, yaw=0.3),
+)
+
+
+def worn(robot: Robot, left: float, right: float, wheelbase: float) -> Robot:
+    """The robot with radii of the left and right wheel, and the wheelbase about its middle, times factors."""
+    middle = np.mean([wheel.position for wheel in robot.wheels], axis=0)
+    wheels = []
+    for wheel in robot.wheels:
+        x, y = (middle + wheelbase * (np.array(wheel.position) - middle)).tolist()
+        share = left if wheel.name == "left" else right
+        wheels.append(wheel.model_copy(update={"radius": wheel.radius * share, "x": x, "y": y}))
+    return robot.model_copy(update={"wheels": tuple(wheels)})
+
+
+def runs_of(robot: Robot, true: Robot, *commands: str) -> tuple[Trajectory, ...]:
+    """Noise-free runs of the true robot, driven by the design ``robot`` (ROBOT or MOVED).
+
+    commands: only the runs whose command begins with one of these.
+    """
+    model, chosen = OdometryModel(robot, true.inverse_kinematic_matrix, "arc"), list[Trajectory]()
+    for run in synthetic_trajectories(ROBOT):
+        if not commands or (run.command or "").startswith(commands):
+            left, right = run.rates.T
+            driven = replace(run, rates=run.rates if robot.wheels[0] == LEFT else np.column_stack([-right, left]))
+            chosen.append(replace(driven, poses=model.poses([driven.log(run.pose_times)])[0]))
+    return tuple(chosen)
+
+
+def solved(calibrator: str, problem: CalibrationProblem) -> RunResult:
+    """The result of a calibrator with its default options."""
+    return run_calibrator(calibrators.create(calibrator), problem)
+
+
+def solved_on(calibrator: str, robot: Robot, true: Robot, *commands: str) -> RunResult:
+    """The result on the runs of a true robot with these commands."""
+    return solved(calibrator, synthetic_problem(robot=robot, trajectories=runs_of(robot, true, *commands)))
+
+
+def ratios(matrix: Array, design: Robot = ROBOT) -> tuple[float, float]:
+    """Wheelbase over that of the design, and right radius over left radius, of a plain robot's matrix (left, right)."""
+    wheelbase = 2 * matrix[0, 1] / matrix[2, 1]
+    return float(wheelbase / sum(abs(wheel.position[1]) for wheel in design.wheels)), float(matrix[0, 1] / matrix[0, 0])
+
+
+def in_sessions(runs: Sequence[Trajectory], *sessions: str) -> tuple[Trajectory, ...]:
+    """The runs in sessions by turns."""
+    return tuple(replace(run, session=sessions[number % len(sessions)]) for number, run in enumerate(runs))
+
 
 ARTICLES = ("ivanjko", "jung_chung", "umbmark")  # which calibrate from the runs of one session
 METHODS = ("censi", *ARTICLES)
@@ -92,9 +157,7 @@ def test_jung_chung_finds_the_wheelbase_exactly_where_the_wheels_are_equal(longe
 @pytest.mark.parametrize(("method", "share", "second_order"), [("jung_chung", 0.5, 2.0), ("umbmark", 0.0, 8.0)])
 @settings(max_examples=15)
 @given(longer=st.floats(-0.02, 0.02), unequal=st.floats(-0.02, 0.02))
-def test_squares_tell_wheelbase_and_wheels_to_first_order(
-    method: str, share: float, second_order: float, longer: float, unequal: float
-) -> None:
+def test_squares_tell_geometry(method: str, share: float, second_order: float, longer: float, unequal: float) -> None:
     """jung_chung takes half of what the wheels differ by for a longer wheelbase."""
     unequal *= 1.0 if method == "jung_chung" else 0.5
     true = worn(ROBOT, 1 - unequal / 2, 1 + unequal / 2, 1 + longer)
@@ -211,9 +274,7 @@ def test_real_recordings_of_another_kind_are_refused(method: str, kind: str, fou
 @pytest.mark.parametrize(
     ("label", "tolerance"), [("censi", 0.04), ("ivanjko", 0.02), ("umbmark", 0.02), ("jung_chung, divided twice", 0.02)]
 )
-def test_the_figures_that_are_known_on_real_recordings_come_out(
-    label: str, tolerance: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_figures_of_real_recordings_come_out(label: str, tolerance: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """Those of jung_chung are of a program that divides the mean heading errors once more than the plug-in."""
     dataset = diff()
     monkeypatch.setattr(published_methods, "recordings", lambda robot: dataset)  # noqa: ARG005

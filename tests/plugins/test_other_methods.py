@@ -111,8 +111,7 @@ def test_derivatives_are_those_of_finite_differences(name: str, integration: Int
     at = geometry.start + 1e-3
 
     def cost(parameters: Array) -> float:
-        value: float = segments.cost(geometry.matrix(parameters)[0])[0]
-        return value
+        return segments.cost(geometry.matrix(parameters)[0])[0]
 
     matrix, slopes = geometry.matrix(at)
     derivatives = np.tensordot(slopes, segments.cost(matrix)[1], 2)
@@ -164,10 +163,7 @@ def test_a_search_that_is_cut_short_does_not_claim_to_have_converged(limit: dict
     ],
 )
 def test_the_figures_of_the_authors_of_optiodom_are_reached(
-    calibrator: str,
-    dataset: Callable[[], Dataset],
-    circles: tuple[float, float],
-    squares: tuple[float, float] | None,
+    calibrator: str, dataset: Callable[[], Dataset], circles: tuple[float, float], squares: tuple[float, float] | None
 ) -> None:
     data = dataset()
     matrix = fit(calibrator, data.robot, of_kind(data, "circular")).matrix
@@ -289,7 +285,7 @@ def with_radii(shares: list[float]) -> tuple[Trajectory, ...]:
 
 
 def maddahi(
-    runs: tuple[Trajectory, ...], parameterisation: ParameterisationName = "matrix", **changes: bool
+    runs: Sequence[Trajectory], parameterisation: ParameterisationName = "matrix", **changes: bool
 ) -> RunResult:
     problem = synthetic_problem(parameterisation, trajectories=runs, evaluations=20_000, **changes)
     return run_calibrator(calibrators.create("maddahi"), problem)

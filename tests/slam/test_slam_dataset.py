@@ -10,18 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_samples import (
-    DRIVE,
-    EPOCH,
-    Sent,
-    header,
-    odometry_error,
-    pose,
-    read,
-    text,
-    write_mcap,
-    write_rosbag1,
-)
+from bag_samples import DRIVE, EPOCH, Sent, header, odometry_error, pose, read, text, write_mcap, write_rosbag1
 from hypothesis import given
 from hypothesis import strategies as st
 from scan_samples import MOUNTED, SECONDS, without_poses
@@ -76,7 +65,6 @@ def found_alone() -> Dataset:
 
 def with_scans(dataset: Dataset, **changed: TrajectoryScans | None) -> Dataset:
     """The data set with other scans for some runs; None: with none."""
-    assert dataset.scans is not None
     scans = dict(dataset.scans) | {name.replace("_", "-"): found for name, found in changed.items()}
     kept = {name: found for name, found in scans.items() if found is not None}
     return replace(dataset, scans=ScansInMemory(LIDAR.scanner, kept))
@@ -90,7 +78,6 @@ class TestPoses:
             np.testing.assert_array_equal(run.pose_times, truth[run.id].times)
             np.testing.assert_array_equal(run.poses[0], START)
             assert np.abs(run.poses - truth[run.id].poses).max() < 0.004
-            assert run.pose_covariances is not None
             assert (np.linalg.eigvalsh(run.pose_covariances) > 0).all()
         assert (found.name, found.robot, found.simulated, found.scans) == ("rooms", ROBOT, True, dataset.scans)
         for before, after in zip(dataset.trajectories, found.trajectories, strict=True):
@@ -113,31 +100,26 @@ class TestPoses:
 
     def test_begin_at_t_0_when_the_first_scan_comes_later(self) -> None:
         dataset, truth = recorded()
-        assert dataset.scans is not None
         scans = dataset.scans.of("run-1")
         late = with_scans(dataset, run_1=TrajectoryScans(scans.times[1:], scans.ranges[1:]))
         run = slam_dataset(late, SlamOptions(), workers=1).trajectories[1]
         np.testing.assert_array_equal(run.pose_times, [0.0, *scans.times[1:]])
         np.testing.assert_array_equal(run.poses[0], START)
-        assert run.pose_covariances is not None
         assert len(run.pose_covariances) == len(run.poses)
         assert np.abs(run.poses - truth["run-1"].poses).max() < 0.01  # as the odometry missed until then
         np.testing.assert_array_equal(run.pose_covariances[0], FLOOR)
 
     def test_are_as_uncertain_as_the_odometry_until_a_first_scan_that_comes_later(self) -> None:
         dataset, truth = recorded()
-        assert dataset.scans is not None
         late = {name: TrajectoryScans(scans.times[8:], scans.ranges[8:]) for name, scans in dataset.scans}
         found = slam_dataset(replace(dataset, scans=ScansInMemory(LIDAR.scanner, late)), SlamOptions(), workers=1)
         for run in found.trajectories:
             way = np.hypot(*(run.poses[1] - START)[:2])
             assert way > 0.2
-            assert run.pose_covariances is not None
             stated = np.sqrt(np.linalg.eigvalsh(run.pose_covariances[:, :2, :2])[:, -1])
             assert stated[0] == pytest.approx(1e-4)
             assert (stated[1:] > 0.09 * way).all()
         every = slam_accuracy(found, truth).every
-        assert every.nees_mean is not None
         assert every.nees_mean < 5
         (warning,) = found.warnings
         assert warning.startswith("SLAM: the robot moves before the first scan, whose pose is therefore as uncertain")
@@ -145,7 +127,6 @@ class TestPoses:
 
     def test_leave_scans_before_t_0_out(self) -> None:
         dataset, _ = recorded()
-        assert dataset.scans is not None
         scans = dataset.scans.of("run-1")
         early = TrajectoryScans(np.concatenate([[-0.2], scans.times]), np.vstack([scans.ranges[:1], scans.ranges]))
         run = slam_dataset(with_scans(dataset, run_1=early), SlamOptions(), workers=1).trajectories[1]
@@ -165,7 +146,6 @@ class TestWhatIsSaid:
     @pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
     def test_missing_and_empty_scans_name_the_run_whoever_found_it(self, workers: int) -> None:
         dataset, _ = recorded()
-        assert dataset.scans is not None
         scans = dataset.scans.of("run-1")
         ranges = scans.ranges.copy()
         ranges[2] = np.inf
@@ -188,7 +168,6 @@ class TestAccuracy:
         assert found.every.poses == sum(len(path.times) - 1 for path in truth.values())
         assert 0 < found.final.position_mean_m <= found.final.position_p95_m <= found.final.position_max_m < 0.004
         assert 0 < found.every.heading_mean_rad < found.every.heading_max_rad < 0.002
-        assert found.every.nees_mean is not None
         assert 1 < found.every.nees_mean < 6
 
     def test_growing_errors_are_drift_and_bias_in_the_robots_frame(self) -> None:
@@ -321,7 +300,6 @@ def thinned(data: Dataset, kept: slice) -> Dataset:
 @given(st.floats(-1, 1), st.floats(-1, 1), st.floats(-9, 9), st.integers(-2, 2))
 def test_a_shift_is_found_whatever_turns_headings_begin_with(x: float, y: float, turn: float, turns: int) -> None:
     found = distances(DATA, moved(DATA, (x, y, turn), turns))
-    assert found is not None
     assert found.poses == sum(len(run.poses) - 1 for run in DATA.trajectories)
     assert found.position_mean_m == pytest.approx(math.hypot(x, y), abs=1e-9)
     assert found.position_p95_m == pytest.approx(math.hypot(x, y), abs=1e-9)
@@ -334,7 +312,6 @@ def test_the_sparser_reference_says_where_they_are_compared() -> None:
     expected = sum(len(run.poses) - 1 for run in sparse.trajectories)
     for one, other in ((DATA, sparse), (sparse, DATA)):
         found = distances(one, other)
-        assert found is not None
         assert found.poses == expected
         assert found.position_mean_m == pytest.approx(0.05)
 

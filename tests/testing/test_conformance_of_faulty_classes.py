@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -86,13 +87,6 @@ class AnswersOutside(Honest):
         return Solution(2 * problem.upper - problem.lower, "outside")
 
 
-class MovesFixedElements(Honest):
-    """Forgets that an element may have no width."""
-
-    def step(self, problem: CalibrationProblem, normal: Array) -> None:
-        problem.cost(problem.start + 1e-6 * normal[:, :1] * np.ones(problem.size))
-
-
 class ScalesTrajectories(Honest):
     """Works in place on what others share."""
 
@@ -108,33 +102,6 @@ class ShiftsReference(Honest):
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         problem.reference = problem.reference + 0.1
         return super().calibrate(problem)
-
-
-class Unseeded(Honest):
-    """Random numbers of its own."""
-
-    def normal(self, problem: CalibrationProblem, shape: tuple[int, int]) -> Array:  # noqa: ARG002
-        return np.random.default_rng().normal(size=shape)
-
-
-class LegacyGenerator(Honest):
-    """NumPy's global generator."""
-
-    def normal(self, problem: CalibrationProblem, shape: tuple[int, int]) -> Array:  # noqa: ARG002
-        return np.random.normal(size=shape)  # noqa: NPY002 (the fault that is to be found)
-
-
-class PlainRandom(Honest):
-    """Python's global generator."""
-
-    def normal(self, problem: CalibrationProblem, shape: tuple[int, int]) -> Array:  # noqa: ARG002
-        return np.array([[random.gauss() for _ in range(shape[1])] for _ in range(shape[0])])
-
-
-class CallsItselfDeterministic(Honest):
-    """Draws, and denies it."""
-
-    stochastic = False
 
 
 class Remembers(Honest):
@@ -240,20 +207,6 @@ class LeavesFiles(Honest):
         super().step(problem, normal)
 
 
-class ReturnsVector(Honest):
-    """Returns what should be in a Solution."""
-
-    def calibrate(self, problem: CalibrationProblem) -> Any:
-        return problem.start
-
-
-class NoReason(Honest):
-    """Does not say why it stopped."""
-
-    def calibrate(self, problem: CalibrationProblem) -> Solution:
-        return Solution(problem.start, " ", converged=False)
-
-
 class AlwaysRefuses(Honest):
     """Needs a package that is not there."""
 
@@ -268,21 +221,34 @@ class Undescribed(Honest):
         count: int = 3
 
 
-class Undocumented(Honest):
-    __doc__ = None
+def faulty(**changes: Any) -> type[Calibrator]:
+    return type("Faulty", (Honest,), {"__doc__": "Faulty.", **changes})
 
 
+def legacy_normal(_: Calibrator, __: CalibrationProblem, shape: tuple[int, int]) -> Array:
+    return np.random.normal(size=shape)  # noqa: NPY002 (the fault that is to be found)
+
+
+def plain_normal(_: Calibrator, __: CalibrationProblem, shape: tuple[int, int]) -> Array:
+    return np.array([[random.gauss() for _ in range(shape[1])] for _ in range(shape[0])])
+
+
+MOVES_FIXED_ELEMENTS = faulty(step=lambda _, problem, normal: problem.cost(problem.start[None] + 1e-6 * normal[:, :1]))
+UNSEEDED = faulty(normal=lambda _, __, shape: np.random.default_rng().normal(size=shape))
+LEGACY, PLAIN = faulty(normal=legacy_normal), faulty(normal=plain_normal)
+RETURNS_A_VECTOR = faulty(calibrate=lambda _, problem: problem.start)
+NO_REASON = faulty(calibrate=lambda _, problem: Solution(problem.start, " ", converged=False))
 CASES_OF_CALIBRATORS = [
     (IgnoresBounds, "bounds are kept", "candidates outside the box, e.g. m"),
     (AnswersOutside, "bounds are kept", "the answer is outside the box (m11, m12"),
-    (MovesFixedElements, "bounds are kept", "candidates outside the box, e.g. m12"),
+    (MOVES_FIXED_ELEMENTS, "bounds are kept", "candidates outside the box, e.g. m12"),
     (ScalesTrajectories, "inputs are left unchanged", "it changed rates of trajectory 01"),
     (ShiftsReference, "inputs are left unchanged", "it changed reference"),
-    (Unseeded, "same seed twice gives the same answer", "different answers; draw all random numbers from problem.rng"),
-    (LegacyGenerator, "same seed twice gives the same answer", "different answers"),
-    (LegacyGenerator, "global random state is left alone", "global generator"),
-    (PlainRandom, "global random state is left alone", "global generator"),
-    (CallsItselfDeterministic, "seed makes no difference where it says so", "depends on the seed"),
+    (UNSEEDED, "same seed twice gives the same answer", "different answers; draw all random numbers from problem.rng"),
+    (LEGACY, "same seed twice gives the same answer", "different answers"),
+    (LEGACY, "global random state is left alone", "global generator"),
+    (PLAIN, "global random state is left alone", "global generator"),
+    (faulty(stochastic=False), "seed makes no difference where it says so", "depends on the seed"),
     (Remembers, "same seed twice gives the same answer", "two runs with seed 0"),
     (WorseThanStart, "synthetic problem is solved or honestly reported", "times the cost of the start"),
     (SearchesUncounted, "budget is kept", "200 by problem.values"),
@@ -294,11 +260,11 @@ CASES_OF_CALIBRATORS = [
     (CountsOnNine, "four wheels work", "calibrate raised ValueError"),
     (Prints, "it works in silence", "it printed 'generation"),
     (LeavesFiles, "it works in silence", "search.log"),
-    (ReturnsVector, "bounds are kept", "calibrate returned ndarray, expected a Solution"),
-    (NoReason, "synthetic problem is solved or honestly reported", "reason is empty"),
+    (RETURNS_A_VECTOR, "bounds are kept", "calibrate returned ndarray, expected a Solution"),
+    (NO_REASON, "synthetic problem is solved or honestly reported", "reason is empty"),
     (AlwaysRefuses, "synthetic problem is solved or honestly reported", "pip install nowhere"),
     (Undescribed, "class and options are documented", "options without a description: count"),
-    (Undocumented, "class and options are documented", "Undocumented has no docstring"),
+    (faulty(__doc__=None), "class and options are documented", "Faulty has no docstring"),
 ]
 
 
@@ -435,76 +401,42 @@ class GoodCost(SumOfNorms):
     """The norm of Eq. (6)."""
 
 
-class ScalarCost(GoodCost):
-    """One number for all candidates."""
-
-    def combine(self, errors: Array, trajectory: Array) -> Any:
-        return super().combine(errors, trajectory).mean()
+def costing(combine: Callable[[Cost, Array, Array], Any]) -> type[Cost]:
+    return type("FaultyCost", (GoodCost,), {"__doc__": "Faulty.", "combine": combine})
 
 
-class NegativeCost(GoodCost):
-    """A logarithm."""
-
-    def combine(self, errors: Array, trajectory: Array) -> Array:
-        return np.log(super().combine(errors, trajectory) + 1e-300)
+norms = GoodCost.combine
 
 
-class OffsetCost(GoodCost):
-    """Something for nothing."""
-
-    def combine(self, errors: Array, trajectory: Array) -> Array:
-        return super().combine(errors, trajectory) + 1
-
-
-class FreeCost(GoodCost):
-    """Nothing for anything."""
-
-    weights = (0.0, 0.0, 0.0)
+def raises_on_nan(cost: Cost, errors: Array, trajectory: Array) -> Any:
+    if np.isnan(errors).any():
+        raise ValueError("NaN")
+    return norms(cost, errors, trajectory)
 
 
-class IgnoresNan(GoodCost):
-    """Leaves out what it cannot add."""
-
-    def combine(self, errors: Array, trajectory: Array) -> Array:
-        return super().combine(np.nan_to_num(errors), trajectory)
+def relative_to_the_worst(*arguments: Any) -> Any:
+    values = norms(*arguments)
+    return values / max(values.max(), 1e-300)
 
 
-class RaisesOnNan(GoodCost):
-    """Insists."""
-
-    def combine(self, errors: Array, trajectory: Array) -> Array:
-        if np.isnan(errors).any():
-            raise ValueError("NaN")
-        return super().combine(errors, trajectory)
+def squares_in_place(cost: Cost, errors: Array, trajectory: Array) -> Any:
+    errors *= errors
+    return np.sqrt(errors.sum(axis=-1)) @ cost.shares(trajectory)
 
 
-class RelativeCost(GoodCost):
-    """Relative to the worst of the batch."""
-
-    def combine(self, errors: Array, trajectory: Array) -> Array:
-        values = super().combine(errors, trajectory)
-        return values / max(values.max(), 1e-300)
-
-
-class InPlaceCost(GoodCost):
-    """Squares where it stands."""
-
-    def combine(self, errors: Array, trajectory: Array) -> Array:
-        errors *= errors
-        return np.sqrt(errors.sum(axis=-1)) @ self.shares(trajectory)
-
-
+OFFSET, RELATIVE = costing(lambda *arguments: norms(*arguments) + 1), costing(relative_to_the_worst)
+NAN_STAYS = "nan stays with its candidate"
 CASES_OF_COSTS = [
-    (ScalarCost, "every candidate has one cost", "shape ()"),
-    (NegativeCost, "costs are finite and not negative", "negative"),
-    (OffsetCost, "no error costs nothing", "errors of zero cost 1"),
-    (OffsetCost, "exact recordings cost nothing", "the true matrix costs 1"),
-    (FreeCost, "errors cost something", "cost nothing"),
-    (IgnoresNan, "nan stays with its candidate", "they must cost NaN"),
-    (RaisesOnNan, "nan stays with its candidate", "ValueError: NaN"),
-    (RelativeCost, "costs do not depend on the batch", "depends on the others"),
-    (RelativeCost, "nan stays with its candidate", "spoils another's cost"),
-    (InPlaceCost, "inputs are left unchanged", "combine changed its arguments"),
+    (costing(lambda *arguments: norms(*arguments).mean()), "every candidate has one cost", "shape ()"),
+    (costing(lambda *arguments: np.log(norms(*arguments) + 1e-300)), "costs are finite and not negative", "negative"),
+    (OFFSET, "no error costs nothing", "errors of zero cost 1"),
+    (OFFSET, "exact recordings cost nothing", "the true matrix costs 1"),
+    (type("FreeCost", (GoodCost,), {"weights": (0.0, 0.0, 0.0)}), "errors cost something", "cost nothing"),
+    (costing(lambda cost, errors, run: norms(cost, np.nan_to_num(errors), run)), NAN_STAYS, "they must cost NaN"),
+    (costing(raises_on_nan), NAN_STAYS, "ValueError: NaN"),
+    (RELATIVE, "costs do not depend on the batch", "depends on the others"),
+    (RELATIVE, NAN_STAYS, "spoils another's cost"),
+    (costing(squares_in_place), "inputs are left unchanged", "combine changed its arguments"),
 ]
 
 
@@ -590,9 +522,7 @@ def test_a_good_cost_and_a_good_importer_pass_every_case(sample: Path) -> None:
 
 
 @pytest.mark.parametrize(("cls", "case", "message"), [*CASES_OF_COSTS, *CASES_OF_IMPORTERS])
-def test_a_cost_or_importer_fails_the_case_it_breaks(
-    cls: type[Cost | Importer], case: str, message: str, sample: Path
-) -> None:
+def test_a_cost_or_importer_fails_its_case(cls: type[Cost | Importer], case: str, message: str, sample: Path) -> None:
     of_cost = issubclass(cls, Cost)
     found = failures(CostConformance, cls) if of_cost else failures(ImporterConformance, cls, source=sample)
     assert message in found[case]

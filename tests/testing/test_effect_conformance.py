@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-from commands import Command, assert_refused
+from commands import Command, assert_refused, succeeded
 
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import ActuatorEffect, Effect, MotionEffect, Parameter, ReferenceEffect, Values
@@ -107,14 +107,6 @@ def scales_in_place(signals: Signals, values: Values) -> Array:
     return values["k"] * signals.rates
 
 
-def smooths(signals: Signals, values: Values) -> Array:
-    return values["k"] * np.cumsum(signals.rates, axis=0)
-
-
-def takes_the_mean(signals: Signals, values: Values) -> Array:
-    return values["k"] * (signals.rates - signals.rates.mean(axis=0))
-
-
 def divides(signals: Signals, values: Values) -> Array:
     with np.errstate(all="ignore"):
         return values["k"] * signals.rates / signals.rates
@@ -133,12 +125,25 @@ CALLS = count()
 RANGES, SHAPES = "parameters have units and plausible ranges", "shapes are those of the contract"
 STAGE, PHYSICS = "stage is one of its kind", "physics and source are given"
 NAMES, ALONE = "parameters have names of their own", "each sample is corrected by itself"
+ZERO, LINEAR, CAUSAL = "zero parameters change nothing", "it is linear in its parameters", "motors are causal"
+DRAWS, NEEDS, TRUE = "results are reproducible", "needs names all that is used", "corrected poses are the true ones"
+OUT_OF_RANGE = Parameter("n", "1", 3, 16, "rollers", choices=(3.0, 17.0))
 
 
-def wrong(base: type[Effect], changes: dict[str, Any]) -> type[Effect]:
-    return type("Wrong", (base,), {"__doc__": "Wrong.", **changes})
+def renamed(*_: Any) -> tuple[Parameter, ...]:
+    return (replace(GAIN, description=f"{next(CALLS)}"),)
 
 
+def reference(**changes: Any) -> type[Effect]:
+    return type("Wrong", (HonestReference,), {"__doc__": "Wrong.", **changes})
+
+
+def motors(driven: Callable[[Array, Values], Array]) -> type[Effect]:
+    by_targets = {"driven": lambda _, __, targets, values: driven(targets, values)}
+    return type("Wrong", (HonestActuator,), {"__doc__": "Wrong.", **by_targets})
+
+
+# s: signals, v: values of the parameters.
 BROKEN: dict[str, tuple[type[Effect], str, str]] = {
     "no docstring": (honest(__doc__=None), "class and options are documented", "has no docstring"),
     "no physics": (honest(physics=" "), PHYSICS, "physics is missing"),
@@ -146,7 +151,7 @@ BROKEN: dict[str, tuple[type[Effect], str, str]] = {
     "no covariate": (honest(shows_in=""), PHYSICS, "shows_in is missing"),
     "an unknown stage": (honest(stage="tyre"), STAGE, "stage is 'tyre'; of a MotionEffect"),
     "another kind's stage": (honest(stage="reference"), STAGE, "wheel, steering, clock"),
-    "a reference effect on wheels": (wrong(HonestReference, {"stage": "wheel"}), STAGE, "'wheel'"),
+    "a reference effect on wheels": (reference(stage="wheel"), STAGE, "'wheel'"),
     "an unknown need": (honest(needs=frozenset({"weather"})), "needs are known", "['weather']; known are wheel_angles"),
     "no parameter": (honest(given=()), RANGES, "without choices"),
     "a list of parameters": (honest(given=[GAIN]), RANGES, "tuple of Parameter"),
@@ -156,89 +161,33 @@ BROKEN: dict[str, tuple[type[Effect], str, str]] = {
     "a range upside down": (with_parameter(low=0.1, high=-0.1), RANGES, "low 0.1"),
     "a range without 0": (with_parameter(low=0.9, high=1.1), RANGES, "not within 0.9 and 1.1"),
     "an endless range": (with_parameter(high=np.inf), RANGES, "not finite"),
-    "a choice out of range": (
-        honest(given=(GAIN, Parameter("n", "1", 3, 16, "rollers", choices=(3.0, 17.0)))),
-        RANGES,
-        "'n'",
-    ),
+    "a choice out of range": (honest(given=(GAIN, OUT_OF_RANGE)), RANGES, "'n'"),
     "one name twice": (honest(given=(GAIN, GAIN)), NAMES, "one name: k, k"),
-    "names that change": (
-        honest(parameters=lambda *_: (replace(GAIN, description=f"{next(CALLS)}"),)),
-        NAMES,
-        "second call",
-    ),
-    "three wheels only": (
-        correcting(lambda signals, values: values["k"] * signals.rates[:, :3]),
-        SHAPES,
-        "(1, 3), expected (1, 4)",
-    ),
-    "a body's correction on wheels": (
-        correcting(lambda signals, values: values["k"] * signals.twists),
-        SHAPES,
-        "expected (1, 4)",
-    ),
-    "one number for all samples": (
-        correcting(lambda signals, values: values["k"] * signals.rates[-1]),
-        SHAPES,
-        "(3,), expected (1, 3)",
-    ),
-    "a constant": (
-        correcting(lambda signals, values: (0.01 + values["k"]) * signals.rates),
-        "zero parameters change nothing",
-        "parameters of 0",
-    ),
-    "nothing at all": (correcting(lambda signals, _: 0 * signals.rates), "parameters change something", "3 wheels"),
+    "names that change": (honest(parameters=renamed), NAMES, "second call"),
+    "three wheels only": (correcting(lambda s, v: v["k"] * s.rates[:, :3]), SHAPES, "(1, 3), expected (1, 4)"),
+    "a body's correction on wheels": (correcting(lambda s, v: v["k"] * s.twists), SHAPES, "expected (1, 4)"),
+    "one number for all samples": (correcting(lambda s, v: v["k"] * s.rates[-1]), SHAPES, "(3,), expected (1, 3)"),
+    "a constant": (correcting(lambda s, v: (0.01 + v["k"]) * s.rates), ZERO, "parameters of 0"),
+    "nothing at all": (correcting(lambda s, _: 0 * s.rates), "parameters change something", "3 wheels"),
     "0/0": (correcting(divides), "results are finite", "not finite"),
-    "a square": (
-        correcting(lambda signals, values: values["k"] ** 2 * signals.rates),
-        "it is linear in its parameters",
-        "not linear",
-    ),
-    "a magnitude": (
-        correcting(lambda signals, values: abs(values["k"]) * signals.rates),
-        "it is linear in its parameters",
-        "not linear",
-    ),
+    "a square": (correcting(lambda s, v: v["k"] ** 2 * s.rates), LINEAR, "not linear"),
+    "a magnitude": (correcting(lambda s, v: abs(v["k"]) * s.rates), LINEAR, "not linear"),
     "work in place": (correcting(scales_in_place), "inputs are left unchanged", "it changed its arguments"),
-    "a sum over samples": (correcting(smooths), ALONE, "row 7 differs"),
-    "a mean over samples": (correcting(takes_the_mean), ALONE, "other"),
-    "the global generator": (correcting(trembles), "results are reproducible", "it draws random numbers"),
-    "a generator of its own": (correcting(trembles_by_itself), "results are reproducible", "results differ"),
-    "angles it did not ask for": (
-        correcting(lambda signals, values: values["k"] * np.cos(signals.wheel_angles)),
-        "needs names all that is used",
-        "name it in needs",
-    ),
-    "a correction the wrong way": (
-        wrong(HonestReference, {"corrected": HonestReference.reported}),
-        "corrected poses are the true ones",
-        "corrected(reported(poses))",
-    ),
+    "a sum over samples": (correcting(lambda s, v: v["k"] * np.cumsum(s.rates, axis=0)), ALONE, "row 7 differs"),
+    "a mean over samples": (correcting(lambda s, v: v["k"] * (s.rates - s.rates.mean(axis=0))), ALONE, "other"),
+    "the global generator": (correcting(trembles), DRAWS, "it draws random numbers"),
+    "a generator of its own": (correcting(trembles_by_itself), DRAWS, "results differ"),
+    "angles it did not ask for": (correcting(lambda s, v: v["k"] * np.cos(s.wheel_angles)), NEEDS, "name it in needs"),
+    "a correction the wrong way": (reference(corrected=HonestReference.reported), TRUE, "corrected(reported(poses))"),
     "delays of one kind": (
-        wrong(HonestReference, {"delays": lambda _, stamps, __: (0 * stamps,)}),
+        reference(delays=lambda _, stamps, __: (0 * stamps,)),
         SHAPES,
         "not enough values to unpack",
     ),
-    "one delay for all": (
-        wrong(HonestReference, {"delays": lambda _, __, values: (values["k"], 0.0)}),
-        SHAPES,
-        "(), expected (1,)",
-    ),
-    "a reference that is always wrong": (
-        wrong(HonestReference, {"reported": lambda _, poses, *__: poses + 0.1}),
-        "zero parameters change nothing",
-        "by 0.1",
-    ),
-    "motors that foresee": (
-        wrong(HonestActuator, {"driven": lambda _, __, t, v: t + v["k"] * t[-1]}),
-        "motors are causal",
-        "earlier",
-    ),
-    "motors that creep": (
-        wrong(HonestActuator, {"driven": lambda _, __, t, v: t + v["k"]}),
-        "motors are causal",
-        "targets are 0",
-    ),
+    "one delay for all": (reference(delays=lambda _, __, v: (v["k"], 0.0)), SHAPES, "(), expected (1,)"),
+    "a reference that is always wrong": (reference(reported=lambda _, poses, *__: poses + 0.1), ZERO, "by 0.1"),
+    "motors that foresee": (motors(lambda targets, v: targets + v["k"] * targets[-1]), CAUSAL, "earlier"),
+    "motors that creep": (motors(lambda targets, v: targets + v["k"]), CAUSAL, "targets are 0"),
 }
 
 
@@ -275,8 +224,7 @@ class Broken(MotionEffect):
 def test_an_effect_is_made_checked_and_listed_on_the_command_line(command: Command) -> None:
     assert command("plugin", "new", "first_slip", "--effect").returncode == 0
     assert command("plugin", "new", "second_slip", "--kind", "effect").returncode == 0
-    checked = command("plugin", "check", "plugins/first_slip.py")
-    assert checked.returncode == 0
+    checked = succeeded(command("plugin", "check", "plugins/first_slip.py"))
     assert "passed  effect first_slip: it is linear in its parameters" in checked.stdout
     assert_refused(command("plugin", "new", "slip", "--effect", "--kind", "cost"), "--effect", "--kind cost")
     listed = command("list").stdout

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from commands import Command, Printed, assert_refused, flower, omnibench
+from commands import Command, assert_refused, flower, omnibench, succeeded
 
 from omnibench.data.storage import load_dataset
 from omnibench.registry import load_plugins
@@ -18,11 +18,6 @@ from omnibench.robot.corrections import motions_of, representatives
 pytestmark = pytest.mark.slow  # one real discovery
 TRUE_K = 0.15  # s/m
 COMMANDS = {"speeds": [0.1, 0.4], "directions_deg": [0, 120, 240], "turn_rates": [-0.5, 0.5], "ramp": 0.3}
-
-
-def told(run: Printed) -> Printed:
-    assert run.returncode == 0, run.stderr
-    return run
 
 
 @pytest.fixture(scope="module")
@@ -36,8 +31,7 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("simulate", "simulation.yaml", "-o", "data", "--effect", f"drag: {{k: {TRUE_K}}}"),
         ("discover", "data", "--output", "out"),
     ):
-        run = omnibench(*arguments, cwd=folder)
-        assert run.returncode == 0, run.stderr
+        succeeded(omnibench(*arguments, cwd=folder))
     return folder
 
 
@@ -65,16 +59,16 @@ def test_it_is_found_by_name_where_it_was_hidden(work: Path) -> None:
     assert abs(found_k["value"] - TRUE_K) < 3 * standard_error  # one 95 % interval in twenty misses
 
 
-def test_evaluate_takes_the_plugins_that_are_named_and_those_of_the_folder_one_is_in(
+def test_evaluate_takes_the_plugins(
     command: Command, work: Path, extended: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run = told(command("evaluate", extended, work / "data", "--json", "--plugins", work / "plugins"))
+    run = succeeded(command("evaluate", extended, work / "data", "--json", "--plugins", work / "plugins"))
     with_it = json.loads(run.stdout)
-    without = json.loads(told(command("evaluate", work / "out" / "plain.yaml", work / "data", "--json")).stdout)
+    without = json.loads(succeeded(command("evaluate", work / "out" / "plain.yaml", work / "data", "--json")).stdout)
     assert with_it["splits"]["validation"]["cost"] < 0.8 * without["splits"]["validation"]["cost"]
     assert with_it["warnings"] == []
     monkeypatch.chdir(work)
-    told(command("evaluate", "out/model.yaml", "data"))
+    succeeded(command("evaluate", "out/model.yaml", "data"))
 
 
 def test_evaluate_warns_of_runs_that_the_effect_was_not_fitted_to(command: Command, work: Path, extended: Path) -> None:
@@ -83,20 +77,18 @@ def test_evaluate_warns_of_runs_that_the_effect_was_not_fitted_to(command: Comma
     motions = np.concatenate([motions_of(known.matrix_array, run.times, run.rates) for run in slow])
     driven = tuple(map(tuple, representatives(known.robot, motions).tolist()))
     write_calibration(known.model_copy(update={"driven": driven}), extended)
-    run = told(command("evaluate", extended, work / "data", "--json", "--plugins", work / "plugins"))
+    run = succeeded(command("evaluate", extended, work / "data", "--json", "--plugins", work / "plugins"))
     (warning,) = json.loads(run.stdout)["warnings"]
     for part in ("24 of 48 runs", "'flower extended'", "such as turning while driving at 0.4", "drag"):
         assert part in warning
     assert run.stderr == f"warning: {warning}\n"
-    again = told(
+    again = succeeded(
         command("simulate", "--like", work / "data", "--model", extended, "-o", "like", "--plugins", work / "plugins")
     )
     assert again.stderr.startswith(f"warning: {warning}\n")
 
 
-def test_a_calibration_whose_plugin_is_not_there_is_refused_in_one_line(
-    command: Command, work: Path, extended: Path
-) -> None:
+def test_a_calibration_without_its_plugin_is_refused_in_one_line(command: Command, work: Path, extended: Path) -> None:
     for arguments in (
         ("evaluate", extended, work / "data"),
         ("certify", extended, work / "data"),
@@ -106,11 +98,9 @@ def test_a_calibration_whose_plugin_is_not_there_is_refused_in_one_line(
         assert_refused(command(*arguments), "unknown effect 'drag'")
 
 
-def test_export_certify_and_swap_know_the_effect_and_say_what_becomes_of_it(
-    command: Command, work: Path, extended: Path
-) -> None:
+def test_export_certify_and_swap_say_what_becomes_of_the_effect(command: Command, work: Path, extended: Path) -> None:
     known = ("--plugins", work / "plugins")
-    exported = told(command("export", extended, "--to", "c_header", *known))
+    exported = succeeded(command("export", extended, "--to", "c_header", *known))
     assert "effects of the calibration are left out: drag" in exported.stderr
     assert_refused(command("certify", extended, work / "data", *known), "has effects (drag)")
     # swap knows it before it asks for a node
@@ -118,6 +108,6 @@ def test_export_certify_and_swap_know_the_effect_and_say_what_becomes_of_it(
 
 
 def test_the_schema_of_a_simulations_config_is_printed(command: Command) -> None:
-    schema = json.loads(told(command("schema", "simulate")).stdout)
+    schema = json.loads(succeeded(command("schema", "simulate")).stdout)
     assert (schema["title"], schema["required"]) == ("SimulationConfig", ["datasets"])
     assert {"FlowerConfig", "EffectTerm"} <= {*schema["$defs"]}

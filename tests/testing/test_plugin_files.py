@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
+from commands import ENVIRONMENT, python
 from timing import PATIENCE
 
 from omnibench.errors import ConfigError, DataError, OmnibenchError, PluginError
@@ -52,15 +50,8 @@ def test_a_new_plugin_passes_its_check(kind: str, tmp_path: Path) -> None:
 def test_the_tests_of_new_plugins_pass_in_pytest(tmp_path: Path) -> None:
     for kind in PLUGIN_KINDS:
         new_plugin(f"my_{kind}", kind, tmp_path)
-    run = subprocess.run(
-        [sys.executable, "-m", "pytest", "-v", "-p", "no:cacheprovider", str(tmp_path)],
-        cwd=tmp_path,
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-        check=False,
-    )
+    program = "import sys, pytest; sys.exit(pytest.main(sys.argv[1:]))"
+    run = python(program, "-v", "-p", "no:cacheprovider", tmp_path, cwd=tmp_path, env=ENVIRONMENT)
     assert run.returncode == 0, run.stdout + run.stderr
     assert run.stdout.count("SKIPPED") == 3  # the seed of a calibrator that is stochastic, other kinds of effects
     assert all(f"test_my_{kind}.py" in run.stdout for kind in PLUGIN_KINDS)
@@ -74,7 +65,7 @@ def test_the_cases_run_where_pytest_is_not_installed(tmp_path: Path) -> None:
         "from omnibench.testing.plugin_files import check_plugin\n"
         f"print(check_plugin({str(tmp_path / 'bare_search.py')!r}).passed)"
     )
-    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=PATIENCE, check=False)
+    run = python(program)
     assert run.stdout == "True\n", run.stderr
 
 
@@ -101,9 +92,7 @@ def test_a_new_plugin_whose_class_would_hide_an_import_is_called_otherwise(kind:
         ("mine", "calibrator", "test_mine.py", "cannot be written"),
     ],
 )
-def test_what_cannot_be_written_is_named_and_nothing_is_written(
-    name: str, kind: str, folder: str, named: str, tmp_path: Path
-) -> None:
+def test_what_cannot_be_written_is_named(name: str, kind: str, folder: str, named: str, tmp_path: Path) -> None:
     (tmp_path / "test_mine.py").write_text("mine")
     with pytest.raises((ConfigError, DataError), match=named):
         new_plugin(name, kind, tmp_path / folder)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import Command as InProcess
-from commands import assert_refused, flower, write_config
+from commands import assert_refused, flower, succeeded, write_config
 from drives import NOISE, ORIGIN, PERIOD, Drive, calibration, drive, fed, odometry, slam
 from hypothesis import given
 from hypothesis import strategies as st
@@ -26,14 +26,7 @@ from omnibench.live.fusion.pose_fusion import FusionSettings
 from omnibench.live.node import LiveNode
 from omnibench.live.wheels.wheel_input import WheelStep
 from omnibench.live.wire.messages import JOINT_STATE
-from omnibench.robot.calibration import (
-    Calibration,
-    EffectTerm,
-    Noise,
-    Provenance,
-    covariance_rows,
-    parse_calibration,
-)
+from omnibench.robot.calibration import Calibration, EffectTerm, Noise, Provenance, covariance_rows, parse_calibration
 from omnibench.robot.effects.effect import MOST_BYTES, encode_weights
 from omnibench.robot.kinematics import Array, relative, rotation
 from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog
@@ -217,9 +210,7 @@ class TestAgreesWithTheBatch:
         st.integers(0, 1000),
         st.sampled_from(["euler", "arc"]),
     )
-    def test_odom_with_any_effects_is_the_batch_odometry(
-        self, names: set[str], seed: int, integration: Integration
-    ) -> None:
+    def test_odom_with_effects_is_that_of_the_batch(self, names: set[str], seed: int, integration: Integration) -> None:
         plain = calibration(integration=integration)
         using = with_effects(*(term(name, **EFFECTS[name]) for name in names), plain=plain)
         path = drive(1.0, seed=seed, using=using)
@@ -234,7 +225,6 @@ class TestAgreesWithTheBatch:
         robot.take_pose(slam(ORIGIN, [0.0, 0.0, 0.0]), 0.0)
         updates = fed(robot, path.payloads()[1:])
         for update in updates:
-            assert update.in_map is not None
             np.testing.assert_allclose(update.in_map[0], update.pose, atol=1e-9)
 
     def test_the_covariance_of_the_matrix_is_used_though_that_of_effects_follows_it(self) -> None:
@@ -286,9 +276,7 @@ class TestSwaps:
         st.integers(0, 99),
         st.booleans(),
     )
-    def test_odom_goes_on_from_where_it_was_as_with_the_other_all_the_time(
-        self, names: set[str], place: int, there: bool
-    ) -> None:
+    def test_odom_goes_on_from_where_it_was_as_with_the_other(self, names: set[str], place: int, there: bool) -> None:
         path, both = drive(1.0), [calibration(), with_effects(*(term(name, **EFFECTS[name]) for name in names))]
         first, second = both if there else both[::-1]
         robot = RobotTracker("apr", first)
@@ -354,7 +342,6 @@ class TestSessions:
         fed(first, path.payloads()[:201])
         first.close()
         saved = RobotMemory(tmp_path, "apr").load()
-        assert saved is not None
         assert saved.session_time == pytest.approx(2.0)
         second = RobotTracker("apr", using)
         second.resume(saved, 0.0, saved.wall)
@@ -365,9 +352,7 @@ class TestSessions:
 class TestAngles:
     @pytest.mark.parametrize("effect", ["heading_drift", "wheel_eccentricity"])
     @pytest.mark.parametrize("missing", [False, True])
-    def test_missing_angles_are_told_once_where_an_effect_needs_them(
-        self, effect: str, missing: bool, caplog: pytest.LogCaptureFixture
-    ) -> None:
+    def test_missing_angles_are_told(self, effect: str, missing: bool, caplog: pytest.LogCaptureFixture) -> None:
         using = with_effects(term(effect, **EFFECTS[effect]))
         samples = [replace(each, positions=None) if missing else each for each in drive(0.2, using=using).samples()]
         with caplog.at_level(logging.WARNING, "omnibench.live"):
@@ -400,9 +385,7 @@ class StretchedTurns(MotionEffect):
 '''
 
 
-def test_live_takes_the_plugins_that_are_named_and_replays_to_the_batch_odometry(
-    command: InProcess, tmp_path: Path
-) -> None:
+def test_live_takes_the_named_plugins_and_replays_to_the_batch_odometry(command: InProcess, tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "stretched_turns.py").write_text(PLUGIN)
     write_node(tmp_path, "apr", replay={"dataset": "small.yaml", "speed": "max"})
@@ -412,8 +395,7 @@ def test_live_takes_the_plugins_that_are_named_and_replays_to_the_batch_odometry
     terms = (term("stretched_turns", k=0.1), term("wheel_eccentricity", **ECCENTRIC), term("acceleration_slip", k=0.05))
     (tmp_path / "calibration.yaml").write_text(to_yaml(with_effects(*terms, session=None, sample_period=0.05)))
     assert_refused(command("live", "node.yaml", "--replay"), "unknown effect 'stretched_turns'")
-    shown = command("live", "node.yaml", "--replay", "--plugins", "mine")
-    assert shown.returncode == 0, shown.stderr
+    shown = succeeded(command("live", "node.yaml", "--replay", "--plugins", "mine"))
     difference = re.search(r"batch odometry: (\S+) \(m, rad\) at most; 0 messages of odom lost", shown.stdout)
     assert difference is not None, shown.stdout
     assert float(difference[1]) <= 1e-9

@@ -70,9 +70,7 @@ def test_the_newest_state_of_any_number_of_wheels_comes_back_as_it_was(memory: R
     [b"\x00" * 8192, b"[" * 4096, b"00000000 {", with_checksum({}) * 2, json.dumps(STATE).encode().ljust(4095) + b"\n"],
     ids=["zeros", "brackets", "torn", "nothing in it", "of a version without checksums"],
 )
-def test_what_is_no_state_at_all_is_left_aside(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, content: bytes
-) -> None:
+def test_what_is_no_state_is_left_aside(tmp_path: Path, caplog: pytest.LogCaptureFixture, content: bytes) -> None:
     assert loaded(tmp_path, content) is None
     assert ("earlier version" in caplog.text) == (b"positions" in content)
 
@@ -103,9 +101,7 @@ def test_what_is_no_state_at_all_is_left_aside(
         {"flows": {"1": 2**64}},
     ],
 )
-def test_a_damaged_state_is_left_aside_and_told(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, change: dict[str, Any]
-) -> None:
+def test_a_damaged_state_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture, change: dict[str, Any]) -> None:
     assert loaded(tmp_path, with_checksum(STATE)) is not None
     assert not caplog.text
     assert loaded(tmp_path, with_checksum(STATE | change)) is None
@@ -113,9 +109,7 @@ def test_a_damaged_state_is_left_aside_and_told(
 
 
 @pytest.mark.parametrize("wheels", [3, 12, 200])
-def test_of_a_write_that_is_torn_at_any_sector_no_part_is_taken(
-    tmp_path: Path, memory: RobotMemory, wheels: int
-) -> None:
+def test_no_part_of_a_write_torn_at_any_sector_is_taken(tmp_path: Path, memory: RobotMemory, wheels: int) -> None:
     def save(step: int) -> bytes:
         place, angles = [np.pi * step] * 3, (np.pi * (np.arange(wheels) + step)).tolist()
         covariance = (1e-4 * np.pi * step * (np.eye(3) + 0.1)).ravel().tolist()
@@ -131,7 +125,6 @@ def test_of_a_write_that_is_torn_at_any_sector_no_part_is_taken(
     for sector in range(0, len(after) + 512, 512):
         for torn in (after[:sector] + before[sector:], before[:sector] + after[sector:]):
             state = loaded(tmp_path, torn)
-            assert state is not None
             taken.append((torn == after, torn == before, state.stamp))
             assert state.pose == state.map_pose == (np.pi * state.stamp,) * 3
     assert {stamp for whole, _, stamp in taken if whole} == {9}
@@ -140,9 +133,7 @@ def test_of_a_write_that_is_torn_at_any_sector_no_part_is_taken(
 
 
 @pytest.mark.parametrize(("file_changes", "runs"), [(False, "synthetic 1.1"), (True, "synthetic 0.9")])
-def test_a_swapped_calibration_is_kept_until_the_file_that_the_node_started_with_changes(
-    tmp_path: Path, file_changes: bool, runs: str
-) -> None:
+def test_a_swap_is_kept_until_the_first_file_changes(tmp_path: Path, file_changes: bool, runs: str) -> None:
     file, elsewhere = tmp_path / "calibration.yaml", tmp_path / "elsewhere.yaml"
     write_calibration(calibration(), file)
     with closing(RobotMemory(tmp_path / "state", "apr")) as memory:

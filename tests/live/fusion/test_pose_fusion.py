@@ -116,13 +116,6 @@ def test_poses_may_come_late_and_in_any_order_and_the_result_is_the_same(data: s
     np.testing.assert_allclose(late.fusion.covariance, punctual.fusion.covariance, atol=1e-15)
 
 
-def test_the_first_pose_says_where_the_robot_is() -> None:
-    robot = Robot().drive(50)
-    offset = np.array([3.0, -2.0, 0.0])
-    assert robot.fusion.correct(PoseMeasurement(stamp(0.3), robot.at(0.3) + offset, R)) == "located"
-    np.testing.assert_allclose(robot.fusion.pose, robot.truth[-1] + offset, atol=1e-12)
-
-
 def test_a_pose_older_than_the_history_is_counted_and_changes_nothing() -> None:
     robot = Robot(history=2.0).drive(1000)
     assert robot.see(8.0) == "located"
@@ -145,27 +138,12 @@ def test_a_pose_that_comes_before_its_wheel_sample_waits_for_it() -> None:
     assert robot.counts.poses == before + 1
 
 
-def test_a_pose_of_the_far_future_is_refused() -> None:
-    robot = Robot(ahead=1.0).drive(10)
-    assert robot.fusion.correct(PoseMeasurement(stamp(5.0), np.zeros(3), R)) == "ahead"
-    assert robot.counts.pose_ahead == 1
-
-
 def test_the_same_pose_twice_counts_once() -> None:
     robot = Robot().drive(50)
     robot.see(0.2)
     robot.see(0.3)
     assert robot.see(0.3) == "duplicate"
     assert robot.counts.poses == 2
-
-
-def test_a_pose_a_kilometre_away_is_rejected_and_the_pose_stays() -> None:
-    robot = Robot().drive(50)
-    robot.see(0.2)
-    before = robot.fusion.pose.copy()
-    assert robot.see(0.3, (1000, 0, 0)) == "rejected"
-    np.testing.assert_array_equal(robot.fusion.pose, before)
-    assert robot.counts.pose_rejected == 1
 
 
 def test_the_gate_rejects_true_poses_as_seldom_as_it_says() -> None:
@@ -190,9 +168,7 @@ def test_the_gate_rejects_true_poses_as_seldom_as_it_says() -> None:
     ],
     ids=["that agree", "one repeated", "that contradict each other", "with a good one between"],
 )
-def test_of_rejected_poses_four_that_agree_are_believed_and_others_never(
-    seen: list[tuple[float, float, float]], outcomes: list[str]
-) -> None:
+def test_four_poses_that_agree_are_believed(seen: list[tuple[float, float, float]], outcomes: list[str]) -> None:
     robot = Robot(reacquire_after=4).drive(100)
     robot.see(0.1)
     assert [robot.see(time, (x, y, 0)) for time, x, y in seen] == outcomes
@@ -253,7 +229,6 @@ def test_the_pose_at_a_time_lies_on_the_path_and_asking_changes_nothing(time: fl
     robot.see(0.1)
     before = robot.fusion.pose.copy()
     found = robot.fusion.at(stamp(time))
-    assert found is not None
     np.testing.assert_allclose(found[0][:2], robot.at(time)[:2] if time >= 0.1 else found[0][:2], atol=1e-9)
     np.testing.assert_allclose(robot.timeline.odometry_at(stamp(time)), robot.at(time), atol=1e-9)
     np.testing.assert_array_equal(robot.fusion.pose, before)

@@ -20,7 +20,6 @@ from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.storage import save_dataset
 from omnibench.errors import ConfigError, DataError, OmnibenchError
 from omnibench.live.replay.concatenated_drive import (
-    ConcatenatedDrive,
     Recording,
     concatenate_recording,
     concatenate_runs,
@@ -106,10 +105,8 @@ class TestPoses:
             for run, half in zip(plain, halves, strict=True)
         ]
         drive = concatenate_runs(make_dataset("covariances", ROBOT, PERIOD, runs))
-        assert drive.slam_covariances is not None
         last = runs[2]
         turn = homogeneous(np.array([0.0, 0.0, drive.start_poses[2, 2] - last.poses[0, 2]]))
-        assert last.pose_covariances is not None
         expected = turn @ last.pose_covariances[1:] @ turn.T
         np.testing.assert_allclose(drive.slam_covariances[drive.slam_run == 2], expected, atol=1e-12)
         mixed = make_dataset("mixed", ROBOT, PERIOD, [*runs[:2], plain[2]])
@@ -156,7 +153,6 @@ class TestWheels:
             runs.append(replace(run, angles=5.0 + tick * np.round(driven / tick)))
         drive = concatenate_runs(make_dataset("ticks", ROBOT, PERIOD, runs), pause=0.0)
         for index, run in enumerate(runs):
-            assert run.angles is not None
             found = drive.angles[drive.run == index][-len(run.times) :]
             np.testing.assert_allclose(np.diff(found, axis=0), np.diff(run.angles, axis=0), atol=1e-12)
 
@@ -272,7 +268,6 @@ class TestTruth:
     def test_with_true_start_poses_the_truth_is_what_the_robots_own_matrix_drives(self) -> None:
         recording = simulated_recording(EncoderNoise(bias_position=0.1, bias_heading=0.1))
         drive = concatenate_recording(recording)  # without noise of the encoders their rates are the targets
-        assert recording.truth is not None
         model = OdometryModel(ROBOT, np.array(recording.truth.matrix), recording.truth.integration)
         (poses,) = model.poses([drive.log()])
         np.testing.assert_allclose(concatenated_truth(drive, recording), poses, atol=1e-9)
@@ -292,10 +287,8 @@ class TestTruth:
         recording = simulated_recording(EncoderNoise(bias_position=0.1, bias_heading=0.1))
         drive = concatenate_runs(recording.dataset, pause=0.0)
         truth = concatenated_truth(drive, recording)
-        assert recording.truth is not None
         model = OdometryModel(ROBOT, np.array(recording.truth.matrix), recording.truth.integration)
         for index, run in enumerate(recording.dataset.trajectories):
-            assert run.targets is not None
             log = WheelLog(run.times, run.targets, drive.start_poses[index], run.times)
             found = truth[drive.run == index][-len(run.times) :]
             np.testing.assert_allclose(found, model.poses([log])[0], atol=1e-9)
@@ -336,27 +329,15 @@ def test_what_cannot_be_chained_is_named(options: dict[str, Any], named: str) ->
         concatenate_runs(options.pop("dataset", random_dataset(1)), **options)
 
 
-@pytest.fixture(scope="module")
-def drive(omni3: Dataset) -> ConcatenatedDrive:
-    return concatenate_runs(omni3)
-
-
-class TestRealRecordings:
-    def test_all_runs_are_concatenated_session_by_session(self, omni3: Dataset, drive: ConcatenatedDrive) -> None:
-        sessions = {run.id: run.session for run in omni3.trajectories}
-        order = [sessions[each] for each in drive.ids]
-        assert len(order) == 67
-        assert sum(before != after for before, after in pairwise(order)) == len(set(order)) - 1
-
-    def test_wheel_angles_and_rates_tell_the_same_motion(self, drive: ConcatenatedDrive) -> None:
-        driven = drive.rates[1:] * np.diff(drive.wheel_times)[:, None]
-        np.testing.assert_allclose(np.diff(drive.angles, axis=0), driven, atol=1e-9)
-        assert (np.diff(drive.wheel_times) > 0).all()
-
-    def test_reference_poses_are_those_composed_by_hand(self, omni3: Dataset, drive: ConcatenatedDrive) -> None:
-        known = {run.id: run for run in omni3.trajectories}
-        by_hand = composed_by_hand(tuple(known[each] for each in drive.ids))
-        np.testing.assert_allclose(homogeneous(drive.slam_poses[-1]), by_hand[-1][-1], atol=1e-8)
+def test_all_runs_of_real_recordings_are_concatenated_session_by_session(omni3: Dataset) -> None:
+    drive, known = concatenate_runs(omni3), {run.id: run for run in omni3.trajectories}
+    runs = tuple(known[each] for each in drive.ids)
+    assert len(runs) == 67
+    assert sum(one.session != other.session for one, other in pairwise(runs)) == len({run.session for run in runs}) - 1
+    driven = drive.rates[1:] * np.diff(drive.wheel_times)[:, None]
+    np.testing.assert_allclose(np.diff(drive.angles, axis=0), driven, atol=1e-9)
+    assert (np.diff(drive.wheel_times) > 0).all()
+    np.testing.assert_allclose(homogeneous(drive.slam_poses[-1]), composed_by_hand(runs)[-1][-1], atol=1e-8)
 
 
 FLOWER = FlowerConfig(
@@ -403,13 +384,6 @@ def test_one_of_several_can_be_chosen(tmp_path: Path) -> None:
     np.testing.assert_allclose(longest, [0.5, 1.0])
 
 
-@pytest.mark.slow
-def test_the_demonstrations_config_is_one() -> None:
-    recording = load_recording(Path(__file__).resolve().parents[3] / "configs" / "apr02.yaml")
-    assert len(recording.dataset.trajectories) == 360
-    assert recording.truth is not None
-
-
 @pytest.mark.parametrize(
     ("datasets", "chosen", "named"),
     [
@@ -421,9 +395,7 @@ def test_the_demonstrations_config_is_one() -> None:
         ({"real": {"path": "recordings"}}, None, "no simulated data set"),
     ],
 )
-def test_a_data_set_that_a_config_does_not_simulate_is_named(
-    tmp_path: Path, datasets: dict[str, Any], chosen: str | None, named: str
-) -> None:
+def test_other_data_sets_are_named(tmp_path: Path, datasets: dict[str, Any], chosen: str | None, named: str) -> None:
     with pytest.raises(OmnibenchError, match=named):
         load_recording(config_with(tmp_path, **datasets), chosen)
 

@@ -231,9 +231,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 class Listener:
     """Takes down what arrives on a robot's inputs, in a session of its own, as a node would."""
 
-    def __init__(
-        self, loopback: Loopback, profile: Profile = "plain", *, work: float = 0.0, stall: float = 0.0
-    ) -> None:
+    def __init__(self, loopback: Loopback, profile: Profile = "plain", *, work: float = 0, stall: float = 0) -> None:
         self._work = work  # s that it takes for a message
         self._stall = stall  # s more for the first one
         self._payloads: dict[str, list[bytes]] = {topic: [] for topic in TOPICS}
@@ -332,14 +330,6 @@ class TestPlayer:
         until(lambda: node.count == reports[0].total, "all messages")
         assert min(message.stamp for message in node.messages("joint_states")) == ORIGIN
 
-    def test_a_node_without_fusion_is_enough(self, loopback: Loopback) -> None:
-        node = GraphNode(loopback.client(), KeySpace(), "wheels only")
-        samples: list[Any] = []
-        subscriber = node.subscribe("apr02", "joint_states", samples.append)
-        report = player(loopback, speed="max").play()
-        until(lambda: len(samples) == report.sent["joint_states"], "all wheel samples")
-        subscriber.undeclare()
-
     def test_nobody_who_subscribes_is_one_line_unless_nobody_is_waited_for(self, loopback: Loopback) -> None:
         begin = time.perf_counter()
         with pytest.raises(ConfigError, match=r"apr02/joint_states after 0\.3 s"):
@@ -362,9 +352,7 @@ class TestStopping:
         return Listener(loopback)
 
     @pytest.mark.usefixtures("node")
-    def test_progress_tells_messages_and_seconds_of_the_recording(
-        self, loopback: Loopback, clock: Clock, progress: list[Progress]
-    ) -> None:
+    def test_progress_tells_messages_and_time(self, loopback: Loopback, clock: Clock, progress: list[Progress]) -> None:
         report = player(loopback, speed=4).play(clock, watch=progress.append)
         assert len(progress) >= 5
         done = [each.done for each in progress]
@@ -374,9 +362,7 @@ class TestStopping:
         times = [float(each.note.split()[0]) for each in progress]
         assert times == sorted(times)
 
-    def test_it_stops_at_once_when_asked(
-        self, loopback: Loopback, clock: Clock, node: Listener, progress: list[Progress]
-    ) -> None:
+    def test_it_is_stopped(self, loopback: Loopback, clock: Clock, node: Listener, progress: list[Progress]) -> None:
         def stop_after_half_a_second(now: Progress) -> None:
             progress.append(now)
             if len(progress) == 5:  # they come ten times a second
@@ -390,7 +376,6 @@ class TestStopping:
 
     def test_it_stops_at_once_at_ctrl_c(self, loopback: Loopback, node: Listener) -> None:
         main = threading.main_thread().ident
-        assert main is not None
 
         def interrupt_once_it_plays() -> None:
             until(lambda: node.count > 3, "a few messages")

@@ -94,12 +94,9 @@ def test_a_duplicate_and_a_late_sample_make_no_step() -> None:
 @pytest.mark.parametrize(
     ("low", "length", "settings"), [(-math.pi, 2 * math.pi, {}), (0.0, 2 * math.pi, {}), (0.0, 1.7, {"wrap": 1.7})]
 )
-def test_angles_within_one_turn_or_a_length_that_is_told_are_unwrapped(
-    low: float, length: float, settings: dict[str, float]
-) -> None:
+def test_angles_within_a_turn_or_a_length_are_unwrapped(low: float, length: float, settings: dict[str, float]) -> None:
     path, receiver = drive(8.0), Receiver(**settings)
     for sample in path.samples():
-        assert sample.positions is not None
         receiver.take(JointState(sample.stamp, NAMES, (sample.positions - low) % length + low, None))
     np.testing.assert_allclose(receiver.driven, whole(path), atol=1e-9)
     assert receiver.counts.wraps > 0
@@ -449,7 +446,6 @@ def test_angles_are_those_of_whole_messages_however_the_joints_are_spread_over_s
         beside = [name for name in sample.names if name not in own]
         (expected,) = whole.take(sample)
         (step,) = spread.take(*(only(sample, name) for name in own), only(sample, *beside))
-        assert step.steering is not None
         np.testing.assert_array_equal(step.steering, expected.steering)
         np.testing.assert_array_equal(step.angles, expected.angles)
 
@@ -486,9 +482,7 @@ def test_an_angle_that_misses_for_long_is_held_and_said_and_makes_the_path_unkno
 
 
 @pytest.mark.parametrize(("behind", "old"), [(1, 0), (10, 0), (30, 30)])
-def test_steering_that_arrives_behind_its_wheel_samples_counts_for_the_next_and_is_said_when_too_old(
-    behind: int, old: int
-) -> None:
+def test_steering_behind_its_wheel_samples_counts_for_the_next_until_too_old(behind: int, old: int) -> None:
     """Messages of the steering that wait in a loaded network; every angle tells the number of its sample."""
     receiver = SteeringReceiver(max_steering_age=0.2)
     receiver.take(at_joints(0.0, front=0.0, front_steering=0.0))
@@ -530,7 +524,6 @@ def test_an_angle_that_no_wheel_reaches_one_wheel_without_an_angle_and_other_joi
     assert receiver.counts.bad_steering == 2
     assert receiver.take(at_joints(0.03, shoulder=1.0, elbow=2.0)) == []
     assert "'front' among shoulder, elbow" in receiver.input.last_refusal
-    assert sample.positions is not None
     assert swerve.take(replace(sample, positions=np.where(np.arange(8) == 1, np.nan, sample.positions))) == []
     assert swerve.counts.not_finite == 1
 
@@ -539,21 +532,16 @@ def test_what_ros2_control_does_not_tell_is_nan_and_is_not_taken_for_a_reading()
     """Wheels with a velocity interface alone, steering joints with a position alone, in one message."""
     receiver, path = SteeringReceiver(SWERVE), steered_drive(0.3)
     for sample in path.samples():
-        assert sample.positions is not None
         positions = np.where([name.endswith("_steering") for name in sample.names], sample.positions, np.nan)
         (step,) = receiver.take(replace(sample, positions=positions))
         assert step.positions is None
     assert receiver.counts.anomalies() == {}
-    assert step.steering is not None
     np.testing.assert_allclose(step.angles, path.angles[-1] - path.angles[-2], atol=1e-12)
 
 
 def test_joints_are_called_like_the_wheels_unless_they_are_named() -> None:
     assert joints_of(TRICYCLE).names == ("front", "front_steering")
-    assert joints_of(CAR).names == (
-        *("rear_left", "rear_right"),
-        *("front_left_steering", "front_right_steering"),
-    )
+    assert joints_of(CAR).names == (*("rear_left", "rear_right"), *("front_left_steering", "front_right_steering"))
     named = WheelSettings(joints=("traction",), steering_joints=("fork",))
     assert joints_of(TRICYCLE, named).names == ("traction", "fork")
     steps = SteeringReceiver(TRICYCLE, joints=["traction"], steering_joints=["fork"]).take(
@@ -571,8 +559,6 @@ def test_joints_are_called_like_the_wheels_unless_they_are_named() -> None:
         (synthetic_robot(), ("a",), "no wheel steers"),
     ],
 )
-def test_steering_joints_that_are_not_one_for_each_wheel_are_refused(
-    robot: Robot, joints: tuple[str, ...], named: str
-) -> None:
+def test_steering_joints_other_than_one_a_wheel_are_refused(robot: Robot, joints: tuple[str, ...], named: str) -> None:
     with pytest.raises(ConfigError, match=rf"wheels\.steering_joints: .*{named}"):
         joints_of(robot, WheelSettings(steering_joints=joints))

@@ -116,8 +116,7 @@ def network() -> Iterator[Loopback]:
 
 @pytest.fixture(scope="module", params=PROFILES)
 def profile(request: pytest.FixtureRequest) -> Profile:
-    found: Profile = request.param
-    return found
+    return request.param
 
 
 @pytest.fixture(scope="module")
@@ -164,17 +163,12 @@ def recording(
 
 
 @pytest.mark.parametrize("topic", TOPICS)
-def test_rosbags_reads_the_recording(recording: Path, topic: str) -> None:
+def test_rosbags_and_mcap_ros2_support_read_the_recording(recording: Path, topic: str) -> None:
     with AnyReader([recording]) as reader:
         (connection,) = [each for each in reader.connections if each.topic == ros_name(topic)]
         ((_, _, payload),) = reader.messages([connection])
-        content = reader.deserialize(payload, connection.msgtype)
-    assert connection.msgtype == TOPICS[topic].name
-    assert read(topic, content) == EXPECTED[topic]
-
-
-@pytest.mark.parametrize("topic", TOPICS)
-def test_mcap_ros2_support_reads_the_recording(recording: Path, topic: str) -> None:
+        assert connection.msgtype == TOPICS[topic].name
+        assert read(topic, reader.deserialize(payload, connection.msgtype)) == EXPECTED[topic]
     decoder = pytest.importorskip("mcap_ros2.decoder", reason="mcap-ros2-support is not installed")
     mcap = pytest.importorskip("mcap.reader")
     with recording.open("rb") as file:
@@ -201,19 +195,12 @@ def rmw_node(network: Loopback) -> Iterator[dict[str, Publisher[Any]]]:
     graph.session.close()
 
 
-def definitions(topic: str) -> tuple[str, dict[str, str]]:
-    """The definition of a topic's type, and those of the types within it by name."""
+def type_hash(topic: str) -> str:
+    """As zenoh-ros2-sdk computes it from the definition of a topic's type and those of the types within it."""
+    utils = pytest.importorskip("zenoh_ros2_sdk.utils")
     own, *others = TOPICS[topic].definition.split("=" * 80 + "\n")
     within = dict(text.removeprefix("MSG: ").split("\n", 1) for text in others)
-    return own, {"/msg/".join(name.split("/")): text for name, text in within.items()}
-
-
-def type_hash(topic: str) -> str:
-    """As zenoh-ros2-sdk computes it."""
-    utils = pytest.importorskip("zenoh_ros2_sdk.utils")
-    own, within = definitions(topic)
-    found: str = utils.get_type_hash(TOPICS[topic].name, own, within)
-    return found
+    return utils.get_type_hash(TOPICS[topic].name, own, {name.replace("/", "/msg/"): within[name] for name in within})
 
 
 @pytest.mark.usefixtures("rmw_node")
@@ -227,9 +214,7 @@ def test_another_ros_client_lists_the_topics_with_their_types(sdk: Any, network:
 
 
 @pytest.mark.parametrize("topic", TOPICS)
-def test_another_ros_client_knows_publisher_type_hash_and_qos(
-    sdk: Any, network: Loopback, rmw_node: dict[str, Publisher[Any]], topic: str
-) -> None:
+def test_ros_clients_know_the_qos(sdk: Any, network: Loopback, rmw_node: dict[str, Publisher[Any]], topic: str) -> None:
     assert rmw_node
     info = sdk.get_topic_info(ros_name(topic), 42, "127.0.0.1", network.port, verbose=True)
     (publisher,) = info.publishers
@@ -242,9 +227,7 @@ def test_another_ros_client_knows_publisher_type_hash_and_qos(
 
 
 @pytest.mark.parametrize("topic", TOPICS)
-def test_another_ros_client_reads_the_content(
-    sdk: Any, network: Loopback, rmw_node: dict[str, Publisher[Any]], topic: str
-) -> None:
+def test_a_ros_client_reads_all(sdk: Any, network: Loopback, rmw_node: dict[str, Publisher[Any]], topic: str) -> None:
     came, contents = threading.Event(), []
 
     def callback(content: Any) -> None:
@@ -272,16 +255,13 @@ def test_another_ros_client_reads_the_content(
 
 
 @pytest.mark.parametrize("topic", TOPICS)
-def test_each_message_says_who_sent_it_when_and_which_one_it_is(
-    network: Loopback, rmw_node: dict[str, Publisher[Any]], topic: str
-) -> None:
+def test_each_message_says_who_sent_it(network: Loopback, rmw_node: dict[str, Publisher[Any]], topic: str) -> None:
     package = pytest.importorskip("zenoh_ros2_sdk.attachment", reason="zenoh-ros2-sdk is not installed")
     with samples_of(network, rmw_node[topic]) as next_sample:
         attachments = []
         for _ in range(2):
             rmw_node[topic].put(sample(topic))
             attachment = next_sample().attachment
-            assert attachment is not None
             attachments.append(package.Attachment.from_bytes(attachment.to_bytes()))
     first, second = attachments
     assert second.sequence_id == first.sequence_id + 1

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import os
 import signal
 import struct
@@ -13,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
@@ -22,11 +21,20 @@ from typing import Any
 import numpy as np
 import pytest
 import zenoh
-from announced_robot import AnnouncedRobot
 from mcap.reader import make_reader
-from mcap_recordings import disk_with_room_for, messages_of, publishers, wait_for_subscribers
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from samples import COVARIANCE, PERIOD, STAMP, odometry, sample
+from samples import (
+    COVARIANCE,
+    PERIOD,
+    STAMP,
+    AnnouncedRobot,
+    disk_with_room_for,
+    messages_of,
+    odometry,
+    publishers,
+    sample,
+    wait_for_subscribers,
+)
 from sessions import Loopback, free_port, until
 from timing import PATIENCE
 
@@ -48,17 +56,22 @@ def odom(loopback: Loopback) -> Publisher[Odometry]:
     return odom_publisher(loopback)
 
 
-@pytest.fixture
-def subscription(loopback: Loopback, odom: Publisher[Odometry]) -> Iterator[Subscription]:
-    with subscribe("apr02", connect=loopback.address) as opened:
+@contextmanager
+def subscribed(loopback: Loopback, odom: Publisher[Odometry], **options: Any) -> Iterator[Subscription]:
+    with subscribe("apr02", connect=loopback.address, **options) as opened:
         until(lambda: odom.matched, "the subscription")
         yield opened
 
 
 @pytest.fixture
+def subscription(loopback: Loopback, odom: Publisher[Odometry]) -> Iterator[Subscription]:
+    with subscribed(loopback, odom) as opened:
+        yield opened
+
+
+@pytest.fixture
 def lossless(loopback: Loopback, odom: Publisher[Odometry]) -> Iterator[Subscription]:
-    with subscribe("apr02", connect=loopback.address, lossless=True) as opened:
-        until(lambda: odom.matched, "the subscription")
+    with subscribed(loopback, odom, lossless=True) as opened:
         yield opened
 
 
@@ -87,9 +100,7 @@ def test_messages_come_as_typed_odometry(subscription: Subscription, odom: Publi
 
 
 @pytest.mark.parametrize("buffer", [1, 3])
-def test_a_slow_reader_gets_as_many_of_the_newest_messages_as_its_buffer_holds(
-    loopback: Loopback, odom: Publisher[Odometry], buffer: int
-) -> None:
+def test_a_slow_reader_gets_the_newest_messages(loopback: Loopback, odom: Publisher[Odometry], buffer: int) -> None:
     session = loopback.client()
     with (
         subscribe("apr02", session=session, buffer=buffer) as ring,
@@ -110,12 +121,9 @@ def test_a_lossless_reader_gets_every_message_in_order_however_slow(loopback: Lo
     assert [message.stamp for message in taken(lossless, 2000)] == [odometry(k).stamp for k in range(2000)]
 
 
-def test_latest_waits_for_a_message_hands_it_out_once_and_gives_up_when_nothing_comes(
-    subscription: Subscription, odom: Publisher[Odometry]
-) -> None:
+def test_latest_waits_hands_out_once_and_gives_up(subscription: Subscription, odom: Publisher[Odometry]) -> None:
     threading.Timer(0.1, odom.put, [odometry(3)]).start()
     message = subscription.latest(60.0)
-    assert message is not None
     assert message.stamp == odometry(3).stamp
     began = time.monotonic()
     assert subscription.latest(0.1) is None
@@ -133,9 +141,7 @@ def test_every_profile_is_heard_and_the_fused_odometry_is_another_topic(loopback
     assert (message.frame, message.stamp) == ("map", odometry(2).stamp)
 
 
-def test_a_message_that_cannot_be_decoded_is_counted_and_passed_over(
-    lossless: Subscription, odom: Publisher[Odometry]
-) -> None:
+def test_an_undecodable_message_is_counted_and_passed_over(lossless: Subscription, odom: Publisher[Odometry]) -> None:
     joints = JOINT_STATE.encode(sample("joint_states"))
     for payload in (b"", b"garbage", joints):
         odom.put_encoded(payload)
@@ -144,9 +150,7 @@ def test_a_message_that_cannot_be_decoded_is_counted_and_passed_over(
     assert (lossless.received, lossless.undecodable) == (1, 3)
 
 
-def test_a_callback_gets_every_message_and_one_that_raises_is_counted_logged_once_a_kind_and_goes_on(
-    loopback: Loopback, odom: Publisher[Odometry], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_callback_may_raise(loopback: Loopback, odom: Publisher[Odometry], caplog: pytest.LogCaptureFixture) -> None:
     calls: list[int] = []
 
     def callback(message: Odometry) -> None:
@@ -154,26 +158,18 @@ def test_a_callback_gets_every_message_and_one_that_raises_is_counted_logged_onc
         if len(calls) > 10:
             raise KeyError("x") if len(calls) % 2 else ZeroDivisionError("y")
 
-    with (
-        caplog.at_level(logging.ERROR),
-        subscribe("apr02", connect=loopback.address, lossless=True, callback=callback) as subscription,
-    ):
-        until(lambda: odom.matched, "the subscription")
+    with subscribed(loopback, odom, lossless=True, callback=callback) as subscription:
         for k in range(20):
             odom.put(odometry(k))
         until(lambda: subscription.callback_errors == 10, "all messages")
         assert subscription.received == 20
     assert calls == [odometry(k).stamp for k in range(20)]
-    assert [("KeyError" in each, "ZeroDivisionError" in each) for each in caplog.messages] == [
-        (True, False),
-        (False, True),
-    ]
+    first, second = caplog.messages
+    assert ("KeyError" in first, "ZeroDivisionError" in second) == (True, True)
 
 
 @pytest.mark.parametrize("wait", [list, lambda each: each.latest(120.0) or []], ids=["iterating", "for the latest"])
-def test_closing_from_another_thread_ends_a_reader_that_waits(
-    subscription: Subscription, wait: Callable[[Subscription], list[Odometry]]
-) -> None:
+def test_closing_ends_waiting(subscription: Subscription, wait: Callable[[Subscription], list[Odometry]]) -> None:
     threading.Timer(0.1, subscription.close).start()
     began = time.monotonic()
     assert wait(subscription) == []
@@ -209,9 +205,7 @@ def test_a_callback_may_close_its_subscription(loopback: Loopback, odom: Publish
     own.close()
 
 
-def test_a_session_of_its_own_closes_with_it_and_one_that_was_handed_in_stays_open(
-    loopback: Loopback, odom: Publisher[Odometry]
-) -> None:
+def test_its_own_session_closes_with_it_and_another_stays_open(loopback: Loopback, odom: Publisher[Odometry]) -> None:
     session = loopback.client()
     with subscribe("apr02", session=session):
         pass
@@ -222,7 +216,6 @@ def test_a_session_of_its_own_closes_with_it_and_one_that_was_handed_in_stays_op
     until(lambda: odom.matched, "the subscription")
     subscription.close()
     until(lambda: not odom.matched, "the subscription to go")
-    assert subscription._session is not None
     assert subscription._session.is_closed()
 
 
@@ -263,7 +256,6 @@ def test_ctrl_c_ends_a_reader_that_waits_at_once(loopback: Loopback) -> None:
         [sys.executable, "-c", WAITING_PROCESS, loopback.address], stdout=subprocess.PIPE, text=True
     )
     try:
-        assert process.stdout is not None
         assert process.stdout.readline() == "waits\n"
         process.send_signal(signal.SIGINT)
         assert process.communicate(timeout=PATIENCE)[0] == "interrupted\n"
@@ -273,9 +265,7 @@ def test_ctrl_c_ends_a_reader_that_waits_at_once(loopback: Loopback) -> None:
         process.communicate()
 
 
-def test_messages_that_never_came_are_counted_and_told(
-    lossless: Subscription, odom: Publisher[Odometry], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_losses_are_told(lossless: Subscription, odom: Publisher[Odometry], caplog: pytest.LogCaptureFixture) -> None:
     odom.put(odometry(0))
     odom.next_number()  # of a message that is lost
     odom.put(odometry(2))
@@ -327,13 +317,8 @@ def test_payloads_that_cannot_be_decoded_are_counted_and_left_out(loopback: Loop
     odom = publishers(loopback)["odom"]
     wait_for_subscribers(odom)
     whole = TOPICS["odom"].encode(sample("odom"))
-    for broken in (
-        b"",
-        b"garbage",
-        whole[:100],
-        whole + b"more",
-        TOPICS["joint_states"].encode(sample("joint_states")),
-    ):
+    joints = TOPICS["joint_states"].encode(sample("joint_states"))
+    for broken in (b"", b"garbage", whole[:100], whole + b"more", joints):
         odom.put_encoded(broken)
     odom.put_encoded(whole)
     until(lambda: recorder.messages, "the message that can")
@@ -342,9 +327,7 @@ def test_payloads_that_cannot_be_decoded_are_counted_and_left_out(loopback: Loop
     assert recorder.undecodable == {"/apr02/odom": 5}
 
 
-def test_several_robots_and_tf_once_are_in_one_file_which_is_complete_although_the_session_has_closed(
-    loopback: Loopback, tmp_path: Path
-) -> None:
+def test_several_robots_are_in_one_file_though_the_session_has_closed(loopback: Loopback, tmp_path: Path) -> None:
     session, first, second = loopback.client(), publishers(loopback, "apr02"), publishers(loopback, "apr03")
     with Recorder(session, KEYS, ["apr02", "apr03"], tmp_path / "fleet.mcap") as recorder:
         for each in (first, second):
@@ -407,9 +390,7 @@ def fill(recorder: Recorder, publisher: Publisher[Any]) -> None:
     until(full, "the disk to be full")
 
 
-def test_a_full_disk_ends_the_recording_with_one_line_and_a_file_that_can_be_read(
-    loopback: Loopback, tmp_path: Path
-) -> None:
+def test_a_full_disk_ends_the_recording_with_one_line_and_a_readable_file(loopback: Loopback, tmp_path: Path) -> None:
     failures: list[str] = []
     path = tmp_path / "run.mcap"
     recorder = Recorder(loopback.client(), KEYS, ["apr02"], path, on_failure=failures.append)
@@ -425,9 +406,7 @@ def test_a_full_disk_ends_the_recording_with_one_line_and_a_file_that_can_be_rea
     joints.put(sample("joint_states"))  # who publishes does not notice
 
 
-def test_a_message_that_is_sent_again_is_recorded_once_and_those_that_never_came_are_counted(
-    loopback: Loopback, recorder: Recorder
-) -> None:
+def test_a_repeated_message_is_recorded_once_and_lost_ones_counted(loopback: Loopback, recorder: Recorder) -> None:
     odom = publishers(loopback)["odom"]
     wait_for_subscribers(odom)
     for number in (1, 2, 2, 1, 3, 11):
@@ -601,15 +580,9 @@ def test_the_newest_odometry_of_both_topics_is_known(monitor: RobotMonitor, apr0
     for k in range(20):
         apr02.odom.put(odometry(k))
         apr02.filtered.put(odometry(k, "map"))
-    until(
-        lambda: (
-            (status := status_of(monitor, "apr02")) and status.odom and status.odom.message.stamp == odometry(19).stamp
-        ),
-        "19",
-    )
-    status = until_status(monitor, "apr02", "fused odometry", filtered=..., presence="alive")
-    assert status.odom is not None
-    assert status.filtered is not None
+    status = until_status(monitor, "apr02", "odometry", filtered=..., odom=..., presence="alive")
+    until(lambda: status_of(monitor, "apr02").odom.message.stamp == odometry(19).stamp, "the last odometry")
+    status = status_of(monitor, "apr02")
     np.testing.assert_allclose(status.odom.message.pose, odometry(19).pose, atol=1e-15)
     assert status.filtered.message.frame == "map"
 
@@ -629,35 +602,27 @@ def test_the_rate_is_that_of_arrival(monitor: RobotMonitor, apr02: AnnouncedRobo
 
     def last_came() -> bool:
         status = status_of(monitor, "apr02")
-        assert status is not None
-        assert status.odom is not None
         rates.append(status.odom.rate)
         return status.odom.message.stamp == odometry(50).stamp
 
     until(last_came, "the last message")
     slowest, fastest = 50 / (time.monotonic() - before_first), 50 / (before_last - after_first)
-    assert rates[-1] is not None
     assert slowest <= rates[-1] <= fastest
 
 
 @pytest.mark.parametrize("agree", [True, False])
-def test_the_age_by_the_stamp_is_told_where_the_clocks_agree(
-    monitor: RobotMonitor, apr02: AnnouncedRobot, agree: bool
-) -> None:
+def test_the_stamps_age_is_told_if_clocks_agree(monitor: RobotMonitor, apr02: AnnouncedRobot, agree: bool) -> None:
     apr02.wait_for_subscribers()
     stamped = time.time_ns() - 200_000_000
     apr02.odom.put(replace(odometry(), stamp=stamped) if agree else odometry())  # of 2023
     status = until_status(monitor, "apr02", "odometry", odom=...)
-    assert status.odom is not None
     assert (status.odom.stamp_age is not None) == agree
     if status.odom.stamp_age is not None:
         assert 0.2 <= status.odom.stamp_age <= (time.time_ns() - stamped) / 1e9
         assert 0.0 <= status.odom.age < status.odom.stamp_age
 
 
-def test_a_robot_that_goes_has_left_and_one_without_omnibench_is_seen_by_its_odometry(
-    loopback: Loopback, monitor: RobotMonitor, apr02: AnnouncedRobot
-) -> None:
+def test_a_robot_leaves_and_another_is_seen(loopback: Loopback, monitor: RobotMonitor, apr02: AnnouncedRobot) -> None:
     until_status(monitor, "apr02", "the token", presence="alive")
     apr02.token.undeclare()
     until_status(monitor, "apr02", "the token to go", presence="left")
@@ -667,17 +632,13 @@ def test_a_robot_that_goes_has_left_and_one_without_omnibench_is_seen_by_its_odo
     assert until_status(monitor, "other", "odometry", odom=...).presence == "no token"
 
 
-def test_health_is_asked_for_and_tells_the_counters_that_are_not_zero(
-    monitor: RobotMonitor, apr02: AnnouncedRobot
-) -> None:
+def test_health_is_asked_for_and_tells_counters_above_zero(monitor: RobotMonitor, apr02: AnnouncedRobot) -> None:
     apr02.answer_health("degraded", "poses are refused", samples=100, late=3, pose_rejected=2)
     status = until_status(monitor, "apr02", "an answer", health=...)
     assert status.health == HealthSummary("degraded", "poses are refused", {"late": 3, "pose_rejected": 2})
 
 
-def test_a_robot_that_does_not_answer_tells_its_health_by_diagnostics(
-    monitor: RobotMonitor, apr02: AnnouncedRobot
-) -> None:
+def test_a_robot_that_is_mute_tells_its_health_by_diagnostics(monitor: RobotMonitor, apr02: AnnouncedRobot) -> None:
     until(lambda: apr02.diagnostics.matched, "the monitor's subscription")
     values = (("rate_hz", "99.8"), ("samples", "500"), ("late", "7"))
     apr02.diagnostics.put(Diagnostics(1, (Diagnostic("odometry", 1, "late samples", "apr02", values),)))
@@ -685,9 +646,7 @@ def test_a_robot_that_does_not_answer_tells_its_health_by_diagnostics(
     assert status.health == HealthSummary("warning", "late samples", {"late": 7})
 
 
-def test_an_answer_that_is_no_health_is_passed_over(
-    loopback: Loopback, monitor: RobotMonitor, apr02: AnnouncedRobot
-) -> None:
+def test_nonsense_for_health_is_passed_over(loopback: Loopback, monitor: RobotMonitor, apr02: AnnouncedRobot) -> None:
     asked = Event()
 
     def nonsense(query: zenoh.Query) -> None:
@@ -700,9 +659,7 @@ def test_an_answer_that_is_no_health_is_passed_over(
     assert until_status(monitor, "apr02", "the robot", presence="alive").health is None
 
 
-def test_odometry_that_cannot_be_decoded_or_never_came_is_counted_and_the_last_stays(
-    monitor: RobotMonitor, apr02: AnnouncedRobot
-) -> None:
+def test_undecodable_and_lost_odometry_is_counted(monitor: RobotMonitor, apr02: AnnouncedRobot) -> None:
     def counted(undecodable: int, missed: int) -> bool:
         status = status_of(monitor, "apr02")
         return bool(status and status.odom) and (status.odom.undecodable, status.odom.missed) == (undecodable, missed)
@@ -713,8 +670,6 @@ def test_odometry_that_cannot_be_decoded_or_never_came_is_counted_and_the_last_s
     apr02.odom.put_encoded(b"garbage")
     until(lambda: counted(1, 0), "the count of what cannot be decoded")
     status = status_of(monitor, "apr02")
-    assert status is not None
-    assert status.odom is not None
     np.testing.assert_array_equal(status.odom.message.pose, odometry().pose)
     for _ in range(5):
         apr02.odom.next_number()  # of a message that is lost

@@ -101,9 +101,7 @@ def test_wheel_messages_are_decoded_as_rosbags_does_whoever_sends_in_between(mes
 
 
 @given(joint_states(), st.data())
-def test_a_damaged_wheel_message_is_refused_or_read_as_rosbags_reads_it(
-    messages: list[JointState], data: st.DataObject
-) -> None:
+def test_a_damaged_message_is_refused_or_read_as_by_rosbags(messages: list[JointState], data: st.DataObject) -> None:
     decoder = JointStateDecoder()
     for message in messages:
         payload = bytearray(JOINT_STATE.encode(message))
@@ -171,9 +169,7 @@ class TestMissedMessages:
         assert missed.count == 2 + 9
 
     @pytest.mark.parametrize("flow", [None, (1, 2, 3, False)])
-    def test_one_that_comes_after_all_is_not_missed_and_of_a_flow_one_that_comes_again_is_not_new(
-        self, flow: Flow | None
-    ) -> None:
+    def test_one_that_comes_late_is_not_missed_and_again_in_a_flow_not_new(self, flow: Flow | None) -> None:
         missed = MissedMessages()
         came = [missed.take(numbered(number, flow=flow)) for number in (1, 4, 2, 2, 4, 3)]
         again = 0 if flow is None else None

@@ -74,9 +74,7 @@ class TestSmallGicp:
         assert found.converged
 
     @given(x=metres, y=metres, heading=radians, seed=st.integers(0, 50), far=st.booleans())
-    def test_any_small_motion_is_found_from_anywhere_near(
-        self, x: float, y: float, heading: float, seed: int, far: bool
-    ) -> None:
+    def test_any_small_motion_is_found(self, x: float, y: float, heading: float, seed: int, far: bool) -> None:
         true = np.array([x, y, heading])
         scan = points_of(ranges_at(true))
         start = true + np.random.default_rng(seed).uniform(-1, 1, 3) * [0.1, 0.1, 0.05]
@@ -115,9 +113,7 @@ class TestMap:
 
 class TestDeskewing:
     @given(x=st.floats(-0.5, 0.5), y=st.floats(-0.5, 0.5), turn=st.floats(-1, 1), heading=st.floats(-np.pi, np.pi))
-    def test_a_scan_on_the_way_becomes_that_of_a_robot_at_rest(
-        self, x: float, y: float, turn: float, heading: float
-    ) -> None:
+    def test_a_scan_on_the_way_becomes_one_at_rest(self, x: float, y: float, turn: float, heading: float) -> None:
         twist, place = np.array([x, y, turn]), np.array([0.1, 0.2, heading])
         moving = points_of(ranges_at(place, twist), twist)
         surroundings = ScanMap(OPTIONS.spacing)
@@ -168,9 +164,7 @@ class TestErrors:
         assert further[1, 1] - FLOOR[1, 1] == pytest.approx(0.03**2 + 0.002**2)
 
     @given(x=st.floats(-5, 5), y=st.floats(-5, 5), heading=st.floats(-4, 4))
-    def test_even_a_robot_that_stands_in_the_dark_has_a_regular_covariance(
-        self, x: float, y: float, heading: float
-    ) -> None:
+    def test_a_robot_that_stands_in_the_dark_has_a_regular_covariance(self, x: float, y: float, heading: float) -> None:
         pose = np.array([x, y, heading])
         errors = PoseErrors(pose)
         errors.keep()
