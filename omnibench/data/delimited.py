@@ -177,7 +177,9 @@ def read_cells(
     lines = _split_lines(file, text, _separator(text, header_lines) if separator == AUTO else separator)
     rows = lines[header_lines:]
     if header_lines:
-        names = [name.strip() for name in _header(file, lines, header_lines)]
+        if len(lines) < header_lines:
+            raise DataError(f"{file}: it has no header with the names of its columns; repair it, or take it out")
+        names = [name.strip() for name in lines[header_lines - 1][1]]
         names[0] = names[0].lstrip("# ")  # as numpy.savetxt writes it
     else:
         names = [str(number) for number in range(1, len(rows[0][1]) + 1)] if rows else []
@@ -306,9 +308,3 @@ def _place(file: Path, name: str, names: Sequence[str]) -> int:
 
 def _is_number(name: str, names: Sequence[str]) -> bool:
     return name.isdecimal() and 1 <= int(name) <= len(names)
-
-
-def _header(file: Path, lines: Sequence[tuple[int, list[str]]], header_lines: int) -> list[str]:
-    if len(lines) < header_lines:
-        raise DataError(f"{file}: it has no header with the names of its columns; repair it, or take it out")
-    return lines[header_lines - 1][1]

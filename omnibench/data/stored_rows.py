@@ -205,7 +205,9 @@ class StoredRows(np.lib.mixins.NDArrayOperatorsMixin):
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:
         if any(isinstance(each, StoredRows) for each in options.get("out", ())):
             raise TypeError("samples that stand in a file cannot be changed; take a copy with np.array")
-        return getattr(ufunc, method)(*(_read(each) for each in inputs), **options)
+        return getattr(ufunc, method)(
+            *((np.asarray(each) if isinstance(each, StoredRows) else each) for each in inputs), **options
+        )
 
     def __getitem__(self, key: Any) -> Any:
         if self.last is not None and isinstance(key, int) and key in (-1, len(self) - 1):
@@ -238,10 +240,6 @@ def noted(rows: Any, name: str, find: Callable[[], Value]) -> Value:
         rows.notes[name] = find()
     found: Value = rows.notes[name]
     return found
-
-
-def _read(value: Any) -> Any:
-    return np.asarray(value) if isinstance(value, StoredRows) else value
 
 
 class Sampled(Protocol):

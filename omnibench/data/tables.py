@@ -785,12 +785,8 @@ def _trajectory(
         sent=sent,
         pose_covariances=covariances,
         references=references,
-        **_run_numbers(run),
+        **{name: float(run[name]) for name in _RUN_NUMBERS if run.get(name) is not None},
     )
-
-
-def _run_numbers(run: dict[str, Any]) -> dict[str, Any]:
-    return {name: float(run[name]) for name in _RUN_NUMBERS if run.get(name) is not None}
 
 
 def _run_row(trajectory: Trajectory) -> dict[str, Any]:

@@ -97,7 +97,8 @@ def wheel_transforms(robot: Robot) -> Iterator[Transform]:
         yield from arrangements(robot)
     else:
         yield from _turned_round(robot)
-    yield from _units(count)
+    for factor, unit in RATE_UNITS:
+        yield Transform(np.eye(3), factor * np.eye(count), _WHEEL, (wrong_unit(unit),))
     yield from _scales(robot)
 
 
@@ -243,11 +244,6 @@ def exchanged(count: int, first: int, second: int) -> tuple[int, ...]:
     order = list(range(count))
     order[first], order[second] = second, first
     return tuple(order)
-
-
-def _units(count: int) -> Iterator[Transform]:
-    for factor, unit in RATE_UNITS:
-        yield Transform(np.eye(3), factor * np.eye(count), _WHEEL, (wrong_unit(unit),))
 
 
 def wrong_unit(unit: str) -> Misreading:
