@@ -172,7 +172,21 @@ def read_cells(
     it has no rows (NoRowsError), a row has more or fewer fields than columns.
     """
     if file.suffix == ".parquet":
-        return _read_parquet(file)
+        # Dates become seconds since 1970, durations seconds.
+        import polars as pl
+
+        from omnibench.data.stored_rows import read_parquet
+
+        frame = read_parquet(file)
+        if frame.is_empty():
+            raise NoRowsError(f"{file}: it has no rows")
+        cells = [
+            column.fill_null("").to_list()
+            if column.dtype == pl.String
+            else _seconds(column).cast(pl.Float64, strict=False).fill_null(np.nan).to_numpy()
+            for column in frame.iter_columns()
+        ]
+        return CellTable(file, tuple(frame.columns), tuple(cells), np.arange(1, len(frame) + 1))
     text = read_text(file)
     lines = _split_lines(file, text, _separator(text, header_lines) if separator == AUTO else separator)
     rows = lines[header_lines:]
@@ -246,24 +260,6 @@ def row_error(file: Path, row: int, line: int, what: str) -> DataError:
     """The error of one row (0 is the first) of a text file, with its line where that is another number."""
     place = f"row {row + 1}" if line == row + 1 else f"row {row + 1} (line {line})"
     return DataError(f"{file}, {place}: {what}")
-
-
-def _read_parquet(file: Path) -> CellTable:
-    """The columns of a Parquet file; dates become seconds since 1970, durations seconds."""
-    import polars as pl
-
-    from omnibench.data.stored_rows import read_parquet
-
-    frame = read_parquet(file)
-    if frame.is_empty():
-        raise NoRowsError(f"{file}: it has no rows")
-    columns = [
-        column.fill_null("").to_list()
-        if column.dtype == pl.String
-        else _seconds(column).cast(pl.Float64, strict=False).fill_null(np.nan).to_numpy()
-        for column in frame.iter_columns()
-    ]
-    return CellTable(file, tuple(frame.columns), tuple(columns), np.arange(1, len(frame) + 1))
 
 
 def _seconds(column: pl.Series) -> pl.Series:

@@ -354,7 +354,7 @@ class Recorded:
 
 @dataclass(frozen=True, eq=False)
 class Explained:
-    """The best reading: its mistakes, those that fit about as well, and d^2 as recorded and as read so.
+    """The best reading: its mistakes, those that fit about as well, and d^2 as recorded.
 
     told: False where the reference is too sparse for this search. unexplained: share of the way or of the turns,
     whichever is less, that no matrix explains if it is read so.
@@ -363,7 +363,6 @@ class Explained:
     mistakes: tuple[Misreading, ...]
     alike: tuple[tuple[Misreading, ...], ...]
     distance: float
-    remains: float
     told: bool = True
     unexplained: float = 0.0
 
@@ -393,12 +392,12 @@ def search(recording: Recorded) -> Explained:
     some = recording.some()
     fit = some.fit()
     if fit is None or not fit.gram.any():  # too sparse, or the wheels stand
-        return Explained((), (), 0.0, 0.0, told=False)
+        return Explained((), (), 0.0, told=False)
     far = DesignDistance(recording.robot)
     distance = far.of(fit)
     contradiction = float(far.contradictions(fit.gram, np.eye(len(fit.gram))[None])[0])
     if distance < _SUSPICIOUS and contradiction < _CONTRADICTING and fit.left[0] < _BADLY:
-        return Explained((), (), distance, distance)
+        return Explained((), (), distance)
     scored = sorted(_scores(some, fit, far), key=lambda each: each.score)
     best, present = scored[0], next(each for each in scored if not each.mistakes)
     # Hardly anything remains of what made the recording suspicious.
@@ -410,14 +409,14 @@ def search(recording: Recorded) -> Explained:
         and best.contradiction <= max(_REMAINS * present.contradiction, _CONTRADICTING)
     )
     if not best.mistakes or not likely:
-        return Explained((), (), distance, distance, unexplained=present.left)
+        return Explained((), (), distance, unexplained=present.left)
     kinds = {mistake.kind for mistake in best.mistakes}
     alike: dict[frozenset[str], tuple[Misreading, ...]] = {}
     for each in scored[1:]:
         other = frozenset(mistake.kind for mistake in each.mistakes)
         if each.score < best.score + _ALIKE and other != kinds and len(each.mistakes) <= len(best.mistakes):
             alike.setdefault(other, each.mistakes)
-    return Explained(best.mistakes, tuple(alike.values()), distance, best.distance, unexplained=best.left)
+    return Explained(best.mistakes, tuple(alike.values()), distance, unexplained=best.left)
 
 
 def _scores(recording: Recorded, fit: FreeFit, far: DesignDistance) -> Iterator[_Scored]:

@@ -42,7 +42,8 @@ def scanner_mounting(bag: Bag, frame: str) -> ScannerMounting | None:
             if min(tilt, math.pi - tilt) > _LARGEST_TILT:
                 raise DataError(
                     f"{bag.path}: the scanner's frame {frame} is tilted by {math.degrees(tilt):.0f} degrees, so that "
-                    "it does not scan the plane of the floor; if it does, set scanner_mount; scans=false leaves the scans out"
+                    "it does not scan the plane of the floor; if it does, set scanner_mount; scans=false leaves the "
+                    "scans out"
                 )
             yaw = math.atan2(whole[1, 0], whole[0, 0])
             return ScannerMounting(Mount(x=float(whole[0, 3]), y=float(whole[1, 3]), yaw=yaw), upside_down)
