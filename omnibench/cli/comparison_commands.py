@@ -79,7 +79,9 @@ def compare(
     asked = plugin_folders(plugins or [])
     given = {"backend": backend, "workers": workers, "tls": tls_files(tls_ca, tls_cert, tls_key)}
     given = {name: value for name, value in given.items() if value is not None}
-    if _is_study(config):
+    from omnibench.study.study import is_study
+
+    if len(config) == 1 and config[0].is_file() and is_study(config[0]):
         return _study(config[0], _named_paths(data), asked, given, output, figures, force=force)
     comparison = _asked_comparison(config, data, asked)
     folders = [*comparison.plugins, *(folder.resolve() for folder in asked)]
@@ -100,13 +102,6 @@ def compare(
         )
         raise typer.Exit(1)
     return print_comparison_ending(result)
-
-
-def _is_study(given: Sequence[Path]) -> bool:
-    """True if the one argument is the config of a study."""
-    from omnibench.study.study import is_study
-
-    return len(given) == 1 and given[0].is_file() and is_study(given[0])
 
 
 def _study(

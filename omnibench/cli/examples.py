@@ -53,7 +53,14 @@ def write_example(example: Example, folder: Path, *, force: bool = False) -> lis
     force: replace what is there. ConfigError in one line: a file that differs is there, or the recording is.
     DataError: the disk refuses.
     """
-    wanted = {folder / file: content for file, content in _contents(example)}
+    places = [(place, pattern) for pattern in example.files for place in (bundled_folder(), HANDBOOK)]
+    places += [(SAMPLES / example.sample, "**/*")] if example.sample else []
+    wanted = {
+        folder / file.relative_to(place): file.read_bytes()
+        for place, pattern in places
+        for file in sorted(place.glob(pattern))
+        if file.is_file()
+    }
     for path, content in wanted.items():
         if path.exists() and (not path.is_file() or path.read_bytes() != content) and not force:
             raise ConfigError(f"{path} is there already; choose another folder, or --force to replace it")
@@ -63,7 +70,9 @@ def write_example(example: Example, folder: Path, *, force: bool = False) -> lis
     write_files(missing)
     if recording is None:
         return list(missing)
-    _simulate(folder / example.files[0], recording, force)
+    from omnibench.simulate.simulation_request import SimulationRequest
+
+    SimulationRequest(recording, folder / example.files[0], force=force).write("csv")
     return [*missing, recording]
 
 
@@ -71,21 +80,3 @@ def bundled_folder() -> Path:
     """The folder with ``configs`` and ``plugins``: their copy in an installed package, or else the clone itself."""
     installed = Path(__file__).with_name("example_files")
     return installed if installed.is_dir() else Path(__file__).parents[2]
-
-
-def _contents(example: Example) -> list[tuple[str, bytes]]:
-    """The example's files by their path in the folder that it is written to."""
-    places = [(folder, pattern) for pattern in example.files for folder in (bundled_folder(), HANDBOOK)]
-    places += [(SAMPLES / example.sample, "**/*")] if example.sample else []
-    return [
-        (file.relative_to(folder).as_posix(), file.read_bytes())
-        for folder, pattern in places
-        for file in sorted(folder.glob(pattern))
-        if file.is_file()
-    ]
-
-
-def _simulate(config: Path, output: Path, force: bool) -> None:
-    from omnibench.simulate.simulation_request import SimulationRequest
-
-    SimulationRequest(output, config, force=force).write("csv")

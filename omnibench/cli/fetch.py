@@ -165,7 +165,15 @@ def open_clone(repository: str, folder: Path, commit: str, report: Reporter) -> 
     if not _COMMIT.fullmatch(commit):
         raise ConfigError(f"commit {commit!r}: expected 4 to 40 hexadecimal digits, or {NEWEST} for the newest")
     if folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
-        _check_clone(repository, folder)
+        away = f"move it away, and {repository} is cloned anew"
+        if not (folder / ".git").exists():
+            raise ConfigError(f"{folder} is there already and is no clone; {away}")
+        remote = _ask(folder, "config", "--get", "remote.origin.url")
+        cloned = _REMOTE.search(remote)
+        if cloned is None or cloned[1].lower() != repository.lower():
+            raise ConfigError(f"{folder} is a clone of {remote or 'nothing'}, not of {repository}; {away}")
+        if changed := _ask(folder, "status", "--porcelain", "--untracked-files=all").splitlines():
+            raise ConfigError(f"{folder}: {changed[0].split(maxsplit=1)[-1]} is not as in the repository; {away}")
         if (found := _find(folder, commit)) is None:
             whole = ("--unshallow",) if _ask(folder, "rev-parse", "--is-shallow-repository") == "true" else ()
             _work(repository, ("fetch", "--progress", *whole, "origin"), folder, report)
@@ -197,19 +205,6 @@ def _make(repository: str, folder: Path, commit: str, report: Reporter) -> None:
         with suppress(OSError):
             for parent in made:  # they stay unless empty
                 parent.rmdir()
-
-
-def _check_clone(repository: str, folder: Path) -> None:
-    """ConfigError unless the folder is an unchanged clone of the repository."""
-    away = f"move it away, and {repository} is cloned anew"
-    if not (folder / ".git").exists():
-        raise ConfigError(f"{folder} is there already and is no clone; {away}")
-    remote = _ask(folder, "config", "--get", "remote.origin.url")
-    cloned = _REMOTE.search(remote)
-    if cloned is None or cloned[1].lower() != repository.lower():
-        raise ConfigError(f"{folder} is a clone of {remote or 'nothing'}, not of {repository}; {away}")
-    if changed := _ask(folder, "status", "--porcelain", "--untracked-files=all").splitlines():
-        raise ConfigError(f"{folder}: {changed[0].split(maxsplit=1)[-1]} is not as in the repository; {away}")
 
 
 def _check_out(repository: str, folder: Path, commit: str, found: str | None, report: Reporter) -> None:
@@ -345,10 +340,9 @@ def fetch_recording(
     *,
     commit: str | None = None,
     force: bool = False,
-    clones: Path = CLONES,
     report: Reporter = no_progress,
 ) -> Fetched:
-    """Clone a public recording into ``clones`` and import it; a clone that is there is used again.
+    """Clone a public recording into ``CLONES`` and import it; a clone that is there is used again.
 
     name: of the catalogue, or OWNER/REPO on GitHub, which is imported where its format is recognised. output: folder of
     the data set, or of several data sets. commit: to check out, ``HEAD`` for the newest; default: the one tested, or
@@ -360,9 +354,25 @@ def fetch_recording(
         check_dataset_folder(folder)
     refuse_existing(*folders, force=force, folders=True)
     default = asked.recording.commit if asked.recording else NEWEST
-    clone = open_clone(asked.repository, clones / asked.repository, commit or default, report)
+    clone = open_clone(asked.repository, CLONES / asked.repository, commit or default, report)
     if asked.recording is None:
-        return _unknown(clone, folders[0], force, report)
+        # Any other repository has one data set, if its format is recognised; else a refusal says why it has none.
+        folder = folders[0]
+        file = _licence_file(clone.folder)
+        fetched = Fetched(clone, f"{GITHUB}/{clone.repository}", _title(file), file, {})
+        report(Progress("importing"))
+        try:
+            fetched = replace(fetched, importer=recognised(clone.folder))
+            dataset = _imported(fetched, fetched.importer, clone.folder, folder, {})
+            wrong = [each for each in dataset.warnings if isinstance(each, FindingWarning) and each.unit]
+            if wrong:
+                raise DataError("; ".join(wrong))
+        except (ConfigError, DataError) as refused:
+            return replace(fetched, refusal=str(refused))
+        finally:
+            report(Progress("importing", result=""))
+        _save(fetched, dataset, folder, force)
+        return replace(fetched, datasets={folder: dataset})
     return _known(clone, asked, asked.recording, folders, force, report)
 
 
@@ -378,7 +388,11 @@ def _known(
     clone: Clone, asked: Asked, recording: PublicRecording, folders: list[Path], force: bool, report: Reporter
 ) -> Fetched:
     """The data sets of a recording of the catalogue."""
-    _provide(recording)
+    # The plug-in with the recording's importer, unless one of that name is there.
+    if recording.plugin and recording.importer not in [entry.name for entry in importers.entries()]:
+        failure = load_plugin_file(bundled_folder() / "plugins" / recording.plugin)
+        if failure is not None:
+            raise PluginError(f"plug-in {failure.origin} cannot be imported: {failure.error}")
     cite = recording.article or f"{GITHUB}/{clone.repository}"
     fetched = Fetched(clone, cite, recording.licence, _licence_file(clone.folder), {})
     datasets = {}
@@ -391,33 +405,6 @@ def _known(
         _save(fetched, datasets[folder], folder, force)
         report(Progress(f"importing {wanted.name}", result=""))
     return replace(fetched, datasets=datasets)
-
-
-def _unknown(clone: Clone, folder: Path, force: bool, report: Reporter) -> Fetched:
-    """The data set of any other repository, if its format is recognised; else why nothing was imported."""
-    file = _licence_file(clone.folder)
-    fetched = Fetched(clone, f"{GITHUB}/{clone.repository}", _title(file), file, {})
-    report(Progress("importing"))
-    try:
-        fetched = replace(fetched, importer=recognised(clone.folder))
-        dataset = _imported(fetched, fetched.importer, clone.folder, folder, {})
-        wrong = [each for each in dataset.warnings if isinstance(each, FindingWarning) and each.unit]
-        if wrong:
-            raise DataError("; ".join(wrong))
-    except (ConfigError, DataError) as refused:
-        return replace(fetched, refusal=str(refused))
-    finally:
-        report(Progress("importing", result=""))
-    _save(fetched, dataset, folder, force)
-    return replace(fetched, datasets={folder: dataset})
-
-
-def _provide(recording: PublicRecording) -> None:
-    """Load the plug-in with a recording's importer, unless one of that name is there. PluginError: it fails."""
-    if recording.plugin and recording.importer not in [entry.name for entry in importers.entries()]:
-        failure = load_plugin_file(bundled_folder() / "plugins" / recording.plugin)
-        if failure is not None:
-            raise PluginError(f"plug-in {failure.origin} cannot be imported: {failure.error}")
 
 
 def _imported(fetched: Fetched, importer: str, source: Path, folder: Path, options: Mapping[str, Any]) -> Dataset:

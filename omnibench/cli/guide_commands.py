@@ -3,7 +3,7 @@
 import shlex
 import sys
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from importlib import import_module
 from itertools import groupby
 from pathlib import Path
@@ -34,10 +34,14 @@ def guide(
     topic: Annotated[str | None, typer.Argument(help="What to read about. Default: the list of topics.")] = None,
 ) -> None:
     """Show the handbook: a topic, or the list of topics."""
-    from omnibench.cli.handbook_topics import find_topic
+    from omnibench.cli.handbook_topics import find_topic, topics
 
     if topic is None:
-        _list_topics()
+        listed = topics()
+        for group in dict.fromkeys(topic.group for topic in listed):
+            typer.echo(f"{group}:")
+            _print_names({topic.name: topic.summary for topic in listed if topic.group == group})
+        print_ending("these are the pages of the handbook", "read one", "omnibench", "guide", "getting-started")
     else:
         _show(find_topic(topic).text)
         print_ending(f"this was the page {topic!r}", "see what else there is to read", "omnibench", "guide")
@@ -53,16 +57,25 @@ def example(
 
     An example is a config with all that it needs, or a small recording.
     """
-    from omnibench.cli.examples import find_example, write_example
+    from omnibench.cli.examples import EXAMPLES, find_example, write_example
     from omnibench.files import resolved
 
     if name is None:
-        return _list_examples()
+        _print_names({each.name: each.summary for each in EXAMPLES})
+        print_ending("these are the examples", "write one into a folder", "omnibench", "example", "small", "-o", "demo")
+        return None
     chosen = find_example(name)
     if output is None:
         raise ConfigError(f"say where the example goes: omnibench example {name} -o DIR")
     written = write_example(chosen, output, force=force)
-    _list_written(written)
+    # A line for each file, and one for a folder of many.
+    for folder, group in groupby(written, lambda file: file.parent):
+        listed = list(group)
+        if len(listed) > _MOST_LISTED:
+            typer.echo(f"written: {folder} ({plural(len(listed), 'file')})")
+        else:
+            for file in listed:
+                typer.echo(f"written: {file}")
     if not written:
         typer.echo("nothing is written: all of it is there already, unchanged")
     if chosen.note:
@@ -73,34 +86,6 @@ def example(
     for command in chosen.commands:
         typer.echo(f"  {command}")
     return print_ending(f"{output} holds the example {name}", "type the lines above")
-
-
-def _list_written(files: Sequence[Path]) -> None:
-    """A line for each file, and one for a folder of many."""
-    for folder, group in groupby(files, lambda file: file.parent):
-        listed = list(group)
-        if len(listed) > _MOST_LISTED:
-            typer.echo(f"written: {folder} ({plural(len(listed), 'file')})")
-        else:
-            for file in listed:
-                typer.echo(f"written: {file}")
-
-
-def _list_topics() -> None:
-    from omnibench.cli.handbook_topics import topics
-
-    listed = topics()
-    for group in dict.fromkeys(topic.group for topic in listed):
-        typer.echo(f"{group}:")
-        _print_names({topic.name: topic.summary for topic in listed if topic.group == group})
-    print_ending("these are the pages of the handbook", "read one", "omnibench", "guide", "getting-started")
-
-
-def _list_examples() -> None:
-    from omnibench.cli.examples import EXAMPLES
-
-    _print_names({each.name: each.summary for each in EXAMPLES})
-    print_ending("these are the examples", "write one into a folder", "omnibench", "example", "small", "-o", "demo")
 
 
 def _print_names(summaries: Mapping[str, str]) -> None:

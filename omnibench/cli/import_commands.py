@@ -314,11 +314,18 @@ def fetch(
 
     Your git clones it into ./clones; a clone that is there is used again. Without NAME: the list of known recordings.
     """
-    from omnibench.cli.fetch import fetch_recording
+    from omnibench.cli.fetch import RECORDINGS, fetch_recording
     from omnibench.cli.terminal.progress_display import ProgressDisplay
 
     if name is None:
-        return _list_recordings()
+        width = make_console().width
+        for recording in RECORDINGS:
+            typer.echo(f"{recording.repository} ({recording.licence}); reference: {recording.reference}")
+            for listed in recording.datasets:
+                text = f"{listed.robot}: {listed.runs}"
+                typer.echo(fill(text, width, initial_indent=f"  {listed.name:10}", subsequent_indent=" " * _NAMES))
+        print_ending("these are the public recordings that are known", "fetch one", "omnibench", "fetch", "omni3")
+        return None
     with ProgressDisplay() as watch:
         fetched = fetch_recording(name, output, commit=commit, force=force, report=watch)
     for folder, dataset in fetched.datasets.items():
@@ -353,16 +360,3 @@ def _say_what_next(fetched: "Fetched") -> None:
         return print_ending(f"{clone.folder} holds {clone.repository}", "see what can be imported", "omnibench", "list")
     command = ("omnibench", "import", fetched.importer, "--help")
     return print_ending(f"{clone.folder} holds {clone.repository}", "see what its import needs", *command)
-
-
-def _list_recordings() -> None:
-    """Every data set of the catalogue, with its robot, its runs and its licence."""
-    from omnibench.cli.fetch import RECORDINGS
-
-    width = make_console().width
-    for recording in RECORDINGS:
-        typer.echo(f"{recording.repository} ({recording.licence}); reference: {recording.reference}")
-        for dataset in recording.datasets:
-            text = f"{dataset.robot}: {dataset.runs}"
-            typer.echo(fill(text, width, initial_indent=f"  {dataset.name:10}", subsequent_indent=" " * _NAMES))
-    print_ending("these are the public recordings that are known", "fetch one", "omnibench", "fetch", "omni3")

@@ -384,23 +384,6 @@ def _check_run(place: str, robot: Robot, trajectory: Trajectory) -> None:
     if trajectory.split not in SPLITS:
         hint = nearest(str(trajectory.split), SPLITS)
         raise DataError(f"{where}: split is {trajectory.split!r}; {hint}it must be train or validation")
-    _check_shapes(where, robot, trajectory)
-    arrays = {name: array for name in _ARRAYS if (array := getattr(trajectory, name)) is not None}
-    for name, flaw in (
-        *((name, values_flaw(array)) for name, array in arrays.items() if not in_file(array)),
-        ("times", None if in_file(trajectory.times) else wheel_times_flaw(trajectory.times, trajectory.id)),
-        ("pose_times", pose_times_flaw(trajectory.pose_times, trajectory.id)),
-    ):
-        if flaw is not None:
-            raise DataError(f"{where}: {name}, row {flaw[0] + 1}: {flaw[1]}")
-    run = trajectory
-    if run.references is not None and (flaw := reference_flaw(run.references, run.times)) is not None:
-        raise DataError(f"{where}: references, row {flaw[0] + 1}: {flaw[1]}")
-    if (flaw := reach_flaw(robot, run.times, run.rates, run.pose_times, run.poses)) is not None:
-        raise DataError(f"{where}: {flaw[1]}")
-
-
-def _check_shapes(where: str, robot: Robot, trajectory: Trajectory) -> None:
     samples, poses = trajectory.times.shape, trajectory.pose_times.shape
     expected: dict[str, tuple[int, ...]] = {"rates": (*samples, len(robot.wheel_names)), "poses": (*poses, 3)}
     expected |= {"angles": expected["rates"], "targets": expected["rates"], "pose_covariances": (*poses, 3, 3)}
@@ -415,6 +398,19 @@ def _check_shapes(where: str, robot: Robot, trajectory: Trajectory) -> None:
             raise DataError(f"{where}: {item} has shape {given}, expected {shape}")
     if not samples[0] or not poses[0]:
         raise DataError(f"{where}: it has no {'reference poses' if samples[0] else 'wheel samples'}")
+    arrays = {name: array for name in _ARRAYS if (array := getattr(trajectory, name)) is not None}
+    for name, flaw in (
+        *((name, values_flaw(array)) for name, array in arrays.items() if not in_file(array)),
+        ("times", None if in_file(trajectory.times) else wheel_times_flaw(trajectory.times, trajectory.id)),
+        ("pose_times", pose_times_flaw(trajectory.pose_times, trajectory.id)),
+    ):
+        if flaw is not None:
+            raise DataError(f"{where}: {name}, row {flaw[0] + 1}: {flaw[1]}")
+    references, times = trajectory.references, trajectory.times
+    if references is not None and (flaw := reference_flaw(references, times)) is not None:
+        raise DataError(f"{where}: references, row {flaw[0] + 1}: {flaw[1]}")
+    if (flaw := reach_flaw(robot, times, trajectory.rates, trajectory.pose_times, trajectory.poses)) is not None:
+        raise DataError(f"{where}: {flaw[1]}")
 
 
 def _standing(standing: Sequence[str], trajectories: Sequence[Trajectory]) -> list[str]:

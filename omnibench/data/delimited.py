@@ -172,12 +172,28 @@ def read_cells(
     it has no rows (NoRowsError), a row has more or fewer fields than columns.
     """
     if file.suffix == ".parquet":
-        return _read_parquet(file)
+        # Dates become seconds since 1970, durations seconds.
+        import polars as pl
+
+        from omnibench.data.stored_rows import read_parquet
+
+        frame = read_parquet(file)
+        if frame.is_empty():
+            raise NoRowsError(f"{file}: it has no rows")
+        cells = [
+            column.fill_null("").to_list()
+            if column.dtype == pl.String
+            else _seconds(column).cast(pl.Float64, strict=False).fill_null(np.nan).to_numpy()
+            for column in frame.iter_columns()
+        ]
+        return CellTable(file, tuple(frame.columns), tuple(cells), np.arange(1, len(frame) + 1))
     text = read_text(file)
     lines = _split_lines(file, text, _separator(text, header_lines) if separator == AUTO else separator)
     rows = lines[header_lines:]
     if header_lines:
-        names = [name.strip() for name in _header(file, lines, header_lines)]
+        if len(lines) < header_lines:
+            raise DataError(f"{file}: it has no header with the names of its columns; repair it, or take it out")
+        names = [name.strip() for name in lines[header_lines - 1][1]]
         names[0] = names[0].lstrip("# ")  # as numpy.savetxt writes it
     else:
         names = [str(number) for number in range(1, len(rows[0][1]) + 1)] if rows else []
@@ -246,24 +262,6 @@ def row_error(file: Path, row: int, line: int, what: str) -> DataError:
     return DataError(f"{file}, {place}: {what}")
 
 
-def _read_parquet(file: Path) -> CellTable:
-    """The columns of a Parquet file; dates become seconds since 1970, durations seconds."""
-    import polars as pl
-
-    from omnibench.data.stored_rows import read_parquet
-
-    frame = read_parquet(file)
-    if frame.is_empty():
-        raise NoRowsError(f"{file}: it has no rows")
-    columns = [
-        column.fill_null("").to_list()
-        if column.dtype == pl.String
-        else _seconds(column).cast(pl.Float64, strict=False).fill_null(np.nan).to_numpy()
-        for column in frame.iter_columns()
-    ]
-    return CellTable(file, tuple(frame.columns), tuple(columns), np.arange(1, len(frame) + 1))
-
-
 def _seconds(column: pl.Series) -> pl.Series:
     """A column of dates or durations in seconds; another as it is."""
     import polars as pl
@@ -306,9 +304,3 @@ def _place(file: Path, name: str, names: Sequence[str]) -> int:
 
 def _is_number(name: str, names: Sequence[str]) -> bool:
     return name.isdecimal() and 1 <= int(name) <= len(names)
-
-
-def _header(file: Path, lines: Sequence[tuple[int, list[str]]], header_lines: int) -> list[str]:
-    if len(lines) < header_lines:
-        raise DataError(f"{file}: it has no header with the names of its columns; repair it, or take it out")
-    return lines[header_lines - 1][1]

@@ -272,20 +272,15 @@ def with_whole_turns(robot: Robot, log: WheelLog, references: References) -> Ref
     for chosen, known, first in ((absolute, references.start_known, log.start[2]), (counted, True, 0.0)):
         if chosen.any():
             stamps, headings = references.t1[chosen], values[chosen, 0]
-            driven = _turned(robot, log, stamps)
+            # Angles (S,) that the design robot has turned by at the stamps, rad.
+            wanted = WheelLog(log.times, log.rates, np.zeros(3), stamps, steering=log.steering, drive=log.drive)
+            (poses,) = OdometryModel.of_design(robot, "arc").poses([wanted])
+            driven: Array = poses[:, 2]
             before = (first, 0.0) if known else (headings[0], driven[0])
             steps = np.diff(headings, prepend=before[0])
             turns = np.round((np.diff(driven, prepend=before[1]) - steps) / TURN)
             values[chosen, 0] = headings + TURN * np.cumsum(turns)
     return references.with_values(values)
-
-
-def _turned(robot: Robot, log: WheelLog, stamps: Array) -> Array:
-    """Angles (S,) that the design robot has turned by at stamps (S,), rad."""
-    wanted = WheelLog(log.times, log.rates, np.zeros(3), stamps, steering=log.steering, drive=log.drive)
-    (poses,) = OdometryModel.of_design(robot, "arc").poses([wanted])
-    turned: Array = poses[:, 2]
-    return turned
 
 
 # How many times too large references in another unit are, and that unit.

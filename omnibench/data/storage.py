@@ -141,7 +141,20 @@ class ScansOnDisk(Scans):
 
     def _read_index(self, known: set[str]) -> dict[str, tuple[Rows, Array]]:
         """Rows and stamps of every trajectory, in its order."""
-        table = self._names_and_stamps()
+        if self.file.suffix == ".parquet":
+            count_rows(self.file)
+        else:
+            check_file(self.file, text=True)
+        with readable(self.file):
+            schema = self._lazy().collect_schema()
+        for column in _COLUMNS:
+            if column not in schema:
+                raise missing_column(self.file, column, schema)
+        frame = self._collect(self._lazy().select("trajectory", "t"))
+        if frame.is_empty():
+            raise DataError(f"{self.file}: it has no rows; remove it, or record scans")
+        table = Table(self.file, frame if self.file.suffix == ".parquet" else unquoted_formulas(frame))
+        table.name_trajectories()
         times = table.numbers("t")
         table.refuse(times < 0, lambda row: f"t is {times[row]:g}; it must not be negative")
         index = {}
@@ -157,24 +170,6 @@ class ScansOnDisk(Scans):
                 raise table.fail(int(run_rows[flaw[0]]), f"t {flaw[1]}")
             index[str(trajectory)] = run_rows, stamps
         return index
-
-    def _names_and_stamps(self) -> Table:
-        """The checked columns of trajectories and stamps."""
-        if self.file.suffix == ".parquet":
-            count_rows(self.file)
-        else:
-            check_file(self.file, text=True)
-        with readable(self.file):
-            schema = self._lazy().collect_schema()
-        for column in _COLUMNS:
-            if column not in schema:
-                raise missing_column(self.file, column, schema)
-        frame = self._collect(self._lazy().select("trajectory", "t"))
-        if frame.is_empty():
-            raise DataError(f"{self.file}: it has no rows; remove it, or record scans")
-        table = Table(self.file, frame if self.file.suffix == ".parquet" else unquoted_formulas(frame))
-        table.name_trajectories()
-        return table
 
     def _fail(self, row: int, what: str) -> DataError:
         return DataError(f"{self.file}, row {row + 1}: {what}")

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import math
 import threading
+from bisect import bisect_right
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -48,7 +48,7 @@ class BlockFile:
 
     def rows(self, columns: tuple[str, ...], first: int, count: int) -> Array:
         """Values (count, n) of some columns from row ``first`` on, of one block, read-only."""
-        block = int(np.searchsorted(self._edges, first, side="right")) - 1
+        block = bisect_right(self.edges, first) - 1
         begin = self.edges[block]
         return _BLOCKS.of(self, columns, block)[first - begin : first - begin + count]
 
@@ -62,10 +62,6 @@ class BlockFile:
         values = read_rows(self.file, columns, begin, end - begin).cast(pl.Float64).to_numpy()
         values.flags.writeable = False
         return values
-
-    @cached_property
-    def _edges(self) -> Array:
-        return np.array(self.edges)
 
 
 def file_state(file: Path) -> tuple[int, int]:
@@ -205,7 +201,9 @@ class StoredRows(np.lib.mixins.NDArrayOperatorsMixin):
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:
         if any(isinstance(each, StoredRows) for each in options.get("out", ())):
             raise TypeError("samples that stand in a file cannot be changed; take a copy with np.array")
-        return getattr(ufunc, method)(*(_read(each) for each in inputs), **options)
+        return getattr(ufunc, method)(
+            *(np.asarray(each) if isinstance(each, StoredRows) else each for each in inputs), **options
+        )
 
     def __getitem__(self, key: Any) -> Any:
         if self.last is not None and isinstance(key, int) and key in (-1, len(self) - 1):
@@ -238,10 +236,6 @@ def noted(rows: Any, name: str, find: Callable[[], Value]) -> Value:
         rows.notes[name] = find()
     found: Value = rows.notes[name]
     return found
-
-
-def _read(value: Any) -> Any:
-    return np.asarray(value) if isinstance(value, StoredRows) else value
 
 
 class Sampled(Protocol):

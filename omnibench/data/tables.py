@@ -110,11 +110,8 @@ class Table:
 
     def stack(self, columns: Sequence[str]) -> Array | None:
         """Optional columns as (rows, n), or None when none is there. DataError when only some are."""
-        missing = [column for column in columns if column not in self.frame.columns]
-        if len(missing) == len(columns):
+        if not _all_there(self.file, columns, self.frame.columns):
             return None
-        if missing:
-            raise DataError(f"{self.file}: column {missing[0]!r} is missing; give all of {', '.join(columns)} or none")
         return np.column_stack([self.numbers(column) for column in columns])
 
 
@@ -418,7 +415,13 @@ class StoredWheels:
         if not all(types[column].is_numeric() for column in columns):
             raise WholeTableError
         rows = self._rows_of_runs(runs, columns)
-        blocks = BlockFile(file, _block_edges(rows), state)
+        # First rows of blocks of whole runs, and the end of the last.
+        edges = [0]
+        ends = sorted(of_run.first + of_run.count for of_run in rows)
+        for end, after in zip(ends, [*ends[1:], None], strict=True):
+            if after is None or after - edges[-1] > BLOCK_ROWS:
+                edges.append(end)
+        blocks = BlockFile(file, tuple(edges), state)
         together = [column for name in ("times", "rates", "steering") for column in wanted.get(name, ())]
         return [WheelArrays(**_arrays(blocks, wanted, together, of_run)) for of_run in rows]
 
@@ -486,16 +489,6 @@ def _arrays(blocks: BlockFile, wanted: dict[str, list[str]], together: Sequence[
     return arrays
 
 
-def _block_edges(rows: Sequence[RunRows]) -> tuple[int, ...]:
-    """First rows of blocks of whole runs, and the end of the last."""
-    edges = [0]
-    ends = sorted(of_run.first + of_run.count for of_run in rows)
-    for end, after in zip(ends, [*ends[1:], None], strict=True):
-        if after is None or after - edges[-1] > BLOCK_ROWS:
-            edges.append(end)
-    return tuple(edges)
-
-
 POSE_COLUMNS = ("trajectory", "t", "x", "y", "theta")
 COMMAND_COLUMNS = ("trajectory", "t", "v", "alpha", "omega", "t_r")
 _RUN_NUMBERS = ("started_at", "v", "alpha", "omega", "duration", "distance")
@@ -558,8 +551,9 @@ def make_dataset(
         runs = _tables(robot, trajectories, wheels, poses, references).trajectories(robot)
     if not isinstance(sample_period, Real | None):
         raise DataError(f"data set {name}: sample_period is {sample_period!r}, expected a number of seconds")
-    period = _sample_period(runs) if sample_period is None else sample_period
-    return of_trajectories(name, robot, period, runs, scans=scans, **texts)
+    if sample_period is None:  # the median; that there is no run is said next
+        sample_period = round(median_period(runs), _PERIOD_DECIMALS) if runs else 1.0
+    return of_trajectories(name, robot, sample_period, runs, scans=scans, **texts)
 
 
 def _runs(name: str, trajectories: Any, others: bool) -> list[Trajectory]:
@@ -572,13 +566,6 @@ def _runs(name: str, trajectories: Any, others: bool) -> list[Trajectory]:
             given = type(run).__name__
             raise DataError(f"data set {name}: a trajectory is of type {given}; of tables give wheels= and poses=, too")
     return [run.with_arrays() for run in runs]
-
-
-def _sample_period(runs: Sequence[Trajectory]) -> float:
-    """The median time between wheel samples, s."""
-    if not runs:
-        return 1.0  # that there is no run is said next
-    return round(median_period(runs), _PERIOD_DECIMALS)
 
 
 def _tables(robot: Robot, trajectories: Any, wheels: Any, poses: Any, references: Any) -> DatasetTables:
@@ -642,7 +629,21 @@ class DatasetTables:
     def trajectories(self, robot: Robot) -> list[Trajectory]:
         """The runs of the tables. DataError names the table, the row and what is wrong."""
         runs, poses = self.runs, self.poses
-        _check_runs(runs)
+        for column in (*_RUN_NUMBERS, "repetition"):
+            if column in runs.frame.columns:
+                series = runs.floats(column)
+                _refuse_infinite(runs, series)
+                runs.frame = runs.frame.with_columns(series.alias(column))
+        if "repetition" in runs.frame.columns:
+            numbers = runs.frame["repetition"]
+            runs.refuse(numbers % 1 != 0, lambda row: f"repetition is {numbers[row]}, not a whole number")
+        named = runs.frame["trajectory"]
+        runs.refuse(
+            ~named.is_first_distinct(), lambda row: f"trajectory {named[row]} is there twice; give each its own id"
+        )
+        for row, split in enumerate(runs.frame["split"]):
+            if split not in SPLITS:
+                raise runs.fail(row, f"split is {split!r}; {nearest(str(split), SPLITS)}it must be train or validation")
         samples = self.wheels.of_runs(runs, robot)
         ids = runs.frame["trajectory"].to_list()
         ends = {run: arrays.times for run, arrays in zip(ids, samples, strict=True)}
@@ -718,22 +719,6 @@ class _PoseColumns:
         self.covariances = None if upper is None else upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
 
 
-def _check_runs(runs: Table) -> None:
-    for column in (*_RUN_NUMBERS, "repetition"):
-        if column in runs.frame.columns:
-            series = runs.floats(column)
-            _refuse_infinite(runs, series)
-            runs.frame = runs.frame.with_columns(series.alias(column))
-    if "repetition" in runs.frame.columns:
-        numbers = runs.frame["repetition"]
-        runs.refuse(numbers % 1 != 0, lambda row: f"repetition is {numbers[row]}, not a whole number")
-    ids = runs.frame["trajectory"]
-    runs.refuse(~ids.is_first_distinct(), lambda row: f"trajectory {ids[row]} is there twice; give each its own id")
-    for row, split in enumerate(runs.frame["split"]):
-        if split not in SPLITS:
-            raise runs.fail(row, f"split is {split!r}; {nearest(str(split), SPLITS)}it must be train or validation")
-
-
 def _refuse_infinite(runs: Table, values: pl.Series) -> None:
     infinite = ~values.is_finite() & values.is_not_null()
     runs.refuse(infinite, lambda row: f"{values.name} is {values[row]}; leave it empty if it is not known")
@@ -768,6 +753,7 @@ def _trajectory(
     if reference is not None and len(pose_rows):
         pose_times, poses = reference.times[pose_rows], reference.poses[pose_rows]
         covariances = None if reference.covariances is None else reference.covariances[pose_rows]
+    numbers: dict[str, Any] = {name: float(run[name]) for name in _RUN_NUMBERS if run.get(name) is not None}
     return Trajectory(
         id=run["trajectory"],
         split=cast(Split, run["split"]),
@@ -785,12 +771,8 @@ def _trajectory(
         sent=sent,
         pose_covariances=covariances,
         references=references,
-        **_run_numbers(run),
+        **numbers,
     )
-
-
-def _run_numbers(run: dict[str, Any]) -> dict[str, Any]:
-    return {name: float(run[name]) for name in _RUN_NUMBERS if run.get(name) is not None}
 
 
 def _run_row(trajectory: Trajectory) -> dict[str, Any]:
@@ -817,7 +799,6 @@ def _pose_frame(trajectory: Trajectory) -> pl.DataFrame:
     columns: dict[str, Any] = {"trajectory": [trajectory.id] * count, "t": trajectory.pose_times}
     columns |= {name: trajectory.poses[:, index] for index, name in enumerate(("x", "y", "theta"))}
     covariances = trajectory.pose_covariances
-    for index, name in enumerate(_COVARIANCE):
-        row, column = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))[index]
+    for name, (row, column) in zip(_COVARIANCE, ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)), strict=True):
         columns[f"cov_{name}"] = [None] * count if covariances is None else covariances[:, row, column]
     return pl.DataFrame(columns, schema_overrides={name: pl.Float64 for name in columns if name != "trajectory"})

@@ -150,7 +150,12 @@ class LiveNode(Closing):
             intake = Intake()
             started.callback(intake.close)
             listeners = started.enter_context(ExitStack())  # closed after the services, to have their last messages
-            self._services = self._start_services(intake, started)
+            graph = GraphNode(self.session, self.keys, self.config.name)
+            services = []
+            for tracker in self.trackers.values():
+                services.append(service := RobotService(graph, tracker, intake))
+                started.callback(service.close)
+            self._services = services
             # after the services: a replay begins with the first subscriber, and the samples are for these
             self._serve_foxglove(listeners)
             self._record(listeners)
@@ -182,7 +187,15 @@ class LiveNode(Closing):
         """Refuse a robot that another node runs, and warn of tf frames that another node may publish too."""
         claim = Claim(self.session, self.trackers.keys(), _PRESENCE_TIMEOUT)
         started.callback(claim.close)
-        _warn_of_shared_frames(self.config.on_common_frames(), claim.others)
+        # All robots share the topic tf: two on frames of the same names overwrite each other's transforms.
+        robots = self.config.on_common_frames()
+        if robots and claim.others:
+            name = robots[0]
+            LOG.warning(
+                "robot %s publishes tf between map, odom and base_link, and so may %s on the same network; "
+                "`frames: prefixed` makes them %s/odom and %s/base_link",
+                *(name, ", ".join(claim.others), name, name),
+            )
 
     def _serve_foxglove(self, listeners: ExitStack) -> None:
         """Serve the robots' topics to Foxglove, if the config asks for it."""
@@ -205,15 +218,6 @@ class LiveNode(Closing):
         listeners.callback(lambda: _tell_missed(f"the recording {path}", recorder.missed.total()))
         LOG.warning("recording to %s", path)
 
-    def _start_services(self, intake: Intake, started: ExitStack) -> list[RobotService]:
-        """Subscribe to every robot's wheels and poses, and publish what its tracker makes of them."""
-        graph = GraphNode(self.session, self.keys, self.config.name)
-        services = []
-        for tracker in self.trackers.values():
-            services.append(service := RobotService(graph, tracker, intake))
-            started.callback(service.close)
-        return services
-
 
 def load_effects(config: LiveConfig) -> None:
     """Load the plug-ins whose effects calibrations may name; one that cannot be imported is a warning in the log."""
@@ -224,20 +228,6 @@ def load_effects(config: LiveConfig) -> None:
 def _tell_missed(where: str, messages: int) -> None:
     if messages:
         LOG.warning("%s lacks %s, lost on the way", where, plural(messages, "message"))
-
-
-def _warn_of_shared_frames(robots: Sequence[str], others: Sequence[str]) -> None:
-    """All robots share the topic tf: two on frames of the same names overwrite each other's transforms.
-
-    robots: this node's, on the default frames. others: robots of other nodes.
-    """
-    if robots and others:
-        name = robots[0]
-        LOG.warning(
-            "robot %s publishes tf between map, odom and base_link, and so may %s on the same network; "
-            "`frames: prefixed` makes them %s/odom and %s/base_link",
-            *(name, ", ".join(others), name, name),
-        )
 
 
 def robot_info(config: LiveConfig, keys: KeySpace, tracker: RobotTracker) -> Mapping[str, Any]:

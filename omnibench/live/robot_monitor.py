@@ -140,7 +140,9 @@ class RobotMonitor(Closing):
         now = time.monotonic()
         if now - self._queried_at >= _QUERY_PERIOD:
             self._queried_at = now
-            self._query_health()
+            key = f"omnibench/{self._robot or '*'}/health"
+            take, everyone = direct(self._take_answer), zenoh.QueryTarget.ALL
+            self._session.get(key, take, target=everyone, timeout=_QUERY_PERIOD, source_info=source_of(self._session))
         alive, left = self._presence.alive, self._presence.left
         with self._lock:
             streams, answers = dict(self._streams), dict(self._answers)
@@ -181,11 +183,6 @@ class RobotMonitor(Closing):
                 stream.take(sample)
 
         return self._session.declare_subscriber(expression, direct(take_odometry))
-
-    def _query_health(self) -> None:
-        key = f"omnibench/{self._robot or '*'}/health"
-        take, everyone = direct(self._take_answer), zenoh.QueryTarget.ALL
-        self._session.get(key, take, target=everyone, timeout=_QUERY_PERIOD, source_info=source_of(self._session))
 
     def _take_answer(self, reply: zenoh.Reply) -> None:
         if reply.ok is None:
@@ -257,8 +254,12 @@ class _Stream:
         lag = arrived_at_by_clock - self._message.seconds
         age = max(now - arrived_at, 0.0)
         stamp_age = age + lag if 0 <= lag <= _LARGEST_LAG else None
-        return OdometryStatus(self._message, self._rate(), age, stamp_age, self._undecodable, self._numbers.count)
-
-    def _rate(self) -> float | None:
-        (first, count_before), (last, count) = self._history[0], self._history[-1]
-        return (count - count_before) / (last - first) if last > first else None
+        (first, count_before), (last, after) = self._history[0], self._history[-1]
+        return OdometryStatus(
+            self._message,
+            (after - count_before) / (last - first) if last > first else None,
+            age,
+            stamp_age,
+            self._undecodable,
+            self._numbers.count,
+        )

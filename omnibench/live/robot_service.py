@@ -17,7 +17,7 @@ import zenoh
 from omnibench.errors import one_line
 from omnibench.live.acknowledged_flows import AcknowledgedFlows
 from omnibench.live.estimation.counts import anomalies_in_words
-from omnibench.live.estimation.health import Health, diagnostic
+from omnibench.live.estimation.health import diagnostic
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.stopping import Closing, RateLimiter
 from omnibench.live.wire.messages import Diagnostics, MissedMessages, flow_of
@@ -177,7 +177,19 @@ class RobotService:
         health = self.tracker.health(time.monotonic())
         status = diagnostic(health, hardware=self.tracker.calibration.robot.name)
         self._diagnostics.put(Diagnostics(time.time_ns(), (status,)))
-        self._log_changes(health)
+        # Log a new status, and anomalies that were counted since they were last logged.
+        if health.status != self._logged_status:
+            self._logged_status = health.status
+            LOG.info("%s: %s (%s)", health.robot, health.status, health.message)
+        anomalies = self.tracker.counts.anomalies()
+        new = {kind: count - self._logged_anomalies.get(kind, 0) for kind, count in anomalies.items()}
+        in_words = anomalies_in_words({kind: count for kind, count in new.items() if count})
+        if in_words and self._rate_limiter.allows("anomalies"):
+            self._logged_anomalies = anomalies
+            refused = self.tracker.refusals != self._logged_refusals
+            self._logged_refusals = self.tracker.refusals
+            last = f"; the last: {health.last_refusal}" if refused and health.last_refusal else ""
+            LOG.warning("%s: %s%s", health.robot, in_words, last)
 
     def close(self) -> None:
         """Take what waits, nothing more, and leave."""
@@ -270,28 +282,11 @@ class RobotService:
                 for update in updates:
                     self._publish(update)
         except Exception as error:  # the stream has to go on
-            self._failed("pose" if message.is_pose else "wheels", error)
+            input_name = "pose" if message.is_pose else "wheels"
+            self.tracker.count_failure()
+            if self._rate_limiter.allows(input_name):
+                LOG.error("%s: a %s message failed: %s: %s", self.tracker.name, input_name, type(error).__name__, error)
 
     def _publish(self, update: Update) -> None:
         for publisher, encoded in self._outputs:
             publisher.put_encoded(encoded(update))
-
-    def _failed(self, input_name: str, error: Exception) -> None:
-        self.tracker.count_failure()
-        if self._rate_limiter.allows(input_name):
-            LOG.error("%s: a %s message failed: %s: %s", self.tracker.name, input_name, type(error).__name__, error)
-
-    def _log_changes(self, health: Health) -> None:
-        """Log a new status, and anomalies that were counted since they were last logged."""
-        if health.status != self._logged_status:
-            self._logged_status = health.status
-            LOG.info("%s: %s (%s)", health.robot, health.status, health.message)
-        anomalies = self.tracker.counts.anomalies()
-        new = {kind: count - self._logged_anomalies.get(kind, 0) for kind, count in anomalies.items()}
-        in_words = anomalies_in_words({kind: count for kind, count in new.items() if count})
-        if in_words and self._rate_limiter.allows("anomalies"):
-            self._logged_anomalies = anomalies
-            refused = self.tracker.refusals != self._logged_refusals
-            self._logged_refusals = self.tracker.refusals
-            last = f"; the last: {health.last_refusal}" if refused and health.last_refusal else ""
-            LOG.warning("%s: %s%s", health.robot, in_words, last)

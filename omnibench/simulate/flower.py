@@ -146,78 +146,51 @@ def _mean_shares(times: Array, ramp: float) -> Array:
 
 
 def _session(config: FlowerConfig, robot: TrueRobot, split: Split, session: Session) -> Iterator[Trajectory]:
+    """The runs: targets and steering by the design values, wheel rates by the motors, motion by the true robot.
+
+    Encoders are exact between runs, so that recorded and true wheel angles do not drift apart: the angles (N,) at a
+    run's end are those at which the next one begins.
+    """
     rng = np.random.default_rng(session.seed)
     commands = [(each, each.repetitions) for each in planned_commands(config, session)]
     runs = runs_of(commands, config.order, rng)
-    started_at = 0.0
-    angles: Array = np.zeros(len(config.robot.wheel_names))
-    for number, (command, repetition) in enumerate(runs, 1):
-        planned = _Planned(f"{split}-{number:03d}", split, command, repetition, started_at, angles)
-        run, angles = _drive(config, robot, planned, session, rng)
-        yield run
-        started_at += float(run.times[-1]) + PAUSE
-
-
-@dataclass(frozen=True)
-class _Planned:
-    """A run to be driven, s since the start of its session, and the wheel angles (N,) at its begin, rad."""
-
-    id: str
-    split: Split
-    command: PlannedCommand
-    repetition: int
-    started_at: float
-    angles: Array
-
-
-def _drive(
-    config: FlowerConfig, robot: TrueRobot, planned: _Planned, session: Session, rng: np.random.Generator
-) -> tuple[Trajectory, Array]:
-    """One run: targets and steering by the design values, wheel rates by the motors, motion by the true robot.
-
-    Encoders are exact between runs, so that recorded and true wheel angles do not drift apart: the angles (N,) at the
-    run's end are those at which the next one begins.
-    """
-    timed = planned.command.timed
-    command, ramp = timed.command, timed.ramp
-    times, pose_times = stamps_of_run(timed.duration, config.sample_period, config.pose_period)
-    variation = timed.variation
-    targets = commanded_rates(config.robot, command, times, ramp, variation)
-    start = _start(config, planned.command.heading, rng)
-    driven, steering = robot.driven(times, targets), commanded_steering(config.robot, command, times, variation)
-    log = robot.log(times, driven, start, pose_times, planned.angles, planned.started_at, planned.split, steering)
-    rates = log.rates + config.noise.encoder * rng.standard_normal(targets.shape)
-    if steering is not None:
-        steering = steering + config.noise.steering * rng.standard_normal(steering.shape)
-    poses = robot.reported(log)
-    angles = planned.angles + np.cumsum(rates * config.sample_period, axis=0)
-    run = Trajectory(
-        id=planned.id,
-        split=planned.split,
-        command=planned.command.name,
-        repetition=planned.repetition,
-        session=planned.split,
-        started_at=planned.started_at,
-        v=command.speed,
-        alpha=command.direction,
-        omega=command.turn_rate,
-        duration=float(times[-1]),
-        distance=command.speed * (float(times[-1]) - ramp),
-        times=times,
-        rates=rates,
-        pose_times=pose_times,
-        poses=poses + session.noise_scale * reference_noise(config.noise, pose_times, rng),
-        angles=angles,
-        targets=targets,
-        steering=steering,
-    )
-    return run, angles[-1]
-
-
-def _start(config: FlowerConfig, heading: float | None, rng: np.random.Generator) -> Array:
-    half = config.start_area / 2
-    start = np.zeros(3) if config.start == "fixed" else rng.uniform((-half, -half, -math.pi), (half, half, math.pi))
-    return start if heading is None else np.append(start[:2], heading)
+    half, started_at = config.start_area / 2, 0.0
+    before: Array = np.zeros(len(config.robot.wheel_names))
+    for number, (planned, repetition) in enumerate(runs, 1):
+        timed = planned.timed
+        command, ramp, variation = timed.command, timed.ramp, timed.variation
+        times, pose_times = stamps_of_run(timed.duration, config.sample_period, config.pose_period)
+        targets = commanded_rates(config.robot, command, times, ramp, variation)
+        start = np.zeros(3) if config.start == "fixed" else rng.uniform((-half, -half, -math.pi), (half, half, math.pi))
+        start = start if planned.heading is None else np.append(start[:2], planned.heading)
+        driven, steering = robot.driven(times, targets), commanded_steering(config.robot, command, times, variation)
+        log = robot.log(times, driven, start, pose_times, before, started_at, split, steering)
+        rates = log.rates + config.noise.encoder * rng.standard_normal(targets.shape)
+        if steering is not None:
+            steering = steering + config.noise.steering * rng.standard_normal(steering.shape)
+        poses = robot.reported(log)
+        angles = before + np.cumsum(rates * config.sample_period, axis=0)
+        yield Trajectory(
+            id=f"{split}-{number:03d}",
+            split=split,
+            command=planned.name,
+            repetition=repetition,
+            session=split,
+            started_at=started_at,
+            v=command.speed,
+            alpha=command.direction,
+            omega=command.turn_rate,
+            duration=float(times[-1]),
+            distance=command.speed * (float(times[-1]) - ramp),
+            times=times,
+            rates=rates,
+            pose_times=pose_times,
+            poses=poses + session.noise_scale * reference_noise(config.noise, pose_times, rng),
+            angles=angles,
+            targets=targets,
+            steering=steering,
+        )
+        started_at, before = started_at + (float(times[-1]) + PAUSE), angles[-1]
 
 
 def stamps_of_run(duration: float, sample_period: float, pose_period: float) -> tuple[Array, Array]:

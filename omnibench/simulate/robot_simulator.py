@@ -23,7 +23,7 @@ from omnibench.simulate.flower import PAUSE, runs_of
 from omnibench.simulate.lidar import measure_scans, scan_stamps
 from omnibench.simulate.motion_commands import CommandedMotion, command_motion, target_rates
 from omnibench.simulate.motors import TRUE_STEP, DrivenRun, check_reach, drive_session
-from omnibench.simulate.robot_config import Placement, RobotConfig
+from omnibench.simulate.robot_config import RobotConfig
 from omnibench.simulate.truth import Simulation, TrueRobot, true_record
 from omnibench.slam.slam_dataset import slam_dataset
 
@@ -119,7 +119,13 @@ class _RobotSimulator:
         """The runs of a session one after the other; wheel angles go on from run to run."""
         config, rng = self.config, np.random.default_rng(session.seed)
         runs = runs_of([(command, config.repetitions) for command in self.commands], config.order, rng)
-        motions = [self._motion(command, session, rng) for command, _ in runs]
+        motions = [
+            command_motion(
+                command, session.distance if command.speed else None, config.commands.turn_duration, config.profile,
+                config.link, config.sample_period, config.settle, rng,
+            )
+            for command, _ in runs
+        ]  # fmt: skip
         steered, motions = self._steered([command for command, _ in runs], motions)
         targets = [target_rates(config.robot, motion) for motion in motions]
         rates = [self.robot.driven(motion.times, target) for motion, target in zip(motions, targets, strict=True)]
@@ -128,7 +134,7 @@ class _RobotSimulator:
         driven = drive_session(
             config.motor, config.controller, config.encoder, rates, config.sample_period, np.zeros(rates[0].shape[1])
         )
-        started_at, angles = 0.0, np.zeros(len(config.robot.wheel_names))
+        started_at, angles, direct = 0.0, np.zeros(len(config.robot.wheel_names)), config.robot.drive.direct
         for number, ((command, repetition), motion, target, steering, wheels) in enumerate(
             zip(runs, motions, targets, steered, driven, strict=True), 1
         ):
@@ -153,19 +159,11 @@ class _RobotSimulator:
                 poses=np.zeros((1, 3)),
                 angles=wheels.angles,
                 targets=target,
-                steering=self._measured(steering, rng),
-                drive=None if config.robot.drive.direct else config.robot.drive,
+                steering=None if direct else config.steering.measured(steering[self._steps :: self._steps], rng),
+                drive=None if direct else config.robot.drive,
             )
             yield self._scanned(run, wheels, steering, motion, rng)
             started_at += float(motion.times[-1]) + PAUSE
-
-    def _motion(self, command: Command, session: RobotSession, rng: np.random.Generator) -> CommandedMotion:
-        config = self.config
-        way = session.distance if command.speed else None
-        return command_motion(
-            command, way, config.commands.turn_duration, config.profile, config.link, config.sample_period,
-            config.settle, rng,
-        )  # fmt: skip
 
     def _steered(
         self, commands: Sequence[Command], motions: Sequence[CommandedMotion]
@@ -179,12 +177,6 @@ class _RobotSimulator:
             angles.append(config.steering.angles(before, wanted, len(rested[-1].times) * self._steps))
             before = angles[-1][-1]
         return angles, rested
-
-    def _measured(self, steering: Array, rng: np.random.Generator) -> Array | None:
-        """Measured steering angles (F, S), rad, at the samples' ends; None for a robot without any."""
-        if self.config.robot.drive.direct:
-            return None
-        return self.config.steering.measured(steering[self._steps :: self._steps], rng)
 
     @property
     def _steps(self) -> int:
@@ -207,10 +199,17 @@ class _RobotSimulator:
     ) -> _Recorded:
         """The run with its scans; its poses are the design model's odometry until SLAM replaces them."""
         config, plan = self.config, self.plan
-        log = _true_log(run, wheels.wheel_angles, steering)
+        # Log of the true wheels at every millisecond.
+        ends = TRUE_STEP * np.arange(len(wheels.wheel_angles))
+        rates = np.diff(wheels.wheel_angles, axis=0) / TRUE_STEP
+        steered = None if run.drive is None else steering[1:]
+        angles = wheels.wheel_angles[1:]
+        log = WheelLog(ends[1:], rates, np.zeros(3), ends, angles, run.started_at, run.session, steered, run.drive)
         path = self.robot.poses(log)
         seen = self.robot.reported(log)  # the LIDAR's poses: with the effects on the reference
-        start = _placed(plan.start, config.placement, rng)
+        # The robot is put on its mark by hand.
+        spread = [config.placement.position, config.placement.position, math.radians(config.placement.heading_deg)]
+        start = plan.start + spread * rng.standard_normal(3)
         places = _places(compose(start, path), self.robot.model.robot.mount)
         plan.check_path(places, log.stamps, config.radius, f"run {run.id}")
         stamps = scan_stamps(config.lidar, float(run.times[-1]), rng)
@@ -259,19 +258,3 @@ def _missed_targets(runs: Sequence[_Recorded]) -> tuple[str, ...]:
         f"in {len(missed)} of {len(runs)} runs the wheels do not follow their targets: in {name} they turn "
         f"{share:.0%} of their target angles; check motor and controller",
     )
-
-
-def _true_log(run: Trajectory, wheel_angles: Array, steering: Array) -> WheelLog:
-    """Log of the true wheels from their angles (K + 1, N) and steering angles (K + 1, S), rad, at every millisecond."""
-    stamps = TRUE_STEP * np.arange(len(wheel_angles))
-    rates = np.diff(wheel_angles, axis=0) / TRUE_STEP
-    steered = None if run.drive is None else steering[1:]
-    return WheelLog(
-        stamps[1:], rates, np.zeros(3), stamps, wheel_angles[1:], run.started_at, run.session, steered, run.drive
-    )
-
-
-def _placed(mark: Array, placement: Placement, rng: np.random.Generator) -> Array:
-    """True start pose (3,) of a robot that is put on its mark by hand."""
-    spread = [placement.position, placement.position, math.radians(placement.heading_deg)]
-    return mark + spread * rng.standard_normal(3)

@@ -21,7 +21,6 @@ from omnibench.errors import ConfigError, DataError
 from omnibench.files import TableFormat, refuse_existing, remove, resolved, write_text
 from omnibench.progress import Reporter, no_progress
 from omnibench.robot.calibration import Calibration, read_calibration
-from omnibench.robot.kinematics import Array
 from omnibench.simulate.source import SimulationSource, check_effect_options, read_simulation
 from omnibench.simulate.truth import Simulation, reference_noise
 from omnibench.slam.slam_request import SlamAccuracy, slam_accuracy
@@ -40,15 +39,26 @@ def simulate_like(dataset: Dataset, calibration: Calibration, noise_seed: int | 
     poses = [np.vstack([run.start, path[1:]]) for run, path in zip(dataset.trajectories, reported, strict=True)]
     how = "without noise"
     if noise_seed is not None:
-        poses = _with_noise(dataset, poses, calibration, noise_seed)
+        noise = calibration.noise
+        if noise is None or not any(noise.model_dump().values()):
+            raise DataError(
+                f"calibration {calibration.name!r} has no noise of the reference; leave --noise out, or calibrate with "
+                "trajectory_ml, which estimates it"
+            )
+        rng = np.random.default_rng(noise_seed)
+        stamps = [run.pose_times for run in dataset.trajectories]
+        poses = [path + reference_noise(noise, times, rng) for path, times in zip(poses, stamps, strict=True)]
         how = f"with its noise, seed {noise_seed}"
     runs = zip(dataset.trajectories, poses, strict=True)
+    names = ", ".join(term.name for term in calibration.effects)
+    model = f"calibration {calibration.name}" + (f" with {names}" if names else "")
+    how_made = f"Simulated like {dataset.name} by {model}, {how}: its wheels, and poses as the model has them."
     simulated = make_dataset(
         dataset.name,
         dataset.robot,
         dataset.sample_period,
         [replace(run, poses=path, pose_covariances=None) for run, path in runs],
-        description=_described(dataset, calibration, how),
+        description=f"{how_made} {dataset.description}".strip(),
         source=f"simulated by omnibench from the wheels of {dataset.name}"
         + (f" ({dataset.source})" if dataset.source else ""),
         licence=dataset.licence,
@@ -59,25 +69,6 @@ def simulate_like(dataset: Dataset, calibration: Calibration, noise_seed: int | 
     if dataset.scans is not None:
         warnings.append("the recording's scans are left out: they show where its robot was")
     return replace(simulated, warnings=(*simulated.warnings, *warnings))
-
-
-def _with_noise(dataset: Dataset, poses: list[Array], calibration: Calibration, seed: int) -> list[Array]:
-    noise = calibration.noise
-    if noise is None or not any(noise.model_dump().values()):
-        raise DataError(
-            f"calibration {calibration.name!r} has no noise of the reference; leave --noise out, or calibrate with "
-            "trajectory_ml, which estimates it"
-        )
-    rng = np.random.default_rng(seed)
-    stamps = [run.pose_times for run in dataset.trajectories]
-    return [path + reference_noise(noise, times, rng) for path, times in zip(poses, stamps, strict=True)]
-
-
-def _described(dataset: Dataset, calibration: Calibration, how: str) -> str:
-    names = ", ".join(term.name for term in calibration.effects)
-    model = f"calibration {calibration.name}" + (f" with {names}" if names else "")
-    how_made = f"Simulated like {dataset.name} by {model}, {how}: its wheels, and poses as the model has them."
-    return f"{how_made} {dataset.description}".strip()
 
 
 ACCURACY_FILE = "slam_accuracy.json"
@@ -125,7 +116,18 @@ class SimulationRequest:
         elif self.model is None:
             raise ConfigError(f"--like {self.like}: say with --model CALIBRATION by which model")
         else:
-            self._check_like()
+            assert self.like is not None
+            given = (
+                (f"CONFIG {self.config}", self.config is not None),
+                ("--truth", self.truth is not None),
+                ("--dataset", self.dataset is not None),
+                ("--effect", bool(self.effects)),
+            )
+            _refuse(given, "does not go with --like, which takes all from the recording and the calibration")
+            if self.seed is not None and not self.noise:
+                raise ConfigError("--seed: is for --noise, which is not asked for; add --noise, or leave --seed out")
+            if resolved(self.output) == resolved(self.like):
+                raise ConfigError(f"-o {self.output}: is the recording itself; name another folder")
         if self.truth is not None and resolved(self.truth).is_relative_to(resolved(self.output)):
             raise ConfigError("--truth: must be a folder apart from the data set's")
 
@@ -148,7 +150,10 @@ class SimulationRequest:
         """
         check_dataset_folder(self.output)
         refuse_existing(self.output, force=self.force, folders=True)
-        refuse_existing(*self._truth_files, force=self.force)
+        refuse_existing(
+            *([] if self.truth is None else [self.truth / name for name in (TRUTH_FILE, POSES_FILE, ACCURACY_FILE)]),
+            force=self.force,
+        )
         if self.config is None:
             assert self.like is not None
             assert self.model is not None
@@ -164,11 +169,6 @@ class SimulationRequest:
             self._write_truth(self.truth, simulation, accuracy)
         return WrittenSimulation(simulation.dataset, simulation, accuracy)
 
-    @property
-    def _truth_files(self) -> list[Path]:
-        """Files of a truth that would be replaced."""
-        return [] if self.truth is None else [self.truth / name for name in (TRUTH_FILE, POSES_FILE, ACCURACY_FILE)]
-
     def _write_truth(self, folder: Path, simulation: Simulation, accuracy: SlamAccuracy | None) -> None:
         write_text(folder / TRUTH_FILE, to_yaml(simulation.truth))
         if accuracy is None:
@@ -177,20 +177,6 @@ class SimulationRequest:
             return
         write_true_poses(folder, simulation.paths)
         write_text(folder / ACCURACY_FILE, to_json(accuracy) + "\n")
-
-    def _check_like(self) -> None:
-        assert self.like is not None
-        given = (
-            (f"CONFIG {self.config}", self.config is not None),
-            ("--truth", self.truth is not None),
-            ("--dataset", self.dataset is not None),
-            ("--effect", bool(self.effects)),
-        )
-        _refuse(given, "does not go with --like, which takes all from the recording and the calibration")
-        if self.seed is not None and not self.noise:
-            raise ConfigError("--seed: is for --noise, which is not asked for; add --noise, or leave --seed out")
-        if resolved(self.output) == resolved(self.like):
-            raise ConfigError(f"-o {self.output}: is the recording itself; name another folder")
 
 
 def _refuse(options: Iterable[tuple[str, bool]], why: str) -> None:

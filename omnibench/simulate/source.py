@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -138,31 +138,24 @@ def read_simulation(path: Path | str, dataset: str | None = None) -> SimulationS
     model = ComparedData if "calibrators" in content else SimulationConfig
     config = validate(model, content, str(path), path.resolve().parent)
     sources = {name: source.simulate for name, source in config.datasets.items()}
-    name, chosen = _chosen(sources, dataset, str(path))
-    return SimulationSource(name, chosen, config.description, config.plugins)
+    simulated = {key: config for key, config in sources.items() if config is not None}
+    if dataset is not None and dataset in sources and dataset not in simulated:
+        raise ConfigError(f"{path}: data set {dataset!r} is not simulated; name its folder in place of the config")
+    if dataset is not None and dataset not in simulated:
+        raise UnknownNameError("simulated data set", dataset, simulated, str(path))
+    if not simulated:
+        raise ConfigError(f"{path}: no simulated data set in it; name the folder of a data set")
+    if dataset is None and len(simulated) > 1:
+        known = ", ".join(sorted(simulated))
+        raise ConfigError(f"{path}: several simulated data sets; choose one with --dataset: {known}")
+    name = dataset or next(iter(simulated))
+    return SimulationSource(name, simulated[name], config.description, config.plugins)
 
 
 def check_effect_options(given: Sequence[str]) -> None:
     """Raise UnknownNameError for an ``--effect`` that is not known; to be called once the plug-ins are loaded."""
     for text in given:
         effects.entry(_effect(text).name, f"--effect {text}")
-
-
-def _chosen(
-    sources: Mapping[str, FlowerConfig | RobotConfig | None], name: str | None, place: str
-) -> tuple[str, FlowerConfig | RobotConfig]:
-    simulated = {key: config for key, config in sources.items() if config is not None}
-    if name is not None and name in sources and name not in simulated:
-        raise ConfigError(f"{place}: data set {name!r} is not simulated; name its folder in place of the config")
-    if name is not None and name not in simulated:
-        raise UnknownNameError("simulated data set", name, simulated, place)
-    if not simulated:
-        raise ConfigError(f"{place}: no simulated data set in it; name the folder of a data set")
-    if name is None and len(simulated) > 1:
-        known = ", ".join(sorted(simulated))
-        raise ConfigError(f"{place}: several simulated data sets; choose one with --dataset: {known}")
-    name = name or next(iter(simulated))
-    return name, simulated[name]
 
 
 def _effect(text: str) -> EffectTerm:

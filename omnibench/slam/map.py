@@ -129,7 +129,20 @@ class ScanMap:
 
     def add(self, lines: Lines, pose: Array, keyframe: int) -> int:
         """Add the new part of a scan's lines, seen from a pose (3,), if it is large enough; return how many points."""
-        seen = self._sampled(lines, pose, keyframe)
+        counts = np.maximum(1, np.ceil(2 * lines.half_lengths / self.spacing).astype(int))
+        line = np.repeat(np.arange(len(counts)), counts)
+        place = np.arange(len(line)) - np.repeat(np.cumsum(counts) - counts, counts)
+        along = ((2 * place + 1) / counts[line] - 1) * lines.half_lengths[line]
+        tangents = np.column_stack([-lines.normals[:, 1], lines.normals[:, 0]])[line]
+        turn = rotation(pose[2])[:2, :2].T
+        seen = Surface(
+            centres=pose[:2] + (lines.centres[line] + along[:, None] * tangents) @ turn,
+            normals=lines.normals[line] @ turn,
+            line=self._lines + line,
+            rays=lines.rays[line],
+            tilt_variances=lines.tilt_variances[line],
+            keyframe=np.full(len(line), keyframe),
+        )
         new = np.ones(len(seen.centres), dtype=bool)
         if len(self) and len(new):
             near, distance = self.nearest(seen.centres)
@@ -142,7 +155,16 @@ class ScanMap:
         self.surface = Surface(
             *(np.concatenate([getattr(self.surface, name), getattr(fresh, name)]) for name in _FIELDS)
         )
-        self._rebuild()
+        centres, normals = self.surface.centres, self.surface.normals
+        crosses = np.zeros((len(centres), 5, 3))
+        crosses[:, :, :2] = centres[:, None]
+        step = _CROSS * np.column_stack([-normals[:, 1], normals[:, 0]])
+        crosses[:, 1, :2] += step
+        crosses[:, 2, :2] -= step
+        crosses[:, 3, 2], crosses[:, 4, 2] = _CROSS, -_CROSS
+        self._cloud = small_gicp.PointCloud(crosses.reshape(-1, 3))
+        self._tree = small_gicp.KdTree(self._cloud)
+        small_gicp.estimate_normals(self._cloud, self._tree, 5)
         return int(new.sum())
 
     def merge_oldest(self) -> None:
@@ -180,34 +202,6 @@ class ScanMap:
         turned = np.arctan2(transform[1, 0], transform[0, 0]) - start[2]
         heading = start[2] + turned - 2 * np.pi * np.round(turned / (2 * np.pi))
         return np.array([transform[0, 3], transform[1, 3], heading])
-
-    def _sampled(self, lines: Lines, pose: Array, keyframe: int) -> Surface:
-        counts = np.maximum(1, np.ceil(2 * lines.half_lengths / self.spacing).astype(int))
-        line = np.repeat(np.arange(len(counts)), counts)
-        place = np.arange(len(line)) - np.repeat(np.cumsum(counts) - counts, counts)
-        along = ((2 * place + 1) / counts[line] - 1) * lines.half_lengths[line]
-        tangents = np.column_stack([-lines.normals[:, 1], lines.normals[:, 0]])[line]
-        turn = rotation(pose[2])[:2, :2].T
-        return Surface(
-            centres=pose[:2] + (lines.centres[line] + along[:, None] * tangents) @ turn,
-            normals=lines.normals[line] @ turn,
-            line=self._lines + line,
-            rays=lines.rays[line],
-            tilt_variances=lines.tilt_variances[line],
-            keyframe=np.full(len(line), keyframe),
-        )
-
-    def _rebuild(self) -> None:
-        centres, normals = self.surface.centres, self.surface.normals
-        crosses = np.zeros((len(centres), 5, 3))
-        crosses[:, :, :2] = centres[:, None]
-        step = _CROSS * np.column_stack([-normals[:, 1], normals[:, 0]])
-        crosses[:, 1, :2] += step
-        crosses[:, 2, :2] -= step
-        crosses[:, 3, 2], crosses[:, 4, 2] = _CROSS, -_CROSS
-        self._cloud = small_gicp.PointCloud(crosses.reshape(-1, 3))
-        self._tree = small_gicp.KdTree(self._cloud)
-        small_gicp.estimate_normals(self._cloud, self._tree, 5)
 
 
 def _upright(points: Array) -> Array:

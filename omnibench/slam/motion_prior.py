@@ -64,7 +64,7 @@ def smoothed(odometry: Callable[[Array], Array], times: Array, duration: float) 
     delays = np.maximum(times[:, None] + delays, 0.0) - times[:, None]  # (S, count)
     stamps, place = np.unique(np.column_stack([times, times[:, None] + delays]), return_inverse=True)
     poses = odometry(stamps)[place.reshape(len(times), -1)]
-    motions = _since(poses[:, 0], poses[:, 1:])
+    motions = unit_twist(relative(poses[:, 0][:, None], poses[:, 1:]))
     basis = np.concatenate([np.ones((*delays.shape, 1)), _powers(delays, _DEGREE)], axis=2)
     inverse = np.linalg.pinv(basis)
     fitted = inverse @ motions
@@ -85,11 +85,6 @@ def smoothed(odometry: Callable[[Array], Array], times: Array, duration: float) 
 def _powers(delays: Array, count: int) -> Array:
     """The first ``count`` powers of delays (..., n), from 1 on: (..., n, count)."""
     return delays[..., None] ** np.arange(1, count + 1)
-
-
-def _since(first: Array, poses: Array) -> Array:
-    """Poses (S, n, 3) as motions since the poses (S, 3)."""
-    return unit_twist(relative(first[:, None], poses))
 
 
 # The study tests/studies/constants_slam.py varies these numbers by 0.5 and 2. In three rooms SLAM's median error

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
@@ -124,7 +124,17 @@ def with_paths(dataset: Dataset, paths: Sequence[SlamPath]) -> Dataset:
         simulated=dataset.simulated,
         scans=dataset.scans,
     )
-    return replace(made, warnings=made.warnings + _warnings(dataset.trajectories, paths))
+    # One sentence for a problem that several runs have.
+    by_problem: dict[str, list[tuple[str, PathWarning]]] = {}
+    for trajectory, path in zip(dataset.trajectories, paths, strict=True):
+        for warning in path.warnings:
+            by_problem.setdefault(warning.problem, []).append((trajectory.id, warning))
+    warnings = (
+        f"SLAM: {merged_warning([warning for _, warning in concerned])}: {len(concerned)} of {len(paths)} runs, "
+        f"e.g. {', '.join(run for run, _ in concerned[:3])}"
+        for concerned in by_problem.values()
+    )
+    return replace(made, warnings=(*made.warnings, *warnings))
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,40 +185,21 @@ def _locate(run: _Run, _: Reporter) -> SlamPath:
             raise DataError("SLAM: no scan at or after t = 0")
         if scans.times[0] <= _AT_START:
             return run_slam(scans, run.scanner, run.options, trajectory.start, odometry)
-        before = _before_first_scan(odometry, float(scans.times[0]))
-        deviations = odometry_deviations(before.driven, run.options.odometry_error)
-        path = run_slam(scans, run.scanner, run.options, before.end, odometry, deviations)
-        return _from_start(path, trajectory.start, before)
+        # The way along x and y and the turn before the first scan, m, m, rad; motion back and forth adds up.
+        until = float(scans.times[0])
+        poses = odometry(np.linspace(0.0, until, 2 + int(until / _STEP)))
+        driven = np.sum([np.abs(relative(one, other)) for one, other in pairwise(poses)], axis=0)
+        deviations = odometry_deviations(driven, run.options.odometry_error)
+        path = run_slam(scans, run.scanner, run.options, poses[-1], odometry, deviations)
     except DataError as error:
         raise DataError(f"data set {run.dataset}: trajectory {trajectory.id}: {error}") from None
-
-
-@dataclass(frozen=True, eq=False)
-class _Before:
-    """The motion from t = 0 to the first scan.
-
-    driven (3,): way along x and y and turn, m, m, rad; motion back and forth adds up. end (3,): the pose there.
-    """
-
-    driven: Array
-    end: Array
-
-
-def _before_first_scan(odometry: Callable[[Array], Array], until: float) -> _Before:
-    poses = odometry(np.linspace(0.0, until, 2 + int(until / _STEP)))
-    moved = [np.abs(relative(one, other)) for one, other in pairwise(poses)]
-    return _Before(np.sum(moved, axis=0), poses[-1])
-
-
-def _from_start(path: SlamPath, start: Array, before: _Before) -> SlamPath:
-    """The path with the start pose at t = 0 in front, for a run whose first scan comes later."""
-    far = length(before.driven) > _FAR
+    # The start pose at t = 0 stands before the path of a run whose first scan comes later.
     late = "the robot moves before the first scan, whose pose is therefore as uncertain as the odometry"
     return replace(
         path,
-        warnings=(*path.warnings, PathWarning(late)) if far else path.warnings,
+        warnings=(*path.warnings, PathWarning(late)) if length(driven) > _FAR else path.warnings,
         times=np.concatenate([[0.0], path.times]),
-        poses=np.vstack([start, path.poses]),
+        poses=np.vstack([trajectory.start, path.poses]),
         covariances=np.concatenate([FLOOR[None], path.covariances]),
         matched=np.concatenate([path.matched[:1], path.matched]),
     )
@@ -217,16 +208,3 @@ def _from_start(path: SlamPath, start: Array, before: _Before) -> SlamPath:
 def _with_path(trajectory: Trajectory, path: SlamPath) -> Trajectory:
     symmetric = (path.covariances + np.swapaxes(path.covariances, 1, 2)) / 2  # data sets hold symmetric covariances
     return replace(trajectory, pose_times=path.times, poses=path.poses, pose_covariances=symmetric)
-
-
-def _warnings(trajectories: Sequence[Trajectory], paths: Sequence[SlamPath]) -> tuple[str, ...]:
-    """The warnings about all paths, one sentence for a problem that several runs have."""
-    by_problem: dict[str, list[tuple[str, PathWarning]]] = {}
-    for trajectory, path in zip(trajectories, paths, strict=True):
-        for warning in path.warnings:
-            by_problem.setdefault(warning.problem, []).append((trajectory.id, warning))
-    return tuple(
-        f"SLAM: {merged_warning([warning for _, warning in concerned])}: {len(concerned)} of {len(paths)} runs, "
-        f"e.g. {', '.join(run for run, _ in concerned[:3])}"
-        for concerned in by_problem.values()
-    )

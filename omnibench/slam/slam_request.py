@@ -305,7 +305,9 @@ class SlamRequest:
             check_dataset_folder(self.output)
             going_on = any(_paths_beside(self.output).glob("*.json"))  # stopped before the data set was complete
             refuse_existing(self.output, force=self.force or going_on, folders=True)
-        local = _has_local_terms(model)
+        # Terms of plug-ins, whose classes other processes do not know and no path's key covers.
+        terms = () if model is None else model.terms
+        local = not all(type(term.effect).__module__.startswith("omnibench.") for term in terms)
         folder = None if local or self.output is None else _paths_beside(self.output)
         with _kept(folder):
             workers = 1 if local else _WORKERS
@@ -335,12 +337,6 @@ class SlamRequest:
         calibration = read_calibration(self.model)
         calibration.check_wheels(recorded.robot, f"the data set {recorded.name}", place=f"--model {self.model}: ")
         return calibration.model
-
-
-def _has_local_terms(model: OdometryModel | None) -> bool:
-    """True if terms come from plug-ins, whose classes other processes do not know and no path's key covers."""
-    terms = () if model is None else model.terms
-    return not all(type(term.effect).__module__.startswith("omnibench.") for term in terms)
 
 
 def _paths_beside(output: Path) -> Path:

@@ -56,7 +56,21 @@ def run_slam(
     start pose along the robot's axes, m, m, rad; default: it is exact. DataError in one line: no scan, or one without
     returns.
     """
-    _check(scans, scanner, options, odometry)
+    if len(scans.times) == 0:
+        raise DataError("SLAM: there is no scan")
+    if scans.ranges.shape != (len(scans.times), scanner.rays):
+        raise DataError(
+            f"SLAM: ranges have shape {scans.ranges.shape}, expected {(len(scans.times), scanner.rays)}: scans, rays"
+        )
+    walls = scanner.valid(scans.ranges) & ~scanner.on_floor(scans.ranges)
+    for index in np.flatnonzero(~walls.any(axis=1))[:1]:
+        floor = ", but of the floor" if scanner.valid(scans.ranges[index]).any() else ""
+        raise DataError(
+            f"SLAM: the scan at {scans.times[index]:g} s is empty: no range from {scanner.range_min:g} to "
+            f"{scanner.range_max:g} m{floor}; leave it out"
+        )
+    if options.start == "odometry" and odometry is None:
+        raise DataError("SLAM: start is odometry, but there is none; choose start: last_pose")
     duration = float(scanner.delays[-1])
     motion: MotionPrior = LastPosePrior(scans.times, duration, options)
     if options.start == "odometry" and odometry is not None:
@@ -66,12 +80,14 @@ def run_slam(
     slam = _Slam(scanner, noise, options, motion, np.asarray(start, dtype=float), errors)
     located = [slam.begin(scans.ranges[0])]
     located += [slam.go_on(number, ranges) for number, ranges in enumerate(scans.ranges[1:], 1)]
+    # Among the times of scans several may be equal.
+    stamps, place = np.unique(scans.times, return_inverse=True)
     return SlamPath(
         scans.times,
         np.array([match.pose for match, _ in located]),
         np.array([covariance for _, covariance in located]),
         np.array([match.matched for match, _ in located]),
-        path_warnings([match for match, _ in located], options, _at(odometry, scans.times)),
+        path_warnings([match for match, _ in located], options, None if odometry is None else odometry(stamps)[place]),
     )
 
 
@@ -125,18 +141,12 @@ class _Slam:
         match = refine(self._map, scan, pose, predicted.start, options)
         covariance = self._errors.step(match, predicted.deviations, deviations)
         self._pose = match.pose
-        if self._is_keyframe(match, deviations):
-            self._add(scan, deviations)
-        return match, covariance
-
-    def _is_keyframe(self, match: Match, deviations: Array) -> bool:
-        """True if the robot has come far enough for new surfaces; a scan that may be skewed waits while it can.
-
-        deviations (3,): standard deviations of the twist within the scan, m/s, m/s, rad/s.
-        """
+        # New surfaces once the robot has come far enough; a scan that may be skewed waits while it can.
         x, y, turned = match.pose - self._keyframe
         far = np.hypot(x, y) > self._options.keyframe_distance or abs(turned) > self._options.keyframe_angle
-        return bool(far and (match.matched < _NEEDED or not self._skews(deviations))) or not self._map.is_usable
+        if bool(far and (match.matched < _NEEDED or not self._skews(deviations))) or not self._map.is_usable:
+            self._add(scan, deviations)
+        return match, covariance
 
     def _skews(self, twist: Array) -> bool:
         """True if an error (3,) of the twist during a scan, m/s, m/s, rad/s, matters."""
@@ -158,29 +168,3 @@ class _Slam:
         if self._errors.keyframes > _KEYFRAMES:
             self._map.merge_oldest()
             self._errors.merge_oldest()
-
-
-def _at(odometry: Callable[[Array], Array] | None, times: Array) -> Array | None:
-    """Poses (S, 3) of the odometry at times (S,), among which several may be equal."""
-    stamps, place = np.unique(times, return_inverse=True)
-    return None if odometry is None else odometry(stamps)[place]
-
-
-def _check(
-    scans: TrajectoryScans, scanner: Scanner, options: SlamOptions, odometry: Callable[[Array], Array] | None
-) -> None:
-    if len(scans.times) == 0:
-        raise DataError("SLAM: there is no scan")
-    if scans.ranges.shape != (len(scans.times), scanner.rays):
-        raise DataError(
-            f"SLAM: ranges have shape {scans.ranges.shape}, expected {(len(scans.times), scanner.rays)}: scans, rays"
-        )
-    walls = scanner.valid(scans.ranges) & ~scanner.on_floor(scans.ranges)
-    for index in np.flatnonzero(~walls.any(axis=1))[:1]:
-        floor = ", but of the floor" if scanner.valid(scans.ranges[index]).any() else ""
-        raise DataError(
-            f"SLAM: the scan at {scans.times[index]:g} s is empty: no range from {scanner.range_min:g} to "
-            f"{scanner.range_max:g} m{floor}; leave it out"
-        )
-    if options.start == "odometry" and odometry is None:
-        raise DataError("SLAM: start is odometry, but there is none; choose start: last_pose")

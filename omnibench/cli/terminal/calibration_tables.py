@@ -18,13 +18,12 @@ from omnibench.fit.calibrate import CalibrationRun
 from omnibench.fit.certify import QUADRATURE, CertifiedCalibration
 from omnibench.fit.evaluate import Evaluation
 from omnibench.fit.geometry import WheelGeometry
-from omnibench.fit.identifiability import ParameterEstimate
 from omnibench.report.blocks import Cell, Column, Row, Table
 from omnibench.report.numbers import noise_in_words
 from omnibench.robot.calibration import Calibration, HeldOutVerdict
 from omnibench.robot.export.c_header import left_out
 from omnibench.robot.export.formats import export_calibration
-from omnibench.robot.kinematics import Robot, relative_deviations
+from omnibench.robot.kinematics import relative_deviations
 from omnibench.words import plural
 
 _NONE = "no interval"
@@ -68,7 +67,23 @@ def print_calibration(console: Console, run: CalibrationRun) -> None:
     calibration, result = run.calibration, run.result
     print_table(console, _matrix_table(run))
     if run.uncertainty is not None and run.uncertainty.parameters is not None:
-        print_table(console, _parameter_table(calibration.robot, run.uncertainty.parameters))
+        rows = []
+        geometry = WheelGeometry(calibration.robot, fitted_mount=True)
+        design = dict(zip(geometry.names, geometry.start, strict=True))
+        for parameter in run.uncertainty.parameters:
+            start = design[parameter.name]
+            factor, decimals, unit = (math.degrees(1.0), 3, "deg") if parameter.unit == "rad" else (1.0, 5, "m")
+            interval = Cell("", parameter.untold)
+            if parameter.low is not None and parameter.high is not None:
+                low, high = (f"{factor * bound:.{decimals}f}" for bound in (parameter.low, parameter.high))
+                interval = Cell("", f"{low} to {high} {unit}")
+            values = (f"{factor * value:.{decimals}f} {unit}" for value in (start, parameter.value))
+            deviation = _deviation(float(relative_deviations(np.array(parameter.value), np.array(start))))
+            if parameter.unit == "rad":  # an angle's zero is a convention, so that no share of it means anything
+                deviation = f"{math.degrees(parameter.value - start):+.3f} deg"
+            rows.append(Row.of(parameter.name, *values, deviation, interval))
+        columns = (Column("parameter", numeric=False), *map(Column, ("design", "fitted", "deviation", "95 %")))
+        print_table(console, Table("physical parameters", columns, tuple(rows)))
     if run.uncertainty is not None:
         console.print(f"95 % intervals: {run.uncertainty.source}", soft_wrap=True)
         if run.intervals is not None:
@@ -141,26 +156,6 @@ def _intervals(run: CalibrationRun) -> Iterator[tuple[str, ElementIntervals]]:
         yield "95 %", run.uncertainty.intervals
     if run.intervals is not None:
         yield "95 %, resampled", run.intervals
-
-
-def _parameter_table(robot: Robot, parameters: Sequence[ParameterEstimate]) -> Table:
-    rows = []
-    geometry = WheelGeometry(robot, fitted_mount=True)
-    design = dict(zip(geometry.names, geometry.start, strict=True))
-    for parameter in parameters:
-        start = design[parameter.name]
-        factor, decimals, unit = (math.degrees(1.0), 3, "deg") if parameter.unit == "rad" else (1.0, 5, "m")
-        interval = Cell("", parameter.untold)
-        if parameter.low is not None and parameter.high is not None:
-            low, high = (f"{factor * bound:.{decimals}f}" for bound in (parameter.low, parameter.high))
-            interval = Cell("", f"{low} to {high} {unit}")
-        values = (f"{factor * value:.{decimals}f} {unit}" for value in (start, parameter.value))
-        deviation = _deviation(float(relative_deviations(np.array(parameter.value), np.array(start))))
-        if parameter.unit == "rad":  # an angle's zero is a convention, so that no share of it means anything
-            deviation = f"{math.degrees(parameter.value - start):+.3f} deg"
-        rows.append(Row.of(parameter.name, *values, deviation, interval))
-    columns = (Column("parameter", numeric=False), *map(Column, ("design", "fitted", "deviation", "95 %")))
-    return Table("physical parameters", columns, tuple(rows))
 
 
 def print_evaluation(console: Console, evaluation: Evaluation) -> None:

@@ -9,7 +9,6 @@ from omnibench.cli.terminal.console import print_ending
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from omnibench.data.checks.finding import Finding
     from omnibench.fit.check.checking import CheckReport
 
 _NEEDED = {True: "a calibration is needed", False: "a calibration is hardly needed", None: ""}
@@ -22,7 +21,12 @@ def print_check(console: Console, checked: CheckReport, then: str) -> None:
     """
     console.print(f"{checked.verdict.upper()}: {checked.sentence}.", soft_wrap=True)
     for finding in checked.findings:
-        _print_finding(console, finding)
+        console.print()
+        console.print(f"{finding.severity}: {finding.what} [{finding.where}]", soft_wrap=True)
+        if finding.fix.startswith("omnibench "):
+            console.out(f"  {finding.fix}", highlight=False)
+        elif finding.fix:
+            console.print(f"  {finding.fix}", soft_wrap=True)
     if checked.gain:
         needed = _NEEDED[checked.needed]
         console.print()
@@ -35,15 +39,6 @@ def print_check(console: Console, checked: CheckReport, then: str) -> None:
     else:
         words = _words(then)
         print_ending("nothing stands in the way", f"{words[1]} it", *words)
-
-
-def _print_finding(console: Console, finding: Finding) -> None:
-    console.print()
-    console.print(f"{finding.severity}: {finding.what} [{finding.where}]", soft_wrap=True)
-    if finding.fix.startswith("omnibench "):
-        console.out(f"  {finding.fix}", highlight=False)
-    elif finding.fix:
-        console.print(f"  {finding.fix}", soft_wrap=True)
 
 
 def _words(command: str) -> list[str]:

@@ -47,8 +47,25 @@ def print_discovery(console: Console, discovery: Discovery, folder: Path) -> Non
         print_table(console, in_brief(table))
     for line in _remarks(discovery):
         console.print(line, width=width)
-    _print_files(console, discovery, folder)
-    _print_ending(discovery, folder)
+    calibration = f"extended calibration: {folder / 'model.yaml'}"
+    if not discovery.extends:
+        calibration = f"plain calibration, as nothing was added: {folder / 'plain.yaml'}"
+    console.print(calibration, soft_wrap=True)
+    for number, experiment in enumerate(discovery.experiments, 1):
+        if experiment.config:
+            console.print(f"the runs to drive, as a config: {folder / experiment_file(number)}", soft_wrap=True)
+    console.print(f"report: {folder / 'report.html'}", soft_wrap=True)
+    # Run the extended model, drive what separates look-alikes, or keep the plain matrix.
+    if any(experiment.runs for experiment in discovery.experiments):
+        drive = "drive the runs above, import them with --set train=*, join both recordings and discover again"
+        join = ("omnibench", "import", "dataset", "RECORDED", "--set", "join=NEW", "-o", "BOTH")
+        print_ending("more than one effect explains these data", drive, *join)
+    elif discovery.extends:
+        use = ("omnibench", "export", folder / CALIBRATION_FILES["extended"], "--to", "c_header")
+        print_ending("the extended calibration holds what the matrix lacked", "use it on the robot", *use)
+    else:
+        use = ("omnibench", "export", folder / CALIBRATION_FILES["plain"], "--to", "ros2_controllers")
+        print_ending("nothing was added to the matrix", "use the plain calibration", *use)
 
 
 def _tables(discovery: Discovery) -> Iterator[Table]:
@@ -97,28 +114,3 @@ def _first(lines: Sequence[str], head: str, kind: str) -> Iterator[str]:
     yield from (f"{head}{line}" for line in lines[:_LINES])
     if len(lines) > _LINES:
         yield f"{plural(len(lines) - _LINES, f'more {kind}')} in the report"
-
-
-def _print_files(console: Console, discovery: Discovery, folder: Path) -> None:
-    calibration = f"extended calibration: {folder / 'model.yaml'}"
-    if not discovery.extends:
-        calibration = f"plain calibration, as nothing was added: {folder / 'plain.yaml'}"
-    console.print(calibration, soft_wrap=True)
-    for number, experiment in enumerate(discovery.experiments, 1):
-        if experiment.config:
-            console.print(f"the runs to drive, as a config: {folder / experiment_file(number)}", soft_wrap=True)
-    console.print(f"report: {folder / 'report.html'}", soft_wrap=True)
-
-
-def _print_ending(discovery: Discovery, folder: Path) -> None:
-    """Print the last sentence: run the extended model, drive what separates look-alikes, or keep the plain matrix."""
-    if any(experiment.runs for experiment in discovery.experiments):
-        drive = "drive the runs above, import them with --set train=*, join both recordings and discover again"
-        join = ("omnibench", "import", "dataset", "RECORDED", "--set", "join=NEW", "-o", "BOTH")
-        print_ending("more than one effect explains these data", drive, *join)
-    elif discovery.extends:
-        use = ("omnibench", "export", folder / CALIBRATION_FILES["extended"], "--to", "c_header")
-        print_ending("the extended calibration holds what the matrix lacked", "use it on the robot", *use)
-    else:
-        use = ("omnibench", "export", folder / CALIBRATION_FILES["plain"], "--to", "ros2_controllers")
-        print_ending("nothing was added to the matrix", "use the plain calibration", *use)

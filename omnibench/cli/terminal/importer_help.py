@@ -24,7 +24,7 @@ def importer_help(name: str, command: str) -> str:
     entry = importers.entry(name, "import")
     width = min(shutil.get_terminal_size().columns, _WIDEST)
     lines = [f"Usage: {command} {name} SOURCE -o DATASET [--set KEY=VALUE ...]", ""]
-    lines += [*_wrapped(_described(entry.cls), width), ""]
+    lines += [*_wrapped((inspect.getdoc(entry.cls) or "").replace("``", ""), width), ""]
     lines += _wrapped("Options, each set by --set KEY=VALUE, the value in YAML; a list is [a,b]:", width)
     schema = entry.options.model_json_schema(by_alias=True)
     for heading, fields in _groups(entry.options).items():
@@ -32,11 +32,6 @@ def importer_help(name: str, command: str) -> str:
         for key, field in fields.items():
             lines += _option(key, field, schema["properties"].get(key, {}), schema.get("$defs", {}), width)
     return "\n".join(lines)
-
-
-def _described(cls: type) -> str:
-    """The class's docstring, as it is written."""
-    return (inspect.getdoc(cls) or "").replace("``", "")
 
 
 def _wrapped(text: str, width: int) -> list[str]:

@@ -7,7 +7,7 @@ import math
 from rich.console import Console
 
 from omnibench.cli.terminal.tables import print_table
-from omnibench.fit.inspect import Inspection, ScansContent
+from omnibench.fit.inspect import Inspection
 from omnibench.report.recording.inspection_report import driven_by, identifiability_table, split_table
 from omnibench.words import plural
 
@@ -27,8 +27,14 @@ def print_inspection(console: Console, inspection: Inspection) -> None:
         f"({shortest:.3g} to {longest:.3g} ms), {_references(inspection)}",
         soft_wrap=True,
     )
-    if inspection.scans is not None:
-        _print_scans(console, inspection.scans)
+    if (scans := inspection.scans) is not None:
+        every = "" if scans.scan_period_s is None else f" every {1000 * scans.scan_period_s:.3g} ms"
+        console.print(
+            f"{plural(scans.scans, 'scan')}{every} in {plural(scans.trajectories, 'run')}; "
+            f"{plural(scans.rays, 'ray')} over {math.degrees(scans.field_of_view_rad):.0f} deg up to "
+            f"{scans.range_max_m:g} m, of which {scans.seen_share:.0%} measured something",
+            soft_wrap=True,
+        )
     print_table(console, split_table(inspection))
     shares = ", ".join(f"{share:.2g}" for share in inspection.driven_shares)
     what = driven_by(inspection)
@@ -48,13 +54,3 @@ def _references(inspection: Inspection) -> str:
         every = f"every {1000 * inspection.pose_period_s:.3g} ms"
         words = [f"{plural(inspection.reference_poses, 'reference pose')} {every}", *words]
     return ", ".join(words)
-
-
-def _print_scans(console: Console, scans: ScansContent) -> None:
-    every = "" if scans.scan_period_s is None else f" every {1000 * scans.scan_period_s:.3g} ms"
-    console.print(
-        f"{plural(scans.scans, 'scan')}{every} in {plural(scans.trajectories, 'run')}; "
-        f"{plural(scans.rays, 'ray')} over {math.degrees(scans.field_of_view_rad):.0f} deg up to "
-        f"{scans.range_max_m:g} m, of which {scans.seen_share:.0%} measured something",
-        soft_wrap=True,
-    )

@@ -96,20 +96,6 @@ def print_demonstration(console: Console, shown: Demonstration) -> None:
     print_played(console, shown.report, shown.simulated)
     if shown.report.taken != sum(shown.report.sent.values()) or not shown.report.sent["joint_states"]:
         return  # after a signal; what the node would have made of the rest is not known
-    print_table(console, _deviation_table(shown))
-    console.print(
-        f"odom against the batch odometry: {shown.batch_difference:.1e} (m, rad) at most; 0 messages of odom lost",
-        soft_wrap=True,
-    )
-    counts = {name: value for name, value in shown.health.counts.items() if value}
-    console.print("counted: " + ", ".join(f"{value} {name}" for name, value in counts.items()), soft_wrap=True)
-
-
-def _figure(value: float, decimals: int) -> str:
-    return "–" if math.isnan(value) else f"{value:.{decimals}f}"  # nothing was compared yet
-
-
-def _deviation_table(shown: Demonstration) -> Table:
     estimates = (
         ("odometry of the design matrix", shown.theoretical),
         (f"odom: {shown.calibration}", shown.calibrated),
@@ -126,7 +112,17 @@ def _deviation_table(shown: Demonstration) -> Table:
         Column("heading, RMS", "deg"),
         Column("position at the end", "m"),
     )
-    return Table(f"{shown.robot} against {shown.against}", columns, tuple(rows))
+    print_table(console, Table(f"{shown.robot} against {shown.against}", columns, tuple(rows)))
+    console.print(
+        f"odom against the batch odometry: {shown.batch_difference:.1e} (m, rad) at most; 0 messages of odom lost",
+        soft_wrap=True,
+    )
+    counts = {name: value for name, value in shown.health.counts.items() if value}
+    console.print("counted: " + ", ".join(f"{value} {name}" for name, value in counts.items()), soft_wrap=True)
+
+
+def _figure(value: float, decimals: int) -> str:
+    return "–" if math.isnan(value) else f"{value:.{decimals}f}"  # nothing was compared yet
 
 
 _PERIOD: Final = 0.25  # s between two updates of the line on a terminal; chosen
@@ -241,7 +237,8 @@ def listen(
                 if live:
                     live.update(view(statuses, console), refresh=True)
                     continue
-                for line in _json_lines(statuses) if as_json else _plain_lines(statuses):
+                lines = [json.dumps(json_document(status)) if as_json else plain_line(status) for status in statuses]
+                for line in lines or ([] if as_json else [_NO_ROBOT]):
                     console.print(Text(line), soft_wrap=True)
 
 
@@ -252,7 +249,13 @@ def view(statuses: Sequence[RobotStatus], console: Console) -> RenderableType:
     figures = render_table(_table(statuses, health=False), console.width)
     if console.measure(figures).maximum + _HEALTH_WIDTH <= console.width:
         return render_table(_table(statuses, health=True), console.width)
-    return Group(figures, *(Text(f"{status.robot}: {describe(status)}", style=_style(status)) for status in statuses))
+    return Group(
+        figures,
+        *(
+            Text(f"{status.robot}: {describe(status)}", style="dim" if status.presence == "left" else "")
+            for status in statuses
+        ),
+    )
 
 
 def describe(status: RobotStatus) -> str:
@@ -286,14 +289,6 @@ def plain_line(status: RobotStatus) -> str:
     return "; ".join([f"{status.robot}: {describe(status)}", *map(_plain_odometry, _streams(status))])
 
 
-def _plain_lines(statuses: Sequence[RobotStatus]) -> list[str]:
-    return [plain_line(status) for status in statuses] or [_NO_ROBOT]
-
-
-def _json_lines(statuses: Sequence[RobotStatus]) -> list[str]:
-    return [json.dumps(json_document(status)) for status in statuses]
-
-
 def _table(statuses: Sequence[RobotStatus], health: bool) -> Table:
     rows = []
     for status in statuses:
@@ -303,10 +298,6 @@ def _table(statuses: Sequence[RobotStatus], health: bool) -> Table:
             role: RowRole = "muted" if status.presence == "left" else "plain"
             rows.append(Row.of(name, *_cells(status.robot, stream, by_stamp=health), *words, role=role))
     return Table("", _COLUMNS if health else _COLUMNS[:-1], tuple(rows))
-
-
-def _style(status: RobotStatus) -> str:
-    return "dim" if status.presence == "left" else ""
 
 
 def _cells(robot: str, stream: OdometryStatus | None, by_stamp: bool) -> list[str]:

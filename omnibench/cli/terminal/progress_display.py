@@ -48,9 +48,21 @@ class ProgressDisplay:
         self._bars.stop()
 
     def __call__(self, event: Progress) -> None:
-        state = _state(event)
+        parts = []
+        if event.total is not None:
+            parts.append(f"{event.done:,} of {event.total:,}")
+        elif event.done:
+            parts.append(plural(event.done, event.unit))
+        if event.best is not None and math.isfinite(event.best):
+            parts.append(f"best {event.best:.6f}")
+        state = ", ".join([*parts, *([event.note] if event.note else [])])
         if not self.console.is_terminal and not event.over:
-            self._say(event, state)
+            # A line in a pipe, if there is something to say and it is time.
+            if not self._tasks and not event.done:
+                of_all = "" if event.total is None else f": {plural(event.total, event.unit)}"
+                self.keep(f"{event.task}{of_all}")
+            elif state and time.monotonic() - self._said >= self._period:
+                self.keep(f"{event.task}: {state}")
         if event.task not in self._tasks:
             self._bars.start()  # only now is there something to show
             self._tasks[event.task] = self._bars.add_task(event.task, total=event.total, state=state)
@@ -65,23 +77,3 @@ class ProgressDisplay:
         """Print a line that stays."""
         self.console.print(line, soft_wrap=True, markup=False, highlight=False)
         self._said = time.monotonic()
-
-    def _say(self, event: Progress, state: str) -> None:
-        """A line in a pipe, if there is something to say and it is time."""
-        if not self._tasks and not event.done:
-            of_all = "" if event.total is None else f": {plural(event.total, event.unit)}"
-            self.keep(f"{event.task}{of_all}")
-        elif state and time.monotonic() - self._said >= self._period:
-            self.keep(f"{event.task}: {state}")
-
-
-def _state(event: Progress) -> str:
-    """Progress of a task in words."""
-    parts = []
-    if event.total is not None:
-        parts.append(f"{event.done:,} of {event.total:,}")
-    elif event.done:
-        parts.append(plural(event.done, event.unit))
-    if event.best is not None and math.isfinite(event.best):
-        parts.append(f"best {event.best:.6f}")
-    return ", ".join([*parts, *([event.note] if event.note else [])])

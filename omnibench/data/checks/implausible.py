@@ -75,7 +75,14 @@ def odd_gears(recording: Recording) -> list[Explanation]:
         return recording.read(Reading(factors=share)).misfit
 
     farthest = farthest_steered(recording.logs)
-    coarse = min(_shares(float(farthest.max())), key=misfit)
+    # Factors of steering angles of up to ``widest``, rad, that are tried.
+    widest = float(farthest.max())
+    smallest = min(_LEAST_STEERED / widest, 1 / _LARGEST) if widest > 0 else 1 / _LARGEST
+    steps = math.ceil(math.log(1 / _NEAREST / smallest, _APART)), math.ceil(math.log(_LARGEST / _NEAREST, _APART))
+    coarse = min(
+        [*np.geomspace(smallest, 1 / _NEAREST, 1 + steps[0]), *np.geomspace(_NEAREST, _LARGEST, 1 + steps[1])],
+        key=misfit,
+    )
     least, share = min((misfit(share), share) for share in (coarse * _FINER).tolist())
     beyond = [in_degrees(names, group) for group in groups(len(names))[1:] if farthest @ group > _TURN]
     single = [Explanation(reading.mistakes, recording.read(reading).misfit) for reading in beyond]
@@ -84,13 +91,6 @@ def odd_gears(recording: Recording) -> list[Explanation]:
         degrees = in_degrees(names, np.ones(len(names))).mistakes
         return [Explanation(degrees, misfit(DEGREE), unit=True, may_remain=remains), *single]
     return [Explanation(gear(share).mistakes, least), *single]
-
-
-def _shares(farthest: float) -> list[float]:
-    """Factors of steering angles of up to ``farthest``, rad, that are tried."""
-    least = min(_LEAST_STEERED / farthest, 1 / _LARGEST) if farthest > 0 else 1 / _LARGEST
-    steps = math.ceil(math.log(1 / _NEAREST / least, _APART)), math.ceil(math.log(_LARGEST / _NEAREST, _APART))
-    return [*np.geomspace(least, 1 / _NEAREST, 1 + steps[0]), *np.geomspace(_NEAREST, _LARGEST, 1 + steps[1])]
 
 
 def odd_zeros(recording: Recording) -> list[Explanation]:

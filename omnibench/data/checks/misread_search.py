@@ -119,7 +119,10 @@ class Windows:
                 _unexplained(self.turned, self.driven @ heading.real, heading_weights),
             ]
         )
-        slip = _slip(self.driven)
+        # Slip of the wheels as a covariance (M, M) of the matrix, as a share of a row's scale squared.
+        _, strengths, directions = np.linalg.svd(self.driven, full_matrices=False)
+        shares = np.maximum(strengths / max(float(strengths[0]), 1e-300), 1e-4)
+        slip: Array = (directions.T * (_SLIP / shares) ** 2) @ directions
         rows = [
             _covariance(self.bent, self.moved - self.bent @ position, position_weights) / 2,
             _covariance(self.bent, self.moved - self.bent @ position, position_weights) / 2,
@@ -150,7 +153,9 @@ def _of_run(run: int, log: WheelLog, poses: Array) -> Windows | None:
     apart = max(_WINDOW, period)
     if apart > _LONGEST:
         return None
-    chosen = _every(stamps, apart)
+    # Stamps that are ``apart``, s, or a little more.
+    numbers = np.floor((stamps - stamps[0]) / apart + 1e-9)
+    chosen = np.flatnonzero(np.diff(numbers, prepend=-1.0))
     first, last = chosen[:-1], chosen[1:]
     near = stamps[last] - stamps[first] < 1.5 * apart + period
     first, last = first[near], last[near]
@@ -177,12 +182,6 @@ def _of_run(run: int, log: WheelLog, poses: Array) -> Windows | None:
         np.full(len(first), run),
         np.column_stack([begins, ends]),
     )
-
-
-def _every(stamps: Array, apart: float) -> NDArray[np.intp]:
-    """Indices of stamps (K,) that are ``apart``, s, or a little more."""
-    numbers = np.floor((stamps - stamps[0]) / apart + 1e-9)
-    return np.flatnonzero(np.diff(numbers, prepend=-1.0))
 
 
 def _robust(columns: Complex, wanted: Complex) -> tuple[Complex, Array]:
@@ -213,14 +212,6 @@ def _covariance(columns: Complex, left: Array | Complex, weights: Array) -> Arra
     variance = _CORRELATED_WINDOWS * float(weights @ np.abs(left) ** 2) / max(float(weights.sum()), 1.0)
     covariance: Array = (vectors / values) @ vectors.T * variance
     return covariance
-
-
-def _slip(driven: Array) -> Array:
-    """Covariance (M, M), as a share of a row's scale squared, of a matrix with what slip of the wheels makes of it."""
-    _, strengths, directions = np.linalg.svd(driven, full_matrices=False)
-    shares = np.maximum(strengths / max(float(strengths[0]), 1e-300), 1e-4)
-    slip: Array = (directions.T * (_SLIP / shares) ** 2) @ directions
-    return slip
 
 
 # Standard deviations by which robots differ from their designs, as shares (chosen; OptiOdom's tricycle is 7 % off in
@@ -350,7 +341,7 @@ class Recorded:
 
     def with_headings(self, factor: float) -> Recorded:
         """With headings times a factor."""
-        return replace(self, poses=[_times(each, factor) for each in self.poses])
+        return replace(self, poses=[each * (1.0, 1.0, factor) for each in self.poses])
 
     def in_degrees(self, row_3: Array) -> Recorded:
         """With headings that were recorded in degrees, and made continuous as if they were radians."""
@@ -363,7 +354,7 @@ class Recorded:
 
 @dataclass(frozen=True, eq=False)
 class Explained:
-    """The best reading: its mistakes, those that fit about as well, and d^2 as recorded and as read so.
+    """The best reading: its mistakes, those that fit about as well, and d^2 as recorded.
 
     told: False where the reference is too sparse for this search. unexplained: share of the way or of the turns,
     whichever is less, that no matrix explains if it is read so.
@@ -372,7 +363,6 @@ class Explained:
     mistakes: tuple[Misreading, ...]
     alike: tuple[tuple[Misreading, ...], ...]
     distance: float
-    remains: float
     told: bool = True
     unexplained: float = 0.0
 
@@ -402,30 +392,31 @@ def search(recording: Recorded) -> Explained:
     some = recording.some()
     fit = some.fit()
     if fit is None or not fit.gram.any():  # too sparse, or the wheels stand
-        return Explained((), (), 0.0, 0.0, told=False)
+        return Explained((), (), 0.0, told=False)
     far = DesignDistance(recording.robot)
     distance = far.of(fit)
     contradiction = float(far.contradictions(fit.gram, np.eye(len(fit.gram))[None])[0])
     if distance < _SUSPICIOUS and contradiction < _CONTRADICTING and fit.left[0] < _BADLY:
-        return Explained((), (), distance, distance)
+        return Explained((), (), distance)
     scored = sorted(_scores(some, fit, far), key=lambda each: each.score)
     best, present = scored[0], next(each for each in scored if not each.mistakes)
-    likely = best.score <= present.score - _BETTER and best.left < UNRELATED and _explains(best, present)
+    # Hardly anything remains of what made the recording suspicious.
+    nearer = best.distance <= max(_REMAINS * present.distance, _SUSPICIOUS)
+    likely = (
+        best.score <= present.score - _BETTER
+        and best.left < UNRELATED
+        and nearer
+        and best.contradiction <= max(_REMAINS * present.contradiction, _CONTRADICTING)
+    )
     if not best.mistakes or not likely:
-        return Explained((), (), distance, distance, unexplained=present.left)
+        return Explained((), (), distance, unexplained=present.left)
     kinds = {mistake.kind for mistake in best.mistakes}
     alike: dict[frozenset[str], tuple[Misreading, ...]] = {}
     for each in scored[1:]:
         other = frozenset(mistake.kind for mistake in each.mistakes)
         if each.score < best.score + _ALIKE and other != kinds and len(each.mistakes) <= len(best.mistakes):
             alike.setdefault(other, each.mistakes)
-    return Explained(best.mistakes, tuple(alike.values()), distance, best.distance, unexplained=best.left)
-
-
-def _explains(best: _Scored, present: _Scored) -> bool:
-    """True if hardly anything remains of what made a recording suspicious."""
-    nearer = best.distance <= max(_REMAINS * present.distance, _SUSPICIOUS)
-    return nearer and best.contradiction <= max(_REMAINS * present.contradiction, _CONTRADICTING)
+    return Explained(best.mistakes, tuple(alike.values()), distance, unexplained=best.left)
 
 
 def _scores(recording: Recorded, fit: FreeFit, far: DesignDistance) -> Iterator[_Scored]:
@@ -479,7 +470,8 @@ def _bases(recording: Recorded, fit: FreeFit) -> Iterator[_Base]:
     if flipped is not None:
         yield _Base(flipped, flipped=True)
     in_degrees = recording.in_degrees(recording.robot.inverse_kinematic_matrix[2])
-    cost = 0.0 if _beyond_a_turn(recording.poses) else _IN_DEGREES
+    # Headings in rad hardly begin beyond a whole turn.
+    cost = 0.0 if any(abs(float(each[0, 2])) > 1.01 * _TURN for each in recording.poses) else _IN_DEGREES
     for factor in (1.0, -1.0):
         base = in_degrees.with_headings(factor).fit()
         if base is not None:
@@ -488,15 +480,6 @@ def _bases(recording: Recorded, fit: FreeFit) -> Iterator[_Base]:
         base = recording.steered(reading).fit()
         if base is not None:
             yield _Base(base, reading.mistakes, reading.cost, plain=True)
-
-
-def _beyond_a_turn(poses: Sequence[Array]) -> bool:
-    """True if a run begins with a heading beyond a whole turn, which radians hardly do."""
-    return any(abs(float(each[0, 2])) > 1.01 * _TURN for each in poses)
-
-
-def _times(poses: Array, factor: float) -> Array:
-    return poses * (1.0, 1.0, factor)
 
 
 def _as_degrees(log: WheelLog, poses: Array, row_3: Array) -> Array:

@@ -96,9 +96,23 @@ def wheel_transforms(robot: Robot) -> Iterator[Transform]:
     if robot.drive.direct:
         yield from arrangements(robot)
     else:
-        yield from _turned_round(robot)
-    yield from _units(count)
-    yield from _scales(robot)
+        # Wheels of a robot that steers, counted the wrong way round: every one alone, and all.
+        drive, wheels = robot.drive, len(robot.drive.wheels)
+        for signs in _few_signs(wheels):
+            factors = signal_factors(robot, np.array(signs, dtype=float))
+            if factors is not None:
+                mistake = arrangement(drive.wheels, range(wheels), signs)
+                yield Transform(np.eye(3), np.diag(factors), _WHEEL, (mistake,))
+    for factor, unit in RATE_UNITS:
+        yield Transform(np.eye(3), factor * np.eye(count), _WHEEL, (wrong_unit(unit),))
+    # Counts of one wheel or of all that are off by a factor.
+    names = robot.wheel_names
+    groups = [np.ones(len(names))] + [row for row in np.eye(len(names)) if len(names) > 1]
+    for group in groups:
+        for factor, cost in [(each, _WHEEL) for each in _COUNTS] + [(float(each), _FITTED) for each in _GEARS]:
+            factors = signal_factors(robot, np.where(group > 0, factor, 1.0))
+            if factors is not None:
+                yield Transform(np.eye(3), np.diag(factors), cost, (scaled(names, group, factor),))
 
 
 def reference_transforms(flipped: bool) -> Iterator[Transform]:
@@ -111,7 +125,11 @@ def reference_transforms(flipped: bool) -> Iterator[Transform]:
         rows = rotation(angle) @ np.diag([1.0, -1.0, -1.0] if mirror else [1.0, 1.0, 1.0])
         changes: dict[str, Any] = {"pose_signs": list(signs)} if min(signs) < 0 else {}
         changes |= {"pose_order": [1, 0, 2]} if swapped else {}
-        words = _mirrored_in_words(signs, swapped)
+        parts = ["x and y are exchanged"] if swapped else []
+        negative = [name for name, sign in zip(("x", "y", "the heading"), signs, strict=True) if sign < 0]
+        if negative:
+            parts.append(f"{' and '.join(negative)} {'has' if len(negative) == 1 else 'have'} the wrong sign")
+        words = f"the reference is mirrored: {' and '.join(parts)}"
         mistake = Misreading("reference_mirrored", words, "the reference", changes)
         return Transform(rows, np.eye(0), _REFERENCE + 0.1 * (sum(sign < 0 for sign in signs) + swapped), (mistake,))
 
@@ -158,14 +176,6 @@ def turned_reference(angle: float) -> Transform:
     return Transform(rotation(-angle), np.eye(0), _REFERENCE, (mistake,))
 
 
-def _mirrored_in_words(signs: Sequence[int], swapped: bool) -> str:
-    parts = ["x and y are exchanged"] if swapped else []
-    negative = [name for name, sign in zip(("x", "y", "the heading"), signs, strict=True) if sign < 0]
-    if negative:
-        parts.append(f"{' and '.join(negative)} {'has' if len(negative) == 1 else 'have'} the wrong sign")
-    return f"the reference is mirrored: {' and '.join(parts)}"
-
-
 def arrangements(robot: Robot) -> Iterator[Transform]:
     """Every order and sign of up to four wheels; of more, one mistake."""
     names, count = robot.wheel_names, len(robot.wheel_names)
@@ -181,13 +191,14 @@ def arrangements(robot: Robot) -> Iterator[Transform]:
         columns = np.zeros((count, count))
         for column, (wheel, sign) in enumerate(zip(order, signs, strict=True)):
             columns[column, wheel] = sign  # recorded column = sign x rate of wheel
-        yield Transform(np.eye(3), columns, _arrangement_cost(order, signs), (arrangement(names, order, signs),))
-
-
-def _arrangement_cost(order: Sequence[int], signs: Sequence[int]) -> float:
-    moved = sum(wheel != column for column, wheel in enumerate(order))
-    negative = sum(sign < 0 for sign in signs)
-    return _WHEEL * (moved / 2 + (1 if negative == len(signs) else negative))
+        moved = sum(wheel != column for column, wheel in enumerate(order))
+        negative = sum(sign < 0 for sign in signs)
+        yield Transform(
+            np.eye(3),
+            columns,
+            _WHEEL * (moved / 2 + (1 if negative == len(signs) else negative)),
+            (arrangement(names, order, signs),),
+        )
 
 
 def arrangement(names: Sequence[str], order: Sequence[int], signs: Sequence[int]) -> Misreading:
@@ -213,16 +224,6 @@ def arrangement(names: Sequence[str], order: Sequence[int], signs: Sequence[int]
     return Misreading("wheels_negated" if every else "wheel_negated", words, wheels_in_words(negative), changes)
 
 
-def _turned_round(robot: Robot) -> Iterator[Transform]:
-    """Wheels of a robot that steers, counted the wrong way round: every one alone, and all."""
-    drive, count = robot.drive, len(robot.drive.wheels)
-    for signs in _few_signs(count):
-        factors = signal_factors(robot, np.array(signs, dtype=float))
-        if factors is not None:
-            mistake = arrangement(drive.wheels, range(count), signs)
-            yield Transform(np.eye(3), np.diag(factors), _WHEEL, (mistake,))
-
-
 def signal_factors(robot: Robot, factors: Array) -> Array | None:
     """Factors (M,) of the drive signals if those of the wheels' rates are (N,); None where they mix, as of a car."""
     if len(set(factors.tolist())) == 1:
@@ -245,27 +246,11 @@ def exchanged(count: int, first: int, second: int) -> tuple[int, ...]:
     return tuple(order)
 
 
-def _units(count: int) -> Iterator[Transform]:
-    for factor, unit in RATE_UNITS:
-        yield Transform(np.eye(3), factor * np.eye(count), _WHEEL, (wrong_unit(unit),))
-
-
 def wrong_unit(unit: str) -> Misreading:
     """Wheel rates in another unit than rad/s."""
     name = "turns a second" if unit == "rev/s" else unit
     words = f"wheel rates look like {name}; omega_* must be rad/s"
     return Misreading("wheel_unit", words, "all wheels", {"wheel_unit": unit})
-
-
-def _scales(robot: Robot) -> Iterator[Transform]:
-    """Counts of one wheel or of all that are off by a factor."""
-    names = robot.wheel_names
-    groups = [np.ones(len(names))] + [row for row in np.eye(len(names)) if len(names) > 1]
-    for group in groups:
-        for factor, cost in [(each, _WHEEL) for each in _COUNTS] + [(float(each), _FITTED) for each in _GEARS]:
-            factors = signal_factors(robot, np.where(group > 0, factor, 1.0))
-            if factors is not None:
-                yield Transform(np.eye(3), np.diag(factors), cost, (scaled(names, group, factor),))
 
 
 def scaled(names: Sequence[str], group: Array, factor: float) -> Misreading:

@@ -293,12 +293,22 @@ def read_log(session: SessionMetadata) -> SessionLog | None:
     for line, text in enumerate(read_text(file).splitlines(), 1):
         fields = text.split(",")
         if fields[0] == "Run:":
-            run = _run_of(file, line, fields)
+            if len(fields) < 2 or not fields[1].strip().isdigit():
+                raise DataError(f"{file}, line {line}: expected the number of a run after 'Run:'")
+            run = int(fields[1])
         elif fields[0] in ("RUNFINISHED", "METHODFINISHED") or fields[0].startswith("+++"):
             run = None
         elif run is not None:
             runs.append(run)
-            rows.append(_log_row(file, line, fields, form.fields))
+            if len(fields) < form.fields:
+                raise DataError(f"{file}, line {line}: it has {len(fields)} fields, expected {form.fields}")
+            try:
+                numbers = [float(field) for field in fields[: form.fields]]
+            except ValueError as error:
+                raise DataError(f"{file}, line {line}: {error}") from None
+            if not all(map(math.isfinite, numbers)):
+                raise DataError(f"{file}, line {line}: a value is not finite; remove or repair the row")
+            rows.append(numbers)
         elif not rows:
             header.append(fields)
     if not rows:
@@ -321,24 +331,6 @@ def _commands(session: SessionMetadata, table: Array) -> Array | None:
     speed, turn = table[:, form.commands].T
     metres = session.angle_per_tick * float(np.mean(session.geometry.diameters)) / 2
     return np.column_stack([speed * metres, np.zeros(len(table)), turn]) / cycle
-
-
-def _run_of(file: Path, line: int, fields: list[str]) -> int:
-    if len(fields) < 2 or not fields[1].strip().isdigit():
-        raise DataError(f"{file}, line {line}: expected the number of a run after 'Run:'")
-    return int(fields[1])
-
-
-def _log_row(file: Path, line: int, fields: list[str], count: int) -> list[float]:
-    if len(fields) < count:
-        raise DataError(f"{file}, line {line}: it has {len(fields)} fields, expected {count}")
-    try:
-        numbers = [float(field) for field in fields[:count]]
-    except ValueError as error:
-        raise DataError(f"{file}, line {line}: {error}") from None
-    if not all(map(math.isfinite, numbers)):
-        raise DataError(f"{file}, line {line}: a value is not finite; remove or repair the row")
-    return numbers
 
 
 def _path(header: Sequence[Sequence[str]]) -> str:
@@ -419,7 +411,20 @@ class Optiodom(Importer):
 
     def read(self, source: Path) -> Dataset:
         """All sessions under ``source``; DataError names the file and the row of what is wrong."""
-        sessions = self._sessions(source)
+        # The sessions of the one robot to import.
+        sessions = [read_metadata(file) for file in sorted(source.resolve().rglob("*_metadata.csv"))]
+        if not sessions:
+            raise DataError(f"{source}: no *_metadata.csv below it; name a folder with OptiOdom sessions (data/omni3)")
+        found = sorted({session.robot for session in sessions})
+        wanted = self.options.robot
+        if wanted is None and len(found) > 1:
+            raise DataError(
+                f"{source}: it holds recordings of {plural(len(found), 'robot')}, {', '.join(found)}; import one at a "
+                f"time: name its folder, or --set robot={found[0]}"
+            )
+        if wanted is not None and wanted not in found:
+            raise DataError(f"{source}: it holds no recordings of robot {wanted}; found: {', '.join(found)}")
+        sessions = [session for session in sessions if wanted in (None, session.robot)]
         geometry, notes = _reference_geometry(sessions)
         wheels = sessions[0].kind.wheels(geometry)
         robot = Robot(name=self.options.robot_name or f"inesc_tec_{sessions[0].robot}", wheels=wheels)
@@ -444,22 +449,6 @@ class Optiodom(Importer):
             licence="MIT",
         )
         return replace(dataset, warnings=(*notes, *dataset.warnings))
-
-    def _sessions(self, source: Path) -> list[SessionMetadata]:
-        """The sessions of the one robot to import."""
-        sessions = [read_metadata(file) for file in sorted(source.resolve().rglob("*_metadata.csv"))]
-        if not sessions:
-            raise DataError(f"{source}: no *_metadata.csv below it; name a folder with OptiOdom sessions (data/omni3)")
-        found = sorted({session.robot for session in sessions})
-        wanted = self.options.robot
-        if wanted is None and len(found) > 1:
-            raise DataError(
-                f"{source}: it holds recordings of {plural(len(found), 'robot')}, {', '.join(found)}; import one at a "
-                f"time: name its folder, or --set robot={found[0]}"
-            )
-        if wanted is not None and wanted not in found:
-            raise DataError(f"{source}: it holds no recordings of robot {wanted}; found: {', '.join(found)}")
-        return [session for session in sessions if wanted in (None, session.robot)]
 
 
 def _reference_geometry(sessions: Sequence[SessionMetadata]) -> tuple[Geometry, list[str]]:

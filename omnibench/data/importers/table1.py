@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -114,7 +114,14 @@ class Table1(Importer):
         wheels = self.options.robot.wheel_names
         samples = read_numbers(folder / "wheels.csv", ("t", *(f"omega_{wheel}" for wheel in wheels)))
         slam = read_numbers(folder / "slam.csv", _POSE)
-        command = _read_command(folder / "command.csv", wheels)
+        target_names = [f"omega_M{wheel}" for wheel in wheels]
+        table = read_numbers(folder / "command.csv", _COMMAND, optional=target_names)
+        if len(table.values) != 1:
+            raise DataError(
+                f"{table.file}: it has {plural(len(table.values), 'row')}, expected one: the command of this trajectory"
+            )
+        v, degrees, omega, distance = (float(value) for value in table.columns(_COMMAND)[0])
+        alpha, has_targets = math.radians(degrees), all(name in table for name in target_names)
         times, pose_times = _times(samples), _times(slam)
         metres = _METRES[self.options.position_unit]
         units = (metres, metres, math.radians(1))
@@ -144,44 +151,17 @@ class Table1(Importer):
             rates=samples.values[aligned.kept, 1:] * RPM,
             pose_times=aligned.pose_times,
             poses=aligned.poses,
-            command=command.name,
+            command=f"v{v:g}_a{math.degrees(alpha):g}_w{omega:g}_d{distance:g}",
             session=name.rsplit("/", 1)[0] if "/" in name else None,
-            v=command.v,
-            alpha=command.alpha,
-            omega=command.omega,
-            distance=command.distance,
+            v=v,
+            alpha=alpha,
+            omega=omega,
+            distance=distance,
             duration=float(times[-1]),
             odometry=odometry,
             sent=sent,
-            targets=None if command.targets is None else np.tile(command.targets, (len(times), 1)),
+            targets=np.tile(table.columns(target_names)[0] * RPM, (len(times), 1)) if has_targets else None,
         )
-
-
-@dataclass(frozen=True, eq=False)
-class _Command:
-    """A row of command.csv: m/s, rad, rad/s, m; targets (N,) in rad/s."""
-
-    v: float
-    alpha: float
-    omega: float
-    distance: float
-    targets: Array | None
-
-    @property
-    def name(self) -> str:
-        return f"v{self.v:g}_a{math.degrees(self.alpha):g}_w{self.omega:g}_d{self.distance:g}"
-
-
-def _read_command(file: Path, wheels: Sequence[str]) -> _Command:
-    targets = [f"omega_M{wheel}" for wheel in wheels]
-    table = read_numbers(file, _COMMAND, optional=targets)
-    if len(table.values) != 1:
-        raise DataError(
-            f"{file}: it has {plural(len(table.values), 'row')}, expected one: the command of this trajectory"
-        )
-    v, alpha, omega, distance = (float(value) for value in table.columns(_COMMAND)[0])
-    target_rates = table.columns(targets)[0] * RPM if all(name in table for name in targets) else None
-    return _Command(v, math.radians(alpha), omega, distance, target_rates)
 
 
 def _read_scans(file: Path, scanner: Scanner, zero: float, end: float) -> TrajectoryScans:

@@ -171,7 +171,14 @@ class QueryServer:
         if service == "health":
             return tracker.health(time.monotonic())
         if service == "pose":
-            return _pose_answer(tracker, parameters)
+            estimate = tracker.pose_at(read_time(parameters["at"]) if "at" in parameters else None)
+            answer: dict[str, Any] = {"robot": tracker.name, "at": estimate.stamp / 1e9, "at_ns": estimate.stamp}
+            answer["odom"] = _planar(estimate.odometry)
+            answer["map"] = None
+            if estimate.in_map is not None:
+                pose, covariance = estimate.in_map
+                answer["map"] = _planar(pose) | {"covariance": covariance.tolist()}
+            return answer
         if service == "calibration":
             if payload:  # the right to query this key must not be a right to swap the calibration
                 raise ConfigError(f"omnibench/{name}/calibration: put it there, or ask omnibench/{name}/swap with it")
@@ -236,17 +243,6 @@ def _size(content: zenoh.ZBytes | None) -> int:
 def _refuse(query: zenoh.Query, name: str, reason: str) -> None:
     answer = to_json({"robot": name, "error": one_line(reason)})
     query.reply_err(answer, encoding=zenoh.Encoding.APPLICATION_JSON)
-
-
-def _pose_answer(tracker: RobotTracker, parameters: dict[str, str]) -> Mapping[str, Any]:
-    estimate = tracker.pose_at(read_time(parameters["at"]) if "at" in parameters else None)
-    answer: dict[str, Any] = {"robot": tracker.name, "at": estimate.stamp / 1e9, "at_ns": estimate.stamp}
-    answer["odom"] = _planar(estimate.odometry)
-    answer["map"] = None
-    if estimate.in_map is not None:
-        pose, covariance = estimate.in_map
-        answer["map"] = _planar(pose) | {"covariance": covariance.tolist()}
-    return answer
 
 
 def _planar(pose: Array) -> dict[str, float]:

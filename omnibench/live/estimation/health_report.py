@@ -26,7 +26,12 @@ class HealthReporter:
 
     def report(self, state: RobotState, now: float, waiting_since: float | None = None) -> Health:
         """The health at ``now`` (s, monotonic). waiting_since: when the oldest message that waits came."""
-        self._measure(state, now)
+        # Rate and waiting time of samples, measured once a window.
+        since, counted = self._counted
+        if now - since >= _RATE_WINDOW:
+            self._rate = (state.counts.samples - counted) / (now - since)
+            self._counted = now, state.counts.samples
+            self._behind, state.behind = state.behind, 0.0
         if waiting_since is not None:
             state.behind = max(state.behind, now - waiting_since)
         age = None if state.arrival is None else now - state.arrival
@@ -51,14 +56,6 @@ class HealthReporter:
             last_swap=state.last_swap,
             unfitted_motion_s=state.monitor.seconds,
         )
-
-    def _measure(self, state: RobotState, now: float) -> None:
-        """Measure the rate and the waiting time of samples, once a window."""
-        since, counted = self._counted
-        if now - since >= _RATE_WINDOW:
-            self._rate = (state.counts.samples - counted) / (now - since)
-            self._counted = now, state.counts.samples
-            self._behind, state.behind = state.behind, 0.0
 
     def _longest_wait(self, state: RobotState) -> float:
         return max(self._behind, state.behind)

@@ -145,7 +145,7 @@ class RobotMemory:
 
     def calibration(self, configured: Path) -> Calibration:
         """The calibration to start with: the last one swapped in, unless the config's file has changed since."""
-        self._configured = _digest(configured)
+        self._configured = hashlib.sha256(read_bytes(configured)).hexdigest()
         if self._swapped.exists():
             try:
                 kept = read_model(SwappedCalibration, self._swapped)
@@ -165,10 +165,6 @@ class RobotMemory:
 
 def _checksum(text: bytes) -> bytes:
     return b"%08x" % zlib.crc32(text)
-
-
-def _digest(path: Path) -> str:
-    return hashlib.sha256(read_bytes(path)).hexdigest()
 
 
 _PERIOD = 0.1  # s between two states; chosen: a node that is killed loses no more

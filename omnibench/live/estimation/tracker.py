@@ -200,7 +200,12 @@ class RobotTracker:
     def _integrate(self, step: WheelStep) -> Motion:
         """Step 3: odometry and its covariance after the step; the motion that the step made."""
         state = self._state
-        self._warn_of_guessed_angles(step)
+        if self._state.guessed_angles and step.positions is None:
+            LOG.warning(
+                "%s: %s acts by wheel angles, and the messages tell none: they are counted from 0, at a guess",
+                *(self.name, self._state.guessed_angles),
+            )
+            self._state.guessed_angles = ""
         if state.fusion is not None and state.fusion.located:
             state.odometry.set_odom_heading(float(state.fusion.pose[2] - state.odometry.pose[2]))
         motion = state.odometry.step(step)
@@ -228,15 +233,6 @@ class RobotTracker:
             odometry.twist_covariance,
             None if fusion is None else (fusion.pose, fusion.covariance),
         )
-
-    def _warn_of_guessed_angles(self, step: WheelStep) -> None:
-        """Warn once if effects act by absolute wheel angles and the sender gives none."""
-        if self._state.guessed_angles and step.positions is None:
-            LOG.warning(
-                "%s: %s acts by wheel angles, and the messages tell none: they are counted from 0, at a guess",
-                *(self.name, self._state.guessed_angles),
-            )
-            self._state.guessed_angles = ""
 
     def _add_to_timeline(self, motion: Motion) -> None:
         timeline, fusion, pose = self._state.timeline, self._state.fusion, self._state.odometry.pose

@@ -219,7 +219,9 @@ class Fusion:
         self._waiting.clear()
         self._rejections.clear()
         self.located = True
-        self._now(pose, covariance)
+        self._filter.set(pose, covariance)
+        newest = self._timeline.entries[-1]
+        newest.pose, newest.covariance = self._filter.pose, self._filter.covariance
 
     def reset(self) -> None:
         """Forget where the robot is; the next pose of SLAM locates it."""
@@ -311,24 +313,17 @@ class Fusion:
         if index == 0:  # the motion up to the oldest entry is not known: its pose is corrected as it is
             self._apply(measurement)
             entry.pose, entry.covariance = self._filter.pose, self._filter.covariance
-        self._replay(max(index, 1))
-
-    def _now(self, pose: Array, covariance: Array) -> None:
-        self._filter.set(pose, covariance)
-        newest = self._timeline.entries[-1]
-        newest.pose, newest.covariance = self._filter.pose, self._filter.covariance
-
-    def _replay(self, first: int) -> None:
-        """Filter all motions and poses from entry ``first`` on again."""
+        # Filter all motions and poses from the entry on again.
+        first = max(index, 1)
         entries = self._timeline.entries
         self._filter.set(entries[first - 1].pose, entries[first - 1].covariance)
-        for index in range(first, len(entries)):
-            entry = entries[index]
-            if entry.measurements:
-                self._to(index, entry.stamp)
+        for number in range(first, len(entries)):
+            later = entries[number]
+            if later.measurements:
+                self._to(number, later.stamp)
             else:
-                self._filter.predict(entry.motion)
-            entry.pose, entry.covariance = self._filter.pose, self._filter.covariance
+                self._filter.predict(later.motion)
+            later.pose, later.covariance = self._filter.pose, self._filter.covariance
 
     def _to(self, index: int, stamp: int) -> None:
         """Bring the filter to a time (ns) within an entry's motion, with the entry's poses up to then."""

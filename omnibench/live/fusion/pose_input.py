@@ -41,22 +41,18 @@ class PoseInput:
             self._counts.pose_undecodable += 1
             raise
         try:
-            self._check(message)
+            if message.frame not in ("", self._frame):
+                raise MessageError(f"the pose is in frame {message.frame!r}, not in {self._frame!r}")
+            if not np.isfinite(message.pose).all():
+                raise MessageError("the pose is not finite")
+            if np.abs(message.pose[:2]).max() > _FARTHEST:
+                raise MessageError(f"the pose lies {np.abs(message.pose[:2]).max():.3g} m away")
         except MessageError:
             self._counts.pose_invalid += 1
             raise
         by_arrival = self._settings.stamps == "arrival" and not replayed
         stamp = arrival_stamp(arrival) if by_arrival else message.stamp
         return PoseMeasurement(stamp, message.pose, self._covariance(message, calibration), arrival)
-
-    def _check(self, message: PoseEstimate) -> None:
-        """MessageError: the pose cannot be."""
-        if message.frame not in ("", self._frame):
-            raise MessageError(f"the pose is in frame {message.frame!r}, not in {self._frame!r}")
-        if not np.isfinite(message.pose).all():
-            raise MessageError("the pose is not finite")
-        if np.abs(message.pose[:2]).max() > _FARTHEST:
-            raise MessageError(f"the pose lies {np.abs(message.pose[:2]).max():.3g} m away")
 
     def _covariance(self, message: PoseEstimate, calibration: Calibration) -> Array:
         """The covariance (3, 3) of a message, or the default where that says that it is unknown, with a warning."""

@@ -65,13 +65,24 @@ def make_keys(
     Returns the files written. ConfigError: a name or a host is not valid, hosts are given and no router, or a file
     exists already; DataError: a file cannot be written.
     """
-    _check(names, days)
+    for name in names:
+        if not _NAME.fullmatch(name) or name in _RESERVED:
+            raise ConfigError(f"{name!r} cannot name a certificate; use letters, digits, _ . and - as in apr02")
+    if len(set(names)) < len(names):
+        raise ConfigError(f"a name is given twice: {', '.join(names)}")
+    if not 1 <= days <= 36500:
+        raise ConfigError(f"{days} days: a certificate is valid for 1 to 36500 days")
     router = _checked_router(router, names, needed=bool(hosts))
     served = [_general_name(host) for host in dict.fromkeys((*_LOOPBACK, *hosts))]
     until = datetime.now(UTC) + timedelta(days=days)
     made: dict[str, _Pair] = {}
     if overwrite or not (folder / "ca.pem").exists():
-        made["ca"] = authority = _new_authority(until)
+        extensions = (
+            (x509.BasicConstraints(ca=True, path_length=0), True),
+            (_key_usage("key_cert_sign", "crl_sign"), True),
+        )
+        # The number tells two CAs apart.
+        made["ca"] = authority = _signed(f"omnibench test CA {secrets.token_hex(4)}", until, extensions)
     else:
         authority = _existing_authority(folder)
     made |= {name: _member(name, served if name == router else (), until, authority) for name in names}
@@ -85,18 +96,13 @@ def make_keys(
     if existing and not overwrite:
         raise ConfigError(f"{existing[0]}: is there already; choose other names, or --force to replace all in {folder}")
     for path, content in contents.items():
-        _write(path, content, private=path.suffix != ".pem")
+        with replacing(path) as partial:
+            descriptor = os.open(
+                partial, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644 if path.suffix == ".pem" else 0o600
+            )
+            with os.fdopen(descriptor, "wb") as file:
+                file.write(content)
     return list(contents)
-
-
-def _check(names: Sequence[str], days: int) -> None:
-    for name in names:
-        if not _NAME.fullmatch(name) or name in _RESERVED:
-            raise ConfigError(f"{name!r} cannot name a certificate; use letters, digits, _ . and - as in apr02")
-    if len(set(names)) < len(names):
-        raise ConfigError(f"a name is given twice: {', '.join(names)}")
-    if not 1 <= days <= 36500:
-        raise ConfigError(f"{days} days: a certificate is valid for 1 to 36500 days")
 
 
 def _checked_router(router: str | None, names: Sequence[str], *, needed: bool) -> str | None:
@@ -109,14 +115,6 @@ def _checked_router(router: str | None, names: Sequence[str], *, needed: bool) -
             f"{chosen!r}, whose certificate would be the router's, is not among {', '.join(names)}; say --router NAME"
         )
     return None
-
-
-def _new_authority(until: datetime) -> _Pair:
-    extensions = (
-        (x509.BasicConstraints(ca=True, path_length=0), True),
-        (_key_usage("key_cert_sign", "crl_sign"), True),
-    )
-    return _signed(f"omnibench test CA {secrets.token_hex(4)}", until, extensions)  # the number tells two CAs apart
 
 
 def _member(name: str, served: Sequence[x509.GeneralName], until: datetime, authority: _Pair) -> _Pair:
@@ -187,10 +185,3 @@ def _passwords(folder: Path, names: Sequence[str], *, keep: bool) -> dict[Path, 
     lines += [f"{name}:{password}" for name, password in passwords.items()]
     files = {folder / f"{name}.password": f"{password}\n".encode() for name, password in passwords.items()}
     return files | {path: "".join(f"{line}\n" for line in lines).encode()}
-
-
-def _write(path: Path, content: bytes, *, private: bool) -> None:
-    with replacing(path) as partial:
-        descriptor = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600 if private else 0o644)
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(content)

@@ -52,8 +52,13 @@ class Claim:
         try:
             deadline = time.monotonic() + _PATIENCE
             while True:
+                # Robots that are claimed, and the sessions that claim them.
+                replies = session.liveliness().get(_CLAIMS, timeout=timeout)
+                keys = [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
                 rivals = [
-                    (robot, rival) for robot, rival in _claims(session, timeout) if robot in robots and rival != own
+                    (robot, rival)
+                    for robot, rival in [(key.split("/")[1], key.rpartition("/claim-")[2]) for key in keys]
+                    if robot in robots and rival != own
                 ]
                 self.others = alive_robots(session, timeout)  # after the claims: one that has gone may run by now
                 for robot in robots:
@@ -78,13 +83,6 @@ class Claim:
 def _taken(robot: str, why: str) -> ConfigError:
     """Two nodes for one robot would publish every stamp twice."""
     return ConfigError(f"robot {robot!r} {why}, or give this one's another name")
-
-
-def _claims(session: zenoh.Session, timeout: float) -> list[tuple[str, str]]:
-    """Robots that are claimed, and the sessions that claim them."""
-    replies = session.liveliness().get(_CLAIMS, timeout=timeout)
-    keys = [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
-    return [(key.split("/")[1], key.rpartition("/claim-")[2]) for key in keys]
 
 
 def nothing_received(robot: str, seconds: float, alive: tuple[str, ...]) -> str:

@@ -296,7 +296,10 @@ def open_session(config: SessionConfig, purpose: str, stop: Stop | None = None) 
         except zenoh.ZError as error:
             raise ConfigError(_why_not_open(config, error)) from None
         try:
-            _check_connected(session, config)
+            # Zenoh opens a router or peer even if it is refused, and retries for ever.
+            patience = 0.0 if config.mode == "client" else max(_CONNECT_TIMEOUT, config.wait)
+            if config.connecting and not wait_until(lambda: is_connected(session), patience):
+                raise ConfigError(why_not_connected(config))
         except BaseException:
             close_session(session)
             raise
@@ -369,14 +372,30 @@ def _settings(config: SessionConfig) -> Iterator[tuple[str, Any]]:
     if config.mode == "client":
         yield "connect/timeout_ms", round(config.wait * 1000)
     if config.users_file is not None:
-        _check_users(config.users_file)
+        # Zenoh would refuse everybody with an empty file, and names no wrong line.
+        lines = _lines(config.users_file, "users_file")
+        if not any(lines):
+            raise ConfigError(f"users_file: {config.users_file} holds no user; write lines of user:password")
+        for number, line in enumerate(lines, 1):
+            user, _, password = line.partition(":")
+            if line and not (user and password):
+                raise ConfigError(f"users_file: {config.users_file}, line {number}: expected user:password")
         yield "transport/auth/usrpwd/dictionary_file", str(config.users_file)
     if config.user is not None:
         yield "transport/auth/usrpwd/user", config.user.name
         yield "transport/auth/usrpwd/password", _password(config.user)
-    if config.tls is not None:
-        check_files(config.tls, listening=bool(config.listening))
-        yield "transport/link/tls", _tls_settings(config.tls)
+    if (tls := config.tls) is not None:
+        check_files(tls, listening=bool(config.listening))
+        settings: dict[str, Any] = {
+            "root_ca_certificate": str(tls.ca),
+            "enable_mtls": tls.mutual,
+            "verify_name_on_connect": tls.verify_name,
+            "close_link_on_expiration": True,
+        }
+        if tls.certificate is not None:
+            for side in ("listen", "connect"):
+                settings[f"{side}_certificate"], settings[f"{side}_private_key"] = str(tls.certificate), str(tls.key)
+        yield "transport/link/tls", settings
     if config.access is not None:
         yield "access_control", _access_settings(config.access, config)
 
@@ -385,19 +404,6 @@ def _access_settings(access: Access, config: SessionConfig) -> Mapping[str, Any]
     if config.tls is not None and config.tls.mutual and config.tls.certificate is not None:
         return access_control(access, by_certificate=True, own_name=common_name(config.tls.certificate))
     return access_control(access, by_certificate=False, own_name=config.user.name if config.user else None)
-
-
-def _tls_settings(tls: Tls) -> Mapping[str, Any]:
-    settings: dict[str, Any] = {
-        "root_ca_certificate": str(tls.ca),
-        "enable_mtls": tls.mutual,
-        "verify_name_on_connect": tls.verify_name,
-        "close_link_on_expiration": True,
-    }
-    if tls.certificate is not None:
-        for side in ("listen", "connect"):
-            settings[f"{side}_certificate"], settings[f"{side}_private_key"] = str(tls.certificate), str(tls.key)
-    return settings
 
 
 def _password(user: User) -> str:
@@ -415,29 +421,11 @@ def _password(user: User) -> str:
     return lines[0]
 
 
-def _check_users(path: Path) -> None:
-    """ConfigError: the users' file is empty (Zenoh would refuse everybody) or has a wrong line (Zenoh names none)."""
-    lines = _lines(path, "users_file")
-    if not any(lines):
-        raise ConfigError(f"users_file: {path} holds no user; write lines of user:password")
-    for number, line in enumerate(lines, 1):
-        user, _, password = line.partition(":")
-        if line and not (user and password):
-            raise ConfigError(f"users_file: {path}, line {number}: expected user:password")
-
-
 def _lines(path: Path, what: str) -> list[str]:
     try:
         return read_text(path, _MOST_BYTES).splitlines()
     except DataError as error:
         raise ConfigError(f"{what}: {error}") from None
-
-
-def _check_connected(session: zenoh.Session, config: SessionConfig) -> None:
-    """ConfigError: no connection. Zenoh opens a router or peer even if it is refused, and retries for ever."""
-    patience = 0.0 if config.mode == "client" else max(_CONNECT_TIMEOUT, config.wait)
-    if config.connecting and not wait_until(lambda: is_connected(session), patience):
-        raise ConfigError(why_not_connected(config))
 
 
 def is_connected(session: zenoh.Session) -> bool:

@@ -139,7 +139,15 @@ def concatenate_runs(
     moves = np.array([relative(run.start, run.final_pose) for run in runs])
     starts = _composed(runs[0].start, moves)
     if start_poses is not None:
-        starts = _given_start_poses(dataset, np.asarray(start_poses, dtype=float), moves)
+        # Multiples of 2 pi are added so that headings are continuous from run to run.
+        poses = np.asarray(start_poses, dtype=float)
+        if poses.shape != moves.shape or not np.isfinite(poses).all():
+            raise DataError(
+                f"data set {dataset.name}: start poses have shape {poses.shape}, expected {moves.shape}, finite"
+            )
+        leaps = np.diff(poses[:, 2]) - moves[:-1, 2]
+        turns = np.concatenate([[0.0], np.cumsum(np.round(leaps / FULL_TURN))])
+        starts = np.column_stack([poses[:, :2], poses[:, 2] - FULL_TURN * turns])
     # Samples of a standstill do not come oftener than others, whatever the data set's nominal period is.
     periods = np.concatenate([np.diff(run.times, prepend=0.0) for run in runs])
     period = max(dataset.sample_period, 0.5 * float(np.median(periods)))
@@ -313,17 +321,6 @@ def _composed(first: Array, moves: Array) -> Array:
     return np.array(list(accumulate(moves[:-1], compose, initial=first)))
 
 
-def _given_start_poses(dataset: Dataset, start_poses: Array, moves: Array) -> Array:
-    """The given start poses, checked, with multiples of 2 pi added so that headings are continuous from run to run."""
-    if start_poses.shape != moves.shape or not np.isfinite(start_poses).all():
-        raise DataError(
-            f"data set {dataset.name}: start poses have shape {start_poses.shape}, expected {moves.shape}, finite"
-        )
-    leaps = np.diff(start_poses[:, 2]) - moves[:-1, 2]
-    turns = np.concatenate([[0.0], np.cumsum(np.round(leaps / FULL_TURN))])
-    return np.column_stack([start_poses[:, :2], start_poses[:, 2] - FULL_TURN * turns])
-
-
 class _TruthOfRuns:
     """The true motion of a simulated robot. DataError: the recording has no truth."""
 
@@ -434,7 +431,15 @@ def make_schedule(drive: ConcatenatedDrive, config: ReplayConfig) -> Schedule:
     """The arrivals of a drive's messages. They depend on the seed only; each topic has its own random numbers."""
     wheel_seed, slam_seed = np.random.SeedSequence(config.seed).spawn(2)
     samples, sampled = _arrivals(drive.wheel_times, config.wheels, np.random.default_rng(wheel_seed))
-    kept = _thinned(drive.slam_times, config.slam.period)
+    # Poses that are at least a period apart, beginning with the first.
+    chosen, index = [], 0
+    while index < len(drive.slam_times):
+        chosen.append(index)
+        index = max(
+            index + 1,
+            int(np.searchsorted(drive.slam_times, drive.slam_times[index] + config.slam.period - _SAME_ARRIVAL)),
+        )
+    kept = np.array(chosen, dtype=np.intp)
     poses, posed = _arrivals(drive.slam_times[kept], config.slam, np.random.default_rng(slam_seed))
     arrivals = np.concatenate([sampled, posed])
     topics = np.repeat(np.array([WHEELS, SLAM], dtype=np.int8), [len(samples), len(poses)])
@@ -453,12 +458,3 @@ def _arrivals(times: Array, channel: Channel, rng: np.random.Generator) -> tuple
     when = np.concatenate([late[0][arrives], late[1][twice]])
     order = np.lexsort((indices, when))
     return indices[order], when[order]
-
-
-def _thinned(times: Array, period: float) -> NDArray[np.intp]:
-    """Indices of times that are at least ``period`` s apart, beginning with the first."""
-    kept, index = [], 0
-    while index < len(times):
-        kept.append(index)
-        index = max(index + 1, int(np.searchsorted(times, times[index] + period - _SAME_ARRIVAL)))
-    return np.array(kept, dtype=np.intp)

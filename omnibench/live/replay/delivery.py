@@ -138,13 +138,12 @@ class AcknowledgedDelivery(Delivery):
         if len(self._under_way) < WINDOW and (not self._under_way or self._silence() < _FIRST_RETRY) and not self._gap:
             return
         began = time.monotonic()
-        while not self._stop.is_set() and (len(self._under_way) >= WINDOW or self._gap or self._lost_touch()):
+        while not self._stop.is_set() and (
+            len(self._under_way) >= WINDOW or self._gap or (bool(self._under_way) and self._silence() >= _FIRST_RETRY)
+        ):
             self._wait()
         waited = time.monotonic() - began
         self.paused += waited if waited > _FIRST_RETRY else 0.0
-
-    def _lost_touch(self) -> bool:
-        return bool(self._under_way) and self._silence() >= _FIRST_RETRY
 
     def _silence(self) -> float:
         """Time since the last progress, s."""

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import zenoh
-from numpy.typing import NDArray
 
 from omnibench.errors import ConfigError, OmnibenchError
 from omnibench.live.control.request_queue import source_of
@@ -83,7 +82,9 @@ class _Messages:
         self._joints = joints_of(drive.robot).names if names is None else tuple(names)
         check_joints(self._joints, (*drive.robot.wheel_names, *drive.robot.drive.steered), "joints")
         self._schedule = make_schedule(drive, config)
-        self._sampled, self._posed = (_nanoseconds(times) for times in (drive.wheel_times, drive.slam_times))
+        self._sampled, self._posed = (
+            np.round(times * 1e9).astype(np.int64) for times in (drive.wheel_times, drive.slam_times)
+        )
         self._covariances = _pose_covariances(drive, config.slam, noise)
         self._positions, self._velocities = _joint_values(drive, config.wheels.use)
 
@@ -272,10 +273,6 @@ def _joint_values(drive: ConcatenatedDrive, use: str) -> tuple[Array | None, Arr
         return angles, rates
     positions = np.hstack([np.full_like(drive.rates, np.nan) if angles is None else angles, drive.steering])
     return positions, None if rates is None else np.hstack([rates, np.full_like(drive.steering, np.nan)])
-
-
-def _nanoseconds(times: Array) -> NDArray[np.int64]:
-    return np.round(times * 1e9).astype(np.int64)
 
 
 def _pose_covariances(drive: ConcatenatedDrive, slam: SlamChannel, noise: Noise | None) -> Array:

@@ -48,7 +48,9 @@ class RunAttributes:
 
 def read_run_attributes(source: Path, options: CsvOptions, warnings: list[str]) -> dict[str, RunAttributes]:
     """The attributes of each run by its name; empty without a table of runs. DataError names the row of a flaw."""
-    file = options.runs_table or _beside(source)
+    file = options.runs_table or file_called(
+        source if source.is_dir() else source.parent, RUN_TABLES, other_than=source
+    )
     if file is None:
         return {}
     table = load(file, options).in_lower_case()
@@ -93,10 +95,6 @@ def check_names(attributes: Collection[str], runs: Collection[str], warnings: li
     extra = [run for run in attributes if run not in runs]
     if extra:
         warnings.append(f"the table of runs lists runs that have no samples: {', '.join(extra[:12])}")
-
-
-def _beside(source: Path) -> Path | None:
-    return file_called(source if source.is_dir() else source.parent, RUN_TABLES, other_than=source)
 
 
 def _number(numbers: np.ndarray | None, row: int) -> float | None:

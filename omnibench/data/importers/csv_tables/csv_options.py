@@ -304,7 +304,12 @@ _SIDES = {"left": ("left", "l"), "right": ("right", "r"), "front": ("front", "f"
 def missing_error(table: CellTable, missing: Sequence[Wanted], options: CsvOptions) -> ColumnError:
     """The error that names what is missing, what was found, and what to type if that is meant."""
     if not table.headed:
-        return _unnamed(table.file, missing, len(table.names))
+        shown = ", ".join(f"{wanted.key}: 1" for wanted in missing[:1]) or "t: 1"
+        keys = ", ".join(wanted.key for wanted in missing)
+        return ColumnError(
+            f"{table.file}: it has no header and {len(table.names)} columns; say by numbers, from 1, which of them are "
+            f'{keys}: --set "columns={{{shown}, ...}}"'
+        )
     names = [f"'{wanted.names[0]}'" for wanted in missing]
     what = f"column {names[0]} is" if len(names) == 1 else f"columns {', '.join(names[:-1])} and {names[-1]} are"
     found = ", ".join(filter(None, table.names))
@@ -313,15 +318,6 @@ def missing_error(table: CellTable, missing: Sequence[Wanted], options: CsvOptio
     else:
         way = _way_out(table, missing, options)
     return ColumnError(f"{table.file}: {what} missing; found: {found}; {way}")
-
-
-def _unnamed(file: Path, missing: Sequence[Wanted], count: int) -> ColumnError:
-    shown = ", ".join(f"{wanted.key}: 1" for wanted in missing[:1]) or "t: 1"
-    keys = ", ".join(wanted.key for wanted in missing)
-    return ColumnError(
-        f"{file}: it has no header and {count} columns; say by numbers, from 1, which of them are {keys}: "
-        f'--set "columns={{{shown}, ...}}"'
-    )
 
 
 def _way_out(table: CellTable, missing: Sequence[Wanted], options: CsvOptions) -> str:
@@ -334,7 +330,8 @@ def _way_out(table: CellTable, missing: Sequence[Wanted], options: CsvOptions) -
         if (likely := _likely(wanted, free, options)) is not None:
             taken[wanted.key] = likely
     units = typed_units(unit_options(taken, options, shared=True))
-    typed = "".join(f" --set {setting}" for setting in [*units, *_decimals(table, taken)])
+    commas = any(DECIMAL_COMMA.fullmatch(cell) for name in taken.values() for cell in table.texts(name))
+    typed = "".join(f" --set {setting}" for setting in [*units, *(["decimal=comma"] if commas else [])])
     shown = ", ".join(f"{wanted.key}: {_typed(taken.get(wanted.key, 'NAME'))}" for wanted in missing)
     if len(taken) < len(missing):
         return f'name {"it" if len(missing) == 1 else "them"}: --set "columns={{{shown}}}"{typed}'
@@ -344,12 +341,6 @@ def _way_out(table: CellTable, missing: Sequence[Wanted], options: CsvOptions) -
 def _typed(name: str) -> str:
     """A name as a value in a mapping of YAML that is typed between double quotes."""
     return name if as_yaml(name) == name else "'" + name.replace("'", "''") + "'"
-
-
-def _decimals(table: CellTable, taken: Mapping[str, str]) -> list[str]:
-    """The option of decimal commas, where cells of the columns have them."""
-    commas = any(DECIMAL_COMMA.fullmatch(cell) for name in taken.values() for cell in table.texts(name))
-    return ["decimal=comma"] if commas else []
 
 
 def _likely(wanted: Wanted, names: Sequence[str], options: CsvOptions) -> str | None:

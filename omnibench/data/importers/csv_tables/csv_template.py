@@ -138,7 +138,11 @@ def write_template(folder: Path, robot_type: str, *, references: bool = False) -
             run = f"{command}_{repetition}"
             runs.append(f"{run},{command},{repetition}")
             log = _log(robot, np.array(twist))
-            files[folder / f"{run}_wheels.csv"] = _wheels_table(robot, log)
+            names = [f"omega_{wheel}" for wheel in robot.wheel_names] + [
+                f"steer_{wheel}" for wheel in robot.drive.steered
+            ]
+            columns = log.rates if log.steering is None else np.hstack([log.rates, log.steering])
+            files[folder / f"{run}_wheels.csv"] = _csv(["t", *names], log.times, columns)
             if references:
                 measured.append(f"{run},{_measured(robot, log, command, rng)}")
             else:
@@ -179,12 +183,6 @@ def _log(robot: Robot, twist: Array) -> WheelLog:
     stamps = _POSE_PERIOD * np.arange(round(_LENGTH / _POSE_PERIOD) + 1)
     drive = None if robot.drive.direct else robot.drive
     return WheelLog(times, share[:, None] * rates, np.zeros(3), stamps, steering=steering, drive=drive)
-
-
-def _wheels_table(robot: Robot, log: WheelLog) -> str:
-    names = [f"omega_{wheel}" for wheel in robot.wheel_names] + [f"steer_{wheel}" for wheel in robot.drive.steered]
-    columns = log.rates if log.steering is None else np.hstack([log.rates, log.steering])
-    return _csv(["t", *names], log.times, columns)
 
 
 def _poses_table(robot: Robot, log: WheelLog, rng: np.random.Generator) -> str:

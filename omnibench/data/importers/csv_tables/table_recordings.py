@@ -112,11 +112,7 @@ def load(file: Path, options: CsvOptions) -> CellTable:
     table = read_cells(file, separator=separator, header_lines=options.header_lines, decimal_comma=comma)
     if options.header_lines or file.suffix == ".parquet":
         return table
-    return _as_expected(table, options)
-
-
-def _as_expected(table: CellTable, options: CsvOptions) -> CellTable:
-    """A table without a header that has exactly the columns that are wanted of one of its streams, with their names."""
+    # A table without a header that has exactly the columns that are wanted of one of its streams gets their names.
     for wanted in (wheel_columns(options), pose_columns(options, shared=False)):
         names = [each.names[0] for each in wanted.all]
         if len(names) == len(table.names) and not any(name.isdecimal() for name in names):
@@ -211,7 +207,7 @@ def _by_headers(
         except NoRowsError:
             warnings.append(f"{file}: left out, as it has no rows")
             continue
-        name, wanted = _stem(file, source), pose_columns(options, shared=True)
+        name, wanted = file.relative_to(source).with_suffix("").as_posix(), pose_columns(options, shared=True)
         posed = references.of(name) is None or not _all_missing(wanted, table)
         missing = [*wheel_columns(options).missing(table), *(wanted.missing(table) if posed else ())]
         if missing:
@@ -239,10 +235,6 @@ def _check_apart(tables: Sequence[CellTable], options: CsvOptions) -> None:
             f"{wheels[0]} holds wheels and {poses[0].name} poses; call them <run>_wheels.csv and <run>_poses.csv, or "
             "say what their names end in: --set wheel_suffix=ENDING --set pose_suffix=ENDING"
         )
-
-
-def _stem(file: Path, source: Path) -> str:
-    return file.relative_to(source).with_suffix("").as_posix()
 
 
 Rows = NDArray[np.intp]
@@ -380,12 +372,15 @@ def _stream(
     Rows without any value of the stream are left out, and so are rows that repeat a time.
     """
     time, names = wanted.names(table)
-    filled = _filled(table, names)
+    filled = np.flatnonzero(~np.isnan(table.numbers(names)).all(axis=1))
     if not len(filled):
         raise DataError(f"{table.file}: no row has values of the {wanted.what} ({', '.join(names)})")
     rows = table if len(filled) == len(table) else table.only(filled)
     if shared and wanted.what == "poses":
-        _check_clock(rows, time)
+        # Poses in the rows of the wheels are without a time where they have a clock of their own.
+        for row in np.flatnonzero(np.isnan(rows.numbers([time])[:, 0]))[:1].tolist():
+            way = 'where poses have a column of times of their own, --set "columns={pose_t: NAME}"'
+            raise rows.fail(row, f"{time} is missing; {way}")
     numbers = rows.finite([time, *names])
     blank = len(table) - len(filled)
     if blank and not shared:
@@ -401,13 +396,6 @@ def _stream(
         raise DataError(f"{error}{_of_runs(rows, time)}") from None
 
 
-def _check_clock(table: CellTable, time: str) -> None:
-    """DataError: poses in the rows of the wheels are without a time, as where they have a clock of their own."""
-    for row in np.flatnonzero(np.isnan(table.numbers([time])[:, 0]))[:1].tolist():
-        way = 'where poses have a column of times of their own, --set "columns={pose_t: NAME}"'
-        raise table.fail(row, f"{time} is missing; {way}")
-
-
 def _of_runs(table: CellTable, time: str) -> str:
     """Hint at run_column where times begin anew, as in a table of several runs; empty where they do not."""
     anew = (np.flatnonzero(np.diff(table.numbers([time])[:, 0]) < 0) + 1).tolist()
@@ -418,11 +406,6 @@ def _of_runs(table: CellTable, time: str) -> str:
         if [row for row in range(1, len(cells)) if cells[row] != cells[row - 1]] == anew:
             return f"; does {name} name the run of each row? --set {quote(f'run_column={as_yaml(name)}')}"
     return "; repair the row, or, in a table of several runs, name the column of runs: --set run_column=NAME"
-
-
-def _filled(table: CellTable, names: Sequence[str]) -> NDArray[np.intp]:
-    """The rows that hold any of the values."""
-    return np.flatnonzero(~np.isnan(table.numbers(names)).all(axis=1))
 
 
 _NO_ROWS: Rows = np.empty(0, dtype=np.intp)

@@ -271,10 +271,20 @@ def pose_topic(
     if name is not None:
         return _named(bag, name, "pose_topic", types)
     candidates = [topic for topic in bag.topics if topic.type in POSE_TYPES]
-    references = [topic for topic in candidates if topic.messages and not _is_odometry(topic)]
+    references = [
+        topic
+        for topic in candidates
+        if topic.messages and {"odom", "odometry"}.isdisjoint(re.split(r"[^a-z]+", topic.name.lower()))
+    ]
     if not references and (scans is not None or sensors):
         return None
-    others = [topic for topic in bag.topics if topic.type in types and topic.messages and not _is_fixed(topic)]
+    others = [
+        topic
+        for topic in bag.topics
+        if topic.type in types
+        and topic.messages
+        and not (topic.type == TRANSFORMS and topic.name.endswith("tf_static"))
+    ]
     if not references and others:
         raise ConfigError(
             f"{bag.path}: the only poses are {_listed(others)}, by name or type the robot's own odometry and not a "
@@ -324,11 +334,3 @@ def _ends_in(topic: Topic, ending: str) -> bool:
 
 def _space(topic: Topic) -> str:
     return topic.name.strip("/").rpartition("/")[0]
-
-
-def _is_fixed(topic: Topic) -> bool:
-    return topic.type == TRANSFORMS and topic.name.endswith("tf_static")
-
-
-def _is_odometry(topic: Topic) -> bool:
-    return not {"odom", "odometry"}.isdisjoint(re.split(r"[^a-z]+", topic.name.lower()))

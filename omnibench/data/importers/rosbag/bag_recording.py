@@ -28,7 +28,7 @@ from omnibench.data.importers.rosbag.scan_stream import RunScans, ScanStream, re
 from omnibench.data.importers.rosbag.sensor_references import SensorReferences, read_sensors
 from omnibench.data.importers.runs.recorded_streams import ReferenceStream
 from omnibench.data.importers.runs.recording_runs import Span, breaks, cut_run, departure, find_rests, from_rest, parted
-from omnibench.data.importers.wheel_samples import Losses, WheelSamples, wheel_samples
+from omnibench.data.importers.wheel_samples import WheelSamples, wheel_samples
 from omnibench.errors import DataError, one_line
 from omnibench.robot.kinematics import Array, interpolated
 from omnibench.words import plural
@@ -182,7 +182,13 @@ def read_recording(path: Path, name: str, options: RosbagOptions, warnings: list
         longest_gap=gap,
         still=options.still,
     )
-    warnings.extend(_losses_in_words(losses, place))
+    words = []
+    if losses.gaps:
+        words.append(
+            f"{place}: wheel samples are missing {plural(losses.gaps, 'time')} while the wheels turned, "
+            f"up to {losses.longest:.3g} s; runs end there"
+        )
+    warnings.extend(words + losses.in_words(place, "message"))
     origin = int(wheels.stamps[0])
     # Exact to the nanosecond, which a double of unix time is not.
     stream = ReferenceStream.without_poses()
@@ -334,13 +340,3 @@ def _check_clocks(path: Path, topic: Topic, wheels: WheelStream, what: str, othe
         f"{path}: no two {what} while the wheels were recorded, by the stamps of their headers ({shown}); both must be "
         f"stamped by one clock, or set recorded_stamps=[{topic.name},{other.name}] to take the times of recording"
     )
-
-
-def _losses_in_words(losses: Losses, place: str) -> list[str]:
-    words = []
-    if losses.gaps:
-        words.append(
-            f"{place}: wheel samples are missing {plural(losses.gaps, 'time')} while the wheels turned, "
-            f"up to {losses.longest:.3g} s; runs end there"
-        )
-    return words + losses.in_words(place, "message")

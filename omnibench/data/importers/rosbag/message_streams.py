@@ -82,21 +82,16 @@ def read_poses(
     sigma: standard deviations (m, deg) of poses whose covariance is unknown. DataError.
     """
     messages = MessageFilter(bag, topic, part)
-    rows, covariances, numbers, stamps = [], [], [], []
-    for record, stamp, (pose, covariance) in messages.decoded(_pose):
-        rows.append(pose)
-        covariances.append(covariance)
-        numbers.append(record.number)
-        stamps.append(stamp)
-    table = np.array(rows, dtype=float).reshape(-1, 6)
-    number, stamp_array = np.array(numbers, dtype=np.int64), np.array(stamps, dtype=np.int64)
+    rows, number, stamps = messages.collected(_pose)
+    table = np.array([pose for pose, _ in rows], dtype=float).reshape(-1, 6)
+    covariances = [covariance for _, covariance in rows]
     good = messages.keep(possible(table[:, :2]), number, "without a finite position")
     headings = planar_headings(table[:, 2:])
     flawed = good[headings.flawed[good]]
     if len(flawed):
         detail = headings.flaw(int(flawed[0]))
         good = good[messages.keep(~headings.flawed[good], number[good], f"with a wrong orientation, as {detail}")]
-    order = good[messages.in_order(stamp_array[good], number[good])]
+    order = good[messages.in_order(stamps[good], number[good])]
     messages.require(len(order))
     warnings.extend(messages.warnings())
     poses = np.column_stack([table[:, :2], headings.headings])[order]
@@ -109,10 +104,10 @@ def read_poses(
         table[~usable] = pose_covariance(*sigma)
         if not usable.all():
             warnings.append(f"{unknown}: {sigma[0]:g} m and {sigma[1]:g} deg count for them (pose_sigma)")
-        return PoseStream(stamp_array[order], poses, table)
+        return PoseStream(stamps[order], poses, table)
     if usable.any() and not usable.all():
         warnings.append(f"{unknown}, so that those of the others are left out; set pose_sigma=[m,deg] to use them")
-    return PoseStream(stamp_array[order], poses, table if usable.all() else None)
+    return PoseStream(stamps[order], poses, table if usable.all() else None)
 
 
 def header_stamp(message: Any) -> int:
@@ -158,6 +153,12 @@ class MessageFilter:
                 self._drop(_NO_STAMP, record.number)
             else:
                 yield record, stamp, content
+
+    def collected(self, unpack: Callable[[Any], T]) -> tuple[list[T], Stamps, Stamps]:
+        """The results of ``unpack`` of all these messages, their numbers (K,) and their stamps (K,), ns."""
+        rows = [(content, record.number, stamp) for record, stamp, content in self.decoded(unpack)]
+        numbers, stamps = (np.array([row[column] for row in rows], dtype=np.int64) for column in (1, 2))
+        return [content for content, _, _ in rows], numbers, stamps
 
     def keep(self, good: NDArray[np.bool_], numbers: Stamps, reason: str) -> NDArray[np.intp]:
         """Indices of the good messages; the others are dropped for ``reason``."""

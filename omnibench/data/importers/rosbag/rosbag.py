@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -98,7 +97,12 @@ class Rosbag(Importer):
                 "reference poses apart"
             )
         if unreferenced:
-            runs = self._with_placeholders(runs)
+            # The design model's odometry, from (0, 0, 0) on, in the place of reference poses.
+            design = OdometryModel.of_design(self.options.robot, "arc")
+            if not self.options.robot.drive.direct:
+                runs = [replace(run, drive=self.options.robot.drive) for run in runs]
+            poses = design.poses([run.log(run.pose_times) for run in runs])
+            runs = [replace(run, poses=pose) for run, pose in zip(runs, poses, strict=True)]
         chosen = self.options.divided(complete(runs))
         dataset = self.options.dataset(
             chosen, gather_scans({run.id: scans[run.id] for run in chosen if run.id in scans})
@@ -112,11 +116,3 @@ class Rosbag(Importer):
         if unreferenced:  # the data set is checked once more when it has its poses
             return replace(dataset, referenced=False, warnings=tuple(warnings))
         return replace(dataset, warnings=(*warnings, *dataset.warnings))
-
-    def _with_placeholders(self, runs: Sequence[Trajectory]) -> list[Trajectory]:
-        """The runs with the design model's odometry, from (0, 0, 0) on, in the place of reference poses."""
-        design = OdometryModel.of_design(self.options.robot, "arc")
-        if not self.options.robot.drive.direct:
-            runs = [replace(run, drive=self.options.robot.drive) for run in runs]
-        poses = design.poses([run.log(run.pose_times) for run in runs])
-        return [replace(run, poses=pose) for run, pose in zip(runs, poses, strict=True)]

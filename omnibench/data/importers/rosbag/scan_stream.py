@@ -37,7 +37,16 @@ def scanner_mounting(bag: Bag, frame: str) -> ScannerMounting | None:
     child, whole = frame.strip("/"), np.eye(4)
     for _ in range(len(parents) + 1):
         if child.rpartition("/")[2] in _BASES:
-            return _planar(whole, bag, frame)
+            tilt = math.acos(np.clip(whole[2, 2], -1.0, 1.0))
+            upside_down = tilt > math.pi / 2
+            if min(tilt, math.pi - tilt) > _LARGEST_TILT:
+                raise DataError(
+                    f"{bag.path}: the scanner's frame {frame} is tilted by {math.degrees(tilt):.0f} degrees, so that "
+                    "it does not scan the plane of the floor; if it does, set scanner_mount; scans=false leaves the "
+                    "scans out"
+                )
+            yaw = math.atan2(whole[1, 0], whole[0, 0])
+            return ScannerMounting(Mount(x=float(whole[0, 3]), y=float(whole[1, 3]), yaw=yaw), upside_down)
         if child not in parents:
             return None
         child, step = parents[child]
@@ -65,18 +74,6 @@ def fixed_transforms(bag: Bag) -> dict[str, tuple[str, Array]]:
                 if np.isfinite(matrix).all():
                     parents[stamped.child_frame_id.strip("/")] = stamped.header.frame_id.strip("/"), matrix
     return parents
-
-
-def _planar(transform: Array, bag: Bag, frame: str) -> ScannerMounting:
-    tilt = math.acos(np.clip(transform[2, 2], -1.0, 1.0))
-    upside_down = tilt > math.pi / 2
-    if min(tilt, math.pi - tilt) > _LARGEST_TILT:
-        raise DataError(
-            f"{bag.path}: the scanner's frame {frame} is tilted by {math.degrees(tilt):.0f} degrees, so that it does "
-            "not scan the plane of the floor; if it does, set scanner_mount; scans=false leaves the scans out"
-        )
-    yaw = math.atan2(transform[1, 0], transform[0, 0])
-    return ScannerMounting(Mount(x=float(transform[0, 3]), y=float(transform[1, 3]), yaw=yaw), upside_down)
 
 
 _SAME = 1e-5  # rad over the whole scan, m; differences of geometry within one scanner: messages are in single precision
@@ -202,7 +199,19 @@ def read_scans(bag: Bag, topic: Topic, mount: Mount | None, warnings: list[str])
         raise DataError(f"{error}; {_WAY_OUT}") from None
     assert shape is not None  # else nothing is left
     warnings.extend(messages.warnings())
-    increment = _time_increment([row[4] for row in rows], scan_time, place, warnings)
+    # The scanner's time between rays, s: the median of its scans.
+    increments = [row[4] for row in rows]
+    increment = float(np.median(increments))
+    if np.abs(np.array(increments) - increment).max() > _SAME_INCREMENT * abs(increment):
+        low, high = min(increments), max(increments)
+        warnings.append(
+            f"{place}: time_increment varies from {low:.3g} to {high:.3g} s; its median, {increment:.3g} s, is taken"
+        )
+    if increment == 0 and scan_time > 0:
+        warnings.append(
+            f"{place}: time_increment is 0, so that each scan counts as taken at one instant, though scan_time is "
+            f"{scan_time:.3g} s"
+        )
     scanner = _scanner(shape, increment, _mounting(bag, frame, mount, place, warnings), topic, place)
     return ScanStream(bag.path, topic, scanner, stamps[order], logged[order])
 
@@ -256,22 +265,6 @@ def _difference(expected: _Shape, given: _Shape) -> str:
     return ""
 
 
-def _time_increment(increments: list[float], scan_time: float, place: str, warnings: list[str]) -> float:
-    """The scanner's time between rays, s: the median of its scans."""
-    increment = float(np.median(increments))
-    if np.abs(np.array(increments) - increment).max() > _SAME_INCREMENT * abs(increment):
-        low, high = min(increments), max(increments)
-        warnings.append(
-            f"{place}: time_increment varies from {low:.3g} to {high:.3g} s; its median, {increment:.3g} s, is taken"
-        )
-    if increment == 0 and scan_time > 0:
-        warnings.append(
-            f"{place}: time_increment is 0, so that each scan counts as taken at one instant, though scan_time is "
-            f"{scan_time:.3g} s"
-        )
-    return increment
-
-
 def _mounting(bag: Bag, frame: str, mount: Mount | None, place: str, warnings: list[str]) -> ScannerMounting:
     if mount is not None:
         return ScannerMounting(mount)
@@ -311,7 +304,12 @@ def read_transforms(bag: Bag, topic: Topic, frames: Sequence[str], warnings: lis
     Transforms between are composed in the plane. ConfigError: no frames are given, or nothing leads from one to the
     other. DataError as for ``read_poses``.
     """
-    moving = _parents(bag, topic)
+    # The parent of every frame that moves.
+    moving = {
+        stamped.child_frame_id.strip("/"): stamped.header.frame_id.strip("/")
+        for record in bag.records(topic)
+        for stamped in getattr(record.message, "transforms", ())
+    }
     fixed = fixed_transforms(bag)
     parents = moving | {child: parent for child, (parent, _) in fixed.items()}
     shown = ", ".join(f"{parent} > {child}" for child, parent in parents.items()) or "none"
@@ -342,15 +340,6 @@ def read_transforms(bag: Bag, topic: Topic, frames: Sequence[str], warnings: lis
             _at(streams[link], stamps) if link in streams else np.broadcast_to(_in_plane(fixed[link][1]), poses.shape),
         )
     return PoseStream(stamps, poses, None)
-
-
-def _parents(bag: Bag, topic: Topic) -> dict[str, str]:
-    """The parent of every frame that moves."""
-    return {
-        stamped.child_frame_id.strip("/"): stamped.header.frame_id.strip("/")
-        for record in bag.records(topic)
-        for stamped in getattr(record.message, "transforms", ())
-    }
 
 
 def _transform(child: str, message: Any) -> Any:

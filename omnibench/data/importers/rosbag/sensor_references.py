@@ -56,13 +56,8 @@ def read_inertial(bag: Bag, topic: Topic, sigma: float | None, gyro: bool, warni
     covariances are not known, or too few messages are left.
     """
     messages = MessageFilter(bag, topic)
-    rows, numbers, stamps = [], [], []
-    for record, stamp, row in messages.decoded(_reading):
-        rows.append(row)
-        numbers.append(record.number)
-        stamps.append(stamp)
+    rows, number, times = messages.collected(_reading)
     table = np.array(rows, dtype=float).reshape(-1, 7)
-    number, times = np.array(numbers, dtype=np.int64), np.array(stamps, dtype=np.int64)
     oriented = not gyro and len(table) > 0 and bool((table[:, 5] != -1).all())
     if oriented:
         headings = planar_headings(table[:, :4])
@@ -140,13 +135,8 @@ def read_fixes(bag: Bag, topic: Topic, sigma: float | None, warnings: list[str])
     sigma: m, of all fixes; None: by their covariances. DataError: these are not known, or too few fixes are left.
     """
     messages = MessageFilter(bag, topic)
-    rows, numbers, stamps = [], [], []
-    for record, stamp, row in messages.decoded(_fix):
-        rows.append(row)
-        numbers.append(record.number)
-        stamps.append(stamp)
+    rows, number, times = messages.collected(_fix)
     table = np.array(rows, dtype=float).reshape(-1, 6)
-    number, times = np.array(numbers, dtype=np.int64), np.array(stamps, dtype=np.int64)
     good = messages.keep(table[:, 0] >= 0, number, "without a fix (status -1)")
     possible = (np.abs(table[:, 1]) <= 90) & (np.abs(table[:, 2]) <= 360)
     good = good[messages.keep(possible[good], number[good], "without latitude and longitude")]

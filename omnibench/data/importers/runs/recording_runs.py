@@ -147,7 +147,14 @@ def cut_run(
     if not len(chosen):
         return None
     if not len(reference.times) or (len(reference.times) == 1 and reference.measured is not None):
-        return _without_poses(whole, samples, chosen, reference)
+        # The run of the chosen samples, from the one pose there is or from the origin of a frame of its own.
+        zero = float(samples.begins[chosen[0]])
+        start = reference.poses if len(reference.poses) else np.zeros((1, 3))
+        return CutRun(
+            replace(_sampled(whole, samples, chosen, zero), pose_times=np.zeros(1), poses=start, pose_covariances=None),
+            zero,
+            chosen,
+        )
     times, poses = reference.times[seen], reference.poses[seen]
     if len(times) < 2:
         return None
@@ -163,19 +170,6 @@ def cut_run(
         pose_covariances=None if reference.covariances is None else reference.covariances[shown],
     )
     return CutRun(trajectory, aligned.zero, kept)
-
-
-def _without_poses(
-    whole: Trajectory, samples: WheelSamples, chosen: NDArray[np.intp], reference: ReferenceStream
-) -> CutRun:
-    """The run of the chosen samples, from the one pose there is or from the origin of a frame of its own."""
-    zero = float(samples.begins[chosen[0]])
-    start = reference.poses if len(reference.poses) else np.zeros((1, 3))
-    return CutRun(
-        replace(_sampled(whole, samples, chosen, zero), pose_times=np.zeros(1), poses=start, pose_covariances=None),
-        zero,
-        chosen,
-    )
 
 
 def _sampled(whole: Trajectory, samples: WheelSamples, kept: NDArray[np.intp], zero: float) -> Trajectory:
@@ -279,7 +273,17 @@ def recording_runs(
             continue
         # From pose to pose where it was cut: one interpolated within a drive would be wrong by the path's bend.
         untouched = not named and piece == uncut[0]
-        run = _run(whole, samples, reference, piece, slice(None) if untouched else _seen(reference, piece.span))
+        run = _run(
+            whole,
+            samples,
+            reference,
+            piece,
+            slice(None)
+            if untouched
+            else slice(
+                *np.searchsorted(reference.times, (piece.span[0] - _SAME_TIME, piece.span[1] + _SAME_TIME)).tolist()
+            ),
+        )
         if run is None:
             bare += 1
         elif named:
@@ -319,10 +323,6 @@ def _cut(
             begun = from_rest(samples, piece.part, span, reference.times) if options.start_at_rest else span
             cut.append(None if begun is None else _Piece(piece.part, begun, len(spans) > 1))
     return cut
-
-
-def _seen(reference: ReferenceStream, span: Span) -> slice:
-    return slice(*np.searchsorted(reference.times, (span[0] - _SAME_TIME, span[1] + _SAME_TIME)).tolist())
 
 
 def _run(
@@ -455,7 +455,7 @@ def _parts(run: Trajectory, streams: RecordedStreams, options: ReferenceOptions,
         read = replace(run, poses=poses, pose_covariances=reference.covariances, references=measured)
         return [Part(read, run.id, 0.0, whole=True)]
     parts = []
-    recorded = _recorded(run, streams.samples)
+    recorded = np.searchsorted(run.times, streams.samples.ends)
     for cut in recording_runs(run, streams.samples, reference, options, notes, streams.place):
         rows = recorded[cut.kept]
         targets, odometry = (None if array is None else array[rows] for array in (run.targets, run.odometry))
@@ -467,11 +467,6 @@ def _parts(run: Trajectory, streams: RecordedStreams, options: ReferenceOptions,
         made = replace(cut.trajectory, targets=targets, odometry=odometry, sent=sent, distance=distance)
         parts.append(Part(replace(made, duration=run.duration) if whole else made, run.id, cut.zero, whole))
     return parts
-
-
-def _recorded(run: Trajectory, samples: WheelSamples) -> NDArray[np.intp]:
-    """Indices of the run's samples that are left."""
-    return np.searchsorted(run.times, samples.ends)
 
 
 def scans_of(scans: Scans, parts: Sequence[Part]) -> Scans:
