@@ -61,9 +61,11 @@ def options_of(model: type[BaseModel]) -> list[Any]:
 
 def _parameters(model: type[BaseModel]) -> Iterator[inspect.Parameter]:
     """The fields as parameters of a function from which Typer makes options."""
+    from pydantic import BaseModel
+
     properties = model.model_json_schema()["properties"]
     for name, field in model.model_fields.items():
-        if hasattr(field.default, "model_fields"):
+        if isinstance(field.default, BaseModel):
             yield from _parameters(type(field.default))
             continue
         kinds = properties[name].get("anyOf", [properties[name]])
