@@ -152,7 +152,6 @@ main()
 
 
 def test_ctrl_c_where_python_ignores_exceptions_ends_the_command_soon_after() -> None:
-    command = [sys.executable, "-c", IGNORED]
-    run = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
+    run = python(IGNORED)
     assert (run.returncode, run.stdout) == (130, "")
     assert run.stderr.split() == ["interrupted;", "the", "same", "command", "begins", "anew"]
