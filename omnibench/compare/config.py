@@ -29,6 +29,13 @@ from omnibench.simulate.source import DatasetSource
 LEAST_MEMORY = 256.0  # 10^6 bytes; a worker process has 200 MB before its run begins (measured, RLIMIT_DATA)
 
 
+def with_names(entries: Any, key: str) -> Any:
+    """The entries of a list, those that are a name alone as a mapping from ``key``; the model refuses unknown ones."""
+    if isinstance(entries, list | tuple):
+        return [{key: entry} if isinstance(entry, str) else entry for entry in entries]
+    return entries
+
+
 def known_backend(backend: str) -> str:
     """The name of a backend. ValueError: it is none's."""
     if flaw := name_flaw(backend):
@@ -108,12 +115,17 @@ class PublishedResult(Model):
         return printed if printed is not None or costs is None else 1 - costs[1] / costs[0]
 
 
-class CompareConfig(Model):
-    """A comparison: data sets x calibrators x seeds, with one cost and one budget for all."""
+class NamedConfig(Model):
+    """Name and remarks of a comparison or a study."""
 
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=60)
     description: str = ""
     notes: tuple[str, ...] = Field((), description="what a reader of the report must know")
+
+
+class CompareConfig(NamedConfig):
+    """A comparison: data sets x calibrators x seeds, with one cost and one budget for all."""
+
     datasets: dict[Annotated[str, Field(min_length=1, max_length=60)], DatasetSource] = Field(min_length=1)
     cost: CostChoice = CostChoice()
     loss: LossName = Field(
@@ -166,9 +178,7 @@ class CompareConfig(Model):
     @field_validator("calibrators", mode="before", json_schema_input_type=tuple[str | CalibratorEntry, ...])
     @classmethod
     def _names_stand_for_entries(cls, entries: Any) -> Any:
-        if isinstance(entries, list | tuple):
-            return [{"name": entry} if isinstance(entry, str) else entry for entry in entries]
-        return entries
+        return with_names(entries, "name")
 
     @field_validator("cost", mode="before", json_schema_input_type=str | CostChoice)
     @classmethod

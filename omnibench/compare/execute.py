@@ -13,7 +13,7 @@ from omnibench.compare.config import load_calibrators
 from omnibench.compare.plan import PlannedRun, RunTask
 from omnibench.errors import DataError, Interrupted
 from omnibench.fit.calibrator import Outcome, RunResult, Timing, describe_error, run_calibrator
-from omnibench.fit.problem import CalibrationProblem, make_problem
+from omnibench.fit.problem import make_problem
 from omnibench.fit.shrinkage import shrunk
 from omnibench.jobs.job import Backend, BackendError, Failure, Job, JobWatch, ResultStore, run_jobs
 from omnibench.processes import interrupts_not_in_callbacks
@@ -81,22 +81,18 @@ def _solve(task: RunTask, report: Reporter) -> RunResult:
         problem = make_problem(task.settings, task.robot, task.trajectories, report)
         result = shrunk(problem, run_calibrator(calibrator, problem), fitted=calibrator.fitted)
         if task.timing and result.matrix is not None:
-            result = replace(result, timing=Timing(_reference_seconds(problem), platform.node()))
+            # Wall time in s of one evaluation of the start's cost by direct integration, the best of a few
+            spent = []
+            for _ in range(_REFERENCES):
+                began = time.perf_counter()
+                problem.values(problem.start[None])
+                spent.append(time.perf_counter() - began)
+            result = replace(result, timing=Timing(min(spent), platform.node()))
     except BaseException as error:  # whatever a plug-in raises, wherever, is this run's outcome
         result = _without_answer(Outcome.FAILED, describe_error(error))
     if result.outcome is Outcome.FAILED:
         raise _RunFailed(result)
     return result
-
-
-def _reference_seconds(problem: CalibrationProblem) -> float:
-    """Wall time in s of one evaluation of the start's cost by direct integration, the best of a few."""
-    spent = []
-    for _ in range(_REFERENCES):
-        began = time.perf_counter()
-        problem.values(problem.start[None])
-        spent.append(time.perf_counter() - began)
-    return min(spent)
 
 
 def _without_answer(outcome: Outcome, reason: str, evaluations: int = 0, seconds: float = 0.0) -> RunResult:

@@ -11,7 +11,7 @@ from typing import Any, get_type_hints
 
 import polars as pl
 
-from omnibench.compare.config import CompareConfig
+from omnibench.compare.config import CompareConfig, NamedConfig
 from omnibench.compare.result import THEORETICAL_NAME, ComparisonResult, EntryStatistics, RunRecord, ScoredRun
 from omnibench.config import read_yaml, to_json, to_yaml
 from omnibench.data.dataset import SPLITS, Dataset
@@ -37,55 +37,57 @@ from omnibench.robot.calibration import (
 )
 
 # First line of config.yaml in a folder of results. A folder whose config.yaml lacks it is not written to.
-_MARK = "# The effective config of a comparison; the results beside it were made with it."
+_MARK = "# The effective config of a {}; the results beside it were made with it."
 
 
-def check_output(folder: Path | None, config: CompareConfig, *, force: bool = False) -> None:
-    """Check the folder of results before the work.
+def check_output(folder: Path | None, config: NamedConfig, noun: str = "comparison", *, force: bool = False) -> None:
+    """Check the folder of results of a comparison or study (noun) before the work.
 
-    DataError: it is a file, or it holds anything but an earlier comparison of the same name, and not ``force``.
+    DataError: it is a file, or it holds anything but an earlier one of the same name, and not ``force``.
     """
-    if folder is not None:
-        check_results_folder(folder, _MARK, "comparison", force=force)
-        if not force:
-            _check_name(folder, config)
-
-
-def prepare_output(config: CompareConfig, folder: Path | None, *, force: bool = False) -> Path:
-    """The folder to write to, with the effective config in it.
-
-    Default: ``results/<config name>/<time>``, with a link ``latest``. DataError when it cannot be written to, or as
-    ``check_output`` does.
-    """
-    check_output(folder, config, force=force)
-    chosen = folder or new_results_folder(RESULTS / config.name)
-    write_text(chosen / "config.yaml", f"{_MARK}\n{to_yaml(config)}")
     if folder is None:
-        link_latest(chosen)
-    return chosen
-
-
-def _check_name(folder: Path, config: CompareConfig) -> None:
-    if not (folder / "config.yaml").is_file():
+        return
+    check_results_folder(folder, _MARK.format(noun), noun, force=force)
+    if force or not (folder / "config.yaml").is_file():
         return
     earlier = read_yaml(folder / "config.yaml")
     name, others = earlier.get("name"), earlier.get("datasets", {})
     if name != config.name:
-        raise DataError(f"{folder}: holds the comparison {name!r}; name another folder for {config.name!r}, or --force")
-    if not set(others) & set(config.datasets):
+        raise DataError(f"{folder}: holds the {noun} {name!r}; name another folder for {config.name!r}, or --force")
+    if isinstance(config, CompareConfig) and not set(others) & set(config.datasets):
         raise DataError(
             f"{folder}: holds a comparison on {', '.join(map(repr, others))}; name another folder for "
             f"{', '.join(map(repr, config.datasets))}, or --force"
         )
 
 
+def prepare_output(config: NamedConfig, folder: Path | None, noun: str = "comparison", *, force: bool = False) -> Path:
+    """The folder to write to, with the effective config in it.
+
+    Default: ``results/<config name>/<time>``, with a link ``latest``. DataError when it cannot be written to, or as
+    ``check_output`` does.
+    """
+    check_output(folder, config, noun, force=force)
+    chosen = folder or new_results_folder(RESULTS / config.name)
+    write_text(chosen / "config.yaml", f"{_MARK.format(noun)}\n{to_yaml(config)}")
+    if folder is None:
+        link_latest(chosen)
+    return chosen
+
+
 def write_results(result: ComparisonResult) -> None:
     """Write summary.json, the tables and the calibration of every entry's typical run."""
-    earlier = _earlier_calibrations(result.output)
+    # The calibration files of an earlier comparison in the folder: the config may have other entries now
+    try:
+        rows = json.loads((result.output / "summary.json").read_text(encoding="utf-8"))["statistics"]
+        before = [row for row in rows if row["answers"] and row["calibrator"] != THEORETICAL_NAME]
+        earlier = _calibration_files(result.output, [(row["dataset"], row["label"]) for row in before])
+    except (OSError, ValueError, KeyError, TypeError):
+        earlier = []
     write_text(result.output / "summary.json", to_json(summary(result)) + "\n")
     for name, table in _tables(result).items():
         write_table(result.output / f"{name}.parquet", table)
-    for file in earlier:  # the config may have other entries now
+    for file in earlier:
         remove(file)
     fitted = _fitted(result)
     files = _calibration_files(result.output, [(entry.dataset, entry.label) for entry in fitted])
@@ -110,22 +112,23 @@ def _fitted(result: ComparisonResult) -> list[EntryStatistics]:
 def _calibration_files(folder: Path, entries: Iterable[tuple[str, str]]) -> list[Path]:
     """The calibration files of entries, which are given by data set and label."""
     written: set[str] = set()
-    names = [_file_name(f"{dataset}-{label}", written) for dataset, label in entries]
-    return [folder / "calibrations" / f"{name}.yaml" for name in names]
-
-
-def _earlier_calibrations(folder: Path) -> list[Path]:
-    """The calibration files of the comparison whose summary stands in a folder."""
-    try:
-        rows = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["statistics"]
-        fitted = [row for row in rows if row["answers"] and row["calibrator"] != THEORETICAL_NAME]
-        return _calibration_files(folder, [(row["dataset"], row["label"]) for row in fitted])
-    except (OSError, ValueError, KeyError, TypeError):
-        return []
+    files = []
+    for dataset, label in entries:
+        plain = re.sub(r"[^A-Za-z0-9_.-]+", "_", f"{dataset}-{label}").strip("_")
+        # Names of files differ in more than letter case
+        name, count = plain, 1
+        while name.lower() in written:
+            count += 1
+            name = f"{plain}-{count}"
+        written.add(name.lower())
+        files.append(folder / "calibrations" / f"{name}.yaml")
+    return files
 
 
 def summary(result: ComparisonResult) -> dict[str, Any]:
     """The content of summary.json."""
+    # The units and the method of the intervals of each data set and split
+    designs = {run.record.dataset: run.design for run in result.runs}
     return {
         "name": result.config.name,
         "dataset": ", ".join(result.datasets),
@@ -136,24 +139,18 @@ def summary(result: ComparisonResult) -> dict[str, Any]:
         "budget": result.config.budget.model_dump(),
         "runs": [run.record.model_dump(mode="json") for run in result.runs],
         "statistics": [_statistics_row(entry) for entry in result.statistics],
-        "intervals": _interval_units(result),
+        "intervals": {
+            name: {
+                split: {"unit": score.units.name, "units": score.units.count, "method": score.units.method}
+                for split, score in design.items()
+            }
+            for name, design in designs.items()
+        },
         "held_out": {name: {"label": each.label} | each.verdict.model_dump() for name, each in result.held_out.items()},
         "sessions": {name: list(sentences) for name, sentences in result.sessions.items()},
         "certificates": [certificate.model_dump() for certificate in result.certificates],
         "warnings": list(result.warnings),
         "environment": result.environment.model_dump(),
-    }
-
-
-def _interval_units(result: ComparisonResult) -> dict[str, dict[str, Any]]:
-    """The units and the method of the intervals of each data set and split."""
-    designs = {run.record.dataset: run.design for run in result.runs}
-    return {
-        name: {
-            split: {"unit": score.units.name, "units": score.units.count, "method": score.units.method}
-            for split, score in design.items()
-        }
-        for name, design in designs.items()
     }
 
 
@@ -194,17 +191,6 @@ def calibration_of(run: ScoredRun, result: ComparisonResult) -> Calibration:
             reason=run.record.reason,
         ),
     )
-
-
-def _file_name(title: str, taken: set[str]) -> str:
-    """A title as a file name that differs from those ``taken`` in more than letter case, and is added to them."""
-    plain = re.sub(r"[^A-Za-z0-9_.-]+", "_", title).strip("_")
-    name, count = plain, 1
-    while name.lower() in taken:
-        count += 1
-        name = f"{plain}-{count}"
-    taken.add(name.lower())
-    return name
 
 
 # Column types, for columns in which every value may be missing.

@@ -46,7 +46,18 @@ def run_key(settings: FitSettings, dataset: Dataset) -> str:
     and the files of the calibrators and the cost that it names. Files in ``fit/calibrators/`` that it does not name are
     left out, so that a new calibrator does not discard the stored runs of the others; none of them imports another.
     """
-    code = named_code(settings) + _shared_code()
+    # Hash of the code of the calibrator, of the calibrators that its options name, of the cost, and of their bases
+    assert settings.cost is not None  # the settings are complete
+    named = {settings.calibrator, *(value for value in settings.options.values() if isinstance(value, str))}
+    classes = [known.cls for known in calibrators.entries() if known.name in named]
+    classes.append(costs.entry(settings.cost.name).cls)
+    modules = {sys.modules.get(base.__module__) for cls in classes for base in cls.__mro__}
+    digest = hashlib.sha256()
+    for name in sorted({name for cls in classes for name in getattr(cls, "uses", ())}):
+        digest.update(_code_of(name).encode())
+    for file in sorted({file for module in modules if (file := getattr(module, "__file__", None))}):
+        digest.update(hashlib.sha256(Path(file).read_bytes()).digest())
+    code = digest.hexdigest() + _shared_code()
     return content_key({"data": dataset.hash, "settings": settings, "code": code})
 
 
@@ -62,21 +73,6 @@ def shared_code(package: Path) -> str:
 @cache
 def _shared_code() -> str:
     return shared_code(_PACKAGE)
-
-
-def named_code(settings: FitSettings) -> str:
-    """Hash of the code of the calibrator, of the calibrators that its options name, of the cost, and of their bases."""
-    assert settings.cost is not None  # the settings are complete
-    named = {settings.calibrator, *(value for value in settings.options.values() if isinstance(value, str))}
-    classes = [known.cls for known in calibrators.entries() if known.name in named]
-    classes.append(costs.entry(settings.cost.name).cls)
-    modules = {sys.modules.get(base.__module__) for cls in classes for base in cls.__mro__}
-    digest = hashlib.sha256()
-    for name in sorted({name for cls in classes for name in getattr(cls, "uses", ())}):
-        digest.update(_code_of(name).encode())
-    for file in sorted({file for module in modules if (file := getattr(module, "__file__", None))}):
-        digest.update(hashlib.sha256(Path(file).read_bytes()).digest())
-    return digest.hexdigest()
 
 
 def _code_of(name: str) -> str:

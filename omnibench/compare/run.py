@@ -60,7 +60,8 @@ def certify(
     proofs: list[tuple[PlannedRun, BoxCertificate]] = []
     for run, done in zip(plan, scored, strict=True):
         wanted = run.element_box is not None and done.matrix is not None
-        if choice and wanted and not any(_same_box(run, owner) for owner, _ in proofs):
+        boxes = [(owner.dataset_name, owner.element_box) for owner, _ in proofs]
+        if choice and wanted and (run.dataset_name, run.element_box) not in boxes:
             answers = [
                 other.matrix.ravel()
                 for planned, other in zip(plan, scored, strict=True)
@@ -71,10 +72,6 @@ def certify(
         tuple(_with_proven_gap(run, done, proofs) for run, done in zip(plan, scored, strict=True)),
         tuple(proof for _, proof in proofs),
     )
-
-
-def _same_box(run: PlannedRun, other: PlannedRun) -> bool:
-    return run.dataset_name == other.dataset_name and run.element_box == other.element_box
 
 
 def _proof(choice: CertificateChoice, run: PlannedRun, answers: Sequence[Array]) -> list[BoxCertificate]:
@@ -153,9 +150,13 @@ def run_comparison(
         with _naming_failed_plugins(failures):
             config = effective_config(config)
             with ExitStack() as opened:
-                backend = opened.enter_context(open_backend(_backend(config), PRELOAD, progress))
+                workers = config.workers or os.cpu_count() or 1
+                choice = BackendChoice(name=config.backend, workers=workers, tls=config.tls)
+                backend = opened.enter_context(open_backend(choice, PRELOAD, progress))
                 # Processes that are started for simulation serve the calibrators, too.
-                opened.enter_context(one_thread_processes(_preload(config)))
+                # Modules for the processes of calibrators, and for those of SLAM where a robot's scans are simulated
+                scans = any(isinstance(source.simulate, RobotConfig) for source in config.datasets.values())
+                opened.enter_context(one_thread_processes((*PRELOAD, *(SLAM_PRELOAD if scans else ()))))
                 datasets = load_datasets(config, progress)
                 plan = make_plan(config, datasets)
                 folder = prepare_output(config, output, force=force)
@@ -186,16 +187,6 @@ def run_comparison(
             write_results(result)
             write_document(comparison_document(result), folder / "report.html")
         return result
-
-
-def _backend(config: CompareConfig) -> BackendChoice:
-    return BackendChoice(name=config.backend, workers=config.workers or os.cpu_count() or 1, tls=config.tls)
-
-
-def _preload(config: CompareConfig) -> tuple[str, ...]:
-    """Modules for the processes of calibrators, and for those of SLAM where a robot's scans are simulated."""
-    scans = any(isinstance(source.simulate, RobotConfig) for source in config.datasets.values())
-    return (*PRELOAD, *(SLAM_PRELOAD if scans else ()))
 
 
 @contextmanager

@@ -100,7 +100,17 @@ def score(
     for run in plan:
         if run.dataset_name not in scorers:
             dataset = datasets[run.dataset_name]
-            scorers[run.dataset_name] = _scorers(config, dataset)
+            # A scorer for each split that has trajectories
+            scorers[run.dataset_name] = {
+                split: SplitScorer(
+                    dataset.split(split),
+                    costs.create(config.cost.name, config.cost.options),
+                    config.integration,
+                    config.bootstrap.unit,
+                )
+                for split in SPLITS
+                if dataset.split(split)
+            }
             design[run.dataset_name] = _scores(scorers[run.dataset_name], dataset.robot.inverse_kinematic_matrix)
     scored = []
     for run, result in zip(plan, results, strict=True):
@@ -109,23 +119,39 @@ def score(
         except DataError as error:  # a run lacks what an effect of the answer needs
             result = replace(result, outcome=Outcome.FAILED, reason=str(error), vector=None, matrix=None, cost=None)
             scores = {}
-        scored.append(_scored(run, result, scores, design[run.dataset_name]))
+        # The run as a row of summary.json, with its scores
+        design_scores = design[run.dataset_name]
+        settings = run.settings
+        assert settings.calibrator is not None and settings.parameterisation is not None  # noqa: PT018 (they are complete)
+        record = RunRecord(
+            dataset=run.dataset_name,
+            label=run.label,
+            calibrator=settings.calibrator,
+            parameterisation=settings.parameterisation,
+            box=run.box_name,
+            seed=settings.seed,
+            options=settings.options,
+            outcome=result.outcome,
+            reason=result.reason,
+            **_columns("train", scores, design_scores),
+            **_columns("validation", scores, design_scores),
+            evaluations=result.evaluations,
+            seconds=result.seconds,
+            reference_seconds=None if result.timing is None else result.timing.reference_seconds,
+            machine=None if result.timing is None else result.timing.machine,
+            matrix=None if result.matrix is None else matrix_rows(result.matrix),
+            parameters=_parameters(run, result),
+            at_bounds=result.at_bounds,
+            held=result.held,
+            gap=None,
+            gap_box=None,
+            proven_gap=None,
+        )
+        scored.append(
+            ScoredRun(record, run.search_space, result.history, scores, design_scores, result.extension, result.noise)
+        )
     exact = [(run, done) for run, done in zip(plan, scored, strict=True) if _is_exact(run, done)]
     return tuple(_with_gap(run, done, exact) for run, done in zip(plan, scored, strict=True))
-
-
-def _scorers(config: CompareConfig, dataset: Dataset) -> dict[Split, SplitScorer]:
-    """A scorer for each split that has trajectories."""
-    return {
-        split: SplitScorer(
-            dataset.split(split),
-            costs.create(config.cost.name, config.cost.options),
-            config.integration,
-            config.bootstrap.unit,
-        )
-        for split in SPLITS
-        if dataset.split(split)
-    }
 
 
 def _scores(scorers: Mapping[Split, SplitScorer], matrix: Array) -> dict[Split, SplitScore]:
@@ -154,41 +180,6 @@ def position_error(errors: Array) -> float:
 def heading_error(errors: Array) -> float:
     """Mean absolute heading of final errors (Z, 3), rad."""
     return float(positions_and_headings(errors)[1].mean())
-
-
-def _scored(
-    run: PlannedRun,
-    result: RunResult,
-    scores: Mapping[Split, SplitScore],
-    design: Mapping[Split, SplitScore],
-) -> ScoredRun:
-    settings = run.settings
-    assert settings.calibrator is not None and settings.parameterisation is not None  # noqa: PT018 (they are complete)
-    record = RunRecord(
-        dataset=run.dataset_name,
-        label=run.label,
-        calibrator=settings.calibrator,
-        parameterisation=settings.parameterisation,
-        box=run.box_name,
-        seed=settings.seed,
-        options=settings.options,
-        outcome=result.outcome,
-        reason=result.reason,
-        **_columns("train", scores, design),
-        **_columns("validation", scores, design),
-        evaluations=result.evaluations,
-        seconds=result.seconds,
-        reference_seconds=None if result.timing is None else result.timing.reference_seconds,
-        machine=None if result.timing is None else result.timing.machine,
-        matrix=None if result.matrix is None else matrix_rows(result.matrix),
-        parameters=_parameters(run, result),
-        at_bounds=result.at_bounds,
-        held=result.held,
-        gap=None,
-        gap_box=None,
-        proven_gap=None,
-    )
-    return ScoredRun(record, run.search_space, result.history, scores, design, result.extension, result.noise)
 
 
 def _columns(split: Split, scores: Mapping[Split, SplitScore], design: Mapping[Split, SplitScore]) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from operator import itemgetter
 
 import numpy as np
 
-from omnibench.compare.result import EntryStatistics, EntryVerdict, RunRecord, ScoredRun, SplitScore, SplitStatistics
+from omnibench.compare.result import EntryStatistics, EntryVerdict, ScoredRun, SplitScore, SplitStatistics
 from omnibench.data.dataset import Dataset, Split
 from omnibench.fit.evaluate import judge, nothing_held_out
 from omnibench.fit.ratio_intervals import Bootstrap, Interval, RatioIntervals
@@ -38,7 +38,45 @@ def entry_statistics(runs: Sequence[ScoredRun], bootstrap: Bootstrap) -> tuple[E
     for (dataset, label), group in groups.items():
         competing = [run for (name, _), run in typical.items() if name == dataset and run is not None]
         best = _best(competing, intervals)
-        statistics.append(_statistics(group, typical[dataset, label], best, intervals))
+        median_run = typical[dataset, label]
+        record = group[0].record
+        costs = [run.record.train_cost for run in group if run.record.train_cost is not None]
+        gaps = [run.record.gap for run in group if run.record.gap is not None]
+        proven = [run.record.proven_gap for run in group if run.record.proven_gap is not None]
+        difference, equal = None, None
+        if median_run is not None and best is not None:
+            difference, equal = _against_best(median_run, best, intervals)
+        splits: dict[Split, SplitStatistics] = {}
+        if median_run is not None:
+            for split, score in median_run.scores.items():
+                cost, designed = intervals.mean(score.costs, score.units), median_run.design[split].costs
+                improvement = intervals.improvement(score.costs, designed, score.units, score.rounding)
+                splits[split] = SplitStatistics(cost, improvement)
+        records = [run.record for run in group]
+        ratios = [each.seconds / each.reference_seconds for each in records if each.reference_seconds]
+        statistics.append(
+            EntryStatistics(
+                dataset=record.dataset,
+                label=record.label,
+                calibrator=record.calibrator,
+                parameterisation=record.parameterisation,
+                box=record.box,
+                runs=len(group),
+                answers=len(costs),
+                typical=median_run,
+                train_median=float(np.median(costs)) if costs else None,
+                train_spread=float(np.subtract(*np.percentile(costs, [75, 25]))) if costs else None,
+                splits=splits,
+                difference=difference,
+                practically_equal=equal,
+                is_best=median_run is not None and median_run is best,
+                gap_median=float(np.median(gaps)) if gaps else None,
+                proven_gap_median=float(np.median(proven)) if proven else None,
+                evaluations_median=float(np.median([run.record.evaluations for run in group])),
+                seconds_median=float(np.median([run.record.seconds for run in group])),
+                reference_evaluations_median=float(np.median(ratios)) if ratios else None,
+            )
+        )
     return tuple(statistics)
 
 
@@ -97,57 +135,6 @@ def _best(competing: Sequence[ScoredRun], intervals: RatioIntervals) -> ScoredRu
     lowest = min(competing, key=_judged_cost)
     rivals = [run for run in competing if _against_best(run, lowest, intervals)[1] is not False]
     return min(rivals, key=lambda run: (run.record.train_cost or 0.0, _judged_cost(run)))
-
-
-def _statistics(
-    group: Sequence[ScoredRun],
-    typical: ScoredRun | None,
-    best: ScoredRun | None,
-    intervals: RatioIntervals,
-) -> EntryStatistics:
-    record = group[0].record
-    costs = [run.record.train_cost for run in group if run.record.train_cost is not None]
-    gaps = [run.record.gap for run in group if run.record.gap is not None]
-    proven = [run.record.proven_gap for run in group if run.record.proven_gap is not None]
-    difference, equal = None, None
-    if typical is not None and best is not None:
-        difference, equal = _against_best(typical, best, intervals)
-    return EntryStatistics(
-        dataset=record.dataset,
-        label=record.label,
-        calibrator=record.calibrator,
-        parameterisation=record.parameterisation,
-        box=record.box,
-        runs=len(group),
-        answers=len(costs),
-        typical=typical,
-        train_median=float(np.median(costs)) if costs else None,
-        train_spread=float(np.subtract(*np.percentile(costs, [75, 25]))) if costs else None,
-        splits={} if typical is None else _by_split(typical, intervals),
-        difference=difference,
-        practically_equal=equal,
-        is_best=typical is not None and typical is best,
-        gap_median=float(np.median(gaps)) if gaps else None,
-        proven_gap_median=float(np.median(proven)) if proven else None,
-        evaluations_median=float(np.median([run.record.evaluations for run in group])),
-        seconds_median=float(np.median([run.record.seconds for run in group])),
-        reference_evaluations_median=_median_of_references([run.record for run in group]),
-    )
-
-
-def _median_of_references(records: Sequence[RunRecord]) -> float | None:
-    ratios = [each.seconds / each.reference_seconds for each in records if each.reference_seconds]
-    return float(np.median(ratios)) if ratios else None
-
-
-def _by_split(run: ScoredRun, intervals: RatioIntervals) -> dict[Split, SplitStatistics]:
-    return {
-        split: SplitStatistics(
-            cost=intervals.mean(score.costs, score.units),
-            improvement=intervals.improvement(score.costs, run.design[split].costs, score.units, score.rounding),
-        )
-        for split, score in run.scores.items()
-    }
 
 
 def _typical(group: Sequence[ScoredRun]) -> ScoredRun | None:

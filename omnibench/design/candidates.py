@@ -26,7 +26,6 @@ from omnibench.robot.kinematics import Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
 from omnibench.simulate.commands import Command, TimedCommand, default_directions, steering_limit, wheels_of
-from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.drivable_commands import LONGEST, SHORTEST, DrivableCommands, Shapes
 from omnibench.simulate.flower import planned_commands, run_as_designed
 from omnibench.simulate.robot_config import RobotConfig
@@ -45,18 +44,6 @@ _SAMPLE_PERIOD, _POSE_PERIOD = 0.05, 0.25  # s; commands are constant, so that l
 # White noise of a motion capture or of scan matching, and per sqrt(s) what a floor and slip add: the order of magnitude
 # of the recordings that omnibench was tried on, 3 to 9 mm.
 ASSUMED_NOISE = Noise(pose_position=0.005, pose_heading=0.005, walk_position=0.003, walk_heading=0.003)
-
-
-def parse_area(text: str) -> tuple[float, float]:
-    """The sides, m, of an area like ``3x2.5``. ConfigError: it is none."""
-    match = re.fullmatch(r"\s*([0-9.]+)\s*[xX×]\s*([0-9.]+)\s*m?\s*", text)
-    try:
-        sides = (float(match[1]), float(match[2])) if match else (0.0, 0.0)
-    except ValueError:
-        sides = (0.0, 0.0)
-    if min(sides) <= 0 or not math.isfinite(max(sides)):
-        raise ConfigError(f"--area {text}: give two sides in m, like --area 3x2.5")
-    return sides
 
 
 @dataclass(frozen=True)
@@ -103,7 +90,16 @@ def design_source(
     noise["pose_position"] = given.pop("position_noise", noise["pose_position"])
     noise["pose_heading"] = math.radians(given.pop("heading_noise", math.degrees(noise["pose_heading"])))
     if "area" in given:
-        given["area"] = parse_area(given["area"])
+        # The sides, m, of an area like 3x2.5
+        text = given["area"]
+        match = re.fullmatch(r"\s*([0-9.]+)\s*[xX×]\s*([0-9.]+)\s*m?\s*", text)
+        try:
+            sides = (float(match[1]), float(match[2])) if match else (0.0, 0.0)
+        except ValueError:
+            sides = (0.0, 0.0)
+        if min(sides) <= 0 or not math.isfinite(max(sides)):
+            raise ConfigError(f"--area {text}: give two sides in m, like --area 3x2.5")
+        given["area"] = sides
     if "steering_limit" in given:
         given["steering_limit_deg"] = given.pop("steering_limit")
     content = {"robot": str(robot), "noise": noise, **given}
@@ -155,6 +151,10 @@ class RobotCommands(Model):
             )
         _, candidates = driven_as_designed(robot, integration, (_SAMPLE_PERIOD, _POSE_PERIOD), {_SET: commands})
         noise = self.noise
+        # The limits in words
+        words = [f"{self.max_speed:g} m/s", f"{self.max_turn_rate:g} rad/s", f"wheels {self._wheel_rate:.3g} rad/s"]
+        if not self.robot.drive.direct:
+            words.append(f"steering angles {math.degrees(self._steering_limit):g} deg")
         return checked_pool(
             CandidatePool(
                 source=source,
@@ -175,7 +175,8 @@ class RobotCommands(Model):
                 simulated=True,
                 recorded=False,
                 notes=(
-                    self._limits,
+                    f"Commands were made for at most {', '.join(words)}, and a free floor of {self.area[0]:g} x "
+                    f"{self.area[1]:g} m, of which the robot's wheels need {self._half_width:.2g} m about its centre.",
                     "Left is counter-clockwise as seen from above, backward too. Begin where a run stays on the floor.",
                 ),
             )
@@ -217,17 +218,6 @@ class RobotCommands(Model):
         """Sides, m, of the area that the robot's centre may be in."""
         wide, deep = (side - 2 * self._half_width for side in self.area)
         return wide, deep
-
-    @property
-    def _limits(self) -> str:
-        """The limits in words."""
-        words = [f"{self.max_speed:g} m/s", f"{self.max_turn_rate:g} rad/s", f"wheels {self._wheel_rate:.3g} rad/s"]
-        if not self.robot.drive.direct:
-            words.append(f"steering angles {math.degrees(self._steering_limit):g} deg")
-        return (
-            f"Commands were made for at most {', '.join(words)}, and a free floor of {self.area[0]:g} x "
-            f"{self.area[1]:g} m, of which the robot's wheels need {self._half_width:.2g} m about its centre."
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -389,42 +379,6 @@ def candidates_of_config(config: DesignConfig, source: str = "") -> CandidatePoo
     )
 
 
-def candidates_of_simulation(
-    name: str, config: FlowerConfig, integration: Integration, source: str = "", notes: Sequence[str] = ()
-) -> CandidatePool:
-    """The commands that a simulated data set's training session drives, as designed, with the noise that is simulated.
-
-    ConfigError: the commands leave part of the matrix undetermined, there is one only, or the noise is zero.
-    """
-    planned = planned_commands(config, config.train)
-    periods = (config.sample_period, config.pose_period)
-    pool, candidates = driven_as_designed(config.robot, integration, periods, {name: [each.timed for each in planned]})
-    baseline = np.zeros(len(candidates), dtype=np.intp)
-    for each in planned:
-        baseline[pool[each.timed]] += each.repetitions
-    often = f" x {baseline[0]}" if len(set(baseline)) == 1 else f", {plural(int(baseline.sum()), 'run')}"
-    scale = config.train.noise_scale
-    noise = Noise(**{kind: scale * getattr(config.noise, kind) for kind in Noise.model_fields})
-    return checked_pool(
-        CandidatePool(
-            source=source or f"data set {name}",
-            name=name,
-            description="",
-            robot=config.robot,
-            integration=integration,
-            candidates=candidates,
-            sets={name: tuple(range(len(candidates)))},
-            baseline=baseline,
-            baseline_name=f"{len(candidates)} {noun_for(len(candidates), 'command')} of {name}{often}",
-            noise=noise,
-            noise_source="assumed: what the config simulates for training",
-            simulated=True,
-            recorded=False,
-            notes=tuple(notes),
-        )
-    )
-
-
 def _candidates_of_comparison(
     config: ComparedData, name: str | None, integration: Integration | None, place: str
 ) -> CandidatePool:
@@ -442,7 +396,35 @@ def _candidates_of_comparison(
         )
     if source.simulate is None:
         return candidates_of_dataset(source.load(name), chosen, f"{place}: data set {name}")
-    return candidates_of_simulation(name, source.simulate, chosen, place, config.notes)
+    # The commands that the training session of a simulated data set drives, with the noise that is simulated
+    flower = source.simulate
+    planned = planned_commands(flower, flower.train)
+    periods = (flower.sample_period, flower.pose_period)
+    pool, candidates = driven_as_designed(flower.robot, chosen, periods, {name: [each.timed for each in planned]})
+    baseline = np.zeros(len(candidates), dtype=np.intp)
+    for each in planned:
+        baseline[pool[each.timed]] += each.repetitions
+    often = f" x {baseline[0]}" if len(set(baseline)) == 1 else f", {plural(int(baseline.sum()), 'run')}"
+    scale = flower.train.noise_scale
+    noise = Noise(**{kind: scale * getattr(flower.noise, kind) for kind in Noise.model_fields})
+    return checked_pool(
+        CandidatePool(
+            source=place,
+            name=name,
+            description="",
+            robot=flower.robot,
+            integration=chosen,
+            candidates=candidates,
+            sets={name: tuple(range(len(candidates)))},
+            baseline=baseline,
+            baseline_name=f"{len(candidates)} {noun_for(len(candidates), 'command')} of {name}{often}",
+            noise=noise,
+            noise_source="assumed: what the config simulates for training",
+            simulated=True,
+            recorded=False,
+            notes=config.notes,
+        )
+    )
 
 
 def driven_as_designed(

@@ -94,20 +94,17 @@ class DesignProblem:
         try:
             return Candidates(information, self.costs[chosen], self.repetitions)
         except ValueError:
-            raise ConfigError(self._open(information, use, name)) from None
-
-    def _open(self, information: Array, use: Use, name: str | None) -> str:
-        mean = information.mean(axis=0)
-        scale = scale_of(mean)
-        weakest = np.linalg.eigh(mean * scale * scale[:, None])[1][:, 0] * scale
-        elements = (self.basis @ weakest).reshape(3, -1)
-        direction = np.linalg.svd(elements)[2][0]
-        row = int(np.argmax(np.linalg.norm(elements, axis=1))) + 1
-        poses = "the final poses" if use == "final" else "the poses"
-        return (
-            f"{self.pool.source}: {poses} of {name or 'all commands'} leave row {row} of the matrix undetermined along "
-            f"{direction_in_words(direction, self.pool.robot.drive.names)}; add commands that determine it"
-        )
+            mean = information.mean(axis=0)
+            scale = scale_of(mean)
+            weakest = np.linalg.eigh(mean * scale * scale[:, None])[1][:, 0] * scale
+            elements = (self.basis @ weakest).reshape(3, -1)
+            direction = np.linalg.svd(elements)[2][0]
+            row = int(np.argmax(np.linalg.norm(elements, axis=1))) + 1
+            poses = "the final poses" if use == "final" else "the poses"
+            raise ConfigError(
+                f"{self.pool.source}: {poses} of {name or 'all commands'} leave row {row} of the matrix undetermined "
+                f"along {direction_in_words(direction, self.pool.robot.drive.names)}; add commands that determine it"
+            ) from None
 
     def of_all(self, name: str, counts: Counts) -> Counts:
         """Counts of a set's candidates as counts (C,) of all."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -92,18 +92,8 @@ def discover_effects(
     progress.begin("fitting the plain matrix")
     plain = fit_matrix(runs, dataset.robot, dataset.sample_period, start, noise_runs(runs, dataset))
 
-    progress.begin("looking where it fails, and at the catalogue")
-    screening = screen_plain(plain, without)
-    selection = select_effects(screening, rng)
-    extended = extend(plain, selection.chosen)
-    model = _ExtendedModel(screening, selection, extended)
-    if selection.tentative:
-        model = _extend_by_tentative(plain, model, without, rng)
-    if model.selection.chosen:
-        progress.begin("looking again, now that the noise is known better")
-        model = _confirm(plain, model, rng)
-    screening = model.screening
-    models = competing_models(plain, model.selection, model.extended)
+    screening, selection, extended = _select(plain, without, rng, progress)
+    models = competing_models(plain, selection, extended)
     models = with_fitted_forms(plain, screening, models)
     baseline = without_effects(plain, models.used)
     selection = located(models.selection, screening, baseline, models.used, rng)
@@ -118,17 +108,12 @@ def discover_effects(
     term_notes: tuple[str, ...] = ()
     if unknown_term and lacks_a_name(verdict):
         progress.begin("closing the gap without a name")
-        smooth = add_smooth_terms(
-            plain,
-            screening,
-            models,
-            selection.left,
-            lambda model: all_left(model, screening, rng),
-            folds,
+        before = models
+        models, left, term_notes = add_smooth_terms(
+            plain, screening, before, selection.left, lambda model: all_left(model, screening, rng), folds
         )
-        if smooth.models is not models:
-            dependences = without_smooth_term(dependences, smooth.left, screening, selection)
-        models, term_notes = smooth.models, smooth.notes
+        if models is not before:
+            dependences = without_smooth_term(dependences, left, screening, selection)
         effects = named_effects(models, motors)
 
     progress.begin("comparing on runs that were held out")
@@ -170,36 +155,30 @@ def discover_effects(
     return conclude(dataset, request, findings, time.monotonic() - began)
 
 
-@dataclass(frozen=True, eq=False)
-class _ExtendedModel:
-    """An extended model with the selection of its effects, and the screening that these were selected from."""
-
-    screening: Screening
-    selection: Selection
-    extended: Extended
-
-
-def _extend_by_tentative(
-    plain: Fit, model: _ExtendedModel, without: Sequence[str], rng: np.random.Generator
-) -> _ExtendedModel:
-    """Try the effects that were given up, fitted in full, and keep them if most of what they left is then explained.
-
-    To first order, an effect many times as large as the noise leaves residuals that look like another effect.
-    """
-    extended = extend(plain, model.selection.tentative)
-    screening = screen_extended(extended, without)
+def _select(
+    plain: Fit, without: Sequence[str], rng: np.random.Generator, progress: Stages
+) -> tuple[Screening, Selection, Extended]:
+    """Screen the plain matrix, select the effects that explain its residuals, and extend the model by them."""
+    progress.begin("looking where it fails, and at the catalogue")
+    screening = screen_plain(plain, without)
     selection = select_effects(screening, rng)
-    if selection.chosen and selection.left_share < _EXPLAINED * model.selection.left_share:
-        return _ExtendedModel(screening, selection, extended)
-    return model
-
-
-def _confirm(plain: Fit, model: _ExtendedModel, rng: np.random.Generator) -> _ExtendedModel:
-    """Screen and select once more with the noise of the extended model; extend anew if other effects are selected."""
-    screening = screen_again(model.extended, model.screening)
-    selection = select_effects(screening, rng)
-    same = selection.is_same_as(model.selection)
-    return _ExtendedModel(screening, selection, model.extended if same else extend(plain, selection.chosen))
+    extended = extend(plain, selection.chosen)
+    if selection.tentative:
+        # Effects that were given up are fitted in full, and kept if most of what they left is then explained: to first
+        # order, an effect many times as large as the noise leaves residuals that look like another effect.
+        in_full = extend(plain, selection.tentative)
+        screened_in_full = screen_extended(in_full, without)
+        again = select_effects(screened_in_full, rng)
+        if again.chosen and again.left_share < _EXPLAINED * selection.left_share:
+            screening, selection, extended = screened_in_full, again, in_full
+    if selection.chosen:
+        progress.begin("looking again, now that the noise is known better")
+        before = selection
+        screening = screen_again(extended, screening)
+        selection = select_effects(screening, rng)
+        if not selection.is_same_as(before):
+            extended = extend(plain, selection.chosen)
+    return screening, selection, extended
 
 
 def _start_matrix(dataset: Dataset, calibration: Calibration | None) -> Array:

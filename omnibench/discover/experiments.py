@@ -97,7 +97,12 @@ def choose_runs(separation: Separation, information: Array, seconds: Array, reco
     information (C, p, p): of one run of each candidate. seconds (C,): that it takes. recorded: s that a recorded run
     takes.
     """
-    kept = _promising(separation, information, seconds)
+    # Indices of the candidates that alone raise the margin of some pair most for their seconds
+    few = _BATCHES[1]
+    gains = separation.prospect(few * information).mean_margins - separation.prospect(0 * information[:1]).mean_margins
+    per_second = (gains / seconds[:, None, None]).reshape(len(seconds), -1)
+    best = np.argsort(-per_second, axis=0)[:_KEPT]
+    kept = np.unique(best[:, per_second.max(axis=0) > 0])
     problem = _Problem(separation, information[kept], seconds[kept])
     counts = problem.greedy()
     sure = problem.sure(problem.prospect(counts))
@@ -109,15 +114,6 @@ def choose_runs(separation: Separation, information: Array, seconds: Array, reco
     as_many = float(every @ seconds) / recorded
     again = separation.prospect(as_many * separation.recorded_mean)
     return Choice(every, problem.prospect(counts).chance(sure), again.chance(sure), sure)
-
-
-def _promising(separation: Separation, information: Array, seconds: Array) -> NDArray[np.intp]:
-    """Indices of the candidates that alone raise the margin of some pair most for their seconds."""
-    few = _BATCHES[1]
-    gains = separation.prospect(few * information).mean_margins - separation.prospect(0 * information[:1]).mean_margins
-    per_second = (gains / seconds[:, None, None]).reshape(len(seconds), -1)
-    best = np.argsort(-per_second, axis=0)[:_KEPT]
-    return np.unique(best[:, per_second.max(axis=0) > 0])
 
 
 class _Problem:
@@ -148,7 +144,9 @@ class _Problem:
             now = self.prospect(counts)
             if self.sure(now).all():
                 break
-            larger = self._with_more(counts)
+            # Counts (n, C) with a batch of runs more of one candidate
+            each = np.eye(len(counts), dtype=np.intp)
+            larger = np.concatenate([counts + batch * each for batch in _BATCHES])
             taken = self.cost(larger) - self.cost(counts)
             inside = larger @ self._seconds <= LONGEST
             gains = (self.prospect(larger).mean_margins - now.mean_margins).sum(axis=(-2, -1)) / taken
@@ -158,11 +156,6 @@ class _Problem:
                 break
             counts = larger[best]
         return counts
-
-    def _with_more(self, counts: Counts) -> Counts:
-        """Counts (n, C) with a batch of runs more of one candidate."""
-        each = np.eye(len(counts), dtype=np.intp)
-        return np.concatenate([counts + batch * each for batch in _BATCHES])
 
     def pruned(self, counts: Counts, wanted: NDArray[np.bool_]) -> Counts:
         """Counts without the runs that the wanted pairs can do without, the longest first."""
@@ -396,20 +389,13 @@ def candidate_runs(fit: Fit, effects: Sequence[Effect]) -> tuple[CandidateRun, .
     """
     turned = any(effect.shows_in in ("heading", "place") for effect in effects)
     headings: Sequence[float | None] = _HEADINGS if turned else (None,)
-    commands = dict.fromkeys(_drivable(fit, variation_for(effects)))
-    return tuple(CandidateRun(timed, heading, _run(fit, timed, heading)) for timed in commands for heading in headings)
-
-
-def variation_for(effects: Sequence[Effect]) -> Variation:
-    """How commands vary within a run: steering that turns shows what it does, and casters that swing round."""
+    # Commands vary within a run: steering that turns shows what it does, and casters that swing round
     steering = any(effect.stage == "steering" or "steering_side" in effect.needs for effect in effects)
     casters = any("caster_rates" in effect.needs for effect in effects)
-    return Variation(weave=_WEAVE if steering else 0.0, period=_WEAVE_PERIOD, reversals=int(casters))
-
-
-def placed_seconds(runs: Sequence[Trajectory]) -> float:
-    """Mean time that some recorded runs take, s, with placing the robot."""
-    return float(np.mean([run.pose_times[-1] for run in runs])) + PLACING
+    commands = dict.fromkeys(
+        _drivable(fit, Variation(weave=_WEAVE if steering else 0.0, period=_WEAVE_PERIOD, reversals=int(casters)))
+    )
+    return tuple(CandidateRun(timed, heading, _run(fit, timed, heading)) for timed in commands for heading in headings)
 
 
 def _drivable(fit: Fit, variation: Variation) -> Iterator[TimedCommand]:
@@ -472,13 +458,6 @@ _WAYS = {0: "ahead", 90: "left", 180: "backward", 270: "right"}  # directions of
 _SHORTEST_POSES = 0.02  # s between the reference poses that are simulated: denser ones take long and tell little more
 
 
-def commands_in_words(chosen: Sequence[tuple[CandidateRun, int]]) -> tuple[ExperimentCommand, ...]:
-    """Commands of chosen runs in words, with their numbers."""
-    return tuple(
-        ExperimentCommand(_in_words(candidate), count, candidate.timed.duration) for candidate, count in chosen
-    )
-
-
 def description_of(
     names: Sequence[str], runs: int, minutes: float, choice: Choice, inseparable: Sequence[tuple[str, str]]
 ) -> str:
@@ -508,7 +487,8 @@ def plan_config(
     """The experiment as a config for ``omnibench simulate``, with the effects that were found as its truth."""
     between = float(np.median(np.concatenate([np.diff(run.pose_times) for run in dataset.split("train")])))
     variation = chosen[0][0].timed.variation
-    angles = [abs(angle) for candidate, _ in chosen for angle in _steering(candidate)]
+    steering = [candidate.run.steering for candidate, _ in chosen if candidate.run.steering is not None]
+    angles = [abs(float(angle)) for of_run in steering for angle in of_run.ravel()]
     config = FlowerConfig.model_validate(
         {
             "robot": dataset.robot.model_dump() | {"name": dataset.robot.name or "robot"},
@@ -552,11 +532,6 @@ def _listed(candidate: CandidateRun, count: int) -> dict[str, float | int | None
         "repetitions": count,
         "heading_deg": candidate.heading,
     }
-
-
-def _steering(candidate: CandidateRun) -> list[float]:
-    steering = candidate.run.steering
-    return [] if steering is None else [float(angle) for angle in steering.ravel()]
 
 
 def _in_words(candidate: CandidateRun) -> str:
@@ -651,25 +626,24 @@ def _experiment(dataset: Dataset, effects: Sequence[NamedEffect], effect: NamedE
     candidates = candidate_runs(fit, [group.effect for group in rivals.members if group.effect is not None])
     seconds = np.array([candidate.seconds for candidate in candidates])
     information = rivals.of_runs(candidates).information_of_runs
-    choice = choose_runs(rivals.separation, information, seconds, placed_seconds(fit.runs))
+    choice = choose_runs(
+        rivals.separation, information, seconds, float(np.mean([run.pose_times[-1] for run in fit.runs])) + PLACING
+    )
     chosen = [(candidates[index], int(choice.counts[index])) for index in np.flatnonzero(choice.counts)]
     runs, minutes = int(choice.counts.sum()), float(choice.counts @ seconds) / 60
     names = [group.name for group in rivals.members]
-    inseparable = tuple(_inseparable(names, choice))
+    pairs = zip(*np.nonzero(np.triu(~choice.sure)), strict=True)
+    inseparable = tuple((names[first], names[second]) for first, second in pairs)
     return Experiment(
         separates=(effect.name, *effect.confusable_with),
         description=description_of(names, runs, minutes, choice, inseparable),
         config=plan_config(dataset, fit, effects, effect, chosen) if chosen else "",
-        commands=commands_in_words(chosen),
+        commands=tuple(
+            ExperimentCommand(_in_words(candidate), count, candidate.timed.duration) for candidate, count in chosen
+        ),
         runs=runs,
         minutes=minutes,
         chance=choice.chance if chosen else 0.0,
         chance_recorded=choice.chance_recorded if chosen else 0.0,
         inseparable=inseparable,
     )
-
-
-def _inseparable(names: Sequence[str], choice: Choice) -> Iterator[tuple[str, str]]:
-    """Pairs of members that no runs tell apart."""
-    for first, second in zip(*np.nonzero(np.triu(~choice.sure)), strict=True):
-        yield names[first], names[second]

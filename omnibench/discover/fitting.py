@@ -490,7 +490,10 @@ def fit_matrix(
 def extend(plain: Fit, groups: Sequence[Group]) -> Extended:
     """Fit matrix and effects together, from the plain matrix and effects of 0; noise stays where there are none."""
     fit, values, data, columns = _in_turn(plain, groups) if groups else _descend(plain, (), np.zeros(0))
-    return Extended(fit, tuple(groups), data, columns, values, _covariance(fit, data))
+    # Covariance (p, p) of the fitted numbers: by the noise model, or by the runs where they scatter more
+    unit = given(data, []).scale(range(len(data.information)))
+    covariance = FitCovariance(data, fit.runs, fit.noise, unit)
+    return Extended(fit, tuple(groups), data, columns, values, covariance.chosen(covariance.scatter_stands)[0])
 
 
 def _in_turn(fit: Fit, groups: Sequence[Group]) -> tuple[Fit, Array, Whitened, tuple[Array, ...]]:
@@ -583,10 +586,3 @@ def _bends(groups: Sequence[Group]) -> bool:
 
 def _chi_square(data: Whitened) -> float:
     return sum(float(np.square(of_run).sum()) for of_run in data.residuals)
-
-
-def _covariance(fit: Fit, data: Whitened) -> EstimatedCovariance:
-    """Covariance (p, p) of the fitted numbers: by the noise model, or by the runs where they scatter more."""
-    unit = given(data, []).scale(range(len(data.information)))
-    covariance = FitCovariance(data, fit.runs, fit.noise, unit)
-    return covariance.chosen(covariance.scatter_stands)[0]

@@ -87,7 +87,17 @@ class ValidationRuns:
 def validation_runs(dataset: Dataset, fit: Fit) -> ValidationRuns:
     """Runs of the validation split that hold all that the effects of a fit need; jumps are told by its residuals."""
     recorded = [run for run in dataset.split("validation") if len(run.pose_times) > 1]
-    able = [run for run in recorded if not _lacks_inputs(fit.model, run)]
+    # Runs that hold all that the effects of the model need
+    needs = {need for term in fit.model.terms for need in term.effect.needs}
+    able = []
+    for run in recorded:
+        missing = {
+            "wheel_angles": run.angles is None,
+            "session_time": run.started_at is None,
+            "session": run.session is None,
+        }
+        if not any(missing.get(need, False) for need in needs):
+            able.append(run)
     warnings = list(_beyond_training(fit, able))
     if len(able) < len(recorded):
         warnings.append(f"{len(recorded) - len(able)} held-out runs lack what an effect of the model needs: left out.")
@@ -111,17 +121,6 @@ def noise_runs(runs: Sequence[Trajectory], dataset: Dataset) -> tuple[Trajectory
         return usable_runs(repeating_runs(runs, dataset.split("validation")), "validation")
     except DataError:
         return ()
-
-
-def _lacks_inputs(model: OdometryModel, run: Trajectory) -> bool:
-    """True if an effect of the model needs what was not recorded in the run."""
-    needs = {need for term in model.terms for need in term.effect.needs}
-    missing = {
-        "wheel_angles": run.angles is None,
-        "session_time": run.started_at is None,
-        "session": run.session is None,
-    }
-    return any(missing.get(need, False) for need in needs)
 
 
 def _beyond_training(fit: Fit, runs: Sequence[Trajectory]) -> Iterator[str]:
@@ -434,19 +433,14 @@ def step_name(group: Group) -> str:
 def _step(name: str, fit: Fit, extended: Fit, validation: ValidationRuns) -> Step:
     """Errors of a step's model; on held-out runs as ``compare_held_out`` has them."""
     errors = errors_on(replace(extended, model=fit.model), validation) if validation.runs else None
+    under_noise = fit.changed(noise=extended.noise)
+    white = np.concatenate(
+        [weigh(values) for weigh, values in zip(under_noise.weightings, under_noise.residuals, strict=True)]
+    )
     return Step(
         name,
-        _chi2(fit.changed(noise=extended.noise)),
+        float(np.square(white).mean()),
         None if errors is None else float(errors.chi2.mean()),
-        _eq6(fit.nuisance_free_residuals),
+        float(np.mean([np.linalg.norm(values[-1]) for values in fit.nuisance_free_residuals])),
         None if errors is None else float(errors.eq6.mean()),
     )
-
-
-def _chi2(fit: Fit) -> float:
-    white = np.concatenate([weigh(values) for weigh, values in zip(fit.weightings, fit.residuals, strict=True)])
-    return float(np.square(white).mean())
-
-
-def _eq6(residuals: Sequence[Array]) -> float:
-    return float(np.mean([np.linalg.norm(values[-1]) for values in residuals]))

@@ -136,10 +136,23 @@ def write_discovery(
     Default: ``results/<data set name>/<time>``, with a link ``latest``. Raises DataError as ``check_output`` does, or
     if the folder cannot be written to; it is then left as it was.
     """
-    chosen = folder or new_results_folder(RESULTS / _folder_name(discovery.dataset.name))
+    chosen = folder or new_results_folder(
+        RESULTS / (re.sub(r"[^A-Za-z0-9_.-]+", "_", discovery.dataset.name).strip("_.") or "dataset")
+    )
     with results_locked(chosen):
         check_output(folder, options, force=force)
-        write_files(_contents(discovery, options, chosen))
+        texts = {
+            "config.yaml": _config(options),
+            "discovery.json": to_json(discovery_document(discovery, chosen)) + "\n",
+            "report.html": render(discovery_report(discovery, to_yaml(options))),
+            CALIBRATION_FILES["plain"]: to_yaml(discovery.plain),
+        }
+        if discovery.extends:
+            texts[CALIBRATION_FILES["extended"]] = to_yaml(discovery.extended)
+        texts |= _experiments(discovery)
+        contents = {chosen / name: text.encode("utf-8") for name, text in texts.items()}
+        contents[chosen / "residuals.parquet"] = encode_table(residual_table(discovery), "parquet")
+        write_files(contents)
         for stale in chosen.glob("experiment-*.yaml"):  # files of an earlier discovery
             if stale.name not in _experiments(discovery):
                 remove(stale)
@@ -148,21 +161,6 @@ def write_discovery(
     if folder is None:
         link_latest(chosen)
     return chosen
-
-
-def _contents(discovery: Discovery, options: DiscoverOptions, folder: Path) -> dict[Path, bytes]:
-    texts = {
-        "config.yaml": _config(options),
-        "discovery.json": to_json(discovery_document(discovery, folder)) + "\n",
-        "report.html": render(discovery_report(discovery, to_yaml(options))),
-        CALIBRATION_FILES["plain"]: to_yaml(discovery.plain),
-    }
-    if discovery.extends:
-        texts[CALIBRATION_FILES["extended"]] = to_yaml(discovery.extended)
-    texts |= _experiments(discovery)
-    contents = {folder / name: text.encode("utf-8") for name, text in texts.items()}
-    contents[folder / "residuals.parquet"] = encode_table(residual_table(discovery), "parquet")
-    return contents
 
 
 def _experiments(discovery: Discovery) -> dict[str, str]:
@@ -198,8 +196,3 @@ def residual_table(discovery: Discovery) -> pl.DataFrame:
     ):
         columns |= dict(zip((f"{label}_{name}" for name in names), np.concatenate(values).T, strict=True))
     return pl.DataFrame(columns, schema_overrides={"command": pl.String})
-
-
-def _folder_name(name: str) -> str:
-    """A name as one that a folder can have."""
-    return re.sub(r"[^A-Za-z0-9_.-]+", "_", name).strip("_.") or "dataset"

@@ -21,9 +21,10 @@ class Badge:
     tone: Tone = "plain"
 
 
-def simulated_badge(simulated: bool) -> tuple[Badge, ...]:
-    """The badge of simulated data; nothing for recorded ones."""
-    return (Badge("SIMULATED DATA", "warning"),) if simulated else ()
+def simulated_badge(*simulated: bool) -> tuple[Badge, ...]:
+    """The badge of simulated data sets, one or several; nothing for recorded ones."""
+    words = "SIMULATED DATA" if all(simulated) else "SIMULATED AND REAL DATA"
+    return (Badge(words, "warning"),) if any(simulated) else ()
 
 
 @dataclass(frozen=True)

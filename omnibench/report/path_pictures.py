@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -78,14 +78,12 @@ def _typical(runs: Sequence[Trajectory], ends: Sequence[Array]) -> tuple[dict[st
     if len(kinds) < _PATHS:
         chosen = spread([run for run in runs if np.ptp(run.poses[:, :2], axis=0).max() > _LEAST_WINDOW] or runs, _PATHS)
         return motion_titles(chosen), f"{plural(len(chosen), 'run')} of different motions." if len(chosen) > 1 else ""
-    medians = {kind: _median(like, gain_of) for kind, like in kinds.items()}
+    medians = {
+        kind: sorted(like, key=lambda run: gain_of[run.id])[(len(like) - 1) // 2] for kind, like in kinds.items()
+    }
     largest = sorted(medians, key=lambda kind: gain_of[medians[kind].id], reverse=True)[:_PATHS]
     words = "Of each kind of motion the run whose error falls by the median of its kind."
     return {f"{kind[0].upper()}{kind[1:]}": run for kind, run in medians.items() if kind in largest}, words
-
-
-def _median(runs: Sequence[Trajectory], value: Mapping[str, float]) -> Trajectory:
-    return sorted(runs, key=lambda run: value[run.id])[(len(runs) - 1) // 2]
 
 
 def _paths(title: str, run: Trajectory, models: Models) -> Figure:

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, ConfigDict, Field, field_validator, model_validator
 
-from omnibench.compare.config import LEAST_MEMORY, CalibratorEntry, known_backend
+from omnibench.compare.config import LEAST_MEMORY, CalibratorEntry, NamedConfig, known_backend, with_names
 from omnibench.config import Model, NonNegative, Positive, RelativePath, printable
 from omnibench.data.splits import Names
 from omnibench.fit.loss import LossName
@@ -101,7 +101,7 @@ class RobotChoice(RecordingSource):
     @field_validator("trainings", mode="before", json_schema_input_type=tuple[str | TrainingChoice, ...])
     @classmethod
     def _names_stand_for_rules(cls, choices: Any) -> Any:
-        return _with_names(choices)
+        return with_names(choices, "by")
 
 
 class RegimeChoice(Model):
@@ -155,12 +155,9 @@ class MethodChoice(CalibratorEntry):
         return {"name": cost} if isinstance(cost, str) else cost
 
 
-class StudyConfig(Model):
+class StudyConfig(NamedConfig):
     """A study: robots x trainings x regimes x methods x seeds, every method fitted to the same runs."""
 
-    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=60)
-    description: str = ""
-    notes: tuple[str, ...] = Field((), description="what a reader of the report must know")
     data: RelativePath = Field(Path(), description="folder of the recordings; relative to the config file")
     robots: dict[Label, RobotChoice] = Field(min_length=1)
     trainings: tuple[TrainingChoice, ...] = Field((TrainingChoice(by="kind"),), min_length=1)
@@ -198,14 +195,12 @@ class StudyConfig(Model):
     @field_validator("methods", mode="before", json_schema_input_type=tuple[str | MethodChoice, ...])
     @classmethod
     def _names_stand_for_methods(cls, methods: Any) -> Any:
-        if isinstance(methods, list | tuple):
-            return [{"name": method} if isinstance(method, str) else method for method in methods]
-        return methods
+        return with_names(methods, "name")
 
     @field_validator("trainings", mode="before", json_schema_input_type=tuple[str | TrainingChoice, ...])
     @classmethod
     def _names_stand_for_rules(cls, choices: Any) -> Any:
-        return _with_names(choices)
+        return with_names(choices, "by")
 
     @model_validator(mode="after")
     def _labels_differ(self) -> StudyConfig:
@@ -220,10 +215,3 @@ class StudyConfig(Model):
         if self.reference is not None and self.reference not in shown:
             raise ValueError(f"reference: no method is called {self.reference!r}; known: {', '.join(shown)}")
         return self
-
-
-def _with_names(choices: Any) -> Any:
-    """Rules by their names alone as ``by``; an unknown name is told by the model."""
-    if isinstance(choices, list | tuple):
-        return [{"by": choice} if isinstance(choice, str) else choice for choice in choices]
-    return choices

@@ -16,18 +16,11 @@ import polars as pl
 
 from omnibench.compare.config import effective_cost, effective_options, load_calibrators
 from omnibench.compare.execute import PRELOAD, execute, resumable
-from omnibench.config import read_model, read_yaml, to_json, to_yaml
+from omnibench.compare.output import check_output, prepare_output
+from omnibench.config import read_model, read_yaml, to_json
 from omnibench.environment import environment
 from omnibench.errors import ConfigError, DataError, UnknownNameError, require_type
-from omnibench.files import (
-    RESULTS,
-    check_results_folder,
-    link_latest,
-    new_results_folder,
-    results_locked,
-    write_table,
-    write_text,
-)
+from omnibench.files import results_locked, write_table, write_text
 from omnibench.fit.calibrator import RunResult
 from omnibench.jobs.backend_choice import BackendChoice, open_backend
 from omnibench.jobs.job import ResultStore
@@ -70,8 +63,6 @@ def read_study_config(path: Path | str, data: Mapping[str, Path] | None = None) 
     return config.model_copy(update={"data": base, "robots": robots})
 
 
-# First line of config.yaml in a folder of results. A folder whose config.yaml lacks it is not written to.
-_MARK = "# The effective config of a study; the results beside it were made with it."
 _COLUMNS: dict[str, Any] = {
     "robot": pl.String, "training": pl.String, "regime": pl.String, "judged": pl.String, "fitted": pl.Boolean,
     "simulated": pl.Boolean, "method": pl.String, "family": pl.String, "status": pl.String, "reason": pl.String,
@@ -84,27 +75,6 @@ _COLUMNS: dict[str, Any] = {
 }  # fmt: skip
 
 
-def check_output(folder: Path | None, config: StudyConfig, *, force: bool = False) -> None:
-    """DataError: the folder of results holds anything but an earlier study of the same name, and not ``force``."""
-    if folder is None:
-        return
-    check_results_folder(folder, _MARK, "study", force=force)
-    if not force and (folder / "config.yaml").is_file():
-        name = read_yaml(folder / "config.yaml").get("name")
-        if name != config.name:
-            raise DataError(f"{folder}: holds the study {name!r}; name another folder for {config.name!r}, or --force")
-
-
-def prepare_output(config: StudyConfig, folder: Path | None, *, force: bool = False) -> Path:
-    """The folder to write to, with the effective config in it; default: ``results/<name>/<time>``, link ``latest``."""
-    check_output(folder, config, force=force)
-    chosen = folder or new_results_folder(RESULTS / config.name)
-    write_text(chosen / "config.yaml", f"{_MARK}\n{to_yaml(config)}")
-    if folder is None:
-        link_latest(chosen)
-    return chosen
-
-
 def write_results(result: StudyResult) -> None:
     """Write the table and summary.json. DataError: the disk refuses."""
     write_table(result.output / "study.parquet", study_table(result))
@@ -114,7 +84,8 @@ def write_results(result: StudyResult) -> None:
 def study_table(result: StudyResult) -> pl.DataFrame:
     """A row for each cell and method, those without an answer among them. Ratios are to the design values, Eq. (6)."""
     rows = [_row(result, cell, method) for cell in result.cells for method in cell.methods.values()] + [
-        _broken(name, reason) for name, reason in result.broken.items()
+        dict.fromkeys(_COLUMNS) | {"robot": name, "status": "recordings cannot be read", "reason": reason}
+        for name, reason in result.broken.items()
     ]
     return pl.DataFrame(rows, _COLUMNS, orient="row")
 
@@ -166,10 +137,6 @@ def _row(result: StudyResult, cell: StudyCell, method: MethodInCell) -> dict[str
     }  # fmt: skip
 
 
-def _broken(name: str, reason: str) -> dict[str, Any]:
-    return dict.fromkeys(_COLUMNS) | {"robot": name, "status": "recordings cannot be read", "reason": reason}
-
-
 def run_study(
     config: StudyConfig, output: Path | None = None, progress: Reporter = no_progress, *, force: bool = False
 ) -> StudyResult:
@@ -182,7 +149,7 @@ def run_study(
     Interrupted: Ctrl-C; the results of all fits that had ended are kept.
     """
     require_type(config, StudyConfig, "study.read_study_config")
-    check_output(output, config, force=force)
+    check_output(output, config, "study", force=force)
     with ExitStack() as lock:
         if output is not None:
             lock.enter_context(results_locked(output))
@@ -192,7 +159,7 @@ def run_study(
             name, reason = next(iter(broken.items()))
             raise DataError(f"no robot's recordings can be read, the first: {name}: {reason}")
         fits = plan_fits(config, robots)
-        folder = prepare_output(config, output, force=force)
+        folder = prepare_output(config, output, "study", force=force)
         if output is None:
             lock.enter_context(results_locked(folder))
         store = ResultStore(folder / "runs", RunResult)
@@ -200,7 +167,9 @@ def run_study(
         plan = list(asked.values())
         with resumable(plan, store, folder, "fits"):
             with ExitStack() as opened:
-                backend = opened.enter_context(open_backend(_backend(config), PRELOAD, progress))
+                workers = config.workers or os.cpu_count() or 1
+                choice = BackendChoice(name=config.backend, workers=workers, tls=config.tls)
+                backend = opened.enter_context(open_backend(choice, PRELOAD, progress))
                 opened.enter_context(one_thread_processes(PRELOAD))
                 results = dict(zip(asked, execute(plan, store, progress, backend), strict=True))
             judged, design = judge_fits(fits, results, config.integration, progress)
@@ -237,7 +206,3 @@ def _with_methods(config: StudyConfig) -> tuple[list[PluginFailure], StudyConfig
             changes["cost"] = effective_cost(method.cost, place)
         methods.append(method.model_copy(update=changes))
     return failures, config.model_copy(update={"methods": tuple(methods)})
-
-
-def _backend(config: StudyConfig) -> BackendChoice:
-    return BackendChoice(name=config.backend, workers=config.workers or os.cpu_count() or 1, tls=config.tls)

@@ -67,7 +67,19 @@ def load_robots(config: StudyConfig, progress: Reporter) -> tuple[tuple[StudiedR
 
 def plan_fits(config: StudyConfig, robots: tuple[StudiedRobot, ...]) -> list[PlannedFit]:
     """All fits of the study; those of one training set share it. ConfigError: a pattern matches no training."""
-    _check_patterns(config, robots)
+    # Every pattern must match a training or regime; while some robots cannot be read, all trainings are not known
+    trainings = list(dict.fromkeys(training.name for robot in robots for training in robot.trainings))
+    given = [(f"method {method.shown}: trainings", method.trainings, trainings) for method in config.methods]
+    given += [(f"regime {name}: trainings", regime.trainings, trainings) for name, regime in config.regimes.items()]
+    given = given if len(robots) == len(config.robots) else []
+    given += [(f"method {method.shown}: regimes", method.regimes, list(config.regimes)) for method in config.methods]
+    for place, patterns, names in given:
+        for pattern in patterns:
+            if pattern != "*" and not any(_named(name, (pattern,)) for name in names):
+                raise ConfigError(
+                    f"config {config.name}: {place}: none is called {pattern}; {nearest(pattern, names)}known: "
+                    f"{', '.join(names) or 'none'}"
+                )
     regimes = {AS_RECORDED: RegimeChoice(), **config.regimes}
     return [
         fit for robot in robots for name, regime in regimes.items() for fit in _of_robot(config, robot, name, regime)
@@ -86,36 +98,13 @@ def _of_robot(config: StudyConfig, robot: StudiedRobot, name: str, regime: Regim
             dataset = replace(robot.dataset, trajectories=runs, scans=None)
             for method in config.methods:
                 if _named(training.name, method.trainings) and (name == AS_RECORDED or _named(name, method.regimes)):
-                    for seed in _seeds(config, method):
+                    for seed in config.seeds if calibrators.entry(method.name).cls.stochastic else config.seeds[:1]:
                         run, reason = _planned(config, robot, method, dataset, seed, f"{training.name} {fold.name}")
                         yield PlannedFit(robot, training, fold, name, method, seed, run, reason)
 
 
-def _check_patterns(config: StudyConfig, robots: tuple[StudiedRobot, ...]) -> None:
-    """ConfigError: a method's or a regime's pattern is that of no training of any robot, or of no regime.
-
-    Where some robots could not be read their trainings are not known, and no pattern of trainings is refused.
-    """
-    trainings = list(dict.fromkeys(training.name for robot in robots for training in robot.trainings))
-    given = [(f"method {method.shown}: trainings", method.trainings, trainings) for method in config.methods]
-    given += [(f"regime {name}: trainings", regime.trainings, trainings) for name, regime in config.regimes.items()]
-    given = given if len(robots) == len(config.robots) else []
-    given += [(f"method {method.shown}: regimes", method.regimes, list(config.regimes)) for method in config.methods]
-    for place, patterns, names in given:
-        for pattern in patterns:
-            if pattern != "*" and not any(_named(name, (pattern,)) for name in names):
-                raise ConfigError(
-                    f"config {config.name}: {place}: none is called {pattern}; {nearest(pattern, names)}known: "
-                    f"{', '.join(names) or 'none'}"
-                )
-
-
 def _named(name: str, patterns: tuple[str, ...]) -> bool:
     return any(fnmatchcase(name, pattern) for pattern in patterns)
-
-
-def _seeds(config: StudyConfig, method: MethodChoice) -> tuple[int, ...]:
-    return config.seeds if calibrators.entry(method.name).cls.stochastic else config.seeds[:1]
 
 
 def _planned(

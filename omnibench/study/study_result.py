@@ -114,15 +114,6 @@ def _best_published(cell: StudyCell) -> MethodInCell | None:
     return min(published, key=lambda each: each.mean("cost") or 0.0) if published else None
 
 
-def answered_everywhere(cells: Sequence[StudyCell], methods: Sequence[str]) -> tuple[str, ...]:
-    """The methods that have an answer in every one of some cells."""
-    return tuple(
-        name
-        for name in methods
-        if all(name in cell.methods and cell.methods[name].errors is not None for cell in cells)
-    )
-
-
 _LEVEL = 0.95
 _FEWEST_METHODS = 3  # methods that Friedman's test compares at least
 _FEWEST_CELLS = 2
@@ -146,7 +137,12 @@ class Ranking:
 
 def ranking(cells: Sequence[StudyCell], methods: Sequence[str]) -> Ranking | None:
     """The ranks of the methods that answered in every cell; None where methods or cells are too few."""
-    names = answered_everywhere(cells, methods)
+    # The methods that answered in every cell
+    names = tuple(
+        name
+        for name in methods
+        if all(name in cell.methods and cell.methods[name].errors is not None for cell in cells)
+    )
     if len(names) < _FEWEST_METHODS or len(cells) < _FEWEST_CELLS:
         return None
     errors = np.array([[cell.methods[name].mean("cost") for name in names] for cell in cells], dtype=float)

@@ -177,9 +177,24 @@ def _kinds_of(runs: Sequence[Trajectory], kinds: Mapping[str, Sequence[str]], pl
 
 def _trainings(runs: _Runs, rule: TrainingChoice) -> Iterator[Training]:
     if rule.by == "split":
-        yield _own_split(runs)
+        train = [
+            index for index, run in enumerate(runs.dataset.trajectories) if run.split == "train" and runs.kinds[index]
+        ]
+        judged = runs.others(train)
+        kinds = dict.fromkeys(runs.kinds[index] for index in train)
+        fold = Fold(
+            "",
+            runs.runs(train),
+            judged,
+            fitted={kind: tuple(i for i in train if runs.kinds[i] == kind) for kind in kinds if kind is not None},
+        )
+        yield Training("own split", (fold,) if train else ())
     elif rule.leave_out == "kind":
-        yield from _kinds_left_out(runs)
+        for kind in runs.names:
+            training = [index for index, each in enumerate(runs.kinds) if each not in (kind, None)]
+            if training:
+                fold = Fold("", runs.runs(training), {kind: runs.others(training)[kind]})
+                yield Training(f"all but {kind}", (fold,))
     else:
         for kind in rule.kinds or runs.names:
             if rule.by == "session":
@@ -188,13 +203,6 @@ def _trainings(runs: _Runs, rule: TrainingChoice) -> Iterator[Training]:
                 yield from _whole_kind(runs, kind, rule.runs_per_command)
             elif rule.leave_out is not None:
                 yield _left_out(runs, kind, rule.leave_out)
-
-
-def _own_split(runs: _Runs) -> Training:
-    train = [index for index, run in enumerate(runs.dataset.trajectories) if run.split == "train" and runs.kinds[index]]
-    judged = runs.others(train)
-    fold = Fold("", runs.runs(train), judged, fitted=_by_kind(runs, train))
-    return Training("own split", (fold,) if train else ())
 
 
 def _whole_kind(runs: _Runs, kind: str, curve: Sequence[int]) -> Iterator[Training]:
@@ -240,14 +248,6 @@ def _left_out(runs: _Runs, kind: str, what: str) -> Training:
     return Training(f"{kind}, a {what} left out", tuple(folds) if len(groups) > 1 else ())
 
 
-def _kinds_left_out(runs: _Runs) -> Iterator[Training]:
-    for kind in runs.names:
-        training = [index for index, each in enumerate(runs.kinds) if each not in (kind, None)]
-        if training:
-            fold = Fold("", runs.runs(training), {kind: runs.others(training)[kind]})
-            yield Training(f"all but {kind}", (fold,))
-
-
 def _grouped(runs: _Runs, members: Sequence[int], what: str) -> dict[str, list[int]]:
     """Indices by session or command; runs without one are a group each."""
     groups: dict[str, list[int]] = {}
@@ -255,8 +255,3 @@ def _grouped(runs: _Runs, members: Sequence[int], what: str) -> dict[str, list[i
         run = runs.dataset.trajectories[index]
         groups.setdefault((run.session if what == "session" else run.command) or run.id, []).append(index)
     return groups
-
-
-def _by_kind(runs: _Runs, members: Sequence[int]) -> dict[str, tuple[int, ...]]:
-    kinds = dict.fromkeys(runs.kinds[index] for index in members)
-    return {kind: tuple(i for i in members if runs.kinds[i] == kind) for kind in kinds if kind is not None}

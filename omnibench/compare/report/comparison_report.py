@@ -28,7 +28,6 @@ from omnibench.data.dataset import SPLITS, Trajectory
 from omnibench.errors import DataError
 from omnibench.fit.identifiability import geometry_of
 from omnibench.report.blocks import (
-    Badge,
     Block,
     Callout,
     Cell,
@@ -196,15 +195,11 @@ def comparison_document(result: ComparisonResult) -> Document:
                 for index, view in enumerate(datasets, 1)
             ),
         )
-    simulated = [view for view in datasets if view.dataset.simulated]
-    badges = simulated_badge(bool(simulated))
-    if simulated and len(simulated) < len(datasets):
-        badges = (Badge("SIMULATED AND REAL DATA", "warning"),)
     return Document(
         title=f"Odometry calibrations compared: {result.config.name}",
         subtitle=result.config.description,
         sections=(body[0], *_about(result), *body[1:], _reproduction(result)),
-        badges=badges,
+        badges=simulated_badge(*(view.dataset.simulated for view in datasets)),
     )
 
 
@@ -251,20 +246,12 @@ def _recording(view: DatasetView) -> tuple[Section, ...]:
 
 def _overview(datasets: list[DatasetView]) -> Section:
     """The answer on several data sets: the best entry of each, and the paths of the first."""
-    tiles = []
+    tiles, rows = [], []
     for view in datasets:
         best = view.best
         gained = improvement_in_words(best, view.scored, 1) if best is not None else (NOTHING, "")
         label = "" if best is None else f"{best.label}{f', {words}' if (words := rivals_in_words(view)) else ''}"
         tiles.append(Fact(f"{view.name}: the cost fell by", gained[0], label))
-    sentence = f"Calibrators compared on {plural(len(datasets), 'data set')}; each has a part of its own below."
-    return answer_section(sentence, tiles, path_picture(datasets[0]), _overview_table(datasets))
-
-
-def _overview_table(datasets: list[DatasetView]) -> Table:
-    rows = []
-    for view in datasets:
-        best = view.best
         reached = None if best is None else best.cost(view.scored)
         decimals = cost_decimals(view)
         rows.append(
@@ -274,10 +261,10 @@ def _overview_table(datasets: list[DatasetView]) -> Table:
                 SPLIT_NAMES[view.scored],
                 fixed(view.theoretical_cost(view.scored), decimals),
                 NOTHING if reached is None else fixed(reached.value, decimals),
-                NOTHING if best is None else Cell(*improvement_in_words(best, view.scored, 1)),
+                NOTHING if best is None else Cell(*gained),
             )
         )
-    return Table(
+    table = Table(
         "Best entry of each data set",
         (
             Column("Data set", numeric=False),
@@ -291,6 +278,8 @@ def _overview_table(datasets: list[DatasetView]) -> Table:
         f"The cost is {cost_in_words(datasets[0])} Small print: 95 % intervals. Of several that are "
         "not told apart, the entry of lowest training cost is named.",
     )
+    sentence = f"Calibrators compared on {plural(len(datasets), 'data set')}; each has a part of its own below."
+    return answer_section(sentence, tiles, path_picture(datasets[0]), table)
 
 
 def _reproduction(result: ComparisonResult) -> Section:

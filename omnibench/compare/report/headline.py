@@ -79,10 +79,11 @@ def entry_chart(view: DatasetView) -> FigureGrid | None:
     figure.update_yaxes(**ends, ticks="", tickfont_color=INK, showgrid=False)
     words = ", ".join(f"{each.label} {fixed(each.cost.value, decimals)}" for each in lines)
     title = f"All entries: cost of the {split} runs, with 95 % intervals"
+    silent = [entry.label for entry in view.statistics if not entry.answers and entry.calibrator != THEORETICAL_NAME]
     caption = (
         f"The lower, the better. Lines: 95 % intervals, {interval_basis(view, view.scored)}; whether entries differ is "
         "judged from paired differences, which is finer. An entry stands with its run of median training cost."
-        + _without(view)
+        + (f" Without an answer: {', '.join(silent)}." if silent else "")
     )
     return FigureGrid((Figure(title, figure, f"{title}: {words}", height),), tuple(items), 1, caption, "all-entries")
 
@@ -108,11 +109,6 @@ def _traces(item: LegendItem, lines: Sequence[_Line], decimals: int) -> list[go.
     values, places = [each.cost.value for _, each in rows], [float(row) for row, _ in rows]
     dots = marks(item, 10, values, places, hover="%{text}", words=words)
     return [*([line(item, 2.5, *joined(spans).T, line_dash="solid")] if spans else []), dots]
-
-
-def _without(view: DatasetView) -> str:
-    silent = [entry.label for entry in view.statistics if not entry.answers and entry.calibrator != THEORETICAL_NAME]
-    return f" Without an answer: {', '.join(silent)}." if silent else ""
 
 
 _ARRIVED = 0.01  # relative: a search whose training cost is further above the lowest one missed the minimum (chosen)
@@ -228,7 +224,9 @@ def _standing(view: DatasetView, best: EntryStatistics) -> str:
         return f"{best.label} is best"
     entries = "other entry is" if others == 1 else "other entries are"
     design = any(entry.calibrator == THEORETICAL_NAME for entry in view.not_told_apart)
-    return f"{_number(others)} {entries} not told apart from it{', the design values among them' if design else ''}"
+    words = ("One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine", "Ten", "Eleven", "Twelve")
+    number = words[others - 1] if others <= 12 else str(others)
+    return f"{number} {entries} not told apart from it{', the design values among them' if design else ''}"
 
 
 def _standing_at_length(view: DatasetView, best: EntryStatistics) -> str:
@@ -245,11 +243,6 @@ def _standing_at_length(view: DatasetView, best: EntryStatistics) -> str:
         f"Not told apart on the {SPLIT_NAMES[view.scored]} runs: {listing(rivals, 20)}; {best.label} has the lowest "
         f"training cost of them. {basis}"
     )
-
-
-def _number(number: int) -> str:
-    words = ("One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine", "Ten", "Eleven", "Twelve")
-    return words[number - 1] if number <= 12 else str(number)
 
 
 def _tiles(view: DatasetView, best: EntryStatistics) -> tuple[Fact, ...]:

@@ -40,21 +40,15 @@ def _blocks(view: DatasetView) -> tuple[Block, ...]:
     parameters = parameter_table(view)
     if parameters is not None:
         blocks.append(parameters)
-    blocks.append(
-        Code(matrices_as_text(view), "Matrices with all digits (YAML): rows x and y in m/rad, heading in rad/rad")
-    )
-    return tuple(blocks)
-
-
-def matrices_as_text(view: DatasetView) -> str:
-    """Every matrix as YAML, with so many digits that reading it gives exactly the same numbers."""
+    # Every matrix as YAML, with so many digits that reading it gives exactly the same numbers
     named = [("theoretical", view.design_matrix)]
     named += [(entry.label, run.matrix) for entry, run in view.calibrated if run.matrix is not None]
     parts = []
     for label, matrix in named:
         rows = ",\n  ".join(f"[{', '.join(repr(float(value)) for value in row)}]" for row in matrix)
         parts.append(f"{json.dumps(label)}: [\n  {rows}]")
-    return "\n".join(parts)
+    blocks.append(Code("\n".join(parts), "Matrices with all digits (YAML): rows x and y in m/rad, heading in rad/rad"))
+    return tuple(blocks)
 
 
 def parameter_table(view: DatasetView) -> Table | None:

@@ -167,7 +167,11 @@ def courses(view: DatasetView) -> list[Course]:
 
     Runs that evaluated one candidate at most, and those whose answer keeps to no box, did not search.
     """
-    lowest = _lowest_costs(view)
+    # The lowest training cost or loss that was reached in each search space; infinite where nothing was
+    lowest: dict[SearchSpace, float] = {}
+    for run in view.runs:
+        space, cost = run.search_space, _reached(view, run)
+        lowest[space] = min(lowest.get(space, math.inf), math.inf if cost is None else cost)
     drawn = []
     for run in view.runs:
         if run.record.evaluations <= 1 or not run.search_space.bounded:
@@ -193,15 +197,6 @@ def _best_known(run: ScoredRun, lowest: float) -> float:
     if record.gap is None or record.train_cost is None:
         return lowest
     return record.train_cost / (1 + record.gap)
-
-
-def _lowest_costs(view: DatasetView) -> Mapping[SearchSpace, float]:
-    """The lowest training cost or loss that was reached in each search space; infinite where nothing was."""
-    lowest: dict[SearchSpace, float] = {}
-    for run in view.runs:
-        space, cost = run.search_space, _reached(view, run)
-        lowest[space] = min(lowest.get(space, math.inf), math.inf if cost is None else cost)
-    return lowest
 
 
 def targets_reached(group: Sequence[Course], runs: int, axis: Axis) -> tuple[Array, Array]:
@@ -272,7 +267,18 @@ def _gaps(searches: _Searches) -> FigureGrid:
         description = f"Relative gap of {style.label} above the best known cost in the same box against evaluations"
         figures.append(Figure(f"{style.label}, {seeds}", figure, description, 230))
     caption = "Gap above the best known cost, a line a seed, marked where the run ended. "
-    caption += _best_in_words(searches.courses)
+    # Best known costs by box, with the entries where a box has several
+    known: dict[tuple[str, str], list[str]] = {}
+    for course in searches.courses:
+        record = course.run.record
+        labels = known.setdefault((record.gap_box or record.box, significant(course.best_known, 8)), [])
+        labels += [] if record.label in labels else [record.label]
+    shared = Counter(box for box, _ in known)
+    costs = "; ".join(
+        f"box {box}{f' of {listing(labels)}' if shared[box] > 1 else ''}: {value}"
+        for (box, value), labels in known.items()
+    )
+    caption += f"Best known training cost: {costs}. Gaps below {_FLOOR:.0e} are drawn at that value."
     return FigureGrid(tuple(figures), (), 3, caption, "gap-above-the-best-cost")
 
 
@@ -324,17 +330,3 @@ def _extent(drawn: Sequence[Course], axis: Axis) -> tuple[float, float]:
 
 def _along(course: Course, axis: Axis) -> Array:
     return course.evaluations if axis == "evaluations" else course.seconds
-
-
-def _best_in_words(drawn: Sequence[Course]) -> str:
-    known: dict[tuple[str, str], list[str]] = {}
-    for course in drawn:
-        record = course.run.record
-        labels = known.setdefault((record.gap_box or record.box, significant(course.best_known, 8)), [])
-        labels += [] if record.label in labels else [record.label]
-    shared = Counter(box for box, _ in known)
-    costs = "; ".join(
-        f"box {box}{f' of {listing(labels)}' if shared[box] > 1 else ''}: {value}"
-        for (box, value), labels in known.items()
-    )
-    return f"Best known training cost: {costs}. Gaps below {_FLOOR:.0e} are drawn at that value."

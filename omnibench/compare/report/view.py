@@ -178,7 +178,16 @@ class DatasetView:
 
 def views(result: ComparisonResult) -> list[DatasetView]:
     """The data sets of a comparison, in the config's order."""
-    styles = _styles(result)
+    # A style for each label; the design values have theirs
+    names = {entry.label: entry.calibrator for entry in result.statistics}
+    names |= {run.record.label: run.record.calibrator for run in result.runs}
+    searches = {label: name for label, name in names.items() if name != THEORETICAL_NAME}
+    drawn = colours({label: _CUSTOMARY.get(name) for label, name in searches.items()})
+    by_label = {
+        label: LegendItem(f"entry-{index}", label, colour, dash, SYMBOLS[index % len(SYMBOLS)])
+        for index, (label, (colour, dash)) in enumerate(drawn.items())
+    }
+    styles = {label: by_label.get(label, THEORETICAL_STYLE) for label in names}
     return [_view(result, name, styles) for name in result.datasets]
 
 
@@ -215,19 +224,6 @@ def _told(errors: Array, runs: Sequence[Trajectory]) -> Array:
     placed, turned = measured_parts(runs)
     told: Array = np.where(np.column_stack([placed, placed, turned]), errors, np.nan)
     return told
-
-
-def _styles(result: ComparisonResult) -> dict[str, LegendItem]:
-    """A style for each label; the design values have theirs."""
-    names = {entry.label: entry.calibrator for entry in result.statistics}
-    names |= {run.record.label: run.record.calibrator for run in result.runs}
-    searches = {label: name for label, name in names.items() if name != THEORETICAL_NAME}
-    drawn = colours({label: _CUSTOMARY.get(name) for label, name in searches.items()})
-    styles = {
-        label: LegendItem(f"entry-{index}", label, colour, dash, SYMBOLS[index % len(SYMBOLS)])
-        for index, (label, (colour, dash)) in enumerate(drawn.items())
-    }
-    return {label: styles.get(label, THEORETICAL_STYLE) for label in names}
 
 
 NO_INTERVAL = "no interval"

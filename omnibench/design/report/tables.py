@@ -107,12 +107,6 @@ def chosen_table(design: Design, of_set: SetDesign) -> Table:
     )
 
 
-def candidate_table(design: Design) -> Table:
-    """All commands that could have been chosen."""
-    rows = tuple(Row.of(*_command_cells(candidate)) for candidate in design.candidates)
-    return Table(f"All {len(rows)} candidates", _COMMAND_COLUMNS, rows)
-
-
 def _command_cells(candidate: Candidate) -> tuple[Cell, ...]:
     words = command_in_words(candidate)
     return (
@@ -283,4 +277,11 @@ def _basis(design: Design) -> tuple[Block, ...]:
             listing([f"{of_set.name}: within {100 * of_set.optimum.gap:.1g} % of its bound" for of_set in design.sets]),
         ),
     )
-    return (Facts(facts), Details(f"All candidates ({len(design.candidates)})", (candidate_table(design),)))
+    rows = tuple(Row.of(*_command_cells(candidate)) for candidate in design.candidates)
+    return (
+        Facts(facts),
+        Details(
+            f"All candidates ({len(design.candidates)})",
+            (Table(f"All {len(rows)} candidates", _COMMAND_COLUMNS, rows),),
+        ),
+    )

@@ -123,7 +123,7 @@ def _heading() -> Iterator[Basis]:
 
     def steady_and_course(along: Paths) -> Array:
         speed = np.hypot(along.signals.twists[:, 0], along.signals.twists[:, 1])
-        steady = [along.of_velocity(speed[:, None] * axis) for axis in np.eye(2)]
+        steady = [along.summed(along.in_world(speed[:, None] * axis)[:, :, None]) for axis in np.eye(2)]
         return np.concatenate([*steady, _smooth(course)(along)], axis=2)
 
     yield _of_effect(course, "the direction of travel in the world", steady_and_course, stage="world")
@@ -139,7 +139,7 @@ def _place(paths: Paths) -> Iterator[Basis]:
 
     bent_map = _by_parameters(bent, paths, area)
     yield _of_effect(bent, "where on the map the reference is read", bent_map, area)
-    patches = list(_patches(places))
+    patches = list(patches_on_grid(places, _GRID))
 
     def of_patches(along: Paths) -> Array:
         shares = np.concatenate([patch.shares(along.signals, shapes) for shapes in patches], axis=1)
@@ -163,12 +163,15 @@ def _part_of(columns: Columns, number: int, along: Paths) -> Array:
     return part
 
 
-def _patches(places: Array) -> Iterator[dict[str, float]]:
-    """Centres and radius of patches on a grid over positions (F, 2), those in which there are positions."""
+def patches_on_grid(places: Array, along: int) -> Iterator[dict[str, float]]:
+    """Centres and radius of patches on a grid over positions (F, 2), those in which there are positions.
+
+    along: number of patches along each side.
+    """
     low = places.min(axis=0)
-    spacing = (places.max(axis=0) - low) / (_GRID - 1)
+    spacing = (places.max(axis=0) - low) / (along - 1)
     radius = _WIDE * max(float(spacing.max()), _SMALL)
-    for steps in product(range(_GRID), repeat=2):
+    for steps in product(range(along), repeat=2):
         x, y = (low + spacing * steps).tolist()
         patch = {"centre_x": x, "centre_y": y, "radius": radius}
         if (bump(places, patch) > np.exp(-1)).mean() > _SEEN:

@@ -25,9 +25,24 @@ def slopes_by(
 ) -> Array:
     """Slopes (S, 3, J) by J parameters of an effect. values: its shapes, and 0 for all else."""
     if isinstance(effect, SmoothEffect):
-        of_functions = _by_functions(paths, effect, names, values)
+        # Slopes (S, 3, 1) by the coefficients of a smooth effect that are asked for; its functions are computed once
+        shares, of_functions = effect.shares(paths.signals, values), dict[str, Array]()
+        for mode in effect.modes:
+            asked = [number for number, label in enumerate(effect.labels) if f"{mode}_{label}" in names]
+            if asked:
+                of_mode = paths.respond(paths.by_modes[mode], shares[:, asked])
+                of_functions |= {f"{mode}_{effect.labels[number]}": of_mode[..., [j]] for j, number in enumerate(asked)}
     elif isinstance(effect, BentMap):
-        of_functions = _by_shifts(paths, effect, values)
+        # Slopes (S, 3, 1) by the coefficients of a bent map, in which the reported pose is linear
+        starts = np.array([log.start for log in paths.logs])
+        there, first = (effect.functions(poses[:, :2], values) for poses in (paths.poses, starts))
+        shifted = there - first[paths.run]
+        axes = zip(effect.axes, np.eye(3), strict=True)
+        of_functions = {
+            f"{axis}_{label}": (shifted[:, [number]] * unit)[..., None]
+            for axis, unit in axes
+            for number, label in enumerate(effect.labels)
+        }
     else:
         of_functions = {}
     return np.concatenate(
@@ -54,32 +69,6 @@ def correction_along(paths: Paths, effect: MotionEffect, values: Mapping[str, fl
 def slopes_by_delay(paths: Paths) -> Array:
     """Slopes (S, 3, 1) by a delay of the reference, s."""
     return _by_unit(paths, ReferenceTimeOffset(), "tau", {"tau": 0.0})
-
-
-def _by_functions(
-    paths: Paths, effect: SmoothEffect, names: Sequence[str], values: Mapping[str, float]
-) -> dict[str, Array]:
-    """Slopes (S, 3, 1) by the coefficients of a smooth effect that are asked for; its functions are computed once."""
-    shares, slopes = effect.shares(paths.signals, values), dict[str, Array]()
-    for mode in effect.modes:
-        asked = [number for number, label in enumerate(effect.labels) if f"{mode}_{label}" in names]
-        if asked:
-            of_mode = paths.respond(paths.by_modes[mode], shares[:, asked])
-            slopes |= {f"{mode}_{effect.labels[number]}": of_mode[..., [j]] for j, number in enumerate(asked)}
-    return slopes
-
-
-def _by_shifts(paths: Paths, effect: BentMap, values: Mapping[str, float]) -> dict[str, Array]:
-    """Slopes (S, 3, 1) by the coefficients of a bent map, in which the reported pose is linear."""
-    starts = np.array([log.start for log in paths.logs])
-    there, first = (effect.functions(poses[:, :2], values) for poses in (paths.poses, starts))
-    shifted = there - first[paths.run]
-    axes = zip(effect.axes, np.eye(3), strict=True)
-    return {
-        f"{axis}_{label}": (shifted[:, [number]] * unit)[..., None]
-        for axis, unit in axes
-        for number, label in enumerate(effect.labels)
-    }
 
 
 def _by_unit(paths: Paths, effect: MotionEffect | ReferenceEffect, name: str, values: Mapping[str, float]) -> Array:

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from omnibench.discover.fitting import Fit, paths_of
 from omnibench.discover.regressors.columns import Group
-from omnibench.discover.regressors.covariate_bases import Basis, area_of
+from omnibench.discover.regressors.covariate_bases import Basis, area_of, patches_on_grid
 from omnibench.discover.regressors.paths import Paths
 from omnibench.discover.regressors.significance import Significance, significance_of_scores, together
 from omnibench.robot.effects.effect import Values
@@ -47,9 +47,7 @@ _WAVES = 400  # plane waves over the floor, at most; the shortest are left out
 _DIRECTIONS, _LINES = 12, 9  # directions of lines across the floor, and lines for each
 _EDGE = 0.05  # m, over which the floor changes at a line
 _CELLS = 9  # patches along each side of the floor
-_WIDE = 0.7  # radius of a patch, of the distance between two, as in covariate_bases.py
 _RUNS = 15  # at least: the scatter of eight scores is hardly known from fewer; chosen
-_SEEN = 0.002  # share of the samples that must lie in a patch, as in covariate_bases.py
 _NUMBERS = 1_000_000  # values of functions that are computed at once (chosen)
 
 
@@ -137,7 +135,12 @@ def _kinds(paths: Paths) -> Iterator[_Kind]:
     extent = places.max(axis=0) - low
     if extent.max() <= _EDGE:
         return
-    waves, lines, patches, area = _wave_numbers(), _lines(places), _patches(places), area_of(places)
+    waves, lines, patches, area = (
+        _wave_numbers(),
+        _lines(places),
+        list(patches_on_grid(places, _CELLS)),
+        area_of(places),
+    )
     step = np.pi / np.maximum(extent, _EDGE)
     east, north = ((places - low) * step).T
     most = max(max(abs(number) for number in pair) for pair in waves)
@@ -205,19 +208,6 @@ def _lines(places: Array) -> list[dict[str, float]]:
         distances = np.quantile(places @ [np.cos(normal), np.sin(normal)], shares)
         lines += [{"normal": normal, "distance": distance, "width": _EDGE} for distance in distances.tolist()]
     return lines
-
-
-def _patches(places: Array) -> list[dict[str, float]]:
-    """Patches on a grid, where there are samples."""
-    low = places.min(axis=0)
-    spacing = (places.max(axis=0) - low) / (_CELLS - 1)
-    radius, patches = _WIDE * float(spacing.max()), []
-    for steps in product(range(_CELLS), repeat=2):
-        x, y = (low + spacing * steps).tolist()
-        patch = {"centre_x": x, "centre_y": y, "radius": radius}
-        if (bump(places, patch) > np.exp(-1)).mean() > _SEEN:
-            patches.append(patch)
-    return patches
 
 
 _LOW, _HIGH = 0.1, 6.0  # waves a turn; slower ones look like radii, for faster ones there are whole columns (chosen)

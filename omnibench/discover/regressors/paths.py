@@ -97,10 +97,6 @@ class Paths:
         """Slopes (S, 3, J) by changes direction (F, 3) times shares (F, J) of the tracked point's twist."""
         return self.respond(self.changes(direction), shares)
 
-    def of_body(self, direction: Array, shares: Array) -> Array:
-        """Slopes (S, 3, J) by changes direction (F, 3) times shares (F, J) of the twist of the robot's centre."""
-        return self.of_twist(self.tracked(direction), shares)
-
     def tracked(self, twists: Array) -> Array:
         """Twists (F, 3) of the tracked point from those of the robot's centre."""
         mount = self.robot.mount
@@ -125,10 +121,6 @@ class Paths:
         """Derivatives (F, 3, N) and (F, 3, S) of the twists by the wheel rates and by the steering angles."""
         by_rate, by_angle = self.robot.drive.slopes(self.signals.rates, self.signals.steering)
         return self.matrix @ by_rate, self.matrix @ by_angle
-
-    def of_velocity(self, change: Array) -> Array:
-        """Slopes (S, 3, 1) by a change (F, 2) of the velocity in the reference's frame, m/s."""
-        return self.summed(self.in_world(change)[:, :, None])
 
     def in_world(self, change: Array) -> Array:
         """Displacements (F, 3) in each sample by a change (F, 2) of the velocity in the reference's frame, m/s."""

@@ -34,7 +34,7 @@ from omnibench.discover.report.tables import (
     weight_in_words,
 )
 from omnibench.discover.report.where_section import where_section
-from omnibench.discover.result import Discovery, Experiment, Gap, NamedEffect, experiment_file
+from omnibench.discover.result import Discovery, Gap, NamedEffect, experiment_file
 from omnibench.environment import package_versions
 from omnibench.report.blocks import (
     Block,
@@ -44,7 +44,6 @@ from omnibench.report.blocks import (
     Document,
     Fact,
     Facts,
-    FigureGrid,
     LegendItem,
     Paragraph,
     Section,
@@ -85,25 +84,21 @@ def _answer(discovery: Discovery) -> Section:
     new_motions = extrapolations_in_words(discovery.extrapolations)
     answer = typeset(answer_in_words(discovery))
     headline = typeset(discovery.headline)
-    return answer_section(
-        answer,
-        tuple(_tiles(discovery)),
-        _picture(discovery),
-        *([Paragraph(headline)] if headline != answer else []),
-        Callout("Motions that the training runs never had", new_motions, "warning"),
-        Callout("Before you rely on it", tuple(map(typeset, discovery.notes))),
-    )
-
-
-def _picture(discovery: Discovery) -> FigureGrid | None:
-    """Paths of a few held-out runs, or of training runs where none are held out, by both models."""
+    # Paths of a few held-out runs, or of training runs where none are held out, by both models
     dataset, training = discovery.dataset, set(discovery.trajectories)
     held_out = [run for run in dataset.trajectories if run.id not in training]
     plain = discovery.plain.model
     models: list[tuple[LegendItem, OdometryModel]] = [(PLAIN, plain), (EXTENDED, discovery.extended.model)]
     if not discovery.extends:
         models = [(DESIGN_ITEM, OdometryModel.of_design(dataset.robot, plain.integration)), (ALONE, plain)]
-    return paths_before_after(held_out or dataset.trajectories, models, "held-out" if held_out else "training")
+    return answer_section(
+        answer,
+        tuple(_tiles(discovery)),
+        paths_before_after(held_out or dataset.trajectories, models, "held-out" if held_out else "training"),
+        *([Paragraph(headline)] if headline != answer else []),
+        Callout("Motions that the training runs never had", new_motions, "warning"),
+        Callout("Before you rely on it", tuple(map(typeset, discovery.notes))),
+    )
 
 
 def _tiles(discovery: Discovery) -> Iterator[Fact]:
@@ -138,10 +133,6 @@ def _cause(discovery: Discovery) -> tuple[str, str]:
     return name, f"{verdict}; weight of the name {weight_in_words(first.weight)}"
 
 
-def _spaced(effect: NamedEffect) -> str:
-    return effect_in_words(effect).replace("_", " ")
-
-
 def _gap_fact(discovery: Discovery, gap: Gap, where: str) -> Fact:
     """The share of the gap that is closed or, where nothing was added, the error beside its floor."""
     if discovery.extends:
@@ -156,10 +147,17 @@ def what_blocks(discovery: Discovery) -> Iterator[Block]:
     yield Paragraph(verdict_at_length(discovery))
     if discovery.effects:
         for effect in discovery.effects:
-            yield Callout(_effect_title(effect), tuple(_effect_remarks(effect)))
+            yield Callout(
+                f"{effect.name}: stage {effect.stage} ({STAGES[effect.stage]})", tuple(_effect_remarks(effect))
+            )
         yield parameter_table(discovery.effects, discovery.dataset)
     for number, experiment in enumerate(discovery.experiments, 1):
-        yield from _experiment(experiment, experiment_file(number))
+        # The paragraph, table and config of the runs that tell the members of a class apart
+        yield Paragraph(f"To separate {listing(list(experiment.separates))}: {experiment.description}")
+        if experiment.commands:
+            yield experiment_table(experiment)
+            title = f"These runs as a config ({experiment_file(number)}): simulate them before they are driven"
+            yield Details(title, (Code(experiment.config),))
     if discovery.absorbed:
         yield absorbed_table(discovery)
     if discovery.not_looked_for:
@@ -167,19 +165,6 @@ def what_blocks(discovery: Discovery) -> Iterator[Block]:
             f"Effects that these recordings cannot show ({len(discovery.not_looked_for)})",
             (not_looked_for_table(discovery),),
         )
-
-
-def _experiment(experiment: Experiment, file: str) -> Iterator[Block]:
-    """The paragraph, table and config of the runs that tell the members of a class apart."""
-    yield Paragraph(f"To separate {listing(list(experiment.separates))}: {experiment.description}")
-    if experiment.commands:
-        yield experiment_table(experiment)
-        title = f"These runs as a config ({file}): simulate them before they are driven"
-        yield Details(title, (Code(experiment.config),))
-
-
-def _effect_title(effect: NamedEffect) -> str:
-    return f"{effect.name}: stage {effect.stage} ({STAGES[effect.stage]})"
 
 
 def _effect_remarks(effect: NamedEffect) -> Iterator[str]:
@@ -199,7 +184,7 @@ def sure_blocks(discovery: Discovery) -> Iterator[Block]:
         yield Facts(
             tuple(
                 Fact(
-                    _spaced(effect),
+                    effect_in_words(effect).replace("_", " "),
                     weight_in_words(effect.weight),
                     f"weight of the name; χ² falls by {count(effect.chi_square)} "
                     f"for {plural(effect.degrees_of_freedom, 'parameter')}",
@@ -209,12 +194,6 @@ def sure_blocks(discovery: Discovery) -> Iterator[Block]:
             "tiles",
         )
     yield from drawn(CANDIDATES, discovery)
-    yield from _left_over(discovery)
-    yield from _classes(discovery)
-    yield from _hidden(discovery)
-
-
-def _left_over(discovery: Discovery) -> Iterator[Block]:
     if discovery.left:
         caption = "What the residuals still depend on, after all that was added"
         yield dependence_table(discovery.left, caption)
@@ -222,13 +201,11 @@ def _left_over(discovery: Discovery) -> Iterator[Block]:
         yield Paragraph(
             "With the effects that were added, the residuals depend on nothing that was tried: noise is left."
         )
-
-
-def _classes(discovery: Discovery) -> Iterator[Block]:
     if discovery.classes:
         yield Callout(
             "What these data cannot tell apart", tuple(" or ".join(names) for names in discovery.classes), "plain"
         )
+    yield from _hidden(discovery)
 
 
 def _hidden(discovery: Discovery) -> Iterator[Block]:

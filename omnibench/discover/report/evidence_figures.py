@@ -78,10 +78,20 @@ def candidate_grid(discovery: Discovery) -> FigureGrid | None:
             continue
         chosen = next((each.name for each in shown if each.name in found and _is_step(discovery, number, each)), None)
         title = f"Step {number}: {f'{chosen} is added' if chosen else 'nothing is added'}"
+        bars = [
+            _Bar(
+                wrapped(each.name, _NAME),
+                0.0,
+                each.chi_square,
+                f"{weight_in_words(each.weight)}, {each.degrees_of_freedom} df",
+                _CHOSEN if each.name == chosen else _UNCHOSEN,
+            )
+            for each in shown
+        ]
         figures.append(
             Figure(
                 title,
-                _candidate_bars(shown, chosen),
+                _bars(bars, "gain in whitened χ²", 1.55),
                 "Fall of the whitened chi2 with each candidate: "
                 + ", ".join(
                     f"{each.name} {each.chi_square:.3g}, weight {weight_in_words(each.weight)}" for each in shown
@@ -105,20 +115,6 @@ def _is_step(discovery: Discovery, number: int, candidate: Candidate) -> bool:
     if number < len(discovery.steps):
         return added(discovery.steps[number]) == candidate.name
     return False
-
-
-def _candidate_bars(shown: Sequence[Candidate], chosen: str | None) -> go.Figure:
-    bars = [
-        _Bar(
-            wrapped(each.name, _NAME),
-            0.0,
-            each.chi_square,
-            f"{weight_in_words(each.weight)}, {each.degrees_of_freedom} df",
-            _CHOSEN if each.name == chosen else _UNCHOSEN,
-        )
-        for each in shown
-    ]
-    return _bars(bars, "gain in whitened χ²", 1.55)
 
 
 @dataclass(frozen=True)
@@ -465,10 +461,31 @@ def _rows(commands: Sequence[CommandResidual], styles: Sequence[ModelStyle]) -> 
     for axis, (name, factor, unit) in enumerate(
         (("forward", 1e3, "mm"), ("to the left", 1e3, "mm"), ("heading", math.degrees(1.0), "°"))
     ):
+        names = [wrapped(each.name) for each in shown]
+        half = NORMAL_95 * factor * np.array([each.error[axis] for each in shown])
+        traces: list[go.Bar | go.Scatter] = [
+            go.Bar(
+                y=[text(name) for name in names],
+                x=coordinates(2 * half),
+                base=coordinates(-half),
+                orientation="h",
+                marker={"color": "#d9dde2", "line": {"width": 0}},
+                width=0.6,
+                legendgroup=NOISE.key,
+                hovertemplate="noise ±%{customdata:.3g} " + unit + "<extra></extra>",
+                customdata=coordinates(half),
+            )
+        ]
+        for style in styles:
+            values = factor * np.array([mean_of(each, style)[axis] for each in shown])
+            traces.append(marks(style, 9, values, names, hover=f"{text(style.label)}: %{{x:.3g}} {unit}"))
+        figure = plot(*traces, x_title=f"residual ({unit})")
+        figure.update_yaxes(autorange="reversed", ticks="", tickfont_color=INK)
+        figure.add_vline(x=0, line={"color": QUIET, "width": 1})
         figures.append(
             Figure(
                 f"Final residual {name}" if axis < 2 else "Final heading residual",
-                _row_plot(shown, styles, axis, factor, unit),
+                figure,
                 f"Mean final residual of each command, {name}, in {unit}",
                 90 + 30 * len(shown),
             )
@@ -479,30 +496,3 @@ def _rows(commands: Sequence[CommandResidual], styles: Sequence[ModelStyle]) -> 
         "grey bars hold 95 % of what noise alone would do to that mean."
     )
     return FigureGrid(tuple(figures), legend(styles), 3 if max(len(each.name) for each in shown) < 14 else 1, caption)
-
-
-def _row_plot(
-    commands: Sequence[CommandResidual], styles: Sequence[ModelStyle], axis: int, factor: float, unit: str
-) -> go.Figure:
-    names = [wrapped(each.name) for each in commands]
-    half = NORMAL_95 * factor * np.array([each.error[axis] for each in commands])
-    traces: list[go.Bar | go.Scatter] = [
-        go.Bar(
-            y=[text(name) for name in names],
-            x=coordinates(2 * half),
-            base=coordinates(-half),
-            orientation="h",
-            marker={"color": "#d9dde2", "line": {"width": 0}},
-            width=0.6,
-            legendgroup=NOISE.key,
-            hovertemplate="noise ±%{customdata:.3g} " + unit + "<extra></extra>",
-            customdata=coordinates(half),
-        )
-    ]
-    for style in styles:
-        values = factor * np.array([mean_of(each, style)[axis] for each in commands])
-        traces.append(marks(style, 9, values, names, hover=f"{text(style.label)}: %{{x:.3g}} {unit}"))
-    figure = plot(*traces, x_title=f"residual ({unit})")
-    figure.update_yaxes(autorange="reversed", ticks="", tickfont_color=INK)
-    figure.add_vline(x=0, line={"color": QUIET, "width": 1})
-    return figure

@@ -75,7 +75,7 @@ def motion_panels(
     for direction, (name, factor, unit) in zip(directions, MODES, strict=True):
         title, y_title = f"Error {name}, over {over}", f"error ({unit})"
         panel = Panel(title, x, (), x_title, y_title, unit, words=words, ticks=ticks)
-        parts.append((paths.of_body(direction, bins), factor, panel))
+        parts.append((paths.of_twist(paths.tracked(direction), bins), factor, panel))
     return fitted_panels(residuals, styles, parts)
 
 
@@ -185,7 +185,10 @@ def wheel_angle_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> Figu
     if angles is None or np.abs(rates).max() < _STILL:
         return None
     spectrum = _spectrum_panels(residuals, styles, angles)
-    strongest = _strongest(spectrum)
+    # The harmonic that stands out most in the plain model, over all wheels; 1 if none does
+    ratios = np.array([np.nan_to_num(panel.curves[0].values / panel.curves[0].half_width) for panel in spectrum])
+    together = np.square(ratios).mean(axis=0)
+    strongest = float(_HARMONICS[int(together.argmax())]) if together.max() > 1 else 1.0
     times = "" if strongest == 1 else f"{strongest:g} × "
     edges = np.linspace(0, 360, _BINS + 1)
     parts = []
@@ -255,13 +258,6 @@ def _spectrum_panels(residuals: Residuals, styles: Sequence[ModelStyle], angles:
         )
         for wheel in range(wheels)
     ]
-
-
-def _strongest(spectrum: Sequence[Panel]) -> float:
-    """The harmonic that stands out most in the plain model, over all wheels; 1 if none does."""
-    ratios = np.array([np.nan_to_num(panel.curves[0].values / panel.curves[0].half_width) for panel in spectrum])
-    together = np.square(ratios).mean(axis=0)
-    return float(_HARMONICS[int(together.argmax())]) if together.max() > 1 else 1.0
 
 
 def _binned(

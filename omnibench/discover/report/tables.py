@@ -84,9 +84,9 @@ class Reading:
     factor: float
     unit: str
 
-    def number(self, value: float, digits: int = 3, signed: bool = False) -> str:
+    def number(self, value: float, digits: int = 3) -> str:
         """A value to ``digits`` significant digits, without its unit."""
-        return significant(self.factor * value, digits, signed)
+        return significant(self.factor * value, digits)
 
     def words(self, value: float, digits: int = 3) -> str:
         """A value to ``digits`` significant digits, with its unit."""
@@ -483,14 +483,15 @@ def not_looked_for_table(discovery: Discovery) -> Table:
     return Table("Not looked for", columns, rows)
 
 
-def _extended_bound(extrapolation: Extrapolation) -> str:
-    return "cannot be said" if is_unbounded(extrapolation) else significant(1e3 * extrapolation.after_m, 3)
-
-
 def extrapolation_table(extrapolations: Sequence[Extrapolation]) -> Table:
     """Motions that no training run had, with the error bounds there."""
     rows = tuple(
-        Row.of(each.command, each.description, significant(1e3 * each.before_m, 3), _extended_bound(each))
+        Row.of(
+            each.command,
+            each.description,
+            significant(1e3 * each.before_m, 3),
+            "cannot be said" if is_unbounded(each) else significant(1e3 * each.after_m, 3),
+        )
         for each in extrapolations
     )
     return Table(

@@ -9,7 +9,6 @@ from itertools import pairwise
 import numpy as np
 
 from omnibench.data.dataset import Trajectory
-from omnibench.discover.regressors.paths import Paths
 from omnibench.discover.report.motion_figures import CovariateFigure, fitted_curves, fitted_panels, grid, motion_panels
 from omnibench.discover.report.residuals import NORMAL_95, Curve, ModelStyle, Panel, Residuals
 from omnibench.report.blocks import FigureGrid
@@ -81,7 +80,13 @@ def order_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGrid
 def stamps_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGrid | None:
     """The time by which reference poses seem to be taken earlier than their stamps say."""
     paths = residuals.paths
-    velocity = _velocities(paths)
+    # Velocities (S, 3) of the poses at the paths' stamps, over 100 ms, m/s and rad/s
+    found = []
+    for log, path in zip(paths.logs, paths.ends, strict=True):
+        times = np.concatenate([[0.0], log.times])
+        late, early = (interpolated(log.stamps + shift, times, path) for shift in (0.05, -0.05))
+        found.append((late - early) / 0.1)
+    velocity = np.concatenate(found)
     if np.abs(velocity).max() < 1e-6:
         return None
     stamp_numbers = residuals.stamp_numbers
@@ -186,16 +191,6 @@ def _block_in_words(runs: Sequence[Trajectory]) -> str:
     if not times:
         return f"{session}{plural(len(runs), 'run')}:"
     return f"{session}{fixed(min(times) / 60, 1)} to {fixed(max(times) / 60, 1)} min:"
-
-
-def _velocities(paths: Paths) -> Array:
-    """Velocities (S, 3) of the poses at the paths' stamps, over 100 ms, m/s and rad/s."""
-    found = []
-    for log, path in zip(paths.logs, paths.ends, strict=True):
-        times = np.concatenate([[0.0], log.times])
-        late, early = (interpolated(log.stamps + shift, times, path) for shift in (0.05, -0.05))
-        found.append((late - early) / 0.1)
-    return np.concatenate(found)
 
 
 # Figures over each covariate: a figure that is added here is shown.

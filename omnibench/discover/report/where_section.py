@@ -5,7 +5,7 @@ The motors' figures are of measured wheel rates minus their targets, before and 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -136,11 +136,14 @@ _NOT_DRAWN = {
 def where_section(discovery: Discovery) -> Section:
     """The section on where: residuals by command, then over each covariate, the significant ones first."""
     residuals = Residuals(discovery)
-    styles = _styles(discovery)
+    # The styles of both models, or of the plain one alone if nothing was added
+    pairs = zip(discovery.before, discovery.after, strict=True)
+    styles = (ALONE,) if all(np.array_equal(*pair) for pair in pairs) else (PLAIN, EXTENDED)
     motors = motor_grid(discovery, residuals.runs)
+    order = list(_NOT_DRAWN)  # new covariates come last
     drawn: dict[str, tuple[Block, ...]] = {
         covariate: tuple(grid for figure in _FIGURES[covariate] if (grid := figure(residuals, styles)) is not None)
-        for covariate in _in_order(_FIGURES)
+        for covariate in sorted(_FIGURES, key=lambda name: order.index(name) if name in order else len(order))
     }
     drawn["motors"] = () if motors is None else (motors,)
     covariates = [
@@ -161,12 +164,6 @@ def where_section(discovery: Discovery) -> Section:
         title = "Residuals over other covariates" if named else "Residuals over all covariates"
         sections.append(Section("where-others", title, tuple(others)))
     return Section("where", "Where", (*_dependences(discovery), Paragraph(_HOW, "note")), tuple(sections))
-
-
-def _in_order(covariates: Iterable[str]) -> list[str]:
-    """The covariates in the order of the report; new ones last."""
-    order = list(_NOT_DRAWN)
-    return sorted(covariates, key=lambda name: order.index(name) if name in order else len(order))
 
 
 def _title(name: str) -> str:
@@ -195,9 +192,3 @@ def _dependences(discovery: Discovery) -> Iterator[Block]:
             "worse for it; a simulation from targets is."
         )
     yield dependence_table(discovery.where, "Where the plain matrix fails")
-
-
-def _styles(discovery: Discovery) -> tuple[ModelStyle, ...]:
-    """The styles of both models, or of the plain one alone if nothing was added."""
-    pairs = zip(discovery.before, discovery.after, strict=True)
-    return (ALONE,) if all(np.array_equal(*pair) for pair in pairs) else (PLAIN, EXTENDED)

@@ -34,7 +34,6 @@ from omnibench.discover.selection.model_selection import ABSORBED, Selection
 from omnibench.discover.selection.screening import Screening
 from omnibench.fit.trajectory_fit import Given, given
 from omnibench.registry import effects
-from omnibench.robot.kinematics import Array
 
 _ALIKE = 0.95  # a, Eq. (1), of one class: log odds of at most 2.5, Eq. (2), a weight below that of a sure name
 _SUM = 0.98  # a, Eq. (1), of several effects that imitate one: log odds of at most 1, Eq. (2)
@@ -62,7 +61,11 @@ class Detectability:
 
 def detectability_of(screening: Screening, selection: Selection) -> Detectability:
     """Detectability of effects beyond the matrix, and sizes that could hide beside the selected effects."""
-    start, visible = screening.beyond_matrix(), _visible(screening)
+    # One group for each effect that is not absorbed: the shape with the largest chi-square difference
+    start = screening.beyond_matrix()
+    tellable = [group for group in screening.groups.effects if start.share_left(group.index) >= ABSORBED]
+    best = best_shapes(tellable, [start.chi_square(each.index) for each in tellable])
+    visible = [tellable[index] for index in best]
     return Detectability(
         absorbed=_absorbed(screening, start),
         not_looked_for=screening.groups.not_looked_for,
@@ -84,13 +87,6 @@ def _absorbed(screening: Screening, start: Given) -> tuple[Absorbed, ...]:
             effect = effects.create(name)
             absorbed[name] = Absorbed(name, effect.stage, effect.measurement or "recordings of another session")
     return tuple(absorbed.values())
-
-
-def _visible(screening: Screening) -> list[Group]:
-    """One group for each effect that is not absorbed: the shape with the largest chi-square difference."""
-    start = screening.beyond_matrix()
-    tellable = [group for group in screening.groups.effects if start.share_left(group.index) >= ABSORBED]
-    return [tellable[index] for index in best_shapes(tellable, [start.chi_square(each.index) for each in tellable])]
 
 
 def _classes(start: Given, visible: Sequence[Group]) -> tuple[tuple[str, ...], ...]:
@@ -143,20 +139,16 @@ def _hidden(screening: Screening, selection: Selection, visible: Sequence[Group]
             continue
         values, covariance = now.estimate(group.index)
         errors = np.sqrt(np.maximum(np.diag(covariance), 0.0) * spread)
-        hidden += _of_parameters(group, values, errors)
+        hidden += [
+            Hidden(
+                group.name,
+                parameter.name,
+                parameter.unit,
+                float(abs(value) + _NORMAL_95 * error),  # Eq. (3)
+                float(_DETECTED * error),  # Eq. (4)
+                max(abs(parameter.low), abs(parameter.high)),
+            )
+            for parameter, value, error in zip(group.parameters, values, errors, strict=True)
+            if error > 0
+        ]
     return tuple(hidden)
-
-
-def _of_parameters(group: Group, values: Array, errors: Array) -> list[Hidden]:
-    return [
-        Hidden(
-            group.name,
-            parameter.name,
-            parameter.unit,
-            float(abs(value) + _NORMAL_95 * error),  # Eq. (3)
-            float(_DETECTED * error),  # Eq. (4)
-            max(abs(parameter.low), abs(parameter.high)),
-        )
-        for parameter, value, error in zip(group.parameters, values, errors, strict=True)
-        if error > 0
-    ]

@@ -149,8 +149,17 @@ def make_groups(paths: Paths, trajectories: Sequence[Trajectory], without: Seque
             named.append(Group("effect", effect.name, (), effect, linear, shape, len(shapes), family=family))
             sources.append(_of_effect(effect, linear, named[-1]))
     bases = list(generic_bases(paths, trajectories))
-    sources += [basis.columns or _none for basis in bases]
-    columns, widths = _stored(paths, sources)
+    sources += [basis.columns or (lambda along: np.zeros((len(along.poses), 3, 0))) for basis in bases]
+    # The columns of all sources along the paths, some runs at a time, and how many each source has
+    columns, widths = ColumnStore(), list[int]()
+    for part in paths.in_parts():
+        of_sources = [source(part) for source in sources]
+        widths = [of_source.shape[2] for of_source in of_sources]
+        together = np.concatenate(of_sources, axis=2)
+        steps = np.diff(together, axis=0, prepend=0.0)
+        firsts = [stamps.start for stamps in part.parts]
+        steps[firsts] = together[firsts]
+        columns.append(steps, [stamps.stop - stamps.start for stamps in part.parts])
     ends = accumulate(widths, initial=0)
     matrix, *others = (tuple(range(low, high)) for low, high in pairwise(ends))
     return Groups(
@@ -166,24 +175,6 @@ def make_groups(paths: Paths, trajectories: Sequence[Trajectory], without: Seque
         columns,
         tuple(not_looked_for),
     )
-
-
-def _stored(paths: Paths, sources: Sequence[Columns]) -> tuple[ColumnStore, list[int]]:
-    """The columns of all sources along the paths, some runs at a time, and how many each source has."""
-    store, widths = ColumnStore(), list[int]()
-    for part in paths.in_parts():
-        columns = [source(part) for source in sources]
-        widths = [of_source.shape[2] for of_source in columns]
-        together = np.concatenate(columns, axis=2)
-        steps = np.diff(together, axis=0, prepend=0.0)
-        firsts = [stamps.start for stamps in part.parts]
-        steps[firsts] = together[firsts]
-        store.append(steps, [stamps.stop - stamps.start for stamps in part.parts])
-    return store, widths
-
-
-def _none(along: Paths) -> Array:
-    return np.zeros((len(along.poses), 3, 0))
 
 
 def _of_effect(effect: MotionEffect | ReferenceEffect, linear: Sequence[Parameter], group: Group) -> Columns:

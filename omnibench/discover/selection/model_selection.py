@@ -89,7 +89,31 @@ def select_effects(screening: Screening, rng: np.random.Generator) -> Selection:
         others = [group for group in screening.groups.effects if group.name not in doubtful]
         search = _search(screening, others, rng)
     where = significance_of(screening.data, screening.groups.matrix.index, screening.groups.bases, rng)
-    return _weighed(screening.beyond_matrix(), search, where)
+    # The weights of all names, and the names that could take the place of each chosen one
+    start = screening.beyond_matrix()
+    chosen = tuple(sorted(search.chosen, key=lambda group: -start.chi_square(group.index)))
+    of_positions = [
+        _probabilities(start, search.pool, chosen, position, search.discrepancy) for position in range(len(chosen))
+    ]
+    weights: dict[str, float] = {}
+    for probabilities in of_positions:
+        for group, probability in probabilities:
+            weights[group.name] = max(weights.get(group.name, 0.0), search.known * probability)  # Eq. (9) times (5)
+    stand_ins = tuple(
+        tuple(other for other, probability in probabilities if other.name != group.name and probability > _CONFUSABLE)
+        for group, probabilities in zip(chosen, of_positions, strict=True)
+    )
+    return Selection(
+        chosen=chosen,
+        weights=weights,
+        known=search.known,
+        stand_ins=stand_ins,
+        steps=search.steps,
+        where=where,
+        left=search.left,
+        left_share=search.left_share,
+        tentative=search.tentative,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,19 +140,15 @@ def _search(screening: Screening, candidates: Sequence[Group], rng: np.random.Ge
         return _Search((), (), pool, steps, left, 0.0, 1.0, DISCREPANCY)
     beyond = significance_of(data, [*fitted, *form_columns(chosen)], bases, rng)
     sets = effect_sets(start, pool, len(chosen))
-    alike = _look_alikes(start, pool, chosen)
+    # Effective number of names that explain as much in the place that has most of them, Eq. (9)
+    of_positions = (_probabilities(start, pool, chosen, position, DISCREPANCY) for position in range(len(chosen)))
+    alike = max(1 / sum(probability**2 for _, probability in of_position) for of_position in of_positions)
     credibility = credibility_of(sets, start, chosen, left, beyond, alike)  # Eq. (9)
     share, known, discrepancy = credibility.left_share, credibility.probability, credibility.discrepancy
     if known < _CREDIBLE:
         left = significance_of(data, screening.groups.matrix.index, bases, rng)
         return _Search((), chosen, pool, steps, left, share, known, discrepancy)
     return _Search(chosen, (), pool, steps, left, share, known, discrepancy)
-
-
-def _look_alikes(start: Given, pool: Sequence[Group], chosen: Sequence[Group]) -> float:
-    """Effective number of names that explain as much in the place that has most of them, Eq. (9)."""
-    of_positions = (_probabilities(start, pool, chosen, position, DISCREPANCY) for position in range(len(chosen)))
-    return max(1 / sum(probability**2 for _, probability in of_position) for of_position in of_positions)
 
 
 def _forward_selection(
@@ -183,33 +203,6 @@ def _within_quantisation(screening: Screening, groups: Sequence[Group]) -> set[s
         return set()
     start = screening.beyond_matrix()
     return {group.name for group in groups if start.chi_square(group.index) <= screening.quantisation_chi_square(group)}
-
-
-def _weighed(start: Given, search: _Search, where: Significance) -> Selection:
-    """The selection that a search leads to, with the weights of all names."""
-    chosen = tuple(sorted(search.chosen, key=lambda group: -start.chi_square(group.index)))
-    of_positions = [
-        _probabilities(start, search.pool, chosen, position, search.discrepancy) for position in range(len(chosen))
-    ]
-    weights: dict[str, float] = {}
-    for probabilities in of_positions:
-        for group, probability in probabilities:
-            weights[group.name] = max(weights.get(group.name, 0.0), search.known * probability)  # Eq. (9) times (5)
-    stand_ins = tuple(
-        tuple(other for other, probability in probabilities if other.name != group.name and probability > _CONFUSABLE)
-        for group, probabilities in zip(chosen, of_positions, strict=True)
-    )
-    return Selection(
-        chosen=chosen,
-        weights=weights,
-        known=search.known,
-        stand_ins=stand_ins,
-        steps=search.steps,
-        where=where,
-        left=search.left,
-        left_share=search.left_share,
-        tentative=search.tentative,
-    )
 
 
 def _probabilities(

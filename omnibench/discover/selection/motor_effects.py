@@ -70,7 +70,10 @@ def select_motor_effects(
 def _screen(runs: Sequence[Trajectory], errors: Sequence[Array], robot: Robot, without: Sequence[str]) -> Screening:
     """All motor effects and generic bases as columns against the errors (F, N) of the rates."""
     groups, sources = _groups(runs, robot, without)
-    noise, columns = _noise_of(errors), ColumnStore()
+    # White noise of the rates, rad/s, from the differences of neighbouring samples: ramps and offsets do not count
+    steps = np.concatenate([np.diff(of_run, axis=0).ravel() for of_run in errors])
+    noise = max(float(np.median(np.abs(steps))) / _MEDIAN / np.sqrt(2), _LEAST * float(np.abs(steps).mean()), _EQUAL)
+    columns = ColumnStore()
     residuals = [of_run.ravel() / noise for of_run in errors]
     scores, information = [], np.zeros(())
     for run, of_run in zip(runs, residuals, strict=True):
@@ -85,12 +88,6 @@ def _screen(runs: Sequence[Trajectory], errors: Sequence[Array], robot: Robot, w
 def _targets(run: Trajectory) -> Array:
     assert run.targets is not None
     return run.targets
-
-
-def _noise_of(errors: Sequence[Array]) -> float:
-    """White noise of the rates, rad/s, from the differences of neighbouring samples: ramps and offsets do not count."""
-    steps = np.concatenate([np.diff(of_run, axis=0).ravel() for of_run in errors])
-    return max(float(np.median(np.abs(steps))) / _MEDIAN / np.sqrt(2), _LEAST * float(np.abs(steps).mean()), _EQUAL)
 
 
 def _groups(runs: Sequence[Trajectory], robot: Robot, without: Sequence[str]) -> tuple[Groups, list[_Slopes]]:

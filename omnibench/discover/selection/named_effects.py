@@ -57,13 +57,20 @@ def _effects(selection: Selection, robot: Robot, values: Array, reach: Array) ->
         row = rows.stop
         weight = selection.weights.get(group.name, 0.0)
         chi_square, rank = tried.get(group.name, (0.0, 0.0))
+        names = [parameter.name for parameter in group.parameters]
+        assert group.effect is not None
+        shapes = []
+        for each in group.effect.parameters(robot):
+            if each.name in group.shapes:
+                value = group.shapes[each.name]
+                shapes.append(EstimatedParameter(each.name, value, each.unit, value, value, shape=True))
         effects.append(
             NamedEffect(
                 name=group.name,
                 stage=group.effect.stage,
                 weight=weight,
-                form=form_in_words(_values_of(group, values[rows])),
-                parameters=(*_estimates(group, values[rows], reach[rows]), *_shapes(group, robot)),
+                form=form_in_words(dict(group.shapes) | dict(zip(names, values[rows].tolist(), strict=True))),
+                parameters=(*_estimates(group, values[rows], reach[rows]), *shapes),
                 confusable_with=confusable,
                 physics=group.effect.physics,
                 source=group.effect.source,
@@ -76,23 +83,11 @@ def _effects(selection: Selection, robot: Robot, values: Array, reach: Array) ->
     return tuple(effects)
 
 
-def _values_of(group: Group, values: Array) -> dict[str, float]:
-    """The values of an effect's linear parameters and of its shapes."""
-    names = [parameter.name for parameter in group.parameters]
-    return dict(group.shapes) | dict(zip(names, values.tolist(), strict=True))
-
-
 def _estimates(group: Group, values: Array, margins: Array) -> list[EstimatedParameter]:
     return [
         EstimatedParameter(parameter.name, float(value), parameter.unit, float(value - margin), float(value + margin))
         for parameter, value, margin in zip(group.parameters, values, margins, strict=True)
     ]
-
-
-def _shapes(group: Group, robot: Robot) -> list[EstimatedParameter]:
-    assert group.effect is not None
-    shapes = [(each, group.shapes[each.name]) for each in group.effect.parameters(robot) if each.name in group.shapes]
-    return [EstimatedParameter(each.name, value, each.unit, value, value, shape=True) for each, value in shapes]
 
 
 def _candidates(step: Significance, selection: Selection) -> tuple[Candidate, ...]:

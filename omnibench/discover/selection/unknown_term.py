@@ -58,15 +58,6 @@ _LARGEST = 3.0  # times the plausible range: a larger coefficient stands for som
 
 
 @dataclass(frozen=True, eq=False)
-class SmoothTerm:
-    """The competing models with smooth terms, or as they were where none is added; what is left then; and notes."""
-
-    models: CompetingModels
-    left: Significance
-    notes: tuple[str, ...]
-
-
-@dataclass(frozen=True, eq=False)
 class _Trial:
     """A term over a covariate, and the chi-square difference (Z,) that it makes for each run when it is held out."""
 
@@ -92,8 +83,10 @@ def add_smooth_terms(
     left: Significance,
     looking_again: Callable[[Extended], Significance],
     folds: NDArray[np.intp],
-) -> SmoothTerm:
+) -> tuple[CompetingModels, Significance, tuple[str, ...]]:
     """Add terms without a name to all competing models, as long as runs that are held out gain by them.
+
+    The competing models with them, or as they were where none is added; what is left then; and notes.
 
     A term is a set of smooth functions of a covariate that the residuals depend on most surely, or an effect of the
     catalogue that explains most and whose name is not sure. left: what the residuals depend on after the effects;
@@ -105,9 +98,14 @@ def add_smooth_terms(
     kinds, notes = folds_of_kinds(plain), list[str]()
     if (count := screening.kinds or 0) < _KINDS:
         few = f"No unnamed term was tried: {plural(count, 'kind')} of motion cannot tell whether it holds for others."
-        return SmoothTerm(models, left, (few,))
+        return models, left, (few,)
     for _ in range(_ROUNDS):
-        covariates = _surest_covariates(left)
+        # The covariates that are most likely what the residuals depend on, if that is no chance
+        significant = {
+            group.name for index, group in enumerate(left.groups) if left.p_value(index) < CHANCE and _term_of(group)
+        }
+        weights = weights_of_covariates(left)
+        covariates = sorted(significant, key=lambda name: -weights[name])[:_COVARIATES]
         trials = [
             trial
             for name in covariates
@@ -123,7 +121,7 @@ def add_smooth_terms(
         models = replace(models, used=weighted[0][1], weighted=weighted)
         notes.append(f"The extended model holds {best.words}: on motions held out it gains {best.gained}.")
         left = looking_again(models.used)
-    return SmoothTerm(models, left, tuple(notes))
+    return models, left, tuple(notes)
 
 
 def _nothing_added(covariates: Sequence[str], best: _Trial | None) -> str:
@@ -131,16 +129,8 @@ def _nothing_added(covariates: Sequence[str], best: _Trial | None) -> str:
         return "No unnamed term was tried: nothing that is left depends on what a model could use."
     if best is None:
         return f"No unnamed term was added: no function of {' or '.join(covariates)} is plainly there by itself."
-    return f"{_capital(best.words)} was tried and left out: on motions held out it gains {best.gained}."
-
-
-def _surest_covariates(left: Significance) -> list[str]:
-    """The covariates that are most likely what the residuals depend on, if that is no chance."""
-    significant = {
-        group.name for index, group in enumerate(left.groups) if left.p_value(index) < CHANCE and _term_of(group)
-    }
-    weights = weights_of_covariates(left)
-    return sorted(significant, key=lambda name: -weights[name])[:_COVARIATES]
+    words = best.words[0].upper() + best.words[1:]
+    return f"{words} was tried and left out: on motions held out it gains {best.gained}."
 
 
 def _trials(
@@ -322,7 +312,3 @@ def _held_out_gains(
                 left = data.residuals[run] - data.columns[run][:, index] @ values
                 gains[run] += sign * float(np.square(left).sum())
     return gains
-
-
-def _capital(text: str) -> str:
-    return text[0].upper() + text[1:]

@@ -44,12 +44,13 @@ def check_document(dataset: Dataset, checked: CheckReport) -> Document:
     counts = {severity: sum(each.severity == severity for each in checked.findings) for severity in _WORDS}
     tiles = [Fact(_WORDS[severity], str(count)) for severity, count in counts.items()]
     tiles.append(Fact("Runs", str(len(dataset.trajectories))))
+    gain = f"What a calibration would gain on runs that it was not fitted to, each in turn; {typeset(checked.gain)}."
     sections = [
         answer_section(
             f"{checked.sentence}.",
             tiles,
             picture,
-            *([Paragraph(_gain(checked.gain), "note")] if checked.gain else []),
+            *([Paragraph(gain, "note")] if checked.gain else []),
             title="Verdict",
         ),
         Section("findings", "Findings, each with what to type", tuple(_blocks(checked.findings))),
@@ -60,10 +61,6 @@ def check_document(dataset: Dataset, checked: CheckReport) -> Document:
         sections=tuple(sections),
         badges=simulated_badge(dataset.simulated),
     )
-
-
-def _gain(gain: str) -> str:
-    return f"What a calibration would gain on runs that it was not fitted to, each in turn; {typeset(gain)}."
 
 
 def _blocks(findings: Sequence[Finding]) -> list[Block]:

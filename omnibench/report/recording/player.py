@@ -71,6 +71,9 @@ def _run(
     targets = None if run.targets is None else _means(run, run.targets, times)
     everything = [rates] if targets is None else [rates, targets]
     drawn = [poses[:, :2], driven[:, :2], *outlines, *(np.reshape(scan["points"], (-1, 2)) for scan in scans)]
+    # Left, bottom, right and top of the picture, m; the farthest 0.5 % of the points on each side are cut off
+    points = np.vstack(drawn)
+    low, high = np.quantile(points, 0.005, axis=0) - _MARGIN, np.quantile(points, 0.995, axis=0) + _MARGIN
     return {
         "times": _rounded(times),
         "poses": _rounded(poses, 4),
@@ -78,15 +81,25 @@ def _run(
         "truth": None if true_poses is None else _rounded(true_poses),
         "rates": _rounded(rates),
         "targets": None if targets is None else _rounded(targets),
-        "rate_limit": _limit(np.vstack(everything)),
+        "rate_limit": round(1.05 * max(float(np.abs(np.vstack(everything)).max()), 1e-3), 3),
         "scans": scans,
         "plan": [_rounded(outline) for outline in outlines],
-        "window": _window(np.vstack(drawn)),
+        "window": _rounded(np.concatenate([low, high])),
         "rated": dataset.robot.wheel_names,
         "steering": None if run.steering is None else _rounded(interpolated(times, run.times, run.steering)),
         "wheels": _wheels(dataset.robot),
         "radius": max(math.hypot(wheel.reach, wheel.radius) for wheel in dataset.robot.wheels),
-        "colours": _colours(),
+        "colours": {
+            "reference": REFERENCE_ITEM.colour,
+            "odometry": ODOMETRY_ITEM.colour,
+            "truth": TRUTH_ITEM.colour,
+            "plan": PLAN_ITEM.colour,
+            "map": SCANS + "66",
+            "scan": _SEEN.colour,
+            "ray": _SEEN.colour + "44",
+            "whole": REFERENCE_ITEM.colour + "55",
+            "robot": INK,
+        },
         "key": _key(bool(scans), truth is not None, bool(outlines)),
     }
 
@@ -120,17 +133,6 @@ def _means(run: Trajectory, values: Array, times: Array) -> Array:
     return means
 
 
-def _limit(rates: Array) -> float:
-    """The rate that fills a bar, rad/s."""
-    return round(1.05 * max(float(np.abs(rates).max()), 1e-3), 3)
-
-
-def _window(points: Array) -> list[float]:
-    """Left, bottom, right and top of the picture, m; the farthest 0.5 % of the points on each side are cut off."""
-    low, high = np.quantile(points, 0.005, axis=0) - _MARGIN, np.quantile(points, 0.995, axis=0) + _MARGIN
-    return _rounded(np.concatenate([low, high]))
-
-
 def _wheels(robot: Robot) -> list[dict[str, Any]]:
     """The wheels that are drawn: radius and place, m, direction of rolling, rad, index of the angle that steers it."""
     steered = robot.drive.steered
@@ -144,20 +146,6 @@ def _wheels(robot: Robot) -> list[dict[str, Any]]:
         for wheel in robot.wheels
         if is_placed(wheel)
     ]
-
-
-def _colours() -> dict[str, str]:
-    return {
-        "reference": REFERENCE_ITEM.colour,
-        "odometry": ODOMETRY_ITEM.colour,
-        "truth": TRUTH_ITEM.colour,
-        "plan": PLAN_ITEM.colour,
-        "map": SCANS + "66",
-        "scan": _SEEN.colour,
-        "ray": _SEEN.colour + "44",
-        "whole": REFERENCE_ITEM.colour + "55",
-        "robot": INK,
-    }
 
 
 def _key(scans: bool, truth: bool, plan: bool) -> list[dict[str, Any]]:

@@ -56,14 +56,22 @@ def contents_table(dataset: Dataset) -> Table:
     """A table of the quantities from motion command to SLAM pose: recorded or not, how many, at what interval."""
     runs = dataset.trajectories
     samples = [run.times for run in runs]
-    number = sum(map(len, samples))
+    number, steers = sum(map(len, samples)), runs[0].steering is not None
+    step = rate_step(runs[0])
     rows = [
         _commands(runs),
         _sent(runs),
         _wheels("Target wheel rates", _rates("ωM", dataset), runs, "targets", "what the motor controllers were told"),
-        _row("Measured wheel rates", _rates("ω", dataset), number, "samples", _every(samples, first=0.0), _steps(runs)),
+        _row(
+            "Measured wheel rates",
+            _rates("ω", dataset),
+            number,
+            "samples",
+            _every(samples, first=0.0),
+            "by encoders" if step is None else f"by encoders, in steps of {significant(step, 3)} rad/s",
+        ),
         _wheels("Wheel angles", "φ", runs, "angles", "absolute, continuous within a session"),
-        *_steering(runs),
+        *([_wheels("Steering angles", "steer", runs, "steering", "at the samples' ends")] if steers else []),
         _wheels("Odometry of the robot", "(x, y, θ)", runs, "odometry", "as it computed it"),
         _scans(dataset),
         _reference(dataset),
@@ -117,17 +125,6 @@ def _wheels(name: str, symbol: str, runs: Sequence[Trajectory], field: str, rema
     if len(recorded) < len(runs):
         remark += f"; in {count(len(recorded))} of {count(len(runs))} runs"
     return _row(name, symbol, sum(map(len, times)), "samples", _every(times, first=0.0), remark)
-
-
-def _steering(runs: Sequence[Trajectory]) -> list[Row]:
-    if runs[0].steering is None:
-        return []
-    return [_wheels("Steering angles", "steer", runs, "steering", "at the samples' ends")]
-
-
-def _steps(runs: Sequence[Trajectory]) -> str:
-    step = rate_step(runs[0])
-    return "by encoders" if step is None else f"by encoders, in steps of {significant(step, 3)} rad/s"
 
 
 def _scans(dataset: Dataset) -> Row:
@@ -228,16 +225,13 @@ def _nees_figures(errors: Sequence[RunErrors]) -> tuple[Block, ...]:
         340,
     )
     time = _curves(known, lambda e: e.times, _squares, "t (s)", "NEES", level=3.0)
+    beyond = int((values > limit).sum())
+    outside = f"{count(beyond)} of {count(len(values))} lie beyond the histogram." if beyond else ""
     caption = (
         "NEES: the squared error weighted by the inverse covariance. Its mean is 3 (line) where covariances are right, "
-        f"and larger where they are too small. {_beyond(values, limit)}"
+        f"and larger where they are too small. {outside}"
     )
     return (FigureGrid((distribution, time), (_RUN, _MEAN, _HIGH), 2, caption.strip()),)
-
-
-def _beyond(values: Array, limit: float) -> str:
-    beyond = int((values > limit).sum())
-    return f"{count(beyond)} of {count(len(values))} lie beyond the histogram." if beyond else ""
 
 
 def _squares(errors: RunErrors) -> Array:
@@ -431,7 +425,7 @@ def pictures(
     }
     wheels: dict[str, tuple[Block, ...]] = {name: (wheel_rates(run, dataset.robot),) for name, run in runs.items()}
     exactness: tuple[str, ...] = ()
-    if plan is not None and not _all_known(runs, begun):
+    if plan is not None and not all(run.id in begun for run in runs.values()):
         exactness = (
             f"The floor plan ({plan.name}) is drawn from the robot's mark; for a run that began beside the mark it is "
             "shifted by that distance.",
@@ -445,10 +439,6 @@ def pictures(
             (Callout("Floor plan", exactness), Choice("Run", rooms)),
         ),
     ]
-
-
-def _all_known(runs: Mapping[str, Trajectory], starts: Mapping[str, Array]) -> bool:
-    return all(run.id in starts for run in runs.values())
 
 
 def _outlines(plan: RoomPlan | None, start: Array | None) -> list[Array]:

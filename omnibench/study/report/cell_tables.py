@@ -10,12 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 import plotly.graph_objects as go
 
+from omnibench.compare.report.view import interval_in_words
 from omnibench.report.blocks import Block, Cell, Choice, Column, Figure, FigureGrid, LegendItem, Row, Section, Table
 from omnibench.report.figures import line, marks
 from omnibench.report.numbers import NOTHING, fixed, seconds
 from omnibench.report.style import INK, THEORETICAL, colours, logarithmic, plot, text, wrapped
 from omnibench.robot.kinematics import Robot
-from omnibench.study.cells import CellRatio, MethodInCell, StudyCell
+from omnibench.study.cells import MethodInCell, StudyCell
 from omnibench.study.study_result import StudyResult, mean_ratio
 from omnibench.study.trainings import AS_RECORDED
 from omnibench.words import plural
@@ -90,10 +91,7 @@ def robot_cells(view: StudyView, robot: str) -> Section:
     """All cells of one robot."""
     cells = view.plain(robot)
     judged = len(view.result.judged_cells)
-    tables: dict[str, tuple[Block, ...]] = {}
-    for cell in cells:
-        name = f"{cell_words(cell)}{' (training errors)' if cell.key.fitted else ''}"
-        tables[name] = (cell_table(cell, view, judged),)
+    tables: dict[str, tuple[Block, ...]] = {_column(cell): (cell_table(cell, view, judged),) for cell in cells}
     return Section(
         f"cells-{robot}",
         robot,
@@ -184,7 +182,7 @@ def _row(each: MethodInCell, cell: StudyCell, view: StudyView, judged: int, best
         name,
         fixed(1e3 * position, 1),
         fixed(math.degrees(heading), 2),
-        Cell(fixed(ratio.value, 3), _interval(ratio)),
+        Cell(fixed(ratio.value, 3), interval_in_words(ratio.alone, 2)),
         Cell("" if cell.key.fitted or ratio.equal else ratio.verdict, partly),
         seconds(each.seconds if view.result.config.timing else None),
         Cell(each.numbers, _change(each, view.design(cell.key.robot))),
@@ -203,11 +201,6 @@ def _change(each: MethodInCell, robot: Robot) -> str:
         if np.abs(row).max() >= _LEAST_SHARE
     ]
     return f"matrix: {'; '.join(rows)} % of the row" if rows else ""
-
-
-def _interval(ratio: CellRatio) -> str:
-    known = ratio.alone.known
-    return "no interval" if known is None else f"{fixed(known[0], 2)} to {fixed(known[1], 2)}"
 
 
 def _is_for_none(cells: Sequence[StudyCell], method: str) -> bool:
@@ -341,17 +334,17 @@ def curve_section(view: StudyView) -> tuple[Section, ...]:
     shown = [
         name
         for name in view.methods
-        if any(_answers(cell, name) for points in drawn.values() for cell in points.values())
+        if any(
+            name in cell.methods and cell.methods[name].errors is not None
+            for points in drawn.values()
+            for cell in points.values()
+        )
     ]
     grid = FigureGrid(
         figures, tuple(view.styles[name] for name in shown), 2,
         "Runs of each command that train, against the mean final error, Eq. (6), of runs that never train.", "curves",
     )  # fmt: skip
     return (Section("curves", "Learning curves", (grid,), about="How many runs a method needs."),)
-
-
-def _answers(cell: StudyCell, method: str) -> bool:
-    return method in cell.methods and cell.methods[method].errors is not None
 
 
 def _curve(view: StudyView, name: str, points: Mapping[int, StudyCell]) -> Figure:

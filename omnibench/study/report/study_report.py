@@ -12,8 +12,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from omnibench.compare.report.view import interval_in_words
 from omnibench.report.blocks import (
-    Badge,
     Block,
     Callout,
     Cell,
@@ -44,7 +44,7 @@ from omnibench.study.report.cell_tables import (
     robot_cells,
     study_view,
 )
-from omnibench.study.study_result import AgainstBest, Ranking, StudyResult, profiles, ranking
+from omnibench.study.study_result import AgainstBest, StudyResult, profiles, ranking
 from omnibench.words import plural
 
 _VERDICTS = ("better", "undecided", "worse")
@@ -123,8 +123,7 @@ def _chart(compared: tuple[AgainstBest, ...], reference: str) -> FigureGrid:
 
 
 def _hover(each: AgainstBest, reference: str) -> str:
-    known = each.ratio.in_family.known
-    interval = "no interval" if known is None else f"{fixed(known[0], 2)} to {fixed(known[1], 2)}"
+    interval = interval_in_words(each.ratio.in_family, 2)
     return (
         f"{each.cell.key.words}: {reference} {fixed(each.ratio.value, 2)} x {each.best} "
         f"({interval}, {each.ratio.units})"
@@ -188,19 +187,13 @@ def _diagram(view: StudyView, cells: Sequence[StudyCell], name: str) -> tuple[Bl
         (Figure(title, figure, words, height),),
         (_BAR,) if ranked.groups else (),
         1,
-        _rank_words(ranked),
-        f"ranks-{name}",
-    )
-    return (grid,)
-
-
-def _rank_words(ranked: Ranking) -> str:
-    return (
         f"Methods that answered in all {plural(ranked.cells, 'cell')}. Bars join methods whose mean ranks differ by "
         f"less than the critical difference, {fixed(ranked.critical_difference, 2)} (Nemenyi, 95 %); Friedman's "
         f"test that all are alike: p = {significant(ranked.p_value, 2)}. Cells of one robot share runs, so that the "
-        "true critical difference is larger."
+        "true critical difference is larger.",
+        f"ranks-{name}",
     )
+    return (grid,)
 
 
 def _profiles(view: StudyView, cells: Sequence[StudyCell], name: str) -> tuple[Block, ...]:
@@ -243,10 +236,6 @@ _SHOWN = 12  # failures that are listed; the others are counted
 def study_document(result: StudyResult) -> Document:
     """The report as blocks."""
     view = study_view(result)
-    simulated = [robot.dataset.simulated for robot in result.robots]
-    badges = simulated_badge(any(simulated))
-    if any(simulated) and not all(simulated):
-        badges = (Badge("SIMULATED AND REAL DATA", "warning"),)
     return Document(
         title=f"Calibration methods on several robots: {result.config.name}",
         subtitle=result.config.description,
@@ -261,7 +250,7 @@ def study_document(result: StudyResult) -> Document:
             _data_section(result),
             _reproduction(result),
         ),
-        badges=badges,
+        badges=simulated_badge(*(robot.dataset.simulated for robot in result.robots)),
     )
 
 
