@@ -108,12 +108,12 @@ def discover_effects(
     term_notes: tuple[str, ...] = ()
     if unknown_term and lacks_a_name(verdict):
         progress.begin("closing the gap without a name")
-        before = models
-        models, left, term_notes = add_smooth_terms(
-            plain, screening, before, selection.left, lambda model: all_left(model, screening, rng), folds
+        smooth = add_smooth_terms(
+            plain, screening, models, selection.left, lambda model: all_left(model, screening, rng), folds
         )
-        if models is not before:
-            dependences = without_smooth_term(dependences, left, screening, selection)
+        if smooth.models is not models:
+            dependences = without_smooth_term(dependences, smooth.left, screening, selection)
+        models, term_notes = smooth.models, smooth.notes
         effects = named_effects(models, motors)
 
     progress.begin("comparing on runs that were held out")

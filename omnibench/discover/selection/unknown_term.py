@@ -58,6 +58,15 @@ _LARGEST = 3.0  # times the plausible range: a larger coefficient stands for som
 
 
 @dataclass(frozen=True, eq=False)
+class SmoothTerm:
+    """The competing models with smooth terms, or as they were where none is added; what is left then; and notes."""
+
+    models: CompetingModels
+    left: Significance
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
 class _Trial:
     """A term over a covariate, and the chi-square difference (Z,) that it makes for each run when it is held out."""
 
@@ -83,10 +92,8 @@ def add_smooth_terms(
     left: Significance,
     looking_again: Callable[[Extended], Significance],
     folds: NDArray[np.intp],
-) -> tuple[CompetingModels, Significance, tuple[str, ...]]:
+) -> SmoothTerm:
     """Add terms without a name to all competing models, as long as runs that are held out gain by them.
-
-    The competing models with them, or as they were where none is added; what is left then; and notes.
 
     A term is a set of smooth functions of a covariate that the residuals depend on most surely, or an effect of the
     catalogue that explains most and whose name is not sure. left: what the residuals depend on after the effects;
@@ -98,7 +105,7 @@ def add_smooth_terms(
     kinds, notes = folds_of_kinds(plain), list[str]()
     if (count := screening.kinds or 0) < _KINDS:
         few = f"No unnamed term was tried: {plural(count, 'kind')} of motion cannot tell whether it holds for others."
-        return models, left, (few,)
+        return SmoothTerm(models, left, (few,))
     for _ in range(_ROUNDS):
         # The covariates that are most likely what the residuals depend on, if that is no chance
         significant = {
@@ -121,7 +128,7 @@ def add_smooth_terms(
         models = replace(models, used=weighted[0][1], weighted=weighted)
         notes.append(f"The extended model holds {best.words}: on motions held out it gains {best.gained}.")
         left = looking_again(models.used)
-    return models, left, tuple(notes)
+    return SmoothTerm(models, left, tuple(notes))
 
 
 def _nothing_added(covariates: Sequence[str], best: _Trial | None) -> str:
