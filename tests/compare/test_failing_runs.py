@@ -52,7 +52,7 @@ WRONG = {
     "says_nothing": ("return None", "failed", "NoneType"),
     "gives_odd_reasons": ("return Solution(problem.start, {'two': 'lines\\nhere'})", "converged", "{'two': 'lines"),
     "spoils_the_history": (
-        "problem.history = [1, 2]; return Solution(problem.start, 'here')",
+        "problem.history[:] = [1, 2]; return Solution(problem.start, 'here')",
         "failed",
         "Expected `Improvement`",
     ),
