@@ -28,7 +28,8 @@ from omnibench.registry import import_copies
 
 _MEGABYTE = 1_000_000  # bytes
 # s after its start in which a process takes further jobs: to start one costs 20 ms (tests/studies/job_overhead.py),
-# 2 % of that; what jobs leave behind in it (memory, caches) is that of a second.
+# 2 % of that; what jobs leave behind in it (memory, caches) is that of a second. The time in which jobs are unpacked is
+# not counted: the first imports their modules, which may take longer than all of them, and every new process again.
 _YOUNG = 1.0
 _OWN = 60.0  # s, for jobs of our own code, which leave nothing behind but what they share: data need not go again
 # What every process of jobs needs; pydantic imports these when a result is first written, which takes 60 ms.
@@ -39,6 +40,7 @@ _FROM_OUTSIDE = (SIGKILL, SIGTERM, SIGHUP, SIGINT)  # signals by which people an
 
 _KEPT: dict[str, Any] = {}  # objects that the last job of this process shared, by their names
 _in_job = False  # True in a process of jobs
+_working_since = 0.0  # s, by time.monotonic, when the last job of this process had been unpacked
 
 
 @contextmanager
@@ -118,6 +120,7 @@ class Packer:
 
 def run_packed(packed: PackedJob, report: Reporter) -> Any:
     """Unpack a job in its process and run it."""
+    global _working_since
     import_copies(packed.plugins)
     shared = {name: pickle.loads(content) for name, content in packed.shared.items()}
     if packed.kept:
@@ -127,6 +130,7 @@ def run_packed(packed: PackedJob, report: Reporter) -> Any:
     unpickler = pickle.Unpickler(BytesIO(packed.content))
     unpickler.persistent_load = shared.__getitem__  # type: ignore[method-assign]
     function, argument = unpickler.load()
+    _working_since = time.monotonic()
     return function(argument, report)
 
 
@@ -140,13 +144,14 @@ class JobEnd:
     """The end of a job, in parts that any process can read.
 
     answer: what ``keep`` returned. error: what the job raised, pickled. lost: why it has neither, as its process died
-    or was ended. reusable: the process is as it was before the job.
+    or was ended. reusable: the process is as it was before the job. unpacking: s that it took.
     """
 
     answer: Any = None
     error: bytes | None = None
     lost: Failure | None = None
     reusable: bool = False
+    unpacking: float = 0.0
 
     def failure(self, job: Job[Any]) -> Failure | None:
         """Why the job has no result; None where it has ended well."""
@@ -165,7 +170,7 @@ class JobProcess:
         with interrupts_deferred(), main_module_hidden():
             self._process.start()
         far.close()
-        self._since = time.monotonic()
+        self.young_since = time.monotonic()
         self._kills = 0
         self._sent: set[str] = set()
         self._job: Job[Any] | None = None  # the last one, without its argument
@@ -180,7 +185,7 @@ class JobProcess:
         """True if it may do the job: a job with a limit gets a fresh process, others one that is young."""
         if self._job is None:
             return True
-        young = time.monotonic() - self._since <= (_OWN if job.own else _YOUNG)
+        young = time.monotonic() - self.young_since <= (_OWN if job.own else _YOUNG)
         return young and not job.limited and self._process.is_alive()
 
     def give(self, job: Job[Any], keep: Callable[[str, Any], Any]) -> None:
@@ -251,6 +256,7 @@ def process_for(job: Job[Any], idle: list[JobProcess], context: Any) -> JobProce
 def release(process: JobProcess, end: JobEnd, idle: list[JobProcess]) -> None:
     """Keep a process whose job has ended for the next one, or end it if the job has left something behind."""
     if end.reusable:
+        process.young_since += end.unpacking
         idle.append(process)
     else:
         process.end()
@@ -258,7 +264,7 @@ def release(process: JobProcess, end: JobEnd, idle: list[JobProcess]) -> None:
 
 def _serve(connection: Connection) -> None:
     """Do the jobs that come through the connection."""
-    global _in_job
+    global _in_job, _working_since
     _in_job = True
     signal.signal(SIGINT, SIG_IGN)  # the parent ends it
     signal.signal(SIGTERM, SIG_DFL)  # end at once: Python's handlers would wait for compiled code
@@ -270,7 +276,9 @@ def _serve(connection: Connection) -> None:
             try:
                 if not connection.poll(2 * _OWN):  # nobody gives it a job so late
                     return
+                came = time.monotonic()
                 job, keep = connection.recv()
+                _working_since = time.monotonic()
             except EOFError:
                 return
             except Exception as error:  # whatever unpickling raises: a module that is missing here
@@ -282,7 +290,7 @@ def _serve(connection: Connection) -> None:
                 with suppress(OSError, ValueError):  # closed by a plug-in
                     stream.flush()
             try:
-                connection.send(replace(end, reusable=reusable))
+                connection.send(replace(end, reusable=reusable, unpacking=_working_since - came))
             except OSError:  # a plug-in has closed it
                 os._exit(1)
 
