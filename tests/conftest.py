@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import suppress
@@ -16,6 +17,9 @@ import yaml
 
 # Before numpy is loaded. On small matrices threads of BLAS only wait for each other when several tests run at once.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+# Commands, workers and jobs are hundreds of processes, each of which would compile all that it imports.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 import real_recordings
 import shared_results
