@@ -10,6 +10,7 @@ _PUBLIC = {
     "Budget": "fit.settings",
     "Calibration": "robot.calibration",
     "Dataset": "data.dataset",
+    "FitSettings": "fit.settings",
     "LiveNode": "live.node",
     "OmnibenchError": "errors",
     "Reference": "data.references",
@@ -69,6 +70,7 @@ if TYPE_CHECKING:  # imports for type checkers; tests/ground/test_package.py hol
     from omnibench.fit.evaluate import evaluate as evaluate
     from omnibench.fit.inspect import inspect_dataset as inspect_dataset
     from omnibench.fit.settings import Budget as Budget
+    from omnibench.fit.settings import FitSettings as FitSettings
     from omnibench.live.config import read_live_config as read_live_config
     from omnibench.live.node import LiveNode as LiveNode
     from omnibench.live.wire.subscriber import subscribe as subscribe

@@ -273,8 +273,8 @@ def answers_of_checks() -> Answer:
 
 
 PARTS = {
-    "fit": Part("omnibench.fit", answers_of_fit, ("omnibench.fit.bounds", "omnibench.fit.evaluator")),
-    "bounds": Part("omnibench.fit.bounds", answers_of_bounds),
+    "fit": Part("omnibench.fit", answers_of_fit, ("omnibench.fit.certify", "omnibench.fit.evaluator")),
+    "bounds": Part("omnibench.fit.certify", answers_of_bounds),
     "evaluator": Part("omnibench.fit.evaluator", answers_of_evaluator),
     "design": Part("omnibench.design", answers_of_design, ("omnibench.design.report",)),
     "design_report": Part("omnibench.design.report", answers_of_design_report),
