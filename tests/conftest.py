@@ -17,9 +17,6 @@ import yaml
 
 # Before numpy is loaded. On small matrices threads of BLAS only wait for each other when several tests run at once.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-# Commands, workers and jobs are hundreds of processes, each of which would compile all that it imports.
-os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
-sys.dont_write_bytecode = False
 
 import real_recordings
 import shared_results
@@ -42,6 +39,9 @@ def pytest_configure(config: pytest.Config) -> None:
     Workers inherit the folder's name, and commands what this process does with Ctrl-C, which it would ignore if the
     suite was started in the background.
     """
+    # Commands, workers and jobs are hundreds of processes, each of which would compile all that it imports.
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    sys.dont_write_bytecode = False
     with suppress(ValueError):  # not in the main thread
         signal.signal(signal.SIGINT, signal.default_int_handler)
     if not hasattr(config, "workerinput"):
