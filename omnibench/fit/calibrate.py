@@ -20,7 +20,7 @@ from omnibench.fit.open_combinations import open_sentences
 from omnibench.fit.prior import default_cost, default_mount, default_unidentified
 from omnibench.fit.problem import CalibrationProblem, make_problem
 from omnibench.fit.ratio_intervals import FEWEST, Units, units_of
-from omnibench.fit.settings import CostChoice, FitSettings
+from omnibench.fit.settings import CompleteSettings, CostChoice, FitSettings
 from omnibench.fit.shrinkage import shrunk
 from omnibench.fit.span import WheelDirection
 from omnibench.fit.steering_fit import corrected_runs, fit_steering, on_bounds, words_of
@@ -112,17 +112,17 @@ def calibrate(
     robot, training = dataset.robot, training_split(dataset)
 
     # The choices, with what is usual for this robot and these runs.
-    settings, calibrator = complete_settings(_given(settings, choices), robot, training)
+    chosen, calibrator = complete_settings(_given(settings, choices), robot, training)
 
     # The steering first, where it is to be fitted: the matrix is then fitted to the corrected drive signals.
     terms: tuple[Term, ...] = ()
     runs: Sequence[Trajectory] = training
-    if settings.steering == "fit":
-        terms = fit_steering(settings, robot, training, dataset.sample_period, watch)
+    if chosen.steering == "fit":
+        terms = fit_steering(chosen, robot, training, dataset.sample_period, watch)
         runs = corrected_runs(robot, training, terms, dataset.sample_period)
 
     # The answer, shrunk to the design where that is asked for.
-    problem = make_problem(settings, robot, runs, renamed(watch, calibrator.name))
+    problem = make_problem(chosen, robot, runs, renamed(watch, calibrator.name))
     result = shrunk(problem, run_calibrator(calibrator, problem), fitted=calibrator.fitted)
     if result.matrix is None or result.vector is None:
         raise ConfigError(f"calibrator {calibrator.name!r} gave no answer ({result.outcome}): {result.reason}")
@@ -136,20 +136,19 @@ def calibrate(
             without_covariance = str(error)
     units = units_of(training)
     drawn = None
-    if settings.intervals and units.count >= FEWEST and uncertainty:
+    if chosen.intervals and units.count >= FEWEST and uncertainty:
         drawn = bootstrap_intervals(problem, result.vector, units=units, rng=problem.rng, backend=backend)
 
     # The calibration file, and what the data leave open.
     searched = problem.parameterisation
-    assert settings.unidentified is not None  # the settings are complete
     return CalibrationRun(
-        calibration=_calibration(dataset, settings, problem, result, terms, uncertainty),
+        calibration=_calibration(dataset, chosen, problem, result, terms, uncertainty),
         result=result,
         intervals=drawn,
         parameters=fitted_parameters(searched, result.vector) if isinstance(searched, WheelGeometry) else None,
         uncertainty=uncertainty,
-        warnings=tuple(_warnings(settings, calibrator, problem, runs, terms, units, without_covariance)),
-        kept=kept_motions(robot, problem.span, searched.name, settings.unidentified),
+        warnings=tuple(_warnings(chosen, calibrator, problem, runs, terms, units, without_covariance)),
+        kept=kept_motions(robot, problem.span, searched.name, chosen.unidentified),
         units=units,
     )
 
@@ -170,8 +169,8 @@ def _given(settings: FitSettings | str | None, choices: dict[str, Any]) -> FitSe
 
 def complete_settings(
     settings: FitSettings, robot: Robot, training: Sequence[Trajectory]
-) -> tuple[FitSettings, Calibrator]:
-    """Settings that name what is usual for a robot and its runs where they left it open, and their calibrator.
+) -> tuple[CompleteSettings, Calibrator]:
+    """Settings completed by what is usual for a robot and its runs, and their calibrator.
 
     UnknownNameError or ConfigError: a name is unknown, or two choices contradict each other.
     """
@@ -205,19 +204,19 @@ def complete_settings(
         "unidentified": unidentified,
         "mount": mount,
     }
-    return settings.model_copy(update=complete), calibrator
+    return CompleteSettings(**(dict(settings) | complete)), calibrator
 
 
 def _calibration(
     dataset: Dataset,
-    settings: FitSettings,
+    settings: CompleteSettings,
     problem: CalibrationProblem,
     result: RunResult,
     terms: tuple[Term, ...],
     uncertainty: Uncertainty | None,
 ) -> Calibration:
     """The calibration of an answer, with how it came about. The costs in the file are without a loss."""
-    assert settings.cost is not None and result.matrix is not None  # noqa: PT018 (there is an answer)
+    assert result.matrix is not None  # there is an answer
     robot, training, validation = dataset.robot, dataset.split("train"), dataset.split("validation")
     extension = result.extension or ModelExtension(effects=tuple(map(EffectTerm.of, terms)))
     covariance = covariance_rows(uncertainty.covariance) if uncertainty and not terms else None
@@ -259,7 +258,7 @@ def _calibration(
 
 
 def _warnings(
-    settings: FitSettings,
+    settings: CompleteSettings,
     calibrator: Calibrator,
     problem: CalibrationProblem,
     runs: Sequence[Trajectory],
@@ -268,7 +267,6 @@ def _warnings(
     without_covariance: str,
 ) -> Iterator[str]:
     """Sentences on what the data leave open, or a fit rests on; without_covariance: why it has none, if so."""
-    assert settings.unidentified is not None  # the settings are complete
     robot, searched = problem.robot, problem.parameterisation
     yield from warnings_of_calibration(robot, problem.span, searched.name, settings.unidentified)
     yield from open_sentences(robot, runs, settings.unidentified, span=problem.span)

@@ -30,7 +30,7 @@ from omnibench.fit.parameterisation import Box, MatrixElements, Parameterisation
 from omnibench.fit.prior import MountChoice, default_mount
 from omnibench.fit.reference_rows import ReferenceBatch
 from omnibench.fit.settings import Budget as Budget
-from omnibench.fit.settings import FitSettings
+from omnibench.fit.settings import CompleteSettings
 from omnibench.fit.span import DrivenSpan, Unidentified, directions_kept, driven_span, unidentified_directions
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.registry import costs
@@ -430,13 +430,9 @@ class CalibrationProblem(SearchBox):
 
 
 def make_problem(
-    settings: FitSettings, robot: Robot, runs: Sequence[Trajectory], watch: Reporter = no_progress
+    settings: CompleteSettings, robot: Robot, runs: Sequence[Trajectory], watch: Reporter = no_progress
 ) -> CalibrationProblem:
-    """The problem of some runs by settings that name the cost, the parameterisation and ``unidentified``.
-
-    ConfigError: the box excludes the start. DataError: there are no runs.
-    """
-    assert settings.cost and settings.parameterisation and settings.unidentified  # noqa: PT018 (they are complete)
+    """The problem of fitting some runs. ConfigError: the box excludes the start. DataError: there are no runs."""
     span = driven_span(runs)
     searched = make_parameterisation(
         settings.parameterisation,
