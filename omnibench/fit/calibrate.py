@@ -95,11 +95,14 @@ def calibrate(
     student_t: poses that are far off have a bounded influence.
     intervals: also draw resampled intervals about the optimum (closed_form only). A warning says so if there are fewer
     than three commands to draw from (runs, where none is repeated).
-    unidentified: for motions that the data drive so little that slip alone may explain them, ``keep`` the design values
-    or ``fit`` them (see make_parameterisation); ``shrink`` keeps them and shrinks what else is hardly known to the
-    design, of the given tolerance (see shrinkage.py). The run's warnings name them. mount: ``known``, or ``fit`` where
-    the tracked point stands. Defaults of these and of the cost: by the robot (see prior.py). steering: ``fit`` first
-    finds gain, play and coupling of the steering and a car's zero (see steering_fit.py), effects from then on.
+    unidentified: what is done about motions that the data drive so little that slip alone may explain them, which the
+    run's warnings name. ``keep``: the matrix has the design values there; ``fit``: it is fitted there, too (see
+    make_parameterisation); ``shrink``: as ``keep``, and the other elements move towards the design, the more the less
+    the data determine them (see shrinkage.py). tolerance: how far a design may be off, for ``shrink``.
+    mount: pose of the tracked point of a robot that cannot slide: ``known``, as the robot's file says, or ``fit``.
+    Cost, unidentified and mount have defaults that depend on the robot (see prior.py).
+    steering: ``fit``: gain, play and coupling of the steering, and a car's zero, are fitted before the matrix (see
+    steering_fit.py) and are effects of the calibration; ``known``: the measured angles are right.
 
     Raises UnknownNameError or ConfigError for wrong choices, DataError for an empty training split, and ConfigError
     when the calibrator gives no answer.
@@ -112,7 +115,7 @@ def calibrate(
     robot, training = dataset.robot, training_split(dataset)
 
     # The choices, with what is usual for this robot and these runs.
-    chosen, calibrator = complete_settings(_given(settings, choices), robot, training)
+    chosen, calibrator = complete_settings(_with_choices(settings, choices), robot, training)
 
     # The steering first, where it is to be fitted: the matrix is then fitted to the corrected drive signals.
     terms: tuple[Term, ...] = ()
@@ -158,8 +161,11 @@ def default_calibrator(training: Sequence[Trajectory]) -> str:
     return "closed_form" if all(run.references is None for run in training) else "trajectory_ml"
 
 
-def _given(settings: FitSettings | str | None, choices: dict[str, Any]) -> FitSettings:
-    """The settings that were given, with choices in the place of theirs. ConfigError: a choice is unknown or wrong."""
+def _with_choices(settings: FitSettings | str | None, choices: dict[str, Any]) -> FitSettings:
+    """Settings, or those of a calibrator by its name, in which choices that are not None replace the fields they name.
+
+    ConfigError: a choice is unknown, or its value is wrong.
+    """
     if isinstance(settings, FitSettings):
         choices = dict(settings) | choices
     elif settings is not None:
@@ -266,7 +272,10 @@ def _warnings(
     units: Units,
     without_covariance: str,
 ) -> Iterator[str]:
-    """Sentences on what the data leave open, or a fit rests on; without_covariance: why it has none, if so."""
+    """Sentences on what the data leave open, and on what the fit assumes.
+
+    without_covariance: why the calibration has no covariance; empty for one that has.
+    """
     robot, searched = problem.robot, problem.parameterisation
     yield from warnings_of_calibration(robot, problem.span, searched.name, settings.unidentified)
     yield from open_sentences(robot, runs, settings.unidentified, span=problem.span)

@@ -35,9 +35,9 @@ class CostChoice(Model):
 
 
 class FitSettings(Model):
-    """Every choice of a fit. None stands for what is usual for the robot and its runs.
+    """Every choice of a fit. ``calibrate`` fills fields that are None with defaults for the robot and its runs.
 
-    The descriptions are the help of ``omnibench calibrate``.
+    ``omnibench calibrate --help`` prints the descriptions of the fields.
     """
 
     calibrator: str | None = Field(
