@@ -12,7 +12,7 @@ from omnibench.data.splits import training_split
 from omnibench.environment import package_versions
 from omnibench.errors import ConfigError, computable, require_type
 from omnibench.fit.bootstrap import ElementIntervals, bootstrap_intervals
-from omnibench.fit.calibrator import Calibrator, RunResult, as_answered, run_calibrator
+from omnibench.fit.calibrator import Calibrator, RunResult, as_answered, calibration_of_fit, run_calibrator
 from omnibench.fit.evaluate import verdict_on
 from omnibench.fit.geometry import FittedParameter, WheelGeometry, fitted_parameters
 from omnibench.fit.identifiability import inseparable_in_words, kept_motions, warnings_of_calibration
@@ -28,16 +28,7 @@ from omnibench.fit.uncertainty import NoCovarianceError, Uncertainty, uncertaint
 from omnibench.jobs.job import Backend
 from omnibench.progress import Reporter, no_progress, renamed
 from omnibench.registry import calibrators, costs
-from omnibench.robot.calibration import (
-    Calibration,
-    EffectTerm,
-    ModelExtension,
-    Provenance,
-    covariance_rows,
-    extended_model,
-    fitted_calibration,
-    matrix_rows,
-)
+from omnibench.robot.calibration import Calibration, EffectTerm, ModelExtension, covariance_rows, extended_model
 from omnibench.robot.effects.effect import Term
 from omnibench.robot.kinematics import Robot
 from omnibench.views import Shown
@@ -230,36 +221,28 @@ def _calibration(
     noise = uncertainty.noise if uncertainty else result.noise
     squares = settings.loss == "squares"
     cost = costs.create(settings.cost.name, settings.cost.options)
-    return fitted_calibration(
-        name=f"{dataset.name} {settings.calibrator}",
-        robot=robot,
-        sample_period=dataset.sample_period,
-        matrix=matrix_rows(result.matrix),
+    provenance = settings.provenance | {
+        "box": problem.box,
+        "unidentified": settings.unidentified,
+        "tolerance": settings.tolerance,
+        "mount": None if robot.slides else settings.mount or default_mount(robot),
+        "unshrunk_cost": result.shrinkage.unshrunk_cost if result.shrinkage and squares else None,
+        "on_bounds": result.at_bounds,
+        "versions": package_versions(),
+        "training_cost": result.cost if squares else cost.of_model(model, training),
+        "validation_cost": cost.of_model(model, validation) if validation else None,
+        "outcome": result.outcome,
+        "reason": result.reason,
+        "held_out": verdict_on(model, training, validation),
+    }
+    return calibration_of_fit(
+        f"{dataset.name} {settings.calibrator}",
+        dataset,
+        result.matrix,
+        provenance,
         integration=problem.integration,
-        effects=extension.effects,
         noise=noise if any(run.has_poses for run in problem.trajectories) else None,
-        covariance=extension.covariance or covariance,
-        driven=extension.driven,
-        plain=extension.plain,
-        provenance=Provenance(
-            **settings.provenance,
-            dataset=dataset.name,
-            dataset_hash=dataset.hash,
-            fitted=dataset.fingerprints("train"),
-            simulated=dataset.simulated,
-            box=problem.box,
-            unidentified=settings.unidentified,
-            tolerance=settings.tolerance,
-            mount=None if robot.slides else settings.mount or default_mount(robot),
-            unshrunk_cost=result.shrinkage.unshrunk_cost if result.shrinkage and squares else None,
-            on_bounds=result.at_bounds,
-            versions=package_versions(),
-            training_cost=result.cost if squares else cost.of_model(model, training),
-            validation_cost=cost.of_model(model, validation) if validation else None,
-            outcome=result.outcome,
-            reason=result.reason,
-            held_out=verdict_on(model, training, validation),
-        ),
+        **dict(extension) | {"covariance": extension.covariance or covariance},
     )
 
 
@@ -278,7 +261,7 @@ def _warnings(
     """
     robot, searched = problem.robot, problem.parameterisation
     yield from warnings_of_calibration(robot, problem.span, searched.name, settings.unidentified)
-    yield from open_sentences(robot, runs, settings.unidentified, span=problem.span)
+    yield from open_sentences(robot, runs, settings.unidentified, settings.mount, span=problem.span)
     if isinstance(searched, WheelGeometry) and calibrator.fitted:
         yield from inseparable_in_words(searched, problem.unidentified, problem.left_open)
     yield from problem.moved_ends
