@@ -22,7 +22,7 @@ M = TypeVar("M", bound=BaseModel)
 LONGEST_NAME = 200  # characters of a name in a file, of which tables and messages show the whole; chosen
 
 # Limits of a YAML document, far above what configs and calibrations need; chosen.
-_MOST_BYTES: Final = 1 << 22  # of a file
+_MOST_BYTES: Final = 1 << 22  # bytes: a larger file is refused
 MOST_VALUES: Final = 200_000
 _DEEPEST: Final = 32  # levels of nesting
 _LONGEST_NUMBER: Final = 400  # characters: what is longer is text, since long numbers take quadratic time

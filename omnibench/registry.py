@@ -27,7 +27,7 @@ from omnibench.config import Model, validate
 from omnibench.errors import OmnibenchError, PluginError, UnknownNameError
 from omnibench.files import check_file
 
-_MOST_BYTES = 1 << 24  # of a plug-in file; chosen
+_MOST_BYTES = 1 << 24  # bytes: a larger plug-in file is refused; chosen
 _IMPORT_SECONDS = 60.0  # in which a plug-in file must be imported, whatever command loads it; chosen: JAX takes 10 s
 
 _FILE_MODULE = "omnibench_plugin_"  # begins the names of modules that are plug-in files

@@ -55,16 +55,16 @@ def write_example(example: Example, folder: Path, *, force: bool = False) -> lis
     """
     places = [(place, pattern) for pattern in example.files for place in (bundled_folder(), HANDBOOK)]
     places += [(SAMPLES / example.sample, "**/*")] if example.sample else []
-    wanted = {
+    contents = {
         folder / file.relative_to(place): file.read_bytes()
         for place, pattern in places
         for file in sorted(place.glob(pattern))
         if file.is_file()
     }
-    for path, content in wanted.items():
+    for path, content in contents.items():
         if path.exists() and (not path.is_file() or path.read_bytes() != content) and not force:
             raise ConfigError(f"{path} is there already; choose another folder, or --force to replace it")
-    missing = {path: content for path, content in wanted.items() if force or not path.exists()}
+    missing = {path: content for path, content in contents.items() if force or not path.exists()}
     recording = folder / example.recording if example.recording else None
     refuse_existing(recording, force=force, folders=True)
     write_files(missing)

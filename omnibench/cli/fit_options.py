@@ -21,15 +21,15 @@ _TYPES: dict[str, Any] = {"string": str, "integer": int, "number": float, "boole
 
 
 class FitCommand(TyperCommand):
-    """A command that fits: its options are the choices of FitSettings, beside those of its function.
+    """A command whose options are those of its function, and one for each field of FitSettings.
 
-    The function finds their values, by the fields' names, in its context's ``obj``.
+    The function reads the values of the latter from ``context.obj``, a mapping by field name.
     """
 
     _choices: tuple[str, ...] = ()
 
     def get_params(self, ctx: Any) -> list[Any]:
-        """The command's options and arguments, those of the choices after the output."""
+        """The command's options and arguments; the options of FitSettings come after ``--output``."""
         if not self._choices:
             from omnibench.fit.settings import FitSettings
 
@@ -40,13 +40,13 @@ class FitCommand(TyperCommand):
         return super().get_params(ctx)
 
     def invoke(self, ctx: Any) -> Any:
-        """Call the function, the choices in the context."""
+        """Call the function, with the values of FitSettings' options in ``ctx.obj``."""
         ctx.obj = {name: ctx.params.pop(name) for name in self._choices}
         return super().invoke(ctx)
 
 
 def options_of(model: type[BaseModel]) -> list[Any]:
-    """An option for every field of a model, and of the models in it, that one word of a command line can say."""
+    """Options of a command line for the fields of a model, and of models in it, that are text, a number or a flag."""
 
     def chosen() -> None: ...
 
@@ -60,7 +60,7 @@ def options_of(model: type[BaseModel]) -> list[Any]:
 
 
 def _parameters(model: type[BaseModel]) -> Iterator[inspect.Parameter]:
-    """The fields as parameters of a function from which Typer makes options."""
+    """Parameters of a function, from which Typer makes options: one for each field of a model."""
     from pydantic import BaseModel
 
     properties = model.model_json_schema()["properties"]
@@ -69,12 +69,12 @@ def _parameters(model: type[BaseModel]) -> Iterator[inspect.Parameter]:
             yield from _parameters(type(field.default))
             continue
         kinds = properties[name].get("anyOf", [properties[name]])
-        said = next((kind for kind in kinds if kind.get("type") in _TYPES), None)
-        if said is None:
+        schema = next((kind for kind in kinds if kind.get("type") in _TYPES), None)
+        if schema is None:
             continue
-        annotation: Any = Literal[tuple(said["enum"])] if "enum" in said else _TYPES[said["type"]]
-        least = said.get("minimum", said.get("exclusiveMinimum"))
-        least = least + 1 if annotation is int and "exclusiveMinimum" in said else least
+        annotation: Any = Literal[tuple(schema["enum"])] if "enum" in schema else _TYPES[schema["type"]]
+        least = schema.get("minimum", schema.get("exclusiveMinimum"))
+        least = least + 1 if annotation is int and "exclusiveMinimum" in schema else least
         flag = [f"--{name}"] if annotation is bool else []
         option = typer.Option(*flag, help=field.description, min=least)
         annotation = annotation | None if field.default is None else annotation
@@ -84,7 +84,7 @@ def _parameters(model: type[BaseModel]) -> Iterator[inspect.Parameter]:
 
 
 def chosen_settings(context: typer.Context, options: dict[str, Any]) -> FitSettings:
-    """The settings that the options of a FitCommand say; options: the calibrator's.
+    """Settings by the option values of a FitCommand, which are in its context. options: those of the calibrator.
 
     UnknownNameError: there is no such calibrator or cost. ConfigError: a value is wrong.
     """

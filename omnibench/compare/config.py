@@ -18,7 +18,7 @@ from omnibench.fit.loss import LossName
 from omnibench.fit.parameterisation import Box, ParameterisationName
 from omnibench.fit.prior import MountChoice
 from omnibench.fit.ratio_intervals import Bootstrap
-from omnibench.fit.settings import Budget, CostChoice, FitSettings
+from omnibench.fit.settings import Budget, CompleteSettings, CostChoice, FitSettings, objective_in_words
 from omnibench.fit.span import Unidentified
 from omnibench.jobs.backend_choice import name_flaw
 from omnibench.jobs.job import TlsFiles
@@ -60,12 +60,12 @@ class CalibratorEntry(Model):
     box: Box | None = Field(None, description="default: the config's box")
     limits: GeometryLimits | None = Field(None, description="limits of the geometry parameterisation; default: its own")
 
-    def settings(self, common: FitSettings) -> FitSettings:
+    def settings(self, common: FitSettings) -> CompleteSettings:
         """The settings of the entry's fit: those common to a comparison, with its own and its calibrator's."""
         calibrator = calibrators.entry(self.name).cls
         assert common.unidentified is not None  # a comparison says it
         unidentified, mount = as_answered(calibrator, common.unidentified, common.mount)
-        own = {
+        of_entry = {
             "calibrator": self.name,
             "options": self.options,
             "parameterisation": self.parameterisation or calibrator.parameterisation,
@@ -74,7 +74,7 @@ class CalibratorEntry(Model):
             "unidentified": unidentified,
             "mount": mount,
         }
-        return common.model_copy(update=own)
+        return CompleteSettings(**(dict(common) | of_entry))
 
 
 class CertificateChoice(Model):
@@ -168,9 +168,9 @@ class CompareConfig(NamedConfig):
     @property
     def objective(self) -> str:
         """The names of the cost and of its loss, if it has a robust one."""
-        return FitSettings(cost=self.cost, loss=self.loss).objective
+        return objective_in_words(self.cost, self.loss)
 
-    def settings(self, entry: CalibratorEntry, seed: int) -> FitSettings:
+    def settings(self, entry: CalibratorEntry, seed: int) -> CompleteSettings:
         """The settings of an entry's fit."""
         names = ("cost", "loss", "box", "integration", "budget", "unidentified", "tolerance", "mount")
         return entry.settings(FitSettings(seed=seed, **{name: getattr(self, name) for name in names}))

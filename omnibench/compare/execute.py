@@ -75,7 +75,6 @@ class _RunFailed(Exception):  # noqa: N818 (not an error: the outcome of a run t
 def _solve(task: RunTask, report: Reporter) -> RunResult:
     """Solve one run's problem in a worker process."""
     try:
-        assert task.settings.calibrator is not None  # the settings are complete
         load_calibrators(task.plugins, [task.settings.calibrator])
         calibrator = calibrators.create(task.settings.calibrator, task.settings.options)
         problem = make_problem(task.settings, task.robot, task.trajectories, report)

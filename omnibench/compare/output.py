@@ -25,16 +25,9 @@ from omnibench.files import (
     write_table,
     write_text,
 )
+from omnibench.fit.calibrator import calibration_of_fit
 from omnibench.fit.ratio_intervals import Interval
-from omnibench.robot.calibration import (
-    Calibration,
-    ModelExtension,
-    Provenance,
-    Row,
-    covariance_rows,
-    fitted_calibration,
-    write_calibration,
-)
+from omnibench.robot.calibration import Calibration, ModelExtension, Row, covariance_rows, write_calibration
 
 # First line of config.yaml in a folder of results. A folder whose config.yaml lacks it is not written to.
 _MARK = "# The effective config of a {}; the results beside it were made with it."
@@ -157,39 +150,27 @@ def summary(result: ComparisonResult) -> dict[str, Any]:
 def calibration_of(run: ScoredRun, result: ComparisonResult) -> Calibration:
     """The calibration file of a run with an answer."""
     dataset: Dataset = result.datasets[run.record.dataset]
-    assert run.record.matrix is not None  # only runs with an answer are written
+    assert run.matrix is not None  # only runs with an answer are written
     uncertainty = result.uncertainties.get((run.record.dataset, run.record.label))
     covariance = covariance_rows(uncertainty.covariance) if uncertainty else None
     extension = run.extension or ModelExtension(effects=(), covariance=covariance)
-    return fitted_calibration(
-        name=f"{run.record.dataset} {run.record.label}",
-        robot=dataset.robot,
-        sample_period=dataset.sample_period,
-        matrix=run.record.matrix,
+    of_record = {"calibrator", "options", "seed", "box", "outcome", "reason"}
+    provenance = run.record.model_dump(include=of_record) | {
+        "cost": result.config.cost.name,
+        "loss": None if result.config.loss == "squares" else result.config.loss,
+        "on_bounds": run.record.at_bounds,
+        "versions": result.environment.versions,
+        "training_cost": run.record.train_cost,
+        "validation_cost": run.record.validation_cost,
+    }
+    return calibration_of_fit(
+        f"{run.record.dataset} {run.record.label}",
+        dataset,
+        run.matrix,
+        provenance,
         integration=result.config.integration,
         noise=uncertainty.noise if uncertainty else run.noise if run.extension else None,
-        effects=extension.effects,
-        covariance=extension.covariance,
-        driven=extension.driven,
-        plain=extension.plain,
-        provenance=Provenance(
-            dataset=dataset.name,
-            dataset_hash=dataset.hash,
-            fitted=dataset.fingerprints("train"),
-            simulated=dataset.simulated,
-            calibrator=run.record.calibrator,
-            options=run.record.options,
-            seed=run.record.seed,
-            cost=result.config.cost.name,
-            loss=None if result.config.loss == "squares" else result.config.loss,
-            box=run.record.box,
-            on_bounds=run.record.at_bounds,
-            versions=result.environment.versions,
-            training_cost=run.record.train_cost,
-            validation_cost=run.record.validation_cost,
-            outcome=run.record.outcome,
-            reason=run.record.reason,
-        ),
+        **dict(extension),
     )
 
 

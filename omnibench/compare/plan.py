@@ -18,7 +18,7 @@ from omnibench.errors import ConfigError
 from omnibench.fit.geometry import GeometryLimits
 from omnibench.fit.parameterisation import Box, ParameterisationName
 from omnibench.fit.problem import CalibrationProblem, make_parameterisation, make_problem
-from omnibench.fit.settings import FitSettings
+from omnibench.fit.settings import CompleteSettings
 from omnibench.jobs.job import code_digest, content_key
 from omnibench.progress import Reporter, no_progress
 from omnibench.registry import calibrators, costs
@@ -39,7 +39,7 @@ _CALIBRATORS = "fit/calibrators/*.py"
 _NO_PART = "fit/check/*.py"  # judges recordings before they are fitted
 
 
-def run_key(settings: FitSettings, dataset: Dataset) -> str:
+def run_key(settings: CompleteSettings, dataset: Dataset) -> str:
     """The key of one run on one data set: it changes with all that the result depends on.
 
     The code behind a run is what all runs share (``robot/``, ``fit/``, trajectories, the problem that a run is given)
@@ -47,7 +47,6 @@ def run_key(settings: FitSettings, dataset: Dataset) -> str:
     left out, so that a new calibrator does not discard the stored runs of the others; none of them imports another.
     """
     # Hash of the code of the calibrator, of the calibrators that its options name, of the cost, and of their bases
-    assert settings.cost is not None  # the settings are complete
     named = {settings.calibrator, *(value for value in settings.options.values() if isinstance(value, str))}
     classes = [known.cls for known in calibrators.entries() if known.name in named]
     classes.append(costs.entry(settings.cost.name).cls)
@@ -123,7 +122,7 @@ class RunTask:
     plugins: folders of plug-ins to load first. timing: True if the machine's speed is to be measured beside the run.
     """
 
-    settings: FitSettings
+    settings: CompleteSettings
     robot: Robot
     trajectories: tuple[Trajectory, ...]
     plugins: tuple[Path, ...]
@@ -135,7 +134,7 @@ class PlannedRun:
     """One run: an entry of the config on one data set with one seed.
 
     config: where the run's plug-ins, timing and memory are from. training: the data set's training runs, the same
-    object for all runs on it. settings: complete; a geometry does not use their box. box_name: the name of the bounds
+    object for all runs on it. settings: a geometry does not use their box. box_name: the name of the bounds
     that are searched, or ``UNBOUNDED``.
     """
 
@@ -143,7 +142,7 @@ class PlannedRun:
     dataset_name: str
     dataset: Dataset
     training: tuple[Trajectory, ...]
-    settings: FitSettings
+    settings: CompleteSettings
     label: str
     box_name: str
 
@@ -162,7 +161,6 @@ class PlannedRun:
     def search_space(self) -> SearchSpace:
         """The set of matrices that the run chooses from."""
         settings = self.settings
-        assert settings.parameterisation is not None  # the settings are complete
         limits = (settings.limits or GeometryLimits()) if settings.parameterisation == "geometry" else settings.box
         return SearchSpace(settings.parameterisation, limits, self.box_name != UNBOUNDED)
 
@@ -212,16 +210,15 @@ def make_plan(config: CompareConfig, datasets: Mapping[str, Dataset]) -> list[Pl
     return plan
 
 
-def name_of_bounds(settings: FitSettings, robot: Robot, training: Sequence[Trajectory]) -> str:
+def name_of_bounds(settings: CompleteSettings, robot: Robot, training: Sequence[Trajectory]) -> str:
     """The name of the bounds that a fit searches, or ``UNBOUNDED``. ConfigError: the robot has no such parameters."""
-    assert settings.calibrator is not None and settings.parameterisation is not None  # noqa: PT018 (complete)
     if not calibrators.entry(settings.calibrator).cls.bounded:
         return UNBOUNDED
     box, limits = settings.box, settings.limits
     return make_parameterisation(settings.parameterisation, robot, training, box=box, limits=limits).bounds.name
 
 
-def _label(config: CompareConfig, entry: CalibratorEntry, settings: FitSettings, box: str, taken: set[str]) -> str:
+def _label(config: CompareConfig, entry: CalibratorEntry, settings: CompleteSettings, box: str, taken: set[str]) -> str:
     """The entry's label, by default its name with the parameterisation or box that is not the usual one."""
     cls = calibrators.entry(entry.name).cls
     label = entry.label or entry.name

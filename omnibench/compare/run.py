@@ -59,9 +59,9 @@ def certify(
     """
     proofs: list[tuple[PlannedRun, BoxCertificate]] = []
     for run, done in zip(plan, scored, strict=True):
-        wanted = run.element_box is not None and done.matrix is not None
+        in_a_box = run.element_box is not None and done.matrix is not None
         boxes = [(owner.dataset_name, owner.element_box) for owner, _ in proofs]
-        if choice and wanted and (run.dataset_name, run.element_box) not in boxes:
+        if choice and in_a_box and (run.dataset_name, run.element_box) not in boxes:
             answers = [
                 other.matrix.ravel()
                 for planned, other in zip(plan, scored, strict=True)

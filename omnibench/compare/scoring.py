@@ -122,7 +122,6 @@ def score(
         # The run as a row of summary.json, with its scores
         design_scores = design[run.dataset_name]
         settings = run.settings
-        assert settings.calibrator is not None and settings.parameterisation is not None  # noqa: PT018 (they are complete)
         record = RunRecord(
             dataset=run.dataset_name,
             label=run.label,

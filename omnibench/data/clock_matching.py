@@ -407,12 +407,12 @@ _SAME_TIME = 1e-6  # s; unix time in a double has steps of 0.2 us
 class Alignment:
     """Wheel samples and poses from a common t = 0 on.
 
-    zero: time of the recording that becomes t = 0, s. kept (F,): True for wheel samples after it. pose_times (K,) and
-    poses (K, 3) start with the pose at t = 0 and end with the wheels.
+    zero: time of the recording that becomes t = 0, s. after_start (F,): True for wheel samples that end after it.
+    pose_times (K,) and poses (K, 3) start with the pose at t = 0 and end with the wheels.
     """
 
     zero: float
-    kept: NDArray[np.bool_]
+    after_start: NDArray[np.bool_]
     pose_times: Array
     poses: Array
 
@@ -431,13 +431,13 @@ def align(begin: float, wheel_times: Array, pose_times: Array, poses: Array) -> 
     if zero >= min(wheel_times[-1], pose_times[-1]):
         return None
     shown = (pose_times > zero + _SAME_TIME) & (pose_times <= wheel_times[-1] + _SAME_TIME)
-    kept = wheel_times > zero + _SAME_TIME
-    if not shown.any() or not kept.any():
+    after_start = wheel_times > zero + _SAME_TIME
+    if not shown.any() or not after_start.any():
         return None
     start = _pose_at(zero, pose_times, poses)
     return Alignment(
         zero,
-        kept,
+        after_start,
         np.concatenate([[0.0], pose_times[shown] - zero]),
         np.vstack([start, poses[shown]]),
     )

@@ -28,16 +28,10 @@ from omnibench.files import (
     results_locked,
     write_files,
 )
+from omnibench.fit.calibrator import calibration_of_fit
 from omnibench.registry import costs
 from omnibench.report.render import render
-from omnibench.robot.calibration import (
-    Calibration,
-    EffectTerm,
-    Provenance,
-    covariance_rows,
-    fitted_calibration,
-    matrix_rows,
-)
+from omnibench.robot.calibration import Calibration, EffectTerm, covariance_rows, matrix_rows
 from omnibench.robot.kinematics import Array
 
 
@@ -63,11 +57,23 @@ def calibration_of(
     reason: why the fit ended, in words. plain: the fit of the plain matrix, to which the effects of a model fade.
     """
     terms = tuple(EffectTerm.of(term) for term in extended.fit.model.terms)
-    return fitted_calibration(
-        name=f"{dataset.name} {name}",
-        robot=dataset.robot,
-        sample_period=dataset.sample_period,
-        matrix=matrix_rows(extended.fit.model.matrix),
+    provenance = {
+        "calibrator": "discover",
+        "options": {"without": list(request.without), "unknown_term": request.unknown_term},
+        "seed": request.seed,
+        "cost": "final_pose",
+        "box": "none",
+        "versions": package_versions(),
+        "training_cost": _cost(extended, dataset.split("train")),
+        "validation_cost": _cost(extended, dataset.split("validation")),
+        "outcome": "converged",
+        "reason": reason,
+    }
+    return calibration_of_fit(
+        f"{dataset.name} {name}",
+        dataset,
+        extended.fit.model.matrix,
+        provenance,
         integration=extended.fit.model.integration,
         effects=terms,
         noise=extended.fit.noise.noise,
@@ -75,22 +81,6 @@ def calibration_of(
         session=extended.fit.runs[0].session,
         driven=tuple(tuple(float(value) for value in motion) for motion in training_domain(extended)),
         plain=matrix_rows(plain.fit.model.matrix) if plain is not None and terms else None,
-        provenance=Provenance(
-            dataset=dataset.name,
-            dataset_hash=dataset.hash,
-            fitted=dataset.fingerprints("train"),
-            simulated=dataset.simulated,
-            calibrator="discover",
-            options={"without": list(request.without), "unknown_term": request.unknown_term},
-            seed=request.seed,
-            cost="final_pose",
-            box="none",
-            versions=package_versions(),
-            training_cost=_cost(extended, dataset.split("train")),
-            validation_cost=_cost(extended, dataset.split("validation")),
-            outcome="converged",
-            reason=reason,
-        ),
     )
 
 

@@ -12,7 +12,7 @@ from omnibench.data.splits import training_split
 from omnibench.environment import package_versions
 from omnibench.errors import ConfigError, computable, require_type
 from omnibench.fit.bootstrap import ElementIntervals, bootstrap_intervals
-from omnibench.fit.calibrator import Calibrator, RunResult, as_answered, run_calibrator
+from omnibench.fit.calibrator import Calibrator, RunResult, as_answered, calibration_of_fit, run_calibrator
 from omnibench.fit.evaluate import verdict_on
 from omnibench.fit.geometry import FittedParameter, WheelGeometry, fitted_parameters
 from omnibench.fit.identifiability import inseparable_in_words, kept_motions, warnings_of_calibration
@@ -20,7 +20,7 @@ from omnibench.fit.open_combinations import open_sentences
 from omnibench.fit.prior import default_cost, default_mount, default_unidentified
 from omnibench.fit.problem import CalibrationProblem, make_problem
 from omnibench.fit.ratio_intervals import FEWEST, Units, units_of
-from omnibench.fit.settings import CostChoice, FitSettings
+from omnibench.fit.settings import CompleteSettings, CostChoice, FitSettings
 from omnibench.fit.shrinkage import shrunk
 from omnibench.fit.span import WheelDirection
 from omnibench.fit.steering_fit import corrected_runs, fit_steering, on_bounds, words_of
@@ -28,16 +28,7 @@ from omnibench.fit.uncertainty import NoCovarianceError, Uncertainty, uncertaint
 from omnibench.jobs.job import Backend
 from omnibench.progress import Reporter, no_progress, renamed
 from omnibench.registry import calibrators, costs
-from omnibench.robot.calibration import (
-    Calibration,
-    EffectTerm,
-    ModelExtension,
-    Provenance,
-    covariance_rows,
-    extended_model,
-    fitted_calibration,
-    matrix_rows,
-)
+from omnibench.robot.calibration import Calibration, EffectTerm, ModelExtension, covariance_rows, extended_model
 from omnibench.robot.effects.effect import Term
 from omnibench.robot.kinematics import Robot
 from omnibench.views import Shown
@@ -95,11 +86,14 @@ def calibrate(
     student_t: poses that are far off have a bounded influence.
     intervals: also draw resampled intervals about the optimum (closed_form only). A warning says so if there are fewer
     than three commands to draw from (runs, where none is repeated).
-    unidentified: for motions that the data drive so little that slip alone may explain them, ``keep`` the design values
-    or ``fit`` them (see make_parameterisation); ``shrink`` keeps them and shrinks what else is hardly known to the
-    design, of the given tolerance (see shrinkage.py). The run's warnings name them. mount: ``known``, or ``fit`` where
-    the tracked point stands. Defaults of these and of the cost: by the robot (see prior.py). steering: ``fit`` first
-    finds gain, play and coupling of the steering and a car's zero (see steering_fit.py), effects from then on.
+    unidentified: what is done about motions that the data drive so little that slip alone may explain them, which the
+    run's warnings name. ``keep``: the matrix has the design values there; ``fit``: it is fitted there, too (see
+    make_parameterisation); ``shrink``: as ``keep``, and the other elements move towards the design, the more the less
+    the data determine them (see shrinkage.py). tolerance: how far a design may be off, for ``shrink``.
+    mount: pose of the tracked point of a robot that cannot slide: ``known``, as the robot's file says, or ``fit``.
+    Cost, unidentified and mount have defaults that depend on the robot (see prior.py).
+    steering: ``fit``: gain, play and coupling of the steering, and a car's zero, are fitted before the matrix (see
+    steering_fit.py) and are effects of the calibration; ``known``: the measured angles are right.
 
     Raises UnknownNameError or ConfigError for wrong choices, DataError for an empty training split, and ConfigError
     when the calibrator gives no answer.
@@ -112,17 +106,17 @@ def calibrate(
     robot, training = dataset.robot, training_split(dataset)
 
     # The choices, with what is usual for this robot and these runs.
-    settings, calibrator = complete_settings(_given(settings, choices), robot, training)
+    chosen, calibrator = complete_settings(_with_choices(settings, choices), robot, training)
 
     # The steering first, where it is to be fitted: the matrix is then fitted to the corrected drive signals.
     terms: tuple[Term, ...] = ()
     runs: Sequence[Trajectory] = training
-    if settings.steering == "fit":
-        terms = fit_steering(settings, robot, training, dataset.sample_period, watch)
+    if chosen.steering == "fit":
+        terms = fit_steering(chosen, robot, training, dataset.sample_period, watch)
         runs = corrected_runs(robot, training, terms, dataset.sample_period)
 
     # The answer, shrunk to the design where that is asked for.
-    problem = make_problem(settings, robot, runs, renamed(watch, calibrator.name))
+    problem = make_problem(chosen, robot, runs, renamed(watch, calibrator.name))
     result = shrunk(problem, run_calibrator(calibrator, problem), fitted=calibrator.fitted)
     if result.matrix is None or result.vector is None:
         raise ConfigError(f"calibrator {calibrator.name!r} gave no answer ({result.outcome}): {result.reason}")
@@ -136,20 +130,19 @@ def calibrate(
             without_covariance = str(error)
     units = units_of(training)
     drawn = None
-    if settings.intervals and units.count >= FEWEST and uncertainty:
+    if chosen.intervals and units.count >= FEWEST and uncertainty:
         drawn = bootstrap_intervals(problem, result.vector, units=units, rng=problem.rng, backend=backend)
 
     # The calibration file, and what the data leave open.
     searched = problem.parameterisation
-    assert settings.unidentified is not None  # the settings are complete
     return CalibrationRun(
-        calibration=_calibration(dataset, settings, problem, result, terms, uncertainty),
+        calibration=_calibration(dataset, chosen, problem, result, terms, uncertainty),
         result=result,
         intervals=drawn,
         parameters=fitted_parameters(searched, result.vector) if isinstance(searched, WheelGeometry) else None,
         uncertainty=uncertainty,
-        warnings=tuple(_warnings(settings, calibrator, problem, runs, terms, units, without_covariance)),
-        kept=kept_motions(robot, problem.span, searched.name, settings.unidentified),
+        warnings=tuple(_warnings(chosen, calibrator, problem, runs, terms, units, without_covariance)),
+        kept=kept_motions(robot, problem.span, searched.name, chosen.unidentified),
         units=units,
     )
 
@@ -159,8 +152,11 @@ def default_calibrator(training: Sequence[Trajectory]) -> str:
     return "closed_form" if all(run.references is None for run in training) else "trajectory_ml"
 
 
-def _given(settings: FitSettings | str | None, choices: dict[str, Any]) -> FitSettings:
-    """The settings that were given, with choices in the place of theirs. ConfigError: a choice is unknown or wrong."""
+def _with_choices(settings: FitSettings | str | None, choices: dict[str, Any]) -> FitSettings:
+    """Settings, or those of a calibrator by its name, in which choices that are not None replace the fields they name.
+
+    ConfigError: a choice is unknown, or its value is wrong.
+    """
     if isinstance(settings, FitSettings):
         choices = dict(settings) | choices
     elif settings is not None:
@@ -170,8 +166,8 @@ def _given(settings: FitSettings | str | None, choices: dict[str, Any]) -> FitSe
 
 def complete_settings(
     settings: FitSettings, robot: Robot, training: Sequence[Trajectory]
-) -> tuple[FitSettings, Calibrator]:
-    """Settings that name what is usual for a robot and its runs where they left it open, and their calibrator.
+) -> tuple[CompleteSettings, Calibrator]:
+    """Settings completed by what is usual for a robot and its runs, and their calibrator.
 
     UnknownNameError or ConfigError: a name is unknown, or two choices contradict each other.
     """
@@ -205,19 +201,19 @@ def complete_settings(
         "unidentified": unidentified,
         "mount": mount,
     }
-    return settings.model_copy(update=complete), calibrator
+    return CompleteSettings(**(dict(settings) | complete)), calibrator
 
 
 def _calibration(
     dataset: Dataset,
-    settings: FitSettings,
+    settings: CompleteSettings,
     problem: CalibrationProblem,
     result: RunResult,
     terms: tuple[Term, ...],
     uncertainty: Uncertainty | None,
 ) -> Calibration:
     """The calibration of an answer, with how it came about. The costs in the file are without a loss."""
-    assert settings.cost is not None and result.matrix is not None  # noqa: PT018 (there is an answer)
+    assert result.matrix is not None  # there is an answer
     robot, training, validation = dataset.robot, dataset.split("train"), dataset.split("validation")
     extension = result.extension or ModelExtension(effects=tuple(map(EffectTerm.of, terms)))
     covariance = covariance_rows(uncertainty.covariance) if uncertainty and not terms else None
@@ -225,41 +221,33 @@ def _calibration(
     noise = uncertainty.noise if uncertainty else result.noise
     squares = settings.loss == "squares"
     cost = costs.create(settings.cost.name, settings.cost.options)
-    return fitted_calibration(
-        name=f"{dataset.name} {settings.calibrator}",
-        robot=robot,
-        sample_period=dataset.sample_period,
-        matrix=matrix_rows(result.matrix),
+    provenance = settings.provenance | {
+        "box": problem.box,
+        "unidentified": settings.unidentified,
+        "tolerance": settings.tolerance,
+        "mount": None if robot.slides else settings.mount or default_mount(robot),
+        "unshrunk_cost": result.shrinkage.unshrunk_cost if result.shrinkage and squares else None,
+        "on_bounds": result.at_bounds,
+        "versions": package_versions(),
+        "training_cost": result.cost if squares else cost.of_model(model, training),
+        "validation_cost": cost.of_model(model, validation) if validation else None,
+        "outcome": result.outcome,
+        "reason": result.reason,
+        "held_out": verdict_on(model, training, validation),
+    }
+    return calibration_of_fit(
+        f"{dataset.name} {settings.calibrator}",
+        dataset,
+        result.matrix,
+        provenance,
         integration=problem.integration,
-        effects=extension.effects,
         noise=noise if any(run.has_poses for run in problem.trajectories) else None,
-        covariance=extension.covariance or covariance,
-        driven=extension.driven,
-        plain=extension.plain,
-        provenance=Provenance(
-            **settings.provenance,
-            dataset=dataset.name,
-            dataset_hash=dataset.hash,
-            fitted=dataset.fingerprints("train"),
-            simulated=dataset.simulated,
-            box=problem.box,
-            unidentified=settings.unidentified,
-            tolerance=settings.tolerance,
-            mount=None if robot.slides else settings.mount or default_mount(robot),
-            unshrunk_cost=result.shrinkage.unshrunk_cost if result.shrinkage and squares else None,
-            on_bounds=result.at_bounds,
-            versions=package_versions(),
-            training_cost=result.cost if squares else cost.of_model(model, training),
-            validation_cost=cost.of_model(model, validation) if validation else None,
-            outcome=result.outcome,
-            reason=result.reason,
-            held_out=verdict_on(model, training, validation),
-        ),
+        **dict(extension) | {"covariance": extension.covariance or covariance},
     )
 
 
 def _warnings(
-    settings: FitSettings,
+    settings: CompleteSettings,
     calibrator: Calibrator,
     problem: CalibrationProblem,
     runs: Sequence[Trajectory],
@@ -267,11 +255,13 @@ def _warnings(
     units: Units,
     without_covariance: str,
 ) -> Iterator[str]:
-    """Sentences on what the data leave open, or a fit rests on; without_covariance: why it has none, if so."""
-    assert settings.unidentified is not None  # the settings are complete
+    """Sentences on what the data leave open, and on what the fit assumes.
+
+    without_covariance: why the calibration has no covariance; empty for one that has.
+    """
     robot, searched = problem.robot, problem.parameterisation
     yield from warnings_of_calibration(robot, problem.span, searched.name, settings.unidentified)
-    yield from open_sentences(robot, runs, settings.unidentified, span=problem.span)
+    yield from open_sentences(robot, runs, settings.unidentified, settings.mount, span=problem.span)
     if isinstance(searched, WheelGeometry) and calibrator.fitted:
         yield from inseparable_in_words(searched, problem.unidentified, problem.left_open)
     yield from problem.moved_ends

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, ClassVar
@@ -11,15 +11,23 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import BaseModel
 
-from omnibench.data.dataset import Trajectory
-from omnibench.errors import ConfigError, NotApplicableError, OmnibenchError, PluginError, one_line
+from omnibench.data.dataset import Dataset, Trajectory
+from omnibench.errors import ConfigError, DataError, NotApplicableError, OmnibenchError, PluginError, one_line
 from omnibench.fit.parameterisation import ParameterisationName
 from omnibench.fit.prior import MountChoice
 from omnibench.fit.problem import BudgetSpent, CalibrationProblem, Improvement
 from omnibench.fit.span import Unidentified
 from omnibench.jobs.job_process import memory_limit
 from omnibench.registry import AnyOptions, Options, PluginFailure, calibrators
-from omnibench.robot.calibration import ModelExtension, Noise, extended_model, matrix_flaw
+from omnibench.robot.calibration import (
+    Calibration,
+    ModelExtension,
+    Noise,
+    Provenance,
+    extended_model,
+    matrix_flaw,
+    matrix_rows,
+)
 from omnibench.robot.kinematics import Array, JsonArray, Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.views import Brief
@@ -229,6 +237,37 @@ def refusal_of(calibrator: Calibrator, robot: Robot, runs: Sequence[Trajectory])
 def model_of_answer(problem: CalibrationProblem, matrix: Array, extension: ModelExtension | None) -> OdometryModel:
     """The odometry model of a matrix (3, M), with what extends it. OmnibenchError: an effect does not fit the robot."""
     return extended_model(problem.robot, matrix, problem.integration, problem.sample_period, extension)
+
+
+def calibration_of_fit(
+    name: str, dataset: Dataset, matrix: Array, provenance: Mapping[str, Any], **fields: Any
+) -> Calibration:
+    """The calibration with a matrix (3, M) that was fitted to a data set's training runs.
+
+    provenance: fields of Provenance, without those of the data set. fields: the other fields of Calibration. DataError:
+    the recordings led to values that no robot has.
+    """
+    origin = Provenance(
+        dataset=dataset.name,
+        dataset_hash=dataset.hash,
+        fitted=dataset.fingerprints("train"),
+        simulated=dataset.simulated,
+        **provenance,
+    )
+    try:
+        return Calibration(
+            name=name,
+            robot=dataset.robot,
+            sample_period=dataset.sample_period,
+            matrix=matrix_rows(matrix),
+            provenance=origin,
+            **fields,
+        )
+    except ConfigError as error:
+        reason = f"{error}".removeprefix("Calibration: ")
+        raise DataError(
+            f"calibration {name!r}: {reason}; check the recordings for poses and rates far from all others"
+        ) from None
 
 
 def describe_error(error: BaseException) -> str:

@@ -33,11 +33,12 @@ from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.cost import SumOfNorms
 from omnibench.fit.evaluator import ElementBox, Path, cut, impulses, make_path, quadrature
 from omnibench.fit.parameterisation import Box, BoxName, ExplicitBox, MatrixElements
-from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
+from omnibench.fit.problem import CalibrationProblem, make_problem
+from omnibench.fit.settings import CompleteSettings, CostChoice
 from omnibench.jobs.job import Backend, gathered
 from omnibench.processes import one_thread
 from omnibench.progress import Progress, Reporter, no_progress
-from omnibench.registry import calibrators, costs
+from omnibench.registry import calibrators
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Complex, Integration, OdometryBatch, WheelLog
@@ -550,26 +551,23 @@ def certify_optimum(
             f"calibration {calibration.name!r} was fitted with the loss {provenance.loss}, and a bound is proven for a "
             "cost without one; certify a calibration that was fitted without --loss"
         )
-    searched = provenance.box if provenance else ""
-    chosen: Box = box or ("paper" if searched == "paper" else "row")
-    training = training_split(dataset)
-    problem = CalibrationProblem(
-        dataset.robot,
-        training,
-        costs.create(provenance.cost if provenance else "final_pose"),
-        make_parameterisation(
-            "matrix", dataset.robot, training, box=chosen, mount=provenance.mount if provenance else "known"
-        ),
+    settings = CompleteSettings(
+        calibrator="closed_form",
+        cost=CostChoice(name=provenance.cost) if provenance else CostChoice(),
+        parameterisation="matrix",
+        box=box or ("paper" if provenance and provenance.box == "paper" else "row"),
         integration=calibration.integration,
-        budget=Budget(),
         seed=0,
+        unidentified="keep",
+        mount=provenance.mount if provenance else "known",
     )
+    problem = make_problem(settings, dataset.robot, training_split(dataset))
     vector = calibration.matrix_array.ravel()
     cost = float(problem.values(vector[None])[0])
     inside = bool(problem.inside(vector[None])[0])
     shrinking = None
     if provenance is not None and provenance.unidentified == "shrink":
-        optimum = run_calibrator(calibrators.create("closed_form"), problem)
+        optimum = run_calibrator(calibrators.create(settings.calibrator), problem)
         if optimum.vector is None or optimum.cost is None:
             raise DataError(f"calibration {calibration.name!r}: its unshrunk optimum is not found: {optimum.reason}")
         if optimum.cost > problem.objective.rounding:  # no share of rounding means anything

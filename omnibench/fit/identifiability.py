@@ -273,15 +273,19 @@ class Identifiability(Model):
 
 
 def identifiability(
-    robot: Robot, trajectories: Sequence[Trajectory], integration: Integration = "arc"
+    robot: Robot,
+    trajectories: Sequence[Trajectory],
+    integration: Integration = "arc",
+    *,
+    span: DrivenSpan | None = None,
 ) -> Identifiability:
     """Precision with which runs determine the matrix, along every direction of wheel rates, and the wheels' geometry.
 
     Standard deviations are those of the Cramer-Rao bound: no unbiased estimator has smaller ones, and a model that does
     not fit has larger ones. The noise is estimated from repetitions of commands or, without any, from all residuals of
-    a quick linear fit. DataError when there are no trajectories.
+    a quick linear fit. span: what the runs drive; default: computed here. DataError when there are no trajectories.
     """
-    span = driven_span(trajectories)
+    span = span or driven_span(trajectories)
     estimate, matrix = _quick_noise(robot, trajectories, span, integration)
     posed = [run for run in trajectories if run.has_poses]
     information = information_of_runs(posed, matrix, integration, estimate.noise).sum(axis=0)

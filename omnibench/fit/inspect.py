@@ -85,7 +85,7 @@ def inspect_dataset(dataset: Dataset) -> Inspection:
     marked = dataset.split("train")
     training = marked or trajectories
     span = driven_span(training)
-    identifiable = identifiability(dataset.robot, training)
+    identifiable = identifiability(dataset.robot, training, span=span)
     undriven = tuple(direction_in_words(direction, dataset.robot.drive.names) for direction in span.null)
     kinds = [kind for run in trajectories if run.references is not None for kind in run.references.kinds.tolist()]
     findings = list(identifiable.sentences)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from omnibench.data.dataset import Trajectory
 from omnibench.data.references import UNITS
 from omnibench.fit.parameterisation import MatrixElements, Parameterisation
-from omnibench.fit.prior import default_mount
+from omnibench.fit.prior import MountChoice, default_mount
 from omnibench.fit.reference_rows import ReferenceBatch, reference_rows
 from omnibench.fit.span import DrivenSpan, Unidentified, directions_kept, driven_span
 from omnibench.robot.kinematics import Array, Robot
@@ -79,6 +79,7 @@ def open_sentences(
     robot: Robot,
     runs: Sequence[Trajectory],
     unidentified: Unidentified = "keep",
+    mount: MountChoice | None = None,
     *,
     span: DrivenSpan | None = None,
 ) -> tuple[str, ...]:
@@ -86,7 +87,7 @@ def open_sentences(
     if all(run.references is None for run in runs):
         return ()
     kept = directions_kept(robot, span or driven_span(runs), unidentified)
-    searched = MatrixElements(robot, "row", kept, default_mount(robot) == "known")
+    searched = MatrixElements(robot, "row", kept, (mount or default_mount(robot)) == "known")
     searched = with_open_combinations(searched, runs)
     end = "keeps the design values" if unidentified != "shrink" else "rests on the design and its tolerance"
     return tuple(_sentences(searched, runs, end))

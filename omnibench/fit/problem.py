@@ -30,7 +30,7 @@ from omnibench.fit.parameterisation import Box, MatrixElements, Parameterisation
 from omnibench.fit.prior import MountChoice, default_mount
 from omnibench.fit.reference_rows import ReferenceBatch
 from omnibench.fit.settings import Budget as Budget
-from omnibench.fit.settings import FitSettings
+from omnibench.fit.settings import CompleteSettings
 from omnibench.fit.span import DrivenSpan, Unidentified, directions_kept, driven_span, unidentified_directions
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.registry import costs
@@ -40,10 +40,11 @@ from omnibench.robot.stored_odometry import StoredOdometry
 
 _PROGRESS_PERIOD = 0.1  # s, least time between two reports of progress: ten a second are all that a reader sees
 _MOST_POSES = 4_000_000  # poses of candidates that are held together, 0.1 GB (chosen)
-# Evaluations from which on the fast evaluator repays the time it takes to build. Both ways give the same costs to 1e-11
-# m; half of it and twice change no estimate (tests/studies/constants_fit.py).
+# Evaluations of one run of a calibrator, from which on building the fast evaluator saves time. Its costs are those of
+# direct integration to 1e-11 m; half of this number and twice change no estimate (tests/studies/constants_fit.py).
 _WORTH_BUILDING = 50
-# Of runs that are read where they are used: building takes 19 us a sample, one evaluation 0.05 us (chosen).
+# The same for stored runs, which every direct integration reads from their files: building takes 19 us a sample, one
+# evaluation 0.05 us (chosen).
 _WORTH_BUILDING_OF_STORED = 400
 _ON_BOUND = 1e-6  # share of the box's width: an element closer than that to a bound lies on it
 _ROUNDING = 1e-12  # share of a bound: an element beyond it by less lies in the box
@@ -77,10 +78,10 @@ class SearchBox:
 
     def __init__(self, names: tuple[str, ...], start: Array, lower: Array, upper: Array) -> None:
         self.names = names
-        self.start = _frozen(start)
-        self.lower = _frozen(lower)
-        self.upper = _frozen(upper)
-        self.free: NDArray[np.bool_] = _frozen(self.upper > self.lower)
+        self.start = _read_only(start)
+        self.lower = _read_only(lower)
+        self.upper = _read_only(upper)
+        self.free: NDArray[np.bool_] = _read_only(self.upper > self.lower)
 
     @property
     def size(self) -> int:
@@ -164,7 +165,7 @@ class Record:
             running = np.minimum.accumulate(np.concatenate([[self.best_cost], eligible]))
             for index in np.flatnonzero(running[1:] < running[:-1]):
                 self.best_cost = float(eligible[index])
-                self.best_vector = _frozen(candidates[index])
+                self.best_vector = _read_only(candidates[index])
                 self.history.append(Improvement(self.evaluations + int(index) + 1, self.seconds, self.best_cost))
         self.evaluations += len(candidates)
         self.report(self.evaluations, self.budget.evaluations, "evaluation", self.best_cost)
@@ -221,7 +222,7 @@ class CalibrationProblem(SearchBox):
         self.rng = np.random.default_rng(seed)
         self.odometry = cost.batch(self.trajectories, integration)
         # x, y and heading contiguous, the memory order in which the odometry returns poses.
-        self.reference = _frozen(np.ascontiguousarray(cost.reference(self.trajectories).T)).T
+        self.reference = _read_only(np.ascontiguousarray(cost.reference(self.trajectories).T)).T
         bounds, start, relevant = parameterisation.bounds, parameterisation.start, self._relevant()
         self.box = bounds.name
         lower, upper = np.where(relevant, bounds.lower, start), np.where(relevant, bounds.upper, start)
@@ -241,7 +242,7 @@ class CalibrationProblem(SearchBox):
 
     @cached_property
     def unidentified(self) -> Array:
-        """Directions (q, M), orthonormal, that the runs drive so little that slip alone may explain them, or not."""
+        """Directions (q, M) of drive signals, orthonormal: undriven ones, and weak ones, which slip may explain."""
         return unidentified_directions(self.robot, self.span)
 
     @cached_property
@@ -304,7 +305,7 @@ class CalibrationProblem(SearchBox):
         return self.record.history
 
     def report(self, done: int, total: int, unit: str, best: float | None = None) -> None:
-        """Report the progress of a method that asks for no costs, which are reported by themselves."""
+        """Report the progress of a method that does not call ``cost``, which reports by itself."""
         self.record.report(done, total, unit, best)
 
     # Costs of candidates.
@@ -326,7 +327,7 @@ class CalibrationProblem(SearchBox):
         while count < len(candidates):
             if not self._evaluator_tried and self._repays_building(len(candidates) - count):
                 self.build_evaluator()
-            part = candidates[count : count + self._in_time]
+            part = candidates[count : count + self._part_size]
             of_part = self._costs(part, self._evaluator) if self._evaluator else self.values(part)
             values[count : count + len(part)] = of_part
             self.record.add(part, of_part, self)
@@ -340,11 +341,10 @@ class CalibrationProblem(SearchBox):
         return self._costs(candidates, None)
 
     def build_evaluator(self) -> PoseEvaluator | PartedEvaluator | None:
-        """The fast evaluator, which ``cost`` uses from now on; None where direct integration is faster.
+        """Build the fast evaluator, which ``cost`` then uses in the place of direct integration, and return it.
 
-        There is none for references other than poses either.
-
-        ``cost`` builds it by itself when a search asks for many candidates. Both ways give the same costs to 1e-11.
+        None where direct integration is faster, or the runs have references other than poses. ``cost`` calls this when
+        a search asks for many candidates. The costs of both ways are equal to 1e-11.
         """
         if not self._evaluator_tried and isinstance(self.odometry, OdometryBatch):
             logs, odometry, searched = self.objective.logs(self.trajectories), self.odometry, self.parameterisation
@@ -366,7 +366,11 @@ class CalibrationProblem(SearchBox):
         return self.parameterisation.matrices(vector[None])[0]
 
     def settled(self, vector: Array) -> Array:
-        """The clipped vector (n,); for matrix elements those of its matrix, unless these leave the box."""
+        """The vector (n,) clipped to the box.
+
+        Matrix elements are replaced by those of the matrix that they stand for, in which the directions that are not
+        searched have the design values, unless these elements lie outside the box.
+        """
         vector = np.clip(vector, self.lower, self.upper)
         if self.parameterisation.name != "matrix":
             return vector
@@ -378,11 +382,11 @@ class CalibrationProblem(SearchBox):
         if not isinstance(self.odometry, StoredOdometry):
             return self.evaluations + asked >= _WORTH_BUILDING
         worth = _WORTH_BUILDING_OF_STORED
-        return self.evaluations > 0 and self.evaluations + asked >= worth and self._in_time >= worth
+        return self.evaluations > 0 and self.evaluations + asked >= worth and self._part_size >= worth
 
     @property
-    def _in_time(self) -> int:
-        """Candidates that are evaluated together: of runs in memory all, of others as many as the time left allows."""
+    def _part_size(self) -> int:
+        """Candidates evaluated between two checks of the time: all, or of stored runs as many as there is time for."""
         if self._evaluator or not isinstance(self.odometry, StoredOdometry):
             return self.budget.evaluations
         if not self.evaluations:
@@ -430,13 +434,9 @@ class CalibrationProblem(SearchBox):
 
 
 def make_problem(
-    settings: FitSettings, robot: Robot, runs: Sequence[Trajectory], watch: Reporter = no_progress
+    settings: CompleteSettings, robot: Robot, runs: Sequence[Trajectory], watch: Reporter = no_progress
 ) -> CalibrationProblem:
-    """The problem of some runs by settings that name the cost, the parameterisation and ``unidentified``.
-
-    ConfigError: the box excludes the start. DataError: there are no runs.
-    """
-    assert settings.cost and settings.parameterisation and settings.unidentified  # noqa: PT018 (they are complete)
+    """The problem of fitting some runs. ConfigError: the box excludes the start. DataError: there are no runs."""
     span = driven_span(runs)
     searched = make_parameterisation(
         settings.parameterisation,
@@ -491,7 +491,7 @@ def make_parameterisation(
     return searched if unidentified == "shrink" else with_open_combinations(searched, trajectories)
 
 
-def _frozen(array: NDArray[Any]) -> NDArray[Any]:
+def _read_only(array: NDArray[Any]) -> NDArray[Any]:
     """A read-only copy."""
     array = np.array(array)
     array.flags.writeable = False

@@ -35,9 +35,9 @@ class CostChoice(Model):
 
 
 class FitSettings(Model):
-    """Every choice of a fit. None stands for what is usual for the robot and its runs.
+    """Every choice of a fit. ``calibrate`` fills fields that are None with defaults for the robot and its runs.
 
-    The descriptions are the help of ``omnibench calibrate``.
+    ``omnibench calibrate --help`` prints the descriptions of the fields.
     """
 
     calibrator: str | None = Field(
@@ -82,21 +82,33 @@ class FitSettings(Model):
         "known", description="fit: first find its gain, play and coupling, and a car's zero."
     )
 
-    @property
-    def objective(self) -> str:
-        """The names of the cost and of its loss, if it has a robust one; empty where the cost is left open."""
-        name = self.cost.name if self.cost else ""
-        return name if self.loss == "squares" else f"{name}, loss {self.loss}"
-
-    @property
-    def provenance(self) -> dict[str, Any]:
-        """The fields of a calibration file's provenance that are choices alone."""
-        assert self.cost is not None  # the settings are complete
-        loss = None if self.loss == "squares" else self.loss
-        names = {"calibrator": self.calibrator, "options": self.options, "seed": self.seed}
-        return names | {"cost": self.cost.name, "loss": loss}
-
     @field_validator("cost", mode="before", json_schema_input_type=str | CostChoice | None)
     @classmethod
     def _name_stands_for_cost(cls, cost: Any) -> Any:
         return {"name": cost} if isinstance(cost, str) else cost
+
+
+class CompleteSettings(FitSettings):
+    """Settings of a fit that name its calibrator, cost, parameterisation and treatment of unidentified motions."""
+
+    calibrator: str
+    cost: CostChoice
+    parameterisation: ParameterisationName
+    unidentified: Unidentified
+
+    @property
+    def objective(self) -> str:
+        """The cost and its loss in words."""
+        return objective_in_words(self.cost, self.loss)
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """The fields of a calibration file's provenance that are choices alone."""
+        loss = None if self.loss == "squares" else self.loss
+        names = {"calibrator": self.calibrator, "options": self.options, "seed": self.seed}
+        return names | {"cost": self.cost.name, "loss": loss}
+
+
+def objective_in_words(cost: CostChoice, loss: LossName) -> str:
+    """The names of a cost and of its loss, if that is a robust one."""
+    return cost.name if loss == "squares" else f"{cost.name}, loss {loss}"

@@ -25,7 +25,7 @@ from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.loss import RobustCost, norms_of, with_ends_from_others, with_loss
 from omnibench.fit.problem import Budget, make_problem
-from omnibench.fit.settings import FitSettings
+from omnibench.fit.settings import CompleteSettings
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.registry import calibrators, costs, effects
 from omnibench.robot.corrections import corrected, needs_of
@@ -81,9 +81,13 @@ def _numbers_of(robot: Robot) -> list[_Number]:
 
 
 def fit_steering(
-    settings: FitSettings, robot: Robot, runs: Sequence[Trajectory], sample_period: float, watch: Reporter = no_progress
+    settings: CompleteSettings,
+    robot: Robot,
+    runs: Sequence[Trajectory],
+    sample_period: float,
+    watch: Reporter = no_progress,
 ) -> tuple[Term, ...]:
-    """The effects of a robot's steering that fit runs best, by complete settings; sample_period: nominal, s.
+    """The effects of a robot's steering that fit runs best; sample_period: nominal, s.
 
     ConfigError: the robot has no steering, the cost is no sum of norms, or no matrix can be fitted.
     """
@@ -107,7 +111,7 @@ class SteeringFit:
     robot: Robot
     runs: tuple[Trajectory, ...]
     sample_period: float
-    settings: FitSettings
+    settings: CompleteSettings
     watch: Reporter = no_progress
 
     def terms(self) -> tuple[Term, ...]:
@@ -152,7 +156,6 @@ class SteeringFit:
     @cached_property
     def _smooth(self) -> RobustCost:
         """The cost that is minimised. ConfigError: the one that was asked for is no sum of norms."""
-        assert self.settings.cost is not None  # the settings are complete
         cost = costs.create(self.settings.cost.name, self.settings.cost.options)
         if norms_of(cost) is None:
             raise ConfigError(f"steering: fit needs a cost that is a sum of norms, which {cost.name} is not")

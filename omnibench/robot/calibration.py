@@ -306,17 +306,6 @@ def matrix_flaw(matrix: Array) -> str:
     return "" if matrix.any() else "zeros only: no wheel would move the robot"
 
 
-def fitted_calibration(name: str, **fields: Any) -> Calibration:
-    """The calibration that a fit ends in. DataError: recordings led it to values that no robot has."""
-    try:
-        return Calibration(name=name, **fields)
-    except ConfigError as error:
-        reason = f"{error}".removeprefix("Calibration: ")
-        raise DataError(
-            f"calibration {name!r}: {reason}; check the recordings for poses and rates far from all others"
-        ) from None
-
-
 def matrix_rows(matrix: Array) -> tuple[Row, Row, Row]:
     """A matrix (3, M) as rows of a document."""
     first, second, third = (tuple(float(value) for value in row) for row in matrix)

@@ -50,8 +50,8 @@ class WheelLog:
     start (3,): pose at t = 0 (m, m, rad). stamps (S,): when poses are wanted, s, increasing, >= 0.
     Needed by some effects only, None if unknown: wheel_angles (F, N): absolute, at the end of each sample, rad.
     started_at: s since the session's start. session: its name.
-    Of robots with measured steering angles: steering (F, S): at the end of each sample, rad. drive: the robot's drive
-    signals; None where the rates are the signals.
+    Of robots with W wheels whose steering angles are measured: steering (F, W): at the end of each sample, rad.
+    drive: makes drive signals of rates and steering angles; None where the rates are the signals.
     """
 
     times: Array
@@ -66,7 +66,7 @@ class WheelLog:
 
     @kept_with_samples
     def middle_steering(self) -> Array | None:
-        """Steering angles (F, S) in the middle of each sample, rad; None where none are measured."""
+        """Steering angles (F, W) in the middle of each sample, rad; None where none are measured."""
         return None if self.steering is None else in_the_middle(self.steering)
 
     @kept_with_samples
@@ -113,12 +113,12 @@ class RunSamples:
 
     @classmethod
     def of(cls, times: Sequence[Array]) -> RunSamples:
-        """The samples of runs that end at times (F,), s, of each run."""
+        """The samples of runs from the times (F,) at which the samples of each run end, s from its start."""
         return cls(np.concatenate(times), np.cumsum([0, *map(len, times)]))
 
     @cached_property
-    def run(self) -> NDArray[np.intp]:
-        """The run (F,) of each sample."""
+    def run_of_sample(self) -> NDArray[np.intp]:
+        """Index (F,) of the run of each sample."""
         return np.repeat(np.arange(len(self.edges) - 1), np.diff(self.edges))
 
     @cached_property
@@ -332,11 +332,11 @@ class OdometryStream:
         wheel_angles: Array | None = None,  # noqa: ARG002
         steering: Array | None = None,
     ) -> Array:
-        """Advance by one sample in which the wheels turned by ``angles`` (N,) rad; the new pose.
+        """Advance by one sample in which the wheels turned by ``angles`` (N,), rad, and return the new pose (3,).
 
-        steering (S,): angles of steered wheels at the sample's end, rad. Only effects use the rest: duration: s.
-        wheel_angles (N,): absolute, at the sample's end, rad; where they are not known they are counted from 0.
-        ValueError: the model has effects and the duration is missing, or the robot steers and the angles are.
+        steering (W,): angles of the steered wheels at the sample's end, rad. Models with effects use the others, too:
+        duration, s, of the sample; wheel_angles (N,): absolute, at the sample's end, rad, default: counted from 0.
+        ValueError: a model with effects is given no duration, or a robot that steers no steering angles.
         """
         self.driven = self.driven_signals(angles, self.steer(steering))
         self.moved = self.matrix @ self.driven
@@ -344,7 +344,10 @@ class OdometryStream:
         return self.pose
 
     def steer(self, steering: Array | None) -> Array | None:
-        """Steering angles (S,) in the middle of a sample that ends at ``steering`` (S,), rad, the next one to come."""
+        """Steering angles (W,) in the middle of the next sample, which ends at the angles ``steering`` (W,), rad.
+
+        The first sample holds its own. None for a robot that does not steer. ValueError: it steers, and they are None.
+        """
         if self._steered_drive is None:
             return None
         if steering is None:
@@ -406,12 +409,12 @@ class PathBatch:
     ) -> None:
         self._samples, self._arc, self._moved = samples, integration == "arc", moved
         self._drift: Complex | None = None if drift is None else drift[:, 0] + 1j * drift[:, 1]
-        run = samples.run
-        self._headings = starts[run, 2] + samples.before(samples.sums(moved[:, 2]))
+        run_of_sample = samples.run_of_sample
+        self._headings = starts[run_of_sample, 2] + samples.before(samples.sums(moved[:, 2]))
         steps = self._steps(moved, self._headings)
         if self._drift is not None:
             steps += self._drift
-        sums, places = samples.sums(steps), (starts[:, 0] + 1j * starts[:, 1])[run]
+        sums, places = samples.sums(steps), (starts[:, 0] + 1j * starts[:, 1])[run_of_sample]
         self._positions: Complex = places + samples.before(sums)
         self._after: Complex = places + sums
 
@@ -464,10 +467,10 @@ class PathBatch:
         return steps
 
 
-class Path:
+class DrivenPath:
     """The path of one run of F samples, as ``PathBatch`` has it of many.
 
-    times (F,): their ends, s. start (3,): pose at t = 0. moved (F, 3), drift (F, 2): as for ``PathBatch``.
+    times (F,): ends of the samples, s. start (3,): pose at t = 0. moved (F, 3), drift (F, 2): as for ``PathBatch``.
     """
 
     def __init__(

@@ -123,7 +123,7 @@ def signals_of_runs(
         accelerations=(smoothed - samples.before(smoothed)) / durations[:, None],
         travelled=_travelled(rates, np.sqrt(twists[:, 0] ** 2 + twists[:, 1] ** 2) * durations, samples),
         wheel_angles=None if angles is None else angles - rates * (durations / 2)[:, None],
-        session_time=None if started_at is None else started_at[samples.run] + elapsed,
+        session_time=None if started_at is None else started_at[samples.run_of_sample] + elapsed,
         session=logs[0].session,
         poses=PathBatch(samples, starts, tracked * durations[:, None], "arc").middles if "poses" in needs else None,
         steering=steering,

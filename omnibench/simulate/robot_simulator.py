@@ -15,7 +15,7 @@ from omnibench.errors import DataError
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.robot.kinematics import Array, Mount, compose, placed, seen_from
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.odometry import Path, WheelLog
+from omnibench.robot.odometry import DrivenPath, WheelLog
 from omnibench.simulate.commands import Command, wheels_of
 from omnibench.simulate.config import RobotSession
 from omnibench.simulate.floor_plan import FloorPlan, make_plan
@@ -80,7 +80,7 @@ def _check_way(config: RobotConfig, plan: FloorPlan, command: Command, session: 
     times = np.linspace(0.0, session.distance / command.speed, max(2, math.ceil(session.distance / _STEP)))
     mount = config.robot.mount
     twist = command.twist if mount is None else mount.twist @ command.twist
-    path = Path(times[-1:], plan.start, times[-1] * twist[None], "arc")
+    path = DrivenPath(times[-1:], plan.start, times[-1] * twist[None], "arc")
     plan.check_path(_places(path.poses(times), mount), times, config.radius, f"command {command.name}")
 
 

@@ -314,7 +314,7 @@ def _method(
         numbers=answered[0].reason if answered else "",
         answers=len(answered),
         cost=", ".join(dict.fromkeys(run.settings.objective for run in runs)),
-        unidentified=", ".join(dict.fromkeys(run.settings.unidentified or "" for run in runs)),
+        unidentified=", ".join(dict.fromkeys(run.settings.unidentified for run in runs)),
         matrix=next((each.result.matrix for each in answered if each.result is not None), None),
     )
 

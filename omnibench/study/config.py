@@ -13,7 +13,7 @@ from omnibench.data.splits import Names
 from omnibench.fit.loss import LossName
 from omnibench.fit.parameterisation import Box
 from omnibench.fit.prior import MountChoice, default_cost, default_unidentified
-from omnibench.fit.settings import Budget, CostChoice, FitSettings
+from omnibench.fit.settings import Budget, CompleteSettings, CostChoice, FitSettings
 from omnibench.fit.span import Unidentified
 from omnibench.jobs.job import TlsFiles
 from omnibench.robot.kinematics import Robot
@@ -177,7 +177,7 @@ class StudyConfig(NamedConfig):
     timing: bool = Field(True, description="no: the runs' seconds are not compared")
     memory_mb: Annotated[float, Field(ge=LEAST_MEMORY)] | None = Field(None, description="as for a comparison")
 
-    def settings_of(self, method: MethodChoice, robot: Robot, runs: int, seed: int) -> FitSettings:
+    def settings_of(self, method: MethodChoice, robot: Robot, runs: int, seed: int) -> CompleteSettings:
         """The settings of a method's fit to so many runs of a robot; what it leaves open is as usual for these."""
         common = FitSettings(
             cost=method.cost or CostChoice(name=default_cost(robot, runs)),

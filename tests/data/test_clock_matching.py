@@ -16,7 +16,7 @@ from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.headings import unwrap
 from omnibench.robot.kinematics import Array, Robot, Wheel, wheel_equations
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.odometry import Path, WheelLog
+from omnibench.robot.odometry import DrivenPath, WheelLog
 
 ROBOT = Robot(
     name="base",
@@ -47,7 +47,7 @@ def streams(
     if not driven:
         rates = wanted
     moved = rates * 0.02
-    path = Path(edges[1:], np.zeros(3), moved @ (1.05 * ROBOT.inverse_kinematic_matrix).T, "arc")
+    path = DrivenPath(edges[1:], np.zeros(3), moved @ (1.05 * ROBOT.inverse_kinematic_matrix).T, "arc")
     stamps = np.arange(0.0, LENGTH - 1.0, 0.05)
     poses = path.poses(stamps + offset + drift * stamps) + rng.normal(
         0.0, [position_noise, position_noise, heading_noise], (len(stamps), 3)

@@ -28,8 +28,7 @@ from omnibench.data.references import Reference, References
 from omnibench.fit.check.checking import CheckReport
 from omnibench.fit.check.missing_motions import command_names
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.odometry import Path as Driven
-from omnibench.robot.odometry import WheelLog
+from omnibench.robot.odometry import DrivenPath, WheelLog
 from omnibench.simulate.simulate import simulate_dataset
 
 Change = Callable[[Trajectory], Trajectory]
@@ -54,7 +53,7 @@ def recording() -> Dataset:
         matrix = robot.inverse_kinematic_matrix * np.array([[1.03], [1.0], [0.96]])
         noise = np.random.default_rng(100 + seed)
         moved = rates * (1 + 0.01 * noise.normal(size=rates.shape)) * 0.04
-        path = Driven(edges[1:], np.zeros(3), moved @ matrix.T, "arc")
+        path = DrivenPath(edges[1:], np.zeros(3), moved @ matrix.T, "arc")
         stamps = np.arange(0.0, 24.0, 0.05)
         poses = path.poses(stamps) + noise.normal(0, [0.001, 0.001, 0.003], (len(stamps), 3))
         runs.append(Trajectory(f"run{seed}", "train", edges[1:], rates, stamps, poses, command=f"c{seed % 4}"))
@@ -259,7 +258,7 @@ def test_runs_that_begin_in_motion_are_told_whatever_the_clocks(late: float) -> 
 def test_a_recording_without_turns_lacks_them_in_words() -> None:
     def straight(run: Trajectory) -> Trajectory:
         kept = run.times > 17.6
-        moved = Driven(run.times, np.zeros(3), np.abs(run.rates[:, :1]) * (0.004, 0, 0), "arc")
+        moved = DrivenPath(run.times, np.zeros(3), np.abs(run.rates[:, :1]) * (0.004, 0, 0), "arc")
         noise = np.random.default_rng(0).normal(0, [0.001, 0.001, 0.002], (len(run.pose_times), 3))
         rates = np.repeat(np.abs(run.rates[:, :1]), 2, axis=1)
         assert kept.any()

@@ -166,6 +166,14 @@ def test_what_is_left_open_keeps_the_design_and_has_no_interval() -> None:
     assert any("no reference tells of turning" in warning for warning in run.warnings)
 
 
+def test_the_direction_of_the_x_axis_is_open_only_where_the_tracked_point_is_fitted() -> None:
+    dataset = reduced("diff", 2, "distance")
+    known, fitted = (" ".join(calibrate(dataset, mount=mount).warnings) for mount in ("known", "fit"))
+    assert "no reference tells of turning" in known
+    assert "x axis points" not in known
+    assert "x axis points" in fitted
+
+
 def test_errors_are_told_by_kind_and_in_sigmas() -> None:
     dataset = reduced("diff", 3, "distance and turn")
     run = calibrate(dataset)

@@ -18,7 +18,7 @@ from omnibench.fit.calibrate import CalibrationRun, calibrate
 from omnibench.fit.cost import Cost
 from omnibench.fit.evaluate import final_errors
 from omnibench.fit.geometry import WheelGeometry
-from omnibench.fit.settings import FitSettings
+from omnibench.fit.settings import CompleteSettings
 from omnibench.fit.steering_fit import SteeringFit
 from omnibench.registry import costs
 from omnibench.robot.kinematics import Array, Mount, Robot
@@ -131,7 +131,8 @@ def weaving(coupling: float) -> Dataset:
     return make_dataset("weaving", TRICYCLE, PERIOD, runs, simulated=True)
 
 
-MATRIX = {"parameterisation": "matrix", "unidentified": "keep"}  # what the search for a steering fits
+# What the search for a steering fits.
+MATRIX = {"calibrator": "closed_form", "parameterisation": "matrix", "unidentified": "keep"}
 
 
 class Worst(Cost):
@@ -190,7 +191,7 @@ def test_the_slopes_of_the_search_are_those_of_its_cost_where_starts_have_jumped
         poses = runs[place].poses.copy()
         poses[0] += [0.6, -0.8, 0.3]
         runs[place] = replace(runs[place], poses=poses)
-    fit = SteeringFit(TRICYCLE, tuple(runs), PERIOD, FitSettings(cost=cost, loss="huber", **MATRIX))
+    fit = SteeringFit(TRICYCLE, tuple(runs), PERIOD, CompleteSettings(cost=cost, loss="huber", **MATRIX))
     vector, step = np.array([0.5, 0.1, 0.2]), 1e-3
     around = [(fit.cost(vector + moved)[0], fit.cost(vector - moved)[0]) for moved in step * np.eye(3)]
     expected = [(above - below) / (2 * step) for above, below in around]

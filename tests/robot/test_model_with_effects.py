@@ -34,7 +34,7 @@ from omnibench.registry import effects
 from omnibench.robot.effects.effect import MotionEffect, Stage, Values, make_term
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.odometry import Integration, OdometryBatch, OdometryStream, Path, WheelLog, advance
+from omnibench.robot.odometry import DrivenPath, Integration, OdometryBatch, OdometryStream, WheelLog, advance
 from omnibench.robot.signals import Signals, SignalStream, signals_of, smoothing_share
 
 BOTH: tuple[Integration, ...] = ("euler", "arc")
@@ -67,12 +67,14 @@ def test_a_path_is_the_odometry_of_its_motions(integration: Integration, seed: i
     durations = np.diff(log.times, prepend=0.0)[:, None]
     moved = log.rates @ APR_02.inverse_kinematic_matrix.T * durations
     expected = OdometryBatch([log], integration).poses(APR_02.inverse_kinematic_matrix[None])[0]
-    found = Path(log.times, log.start, moved, integration).poses(log.stamps)
+    found = DrivenPath(log.times, log.start, moved, integration).poses(log.stamps)
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
 
 
 def test_a_path_stays_at_its_ends() -> None:
-    path = Path(np.array([1.0]), np.array([1.0, 2.0, 0.5]), np.array([[0.3, 0.0, 1.0]]), "arc", np.array([[0.1, 0.2]]))
+    path = DrivenPath(
+        np.array([1.0]), np.array([1.0, 2.0, 0.5]), np.array([[0.3, 0.0, 1.0]]), "arc", np.array([[0.1, 0.2]])
+    )
     ends = path.poses(np.array([0.0, 1.0]))
     np.testing.assert_array_equal(path.poses(np.array([7.0, -3.0])), ends[::-1])
     np.testing.assert_array_equal(ends[0], [1.0, 2.0, 0.5])

@@ -17,7 +17,7 @@ from omnibench.errors import ConfigError, DataError
 from omnibench.fit.evaluate import ModelErrors
 from omnibench.robot.kinematics import Array, Mount, Robot, Wheel
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.odometry import Path
+from omnibench.robot.odometry import DrivenPath
 from omnibench.simulate.commands import Command, Variation
 from omnibench.simulate.flower import true_steering
 from omnibench.simulate.mechanics import (
@@ -248,7 +248,7 @@ def test_the_true_motion_is_that_of_the_odometry_on_other_code(
     start, stamps = np.array([1.0, -2.0, 0.5]), np.linspace(-0.1, times[-1] + 0.1, 11)
     way = "arc" if integration == "arc" else "euler"
     true = TrueMotion(times, start, moved, way, drift).poses(stamps)
-    np.testing.assert_allclose(true, Path(times, start, 0.3 * moved, way, 0.3 * drift).poses(stamps), atol=1e-12)
+    np.testing.assert_allclose(true, DrivenPath(times, start, 0.3 * moved, way, 0.3 * drift).poses(stamps), atol=1e-12)
 
 
 @given(st.floats(-1e-3, 1e-3))

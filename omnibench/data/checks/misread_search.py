@@ -63,7 +63,9 @@ _REWEIGHTED = 5  # rounds of reweighted least squares; outliers are found in thr
 # Slip of the strongest motion that may pass for motion along a weakly driven direction, as a share; of mecanum and
 # skid-steered robots it is the largest; chosen.
 _SLIP = 0.03
-_NULL = 5e-3  # of the strongest direction: one that is driven less is noise; of a wheel that slips nowhere it is 0.003
+# Share of the largest singular value of the wheel angles: a direction with less is noise, and its part of the matrix
+# stays 0; a wheel that slips nowhere leaves 0.003 along the direction in which it would have to slip.
+_NULL = 5e-3
 _CORRELATED_WINDOWS = 4.0  # windows that tell as much as one, since slip lasts; chosen
 _FEWEST = 8  # windows for each column of the matrix, below which it is not told; chosen
 
@@ -220,7 +222,7 @@ _RADIUS, _GAINS, _ELEMENT = 0.06, (0.05, 0.05, 0.12), 0.02
 _LATERAL = 0.2  # the gain of row y of mecanum wheels, which slip sideways; chosen
 _SKID = 0.5  # the gain of row 3 of a skid-steered robot, which turns 20 to 50 % less than its design
 _YAW = 0.035  # rad of the tracked point's heading; chosen, 2 degrees
-_PLACE = 0.1  # of the tracked point, in robot sizes; chosen
+_PLACE = 0.1  # of the robot's size: standard deviation of the tracked point's x and y from the design; chosen
 
 
 class DesignDistance:
@@ -356,14 +358,14 @@ class Recorded:
 class Explained:
     """The best reading: its mistakes, those that fit about as well, and d^2 as recorded.
 
-    told: False where the reference is too sparse for this search. unexplained: share of the way or of the turns,
-    whichever is less, that no matrix explains if it is read so.
+    searched: False where the reference is too sparse, or the wheels stand. unexplained: share of the way or of the
+    turns, whichever is less, that no matrix explains if it is read so.
     """
 
     mistakes: tuple[Misreading, ...]
     alike: tuple[tuple[Misreading, ...], ...]
     distance: float
-    told: bool = True
+    searched: bool = True
     unexplained: float = 0.0
 
 
@@ -392,7 +394,7 @@ def search(recording: Recorded) -> Explained:
     some = recording.some()
     fit = some.fit()
     if fit is None or not fit.gram.any():  # too sparse, or the wheels stand
-        return Explained((), (), 0.0, told=False)
+        return Explained((), (), 0.0, searched=False)
     far = DesignDistance(recording.robot)
     distance = far.of(fit)
     contradiction = float(far.contradictions(fit.gram, np.eye(len(fit.gram))[None])[0])

@@ -138,17 +138,17 @@ class Table1(Importer):
             computed = read_numbers(file, _POSE)
             if not np.array_equal(computed.column("t"), times):
                 raise DataError(f"{file}: its times t are not those of {samples.file.name}; give a row for each")
-            odometry = (computed.columns(_POSE[1:]) * units)[aligned.kept]
+            odometry = (computed.columns(_POSE[1:]) * units)[aligned.after_start]
         if (file := folder / "commands.csv").exists():
             commands = read_numbers(file, _SENT)
             _times(commands)
             sent = commands.columns(_SENT) * (1, 1, math.radians(1), 1, 1) - (aligned.zero, 0, 0, 0, 0)
-        times = times[aligned.kept] - aligned.zero
+        times = times[aligned.after_start] - aligned.zero
         return Trajectory(
             id=name,
             split="train",
             times=times,
-            rates=samples.values[aligned.kept, 1:] * RPM,
+            rates=samples.values[aligned.after_start, 1:] * RPM,
             pose_times=aligned.pose_times,
             poses=aligned.poses,
             command=f"v{v:g}_a{math.degrees(alpha):g}_w{omega:g}_d{distance:g}",

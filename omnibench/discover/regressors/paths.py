@@ -235,7 +235,7 @@ def make_paths(
     middle, ends = path.middles, path.ends
     poses = along_ends(samples, np.concatenate(ends), [log.stamps for log in logs])
     run = np.repeat(np.arange(len(logs)), np.diff(edges))
-    from_start = middle[:, :2] - starts[samples.run, :2]
+    from_start = middle[:, :2] - starts[samples.run_of_sample, :2]
     turns = np.column_stack([np.cos(middle[:, 2]), np.sin(middle[:, 2]), from_start]) * signals.durations[:, None]
     return Paths(
         robot=robot,
@@ -243,7 +243,7 @@ def make_paths(
         logs=tuple(logs),
         signals=replace(signals, poses=middle),
         sessions=tuple((name, part) for name, _, part in sessions),
-        owner=samples.run,
+        owner=samples.run_of_sample,
         middle=middle,
         poses=poses,
         run=run,
@@ -267,7 +267,7 @@ def along_ends(samples: RunSamples, ends: Array, times: Sequence[Array]) -> Arra
     ends (F + Z, 3): poses at the start and at the end of each sample of each run, between which they lie on lines.
     """
     sample, share = samples.locate(times)
-    wanted, run = np.concatenate(times), samples.run[sample]
+    wanted, run = np.concatenate(times), samples.run_of_sample[sample]
     before = ends[sample + run]
     poses: Array = before + share[:, None] * (ends[sample + run + 1] - before)
     number = np.arange(len(samples.edges) - 1)

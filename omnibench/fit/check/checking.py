@@ -106,7 +106,7 @@ def read_otherwise(read: RecordingSource, explained: Explained) -> RecordingSour
     if {finding.kind for finding in warned} - {mistake.kind for mistake in explained.mistakes}:
         other = _mended(read, warned)
         return None if other is None or _unit_warnings(other) or search(recorded(other.dataset)).mistakes else other
-    senseless = explained.unexplained > UNRELATED or (not explained.told and odd_times(read.dataset))
+    senseless = explained.unexplained > UNRELATED or (not explained.searched and odd_times(read.dataset))
     if not senseless or any(finding.kind == "wheel_unit" for finding in read.findings):
         return None
     # Another quantity of the wheels is tried with each other unit of times that are odd.
@@ -257,13 +257,13 @@ def check_recording(read: RecordingSource) -> CheckReport:
         return check_recording(otherwise).model_copy(update={"clocks": tuple(clocks)})
     if frozen:
         misread = []
-    elif explained.told:
+    elif explained.searched:
         misread = list(_misreadings(explained))
     else:  # the search for misreadings needs more poses than there are: what reading the data set warned of stands
         misread = [finding for finding in findings_of(dataset.warnings) if finding.severity == "error"]
     if misread:  # wheels that are misread tell no jumps
         faults = [fault for fault in faults if fault.kind != "reference_jump"]
-    odd = _odd_references(dataset) if explained.told else []
+    odd = _odd_references(dataset) if explained.searched else []
     wrong = any(finding.severity == "error" for finding in (*odd, *odometry, *faults))
     bent = any(finding.kind.startswith(_BENT) for finding in misread)
     foreign = [] if wrong or bent else list(foreign_reference(seen, aligned))

@@ -125,11 +125,11 @@ _RESOLUTION = 1e-9  # s, the resolution of stamps
 
 @dataclass(frozen=True, eq=False)
 class CutRun:
-    """A run from t = 0 on, and the time of the recording that became its t = 0, s. kept: its samples' indices."""
+    """A run from t = 0 on, and the time of the recording that became its t = 0, s. rows: its wheel samples' indices."""
 
     trajectory: Trajectory
     zero: float
-    kept: NDArray[np.intp]
+    rows: NDArray[np.intp]
 
 
 def cut_run(
@@ -161,27 +161,27 @@ def cut_run(
     aligned = align(float(samples.begins[chosen[0]]), samples.ends[chosen], times, poses)
     if aligned is None:
         return None
-    kept = chosen[aligned.kept]
+    rows = chosen[aligned.after_start]
     shown = np.searchsorted(reference.times, aligned.pose_times + (aligned.zero - _RESOLUTION / 2))
     trajectory = replace(
-        _sampled(whole, samples, kept, aligned.zero),
+        _sampled(whole, samples, rows, aligned.zero),
         pose_times=aligned.pose_times,
         poses=aligned.poses,
         pose_covariances=None if reference.covariances is None else reference.covariances[shown],
     )
-    return CutRun(trajectory, aligned.zero, kept)
+    return CutRun(trajectory, aligned.zero, rows)
 
 
-def _sampled(whole: Trajectory, samples: WheelSamples, kept: NDArray[np.intp], zero: float) -> Trajectory:
-    """The recording's run with the wheel samples that are kept, from a time of the recording on, s."""
-    ends = samples.ends[kept] - zero
+def _sampled(whole: Trajectory, samples: WheelSamples, rows: NDArray[np.intp], zero: float) -> Trajectory:
+    """The recording's run with some rows of its wheel samples; zero: time of the recording that becomes t = 0, s."""
+    ends = samples.ends[rows] - zero
     return replace(
         whole,
         times=ends,
-        rates=samples.rates[kept],
+        rates=samples.rates[rows],
         duration=float(ends[-1]),
-        angles=None if samples.angles is None else samples.angles[kept],
-        steering=None if samples.steering is None else samples.steering[kept],
+        angles=None if samples.angles is None else samples.angles[rows],
+        steering=None if samples.steering is None else samples.steering[rows],
     )
 
 
@@ -457,12 +457,12 @@ def _parts(run: Trajectory, streams: RecordedStreams, options: ReferenceOptions,
     parts = []
     recorded = np.searchsorted(run.times, streams.samples.ends)
     for cut in recording_runs(run, streams.samples, reference, options, notes, streams.place):
-        rows = recorded[cut.kept]
+        rows = recorded[cut.rows]
         targets, odometry = (None if array is None else array[rows] for array in (run.targets, run.odometry))
         sent = None if run.sent is None else run.sent - np.array([cut.zero, 0, 0, 0, 0])
         if sent is not None:  # those that hold at some time of the part
             sent = sent[(sent[:, 0] > -sent[:, 4]) & (sent[:, 0] < cut.trajectory.times[-1])]
-        whole = cut.zero == 0 and len(cut.kept) == len(run.times)
+        whole = cut.zero == 0 and len(cut.rows) == len(run.times)
         distance = run.distance if whole else None
         made = replace(cut.trajectory, targets=targets, odometry=odometry, sent=sent, distance=distance)
         parts.append(Part(replace(made, duration=run.duration) if whole else made, run.id, cut.zero, whole))
