@@ -150,7 +150,7 @@ def design(
     from omnibench.config import to_json
     from omnibench.design.candidates import RobotOptions, design_source
     from omnibench.design.design import design_experiment
-    from omnibench.design.report.tables import design_document
+    from omnibench.design.report import design_document
     from omnibench.files import refuse_existing, write_text
     from omnibench.report.render import write_document
 

@@ -28,11 +28,10 @@ from omnibench.processes import one_thread_processes
 from omnibench.progress import Reporter, no_progress
 from omnibench.registry import PluginFailure
 from omnibench.report.render import write_document
-from omnibench.study.cells import CellRatio, MethodInCell, StudyCell, make_cells
 from omnibench.study.config import StudyConfig
-from omnibench.study.report.study_report import study_document
+from omnibench.study.report import study_document
 from omnibench.study.study_plan import judge_fits, load_robots, plan_fits
-from omnibench.study.study_result import StudyResult
+from omnibench.study.study_result import CellRatio, MethodInCell, StudyCell, StudyResult, make_cells
 
 
 def is_study(path: Path) -> bool:
