@@ -16,16 +16,39 @@ from pydantic_core import to_jsonable_python
 from omnibench.config import Model, Name, Positive, read_yaml, to_yaml, validate
 from omnibench.data.checks.finding import findings_of
 from omnibench.data.checks.implausible import implausible
-from omnibench.data.headings import unwrap
 from omnibench.data.references import References, odd_references, reference_flaw, with_whole_turns
 from omnibench.data.run_checks import check_sample_period, pose_times_flaw, reach_flaw, values_flaw, wheel_times_flaw
 from omnibench.data.scans import Scanner, Scans
 from omnibench.data.stored_rows import in_file, median_period, noted, period_of
 from omnibench.errors import ConfigError, DataError, nearest, require_type, shown
 from omnibench.robot.kinematics import Array, Drive, Robot, in_the_middle, interpolated
+from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog, kept_with_samples
 from omnibench.views import Shown
 from omnibench.words import plural
+
+TURN = 2 * np.pi  # rad
+
+
+def unwrap(robot: Robot, logs: Sequence[WheelLog], headings: Sequence[Array]) -> tuple[list[Array], list[int]]:
+    """Continuous headings (rad) and the indices of trajectories in which they are ambiguous.
+
+    Every increment gets the whole turns that bring it closest to the design model's odometry. Where the reference is
+    dense this is the nearest turn; where it is sparse, the odometry tells how often the robot turned in between. A
+    trajectory is ambiguous if the two still differ by more than a quarter turn between two reference poses.
+    """
+    model = OdometryModel.of_design(robot, "arc")
+    unwrapped: list[Array] = []
+    ambiguous: list[int] = []
+    for index, (odometry, heading) in enumerate(zip(model.poses(logs), headings, strict=True)):
+        steps, expected = np.diff(heading), np.diff(odometry[:, 2])
+        turns = np.round((expected - steps) / TURN)
+        # Added to the headings as recorded, so that continuous ones stay as they are to the bit.
+        unwrapped.append(heading + TURN * np.concatenate([[0.0], np.cumsum(turns)]))
+        if len(steps) and np.abs(steps + TURN * turns - expected).max() > TURN / 4:
+            ambiguous.append(index)
+    return unwrapped, ambiguous
+
 
 FORMAT: Final = "omnibench-dataset/1"
 
