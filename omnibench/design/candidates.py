@@ -25,8 +25,17 @@ from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
-from omnibench.simulate.commands import Command, TimedCommand, default_directions, steering_limit, wheels_of
-from omnibench.simulate.drivable_commands import LONGEST, SHORTEST, DrivableCommands, Shapes
+from omnibench.simulate.commands import (
+    LONGEST,
+    SHORTEST,
+    Command,
+    DrivableCommands,
+    Shapes,
+    TimedCommand,
+    default_directions,
+    steering_limit,
+    wheels_of,
+)
 from omnibench.simulate.flower import planned_commands, run_as_designed
 from omnibench.simulate.robot_config import RobotConfig
 from omnibench.simulate.source import ComparedData

@@ -20,7 +20,6 @@ from omnibench.jobs.job_process import local_backend
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.robot.kinematics import Array, JsonArray, relative
 from omnibench.robot.model import OdometryModel
-from omnibench.slam.map import ScanMap
 from omnibench.slam.motion_prior import (
     LastPosePrior,
     MotionPrior,
@@ -30,7 +29,7 @@ from omnibench.slam.motion_prior import (
     odometry_deviations,
 )
 from omnibench.slam.pose_errors import FLOOR, PathWarning, PoseErrors, merged_warning, path_warnings
-from omnibench.slam.scan_matching import Match, ScanPoints, noise_factor, refine, scan_points, search
+from omnibench.slam.scan_matching import Match, ScanMap, ScanPoints, noise_factor, refine, scan_points, search
 from omnibench.slam.slam_options import PRELOAD, SlamOptions
 
 # The study tests/studies/constants_slam.py varies these numbers by 0.5 and 2. In three rooms _SKEWED moves poses by

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.checks.finding import Finding, Kind, Severity
-from omnibench.data.checks.misreading import wheels_in_words
-from omnibench.data.checks.steering_readings import frozen_steering
+from omnibench.data.checks.misreading import frozen_steering, wheels_in_words
 from omnibench.data.clock_matching import ROUNDS, SEARCH, ClockMatch, Streams, Windows, fitted_together, match_clocks
 from omnibench.data.dataset import Trajectory
 from omnibench.data.stored_rows import MOST_DRAWN, drawn_runs, median_period
