@@ -43,11 +43,8 @@ from omnibench.words import noun_for, plural
 
 # What follows offers shapes of runs; more of them change a design little, because it is a choice of few (chosen).
 _SHAPES = Shapes(lines=(0.5, 1.0), radii=(0.1, 0.2, 0.4, 0.8), turns=(45.0, 90.0, 180.0, 360.0), spins=(360.0, 1080.0))
-_MOST = {
-    "steering_limit": 180.0,
-    "position_noise": 10.0,
-    "heading_noise": 90.0,
-}  # deg, m, deg: more is a slip of the pen
+# deg, m, deg: more is a slip of the pen.
+_MOST = {"steering_limit": 180.0, "position_noise": 10.0, "heading_noise": 90.0}
 _SET = "robot"  # name of the candidates' set
 _SAMPLE_PERIOD, _POSE_PERIOD = 0.05, 0.25  # s; commands are constant, so that longer samples tell the same
 # White noise of a motion capture or of scan matching, and per sqrt(s) what a floor and slip add: the order of magnitude

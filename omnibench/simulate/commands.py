@@ -111,13 +111,10 @@ def sharpest_turn(robot: Robot, command: Command, limit: float) -> float:
     return low * abs(command.turn_rate)
 
 
-def within_steering(
-    robot: Robot, commands: Sequence[Command], degrees: float | None
-) -> tuple[list[Command], list[Command]]:
-    """The commands that a robot can steer, and those that are beyond its limit, deg, or need it to turn on the spot."""
+def unsteerable(robot: Robot, commands: Sequence[Command], degrees: float | None) -> list[Command]:
+    """The commands that are beyond a robot's steering limit, deg, or need it to turn on the spot."""
     limit = steering_limit(robot, degrees)
-    kept = [command for command in commands if is_within(robot, command, limit)]
-    return kept, [command for command in commands if command not in kept]
+    return [command for command in commands if not is_within(robot, command, limit)]
 
 
 def beyond_steering(robot: Robot, left_out: Sequence[Command], degrees: float | None) -> str:

@@ -41,7 +41,7 @@ _PROCESS_NOISE = (0.0, 0.0, 0.06, 0.03, 0.03, 0.0, 0.025, 0.025, 0.04, 0.01, 0.0
 _FUSED = (6, 7, 11)  # of these: velocities along x and y, and of yaw
 
 
-def robot_localization(calibration: Calibration) -> tuple[str, tuple[str, ...]]:
+def robot_localization(calibration: Calibration) -> Export:
     """Parameters of ekf_filter_node and of the controller that publishes the odometry as YAML, and warnings.
 
     ConfigError: the calibration has no noise model.
@@ -79,12 +79,13 @@ def robot_localization(calibration: Calibration) -> tuple[str, tuple[str, ...]]:
         Parameter("process_noise_covariance", f"[{process_noise}]"),
     )
     text = "".join(f"# {line}\n" for line in lines) + to_node("ekf_filter_node", node)
+    file_name = f"{_stem(calibration.name)}_robot_localization.yaml"
     if publisher is not None:
-        return text + to_node(publisher.name, covariance_parameters(calibration, publisher)), warnings
+        text += to_node(publisher.name, covariance_parameters(calibration, publisher))
+        return Export(text, warnings, file_name)
     along_x, along_y, turning = (f"{value:.6e}" for value in (growth / calibration.sample_period).tolist())
-    return text + (
-        f"# twist.covariance of the messages: [0] {along_x}, [7] {along_y} m2/s2, [35] {turning} rad2/s2\n"
-    ), warnings
+    text += f"# twist.covariance of the messages: [0] {along_x}, [7] {along_y} m2/s2, [35] {turning} rad2/s2\n"
+    return Export(text, warnings, file_name)
 
 
 def _warnings(calibration: Calibration, noise: Noise, base: Mount) -> tuple[str, ...]:
@@ -131,11 +132,6 @@ def _ros2_controllers(calibration: Calibration) -> Export:
     return Export(text, warnings, f"{_stem(calibration.name)}_{controller.removesuffix('_controller')}.yaml")
 
 
-def _robot_localization(calibration: Calibration) -> Export:
-    text, warnings = robot_localization(calibration)
-    return Export(text, warnings, f"{_stem(calibration.name)}_robot_localization.yaml")
-
-
 def _c_header(calibration: Calibration) -> Export:
     stem = _stem(calibration.name)
     text, warnings = c_header(calibration, stem)
@@ -143,7 +139,7 @@ def _c_header(calibration: Calibration) -> Export:
 
 
 EXPORT_FORMATS: Mapping[str, Callable[[Calibration], Export]] = MappingProxyType(
-    {"c_header": _c_header, "robot_localization": _robot_localization, "ros2_controllers": _ros2_controllers}
+    {"c_header": _c_header, "robot_localization": robot_localization, "ros2_controllers": _ros2_controllers}
 )
 
 

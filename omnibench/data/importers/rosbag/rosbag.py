@@ -88,7 +88,8 @@ def between_rests(span: tuple[float, float], rests: Sequence[tuple[float, float]
     pieces = []
     for before, after in pairwise(edges):
         begin = departure(before, before[0] > span[0], stamps)
-        end = _arrival(after, after[1] < span[1], stamps)
+        # The end at a reference pose of the rest, if it has one: a departure with the time reversed.
+        end = -departure((-after[1], -after[0]), after[1] < span[1], -stamps[::-1])
         pieces.append(Piece(begin, end, after[0] - before[1]))
     return pieces
 
@@ -116,12 +117,6 @@ def from_cuts(times: Array, angles: Array, cuts: Sequence[Cut], stamps: Array, t
         start = float(earlier[-1]) if len(earlier) and _stood(times, angles, earlier[-1], begin, turned) else begin
         pieces.append(Piece(float(start), float(end), float(end - begin), cut.command if whole else None))
     return pieces
-
-
-def _arrival(rest: tuple[float, float], shared: bool, stamps: Array) -> float:
-    """End of the run before a rest, s: at a reference pose of the rest, if it has one."""
-    begin, end = rest
-    return -departure((-end, -begin), shared, -stamps[::-1])
 
 
 def _stood(times: Array, angles: Array, begin: float, end: float, turned: float) -> bool:
@@ -197,14 +192,7 @@ def read_recording(path: Path, name: str, options: RosbagOptions, warnings: list
     place = f"{path}: topic {topic.name}"
     period = float(np.median(np.diff(wheels.readings.times)))
     gap = options.longest_gap or wheels.longest_gap
-    samples, losses = wheel_samples(
-        wheels.readings,
-        options,
-        place,
-        period,
-        longest_gap=gap,
-        still=options.still,
-    )
+    samples, losses = wheel_samples(wheels.readings, options, place, period, longest_gap=gap, still=options.still)
     words = []
     if losses.gaps:
         words.append(
@@ -251,7 +239,8 @@ def cut_into_runs(recording: Recording, options: RosbagOptions, *, alone: bool =
     if short:
         reasons.append(f"{short} shorter than {options.least_run:g} s (least_run)")
     if bare:
-        reasons.append(f"{bare} with fewer than two {_references_in_words(recording)}")
+        unposed = "references" if recording.sensors else "reference poses" if recording.referenced else "scans"
+        reasons.append(f"{bare} with fewer than two {unposed}")
     if driving:
         reasons.append(f"{driving} that never rest (start_at_rest)")
     if reasons:
@@ -259,21 +248,14 @@ def cut_into_runs(recording: Recording, options: RosbagOptions, *, alone: bool =
             f"{recording.place}: {short + bare + driving} of {plural(pieces, 'drive')} left out: {', '.join(reasons)}"
         ]
     if not runs:
-        return runs, [f"{recording.place}: {_nothing(options)}"]
+        problem = f"no message of {options.cut_topic} while the wheels were recorded"
+        if options.cut == "rests":
+            problem = f"the wheels rest all the time (less than {options.rest_rate:g} rad/s, rest_rate)"
+        return runs, [f"{recording.place}: {problem}"]
     if alone and options.cut == "rests" and uncut == len(runs):
         advice = f"no rest of {options.least_rest:g} s cuts it; --set cut=topic or cut=windows for more runs"
         return runs, [f"{recording.place}: {advice}"]
     return runs, []
-
-
-def _references_in_words(recording: Recording) -> str:
-    return "references" if recording.sensors else "reference poses" if recording.referenced else "scans"
-
-
-def _nothing(options: RosbagOptions) -> str:
-    if options.cut == "rests":
-        return f"the wheels rest all the time (less than {options.rest_rate:g} rad/s, rest_rate)"
-    return f"no message of {options.cut_topic} while the wheels were recorded"
 
 
 def _pieces(recording: Recording, part: slice, options: RosbagOptions) -> list[Piece]:
