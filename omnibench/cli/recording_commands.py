@@ -239,7 +239,7 @@ def slam(
         result = request.run(watch, table_format)
         if report is not None or figures is not None:
             watch(Progress("writing the report"))
-            document = recording_document(result.dataset, truth=result.truth, accuracy=result.accuracy)
+            document = recording_document(result.dataset, truth=result.truth, accuracy=result.summary.accuracy)
             if report is not None:
                 write_document(document, report)
             write_asked_figures(document, figures)

@@ -360,8 +360,17 @@ def make_dataset(
             f"headings of {plural(len(ambiguous), 'trajectory')} may be unwrapped wrongly (reference too sparse): "
             f"{shown}"
         ]
-    warnings += [] if warnings else _standing(standing, raw)  # in other units all runs seem to move too far
-    warnings += _late_references(raw) + _other_periods(median, sample_period)
+    # Where all stand, another warning says so; in other units all runs seem to move too far.
+    if 0 < len(standing) < len(raw) and not warnings:
+        warnings.append(
+            f"the reference moves in {plural(len(standing), 'trajectory')} though no wheel turns, which spoils every "
+            f"fit; leave {'it' if len(standing) == 1 else 'them'} out: {', '.join(standing[:5])}"
+        )
+    warnings += _late_references(raw)
+    if not 0.5 < median / sample_period < 2:
+        warnings.append(
+            f"sample_period is {sample_period:g} s, but the wheel samples come every {median:g} s (the median)"
+        )
     unwrapped = [
         replace(trajectory, poses=np.column_stack([trajectory.poses[:, :2], heading]))
         for trajectory, heading in zip(raw, headings, strict=True)
@@ -376,29 +385,16 @@ def make_dataset(
         robot, [(run.log([0.0]), run.references) for run in unwrapped if run.references is not None]
     )
     dataset = Dataset(name, robot, sample_period, tuple(unwrapped), description, source, licence, simulated, (), scans)
-    return replace(dataset, warnings=(*warnings, *_copied(dataset)))
+    if copies := dataset.copies:
+        are = "is a copy of a training run and is" if len(copies) == 1 else "are copies of training runs and are"
+        warnings.append(f"{plural(len(copies), 'trajectory')} {are} left out of validation: {', '.join(copies[:5])}")
+    return replace(dataset, warnings=tuple(warnings))
 
 
 def _with_drive(trajectory: Trajectory, robot: Robot) -> Trajectory:
     """A run with the drive signals of a robot that steers."""
     drive = None if robot.drive.direct else robot.drive
     return trajectory if trajectory.drive == drive else replace(trajectory, drive=drive)
-
-
-def _copied(dataset: Dataset) -> list[str]:
-    """Warning of runs for validation that are copies of training runs."""
-    if not dataset.copies:
-        return []
-    count, shown = len(dataset.copies), ", ".join(dataset.copies[:5])
-    are = "is a copy of a training run and is" if count == 1 else "are copies of training runs and are"
-    return [f"{plural(count, 'trajectory')} {are} left out of validation: {shown}"]
-
-
-def _other_periods(median: float, sample_period: float) -> list[str]:
-    """Warning of a sample period that the stamps contradict."""
-    if 0.5 < median / sample_period < 2:
-        return []
-    return [f"sample_period is {sample_period:g} s, but the wheel samples come every {median:g} s (the median)"]
 
 
 def _check_run(place: str, robot: Robot, trajectory: Trajectory) -> None:
@@ -434,17 +430,6 @@ def _check_run(place: str, robot: Robot, trajectory: Trajectory) -> None:
         raise DataError(f"{where}: references, row {flaw[0] + 1}: {flaw[1]}")
     if (flaw := reach_flaw(robot, times, trajectory.rates, trajectory.pose_times, trajectory.poses)) is not None:
         raise DataError(f"{where}: {flaw[1]}")
-
-
-def _standing(standing: Sequence[str], trajectories: Sequence[Trajectory]) -> list[str]:
-    """Warning of runs in which the reference moves and the wheels do not, where other runs drive."""
-    if not 0 < len(standing) < len(trajectories):
-        return []  # another warning says that no run drives
-    count, shown = len(standing), ", ".join(standing[:5])
-    return [
-        f"the reference moves in {plural(count, 'trajectory')} though no wheel turns, which spoils every fit; leave "
-        f"{'it' if count == 1 else 'them'} out: {shown}"
-    ]
 
 
 def _moves_unseen(matrix: Array, run: Trajectory) -> bool:

@@ -347,27 +347,24 @@ class DrivableCommands:
     def __iter__(self) -> Iterator[TimedCommand]:
         """Lines, arcs to both sides and turns on the spot, each as fast as the limits and the pace allow."""
         for pace in self.shapes.paces:
-            yield from self._at_pace(pace)
-
-    def _at_pace(self, pace: float) -> Iterator[TimedCommand]:
-        rolls = straight_and_pivot(self.robot)
-        pivot = (0.0, 0.0) if rolls is None else rolls[1]
-        for direction in map(math.radians, default_directions(self.robot)):
-            if line := self._drivable(direction, 0.0, pivot, pace):
-                longest = min(max(self.free), LONGEST * line.speed)
-                for share in self.shapes.lines:
-                    yield TimedCommand(line, tidy(share * longest) / line.speed)
-            for radius in self._radii(direction, pivot):
-                for side in (1.0, -1.0):
-                    if arc := self._drivable(direction, side / radius, pivot, pace):
-                        turns = self.shapes.turns
-                        yield from self._of_length(arc, [math.radians(turn) * radius / arc.speed for turn in turns])
-        for side in (1.0, -1.0):
-            turn_rate = side * pace * self._slower(Command(0.0, 0.0, side, pivot))
-            spin = Command(0.0, 0.0, turn_rate, pivot)
-            if is_within(self.robot, spin, self.steering_limit):
-                spins = self.shapes.spins
-                yield from self._of_length(spin, [math.radians(turn) / abs(spin.turn_rate) for turn in spins])
+            rolls = straight_and_pivot(self.robot)
+            pivot = (0.0, 0.0) if rolls is None else rolls[1]
+            for direction in map(math.radians, default_directions(self.robot)):
+                if line := self._drivable(direction, 0.0, pivot, pace):
+                    longest = min(max(self.free), LONGEST * line.speed)
+                    for share in self.shapes.lines:
+                        yield TimedCommand(line, tidy(share * longest) / line.speed)
+                for radius in self._radii(direction, pivot):
+                    for side in (1.0, -1.0):
+                        if arc := self._drivable(direction, side / radius, pivot, pace):
+                            turns = self.shapes.turns
+                            yield from self._of_length(arc, [math.radians(turn) * radius / arc.speed for turn in turns])
+            for side in (1.0, -1.0):
+                turn_rate = side * pace * self._slower(Command(0.0, 0.0, side, pivot))
+                spin = Command(0.0, 0.0, turn_rate, pivot)
+                if is_within(self.robot, spin, self.steering_limit):
+                    spins = self.shapes.spins
+                    yield from self._of_length(spin, [math.radians(turn) / abs(spin.turn_rate) for turn in spins])
 
     def _radii(self, direction: float, pivot: tuple[float, float]) -> list[float]:
         """Radii of arcs, m: shares of the area, and a little more than the smallest that a robot steers."""

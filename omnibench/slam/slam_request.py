@@ -264,10 +264,6 @@ class SlamResult:
     summary: SlamSummary
     truth: Mapping[str, TruePath] | None
 
-    @property
-    def accuracy(self) -> SlamAccuracy | None:
-        return self.summary.accuracy
-
 
 @dataclass(frozen=True)
 class SlamRequest:

@@ -241,8 +241,7 @@ def _is_for_none(cells: Sequence[StudyCell], method: str) -> bool:
 
 
 def _ratio(cell: StudyCell, method: str) -> float | None:
-    mean = cell.methods[method].mean("cost") if method in cell.methods else None
-    design = float(cell.design["cost"].mean())
+    mean, design = cell.mean(method), float(cell.design["cost"].mean())
     return None if mean is None or design == 0 else mean / design
 
 
@@ -337,17 +336,13 @@ def _errors(cell: StudyCell | None, method: str) -> Cell:
 
 
 def _growth(of_place: Mapping[str, StudyCell], regime: str, method: str) -> float | None:
-    means = [
-        of_place[name].methods[method].mean("cost") if name in of_place and method in of_place[name].methods else None
-        for name in (AS_RECORDED, regime)
-    ]
-    before, after = means
+    before, after = (of_place[name].mean(method) if name in of_place else None for name in (AS_RECORDED, regime))
     return None if not before or not after else after / before
 
 
 def _worse_than_design(of_place: Mapping[str, StudyCell], regime: str, method: str) -> bool:
     cell = of_place.get(regime)
-    mean = None if cell is None or method not in cell.methods else cell.methods[method].mean("cost")
+    mean = None if cell is None else cell.mean(method)
     return cell is not None and mean is not None and mean > float(cell.design["cost"].mean()) * (1 + 1e-9)
 
 
@@ -362,15 +357,8 @@ def curve_section(view: StudyView) -> tuple[Section, ...]:
     if not drawn:
         return ()
     figures = tuple(_curve(view, name, points) for name, points in drawn.items())
-    shown = [
-        name
-        for name in view.methods
-        if any(
-            name in cell.methods and cell.methods[name].errors is not None
-            for points in drawn.values()
-            for cell in points.values()
-        )
-    ]
+    cells = [cell for points in drawn.values() for cell in points.values()]
+    shown = [name for name in view.methods if any(cell.mean(name) is not None for cell in cells)]
     grid = FigureGrid(
         figures, tuple(view.styles[name] for name in shown), 2,
         "Runs of each command that train, against the mean final error, Eq. (6), of runs that never train.", "curves",
@@ -383,11 +371,7 @@ def _curve(view: StudyView, name: str, points: Mapping[int, StudyCell]) -> Figur
     traces: list[go.Scatter] = []
     least, most = [], []
     for method in view.methods:
-        pairs = [
-            (count, mean)
-            for count in counts
-            if method in points[count].methods and (mean := points[count].methods[method].mean("cost")) is not None
-        ]
+        pairs = [(count, mean) for count in counts if (mean := points[count].mean(method)) is not None]
         if not pairs:
             continue
         x, y = [float(count) for count, _ in pairs], [mean for _, mean in pairs]

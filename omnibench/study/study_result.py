@@ -242,6 +242,10 @@ class StudyCell:
     design: Mapping[Measure, Array]
     methods: Mapping[str, MethodInCell]
 
+    def mean(self, method: str) -> float | None:
+        """A method's mean error, Eq. (6); None where it was not asked, or has no answer."""
+        return self.methods[method].mean("cost") if method in self.methods else None
+
     def against_design(self, method: str, cells: int) -> CellRatio | None:
         """A method's mean error, Eq. (6), as a ratio to the design values'; None without an answer."""
         errors = self.methods[method].errors if method in self.methods else None
@@ -377,12 +381,13 @@ class StudyResult(Shown):
     def against_best(self) -> tuple[AgainstBest, ...]:
         """The reference method against the best published one, in every judged cell that has both."""
         name = self.config.reference or ""
-        rivals = [(cell, _best_published(cell)) for cell in self.judged_cells if name]
-        compared = [
-            (cell, best.method)
-            for cell, best in rivals
-            if best is not None and name in cell.methods and cell.methods[name].errors is not None
-        ]
+        compared = []
+        for cell in self.judged_cells if name else ():
+            published = [
+                each for each in cell.methods.values() if each.family == "published" and each.errors is not None
+            ]
+            if published and cell.mean(name) is not None:
+                compared.append((cell, min(published, key=lambda each: each.mean("cost") or 0.0).method))
         found = []
         for cell, best in compared:
             ratio = cell.between(name, best, len(compared))
@@ -422,11 +427,6 @@ def _place(fit: PlannedFit) -> tuple[str, ...]:
     return fit.robot.name, fit.training.name, fit.fold.name, regime, f"{fit.method.shown} seed {fit.seed}"
 
 
-def _best_published(cell: StudyCell) -> MethodInCell | None:
-    published = [each for each in cell.methods.values() if each.family == "published" and each.errors is not None]
-    return min(published, key=lambda each: each.mean("cost") or 0.0) if published else None
-
-
 _LEVEL = 0.95
 _FEWEST_METHODS = 3  # methods that Friedman's test compares at least
 _FEWEST_CELLS = 2
@@ -451,11 +451,7 @@ class Ranking:
 def ranking(cells: Sequence[StudyCell], methods: Sequence[str]) -> Ranking | None:
     """The ranks of the methods that answered in every cell; None where methods or cells are too few."""
     # The methods that answered in every cell
-    names = tuple(
-        name
-        for name in methods
-        if all(name in cell.methods and cell.methods[name].errors is not None for cell in cells)
-    )
+    names = tuple(name for name in methods if all(cell.mean(name) is not None for cell in cells))
     if len(names) < _FEWEST_METHODS or len(cells) < _FEWEST_CELLS:
         return None
     errors = np.array([[cell.methods[name].mean("cost") for name in names] for cell in cells], dtype=float)

@@ -41,7 +41,7 @@ from omnibench.data.importers.recording_options import RADIANS, SECONDS
 from omnibench.data.importers.runs.recording_runs import RecordedStreams, ReferenceStream, by_one_clock, recording_runs
 from omnibench.data.importers.tum import read_tum
 from omnibench.data.importers.wheel_samples import WheelReadings, WheelSamples, wheel_samples
-from omnibench.data.references import KINDS, NUMBERS, References, measurement_flaw, references_of
+from omnibench.data.references import KINDS, NUMBERS, References, reference_flaw, references_of
 from omnibench.errors import DataError, nearest
 from omnibench.registry import importers
 from omnibench.robot.kinematics import Array
@@ -328,7 +328,7 @@ def read_measured(table: CellTable, options: CsvOptions, *, shared: bool) -> Ref
     numbers |= {name: numbers[name] * SECONDS[unit] for name in ("t0", "t1")}
     numbers["t0"][from_start] = -np.inf
     references = references_of(kinds, numbers)
-    if (flaw := measurement_flaw(references)) is not None:
+    if (flaw := reference_flaw(references, None)) is not None:
         raise table.fail(flaw[0], flaw[1])
     return references
 

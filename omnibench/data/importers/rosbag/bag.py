@@ -230,10 +230,7 @@ def scan_topic(bag: Bag, name: str | None, wheels: Topic) -> Topic | None:
     if name is not None:
         return _named(bag, name, "scan_topic", SCAN_TYPES)
     candidates = [topic for topic in bag.topics if topic.type in SCAN_TYPES and topic.messages]
-    beside = [topic for topic in candidates if _ends_in(topic, "/scan") and _space(topic) == _space(wheels)]
-    if len(beside) == 1:
-        return beside[0]
-    return _only(bag, "scan_topic", candidates, "/scan", SCAN_TYPES) if candidates else None
+    return _only(bag, "scan_topic", candidates, "/scan", SCAN_TYPES, wheels) if candidates else None
 
 
 def sensor_topics(bag: Bag, names: Sequence[str]) -> tuple[Topic, ...]:
@@ -291,10 +288,7 @@ def pose_topic(
             "reference for it; if one is independent of the wheels, set pose_topic to it, or record a reference: "
             f"{_REFERENCES}"
         )
-    beside = [topic for topic in references if _ends_in(topic, "slam_pose") and _space(topic) == _space(wheels)]
-    if len(beside) == 1:
-        return beside[0]
-    return _only(bag, "pose_topic", references or candidates, "slam_pose", POSE_TYPES)
+    return _only(bag, "pose_topic", references or candidates, "slam_pose", POSE_TYPES, wheels)
 
 
 def _named(bag: Bag, name: str, key: str, types: Sequence[str], words: str = "") -> Topic:
@@ -306,7 +300,10 @@ def _named(bag: Bag, name: str, key: str, types: Sequence[str], words: str = "")
     return topic
 
 
-def _only(bag: Bag, key: str, candidates: Sequence[Topic], ending: str, types: Sequence[str]) -> Topic:
+def _only(
+    bag: Bag, key: str, candidates: Sequence[Topic], ending: str, types: Sequence[str], wheels: Topic | None = None
+) -> Topic:
+    """The only topic with messages, or that ends so; of several that do the one in the namespace of the wheels."""
     if not candidates:
         known = ", ".join(map(str, bag.topics)) or "none"
         others = f", nor another reference ({_REFERENCES})" if key == "pose_topic" else ""
@@ -314,9 +311,11 @@ def _only(bag: Bag, key: str, candidates: Sequence[Topic], ending: str, types: S
     filled = [topic for topic in candidates if topic.messages]
     if not filled:
         raise DataError(f"{bag.path}: {_listed(candidates)}: nothing was recorded on it")
-    chosen = filled if len(filled) == 1 else [topic for topic in filled if _ends_in(topic, ending)]
-    if len(chosen) == 1:
-        return chosen[0]
+    named = [topic for topic in filled if topic.name.endswith(ending)]
+    beside = [topic for topic in named if wheels is not None and _space(topic) == _space(wheels)]
+    for chosen in (beside, filled, named):
+        if len(chosen) == 1:
+            return chosen[0]
     raise ConfigError(f"{bag.path}: several topics could be the {key}; --set {key}=NAME, one of: {_listed(filled)}")
 
 
@@ -326,10 +325,6 @@ def _listed(topics: Sequence[Topic]) -> str:
 
 def _either(types: Sequence[str]) -> str:
     return " or ".join(types)
-
-
-def _ends_in(topic: Topic, ending: str) -> bool:
-    return topic.name.endswith(ending)
 
 
 def _space(topic: Topic) -> str:

@@ -236,19 +236,21 @@ def breaks(samples: WheelSamples, reference: ReferenceStream, options: Reference
         for part in samples.stretches():
             seen = np.flatnonzero((times >= samples.begins[part][0]) & (times <= samples.ends[part][-1]))
             if len(seen):
-                model = OdometryModel.of_design(options.robot, "arc")
-                (driven,) = model.poses([wheel_log(samples, part, options.robot, times[seen])])
+                # The log of the part, from t = 0 at its begin.
+                zero, robot = float(samples.begins[part][0]), options.robot
+                steering = None if samples.steering is None else samples.steering[part]
+                drive = None if robot.drive.direct else robot.drive
+                log = WheelLog(
+                    samples.ends[part] - zero,
+                    samples.rates[part],
+                    np.zeros(3),
+                    times[seen] - zero,
+                    steering=steering,
+                    drive=drive,
+                )
+                (driven,) = OdometryModel.of_design(robot, "arc").poses([log])
                 found |= set(seen[reference_jumps(options.robot, driven, reference.poses[seen])].tolist())
     return [(float(times[index]), float(times[index + 1])) for index in sorted(found)]
-
-
-def wheel_log(samples: WheelSamples, part: slice, robot: Robot, stamps: Array) -> WheelLog:
-    """The log of an unbroken part of the samples, from t = 0 at its begin, with stamps (S,) of the recording, s."""
-    zero = float(samples.begins[part][0])
-    steering = None if samples.steering is None else samples.steering[part]
-    drive = None if robot.drive.direct else robot.drive
-    log = WheelLog(samples.ends[part] - zero, samples.rates[part], np.zeros(3), stamps - zero)
-    return replace(log, steering=steering, drive=drive)
 
 
 def parted(span: Span, breaks: Sequence[Span]) -> Iterator[Span]:
