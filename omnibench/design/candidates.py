@@ -149,7 +149,10 @@ class RobotCommands(Model):
 
         source: for messages. ConfigError: the commands leave part of the matrix undetermined.
         """
-        commands, robot = tuple(dict.fromkeys(self.commands())), self.robot
+        # Lines, arcs to both sides and turns on the spot, each as fast as the limits allow.
+        robot, limit, free = self.robot, self._steering_limit, self._free
+        drivable = DrivableCommands(robot, self.max_speed, self.max_turn_rate, self._wheel_rate, limit, free, _SHAPES)
+        commands = tuple(dict.fromkeys(drivable))
         if not any(timed.command.turn_rate for timed in commands):
             raise ConfigError(
                 f"{source}: no curve that it can drive within {LONGEST:g} s fits an area of {self.area[0]:g} x "
@@ -186,18 +189,6 @@ class RobotCommands(Model):
                     "Left is counter-clockwise as seen from above, backward too. Begin where a run stays on the floor.",
                 ),
             )
-        )
-
-    def commands(self) -> DrivableCommands:
-        """Lines, arcs to both sides and turns on the spot, each as fast as the limits allow."""
-        return DrivableCommands(
-            self.robot,
-            self.max_speed,
-            self.max_turn_rate,
-            self._wheel_rate,
-            self._steering_limit,
-            self._free,
-            _SHAPES,
         )
 
     @property

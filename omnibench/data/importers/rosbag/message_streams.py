@@ -11,8 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from omnibench.data.importers.rosbag.bag import Bag, JointTopics, Record, Topic
-from omnibench.data.importers.rosbag.rosbag_options import RosbagOptions, Use
+from omnibench.data.importers.rosbag.bag import Bag, JointTopics, Record, RosbagOptions, Topic, Use
 from omnibench.data.importers.wheel_samples import Quantity, WheelReadings
 from omnibench.errors import DataError
 from omnibench.robot.joint_choice import JointChoice

@@ -16,6 +16,7 @@ from omnibench.data.importers.rosbag.bag import (
     ODOMETRY,
     TRANSFORMS,
     Bag,
+    RosbagOptions,
     Topic,
     find_bags,
     has_sensors,
@@ -33,7 +34,6 @@ from omnibench.data.importers.rosbag.message_streams import (
     read_poses,
     read_wheels,
 )
-from omnibench.data.importers.rosbag.rosbag_options import RosbagOptions
 from omnibench.data.importers.rosbag.scan_stream import RunScans, ScanStream, gather_scans, read_scans, read_transforms
 from omnibench.data.importers.rosbag.sensor_references import SensorReferences, read_sensors
 from omnibench.data.importers.runs.recording_runs import (

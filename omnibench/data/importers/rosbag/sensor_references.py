@@ -26,9 +26,8 @@ from typing import Any
 
 import numpy as np
 
-from omnibench.data.importers.rosbag.bag import FIX, Bag, Topic
+from omnibench.data.importers.rosbag.bag import FIX, Bag, RosbagOptions, Topic
 from omnibench.data.importers.rosbag.message_streams import MessageFilter, Stamps, planar_headings, possible
-from omnibench.data.importers.rosbag.rosbag_options import RosbagOptions
 from omnibench.data.importers.runs.recording_runs import find_rests, measured_as
 from omnibench.data.importers.wheel_samples import WheelSamples
 from omnibench.data.references import Reference, References
