@@ -118,7 +118,7 @@ def _study(
     from omnibench.cli.terminal.comparison_tables import print_study, print_study_ending
     from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.progress import Progress
-    from omnibench.study.report.study_report import study_document
+    from omnibench.study.report import study_document
     from omnibench.study.study import read_study_config, run_study
 
     config = read_study_config(file, data)

@@ -150,7 +150,7 @@ def design(
     from omnibench.config import to_json
     from omnibench.design.candidates import RobotOptions, design_source
     from omnibench.design.design import design_experiment
-    from omnibench.design.report.tables import design_document
+    from omnibench.design.report import design_document
     from omnibench.files import refuse_existing, write_text
     from omnibench.report.render import write_document
 
@@ -239,7 +239,7 @@ def slam(
         result = request.run(watch, table_format)
         if report is not None or figures is not None:
             watch(Progress("writing the report"))
-            document = recording_document(result.dataset, truth=result.truth, accuracy=result.accuracy)
+            document = recording_document(result.dataset, truth=result.truth, accuracy=result.summary.accuracy)
             if report is not None:
                 write_document(document, report)
             write_asked_figures(document, figures)

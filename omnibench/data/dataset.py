@@ -16,16 +16,39 @@ from pydantic_core import to_jsonable_python
 from omnibench.config import Model, Name, Positive, read_yaml, to_yaml, validate
 from omnibench.data.checks.finding import findings_of
 from omnibench.data.checks.implausible import implausible
-from omnibench.data.headings import unwrap
 from omnibench.data.references import References, odd_references, reference_flaw, with_whole_turns
 from omnibench.data.run_checks import check_sample_period, pose_times_flaw, reach_flaw, values_flaw, wheel_times_flaw
 from omnibench.data.scans import Scanner, Scans
 from omnibench.data.stored_rows import in_file, median_period, noted, period_of
 from omnibench.errors import ConfigError, DataError, nearest, require_type, shown
 from omnibench.robot.kinematics import Array, Drive, Robot, in_the_middle, interpolated
+from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog, kept_with_samples
 from omnibench.views import Shown
 from omnibench.words import plural
+
+TURN = 2 * np.pi  # rad
+
+
+def unwrap(robot: Robot, logs: Sequence[WheelLog], headings: Sequence[Array]) -> tuple[list[Array], list[int]]:
+    """Continuous headings (rad) and the indices of trajectories in which they are ambiguous.
+
+    Every increment gets the whole turns that bring it closest to the design model's odometry. Where the reference is
+    dense this is the nearest turn; where it is sparse, the odometry tells how often the robot turned in between. A
+    trajectory is ambiguous if the two still differ by more than a quarter turn between two reference poses.
+    """
+    model = OdometryModel.of_design(robot, "arc")
+    unwrapped: list[Array] = []
+    ambiguous: list[int] = []
+    for index, (odometry, heading) in enumerate(zip(model.poses(logs), headings, strict=True)):
+        steps, expected = np.diff(heading), np.diff(odometry[:, 2])
+        turns = np.round((expected - steps) / TURN)
+        # Added to the headings as recorded, so that continuous ones stay as they are to the bit.
+        unwrapped.append(heading + TURN * np.concatenate([[0.0], np.cumsum(turns)]))
+        if len(steps) and np.abs(steps + TURN * turns - expected).max() > TURN / 4:
+            ambiguous.append(index)
+    return unwrapped, ambiguous
+
 
 FORMAT: Final = "omnibench-dataset/1"
 
@@ -337,8 +360,17 @@ def make_dataset(
             f"headings of {plural(len(ambiguous), 'trajectory')} may be unwrapped wrongly (reference too sparse): "
             f"{shown}"
         ]
-    warnings += [] if warnings else _standing(standing, raw)  # in other units all runs seem to move too far
-    warnings += _late_references(raw) + _other_periods(median, sample_period)
+    # Where all stand, another warning says so; in other units all runs seem to move too far.
+    if 0 < len(standing) < len(raw) and not warnings:
+        warnings.append(
+            f"the reference moves in {plural(len(standing), 'trajectory')} though no wheel turns, which spoils every "
+            f"fit; leave {'it' if len(standing) == 1 else 'them'} out: {', '.join(standing[:5])}"
+        )
+    warnings += _late_references(raw)
+    if not 0.5 < median / sample_period < 2:
+        warnings.append(
+            f"sample_period is {sample_period:g} s, but the wheel samples come every {median:g} s (the median)"
+        )
     unwrapped = [
         replace(trajectory, poses=np.column_stack([trajectory.poses[:, :2], heading]))
         for trajectory, heading in zip(raw, headings, strict=True)
@@ -353,29 +385,16 @@ def make_dataset(
         robot, [(run.log([0.0]), run.references) for run in unwrapped if run.references is not None]
     )
     dataset = Dataset(name, robot, sample_period, tuple(unwrapped), description, source, licence, simulated, (), scans)
-    return replace(dataset, warnings=(*warnings, *_copied(dataset)))
+    if copies := dataset.copies:
+        are = "is a copy of a training run and is" if len(copies) == 1 else "are copies of training runs and are"
+        warnings.append(f"{plural(len(copies), 'trajectory')} {are} left out of validation: {', '.join(copies[:5])}")
+    return replace(dataset, warnings=tuple(warnings))
 
 
 def _with_drive(trajectory: Trajectory, robot: Robot) -> Trajectory:
     """A run with the drive signals of a robot that steers."""
     drive = None if robot.drive.direct else robot.drive
     return trajectory if trajectory.drive == drive else replace(trajectory, drive=drive)
-
-
-def _copied(dataset: Dataset) -> list[str]:
-    """Warning of runs for validation that are copies of training runs."""
-    if not dataset.copies:
-        return []
-    count, shown = len(dataset.copies), ", ".join(dataset.copies[:5])
-    are = "is a copy of a training run and is" if count == 1 else "are copies of training runs and are"
-    return [f"{plural(count, 'trajectory')} {are} left out of validation: {shown}"]
-
-
-def _other_periods(median: float, sample_period: float) -> list[str]:
-    """Warning of a sample period that the stamps contradict."""
-    if 0.5 < median / sample_period < 2:
-        return []
-    return [f"sample_period is {sample_period:g} s, but the wheel samples come every {median:g} s (the median)"]
 
 
 def _check_run(place: str, robot: Robot, trajectory: Trajectory) -> None:
@@ -411,17 +430,6 @@ def _check_run(place: str, robot: Robot, trajectory: Trajectory) -> None:
         raise DataError(f"{where}: references, row {flaw[0] + 1}: {flaw[1]}")
     if (flaw := reach_flaw(robot, times, trajectory.rates, trajectory.pose_times, trajectory.poses)) is not None:
         raise DataError(f"{where}: {flaw[1]}")
-
-
-def _standing(standing: Sequence[str], trajectories: Sequence[Trajectory]) -> list[str]:
-    """Warning of runs in which the reference moves and the wheels do not, where other runs drive."""
-    if not 0 < len(standing) < len(trajectories):
-        return []  # another warning says that no run drives
-    count, shown = len(standing), ", ".join(standing[:5])
-    return [
-        f"the reference moves in {plural(count, 'trajectory')} though no wheel turns, which spoils every fit; leave "
-        f"{'it' if count == 1 else 'them'} out: {shown}"
-    ]
 
 
 def _moves_unseen(matrix: Array, run: Trajectory) -> bool:

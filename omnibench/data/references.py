@@ -118,10 +118,6 @@ class References(Brief):
         t0, t1, values, sigmas = (array[order] for array in (self.t0, self.t1, self.values, self.sigmas))
         return replace(self, kinds=self.kinds[order], t0=t0, t1=t1, values=values, sigmas=sigmas)
 
-    def with_values(self, values: Array) -> References:
-        """These measurements with other values (R, 2)."""
-        return replace(self, values=values)
-
     def of_run(self, zero: float, end: float, kept: NDArray[np.bool_] | slice = slice(None)) -> References:
         """These measurements, or those kept (R,), by the time of a run that began at ``zero`` and lasted ``end`` s.
 
@@ -185,37 +181,22 @@ def _filled(values: Array, others: Array) -> Array:
 _LATE = 0.5  # s after the last wheel sample: a later reference is not of this run
 
 
-def reference_flaw(references: References, times: Array) -> Flaw | None:
-    """The first flaw in a run's references, None if there is none. times (F,): ends of its wheel samples, s."""
+def reference_flaw(references: References, times: Array | None) -> Flaw | None:
+    """The first flaw in a run's references, None if there is none.
+
+    times (F,): ends of its wheel samples, s; None: whatever the times of the references are.
+    """
     for row, kind in enumerate(references.kinds.tolist()):
-        what = (
-            _kind_flaw(kind)
-            or _times_flaw(kind, float(references.t0[row]), float(references.t1[row]), float(times[-1]))
-            or _numbers_flaw(kind, references.values[row], references.sigmas[row])
-        )
-        if what:
+        if kind not in KINDS:
+            return row, f"kind is {kind!r}; {nearest(kind, KINDS)}it must be one of {', '.join(KINDS)}"
+        what = ""
+        if times is not None:
+            what = _times_flaw(kind, float(references.t0[row]), float(references.t1[row]), float(times[-1]))
+        if what := what or _numbers_flaw(kind, references.values[row], references.sigmas[row]):
             return row, what
-    return _rate_flaw(references)
-
-
-def measurement_flaw(references: References) -> Flaw | None:
-    """The first flaw in kinds, values and standard deviations, whatever their times; None if there is none."""
-    for row, kind in enumerate(references.kinds.tolist()):
-        if what := _kind_flaw(kind) or _numbers_flaw(kind, references.values[row], references.sigmas[row]):
-            return row, what
-    return _rate_flaw(references)
-
-
-def _rate_flaw(references: References) -> Flaw | None:
     if np.isfinite(references.rate_sigma) and 0 <= references.rate_sigma <= LARGEST:
         return None
     return 0, f"sigma_rate is {references.rate_sigma:g}; the standard deviation of a gyro's offset is >= 0, rad/s"
-
-
-def _kind_flaw(kind: str) -> str:
-    if kind in KINDS:
-        return ""
-    return f"kind is {kind!r}; {nearest(kind, KINDS)}it must be one of {', '.join(KINDS)}"
 
 
 def _times_flaw(kind: str, t0: float, t1: float, end: float) -> str:
@@ -280,7 +261,7 @@ def with_whole_turns(robot: Robot, log: WheelLog, references: References) -> Ref
             steps = np.diff(headings, prepend=before[0])
             turns = np.round((np.diff(driven, prepend=before[1]) - steps) / TURN)
             values[chosen, 0] = headings + TURN * np.cumsum(turns)
-    return references.with_values(values)
+    return replace(references, values=values)
 
 
 # How many times too large references in another unit are, and that unit.

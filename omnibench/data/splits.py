@@ -122,12 +122,7 @@ def training_split(dataset: Dataset) -> tuple[Trajectory, ...]:
 
 def every_second(groups: Sequence[Hashable]) -> list[Split]:
     """Splits by turns within each group, in the order given; the first member trains."""
-    seen: Counter[Hashable] = Counter()
-    splits: list[Split] = []
-    for group in groups:
-        splits.append("train" if seen[group] % 2 == 0 else "validation")
-        seen[group] += 1
-    return splits
+    return ["train" if number % 2 else "validation" for number in repetitions(groups)]
 
 
 def repetitions(commands: Sequence[Hashable]) -> list[int]:

@@ -264,23 +264,24 @@ def load_dataset(path: Path | str | Sequence[Path | str], *, most_in_memory: int
         scans=recorded[0].scans if len(recorded) == 1 else None,
     )
     if len(recorded) > 1:
-        left_out = [SCANS_LEFT_OUT] if any(each.scans is not None for each in recorded) else []
-        dataset = replace(dataset, warnings=(*dataset.warnings, *left_out, *_there_twice(dataset.trajectories)))
+        warnings = [*dataset.warnings]
+        if any(each.scans is not None for each in recorded):
+            warnings.append(SCANS_LEFT_OUT)
+        # Runs of several folders that hold the same recording.
+        originals: dict[str, str] = {}
+        copies = [run.id for run in dataset.trajectories if originals.setdefault(run.fingerprint, run.id) != run.id]
+        if copies:
+            shown = some(copies, 5)
+            warnings.append(
+                f"{plural(len(copies), 'run')} of another folder there twice, counted as repetitions: {shown}"
+            )
+        dataset = replace(dataset, warnings=tuple(warnings))
     return replace(dataset, imported=first.imported if len(recorded) == 1 else None)
 
 
 def load_whole(path: Path | str) -> Dataset:
     """Read a data set as load_dataset does, into memory whatever its size: for work that needs all samples at once."""
     return load_dataset(path, most_in_memory=sys.maxsize)
-
-
-def _there_twice(runs: Sequence[Trajectory]) -> list[str]:
-    """Warning of runs of several folders that hold the same recording."""
-    first: dict[str, str] = {}
-    copies = [run.id for run in runs if first.setdefault(run.fingerprint, run.id) != run.id]
-    if not copies:
-        return []
-    return [f"{plural(len(copies), 'run')} of another folder there twice, counted as repetitions: {some(copies, 5)}"]
 
 
 def _all_of(texts: Sequence[str]) -> str:
@@ -332,8 +333,11 @@ def save_dataset(
         ):
             raise DataError(f"data set {dataset.name}: {flaw[1]}; leave it out")
     check_dataset_folder(folder)
-    if not overwrite:
-        _check_origin(folder, dataset)
+    if not overwrite and (folder / "dataset.yaml").is_file():
+        old = read_header(folder)
+        if (old.name, old.simulated) != (dataset.name, dataset.simulated):
+            kind = "simulated " if old.simulated else ""
+            raise DataError(f"{folder}: holds the {kind}data set {old.name!r}; name another folder, or overwrite=True")
     tables = tables_of(dataset)
     contents: dict[Path, FileContent] = {folder / "dataset.yaml": header_of(dataset).text.encode()}
     for name, frame in tables.items():
@@ -363,16 +367,6 @@ def check_dataset_folder(folder: Path) -> None:
     if folder.is_dir() and any(folder.iterdir()) and not (folder / "dataset.yaml").is_file():
         raise DataError(f"{folder}: holds other files; name an empty or new folder for the data set")
     check_place(folder)
-
-
-def _check_origin(folder: Path, dataset: Dataset) -> None:
-    """DataError: the folder holds another data set."""
-    if not (folder / "dataset.yaml").is_file():
-        return
-    old = read_header(folder)
-    if (old.name, old.simulated) != (dataset.name, dataset.simulated):
-        kind = "simulated " if old.simulated else ""
-        raise DataError(f"{folder}: holds the {kind}data set {old.name!r}; name another folder, or overwrite=True")
 
 
 def header_of(dataset: Dataset) -> Header:

@@ -50,7 +50,20 @@ class BlockFile:
         """Values (count, n) of some columns from row ``first`` on, of one block, read-only."""
         block = bisect_right(self.edges, first) - 1
         begin = self.edges[block]
-        return _BLOCKS.of(self, columns, block)[first - begin : first - begin + count]
+        return self._block(columns, block)[first - begin : first - begin + count]
+
+    def _block(self, columns: tuple[str, ...], block: int) -> Array:
+        """A block from memory, or read into it in the place of the one that was used longest ago."""
+        key = self, columns, block
+        with _blocks_lock:
+            if key in _blocks:
+                _blocks.move_to_end(key)
+                return _blocks[key]
+            while len(_blocks) >= _BLOCKS_KEPT:  # before the next is read: memory never holds one more
+                _blocks.popitem(last=False)
+            values = _blocks[key] = self.read(columns, block)
+        tell_reading(len(values), "sample")
+        return values
 
     def read(self, columns: tuple[str, ...], block: int) -> Array:
         """Values (rows, n) of some columns of a block. DataError: the file has changed, or cannot be read."""
@@ -126,27 +139,9 @@ def readable(file: Path) -> Iterator[None]:
         raise DataError(f"{file}: cannot be read: {error}") from None
 
 
-@dataclass
-class _Blocks:
-    """The blocks that were read last, for all threads of this process."""
-
-    kept: OrderedDict[tuple[BlockFile, tuple[str, ...], int], Array] = field(default_factory=OrderedDict)
-    lock: threading.Lock = field(default_factory=threading.Lock)
-
-    def of(self, file: BlockFile, columns: tuple[str, ...], block: int) -> Array:
-        key = file, columns, block
-        with self.lock:
-            if key in self.kept:
-                self.kept.move_to_end(key)
-                return self.kept[key]
-            while len(self.kept) >= _BLOCKS_KEPT:  # before the next is read: memory never holds one more
-                self.kept.popitem(last=False)
-            values = self.kept[key] = file.read(columns, block)
-        tell_reading(len(values), "sample")
-        return values
-
-
-_BLOCKS = _Blocks()
+# The blocks that were read last, for all threads of this process.
+_blocks: OrderedDict[tuple[BlockFile, tuple[str, ...], int], Array] = OrderedDict()
+_blocks_lock = threading.Lock()
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from numbers import Real
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import polars as pl
@@ -257,13 +257,6 @@ class WheelArrays(NamedTuple):
     odometry: Array | None = None
 
 
-class WheelSource(Protocol):
-    """A table of wheel samples, in memory or in its file."""
-
-    def of_runs(self, runs: Table, robot: Robot) -> list[WheelArrays]:
-        """The samples of each of the runs. DataError names the table, the row and what is wrong."""
-
-
 def wheel_columns(robot: Robot) -> dict[str, list[str]]:
     """The columns of each of the arrays of WheelArrays; those of no length are not there."""
     wheels, steered = robot.wheel_names, robot.drive.steered
@@ -296,7 +289,7 @@ class WheelTable:
     table: Table
 
     def of_runs(self, runs: Table, robot: Robot) -> list[WheelArrays]:
-        """The samples of each of the runs, see WheelSource."""
+        """The samples of each of the runs. DataError names the table, the row and what is wrong."""
         table = self.table
         check_steering(table.file, table.frame.columns, robot)
         rows_of_runs = rows_by_trajectory(runs, table)
@@ -318,25 +311,21 @@ REFERENCE_COLUMNS = ("trajectory", "kind")  # those that every such table has
 
 
 def read_references(
-    table: Table | None, wheel_times: Mapping[str, Array], started: Collection[str], runs_file: str
+    runs: Table, table: Table | None, wheel_times: Sequence[Array], started: Collection[str]
 ) -> dict[str, References]:
     """The references of each run that has some; none where there is no such table.
 
     wheel_times: ends of the wheel samples (F,) of each run, s. started: ids of the runs whose start pose is known.
-    runs_file: the table that names the runs. DataError in one line names the file, the row and what is wrong.
+    DataError in one line names the file, the row and what is wrong.
     """
     if table is None:
         return {}
-    owners, kinds = table.frame["trajectory"], table.frame["kind"]
-    table.refuse(~owners.is_in(list(wheel_times)), lambda row: f"trajectory {owners[row]} is not in {runs_file}")
+    ids = runs.frame["trajectory"].to_list()
+    rows_of_runs = rows_by_trajectory(runs, table, ids)
     numbers = {name: _column(table, name) for name in NUMBERS}
-    texts = np.array(["" if kind is None else str(kind).strip() for kind in kinds], dtype=str)
+    texts = np.array(["" if kind is None else str(kind).strip() for kind in table.frame["kind"]], dtype=str)
     found: dict[str, References] = {}
-    number = {run: index for index, run in enumerate(wheel_times)}
-    codes = np.array([number[run] for run in owners], dtype=np.intp)
-    counts = np.bincount(codes, minlength=len(number))
-    of_runs = np.split(np.argsort(codes, kind="stable"), np.cumsum(counts)[:-1])
-    for (run, times), rows in zip(wheel_times.items(), of_runs, strict=True):
+    for run, times, rows in zip(ids, wheel_times, rows_of_runs, strict=True):
         if not len(rows):
             continue
         chosen = {name: values[rows] for name, values in numbers.items()}
@@ -621,7 +610,7 @@ class DatasetTables:
     """
 
     runs: Table
-    wheels: WheelSource
+    wheels: WheelTable | StoredWheels
     poses: Table | None
     references: Table | None
     commands: Table | None = None
@@ -646,9 +635,8 @@ class DatasetTables:
                 raise runs.fail(row, f"split is {split!r}; {nearest(str(split), SPLITS)}it must be train or validation")
         samples = self.wheels.of_runs(runs, robot)
         ids = runs.frame["trajectory"].to_list()
-        ends = {run: arrays.times for run, arrays in zip(ids, samples, strict=True)}
         started = set() if poses is None else set(poses.frame["trajectory"])
-        references = read_references(self.references, ends, started, runs.file.name)
+        references = read_references(runs, self.references, [arrays.times for arrays in samples], started)
         pose_rows = _pose_rows(runs, poses, references)
         reference = None if poses is None else _PoseColumns(poses)
         sent = [None] * len(ids) if self.commands is None else _sent(runs, self.commands)

@@ -25,8 +25,17 @@ from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
-from omnibench.simulate.commands import Command, TimedCommand, default_directions, steering_limit, wheels_of
-from omnibench.simulate.drivable_commands import LONGEST, SHORTEST, DrivableCommands, Shapes
+from omnibench.simulate.commands import (
+    LONGEST,
+    SHORTEST,
+    Command,
+    DrivableCommands,
+    Shapes,
+    TimedCommand,
+    default_directions,
+    steering_limit,
+    wheels_of,
+)
 from omnibench.simulate.flower import planned_commands, run_as_designed
 from omnibench.simulate.robot_config import RobotConfig
 from omnibench.simulate.source import ComparedData
@@ -34,11 +43,8 @@ from omnibench.words import noun_for, plural
 
 # What follows offers shapes of runs; more of them change a design little, because it is a choice of few (chosen).
 _SHAPES = Shapes(lines=(0.5, 1.0), radii=(0.1, 0.2, 0.4, 0.8), turns=(45.0, 90.0, 180.0, 360.0), spins=(360.0, 1080.0))
-_MOST = {
-    "steering_limit": 180.0,
-    "position_noise": 10.0,
-    "heading_noise": 90.0,
-}  # deg, m, deg: more is a slip of the pen
+# deg, m, deg: more is a slip of the pen.
+_MOST = {"steering_limit": 180.0, "position_noise": 10.0, "heading_noise": 90.0}
 _SET = "robot"  # name of the candidates' set
 _SAMPLE_PERIOD, _POSE_PERIOD = 0.05, 0.25  # s; commands are constant, so that longer samples tell the same
 # White noise of a motion capture or of scan matching, and per sqrt(s) what a floor and slip add: the order of magnitude
@@ -143,7 +149,10 @@ class RobotCommands(Model):
 
         source: for messages. ConfigError: the commands leave part of the matrix undetermined.
         """
-        commands, robot = tuple(dict.fromkeys(self.commands())), self.robot
+        # Lines, arcs to both sides and turns on the spot, each as fast as the limits allow.
+        robot, limit, free = self.robot, self._steering_limit, self._free
+        drivable = DrivableCommands(robot, self.max_speed, self.max_turn_rate, self._wheel_rate, limit, free, _SHAPES)
+        commands = tuple(dict.fromkeys(drivable))
         if not any(timed.command.turn_rate for timed in commands):
             raise ConfigError(
                 f"{source}: no curve that it can drive within {LONGEST:g} s fits an area of {self.area[0]:g} x "
@@ -180,18 +189,6 @@ class RobotCommands(Model):
                     "Left is counter-clockwise as seen from above, backward too. Begin where a run stays on the floor.",
                 ),
             )
-        )
-
-    def commands(self) -> DrivableCommands:
-        """Lines, arcs to both sides and turns on the spot, each as fast as the limits allow."""
-        return DrivableCommands(
-            self.robot,
-            self.max_speed,
-            self.max_turn_rate,
-            self._wheel_rate,
-            self._steering_limit,
-            self._free,
-            _SHAPES,
         )
 
     @property

@@ -13,7 +13,7 @@ from omnibench.errors import UnknownNameError
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Robot
 from omnibench.robot.odometry import Integration
-from omnibench.simulate.commands import MotionGrid, SingleCommand, TimedCommand, beyond_steering, within_steering
+from omnibench.simulate.commands import MotionGrid, SingleCommand, TimedCommand, beyond_steering, unsteerable
 from omnibench.simulate.config import SteeringLimit
 from omnibench.words import plural
 
@@ -103,8 +103,7 @@ class DesignConfig(Model):
             if not commands:
                 raise ValueError(f"sets.{name}: no command moves the robot")
             chosen = [timed.command for timed in commands]
-            _, beyond = within_steering(self.robot, chosen, self.steering_limit_deg)
-            if beyond:
+            if beyond := unsteerable(self.robot, chosen, self.steering_limit_deg):
                 why = beyond_steering(self.robot, beyond, self.steering_limit_deg)
                 raise ValueError(f"sets.{name}: {why}; take such commands out")
             samples = sum(command.duration for command in commands) * (1 / self.sample_period + 1 / self.pose_period)

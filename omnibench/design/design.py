@@ -67,7 +67,11 @@ class DesignProblem:
         self.basis: Array = np.kron(np.eye(3), directions.T)
         self.information = {name: self._information(name) for name in USES}
         self._everything: dict[Use, Candidates] = {}
-        self._physical = _element_slopes(pool.robot) if len(directions) == 3 and is_invertible(pool.robot) else None
+        # Of three omni wheels the derivatives (9, 9) of the physical parameters by the matrix elements.
+        self._physical: Array | None = None
+        if len(directions) == 3 and is_invertible(pool.robot):
+            geometry = WheelGeometry(pool.robot)
+            self._physical = np.linalg.inv(geometry.slopes(geometry.start))
 
     def _information(self, use: Use) -> Array:
         """Mean information (C, p, p) of a run of each candidate."""
@@ -130,7 +134,7 @@ class DesignProblem:
             effort=self.effort(counts),
             relative=relative,
             row_percent=(first, second, third),
-            motions=tuple(_motion_precision(name, signals, covariance) for name, signals in _motions(self.pool.robot)),
+            motions=tuple(_motion_precisions(self.pool.robot, covariance)),
             physical=physical,
         )
 
@@ -183,29 +187,18 @@ def _described(candidate: CandidateRun, robot: Robot) -> Candidate:
     )
 
 
-def _motions(robot: Robot) -> Iterator[tuple[str, Array]]:
-    """Each motion of a robot by its name, with the signals (M,) that drive 1 m of it or a full turn, rad."""
+def _motion_precisions(robot: Robot, covariance: Array) -> Iterator[MotionPrecision]:
+    """Standard deviations of 1 m of each motion of a robot and of a full turn; covariance (3M, 3M): of the matrix."""
     names = ("1 m ahead", "1 m aside", "a full turn") if robot.slides and not robot.skid else ("1 m", "a full turn")
     for name, motion in zip(names, robot.motions, strict=True):
         length = math.tau / motion[2] if name == "a full turn" else 1 / math.hypot(motion[0], motion[1])
-        yield name, length * robot.signal_equations @ motion
-
-
-def _motion_precision(name: str, signals: Array, covariance: Array) -> MotionPrecision:
-    """Standard deviations of a motion with those signals (M,) under a covariance (3M, 3M) of the matrix."""
-    along = np.kron(np.eye(3), signals)
-    x, y, heading = np.sqrt(np.maximum(np.diagonal(along @ covariance @ along.T), 0.0)).tolist()
-    return MotionPrecision(motion=name, position_mm=1000 * math.hypot(x, y), heading_deg=math.degrees(heading))
+        along = np.kron(np.eye(3), length * robot.signal_equations @ motion)
+        x, y, heading = np.sqrt(np.maximum(np.diagonal(along @ covariance @ along.T), 0.0)).tolist()
+        yield MotionPrecision(motion=name, position_mm=1000 * math.hypot(x, y), heading_deg=math.degrees(heading))
 
 
 def _cost(candidate: Candidate, per: Per) -> float:
     return {"run": 1.0, "second": candidate.duration_s, "metre": candidate.rolled_m}[per]
-
-
-def _element_slopes(robot: Robot) -> Array:
-    """Derivatives (9, 9) of the physical parameters of three omni wheels with respect to the matrix elements."""
-    geometry = WheelGeometry(robot)
-    return np.linalg.inv(geometry.slopes(geometry.start))
 
 
 def _physical_spread(slopes: Array, covariance: Array, robot: Robot) -> PhysicalSpread:

@@ -62,9 +62,8 @@ from omnibench.robot.effects.effect import Effect
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.signals import of_centre
-from omnibench.simulate.commands import TimedCommand, Variation, is_within
+from omnibench.simulate.commands import DrivableCommands, Shapes, TimedCommand, Variation, is_within
 from omnibench.simulate.config import FlowerConfig
-from omnibench.simulate.drivable_commands import DrivableCommands, Shapes
 from omnibench.simulate.flower import run_as_designed
 from omnibench.words import plural
 

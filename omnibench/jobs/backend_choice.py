@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 from omnibench.config import Model
 from omnibench.errors import ConfigError, nearest
 from omnibench.jobs.job import Backend, TlsFiles
-from omnibench.jobs.local_backends import Processes
+from omnibench.jobs.job_process import Processes
 from omnibench.progress import Progress, Reporter, no_progress
 
 _NAMES = ("processes", "dask")
@@ -84,8 +84,7 @@ def open_backend(
         finally:
             processes.close()
         return
-    from omnibench.jobs.dask_backend import DaskBackend
-    from omnibench.jobs.dask_cluster import checked_requirements, dask_client, say_cluster
+    from omnibench.jobs.dask_backend import DaskBackend, checked_requirements, dask_client, say_cluster
 
     address = None if choice.name == "dask" else choice.name
     with dask_client(address, choice.workers, choice.tls, report) as client:

@@ -64,6 +64,7 @@ class Store(Protocol[T]):
 
     def anchored(self) -> Self:
         """The store, to be found by a job that changes its working folder, too."""
+        return self
 
     def get(self, key: str) -> T | None:
         """The stored result; None where there is none."""
@@ -75,7 +76,8 @@ class Store(Protocol[T]):
         """The result as ``put_content`` takes it from a machine that does not reach the store."""
 
     def put(self, key: str, result: T) -> None:
-        """Store a result."""
+        """Store a result, whole or not at all. DataError when it cannot be written, ValueError for a wrong type."""
+        self.put_content(key, self.content(key, result))
 
     def put_content(self, key: str, content: Any) -> None:
         """Store a result that another process made the content of."""
@@ -85,7 +87,7 @@ class Store(Protocol[T]):
 
 
 @dataclass(frozen=True)
-class ResultStore(Generic[T]):
+class ResultStore(Store[T]):
     """Results by key, each in a JSON file in ``folder``.
 
     kind: their class, a dataclass or a document whose fields pydantic can write and read (arrays: ``JsonArray``).
@@ -104,10 +106,6 @@ class ResultStore(Generic[T]):
             return _adapter(self).validate_json(self.file(key).read_bytes())
         except (OSError, ValueError):  # ValueError: pydantic's and Unicode's errors, too
             return None
-
-    def put(self, key: str, result: T) -> None:
-        """Store a result, whole or not at all. DataError when it cannot be written, ValueError for a wrong type."""
-        self.put_content(key, self.content(key, result))
 
     def keep(self, key: str, result: T) -> None:
         """Store a result, as ``put``: a job whose file is there has done its work, whatever becomes of its parent."""
@@ -275,7 +273,7 @@ def gathered(
     return [results.by_number[number] for number in range(len(arguments))]
 
 
-class _InMemory(Generic[T]):
+class _InMemory(Store[T]):
     """Results in memory, pickled until they are asked for, which is once."""
 
     def __init__(self) -> None:
@@ -283,9 +281,6 @@ class _InMemory(Generic[T]):
 
     def __reduce__(self) -> tuple[type[Self], tuple[()]]:
         return type(self), ()  # where results are made nobody needs the others
-
-    def anchored(self) -> Self:
-        return self
 
     def get(self, key: str) -> T | None:
         content = self._contents.pop(key, None)
@@ -296,9 +291,6 @@ class _InMemory(Generic[T]):
 
     def content(self, _: str, result: T) -> bytes:
         return pickle.dumps(result, pickle.HIGHEST_PROTOCOL)
-
-    def put(self, key: str, result: T) -> None:
-        self.put_content(key, self.content(key, result))
 
     def put_content(self, key: str, content: bytes) -> None:
         self._contents[key] = content

@@ -14,7 +14,7 @@ from omnibench.errors import UnknownNameError
 from omnibench.robot.calibration import EffectTerm, Noise
 from omnibench.robot.kinematics import PUBLISHED, Robot
 from omnibench.robot.odometry import Integration
-from omnibench.simulate.commands import Command, Commands, MotionGrid, beyond_steering, within_steering
+from omnibench.simulate.commands import Command, Commands, MotionGrid, beyond_steering, unsteerable
 from omnibench.words import plural
 
 _MOST_NOISE = 1e4  # rad/s, or a factor; chosen: a hundred thousand turns a minute
@@ -165,12 +165,10 @@ class Experiment(Model, Generic[S]):
         return (f"{left_out}: {self._beyond(beyond)}",)
 
     def _is_steered(self, command: Command) -> bool:
-        extremes = self.commands.extremes(command)
-        return not within_steering(self.robot, extremes, self.steering_limit_deg)[1]
+        return not unsteerable(self.robot, self.commands.extremes(command), self.steering_limit_deg)
 
     def _beyond(self, left_out: Sequence[Command]) -> str:
-        extremes = self.commands.extremes(left_out[0])
-        _, beyond = within_steering(self.robot, extremes, self.steering_limit_deg)
+        beyond = unsteerable(self.robot, self.commands.extremes(left_out[0]), self.steering_limit_deg)
         return beyond_steering(self.robot, beyond, self.steering_limit_deg)
 
     @property

@@ -110,9 +110,8 @@ def _course(now: Phase, target: float, limits: SlewLimits) -> tuple[Phase, ...]:
 
 def _s_curve(now: Phase, target: float, limits: SlewLimits) -> list[tuple[float, float, float]]:
     """Duration, slope at the begin and jerk of the three phases, from any slope to slope 0."""
-    coasting = now.scale + now.slope * abs(now.slope) / (
-        2 * limits.jerk
-    )  # the scale that is reached if the slope goes to 0 at once
+    # The scale that is reached if the slope goes to 0 at once.
+    coasting = now.scale + now.slope * abs(now.slope) / (2 * limits.jerk)
     sign = math.copysign(1.0, target - coasting)
     slope, missing, jerk = sign * now.slope, sign * (target - now.scale), limits.jerk
     peak = max(min(limits.slope, math.sqrt(max(jerk * missing + slope**2 / 2, 0.0))), slope, 0.0)

@@ -190,19 +190,20 @@ class Pid(NamedTuple):
     supply: float
 
 
-def motor_steps(
-    resistance: float, inductance: float, torque: float, inertia: float, static: float, coulomb: float, viscous: float
-) -> MotorSteps:
-    """Transition of a motor. Units: ohm, H; at the wheel N m/A (= V s/rad), kg m2, N m, N m, N m s/rad."""
+def motor_steps(motor: Motor) -> MotorSteps:
+    """Transition of a motor's state."""
+    resistance, inductance, inertia = motor.resistance, motor.inductance, motor.inertia
+    torque = motor.wheel_torque_constant
     system = np.zeros((5, 5))  # state: current, rate, angle, voltage, friction; the last two are constant
     system[0, [0, 1, 3]] = [-resistance / inductance, -torque / inductance, 1 / inductance]
-    system[1, [0, 1, 4]] = [torque / inertia, -viscous / inertia, -1 / inertia]
+    system[1, [0, 1, 4]] = [torque / inertia, -motor.viscous_friction / inertia, -1 / inertia]
     system[2, 1] = 1.0
     moving = np.ascontiguousarray(expm(system * _STEP)[[0, 1, 2]][:, [0, 1, 3, 4]])
     held = math.exp(-resistance / inductance * _STEP)
-    return MotorSteps(moving, held, (1 - held) / resistance, torque, static, coulomb)
+    return MotorSteps(moving, held, (1 - held) / resistance, torque, motor.static_friction, motor.coulomb_friction)
 
 
+@compiled
 def drive_wheel(
     motor: MotorSteps, pid: Pid, tick: float, targets: Array, start: float, sample_steps: int
 ) -> tuple[Array, Array, Array]:
@@ -211,14 +212,6 @@ def drive_wheel(
     tick: angle of an encoder tick, rad. sample_steps: milliseconds of a sample. Returns true angles (sample_steps F +
     1,) at every millisecond, rad; the encoder's count (F,) at the end of every sample; voltages (F,), V.
     """
-    angles, counts, voltages = _drive(motor, pid, tick, np.ascontiguousarray(targets, float), start, sample_steps)
-    return angles, counts, voltages
-
-
-@compiled
-def _drive(
-    motor: MotorSteps, pid: Pid, tick: float, targets: Array, start: float, sample_steps: int
-) -> tuple[Array, Array, Array]:
     samples = len(targets)
     period = sample_steps * TRUE_STEP
     angles = np.empty(samples * sample_steps + 1)
@@ -228,10 +221,8 @@ def _drive(
     current = rate = integral = measured = before = 0.0
     for sample in range(samples):
         if abs(targets[sample]) * period < _STANDING * tick and abs(measured) * period < 1.5 * tick:
-            voltage, integral = (
-                0.0,
-                0.0,
-            )  # the motor brakes: a controller that answers to single ticks would never let it rest
+            # The motor brakes: a controller that answers to single ticks would never let it rest.
+            voltage, integral = 0.0, 0.0
         else:
             voltage, integral = _controlled(pid, targets[sample], measured, before, integral, period)
         for step in range(sample_steps):
@@ -307,11 +298,13 @@ def drive_session(
     steps = round(sample_period / TRUE_STEP)
     if steps < 1 or abs(sample_period - steps * TRUE_STEP) > 1e-9:
         raise ConfigError(f"sample_period {sample_period:g} s: the motors need a whole number of milliseconds")
-    drives = [(_steps_of(each), _pid_of(controller, each)) for each in motors_of_wheels(motor, len(start_angles))]
+    gains = (controller.proportional, controller.integral, controller.derivative)
+    motors = motors_of_wheels(motor, len(start_angles))
+    drives = [(motor_steps(each), Pid(*gains, each.supply_voltage)) for each in motors]
     angles, runs = np.asarray(start_angles, float), []
     for rates in targets:
         wheels = [
-            drive_wheel(*drive, encoder.tick, wheel_rates, angle, steps)
+            drive_wheel(*drive, encoder.tick, np.ascontiguousarray(wheel_rates, float), angle, steps)
             for drive, wheel_rates, angle in zip(drives, rates.T, angles, strict=True)
         ]
         true, counts, voltages = (np.column_stack(columns) for columns in zip(*wheels, strict=True))
@@ -320,19 +313,3 @@ def drive_session(
         runs.append(DrivenRun(true, measured, counts * encoder.tick, voltages))
         angles = true[-1]
     return runs
-
-
-def _steps_of(motor: Motor) -> MotorSteps:
-    return motor_steps(
-        motor.resistance,
-        motor.inductance,
-        motor.wheel_torque_constant,
-        motor.inertia,
-        motor.static_friction,
-        motor.coulomb_friction,
-        motor.viscous_friction,
-    )
-
-
-def _pid_of(controller: Controller, motor: Motor) -> Pid:
-    return Pid(controller.proportional, controller.integral, controller.derivative, motor.supply_voltage)

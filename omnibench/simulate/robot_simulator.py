@@ -44,9 +44,14 @@ def simulate_robot(
     commands = config.driven
     check_reach(config.robot, commands, config.motor)
     sessions = config.sessions
+    # Commands that lead the robot, as designed, out of the room.
+    mount = config.robot.mount
     for command in commands:
-        for session in sessions.values():
-            _check_way(config, plan, command, session)
+        twist = command.twist if mount is None else mount.twist @ command.twist
+        for session in sessions.values() if command.speed else ():
+            times = np.linspace(0.0, session.distance / command.speed, max(2, math.ceil(session.distance / _STEP)))
+            path = DrivenPath(times[-1:], plan.start, times[-1] * twist[None], "arc")
+            plan.check_path(_places(path.poses(times), mount), times, config.radius, f"command {command.name}")
     truth = true_record(config.truth, config.robot, config.sample_period, tuple(sessions), name)
     simulator = _RobotSimulator(config, truth.true_robot(TRUE_STEP), plan, commands)
     runs: list[_Recorded] = []
@@ -71,17 +76,6 @@ def simulate_robot(
     dataset = replace(dataset, warnings=warnings)
     paths = {run.trajectory.id: run.path for run in runs}
     return Simulation(dataset, truth, paths, plan, {run.trajectory.id: run.start for run in runs})
-
-
-def _check_way(config: RobotConfig, plan: FloorPlan, command: Command, session: RobotSession) -> None:
-    """ConfigError if the command leads the robot, as designed, out of the room."""
-    if not command.speed:
-        return
-    times = np.linspace(0.0, session.distance / command.speed, max(2, math.ceil(session.distance / _STEP)))
-    mount = config.robot.mount
-    twist = command.twist if mount is None else mount.twist @ command.twist
-    path = DrivenPath(times[-1:], plan.start, times[-1] * twist[None], "arc")
-    plan.check_path(_places(path.poses(times), mount), times, config.radius, f"command {command.name}")
 
 
 def _places(poses: Array, mount: Mount | None) -> Array:

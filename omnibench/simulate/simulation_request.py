@@ -166,17 +166,14 @@ class SimulationRequest:
         save_dataset(simulation.dataset, self.output, table_format, overwrite=self.force)
         accuracy = slam_accuracy(simulation.dataset, simulation.paths) if simulation.paths else None
         if self.truth is not None:
-            self._write_truth(self.truth, simulation, accuracy)
+            write_text(self.truth / TRUTH_FILE, to_yaml(simulation.truth))
+            if accuracy is None:
+                for name in (POSES_FILE, ACCURACY_FILE):  # an earlier truth's
+                    remove(self.truth / name)
+            else:
+                write_true_poses(self.truth, simulation.paths)
+                write_text(self.truth / ACCURACY_FILE, to_json(accuracy) + "\n")
         return WrittenSimulation(simulation.dataset, simulation, accuracy)
-
-    def _write_truth(self, folder: Path, simulation: Simulation, accuracy: SlamAccuracy | None) -> None:
-        write_text(folder / TRUTH_FILE, to_yaml(simulation.truth))
-        if accuracy is None:
-            for name in (POSES_FILE, ACCURACY_FILE):  # an earlier truth's
-                remove(folder / name)
-            return
-        write_true_poses(folder, simulation.paths)
-        write_text(folder / ACCURACY_FILE, to_json(accuracy) + "\n")
 
 
 def _refuse(options: Iterable[tuple[str, bool]], why: str) -> None:

@@ -30,7 +30,7 @@ from omnibench.robot.model import OdometryModel, reported_poses
 from omnibench.robot.odometry import Integration, WheelLog
 from omnibench.robot.signals import of_centre, signals_of
 from omnibench.simulate.commands import Variation
-from omnibench.simulate.config import EncoderNoise, Tolerances, Truth
+from omnibench.simulate.config import EncoderNoise, Truth
 from omnibench.simulate.floor_plan import FloorPlan
 from omnibench.simulate.mechanics import (
     BODY,
@@ -218,14 +218,11 @@ class TruthRecord(Model):
         robot = self.robot if self.mount is None else self.robot.model_copy(update={"mount": self.mount})
         terms = tuple(effect.term(robot, where) for effect in self.effects)
         model = OdometryModel(robot, np.array(self.matrix), self.integration, terms, step or self.sample_period)
-        return TrueRobot(model, self._contacts)
-
-    @property
-    def _contacts(self) -> WheelContacts | None:
-        if self.wheels is None or _moved_by_matrix(self.robot, self.mount):
-            return None
-        offsets = [self.steering_offsets[name] for name in self.robot.drive.steered]
-        return WheelContacts(self.robot, self.wheels, offsets, self.mount, self.lateral_friction)
+        contacts = None
+        if self.wheels is not None and not _moved_by_matrix(self.robot, self.mount):
+            offsets = [self.steering_offsets[name] for name in self.robot.drive.steered]
+            contacts = WheelContacts(self.robot, self.wheels, offsets, self.mount, self.lateral_friction)
+        return TrueRobot(model, contacts)
 
 
 def true_record(
@@ -239,7 +236,11 @@ def true_record(
     noise: EncoderNoise | None = None,
     variation: Variation | None = None,
 ) -> TruthRecord:
-    """The record of a data set's truth. UnknownNameError as for ``complete_effects``."""
+    """The record of a data set's truth.
+
+    sessions: names of those that are driven. UnknownNameError: no such effect, or no such parameter for this robot and
+    these sessions.
+    """
     drawn = _drawn(truth, robot)
     return TruthRecord(
         dataset=dataset,
@@ -248,22 +249,13 @@ def true_record(
         matrix=matrix_rows(true_matrix(truth, robot)),
         integration=integration,
         noise=noise or EncoderNoise(),
-        effects=complete_effects(truth, robot, sessions, dataset),
+        effects=tuple(_complete(term, robot, sessions, _place(dataset)) for term in truth.effects),
         wheels=drawn and drawn.wheels,
         steering_offsets={} if drawn is None else drawn.steering_offsets,
         mount=robot.mount if drawn is None else drawn.mount,
         lateral_friction=truth.lateral_friction,
         variation=variation or Variation(),
     )
-
-
-def complete_effects(truth: Truth, robot: Robot, sessions: tuple[str, ...], dataset: str) -> tuple[EffectTerm, ...]:
-    """The effects with parameters that are left out set to 0, so that one wheel of several may be eccentric.
-
-    An effect without any parameter is left as it is. sessions: names of those that are driven. UnknownNameError: no
-    such effect, or no such parameter for this robot and these sessions.
-    """
-    return tuple(_complete(term, robot, sessions, _place(dataset)) for term in truth.effects)
 
 
 def true_matrix(truth: Truth, robot: Robot) -> Array:
@@ -316,22 +308,23 @@ def _drawn(truth: Truth, robot: Robot) -> _Drawn | None:
         wheels.append(wheel.model_copy(update=changes))
     steered = robot.drive.steered
     offsets = np.radians(given.steering_deg * rng.standard_normal(len(steered))).tolist()
-    return _Drawn(tuple(wheels), dict(zip(steered, offsets, strict=True)), _drawn_mount(given, robot, rng))
-
-
-def _drawn_mount(given: Tolerances, robot: Robot, rng: np.random.Generator) -> Mount | None:
-    if not given.mount and not given.mount_deg:
-        return robot.mount
-    x, y, yaw = rng.standard_normal(3).tolist()
-    design = robot.mount or Mount()
-    return Mount(
-        x=design.x + given.mount * x,
-        y=design.y + given.mount * y,
-        yaw=design.yaw + math.radians(given.mount_deg) * yaw,
-    )
+    mount = robot.mount
+    if given.mount or given.mount_deg:
+        x, y, yaw = rng.standard_normal(3).tolist()
+        design = robot.mount or Mount()
+        mount = Mount(
+            x=design.x + given.mount * x,
+            y=design.y + given.mount * y,
+            yaw=design.yaw + math.radians(given.mount_deg) * yaw,
+        )
+    return _Drawn(tuple(wheels), dict(zip(steered, offsets, strict=True)), mount)
 
 
 def _complete(term: EffectTerm, robot: Robot, sessions: tuple[str, ...], where: str) -> EffectTerm:
+    """An effect with parameters that are left out set to 0, so that one wheel of several may be eccentric.
+
+    One without any parameter is left as it is.
+    """
     effect = effects.create(term.name, where=where)
     check_applies(effect, robot, f"{where}: effect {term.name!r}")
     parameters = effect.parameters(robot, sessions)

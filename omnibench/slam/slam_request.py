@@ -22,9 +22,8 @@ from omnibench.progress import Reporter, no_progress
 from omnibench.robot.calibration import read_calibration
 from omnibench.robot.kinematics import Array, interpolated, moved_to, rotated
 from omnibench.robot.model import OdometryModel
-from omnibench.slam.slam_dataset import slam_paths, with_paths
+from omnibench.slam.slam_dataset import SlamPath, slam_paths, with_paths
 from omnibench.slam.slam_options import SlamOptions
-from omnibench.slam.slam_run import SlamPath
 
 # Share of the largest variance below which a covariance counts as singular: rounding of its eigenvalues.
 _SINGULAR = 1e-14
@@ -264,10 +263,6 @@ class SlamResult:
     dataset: Dataset
     summary: SlamSummary
     truth: Mapping[str, TruePath] | None
-
-    @property
-    def accuracy(self) -> SlamAccuracy | None:
-        return self.summary.accuracy
 
 
 @dataclass(frozen=True)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, ConfigDict, Field, field_validator, model_validator
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, field_validator, model_validator
 
 from omnibench.compare.config import LEAST_MEMORY, CalibratorEntry, NamedConfig, known_backend, with_names
 from omnibench.config import Model, NonNegative, Positive, RelativePath, printable
@@ -89,6 +90,12 @@ class TrainingChoice(Model):
         return self
 
 
+Rules = Annotated[
+    tuple[TrainingChoice, ...],
+    BeforeValidator(partial(with_names, key="by"), json_schema_input_type=tuple[str | TrainingChoice, ...]),
+]
+
+
 class RobotChoice(RecordingSource):
     """A robot: its recordings, the kinds of path in them, and how these are divided.
 
@@ -96,12 +103,7 @@ class RobotChoice(RecordingSource):
     """
 
     kinds: dict[Label, Names] = {}
-    trainings: tuple[TrainingChoice, ...] = Field((), description="default: the study's")
-
-    @field_validator("trainings", mode="before", json_schema_input_type=tuple[str | TrainingChoice, ...])
-    @classmethod
-    def _names_stand_for_rules(cls, choices: Any) -> Any:
-        return with_names(choices, "by")
+    trainings: Rules = Field((), description="default: the study's")
 
 
 class RegimeChoice(Model):
@@ -160,7 +162,7 @@ class StudyConfig(NamedConfig):
 
     data: RelativePath = Field(Path(), description="folder of the recordings; relative to the config file")
     robots: dict[Label, RobotChoice] = Field(min_length=1)
-    trainings: tuple[TrainingChoice, ...] = Field((TrainingChoice(by="kind"),), min_length=1)
+    trainings: Rules = Field((TrainingChoice(by="kind"),), min_length=1)
     regimes: dict[Label, RegimeChoice] = {}
     methods: tuple[MethodChoice, ...] = Field(min_length=1)
     reference: Label | None = Field(None, description="the method that is compared with the best published one")
@@ -196,11 +198,6 @@ class StudyConfig(NamedConfig):
     @classmethod
     def _names_stand_for_methods(cls, methods: Any) -> Any:
         return with_names(methods, "name")
-
-    @field_validator("trainings", mode="before", json_schema_input_type=tuple[str | TrainingChoice, ...])
-    @classmethod
-    def _names_stand_for_rules(cls, choices: Any) -> Any:
-        return with_names(choices, "by")
 
     @model_validator(mode="after")
     def _labels_differ(self) -> StudyConfig:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -28,11 +28,10 @@ from omnibench.processes import one_thread_processes
 from omnibench.progress import Reporter, no_progress
 from omnibench.registry import PluginFailure
 from omnibench.report.render import write_document
-from omnibench.study.cells import CellRatio, MethodInCell, StudyCell, make_cells
 from omnibench.study.config import StudyConfig
-from omnibench.study.report.study_report import study_document
+from omnibench.study.report import study_document
 from omnibench.study.study_plan import judge_fits, load_robots, plan_fits
-from omnibench.study.study_result import StudyResult
+from omnibench.study.study_result import CellRatio, MethodInCell, StudyCell, StudyResult, make_cells
 
 
 def is_study(path: Path) -> bool:
@@ -99,20 +98,16 @@ def summary(result: StudyResult) -> dict[str, Any]:
         "broken": dict(result.broken),
         "reference": result.config.reference,
         "geometric_mean": result.geometric_mean,
-        "against_best": list(_against_best(result)),
+        "against_best": [
+            {"robot": each.cell.key.robot, "training": each.cell.key.training, "judged": each.cell.key.judged,
+             "best": each.best, "ratio": each.ratio.value, "low": each.ratio.in_family.low,
+             "high": each.ratio.in_family.high, "unit": each.ratio.unit, "verdict": each.ratio.verdict}
+            for each in result.against_best
+        ],
         "failures": list(result.failures),
         "warnings": list(result.warnings),
         "environment": result.environment.model_dump(),
     }  # fmt: skip
-
-
-def _against_best(result: StudyResult) -> Iterator[dict[str, Any]]:
-    for each in result.against_best:
-        key = each.cell.key
-        family = each.ratio.in_family
-        yield {"robot": key.robot, "training": key.training, "judged": key.judged, "best": each.best,
-               "ratio": each.ratio.value, "low": family.low, "high": family.high, "unit": each.ratio.unit,
-               "verdict": each.ratio.verdict}  # fmt: skip
 
 
 def _row(result: StudyResult, cell: StudyCell, method: MethodInCell) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from omnibench.config import validate
 from omnibench.errors import ConfigError, OmnibenchError, PluginError, UnknownNameError
 from omnibench.files import refuse_existing, write_text
 from omnibench.jobs.job import Failure, Job, JobWatch, ResultStore, run_jobs
-from omnibench.jobs.local_backends import Processes
+from omnibench.jobs.job_process import Processes
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.registry import REGISTRIES, Registry, calibrators, costs, effects, importers, registered_from
 from omnibench.testing.calibrator_cases import CalibratorConformance, CostConformance

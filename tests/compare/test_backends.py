@@ -21,7 +21,7 @@ from omnibench.fit.certify import certify_optimum
 from omnibench.fit.problem import Budget
 from omnibench.jobs.backend_choice import BackendChoice, open_backend
 from omnibench.jobs.job import Backend
-from omnibench.jobs.local_backends import InPlace, Processes
+from omnibench.jobs.job_process import InPlace, Processes
 
 
 def test_a_comparison_on_dask_is_equal_to_the_bit_and_goes_on_with_another_backend(tmp_path: Path) -> None:

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from sample_robots import APR_02
 
 from omnibench.data.clock_matching import ClockMatch, Streams, align, match_clocks, median_period
-from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.data.headings import unwrap
+from omnibench.data.dataset import Dataset, Trajectory, make_dataset, unwrap
 from omnibench.robot.kinematics import Array, Robot, Wheel, wheel_equations
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import DrivenPath, WheelLog

@@ -28,7 +28,7 @@ from omnibench.design.candidates import (
 )
 from omnibench.design.config import DesignConfig
 from omnibench.design.design import design_experiment
-from omnibench.design.report.design_figures import equal_in_words, plan_in_words
+from omnibench.design.report import equal_in_words, plan_in_words
 from omnibench.design.result import Design, SetDesign
 from omnibench.errors import ConfigError, DataError, OmnibenchError
 from omnibench.fit.information import information_of_runs

@@ -20,7 +20,7 @@ from omnibench.cli.terminal.design_summary import print_design
 from omnibench.design.candidates import candidates_of_config, candidates_of_dataset
 from omnibench.design.config import DesignConfig
 from omnibench.design.design import design_experiment
-from omnibench.design.report.tables import design_document
+from omnibench.design.report import design_document
 from omnibench.design.result import Design
 from omnibench.report.render import write_document
 from omnibench.simulate.config import FlowerConfig

@@ -29,8 +29,7 @@ from job_samples import IMPORTING_THIS, Answer, Notes, jobs_of, wait_for
 from timing import PATIENCE
 
 import omnibench as package
-import omnibench.jobs.dask_backend as dask_backend
-import omnibench.jobs.dask_cluster as dask_cluster
+from omnibench.jobs import dask_backend
 from omnibench.jobs.backend_choice import BackendChoice, open_backend
 from omnibench.jobs.job import BackendError, JobWatch, ResultStore, TlsFiles, run_jobs
 from omnibench.progress import Progress, Reporter
@@ -228,7 +227,7 @@ def test_a_scheduler_that_is_killed_is_one_line(tmp_path: Path) -> None:
 
 
 def test_a_scheduler_that_freezes_is_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dask_cluster, "WAIT", 3.0)
+    monkeypatch.setattr(dask_backend, "WAIT", 3.0)
     with scheduler(tmp_path) as (place, process), worker(place, tmp_path / "worker"):
         store, choice = ResultStore(tmp_path / "results", Answer), BackendChoice(name=place)
         with pytest.raises(BackendError, match="is lost; start it again"), open_backend(choice) as backend:

@@ -26,7 +26,7 @@ import omnibench.jobs.job_process as job_process
 from omnibench.errors import DataError
 from omnibench.jobs.backend_choice import BackendChoice, open_backend
 from omnibench.jobs.job import Backend, Failure, Job, JobWatch, ResultStore, content_key, gathered, run_jobs
-from omnibench.jobs.local_backends import InPlace, Processes, local_backend
+from omnibench.jobs.job_process import InPlace, Processes, local_backend
 from omnibench.processes import one_thread_processes
 from omnibench.progress import Progress, Reporter
 from omnibench.robot.kinematics import JsonArray
@@ -502,7 +502,7 @@ from pathlib import Path
 from job_samples import jobs_of, run, squared
 from test_jobs import fills_memory
 from omnibench.jobs.job import Job
-from omnibench.jobs.local_backends import Processes
+from omnibench.jobs.job_process import Processes
 Path(sys.argv[2], "cgroup.procs").write_text(str(os.getpid()))
 jobs = [*jobs_of(fills_memory, [None]), Job("other", squared, 3)]
 print(run(Path(sys.argv[1]), jobs, Processes(1)).reason(), flush=True)
@@ -542,7 +542,7 @@ from pathlib import Path
 from job_samples import run, squared
 from test_jobs import until_told
 from omnibench.jobs.job import Job
-from omnibench.jobs.local_backends import Processes
+from omnibench.jobs.job_process import Processes
 folder = Path(sys.argv[1])
 jobs = [Job("first", squared, 2), Job("second", squared, 3), Job("waits", until_told, folder), Job("third", squared, 4)]
 print(run(folder / "results", jobs, Processes(2)).answers(), flush=True)

@@ -23,12 +23,10 @@ from omnibench.robot.odometry import advance
 from omnibench.simulate.commands import Command
 from omnibench.simulate.floor_plan import FloorPlan, RoomPlan, make_plan
 from omnibench.simulate.lidar import Lidar, LidarMount, measure_scans
-from omnibench.slam.map import ScanMap
 from omnibench.slam.motion_prior import LastPosePrior, MotionWithinScan, OdometryPrior, smoothed
-from omnibench.slam.scan_matching import Correspondences, ScanPoints, scan_points
-from omnibench.slam.slam_dataset import slam_dataset
+from omnibench.slam.scan_matching import Correspondences, ScanMap, ScanPoints, scan_points
+from omnibench.slam.slam_dataset import SlamPath, run_slam, slam_dataset
 from omnibench.slam.slam_options import SlamOptions
-from omnibench.slam.slam_run import SlamPath, run_slam
 
 LIDAR = Lidar()
 FAST = Command(0.5, 0.6, 1.0)

@@ -21,8 +21,7 @@ from omnibench.data.checks.implausible import implausible
 from omnibench.data.dataset import Dataset
 from omnibench.design.candidates import candidates_of_dataset
 from omnibench.design.design import design_experiment
-from omnibench.design.report.design_figures import path_figures
-from omnibench.design.report.tables import effort_table
+from omnibench.design.report import effort_table, path_figures
 from omnibench.design.result import Chosen
 from omnibench.fit.calibrate import CalibrationRun, calibrate
 from omnibench.fit.certify import certify_optimum

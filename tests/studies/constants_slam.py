@@ -20,8 +20,8 @@ from omnibench.data.scans import TrajectoryScans
 from omnibench.simulate.commands import Command
 from omnibench.simulate.floor_plan import RoomPlan, make_plan
 from omnibench.simulate.lidar import Lidar
+from omnibench.slam.slam_dataset import run_slam
 from omnibench.slam.slam_options import SlamOptions
-from omnibench.slam.slam_run import run_slam
 
 
 @cache

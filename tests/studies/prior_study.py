@@ -21,10 +21,10 @@ from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.calibrators import posterior
 from omnibench.registry import calibrators, load_plugins
 from omnibench.robot.kinematics import class_of
-from omnibench.study.cells import make_cells
 from omnibench.study.config import MethodChoice, TrainingChoice
 from omnibench.study.study import read_study_config
 from omnibench.study.study_plan import StudiedRobot, judge_fits, load_robots, plan_fits
+from omnibench.study.study_result import make_cells
 
 CONFIG = Path(__file__).parents[2] / "configs" / "real_robots.yaml"
 TOLERANCES: dict[str, Callable[[prior.PhysicalTolerance, float], prior.PhysicalTolerance]] = {

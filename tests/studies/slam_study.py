@@ -29,8 +29,8 @@ from omnibench.simulate.commands import Command
 from omnibench.simulate.floor_plan import FloorPlan, RoomPlan, make_plan
 from omnibench.simulate.lidar import Lidar, measure_scans, scan_stamps
 from omnibench.simulate.motion_commands import CommandLink, MotionProfile, command_motion, target_rates
+from omnibench.slam.slam_dataset import SlamPath, run_slam
 from omnibench.slam.slam_options import SlamOptions
-from omnibench.slam.slam_run import SlamPath, run_slam
 
 ROBOT = Robot(
     name="APR-02",

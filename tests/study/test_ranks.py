@@ -5,8 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from omnibench.study.cells import MEASURES, CellKey, MethodInCell, Pairs, StudyCell, cell_ratio
-from omnibench.study.study_result import profiles, ranking
+from omnibench.study.study_result import (
+    MEASURES,
+    CellKey,
+    MethodInCell,
+    Pairs,
+    StudyCell,
+    cell_ratio,
+    profiles,
+    ranking,
+)
 
 
 def cell(**errors: float | None) -> StudyCell:

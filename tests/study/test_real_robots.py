@@ -11,8 +11,8 @@ from shared_results import made_once, shared_folder
 
 from omnibench.study.config import StudyConfig, TrainingChoice
 from omnibench.study.study import read_study_config, run_study, study_table
+from omnibench.study.study_plan import divide
 from omnibench.study.study_result import StudyResult
-from omnibench.study.trainings import divide
 
 pytestmark = pytest.mark.slow
 

@@ -12,7 +12,7 @@ from studied import robot_dataset
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.errors import DataError, OmnibenchError
 from omnibench.study.config import RegimeChoice, RobotChoice, TrainingChoice
-from omnibench.study.trainings import Training, divide, in_regime
+from omnibench.study.study_plan import Training, divide, in_regime
 
 KINDS = {"line": ("line_*",), "arc": ("arc_*",)}
 

@@ -16,7 +16,7 @@ from omnibench.compare.result import ComparisonResult
 from omnibench.report.blocks import Cell, Column, Row, Table
 from omnibench.report.numbers import NOTHING, fixed
 from omnibench.robot.calibration import read_calibration
-from omnibench.study.report.cell_tables import cell_words
+from omnibench.study.report import cell_words
 from omnibench.study.study_result import StudyResult, mean_ratio
 from omnibench.words import plural
 

@@ -5,14 +5,16 @@ from __future__ import annotations
 from rich.console import Console
 
 from omnibench.cli.terminal.tables import print_table
-from omnibench.design.report.design_figures import (
+from omnibench.design.report import (
     USE_IN_WORDS,
     choice_in_words,
+    chosen_table,
+    effort_table,
+    equal_table,
     motions_in_words,
     origin_in_words,
     plan_in_words,
 )
-from omnibench.design.report.tables import chosen_table, effort_table, equal_table
 from omnibench.design.result import Design
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from omnibench.data.checks.finding import Finding
 from omnibench.data.checks.misread_search import beyond_twists
 from omnibench.data.checks.misreading import (
+    DEGREE,
     EXPLAINED,
     POSITION_UNITS,
     RATE_UNITS,
@@ -24,23 +25,20 @@ from omnibench.data.checks.misreading import (
     Misreading,
     Reading,
     Recording,
-    arrangements,
-    headings_in_degrees,
-    positions_in,
-    scaled,
-    warning_of,
-    wrong_unit,
-)
-from omnibench.data.checks.steering_readings import (
-    DEGREE,
     another_zero,
+    arrangements,
     clockwise,
     farthest_steered,
     frozen_steering,
     gear,
     groups,
+    headings_in_degrees,
     in_degrees,
+    positions_in,
+    scaled,
     simple_readings,
+    warning_of,
+    wrong_unit,
 )
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import WheelLog

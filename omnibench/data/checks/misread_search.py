@@ -46,10 +46,11 @@ from omnibench.data.checks.misreading import (
     headings_in_degrees,
     position_units,
     reference_transforms,
+    steering_readings,
+    steering_transforms,
     turned_reference,
     wheel_transforms,
 )
-from omnibench.data.checks.steering_readings import steering_readings, steering_transforms
 from omnibench.data.stored_rows import in_memory
 from omnibench.robot.kinematics import Array, Robot, interpolated
 from omnibench.robot.odometry import Complex, WheelLog

@@ -203,13 +203,6 @@ class SessionMetadata:
         return 2 * math.pi / (self.gear * self.resolution)
 
 
-def run_number(file: Path) -> int:
-    """The number in the name of a run's file."""
-    match = _RUN.search(file.name)
-    assert match is not None  # only such files are collected
-    return int(match.group(1))
-
-
 def read_metadata(file: Path) -> SessionMetadata:
     """Read a session's metadata and find its runs. DataError names the file and the key that is wrong."""
     values = {fields[0].strip(): fields[1:] for fields in csv.reader(read_text(file).splitlines()) if fields}
@@ -425,11 +418,24 @@ class Optiodom(Importer):
         if wanted is not None and wanted not in found:
             raise DataError(f"{source}: it holds no recordings of robot {wanted}; found: {', '.join(found)}")
         sessions = [session for session in sessions if wanted in (None, session.robot)]
-        geometry, notes = _reference_geometry(sessions)
+        # The commonest geometry, of equally common ones the first session's; and a note if there are others.
+        (geometry, most), *others = Counter(session.geometry for session in sessions).most_common()
+        notes = []
+        if others:
+            rest = "; ".join(f"{other} in {count}" for other, count in others)
+            notes.append(
+                f"sessions state different dimensions of the robot: those of {most} of {len(sessions)} are taken, "
+                f"{geometry} (others: {rest})"
+            )
         wheels = sessions[0].kind.wheels(geometry)
         robot = Robot(name=self.options.robot_name or f"inesc_tec_{sessions[0].robot}", wheels=wheels)
         logs = [read_log(session) if self.options.log else None for session in sessions]
-        notes += _unlogged(sessions, logs) if self.options.log else []
+        unlogged = [session.name for session, log in zip(sessions, logs, strict=True) if log is None]
+        if self.options.log and unlogged:
+            notes.append(
+                f"{len(unlogged)} of {plural(len(sessions), 'session')} have no log ({', '.join(unlogged)}): commands "
+                "are named after the motion by the wheels there, and absolute wheel angles are left out of all runs"
+            )
         runs = [
             _read_run(session, index, log, self.options.log)
             for session, log in zip(sessions, logs, strict=True)
@@ -444,38 +450,13 @@ class Optiodom(Importer):
             robot,
             median_period([run.pose_times for run in runs]),
             divided(complete(runs), train, validation, "group", names=groups),
-            description=" ".join([_DESCRIPTION.format(sessions[0].kind.title), *(f"{_capital(n)}." for n in notes)]),
+            description=" ".join(
+                [_DESCRIPTION.format(sessions[0].kind.title), *(f"{note[:1].upper()}{note[1:]}." for note in notes)]
+            ),
             source=self.options.source,
             licence="MIT",
         )
         return replace(dataset, warnings=(*notes, *dataset.warnings))
-
-
-def _reference_geometry(sessions: Sequence[SessionMetadata]) -> tuple[Geometry, list[str]]:
-    """The commonest geometry, of equally common ones the first session's; and a note if there are others."""
-    (reference, most), *others = Counter(session.geometry for session in sessions).most_common()
-    if not others:
-        return reference, []
-    rest = "; ".join(f"{geometry} in {count}" for geometry, count in others)
-    return reference, [
-        f"sessions state different dimensions of the robot: those of {most} of {len(sessions)} are taken, {reference} "
-        f"(others: {rest})"
-    ]
-
-
-def _unlogged(sessions: Sequence[SessionMetadata], logs: Sequence[SessionLog | None]) -> list[str]:
-    """A note on the sessions without a log, in which absolute angles and commands are not known."""
-    missing = [session.name for session, log in zip(sessions, logs, strict=True) if log is None]
-    if not missing:
-        return []
-    return [
-        f"{len(missing)} of {plural(len(sessions), 'session')} have no log ({', '.join(missing)}): commands are named "
-        "after the motion by the wheels there, and absolute wheel angles are left out of all runs"
-    ]
-
-
-def _capital(words: str) -> str:
-    return words[:1].upper() + words[1:]
 
 
 @dataclass(frozen=True)
@@ -528,7 +509,9 @@ def _read_run(session: SessionMetadata, index: int, log: SessionLog | None, with
 def _with_log(
     run: Trajectory, session: SessionMetadata, log: SessionLog, table: NumberTable, ticks: Array
 ) -> Trajectory:
-    number = run_number(table.file)
+    match = _RUN.search(table.file.name)
+    assert match is not None  # only such files are collected
+    number = int(match.group(1))
     start = session.starts[number - 1] if number <= len(session.starts) else 0.0
     part = log.stretch(number, round(start / float(np.median(np.diff(run.pose_times)))), len(table.values))
     if part is None or not np.allclose(part.ticks, ticks, rtol=0, atol=_SAME_TICKS):

@@ -16,10 +16,9 @@ from pydantic import Field
 from xxhash import xxh3_64_intdigest
 
 from omnibench.config import Model
-from omnibench.data.checks.clock_findings import clock_findings, clocks_of
 from omnibench.data.checks.finding import Finding, FindingWarning, findings_of
 from omnibench.data.checks.misread_search import UNRELATED, Explained, Recorded, Windows, continuous, search
-from omnibench.data.checks.stream_faults import runs_in_words, stream_faults
+from omnibench.data.checks.stream_faults import clock_findings, clocks_of, runs_in_words, stream_faults
 from omnibench.data.clock_matching import ClockMatch
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.importers.copied_reference import follows_the_wheels

@@ -1,4 +1,13 @@
-"""Export formats of calibrations: parameters of ROS 2 controllers and of robot_localization, or a C header."""
+"""Export formats of calibrations: parameters of ROS 2 controllers and of robot_localization, or a C header.
+
+robot_localization gets covariances from the noise of a calibration. The filter takes the velocities of odometry as
+measurements, with the covariance that comes in the message (its preparing_sensor_data.rst and
+configuring_robot_localization.rst, 2015 to 2020). If each message's velocity errs independently by the variance
+s^2 / T, T apart, the variance of the filter's pose grows by s^2 a second whatever the process noise q of the velocity
+is: with the measurement noise s^2 and in continuous time P_vv = sqrt(q) s and P_xv = s^2, so that P_xx' = 2 P_xv -
+P_xv^2 / s^2 + q_x = s^2 + q_x. So x, y and yaw have no process noise here: that of the filter's defaults (0.05 m2/s,
+0.06 rad2/s, params/ekf.yaml) would add to it.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +16,106 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-from omnibench.errors import UnknownNameError, require_type
-from omnibench.robot.calibration import Calibration
+import numpy as np
+
+from omnibench.errors import ConfigError, UnknownNameError, one_line, require_type
+from omnibench.robot.calibration import Calibration, Noise
 from omnibench.robot.export.c_header import c_header
-from omnibench.robot.export.robot_localization import robot_localization
-from omnibench.robot.export.ros2_controllers import ros2_controllers
+from omnibench.robot.export.ros2_controllers import (
+    Parameter,
+    RemainingError,
+    controller,
+    covariance_parameters,
+    interval_in_words,
+    matrix_deviations,
+    pose_variances,
+    ros2_controllers,
+    to_node,
+)
+from omnibench.robot.kinematics import Mount
 from omnibench.views import Brief
+
+# m2/s and rad2/s, then as often per s2 and s4: x, y, z, roll, pitch, yaw, their velocities, accelerations. The
+# package's defaults (params/ekf.yaml), but for x, y and yaw.
+_PROCESS_NOISE = (0.0, 0.0, 0.06, 0.03, 0.03, 0.0, 0.025, 0.025, 0.04, 0.01, 0.01, 0.02, 0.01, 0.01, 0.015)
+_FUSED = (6, 7, 11)  # of these: velocities along x and y, and of yaw
+
+
+def robot_localization(calibration: Calibration) -> Export:
+    """Parameters of ekf_filter_node and of the controller that publishes the odometry as YAML, and warnings.
+
+    ConfigError: the calibration has no noise model.
+    """
+    try:
+        publisher = controller(calibration.robot, calibration.matrix_without_effects)
+    except ConfigError:
+        publisher = None
+    base = Mount() if publisher is None else publisher.base
+    noise, growth = calibration.noise, pose_variances(calibration, base)
+    if noise is None or growth is None:
+        raise ConfigError(
+            f"robot_localization: calibration {calibration.name!r} has no noise model, of which covariances are made; "
+            "calibrate once more with closed_form, which estimates it"
+        )
+    warnings = _warnings(calibration, noise, base)
+    along_x, along_y, heading = np.sqrt(growth).tolist()
+    lines = [
+        f"robot_localization for robot {one_line(calibration.robot.name)!r},",
+        f"from the omnibench calibration {one_line(calibration.name)!r} of {calibration.created:%Y-%m-%d}.",
+        *(f"- {warning}" for warning in warnings),
+        f"Random walk of the odometry: {1e3 * along_x:.3g} mm in x, {1e3 * along_y:.3g} mm in y, "
+        f"{np.degrees(heading):.3g} deg per root second; the filter's pose grows by that.",
+    ]
+    fused = ("true" if index in _FUSED else "false" for index in range(len(_PROCESS_NOISE)))
+    process_noise = ",\n      ".join(
+        ", ".join(str(value) if column == row else "0.0" for column in range(len(_PROCESS_NOISE)))
+        for row, value in enumerate(_PROCESS_NOISE)
+    )
+    node = (
+        Parameter("two_d_mode", "true"),
+        Parameter("odom0", "/odom" if publisher is None else f"/{publisher.name}/{publisher.topic}"),
+        Parameter("odom0_config", tuple(fused), "vx, vy, vyaw: velocities only"),
+        Parameter("odom0_differential", "false"),
+        Parameter("process_noise_covariance", f"[{process_noise}]"),
+    )
+    text = "".join(f"# {line}\n" for line in lines) + to_node("ekf_filter_node", node)
+    file_name = f"{_stem(calibration.name)}_robot_localization.yaml"
+    if publisher is not None:
+        text += to_node(publisher.name, covariance_parameters(calibration, publisher))
+        return Export(text, warnings, file_name)
+    along_x, along_y, turning = (f"{value:.6e}" for value in (growth / calibration.sample_period).tolist())
+    text += f"# twist.covariance of the messages: [0] {along_x}, [7] {along_y} m2/s2, [35] {turning} rad2/s2\n"
+    return Export(text, warnings, file_name)
+
+
+def _warnings(calibration: Calibration, noise: Noise, base: Mount) -> tuple[str, ...]:
+    interval = interval_in_words(calibration)
+    warnings = [
+        f"twist variances are of messages every {interval}; for another interval T multiply them by {interval} / T",
+        "white noise and bias of the calibration's noise are the reference's, and not used",
+    ]
+    unseen = [name for name, walk in (("position", noise.walk_position), ("heading", noise.walk_heading)) if not walk]
+    if unseen:
+        warnings.append(
+            f"the recordings show no random walk of {' and '.join(unseen)}: its variance is 0 here, which the filter "
+            "takes as 1e-9; put in a larger one"
+        )
+    deviations = matrix_deviations(calibration, base)
+    if deviations is None:
+        warnings.append("the calibration has no covariance of its matrix: how far that may be off is not known")
+        return tuple(warnings)
+    # Standard deviations in the worst direction of straight driving and on the spot.
+    positions = np.hypot(deviations[:, 0], deviations[:, 1]).tolist()
+    headings = deviations[:, 2].tolist()
+    sigma = RemainingError(max(positions[:-1]), max(headings[:-1]), positions[-1], headings[-1])
+    warnings.append(
+        f"the matrix may be off by {sigma} (1 sigma); that is the same in every message, so that no variance of a "
+        "message stands for it, and is left out"
+    )
+    if calibration.provenance is not None and calibration.provenance.on_bounds:
+        names = ", ".join(calibration.provenance.on_bounds)
+        warnings.append(f"of {names}, on a bound of the box, no variance is known and none is counted")
+    return tuple(warnings)
 
 
 @dataclass(frozen=True, repr=False)
@@ -29,11 +132,6 @@ def _ros2_controllers(calibration: Calibration) -> Export:
     return Export(text, warnings, f"{_stem(calibration.name)}_{controller.removesuffix('_controller')}.yaml")
 
 
-def _robot_localization(calibration: Calibration) -> Export:
-    text, warnings = robot_localization(calibration)
-    return Export(text, warnings, f"{_stem(calibration.name)}_robot_localization.yaml")
-
-
 def _c_header(calibration: Calibration) -> Export:
     stem = _stem(calibration.name)
     text, warnings = c_header(calibration, stem)
@@ -41,7 +139,7 @@ def _c_header(calibration: Calibration) -> Export:
 
 
 EXPORT_FORMATS: Mapping[str, Callable[[Calibration], Export]] = MappingProxyType(
-    {"c_header": _c_header, "robot_localization": _robot_localization, "ros2_controllers": _ros2_controllers}
+    {"c_header": _c_header, "robot_localization": robot_localization, "ros2_controllers": _ros2_controllers}
 )
 
 

@@ -46,7 +46,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from timing import PATIENCE
 
-from omnibench.data.importers.rosbag.bag_recording import between_rests
+from omnibench.data.importers.rosbag.rosbag import between_rests
 from omnibench.data.importers.runs.recording_runs import find_rests
 from omnibench.data.storage import load_dataset
 from omnibench.errors import ConfigError

@@ -15,10 +15,20 @@ from omnibench.data.true_poses import TruePath
 from omnibench.robot.kinematics import Array, compose, relative
 from omnibench.simulate.floor_plan import RoomPlan, make_plan
 from omnibench.simulate.lidar import Lidar, measure_scans
-from omnibench.slam.map import Lines, ScanMap, fit_lines
 from omnibench.slam.motion_prior import MotionWithinScan
 from omnibench.slam.pose_errors import FLOOR, PoseErrors
-from omnibench.slam.scan_matching import Correspondences, Match, ScanPoints, noise_factor, refine, scan_points, search
+from omnibench.slam.scan_matching import (
+    Correspondences,
+    Lines,
+    Match,
+    ScanMap,
+    ScanPoints,
+    fit_lines,
+    noise_factor,
+    refine,
+    scan_points,
+    search,
+)
 from omnibench.slam.slam_options import SlamOptions
 
 EXACT = Lidar(noise=0.0, far_noise=0.0, dropouts=0.0, resolution=1e-6)

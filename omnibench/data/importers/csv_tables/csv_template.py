@@ -19,10 +19,8 @@ _NOISE = (0.002, 0.002, 0.004)  # m, m, rad, as of motion capture: exact poses w
 _COMMANDS = {"straight": (0.3, 0.0, 0.0), "left": (0.25, 0.0, 0.5), "right": (0.25, 0.0, -0.5)}
 _BACK, _SIDEWAYS = {"back": (-0.3, 0.0, 0.0)}, {"sideways": (0.0, 0.3, 0.0)}
 _SPINS = {"left": (0.0, 0.0, 0.8), "right": (0.0, 0.0, -0.8)}
-_BY_TAPE, _BY_MARK = (
-    0.003,
-    0.01,
-)  # m, rad: standard deviations of a length by tape and of an angle by marks on the floor
+# m, rad: standard deviations of a length by tape and of an angle by marks on the floor
+_BY_TAPE, _BY_MARK = 0.003, 0.01
 
 _HEAD = """\
 # The robot, by its design values: m, and degrees under keys that end in _deg.

@@ -26,11 +26,9 @@ from typing import Any
 
 import numpy as np
 
-from omnibench.data.importers.rosbag.bag import FIX, Bag, Topic
+from omnibench.data.importers.rosbag.bag import FIX, Bag, RosbagOptions, Topic
 from omnibench.data.importers.rosbag.message_streams import MessageFilter, Stamps, planar_headings, possible
-from omnibench.data.importers.rosbag.rosbag_options import RosbagOptions
-from omnibench.data.importers.runs.recorded_streams import measured_as
-from omnibench.data.importers.runs.recording_runs import find_rests
+from omnibench.data.importers.runs.recording_runs import find_rests, measured_as
 from omnibench.data.importers.wheel_samples import WheelSamples
 from omnibench.data.references import Reference, References
 from omnibench.errors import DataError
