@@ -7,11 +7,11 @@ from typing import Annotated, Literal
 
 import typer
 
-from omnibench.cli.fit_options import FitCommand, chosen_settings
 from omnibench.cli.options import (
     BackendName,
     CalibrationFile,
     DatasetFolders,
+    FitCommand,
     Force,
     Json,
     Plugins,
@@ -21,6 +21,7 @@ from omnibench.cli.options import (
     TlsKey,
     Workers,
     asked_backend,
+    chosen_settings,
     load_given_plugins,
     output_option,
     tls_files,

@@ -275,7 +275,7 @@ def check(
         read = read_source(source, importer, parse_settings(settings), robot)
         checked = check_recording(read)
     if report is not None or figures is not None:
-        from omnibench.report.recording.check_document import check_document
+        from omnibench.report.recording.inspection_report import check_document
         from omnibench.report.render import write_document
 
         document = check_document(read.dataset, checked)

@@ -26,9 +26,9 @@ from omnibench.discover.result import (
     few_in_words,
     is_other_session,
 )
+from omnibench.discover.selection.competing_models import candidates_of
 from omnibench.discover.selection.detectability import Detectability
 from omnibench.discover.selection.model_selection import CHANCE, SURE, Selection
-from omnibench.discover.selection.named_effects import candidates_of
 from omnibench.discover.selection.screening import Screening
 from omnibench.fit.sessions import SessionComparison
 from omnibench.robot.kinematics import Array

@@ -26,8 +26,7 @@ from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.regressors.columns import Group
-from omnibench.discover.regressors.effect_slopes import slopes_by
-from omnibench.discover.regressors.paths import Paths, blocks_of, make_paths
+from omnibench.discover.regressors.paths import Paths, blocks_of, make_paths, slopes_by
 from omnibench.fit.calibrators.trajectory_ml import FitCovariance
 from omnibench.fit.information import EstimatedCovariance
 from omnibench.fit.noise import (

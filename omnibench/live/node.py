@@ -28,8 +28,7 @@ from omnibench.live.network.presence import Claim
 from omnibench.live.network.session import close_session, open_session
 from omnibench.live.robot_service import Intake, RobotService
 from omnibench.live.stopping import Closing, RateLimiter, Stop
-from omnibench.live.wire.foxglove import PORT, FoxgloveServer
-from omnibench.live.wire.recorder import Recorder, free_path
+from omnibench.live.wire.recorder import PORT, FoxgloveServer, Recorder, free_path
 from omnibench.live.wire.topics import TOPICS, GraphNode, KeySpace
 from omnibench.registry import load_plugins
 from omnibench.robot.calibration import read_calibration

@@ -15,7 +15,7 @@ from pydantic_core import to_jsonable_python
 
 from omnibench.errors import DataError
 from omnibench.live.control.request_queue import source_of
-from omnibench.live.estimation.counts import anomalies_among
+from omnibench.live.estimation.health import anomalies_among
 from omnibench.live.network.presence import Presence, checked_robot, nothing_received
 from omnibench.live.stopping import Closing, direct, wait_until
 from omnibench.live.wire.messages import DIAGNOSTICS, ODOMETRY, MessageError, MissedMessages, Odometry

@@ -16,8 +16,7 @@ import zenoh
 
 from omnibench.errors import one_line
 from omnibench.live.acknowledged_flows import AcknowledgedFlows
-from omnibench.live.estimation.counts import anomalies_in_words
-from omnibench.live.estimation.health import diagnostic
+from omnibench.live.estimation.health import anomalies_in_words, diagnostic
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.stopping import Closing, RateLimiter
 from omnibench.live.wire.messages import Diagnostics, MissedMessages, flow_of

@@ -20,7 +20,7 @@ from rich.text import Text
 from omnibench.cli.terminal.progress_display import ProgressDisplay
 from omnibench.cli.terminal.tables import print_table, render_table
 from omnibench.errors import DataError, one_line
-from omnibench.live.estimation.counts import anomalies_in_words
+from omnibench.live.estimation.health import anomalies_in_words
 from omnibench.live.network.presence import alive_robots, nothing_received
 from omnibench.live.robot_monitor import OdometryStatus, RobotMonitor, RobotStatus, json_document
 from omnibench.live.stopping import ticks

@@ -83,8 +83,7 @@ from scipy.integrate import quad
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.regressors.columns import ColumnStore, Group
 from omnibench.discover.regressors.covariate_bases import Columns, generic_bases
-from omnibench.discover.regressors.effect_slopes import correction_along, slopes_by, slopes_by_corrections
-from omnibench.discover.regressors.paths import Paths
+from omnibench.discover.regressors.paths import Paths, correction_along, slopes_by, slopes_by_corrections
 from omnibench.discover.regressors.significance import Significance
 from omnibench.fit.trajectory_fit import Given
 from omnibench.registry import effects

@@ -23,8 +23,7 @@ from omnibench.live.replay.concatenated_drive import (
     concatenate_recording,
     concatenated_truth,
 )
-from omnibench.live.replay.delivery import WINDOW, DeliveryError
-from omnibench.live.replay.replay_player import Player, PlayReport
+from omnibench.live.replay.replay_player import WINDOW, DeliveryError, Player, PlayReport
 from omnibench.live.stopping import wait_until
 from omnibench.live.wheels.wheel_input import joints_of
 from omnibench.live.wire.messages import Odometry

@@ -13,7 +13,7 @@ from pydantic import Field
 
 from omnibench.config import Model, Positive
 from omnibench.errors import ConfigError
-from omnibench.live.estimation.counts import Counts
+from omnibench.live.estimation.health import Counts
 from omnibench.live.wire.messages import JointState, MessageError
 from omnibench.robot.joint_choice import JointChoice
 from omnibench.robot.kinematics import FASTEST, FASTEST_RIM, Array, Robot, fastest_rates
