@@ -1,4 +1,4 @@
-"""Held-out runs: cross-validation of a fit, errors of the validation split, the gap that a model leaves, and extrapolation.
+"""Held-out runs: cross-validation of a fit, errors of the validation split, the gap of a model, and extrapolation.
 
 Cross-validation predicts runs of a fit from the runs of the other folds. With I the information X'X and s the scores
 X'e of whitened columns X against whitened residuals e, summed over all runs, and I_f, s_f those over the runs of fold
@@ -27,11 +27,11 @@ gap, its standard error and the share that is closed are
 Where G is within two standard errors of nothing, no share is closed. Where a model errs less than the differences
 scatter, by chance or because the repetitions were no repetitions, their mean is no floor, and all of a gap is closed.
 
-Extrapolation: held-out runs drive motions outside the training domain. The models c that the data cannot tell apart have
-weights w_c, which add up to 1, and predict that a run ends at e_c; the model in use, which is their average and fades
-outside the training domain, predicts e. With S_c the mean square error of the final positions of commands that were held
-out of the fit of c, and J_c, C_c the derivatives of e_c by the numbers of c and their covariance, the mean square error of
-the prediction is
+Extrapolation: held-out runs drive motions outside the training domain. The models c that the data cannot tell apart
+have weights w_c, which add up to 1, and predict that a run ends at e_c; the model in use, which is their average and
+fades outside the training domain, predicts e. With S_c the mean square error of the final positions of commands that
+were held out of the fit of c, and J_c, C_c the derivatives of e_c by the numbers of c and their covariance, the mean
+square error of the prediction is
 
     V = sum of w_c |e_c - e|^2 + sum of w_c (S_c + tr(J_c C_c J_c')).                                               (5)
 

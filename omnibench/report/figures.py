@@ -1,4 +1,4 @@
-"""The traces that figures are made of, in the style of an item of the legend; the drawing of a robot; single figures."""
+"""The traces that figures are made of, in the style of a legend's items; a robot from above; single figures."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """The section on where the plain model fails: covariates that the residuals depend on, and their figures.
 
 Figures of the error of the motion over heading, wheel rate, wheel angle, acceleration, order of runs and stamps; of the
-mean residuals over the time in a run; and over the floor, as arrows and as maps. The motors' figures are of measured wheel rates minus their targets, before and after the actuator effects.
+mean residuals over the time in a run; and over the floor, as arrows and as maps. The motors' figures are of measured
+wheel rates minus their targets, before and after the actuator effects.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 A pose that comes late is inserted where it belongs, and the motions and poses after it are filtered again. A gate
 refuses poses whose normalised innovation is too large; several refused poses that agree replace the filter's.
 
-The timeline holds a robot's last seconds: its motions, the poses after them, and poses measured in between, corrected. A
-message that cannot be a pose in the map is refused and counted.
+The timeline holds a robot's last seconds: its motions, the poses after them, and poses measured in between, corrected.
+A message that cannot be a pose in the map is refused and counted.
 """
 
 from __future__ import annotations

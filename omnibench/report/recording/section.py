@@ -1,8 +1,8 @@
 """The report on a recording, and the section on it that other reports include.
 
 Figures of the errors of reference poses against the truth: over time and distance, at the end, and their NEES. Tables
-of reference poses by SLAM, which are the terminal's, too. The document that templates/player.js plays: poses, wheel rates
-and scans of a run, rounded.
+of reference poses by SLAM, which are the terminal's, too. The document that templates/player.js plays: poses, wheel
+rates and scans of a run, rounded.
 """
 
 from __future__ import annotations
