@@ -139,13 +139,29 @@ class LiveNode(Closing):
         self.keys = KeySpace(config.profile, config.domain)
         load_effects(config)
         with ExitStack() as started:  # closes the parts in reverse order of their start
-            memories = self._open_memories(started) if remember else {}
+            # Each robot's memory: the files of its saved state, locked for this node; none without a ``state`` folder.
+            memories: dict[str, RobotMemory] = {}
+            if remember and config.state is not None:
+                for robot in config.robots:
+                    memories[robot.name] = memory = RobotMemory(config.state, robot.name)
+                    started.callback(memory.close)
             self.trackers = {
                 robot.name: make_tracker(config, robot, memories.get(robot.name)) for robot in config.robots
             }
             self.session = open_session(config.zenoh, f"node {config.name}", stop)
             started.callback(close_session, self.session)
-            self._claim_robots(started)
+            # Refuse a robot that another node runs, and warn of tf frames that another node may publish too.
+            claim = Claim(self.session, self.trackers.keys(), _PRESENCE_TIMEOUT)
+            started.callback(claim.close)
+            # All robots share the topic tf: two on frames of the same names overwrite each other's transforms.
+            robots = config.on_common_frames()
+            if robots and claim.others:
+                name = robots[0]
+                LOG.warning(
+                    "robot %s publishes tf between map, odom and base_link, and so may %s on the same network; "
+                    "`frames: prefixed` makes them %s/odom and %s/base_link",
+                    *(name, ", ".join(claim.others), name, name),
+                )
             intake = Intake()
             started.callback(intake.close)
             listeners = started.enter_context(ExitStack())  # closed after the services, to have their last messages
@@ -156,12 +172,22 @@ class LiveNode(Closing):
                 started.callback(service.close)
             self._services = services
             # after the services: a replay begins with the first subscriber, and the samples are for these
-            self._serve_foxglove(listeners)
-            self._record(listeners)
+            if config.foxglove is not False:
+                server = listeners.enter_context(
+                    FoxgloveServer(port=PORT if config.foxglove is True else config.foxglove)
+                )
+                server.forward(self.session, self.keys, list(self.trackers))
+                listeners.callback(lambda: _tell_missed("Foxglove", server.missed))
+                LOG.warning("Foxglove: open %s", server.address)
+            if config.record is not None:  # in a new file where the config's is there already
+                path = free_path(config.record)
+                recorder = Recorder(self.session, self.keys, list(self.trackers), path, on_failure=LOG.error)
+                listeners.enter_context(recorder)
+                listeners.callback(lambda: _tell_missed(f"the recording {path}", recorder.missed.total()))
+                LOG.warning("recording to %s", path)
             queries = QueryServer(self.session, self.trackers, partial(robot_info, config, self.keys), memories)
             started.callback(queries.close)
-            diagnostics = DiagnosticsTimer(self._services)
-            started.callback(diagnostics.close)
+            started.callback(DiagnosticsTimer(services).close)
             started.enter_context(low_latency())
             self._started = started.pop_all()
 
@@ -172,50 +198,6 @@ class LiveNode(Closing):
     def health(self, robot: str) -> Health:
         """A robot's health now."""
         return self.trackers[robot].health(time.monotonic())
-
-    def _open_memories(self, started: ExitStack) -> dict[str, RobotMemory]:
-        """Each robot's memory: the files of its saved state, locked for this node; none without a ``state`` folder."""
-        memories: dict[str, RobotMemory] = {}
-        if self.config.state is not None:
-            for robot in self.config.robots:
-                memories[robot.name] = memory = RobotMemory(self.config.state, robot.name)
-                started.callback(memory.close)
-        return memories
-
-    def _claim_robots(self, started: ExitStack) -> None:
-        """Refuse a robot that another node runs, and warn of tf frames that another node may publish too."""
-        claim = Claim(self.session, self.trackers.keys(), _PRESENCE_TIMEOUT)
-        started.callback(claim.close)
-        # All robots share the topic tf: two on frames of the same names overwrite each other's transforms.
-        robots = self.config.on_common_frames()
-        if robots and claim.others:
-            name = robots[0]
-            LOG.warning(
-                "robot %s publishes tf between map, odom and base_link, and so may %s on the same network; "
-                "`frames: prefixed` makes them %s/odom and %s/base_link",
-                *(name, ", ".join(claim.others), name, name),
-            )
-
-    def _serve_foxglove(self, listeners: ExitStack) -> None:
-        """Serve the robots' topics to Foxglove, if the config asks for it."""
-        if self.config.foxglove is False:
-            return
-        server = listeners.enter_context(
-            FoxgloveServer(port=PORT if self.config.foxglove is True else self.config.foxglove)
-        )
-        server.forward(self.session, self.keys, list(self.trackers))
-        listeners.callback(lambda: _tell_missed("Foxglove", server.missed))
-        LOG.warning("Foxglove: open %s", server.address)
-
-    def _record(self, listeners: ExitStack) -> None:
-        """Record the robots' topics, if the config asks for it; in a new file where the config's is there already."""
-        if self.config.record is None:
-            return
-        path = free_path(self.config.record)
-        recorder = Recorder(self.session, self.keys, list(self.trackers), path, on_failure=LOG.error)
-        listeners.enter_context(recorder)
-        listeners.callback(lambda: _tell_missed(f"the recording {path}", recorder.missed.total()))
-        LOG.warning("recording to %s", path)
 
 
 def load_effects(config: LiveConfig) -> None:

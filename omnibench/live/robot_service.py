@@ -15,13 +15,12 @@ from typing import Final
 import zenoh
 
 from omnibench.errors import one_line
-from omnibench.live.acknowledged_flows import AcknowledgedFlows
 from omnibench.live.estimation.health import anomalies_in_words, diagnostic
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.stopping import Closing, RateLimiter
 from omnibench.live.wire.messages import Diagnostics, MissedMessages, flow_of
 from omnibench.live.wire.outputs import OUTPUTS, Update
-from omnibench.live.wire.topics import GraphNode
+from omnibench.live.wire.topics import AcknowledgedFlows, GraphNode
 
 LOG = logging.getLogger("omnibench.live")
 _PAUSE: Final = 0.002  # s between turns while the thread is busy; chosen
@@ -99,14 +98,11 @@ class LateUpdates:
 
     def on_time(self) -> None:
         """Publish what waits before an update that is on time."""
-        self._publish_waiting(newer_follows=True)
+        self.publish_waiting(newer_follows=True)
         self._first = None
 
-    def end_turn(self) -> None:
-        """Publish what waits."""
-        self._publish_waiting(newer_follows=False)
-
-    def _publish_waiting(self, *, newer_follows: bool) -> None:
+    def publish_waiting(self, *, newer_follows: bool = False) -> None:
+        """Publish what waits, at the end of a turn or before a newer update."""
         waiting, self._waiting = self._waiting, []
         if waiting and not self._replayed:
             last = len(waiting) - (not newer_follows)
@@ -251,7 +247,7 @@ class RobotService:
                 self._receive_poses()
                 if self._flows.accepts(flow):
                     self._take(message, late=False, published=self._flows.inherited(flow), replayed=True)
-            self._late.end_turn()
+            self._late.publish_waiting()
             if self._flows.heard:  # the sender forgets what is acknowledged: the state has to hold it before
                 self.tracker.save()
                 self._flows.acknowledge()

@@ -57,9 +57,17 @@ class HealthReporter:
         if waiting_since is not None:
             state.behind = max(state.behind, now - waiting_since)
         age = None if state.arrival is None else now - state.arrival
-        status, message = self._status(state, now, age)
+        behind = max(self._behind, state.behind)
+        status, message = self._status(state, now, age, behind)
         covariance = _covariance(state, age if status == "stale" else None)
-        provenance = state.calibration.provenance
+        provenance, fusion, fusion_health = state.calibration.provenance, state.fusion, None
+        if fusion is not None:
+            fusion_health = FusionHealth(
+                located=fusion.located,
+                pose_age_s=None if fusion.fused_at is None else now - fusion.fused_at,
+                last_outcome=fusion.outcome,
+                rejected_in_a_row=fusion.rejected_in_a_row,
+            )
         return Health(
             robot=state.name,
             status=status,
@@ -68,25 +76,24 @@ class HealthReporter:
             simulated=provenance is not None and provenance.simulated,
             rate_hz=self._rate,
             age_s=age,
-            behind_s=self._longest_wait(state),
+            behind_s=behind,
             last_stamp=state.timeline.newest / _SECOND if state.timeline.entries else None,
             position_sigma_m=float(np.sqrt((covariance[0, 0] + covariance[1, 1]) / 2)),
             heading_sigma_rad=float(np.sqrt(covariance[2, 2])),
-            fusion=_fusion_health(state, now),
+            fusion=fusion_health,
             counts=state.counts.as_dict(),
             last_refusal=state.last_refusal,
             last_swap=state.last_swap,
             unfitted_motion_s=state.monitor.seconds,
         )
 
-    def _longest_wait(self, state: RobotState) -> float:
-        return max(self._behind, state.behind)
+    def _status(self, state: RobotState, now: float, age: float | None, behind: float) -> tuple[Status, str]:
+        """The status and its reason in words.
 
-    def _status(self, state: RobotState, now: float, age: float | None) -> tuple[Status, str]:
-        """The status and its reason in words. age: of the last wheel sample, s; None before the first."""
+        age: of the last wheel sample, s; None before the first. behind: longest time that samples waited, s.
+        """
         if age is None:
             return "waiting", f"no wheel sample yet{f': {state.last_refusal}' if state.last_refusal else ''}"
-        behind = self._longest_wait(state)
         if age > self._stale_after + behind:
             wheels = state.wheel_input
             if wheels.repeats and now - wheels.repeated_at <= self._stale_after + behind:
@@ -119,18 +126,6 @@ def _covariance(state: RobotState, silence: float | None) -> Array:
     return fusion.covariance + (odometry.covariance_after_silence(silence) - odometry.covariance)
 
 
-def _fusion_health(state: RobotState, now: float) -> FusionHealth | None:
-    fusion = state.fusion
-    if fusion is None:
-        return None
-    return FusionHealth(
-        located=fusion.located,
-        pose_age_s=None if fusion.fused_at is None else now - fusion.fused_at,
-        last_outcome=fusion.outcome,
-        rejected_in_a_row=fusion.rejected_in_a_row,
-    )
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseAt:
     """A robot's pose at ``stamp`` (ns). odometry: pose (3,) in odom. in_map: pose (3,) and covariance (3, 3)."""
@@ -138,19 +133,6 @@ class PoseAt:
     stamp: int
     odometry: Array
     in_map: tuple[Array, Array] | None
-
-
-def pose_at(state: RobotState, stamp: int | None = None) -> PoseAt:
-    """The pose at a time (ns; default: of the last sample). DataError: nothing is remembered of that time."""
-    timeline = state.timeline
-    if not timeline.entries:
-        raise DataError(f"robot {state.name!r} has sent no wheel sample yet")
-    chosen = timeline.newest if stamp is None else stamp
-    odometry = timeline.odometry_at(chosen)
-    if odometry is None:
-        oldest, newest = timeline.oldest / _SECOND, timeline.newest / _SECOND
-        raise DataError(f"at: {chosen / _SECOND:.6f} s is not within {oldest:.6f} to {newest:.6f} s")
-    return PoseAt(chosen, odometry, state.fusion.at(chosen) if state.fusion else None)
 
 
 _OTHER_ROBOT = 0.5  # share of a row's largest element; chosen: no calibration moves a matrix so far from its design
@@ -361,7 +343,15 @@ class RobotTracker:
     def pose_at(self, stamp: int | None = None) -> PoseAt:
         """The pose at a time (ns; default: of the last sample). DataError: nothing is remembered of that time."""
         with self._state_lock:
-            return pose_at(self._state, stamp)
+            timeline, fusion = self._state.timeline, self._state.fusion
+            if not timeline.entries:
+                raise DataError(f"robot {self.name!r} has sent no wheel sample yet")
+            chosen = timeline.newest if stamp is None else stamp
+            odometry = timeline.odometry_at(chosen)
+            if odometry is None:
+                oldest, newest = timeline.oldest / _SECOND, timeline.newest / _SECOND
+                raise DataError(f"at: {chosen / _SECOND:.6f} s is not within {oldest:.6f} to {newest:.6f} s")
+            return PoseAt(chosen, odometry, fusion.at(chosen) if fusion else None)
 
     def swap(self, calibration: Calibration) -> None:
         """Continue with another calibration from the next sample on. DataError: it is not this robot's."""

@@ -24,7 +24,6 @@ import numpy as np
 import zenoh
 
 from omnibench.errors import ConfigError, OmnibenchError
-from omnibench.live.acknowledged_flows import acknowledgement_key, read_acknowledgement
 from omnibench.live.control.request_queue import source_of
 from omnibench.live.estimation.health import anomalies_among
 from omnibench.live.network.presence import alive_robots, checked_robot
@@ -41,7 +40,7 @@ from omnibench.live.replay.concatenated_drive import (
 from omnibench.live.stopping import Closing, answers, direct, wait_until
 from omnibench.live.wheels.wheel_input import check_joints, joints_of
 from omnibench.live.wire.messages import JointState, PoseEstimate
-from omnibench.live.wire.topics import GraphNode, Publisher
+from omnibench.live.wire.topics import GraphNode, Publisher, acknowledgement_key, read_acknowledgement
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
@@ -64,12 +63,16 @@ class DeliveryError(OmnibenchError):
 class Delivery(Closing):
     """Publishes messages and waits where too many are under way.
 
-    paused: s that it has waited for a receiver. restarts: how often another node went on in the receiver's place.
+    taken: messages that the receiver has taken; None where that is not known. passed: messages that are known to have
+    reached the receiver or, where that is not known, the next router. paused: s that it has waited for a receiver.
+    restarts: how often another node went on in the receiver's place.
     stop: ends any waiting. wait: s without any sign of the receiver after which it is given up, of which those do not
     count in which this process itself was suspended.
     """
 
     def __init__(self, stop: threading.Event, wait: float) -> None:
+        self.taken: int | None = None
+        self.passed = 0
         self.paused = 0.0
         self.restarts = 0
         self._stop, self._patience = stop, wait
@@ -82,16 +85,6 @@ class Delivery(Closing):
         there = sign.wait(_POLL_PERIOD)
         self._waited += min(time.monotonic() - began, _LONGEST_POLL)
         return there
-
-    @property
-    @abstractmethod
-    def taken(self) -> int | None:
-        """Messages that the receiver has taken; None where that is not known."""
-
-    @property
-    @abstractmethod
-    def passed(self) -> int:
-        """Messages that are known to have reached the receiver or, where that is not known, the next router."""
 
     @abstractmethod
     def put(self, publisher: Publisher[Any], payload: bytes) -> bool:
@@ -113,8 +106,8 @@ class AcknowledgedDelivery(Delivery):
         self._robot = robot
         self._flow = secrets.randbits(64)
         self._lock = threading.Lock()
-        self._under_way: deque[tuple[Publisher[Any], bytes, int]] = deque()  # from number _taken on
-        self._sent = self._taken = 0
+        self._under_way: deque[tuple[Publisher[Any], bytes, int]] = deque()  # from number ``passed`` on
+        self._sent = self.taken = 0
         self._gap = False
         self._node: str | None = None  # the node's session, as its acknowledgements name it
         self._progress_at = self._sent_again_at = -math.inf
@@ -122,16 +115,15 @@ class AcknowledgedDelivery(Delivery):
         key = acknowledgement_key(robot, self._flow)
         self._subscriber = session.declare_subscriber(key, direct(self._acknowledged))
 
-    @property
-    def taken(self) -> int:
-        return self._taken
-
-    @property
-    def passed(self) -> int:
-        return self._taken
-
     def put(self, publisher: Publisher[Any], payload: bytes) -> bool:
-        self._wait_for_room()
+        # Wait while the window is full, or while the node has been silent for long.
+        began = time.monotonic()
+        while not self._stop.is_set() and (
+            len(self._under_way) >= WINDOW or self._gap or (bool(self._under_way) and self._silence() >= _FIRST_RETRY)
+        ):
+            self._wait()
+        waited = time.monotonic() - began
+        self.paused += waited if waited > _FIRST_RETRY else 0.0
         if self._stop.is_set():
             return False
         number = publisher.next_number()
@@ -139,7 +131,7 @@ class AcknowledgedDelivery(Delivery):
             if not self._under_way:
                 self._progress_at, self._waited = time.monotonic(), 0.0
             self._under_way.append((publisher, payload, number))
-            place = self._flow, self._sent, self._taken, False
+            place = self._flow, self._sent, self.passed, False
             self._sent += 1
         publisher.put_numbered(payload, number, place)
         return True
@@ -155,18 +147,6 @@ class AcknowledgedDelivery(Delivery):
     def close(self) -> None:
         self._subscriber.undeclare()
 
-    def _wait_for_room(self) -> None:
-        """Wait while the window is full, or while the node has been silent for long."""
-        if len(self._under_way) < WINDOW and (not self._under_way or self._silence() < _FIRST_RETRY) and not self._gap:
-            return
-        began = time.monotonic()
-        while not self._stop.is_set() and (
-            len(self._under_way) >= WINDOW or self._gap or (bool(self._under_way) and self._silence() >= _FIRST_RETRY)
-        ):
-            self._wait()
-        waited = time.monotonic() - began
-        self.paused += waited if waited > _FIRST_RETRY else 0.0
-
     def _silence(self) -> float:
         """Time since the last progress, s."""
         return time.monotonic() - self._progress_at
@@ -178,23 +158,20 @@ class AcknowledgedDelivery(Delivery):
         silence, now = self._silence(), time.monotonic()
         if self._waited > self._patience:
             key = acknowledgement_key(self._robot, "*")
-            rights = "" if self._taken else f" (may this session read {key}?)"
+            rights = "" if self.passed else f" (may this session read {key}?)"
             raise DeliveryError(f"its node has taken nothing for {silence:.0f} s{rights}; `wait` says how long to wait")
         again = now - self._sent_again_at
         if (self._gap and again > _GAP_RETRY) or (silence > self._retry and again > self._retry):
             self._retry = min(2 * self._retry, _LAST_RETRY) if silence > self._retry else self._retry
-            self._send_again()
-
-    def _send_again(self) -> None:
-        """Send all that is under way once more."""
-        with self._lock:
-            self._gap = False
-            first, messages = self._taken, list(self._under_way)
-        self._sent_again_at = time.monotonic()
-        for place, (publisher, payload, number) in enumerate(messages, first):
-            if self._stop.is_set():
-                return
-            publisher.put_numbered(payload, number, (self._flow, place, self._taken, True))
+            # Send all that is under way once more.
+            with self._lock:
+                self._gap = False
+                first, messages = self.passed, list(self._under_way)
+            self._sent_again_at = time.monotonic()
+            for place, (publisher, payload, number) in enumerate(messages, first):
+                if self._stop.is_set():
+                    return
+                publisher.put_numbered(payload, number, (self._flow, place, self.passed, True))
 
     def _acknowledged(self, sample: zenoh.Sample) -> None:
         try:
@@ -202,11 +179,11 @@ class AcknowledgedDelivery(Delivery):
         except struct.error:
             return
         with self._lock:
-            expected = min(expected, self._taken + len(self._under_way))
-            if expected > self._taken:
-                for _ in range(expected - self._taken):
+            expected = min(expected, self.passed + len(self._under_way))
+            if expected > self.passed:
+                for _ in range(expected - self.passed):
                     self._under_way.popleft()
-                self._taken = expected
+                self.taken = self.passed = expected
                 self._progress_at, self._waited = time.monotonic(), 0.0
                 self._retry = _FIRST_RETRY
             self._gap |= gap and bool(self._under_way)
@@ -228,15 +205,6 @@ class UnconfirmedDelivery(Delivery):
         self._linked = is_connected(session)  # otherwise all subscribers are in this session
         self._sent = 0
         self._before = 0  # messages before the last round trip
-        self._passed = 0
-
-    @property
-    def taken(self) -> None:
-        return None
-
-    @property
-    def passed(self) -> int:
-        return self._passed
 
     def put(self, publisher: Publisher[Any], payload: bytes) -> bool:
         if self._sent - self._before >= WINDOW:
@@ -272,7 +240,7 @@ class UnconfirmedDelivery(Delivery):
         if self._arrived.is_set() and not self._stop.is_set() and self._linked and not is_connected(self._session):
             raise DeliveryError("the link to the router was lost")  # which closes a query, too
         if self._arrived.is_set():
-            self._passed = self._before
+            self.passed = self._before
         waited = time.monotonic() - began
         self.paused += waited if waited > _FIRST_RETRY else 0.0
 
@@ -295,28 +263,19 @@ class Event:
     message: JointState | PoseEstimate
 
 
-def events(
-    drive: ConcatenatedDrive,
-    config: ReplayConfig,
-    *,
-    origin: int | None = None,
-    noise: Noise | None = None,
-    names: Sequence[str] | None = None,
-) -> Iterator[Event]:
-    """The messages of a drive, by time of arrival.
+class ReplayMessages:
+    """All messages of a drive without stamps, prepared so that a replay starts without delay.
 
-    origin: stamp of the drive's start, ns (default: the config's, or now). noise: noise model of the reference, for
-    poses whose covariance neither the data set nor the config gives. names (N + S,): names of the joints, those
-    that steer after those of the wheels; default: the usual ones.
+    noise: noise model of the reference, for poses whose covariance neither the data set nor the config gives. names
+    (N + S,): names of the joints, those that steer after those of the wheels; default: the usual ones.
     """
-    return _Messages(drive, config, noise, names).stamped_from(origin)
-
-
-class _Messages:
-    """All messages of a drive without stamps, prepared so that a replay starts without delay."""
 
     def __init__(
-        self, drive: ConcatenatedDrive, config: ReplayConfig, noise: Noise | None, names: Sequence[str] | None
+        self,
+        drive: ConcatenatedDrive,
+        config: ReplayConfig,
+        noise: Noise | None = None,
+        names: Sequence[str] | None = None,
     ) -> None:
         self._drive = drive
         self._origin = config.stamp_origin
@@ -332,7 +291,8 @@ class _Messages:
     def __len__(self) -> int:
         return len(self._schedule)
 
-    def stamped_from(self, origin: int | None) -> Iterator[Event]:
+    def stamped_from(self, origin: int | None = None) -> Iterator[Event]:
+        """The messages by time of arrival. origin: stamp of the drive's start, ns (default: the config's, or now)."""
         start = origin or self._origin or time.time_ns()
         schedule = self._schedule
         return (
@@ -386,8 +346,8 @@ class Player:
 
     A node that runs the robot acknowledges what it takes: nothing is lost at any speed, the node is waited for while it
     is gone, and is given up after the config's ``wait``. Other subscribers confirm nothing; a slow one delays the
-    replay. names, noise: as for ``events``. ConfigError: the robot's name is not valid, or the names are not one for
-    each wheel.
+    replay. names, noise: as for ``ReplayMessages``. ConfigError: the robot's name is not valid, or the names are not
+    one for each wheel.
     """
 
     def __init__(
@@ -401,7 +361,7 @@ class Player:
     ) -> None:
         self._robot = checked_robot(robot)
         self._config = config
-        self._messages = _Messages(drive, config, noise, names)
+        self._messages = ReplayMessages(drive, config, noise, names)
         self._session = graph.session
         self._publishers = {topic: graph.publisher(robot, topic, lossless=True) for topic in TOPICS_PLAYED}
 
@@ -425,10 +385,14 @@ class Player:
         before, anomalies = Counter[str](), Counter[str]()
         try:
             self._wait_for_subscriber(stop)
-            delivery = self._delivery(stop)
+            # To the robot's node, if there is one, or else to whoever subscribes.
+            patience = max(self._config.wait, _LEAST_PATIENCE)
+            running = self._robot in alive_robots(self._session, patience, stop)
+            kind = AcknowledgedDelivery if running else UnconfirmedDelivery
+            delivery = kind(self._session, self._robot, stop, patience)
             before = self._anomalies(delivery, stop)
             begin = reported_at = time.perf_counter()
-            for number, event in enumerate(self._messages.stamped_from(None), 1):
+            for number, event in enumerate(self._messages.stamped_from(), 1):
                 due = begin + delivery.paused + event.arrival / self._config.speed
                 now = time.perf_counter()
                 if due > now:
@@ -457,7 +421,9 @@ class Player:
             if not stop.is_set():  # otherwise the session was closed after stopping
                 raise OmnibenchError(f"replay of {self._robot}: cannot publish any more: {error}") from None
         except DeliveryError as error:
-            raise self._not_delivered(error, delivery) from None
+            total = len(self._messages)
+            missing = f"{total - (0 if delivery is None else delivery.passed):,} of {plural(total, 'message')}"
+            raise DeliveryError(f"{missing} did not reach robot {self._robot!r}: {error}") from None
         finally:
             if delivery is not None:
                 delivery.close()
@@ -467,13 +433,6 @@ class Player:
         late = 0.0 if math.isinf(self._config.speed) else late
         return PlayReport(sent, len(self._messages), taken, restarts, arrival, wall, late, interrupted, anomalies)
 
-    def _delivery(self, stop: threading.Event) -> Delivery:
-        """Delivery to the robot's node, if there is one, or else to whoever subscribes."""
-        patience = max(self._config.wait, _LEAST_PATIENCE)
-        if self._robot in alive_robots(self._session, patience, stop):
-            return AcknowledgedDelivery(self._session, self._robot, stop, patience)
-        return UnconfirmedDelivery(self._session, self._robot, stop, patience)
-
     def _anomalies(self, delivery: Delivery, stop: threading.Event) -> Counter[str]:
         """The counters of the robot's node above 0 of what should not happen; none if there is none, or no answer."""
         if delivery.taken is None:
@@ -482,12 +441,6 @@ class Player:
         healths = answers(lambda do, s: self._session.get(key, do, timeout=s, source_info=source), _HEALTH_WAIT, stop)
         counts = json.loads(healths[0].payload.to_bytes()).get("counts", {}) if healths else {}
         return Counter({name: n for name, n in anomalies_among(counts).items() if name != "irregular"})
-
-    def _not_delivered(self, error: DeliveryError, delivery: Delivery | None) -> DeliveryError:
-        """The error with the number of messages that are not known to have arrived."""
-        total = len(self._messages)
-        missing = f"{total - (0 if delivery is None else delivery.passed):,} of {plural(total, 'message')}"
-        return DeliveryError(f"{missing} did not reach robot {self._robot!r}: {error}")
 
     def _progress(self, sent: int, seconds: float) -> Progress:
         """Messages sent, and how many ``seconds`` of the recording they are."""

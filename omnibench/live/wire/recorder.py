@@ -60,7 +60,9 @@ class McapFile:
     def write(self, name: str, kind: MessageType[Any], payload: bytes, *, log_time: int, publish_time: int) -> None:
         """Add a message of the ROS topic ``name`` in CDR. Times in ns, >= 0; log_time must not decrease."""
         if name not in self._channels:
-            self._channels[name] = self._writer.register_channel(name, "cdr", self._schema(kind))
+            if kind.name not in self._schemas:
+                self._schemas[kind.name] = self._writer.register_schema(kind.name, "ros2msg", kind.definition.encode())
+            self._channels[name] = self._writer.register_channel(name, "cdr", self._schemas[kind.name])
         self._writer.add_message(self._channels[name], log_time, payload, publish_time)
         if self._stream.waiting:  # a chunk was full
             self._writer.flush()
@@ -81,11 +83,6 @@ class McapFile:
     def close(self) -> None:
         """Close the file as the last flush left it, without an index."""
         self._stream.close()
-
-    def _schema(self, kind: MessageType[Any]) -> int:
-        if kind.name not in self._schemas:
-            self._schemas[kind.name] = self._writer.register_schema(kind.name, "ros2msg", kind.definition.encode())
-        return self._schemas[kind.name]
 
 
 def _ending() -> bytes:
@@ -269,20 +266,17 @@ class Recorder:
         stopping = False
         while not stopping:
             stopping = self._stopping.wait(_POLL_PERIOD)
-            self._add_all(file)
+            for count in itertools.count(1):
+                try:
+                    arrival = self._waiting.get_nowait()
+                except Empty:
+                    break
+                self._add(file, arrival)
+                if count % _BATCH == 0:
+                    time.sleep(0)  # lets the node's other threads run
             if time.monotonic() >= flush_at:
                 file.flush()
                 flush_at = time.monotonic() + _FLUSH_PERIOD
-
-    def _add_all(self, file: McapFile) -> None:
-        for count in itertools.count(1):
-            try:
-                arrival = self._waiting.get_nowait()
-            except Empty:
-                return
-            self._add(file, arrival)
-            if count % _BATCH == 0:
-                time.sleep(0)  # lets the node's other threads run
 
     def _add(self, file: McapFile, arrival: Arrival) -> None:
         kind = TOPICS[arrival.topic]
