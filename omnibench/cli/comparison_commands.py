@@ -1,8 +1,8 @@
 """``compare``: several calibrators on equal terms."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -79,10 +79,27 @@ def compare(
     asked = plugin_folders(plugins or [])
     given = {"backend": backend, "workers": workers, "tls": tls_files(tls_ca, tls_cert, tls_key)}
     given = {name: value for name, value in given.items() if value is not None}
-    from omnibench.study.study import is_study
+    from omnibench.study.study import is_study, read_study_config, run_study
 
     if len(config) == 1 and config[0].is_file() and is_study(config[0]):
-        return _study(config[0], _named_paths(data), asked, given, output, figures, force=force)
+        # The exit code is 1 if a recording of a study cannot be read, or no method answered.
+        from omnibench.cli.terminal.comparison_tables import print_study, print_study_ending
+        from omnibench.study.report.study_report import study_document
+
+        study = read_study_config(config[0], _named_paths(data))
+        folders = [*study.plugins, *(folder.resolve() for folder in asked)]
+        study = study.model_copy(update={"plugins": tuple(dict.fromkeys(folders))} | given)
+        with ProgressDisplay() as watch:
+            answer = run_study(study, output, watch, force=force)
+            if figures is not None:
+                watch(Progress("drawing the figures"))
+                write_asked_figures(study_document(answer), figures)
+        warn(answer.warnings)
+        print_study(make_console(), answer)
+        typer.echo(f"report: {answer.output / 'report.html'}")
+        if not print_study_ending(answer):
+            raise typer.Exit(1)
+        return None
     comparison = _asked_comparison(config, data, asked)
     folders = [*comparison.plugins, *(folder.resolve() for folder in asked)]
     comparison = comparison.model_copy(update={"plugins": tuple(dict.fromkeys(folders))} | given)
@@ -102,38 +119,6 @@ def compare(
         )
         raise typer.Exit(1)
     return print_comparison_ending(result)
-
-
-def _study(
-    file: Path,
-    data: Mapping[str, Path],
-    plugins: Sequence[Path],
-    given: Mapping[str, Any],
-    output: Path | None,
-    figures: Path | None,
-    *,
-    force: bool,
-) -> None:
-    """Run a study and print its answer. The exit code is 1 if a recording cannot be read, or no method answered."""
-    from omnibench.cli.terminal.comparison_tables import print_study, print_study_ending
-    from omnibench.cli.terminal.progress_display import ProgressDisplay
-    from omnibench.progress import Progress
-    from omnibench.study.report.study_report import study_document
-    from omnibench.study.study import read_study_config, run_study
-
-    config = read_study_config(file, data)
-    folders = (*config.plugins, *(folder.resolve() for folder in plugins))
-    config = config.model_copy(update={"plugins": tuple(dict.fromkeys(folders))} | dict(given))
-    with ProgressDisplay() as watch:
-        result = run_study(config, output, watch, force=force)
-        if figures is not None:
-            watch(Progress("drawing the figures"))
-            write_asked_figures(study_document(result), figures)
-    warn(result.warnings)
-    print_study(make_console(), result)
-    typer.echo(f"report: {result.output / 'report.html'}")
-    if not print_study_ending(result):
-        raise typer.Exit(1)
 
 
 def _asked_comparison(given: Sequence[Path], data: list[str] | None, plugins: Sequence[Path]) -> "CompareConfig":

@@ -29,12 +29,13 @@ from omnibench.cli.options import (
     tls_files,
     write_asked_figures,
 )
-from omnibench.cli.terminal.console import make_console, print_ending, say, warn
+from omnibench.cli.terminal.console import make_console, print_ending, print_json, say, warn
 from omnibench.errors import ConfigError, DataError
 from omnibench.words import plural
 
 if TYPE_CHECKING:
-    from omnibench.cli.fetch import Fetched
+    from rich.console import Console
+
     from omnibench.fit.check.checking import CheckReport
     from omnibench.fit.check.fixes import RecordingSource
 
@@ -101,6 +102,7 @@ def import_(
     scans but without reference poses get these by SLAM.
     """
     from omnibench.config import parse_settings
+    from omnibench.data.checks.finding import UNITS, FindingWarning
     from omnibench.data.dataset import Imported
     from omnibench.data.splits import division_in_words
     from omnibench.data.storage import check_dataset_folder, save_dataset
@@ -112,7 +114,23 @@ def import_(
     load_given_plugins(plugins, plugin_files)
     entry, given = importers.entry(importer, "import"), parse_settings(settings)
     if template is not None:
-        return _write_template(importer, template, robot_type or "diff", references, force, source, output)
+        # Write tables and robot.yaml to fill in, and say what to type then.
+        from omnibench.data.importers.csv_tables.csv_template import write_template
+
+        if importer != "csv":
+            raise ConfigError(f"--template is for csv, not for {importer}: omnibench import csv --template {template}")
+        if source is not None or output is not None:
+            raise ConfigError("--template DIR writes tables to fill in; leave SOURCE and -o out")
+        refuse_existing(template, force=force, folders=True)
+        files = write_template(template, robot_type or "diff", references=references)
+        typer.echo(f"{plural(len(files), 'file')}: {template}")
+        for file in files:
+            typer.echo(f"  {file.name}", err=True)
+        return print_ending(
+            f"{template} holds robot.yaml and {plural(len(files) - 1, 'table')} to fill in",
+            "put your robot and your samples into them, and import them",
+            *("omnibench", "import", "csv", template, "-o", f"data/{template.resolve().name}"),
+        )
     if references:
         raise ConfigError("--references is for --template DIR; a references.csv among the tables is read by itself")
     if robot_type is not None:
@@ -131,89 +149,40 @@ def import_(
     read = RecordingSource(dataset, importer, source, given, output)
     report = None if no_check else _checked(read)
     if not accept_units:
-        _refuse_units(read, output, report)
+        # Units that cannot be right are refused, with what to type.
+        wrong: list[str] = [each for each in dataset.warnings if isinstance(each, FindingWarning) and each.unit]
+        if not wrong and report is not None:
+            wrong = [each.what for each in report.findings if each.kind in UNITS and each.severity == "error"]
+        if wrong:
+            mended = (report or _checked(read)).command
+            way = f"type {mended}, or " if mended else ""
+            raise DataError(f"{'; '.join(wrong)}; {output} is not written: {way}--accept-units to write it as it is")
     dataset = replace(dataset, imported=Imported.of(importer, source, given))
     save_dataset(dataset, output, table_format, overwrite=force)
-    warn([each for each in dataset.warnings if report is None or not _is_said(each, report.sentence)])
+    said = "" if report is None else report.sentence  # the findings that the check's sentence names
+    warn([each for each in dataset.warnings if not (isinstance(each, FindingWarning) and each.finding.what in said)])
     typer.echo(f"{plural(len(dataset.trajectories), 'trajectory')}: {output}")
     way = " (other: --set validation=PATTERN)" if "validation" in entry.cls.Options.model_fields else ""
     divided = f"{division_in_words(dataset.trajectories, options)}{way}"
     make_console(error=True).print(divided, soft_wrap=True)
     then: tuple[str, tuple[object, ...]] = ("see what they tell", ("omnibench", "inspect", output))
     if report is not None:
+        from omnibench.fit.check.checking import mending
+
         make_console(error=True).print(f"check: {report.sentence}.", soft_wrap=True)
-        then = _after(read, report)
-    print_ending(
-        f"{output} holds {plural(len(dataset.trajectories), 'run')} of {dataset.robot.name}", then[0], *then[1]
-    )
-    return None
-
-
-def _refuse_units(read: "RecordingSource", output: Path, report: "CheckReport | None") -> None:
-    """DataError: the units of a recording cannot be right; it says what to type."""
-    from omnibench.data.checks.finding import UNITS, FindingWarning
-
-    wrong: list[str] = [each for each in read.dataset.warnings if isinstance(each, FindingWarning) and each.unit]
-    if not wrong and report is not None:
-        wrong = [each.what for each in report.findings if each.kind in UNITS and each.severity == "error"]
-    if not wrong:
-        return
-    mended = (report or _checked(read)).command
-    way = f"type {mended}, or " if mended else ""
-    raise DataError(f"{'; '.join(wrong)}; {output} is not written: {way}--accept-units to write it as it is")
+        then = "see what is missing", ("omnibench", "check", output)
+        if typed := mending(read, report):
+            then = "mend it", tuple(shlex.split(typed))
+        elif report.verdict == "ready":
+            then = "calibrate it", ("omnibench", "calibrate", output, "-o", "calibration.yaml")
+    holds = f"{output} holds {plural(len(dataset.trajectories), 'run')} of {dataset.robot.name}"
+    return print_ending(holds, then[0], *then[1])
 
 
 def _checked(read: "RecordingSource") -> "CheckReport":
     from omnibench.fit.check.checking import check_recording  # slow to import, and left out by --no-check
 
     return check_recording(read)
-
-
-def _is_said(warning: str, sentence: str) -> bool:
-    """True for the warning of a finding that the sentence of the check says."""
-    from omnibench.data.checks.finding import FindingWarning
-
-    return isinstance(warning, FindingWarning) and warning.finding.what in sentence
-
-
-def _after(read: "RecordingSource", report: "CheckReport") -> tuple[str, tuple[object, ...]]:
-    """The next step after an import, in words, and the command for it."""
-    from omnibench.fit.check.checking import mending
-
-    if typed := mending(read, report):
-        return "mend it", tuple(shlex.split(typed))
-    if report.verdict == "ready":
-        return "calibrate it", ("omnibench", "calibrate", read.folder, "-o", "calibration.yaml")
-    return "see what is missing", ("omnibench", "check", read.folder)
-
-
-def _write_template(
-    importer: str,
-    folder: Path,
-    robot_type: str,
-    references: bool,
-    force: bool,
-    source: Path | None,
-    output: Path | None,
-) -> None:
-    """Write tables and robot.yaml to fill in, and say what to type then."""
-    from omnibench.data.importers.csv_tables.csv_template import write_template
-    from omnibench.files import refuse_existing
-
-    if importer != "csv":
-        raise ConfigError(f"--template is for csv, not for {importer}: omnibench import csv --template {folder}")
-    if source is not None or output is not None:
-        raise ConfigError("--template DIR writes tables to fill in; leave SOURCE and -o out")
-    refuse_existing(folder, force=force, folders=True)
-    files = write_template(folder, robot_type, references=references)
-    typer.echo(f"{plural(len(files), 'file')}: {folder}")
-    for file in files:
-        typer.echo(f"  {file.name}", err=True)
-    print_ending(
-        f"{folder} holds robot.yaml and {plural(len(files) - 1, 'table')} to fill in",
-        "put your robot and your samples into them, and import them",
-        *("omnibench", "import", "csv", folder, "-o", f"data/{folder.resolve().name}"),
-    )
 
 
 check_app = typer.Typer()
@@ -254,8 +223,7 @@ def check(
 
     Nothing is changed. Exit 0 whatever the verdict; 2 where the source cannot be read.
     """
-    from omnibench.cli.terminal.check_summary import print_check
-    from omnibench.cli.terminal.console import make_console, print_json
+
     from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.config import parse_settings
     from omnibench.errors import PluginError
@@ -286,7 +254,37 @@ def check(
     if as_json:
         print_json(checked.model_dump(mode="json", include={"verdict", "needed", "findings"}))
         return
-    print_check(make_console(), checked, next_command(read))
+    _print_check(make_console(), checked, next_command(read))
+
+
+_NEEDED = {True: "a calibration is needed", False: "a calibration is hardly needed", None: ""}
+
+
+def _print_check(console: "Console", checked: "CheckReport", then: str) -> None:
+    """Print the report; what can be typed is not wrapped, so that it can be copied.
+
+    then: the command line for a recording that is ready.
+    """
+    console.print(f"{checked.verdict.upper()}: {checked.sentence}.", soft_wrap=True)
+    for finding in checked.findings:
+        console.print()
+        console.print(f"{finding.severity}: {finding.what} [{finding.where}]", soft_wrap=True)
+        if finding.fix.startswith("omnibench "):
+            console.out(f"  {finding.fix}", highlight=False)
+        elif finding.fix:
+            console.print(f"  {finding.fix}", soft_wrap=True)
+    if checked.gain:
+        needed = _NEEDED[checked.needed]
+        console.print()
+        console.print(f"{needed}: {checked.gain}" if needed else checked.gain, soft_wrap=True)
+    console.print()
+    if checked.command:
+        print_ending("what can be mended is mended by one import", "type", *shlex.split(checked.command))
+    elif checked.verdict == "record more":
+        print_ending("nothing of this can be typed", "record what is missing, and check again")
+    else:
+        words = shlex.split(then)
+        print_ending("nothing stands in the way", f"{words[1]} it", *words)
 
 
 fetch_app = typer.Typer()
@@ -333,21 +331,13 @@ def fetch(
     for folder, dataset in fetched.datasets.items():
         typer.echo(f"{plural(len(dataset.trajectories), 'trajectory')}: {folder}")
     say(f"source: {fetched.source}, in {fetched.clone.folder}")
-    say(f"licence: {_licence(fetched)}")
+    licence = fetched.licence or "the repository states none; ask its authors before you use it"
+    if fetched.licence_file is not None:
+        place = next(iter(fetched.datasets), fetched.clone.folder) / fetched.licence_file.name
+        licence = f"{fetched.licence or 'see'} ({place})"
+    say(f"licence: {licence}")
     say(f"cite: {fetched.cite}")
-    return _say_what_next(fetched)
-
-
-def _licence(fetched: "Fetched") -> str:
-    """The licence in words, with the file that holds its text."""
-    if fetched.licence_file is None:
-        return fetched.licence or "the repository states none; ask its authors before you use it"
-    folder = next(iter(fetched.datasets), fetched.clone.folder)
-    return f"{fetched.licence or 'see'} ({folder / fetched.licence_file.name})"
-
-
-def _say_what_next(fetched: "Fetched") -> None:
-    """The last sentence: what there is now, and what to type."""
+    # What there is now, and what to type.
     clone = fetched.clone
     if fetched.datasets:
         folder, dataset = next(iter(fetched.datasets.items()))

@@ -11,7 +11,6 @@ import plotly.graph_objects as go
 import polars as pl
 
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.data.references import References
 from omnibench.data.tables import reference_frame, tables_of
 from omnibench.errors import DataError
 from omnibench.report.blocks import Figure, FigureGrid
@@ -93,10 +92,6 @@ def _table(dataset: Dataset, name: str) -> pl.DataFrame:
     return frame.select(column for column in frame.iter_columns() if column.null_count() < len(frame))
 
 
-def _reference_table(references: References) -> pl.DataFrame:
-    return reference_frame([("", references)]).drop("trajectory")
-
-
 class TrajectoryView(View):
     """A run: how long, how far, and its reference path."""
 
@@ -120,8 +115,10 @@ class TrajectoryView(View):
 
     def tables(self) -> Mapping[str, Callable[[], pl.DataFrame]]:
         references = self.shown.references
-        named = {} if references is None else {"references": partial(_reference_table, references)}
-        return {"wheels": self._wheels, "poses": self._poses, **named}
+        tables: dict[str, Callable[[], pl.DataFrame]] = {"wheels": self._wheels, "poses": self._poses}
+        if references is not None:
+            tables["references"] = lambda: reference_frame([("", references)]).drop("trajectory")
+        return tables
 
     def _wheels(self) -> pl.DataFrame:
         run = self.shown

@@ -240,7 +240,10 @@ _MARGIN = 60  # px above and below
 def drawn(grid: FigureGrid) -> go.Figure:
     """The plots of a grid side by side in one figure, with its legend."""
     if len(grid.figures) == 1:
-        return _single(grid)
+        (figure,) = grid.figures
+        alone = go.Figure(figure.plot)
+        alone.update_layout(title_text=text(figure.title), title_x=0.02)
+        return _with_legend(alone, grid, figure.height)
     titles = [text(figure.title) for figure in grid.figures]
     columns = min(grid.columns, len(grid.figures))
     rows = -(-len(grid.figures) // columns)
@@ -258,13 +261,6 @@ def drawn(grid: FigureGrid) -> go.Figure:
             whole.layout[f"{letter}axis{axis}"].update(kept)
     whole.update_layout(template=grid.figures[0].plot.layout.template)
     return _with_legend(whole, grid, rows * max(figure.height for figure in grid.figures))
-
-
-def _single(grid: FigureGrid) -> go.Figure:
-    (figure,) = grid.figures
-    whole = go.Figure(figure.plot)
-    whole.update_layout(title_text=text(figure.title), title_x=0.02)
-    return _with_legend(whole, grid, figure.height)
 
 
 def _with_legend(figure: go.Figure, grid: FigureGrid, height: int) -> go.Figure:

@@ -13,7 +13,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import plotly.graph_objects as go
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup, escape
 from plotly.offline import get_plotlyjs
@@ -151,27 +150,19 @@ def _environment(glossary: Glossary) -> Environment:
         lstrip_blocks=True,
     )
     environment.filters["explained"] = glossary.marked
-    environment.filters["breakable"] = _breakable
+    # Words may break after an underscore, too: long names must not widen a table beyond a phone or paper.
+    environment.filters["breakable"] = lambda words: Markup(escape(words).replace("_", Markup("_<wbr>")))
     environment.globals["new_terms"] = glossary.fresh
-    environment.filters["plot_json"] = _plot_json
+    environment.filters["plot_json"] = lambda figure: _json(json.loads(figure.to_json()))
     environment.filters["script_json"] = _json
     environment.globals["plotly_js"] = Markup(get_plotlyjs())
     environment.globals["source"] = lambda name: Markup(_source(environment, name))
     return environment
 
 
-def _breakable(words: str) -> Markup:
-    """Words that may break after an underscore, too: long names must not widen a table beyond a phone or paper."""
-    return Markup(escape(words).replace("_", Markup("_<wbr>")))
-
-
 def _source(environment: Environment, name: str) -> str:
     assert environment.loader is not None
     return environment.loader.get_source(environment, name)[0]
-
-
-def _plot_json(figure: go.Figure) -> Markup:
-    return _json(json.loads(figure.to_json()))
 
 
 def _json(content: Any) -> Markup:

@@ -1,7 +1,7 @@
 """Replaying a recording on Zenoh as the robot and its SLAM would have sent it, at any speed.
 
 A bounded number of messages is under way at any speed, and it is known what arrived. An omnibench node acknowledges
-what it has taken (``acknowledged_flows``): what is lost with a link or with a node that starts again is sent once more,
+what it has taken (``AcknowledgedFlows``): what is lost with a link or with a node that starts again is sent once more,
 and a node that is gone is waited for. Other subscribers acknowledge nothing: there a round trip to the next Zenoh
 router, behind the messages, bounds how many are under way, and empties the queue at the end.
 """

@@ -3,6 +3,12 @@
 plain: the key is the topic's name, as the DDS bridge (zenoh-bridge-ros2dds) maps it. rmw: keys and liveliness tokens of
 a ROS 2 node on rmw_zenoh; without tokens ``ros2 topic list`` would not show the topic. humble: rmw with Humble's
 placeholder for type hashes. Messages of all profiles carry rmw_zenoh's attachment, without which ROS 2 would drop them.
+
+Acknowledged flows: a node takes each message of a replay once and in order, and tells which it expects next. The rule
+is go-back-n: a message after a gap is refused, and the sender sends again from the first that is missing. A node that
+does not know a flow, since it has just started, expects the lowest number that the sender has no acknowledgement of.
+What is sent again to it may have been taken by a node that was killed before it could acknowledge, and whose odometry
+is out: it is integrated, but not published a second time.
 """
 
 from __future__ import annotations

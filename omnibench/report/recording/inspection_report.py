@@ -385,7 +385,9 @@ def _clock_picture(robot: Robot, runs: Sequence[Trajectory], clocks: Sequence[Cl
     known = [(run, clock) for run, clock in zip(runs, clocks, strict=True) if clock is not None]
     if not known:
         return None
-    farthest = sorted(known, key=lambda pair: -_worst(pair[1]))[:_LOOKED_AT]
+    ends = [(abs(clock.offset), abs(clock.offset + clock.drift * clock.length)) for _, clock in known]
+    order = sorted(range(len(known)), key=lambda index: -max(ends[index]))
+    farthest = [known[index] for index in order[:_LOOKED_AT]]
     views = [(*_view(robot, run, clock), run, clock) for run, clock in farthest]
     _, begin, run, clock = max(views, key=lambda view: view[0])
     span = begin, min(begin + _SHOWN, float(run.times[-1]))
@@ -400,10 +402,6 @@ def _clock_picture(robot: Robot, runs: Sequence[Trajectory], clocks: Sequence[Cl
         figure.plot.update_yaxes(range=[min(values) - margin, max(values) + margin])
     caption = f"Rate of turn in run {run.id}, whose stamps are among those that differ most."
     return FigureGrid(figures, (_WHEELS, _REFERENCE), caption=caption, name="clocks")
-
-
-def _worst(clock: ClockMatch) -> float:
-    return max(abs(clock.offset), abs(clock.offset + clock.drift * clock.length))
 
 
 def _view(robot: Robot, run: Trajectory, clock: ClockMatch) -> tuple[float, float]:

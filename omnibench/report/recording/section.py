@@ -56,7 +56,7 @@ from omnibench.report.recording.recording_figures import (
     wheel_rates,
 )
 from omnibench.report.style import INK, PALETTE, QUIET, plot
-from omnibench.robot.kinematics import Array, Robot, compose, interpolated, placed, seen_from
+from omnibench.robot.kinematics import Array, compose, interpolated, placed, seen_from
 from omnibench.robot.model import OdometryModel
 from omnibench.slam.slam_request import ErrorSummary, RunErrors, SlamAccuracy, SlamSummary, run_errors, slam_accuracy
 from omnibench.words import plural
@@ -94,7 +94,7 @@ def player(
 def _run(
     dataset: Dataset, run: Trajectory, odometry: OdometryModel, truth: TruePath | None, outlines: Sequence[Array]
 ) -> dict[str, Any]:
-    end = run.end
+    end, steered = run.end, dataset.robot.drive.steered
     times = np.linspace(0.0, end, min(_FRAMES, max(2, round(end / 0.02) + 1)))
     poses = poses_at(run, times)
     (driven,) = odometry.poses([run.log(times)])
@@ -120,7 +120,17 @@ def _run(
         "window": _rounded(np.concatenate([low, high])),
         "rated": dataset.robot.wheel_names,
         "steering": None if run.steering is None else _rounded(interpolated(times, run.times, run.steering)),
-        "wheels": _played_wheels(dataset.robot),
+        # Radius and place, m, direction of rolling, rad, index of the angle that steers it, of the wheels drawn.
+        "wheels": [
+            {
+                "radius": wheel.radius,
+                "at": _rounded(np.array(wheel.position), 6),
+                "rolling": wheel.rolling,
+                "steered": steered.index(wheel.name) if wheel.has_steering else None,
+            }
+            for wheel in dataset.robot.wheels
+            if is_placed(wheel)
+        ],
         "radius": max(math.hypot(wheel.reach, wheel.radius) for wheel in dataset.robot.wheels),
         "colours": {
             "reference": REFERENCE_ITEM.colour,
@@ -166,21 +176,6 @@ def _means(run: Trajectory, values: Array, times: Array) -> Array:
     return means
 
 
-def _played_wheels(robot: Robot) -> list[dict[str, Any]]:
-    """The wheels that are drawn: radius and place, m, direction of rolling, rad, index of the angle that steers it."""
-    steered = robot.drive.steered
-    return [
-        {
-            "radius": wheel.radius,
-            "at": _rounded(np.array(wheel.position), 6),
-            "rolling": wheel.rolling,
-            "steered": steered.index(wheel.name) if wheel.has_steering else None,
-        }
-        for wheel in robot.wheels
-        if is_placed(wheel)
-    ]
-
-
 def _key(scans: bool, truth: bool, plan: bool) -> list[dict[str, Any]]:
     items = [REFERENCE_ITEM, ODOMETRY_ITEM] + [TRUTH_ITEM] * truth + [PLAN_ITEM] * plan
     points = [_SEEN, LegendItem("map", "earlier scans", SCANS_ITEM.colour)] * scans
@@ -190,12 +185,6 @@ def _key(scans: bool, truth: bool, plan: bool) -> list[dict[str, Any]]:
 
 def _rounded(values: Array, decimals: int = 3) -> Any:
     return np.round(values, decimals).tolist()
-
-
-def errors_in_words(accuracy: SlamAccuracy) -> str:
-    """The mean errors of the last poses, such as ``1.2 mm and 0.05°``."""
-    final = accuracy.final
-    return f"{_mm(final.position_mean_m)} mm and {_degrees(final.heading_mean_rad)}°"
 
 
 def accuracy_tiles(accuracy: SlamAccuracy) -> tuple[Fact, ...]:
@@ -599,7 +588,9 @@ def _answer(dataset: Dataset, notes: Sequence[str], accuracy: SlamAccuracy | Non
         Fact("Reference poses", count(sum(len(run.poses) for run in runs))),
     )
     if accuracy is not None:
-        sentence += f". Their reference poses end {errors_in_words(accuracy)} from the truth on average"
+        final = accuracy.final
+        errors = f"{_mm(final.position_mean_m)} mm and {_degrees(final.heading_mean_rad)}°"
+        sentence += f". Their reference poses end {errors} from the truth on average"
         tiles = accuracy_tiles(accuracy)
     return answer_section(
         f"{sentence}.",
