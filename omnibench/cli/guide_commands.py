@@ -105,9 +105,8 @@ def _print_names(summaries: Mapping[str, str]) -> None:
         typer.echo(fill(summary, width, initial_indent=f"  {name:{_NAME_WIDTH}}  ", subsequent_indent=" " * _NAMES))
 
 
-plugin_app = typer.Typer()
 _plugin = typer.Typer(help="Write a new plug-in, or check one.", no_args_is_help=True, rich_markup_mode=None)
-plugin_app.add_typer(_plugin, name="plugin")
+guide_app.add_typer(_plugin, name="plugin")
 
 # Where the config of each command is: module and class.
 _CONFIGS = {
@@ -119,7 +118,7 @@ _CONFIGS = {
 }
 
 
-@plugin_app.command("list")
+@guide_app.command("list")
 def list_(plugins: Plugins = None, as_json: Json = False) -> None:
     """List calibrators, costs, effects and importers.
 
@@ -151,7 +150,7 @@ def list_(plugins: Plugins = None, as_json: Json = False) -> None:
     )
 
 
-@plugin_app.command()
+@guide_app.command()
 def schema(
     kind: Annotated[
         Literal["compare", "design", "live", "simulate", "study"], typer.Argument(help="Which command's config.")

@@ -51,7 +51,7 @@ from numpy.typing import NDArray
 
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.discover.fitting import Extended, Fit, at_runs, columns_at, extend, inliers_of, model_with
-from omnibench.discover.regressors.columns import Group
+from omnibench.discover.regressors.significance import Group
 from omnibench.discover.result import Extrapolation, Gap, HeldOut, Step
 from omnibench.errors import DataError
 from omnibench.fit.evaluate import final_errors
@@ -266,11 +266,6 @@ def left_by(extended: Extended, values: Array) -> list[Array]:
     ]
 
 
-def held_out_squares(data: Whitened, index: Sequence[int], folds: NDArray[np.intp]) -> Array:
-    """Chi-square (Z,) of each run by the columns ``index`` as fitted to all folds but the run's own."""
-    return squares_left_by(data, index, values_of_other_folds(data, index, folds))
-
-
 def squares_left_by(data: Whitened, index: Sequence[int], values: Array) -> Array:
     """Chi-square (Z,) of each run by values (Z, n) of the columns ``index``, others for each run."""
     of_runs = zip(data.residuals, data.columns, values, strict=True)
@@ -282,7 +277,8 @@ def held_out_chi_square(data: Whitened, before: Sequence[int], after: Sequence[i
     """Chi-square difference (Z,) of each run between the columns ``before`` and ``after``, its fold held out."""
     every = sorted({*before, *after})
     few, place = data.only(every), {column: row for row, column in enumerate(every)}
-    first, last = (held_out_squares(few, [place[each] for each in index], folds) for index in (before, after))
+    places = [[place[each] for each in index] for index in (before, after)]
+    first, last = (squares_left_by(few, index, values_of_other_folds(few, index, folds)) for index in places)
     return first - last
 
 

@@ -1,5 +1,7 @@
 """Rendering a document as one self-contained HTML file: no network, no fonts, no second file.
 
+One section of it says how to make a report's results again: command, settings, machine and config.
+
 Words that not every reader knows are marked where a report first uses them, and explained below that section.
 """
 
@@ -13,13 +15,17 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+from jinja2 import Environment as Templates
+from jinja2 import PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup, escape
 from plotly.offline import get_plotlyjs
+from pydantic import BaseModel
 
-from omnibench.environment import package_versions
+from omnibench.config import to_yaml
+from omnibench.environment import Environment, package_versions
 from omnibench.files import write_text
-from omnibench.report.blocks import Document
+from omnibench.report.blocks import Code, Details, Document, Fact, Facts, Paragraph, Section
+from omnibench.words import plural
 
 # The word as it is listed, the pattern that it is known by, and its meaning.
 _WORDS: tuple[tuple[str, str, str], ...] = (
@@ -140,9 +146,9 @@ def figures_page(grids: Sequence[Mapping[str, Any]]) -> str:
     return _environment(Glossary()).get_template("figures.html.j2").render(grids=grids)
 
 
-def _environment(glossary: Glossary) -> Environment:
+def _environment(glossary: Glossary) -> Templates:
     """Templates and what they call; a glossary serves one report."""
-    environment = Environment(
+    environment = Templates(
         loader=PackageLoader("omnibench.report"),
         autoescape=select_autoescape(default=True, default_for_string=True),
         undefined=StrictUndefined,
@@ -160,7 +166,7 @@ def _environment(glossary: Glossary) -> Environment:
     return environment
 
 
-def _source(environment: Environment, name: str) -> str:
+def _source(environment: Templates, name: str) -> str:
     assert environment.loader is not None
     return environment.loader.get_source(environment, name)[0]
 
@@ -171,3 +177,26 @@ def _json(content: Any) -> Markup:
     for character in "<>&":  # all else is ASCII already
         dense = dense.replace(character, f"\\u{ord(character):04x}")
     return Markup(dense)
+
+
+def reproduction_section(config: BaseModel, settings: Sequence[Fact], environment: Environment) -> Section:
+    """The section for an effective config, the settings that matter most, and the environment of the work."""
+    facts = (
+        *settings,
+        Fact("Python", environment.python),
+        Fact("Platform", environment.platform),
+        Fact("Processor", environment.processor or "not known", plural(environment.processors, "logical processor")),
+        Fact("Versions", ", ".join(f"{name} {version}" for name, version in environment.versions.items())),
+    )
+    return Section(
+        "reproduction",
+        "How to reproduce",
+        (
+            Paragraph("The effective config lies beside this report. From this folder:"),
+            Code("omnibench compare config.yaml -o again"),
+            Facts(facts),
+            Details("Effective config", (Code(to_yaml(config)),)),
+        ),
+        about="Config, versions and machine.",
+        folded=True,
+    )

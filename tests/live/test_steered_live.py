@@ -19,7 +19,7 @@ from omnibench.config import validate
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.errors import DataError
 from omnibench.live.config import LiveConfig
-from omnibench.live.estimation.saved_state import RobotMemory, SavedState
+from omnibench.live.estimation.robot_state import RobotMemory, SavedState
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.fusion.pose_fusion import FusionSettings
 from omnibench.live.replay.concatenated_drive import ConcatenatedDrive, Recording, ReplayConfig, concatenate_recording

@@ -161,7 +161,8 @@ def print_evaluation(console: Console, evaluation: Evaluation) -> None:
     for split in evaluation.splits:
         title = f"{split}: {plural(evaluation.splits[split].trajectories, 'run')}"
         if evaluation.unfitted is not None:
-            title += f", {_of_all(evaluation.unfitted[split], evaluation.splits[split].trajectories)} held out"
+            part, whole = evaluation.unfitted[split], evaluation.splits[split].trajectories
+            title += f", { {0: 'none', whole: 'all'}.get(part, f'{part:,}') } held out"
         if (outside := evaluation.splits[split].outside) is not None:
             title += f", {100 * outside:.0f} % of the time outside of what it was fitted to"
         rows.append(Row.of(title, role="group"))
@@ -260,10 +261,6 @@ def print_certificate_ending(certified: CertifiedCalibration, file: Path, datase
     else:
         exact = ("omnibench", "calibrate", *datasets, "-o", "better.yaml")
         print_ending(f"a better matrix may save up to {gap:.1%} of the cost", "search for it", *exact)
-
-
-def _of_all(part: int, count: int) -> str:
-    return {0: "none", count: "all"}.get(part, f"{part:,}")
 
 
 def _deviation(share: float) -> str:

@@ -69,7 +69,12 @@ class Paths:
         for first, last in blocks_of([_STAMPS * len(log.stamps) + len(log.times) for log in self.logs], _BLOCK):
             samples = slice(int(edges[first]), int(edges[last]))
             stamps = slice(self.parts[first].start, self.parts[last - 1].stop)
-            within = [(name, _overlap(part, samples)) for name, part in self.sessions]
+            # The samples of each session that are in the part, counted from its first
+            first_of, end = samples.start, samples.stop
+            within = [
+                (name, slice(max(own.start, first_of) - first_of, max(min(own.stop, end), first_of) - first_of))
+                for name, own in self.sessions
+            ]
             yield replace(
                 self,
                 logs=self.logs[first:last],
@@ -79,7 +84,7 @@ class Paths:
                 middle=self.middle[samples],
                 poses=self.poses[stamps],
                 run=self.run[stamps] - first,
-                parts=tuple(_moved(part, -stamps.start) for part in self.parts[first:last]),
+                parts=tuple(slice(own.start - stamps.start, own.stop - stamps.start) for own in self.parts[first:last]),
                 ends=self.ends[first:last],
                 first=self.first + first,
                 _turns=self._turns[samples],
@@ -167,7 +172,23 @@ class Paths:
 
     @cached_property
     def _sums(self) -> csr_array:
-        return _sums(self.logs)
+        """The matrix (S, F) that adds up what samples do between one stamp and the next."""
+        rows, columns, weights = [], [], []
+        stamp, first = 0, 0
+        for log in self.logs:
+            times = np.concatenate([[0.0], log.times])
+            edges = np.unique(np.concatenate([times, np.clip(log.stamps, 0.0, times[-1])]))
+            middles = (edges[1:] + edges[:-1]) / 2
+            sample = np.searchsorted(log.times, middles)
+            interval = np.searchsorted(log.stamps, middles)
+            inside = interval < len(log.stamps)
+            share = np.diff(edges) / np.diff(times)[np.minimum(sample, len(log.times) - 1)]
+            rows.append(stamp + interval[inside])
+            columns.append(first + sample[inside])
+            weights.append(share[inside])
+            stamp, first = stamp + len(log.stamps), first + len(log.times)
+        entries = (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns)))
+        return csr_array(entries, shape=(stamp, first))
 
     def summed(self, changes: Array) -> Array:
         """Slopes (S, 3, J) by changes (F, 3, J) of (z, theta) in each sample."""
@@ -197,15 +218,6 @@ def blocks_of(sizes: Sequence[int], most: int) -> Iterator[tuple[int, int]]:
     yield first, len(sizes)
 
 
-def _overlap(part: slice, other: slice) -> slice:
-    """The samples that are in both, counted from the first of the other."""
-    return _moved(slice(max(part.start, other.start), max(min(part.stop, other.stop), other.start)), -other.start)
-
-
-def _moved(part: slice, by: int) -> slice:
-    return slice(part.start + by, part.stop + by)
-
-
 def make_paths(
     robot: Robot,
     matrix: Array,
@@ -223,7 +235,10 @@ def make_paths(
     assert order == list(range(len(logs))), "runs come by session"
     samples = RunSamples.of([log.times for log in logs])
     sessions, starts = _sessions(logs, samples.edges), np.array([log.start for log in logs])
-    needs = frozenset(_needs(robot) if needs is None else needs) - {"poses"}  # poses are computed in any case
+    if needs is None:
+        every = [effects.create(entry.name) for entry in effects.entries()]
+        needs = frozenset().union(*(effect.needs for effect in every if effect.applies(robot)))
+    needs = frozenset(needs) - {"poses"}  # poses are computed in any case
     of_sessions = [
         signals_of_runs(
             logs[low:high], RunSamples.of([log.times for log in logs[low:high]]), robot, matrix, sample_period, needs
@@ -258,12 +273,6 @@ def make_paths(
     )
 
 
-def _needs(robot: Robot) -> frozenset[str]:
-    """Signals that effects which apply to a robot need."""
-    trial = [effects.create(entry.name) for entry in effects.entries()]
-    return frozenset().union(*(effect.needs for effect in trial if effect.applies(robot)))
-
-
 def along_ends(samples: RunSamples, ends: Array, times: Sequence[Array]) -> Array:
     """Poses (S, 3) of each run at times (K,), s: at rest before its start, straight on after its last sample.
 
@@ -283,26 +292,6 @@ def along_ends(samples: RunSamples, ends: Array, times: Sequence[Array]) -> Arra
     passed = wanted[late] - end[run[late]]
     poses[late] = ends[last[run[late]]] + mean[run[late]] * passed[:, None]
     return poses
-
-
-def _sums(logs: Sequence[WheelLog]) -> csr_array:
-    """The matrix (S, F) that adds up what samples do between one stamp and the next."""
-    rows, columns, weights = [], [], []
-    stamp, first = 0, 0
-    for log in logs:
-        times = np.concatenate([[0.0], log.times])
-        edges = np.unique(np.concatenate([times, np.clip(log.stamps, 0.0, times[-1])]))
-        middles = (edges[1:] + edges[:-1]) / 2
-        sample = np.searchsorted(log.times, middles)
-        interval = np.searchsorted(log.stamps, middles)
-        inside = interval < len(log.stamps)
-        share = np.diff(edges) / np.diff(times)[np.minimum(sample, len(log.times) - 1)]
-        rows.append(stamp + interval[inside])
-        columns.append(first + sample[inside])
-        weights.append(share[inside])
-        stamp, first = stamp + len(log.stamps), first + len(log.times)
-    entries = (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns)))
-    return csr_array(entries, shape=(stamp, first))
 
 
 def _sessions(logs: Sequence[WheelLog], edges: NDArray[np.intp]) -> list[tuple[str | None, tuple[int, int], slice]]:

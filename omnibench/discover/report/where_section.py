@@ -314,7 +314,10 @@ def elapsed_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGr
     panels = []
     for name in sorted(groups):
         members = groups[name]
-        times = _times([residuals.runs[index] for index in members])
+        # Times until which at least half of the runs last
+        stamps = [residuals.runs[index].pose_times for index in members]
+        end = float(np.median([each[-1] for each in stamps]))
+        times = np.linspace(min(float(np.median([each[1] for each in stamps])), end), end, _TIMES)
         means = {style.key: _means(residuals, members, style, times) for style in styles}
         half = NORMAL_95 * residuals.deviations(times) / np.sqrt(_running(residuals, members, times))[:, None]
         for axis, (quantity, factor, unit) in enumerate(_QUANTITIES):
@@ -406,13 +409,6 @@ def _turning(run: Trajectory) -> str:
     if abs(turned) < max(_TURNING * float(run.pose_times[-1]), math.radians(3.0)):
         return "Runs that do not turn"
     return "Runs that turn left" if turned > 0 else "Runs that turn right"
-
-
-def _times(runs: Sequence[Trajectory]) -> Array:
-    """Times until which at least half of the runs last."""
-    end = float(np.median([run.pose_times[-1] for run in runs]))
-    first = float(np.median([run.pose_times[1] for run in runs]))
-    return np.linspace(min(first, end), end, _TIMES)
 
 
 def _running(residuals: Residuals, members: Sequence[int], times: Array) -> Array:

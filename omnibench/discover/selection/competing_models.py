@@ -34,8 +34,7 @@ import numpy as np
 
 from omnibench.discover.fitting import Extended, Fit, at_model, columns_of, extend, model_with, terms_of
 from omnibench.discover.held_out import folds_of_commands, held_out_residuals, is_gain
-from omnibench.discover.regressors.columns import Group
-from omnibench.discover.regressors.significance import Significance
+from omnibench.discover.regressors.significance import Group
 from omnibench.discover.result import Candidate, EstimatedParameter, NamedEffect
 from omnibench.discover.selection.model_selection import SURE, Selection
 from omnibench.discover.selection.motor_effects import MotorEffects
@@ -118,21 +117,21 @@ def competing_models(plain: Fit, selection: Selection, extended: Extended) -> Co
             if difference.mean() > 0:
                 others.append((selection.weights.get(chosen[position].name, 0.0), used))
                 preferred[position] = _reason(stand_in, difference)
-                selection, used = _exchanged(selection, position, stand_in), model
+                # The stand-in takes the place, and the effect that stood there is among the stand-ins.
+                exchanged = tuple(
+                    chosen[position] if group is stand_in else group for group in selection.stand_ins[position]
+                )
+                selection = replace(
+                    selection,
+                    chosen=(*chosen[:position], stand_in, *chosen[position + 1 :]),
+                    stand_ins=(*selection.stand_ins[:position], exchanged, *selection.stand_ins[position + 1 :]),
+                )
+                used = model
             else:
                 others.append((weight, model))
                 preferred[position] = preferred[position] or _reason(chosen[position], -difference)
     weight = min((selection.weights.get(group.name, 0.0) for group in selection.chosen), default=1.0)
     return CompetingModels(used, selection, ((weight, used), *others), tuple(preferred))
-
-
-def _exchanged(selection: Selection, position: int, stand_in: Group) -> Selection:
-    """The selection with a stand-in at one position, and the effect that stood there among the stand-ins."""
-    before = selection.chosen[position]
-    chosen = (*selection.chosen[:position], stand_in, *selection.chosen[position + 1 :])
-    exchanged = tuple(before if group is stand_in else group for group in selection.stand_ins[position])
-    stand_ins = (*selection.stand_ins[:position], exchanged, *selection.stand_ins[position + 1 :])
-    return replace(selection, chosen=chosen, stand_ins=stand_ins)
 
 
 def _reason(group: Group, difference: Array) -> str:
@@ -260,7 +259,16 @@ def named_effects(models: CompetingModels, motors: MotorEffects | None) -> tuple
 
 def candidates_of(selection: Selection) -> tuple[tuple[Candidate, ...], ...]:
     """The effects that were tried at each step, each in its best shape, the largest chi-square difference first."""
-    return tuple(_candidates(step, selection) for step in selection.steps)
+    candidates = []
+    for step in selection.steps:
+        ordered = sorted(step.best_shapes, key=lambda index: -step.chi_square[index])
+        names = [step.groups[index].name for index in ordered]
+        of_step = (
+            Candidate(name, float(step.chi_square[index]), int(step.rank[index]), selection.weights.get(name, 0.0))
+            for name, index in zip(names, ordered, strict=True)
+        )
+        candidates.append(tuple(of_step))
+    return tuple(candidates)
 
 
 def _effects(selection: Selection, robot: Robot, values: Array, reach: Array) -> tuple[NamedEffect, ...]:
@@ -284,7 +292,10 @@ def _effects(selection: Selection, robot: Robot, values: Array, reach: Array) ->
         weight = selection.weights.get(group.name, 0.0)
         chi_square, rank = tried.get(group.name, (0.0, 0.0))
         names = [parameter.name for parameter in group.parameters]
-        assert group.effect is not None
+        estimates = [
+            EstimatedParameter(each.name, float(value), each.unit, float(value - margin), float(value + margin))
+            for each, value, margin in zip(group.parameters, values[rows], reach[rows], strict=True)
+        ]
         shapes = []
         for each in group.effect.parameters(robot):
             if each.name in group.shapes:
@@ -296,7 +307,7 @@ def _effects(selection: Selection, robot: Robot, values: Array, reach: Array) ->
                 stage=group.effect.stage,
                 weight=weight,
                 form=form_in_words(dict(group.shapes) | dict(zip(names, values[rows].tolist(), strict=True))),
-                parameters=(*_estimates(group, values[rows], reach[rows]), *shapes),
+                parameters=(*estimates, *shapes),
                 confusable_with=confusable,
                 physics=group.effect.physics,
                 source=group.effect.source,
@@ -307,19 +318,3 @@ def _effects(selection: Selection, robot: Robot, values: Array, reach: Array) ->
             )
         )
     return tuple(effects)
-
-
-def _estimates(group: Group, values: Array, margins: Array) -> list[EstimatedParameter]:
-    return [
-        EstimatedParameter(parameter.name, float(value), parameter.unit, float(value - margin), float(value + margin))
-        for parameter, value, margin in zip(group.parameters, values, margins, strict=True)
-    ]
-
-
-def _candidates(step: Significance, selection: Selection) -> tuple[Candidate, ...]:
-    ordered = sorted(step.best_shapes, key=lambda index: -step.chi_square[index])
-    names = [step.groups[index].name for index in ordered]
-    return tuple(
-        Candidate(name, float(step.chi_square[index]), int(step.rank[index]), selection.weights.get(name, 0.0))
-        for name, index in zip(names, ordered, strict=True)
-    )

@@ -26,7 +26,7 @@ from omnibench.live.control.request_queue import (
     read_sent_calibration,
     read_time,
 )
-from omnibench.live.estimation.saved_state import RobotMemory
+from omnibench.live.estimation.robot_state import RobotMemory
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.stopping import RateLimiter, direct
 from omnibench.robot.kinematics import Array

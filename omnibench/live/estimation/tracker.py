@@ -22,8 +22,16 @@ import numpy as np
 from omnibench.errors import DataError, OmnibenchError
 from omnibench.live.estimation.health import Counts, FusionHealth, Health, Status, SwapRecord
 from omnibench.live.estimation.live_odometry import Motion
-from omnibench.live.estimation.robot_state import ExtrapolationMonitor, RobotState, new_state, wheel_angle_effects
-from omnibench.live.estimation.saved_state import RobotMemory, SavedState, StateWriter, resume_state
+from omnibench.live.estimation.robot_state import (
+    ExtrapolationMonitor,
+    RobotMemory,
+    RobotState,
+    SavedState,
+    StateWriter,
+    new_state,
+    resume_state,
+    wheel_angle_effects,
+)
 from omnibench.live.fusion.pose_fusion import Entry, Fusion, FusionSettings, Outcome, PoseInput
 from omnibench.live.wheels.wheel_input import WheelSettings, WheelStep
 from omnibench.live.wire.messages import JointState, MessageError, arrival_stamp

@@ -293,20 +293,17 @@ class ReplayMessages:
 
     def stamped_from(self, origin: int | None = None) -> Iterator[Event]:
         """The messages by time of arrival. origin: stamp of the drive's start, ns (default: the config's, or now)."""
-        start = origin or self._origin or time.time_ns()
-        schedule = self._schedule
-        return (
-            Event(float(arrival), TOPICS_PLAYED[topic], (self._sample if topic == WHEELS else self._pose)(start, row))
-            for arrival, topic, row in zip(schedule.arrivals, schedule.topics, schedule.rows, strict=True)
-        )
-
-    def _sample(self, start: int, row: int) -> JointState:
-        positions = None if self._positions is None else self._positions[row]
-        velocities = None if self._velocities is None else self._velocities[row]
-        return JointState(start + int(self._sampled[row]), self._joints, positions, velocities)
-
-    def _pose(self, start: int, row: int) -> PoseEstimate:
-        return PoseEstimate(start + int(self._posed[row]), MAP, self._drive.slam_poses[row], self._covariances[row])
+        start, schedule = origin or self._origin or time.time_ns(), self._schedule
+        for arrival, topic, row in zip(schedule.arrivals, schedule.topics, schedule.rows, strict=True):
+            message: JointState | PoseEstimate
+            if topic == WHEELS:
+                positions = None if self._positions is None else self._positions[row]
+                velocities = None if self._velocities is None else self._velocities[row]
+                message = JointState(start + int(self._sampled[row]), self._joints, positions, velocities)
+            else:
+                stamp, pose = start + int(self._posed[row]), self._drive.slam_poses[row]
+                message = PoseEstimate(stamp, MAP, pose, self._covariances[row])
+            yield Event(float(arrival), TOPICS_PLAYED[topic], message)
 
 
 @dataclass(frozen=True)

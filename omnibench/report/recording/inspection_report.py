@@ -385,9 +385,8 @@ def _clock_picture(robot: Robot, runs: Sequence[Trajectory], clocks: Sequence[Cl
     known = [(run, clock) for run, clock in zip(runs, clocks, strict=True) if clock is not None]
     if not known:
         return None
-    ends = [(abs(clock.offset), abs(clock.offset + clock.drift * clock.length)) for _, clock in known]
-    order = sorted(range(len(known)), key=lambda index: -max(ends[index]))
-    farthest = [known[index] for index in order[:_LOOKED_AT]]
+    off_at_ends = [max(abs(clock.offset), abs(clock.offset + clock.drift * clock.length)) for _, clock in known]
+    farthest = [known[index] for index in np.argsort(-np.array(off_at_ends), kind="stable")[:_LOOKED_AT]]
     views = [(*_view(robot, run, clock), run, clock) for run, clock in farthest]
     _, begin, run, clock = max(views, key=lambda view: view[0])
     span = begin, min(begin + _SHOWN, float(run.times[-1]))

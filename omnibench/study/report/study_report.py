@@ -33,7 +33,7 @@ from omnibench.report.blocks import (
 )
 from omnibench.report.figures import joined, line, marks
 from omnibench.report.numbers import count, fixed, listing, seconds, significant
-from omnibench.report.reproduction import reproduction_section
+from omnibench.report.render import reproduction_section
 from omnibench.report.style import INK, PALETTE, QUIET, logarithmic, plot, text
 from omnibench.study.cells import StudyCell
 from omnibench.study.report.cell_tables import (

@@ -17,8 +17,7 @@ from hypothesis import strategies as st
 
 from omnibench.errors import ConfigError, DataError
 from omnibench.live.estimation.health import Counts, anomalies_in_words, diagnostic
-from omnibench.live.estimation.robot_state import ExtrapolationMonitor
-from omnibench.live.estimation.saved_state import RobotMemory
+from omnibench.live.estimation.robot_state import ExtrapolationMonitor, RobotMemory
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.fusion.pose_fusion import FusionSettings
 from omnibench.live.wheels.wheel_input import WheelSettings, WheelStep
