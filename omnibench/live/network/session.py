@@ -402,8 +402,8 @@ def _settings(config: SessionConfig) -> Iterator[tuple[str, Any]]:
         yield "transport/link/tls", settings
     if config.access is not None:
         certificate = config.tls.certificate if config.tls is not None and config.tls.mutual else None
-        user = config.user.name if config.user else None
-        own_name = user if certificate is None else common_name(certificate)
+        login = config.user.name if config.user else None
+        own_name = login if certificate is None else common_name(certificate)
         yield "access_control", access_control(config.access, by_certificate=certificate is not None, own_name=own_name)
 
 

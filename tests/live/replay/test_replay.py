@@ -223,7 +223,7 @@ class Clock(threading.Event):
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     """The clock by which replays run in this test."""
     clock = Clock()
-    times = SimpleNamespace(perf_counter=lambda: clock.now, time_ns=time.time_ns)
+    times = SimpleNamespace(perf_counter=lambda: clock.now, time_ns=time.time_ns, monotonic=time.monotonic)
     monkeypatch.setattr("omnibench.live.replay.replay_player.time", times)
     return clock
 
