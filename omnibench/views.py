@@ -27,7 +27,7 @@ _VIEWS = {
     "omnibench.data.dataset.Dataset": ("recording_view", "DatasetView"),
     "omnibench.discover.result.Discovery": ("discovery_view", "DiscoveryView"),
     "omnibench.fit.evaluate.Evaluation": ("calibration_view", "EvaluationView"),
-    "omnibench.robot.kinematics.Robot": ("robot_view", "RobotView"),
+    "omnibench.robot.kinematics.Robot": ("recording_view", "RobotView"),
     "omnibench.data.dataset.Trajectory": ("recording_view", "TrajectoryView"),
 }
 _LINES = 20  # of a text, at most: a screenful with what was typed

@@ -10,19 +10,16 @@ import typer
 from typer.core import TyperGroup
 
 from omnibench.cli.calibration_commands import calibration_app
-from omnibench.cli.comparison_commands import comparison_app
-from omnibench.cli.discovery_commands import discovery_app
-from omnibench.cli.guide_commands import guide_app, plugin_app
-from omnibench.cli.import_commands import check_app, fetch_app, import_app
+from omnibench.cli.guide_commands import guide_app
 from omnibench.cli.live_commands import live_app
 from omnibench.cli.recording_commands import recording_app
 
-# Headings of the help and the families under them, in the order in which a newcomer needs them.
+# Headings of the help and the family of commands under each, in the order in which a newcomer needs them.
 FAMILIES = (
-    ("Calibrate and compare", (comparison_app, calibration_app, discovery_app)),
-    ("Recordings", (import_app, fetch_app, check_app, recording_app)),
-    ("Live", (live_app,)),
-    ("Learn and extend", (guide_app, plugin_app)),
+    ("Calibrate and compare", calibration_app),
+    ("Recordings", recording_app),
+    ("Live", live_app),
+    ("Learn and extend", guide_app),
 )
 
 
@@ -72,10 +69,9 @@ def options_of_all(
     """Options of omnibench itself, before any command."""
 
 
-for heading, families in FAMILIES:
-    for family in families:
-        for command in family.registered_commands:
-            command.rich_help_panel = heading
-        for group in family.registered_groups:
-            group.rich_help_panel = heading
-        app.add_typer(family)
+for heading, family in FAMILIES:
+    for command in family.registered_commands:
+        command.rich_help_panel = heading
+    for group in family.registered_groups:
+        group.rich_help_panel = heading
+    app.add_typer(family)

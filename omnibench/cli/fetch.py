@@ -349,17 +349,25 @@ def fetch_recording(
     the newest. force: replace data sets that are there. ConfigError, DataError or PluginError in one line.
     """
     asked = find_recording(name)
-    folders = _folders(asked, output)
+    # The folder that was named, or one below it for each of several data sets.
+    names = [dataset.name for dataset in asked.datasets] or [asked.repository.partition("/")[2]]
+    folders = [(output or DATA) / each for each in names]
+    if output is not None and len(names) == 1:
+        folders = [output]
     for folder in folders:
         check_dataset_folder(folder)
     refuse_existing(*folders, force=force, folders=True)
-    default = asked.recording.commit if asked.recording else NEWEST
+    recording = asked.recording
+    default = recording.commit if recording else NEWEST
     clone = open_clone(asked.repository, CLONES / asked.repository, commit or default, report)
-    if asked.recording is None:
+    if recording is None:
         # Any other repository has one data set, if its format is recognised; else a refusal says why it has none.
         folder = folders[0]
         file = _licence_file(clone.folder)
-        fetched = Fetched(clone, f"{GITHUB}/{clone.repository}", _title(file), file, {})
+        # A licence's title is the first line of its text.
+        text = "" if file is None else file.read_text(encoding="utf-8", errors="replace")
+        title = next((line.strip()[:_LONGEST] for line in text.split("\n") if line.strip()), "")
+        fetched = Fetched(clone, f"{GITHUB}/{clone.repository}", title, file, {})
         report(Progress("importing"))
         try:
             fetched = replace(fetched, importer=recognised(clone.folder))
@@ -373,22 +381,7 @@ def fetch_recording(
             report(Progress("importing", result=""))
         _save(fetched, dataset, folder, force)
         return replace(fetched, datasets={folder: dataset})
-    return _known(clone, asked, asked.recording, folders, force, report)
-
-
-def _folders(asked: Asked, output: Path | None) -> list[Path]:
-    """The folders of the data sets: the one that was named, or one below it for each of several."""
-    names = [dataset.name for dataset in asked.datasets] or [asked.repository.partition("/")[2]]
-    if output is not None and len(names) == 1:
-        return [output]
-    return [(output or DATA) / name for name in names]
-
-
-def _known(
-    clone: Clone, asked: Asked, recording: PublicRecording, folders: list[Path], force: bool, report: Reporter
-) -> Fetched:
-    """The data sets of a recording of the catalogue."""
-    # The plug-in with the recording's importer, unless one of that name is there.
+    # The data sets of a recording of the catalogue, by its plug-in unless an importer of that name is there.
     if recording.plugin and recording.importer not in [entry.name for entry in importers.entries()]:
         failure = load_plugin_file(bundled_folder() / "plugins" / recording.plugin)
         if failure is not None:
@@ -428,11 +421,3 @@ def _licence_file(folder: Path) -> Path | None:
     """The first file of a repository that holds its licence; None if it has none."""
     named = (file for file in sorted(folder.iterdir()) if _LICENCE.fullmatch(file.name.partition(".")[0]))
     return next((file for file in named if file.is_file()), None)
-
-
-def _title(file: Path | None) -> str:
-    """The first line of a licence's text, which is its title."""
-    if file is None:
-        return ""
-    lines = file.read_text(encoding="utf-8", errors="replace").split("\n")
-    return next((line.strip()[:_LONGEST] for line in lines if line.strip()), "")

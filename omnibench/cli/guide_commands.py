@@ -43,7 +43,18 @@ def guide(
             _print_names({topic.name: topic.summary for topic in listed if topic.group == group})
         print_ending("these are the pages of the handbook", "read one", "omnibench", "guide", "getting-started")
     else:
-        _show(find_topic(topic).text)
+        # As pages on a terminal, as it stands where it is piped.
+        markdown = find_topic(topic).text
+        if sys.stdout.isatty():
+            from rich.console import Console
+            from rich.markdown import Markdown
+            from rich.theme import Theme
+
+            console = Console(theme=Theme({"markdown.code": "bold cyan"}), emoji=False)
+            console.width = min(console.width, _READING_WIDTH)
+            console.print(Markdown(markdown, code_theme="ansi_dark"))
+        else:
+            typer.echo(markdown, nl=False)
         print_ending(f"this was the page {topic!r}", "see what else there is to read", "omnibench", "guide")
 
 
@@ -94,22 +105,8 @@ def _print_names(summaries: Mapping[str, str]) -> None:
         typer.echo(fill(summary, width, initial_indent=f"  {name:{_NAME_WIDTH}}  ", subsequent_indent=" " * _NAMES))
 
 
-def _show(markdown: str) -> None:
-    """Markdown as pages on a terminal, as it stands where it is piped."""
-    if not sys.stdout.isatty():
-        return typer.echo(markdown, nl=False)
-    from rich.console import Console
-    from rich.markdown import Markdown
-    from rich.theme import Theme
-
-    console = Console(theme=Theme({"markdown.code": "bold cyan"}), emoji=False)
-    console.width = min(console.width, _READING_WIDTH)
-    return console.print(Markdown(markdown, code_theme="ansi_dark"))
-
-
-plugin_app = typer.Typer()
 _plugin = typer.Typer(help="Write a new plug-in, or check one.", no_args_is_help=True, rich_markup_mode=None)
-plugin_app.add_typer(_plugin, name="plugin")
+guide_app.add_typer(_plugin, name="plugin")
 
 # Where the config of each command is: module and class.
 _CONFIGS = {
@@ -121,24 +118,39 @@ _CONFIGS = {
 }
 
 
-@plugin_app.command("list")
+@guide_app.command("list")
 def list_(plugins: Plugins = None, as_json: Json = False) -> None:
     """List calibrators, costs, effects and importers.
 
     Each with where it comes from: built in, a plug-in's file, or an installed package.
     """
-    from omnibench.cli.terminal.registry_tables import print_registries, registry_document
+    from omnibench.cli.terminal.tables import print_table
+    from omnibench.registry import REGISTRIES, Entry
+    from omnibench.report.blocks import Column, Row, Table
 
     failures = load_given_plugins(plugins)
     if as_json:
-        return print_json(registry_document(failures))
-    print_registries(make_console())
+        # All that a config can name, with the JSON schema of its options, and the plug-ins that failed.
+        def row(entry: Entry[object]) -> dict[str, object]:
+            options = entry.options.model_json_schema().get("properties", {})
+            return {"name": entry.name, "summary": entry.summary, "from": entry.origin, "options": options}
+
+        named = {f"{registry.kind}s": [row(entry) for entry in registry.entries()] for registry in REGISTRIES}
+        failed = [{"from": failure.origin, "error": failure.error} for failure in failures]
+        return print_json({**named, "failures": failed})
+    columns = tuple(Column(heading, numeric=False) for heading in ("name", "what", "from"))
+    for registry in REGISTRIES:
+        rows = tuple(Row.of(entry.name, entry.summary, entry.origin) for entry in registry.entries())
+        if rows:
+            print_table(make_console(), Table(f"{registry.kind}s", columns, rows))
+        else:
+            make_console().print(f"{registry.kind}s: none yet")
     return print_ending(
         "all of these may be named in configs", "read how to choose", "omnibench", "guide", "calibrators"
     )
 
 
-@plugin_app.command()
+@guide_app.command()
 def schema(
     kind: Annotated[
         Literal["compare", "design", "live", "simulate", "study"], typer.Argument(help="Which command's config.")

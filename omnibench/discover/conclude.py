@@ -13,6 +13,7 @@ from omnibench.discover.covariate_dependence import Dependences
 from omnibench.discover.fitting import Extended, Fit
 from omnibench.discover.held_out import ValidationRuns, training_gap
 from omnibench.discover.output import Request, calibration_of
+from omnibench.discover.report.tables import weight_in_words
 from omnibench.discover.result import (
     CovariateDependence,
     Discovery,
@@ -26,9 +27,9 @@ from omnibench.discover.result import (
     few_in_words,
     is_other_session,
 )
+from omnibench.discover.selection.competing_models import candidates_of
 from omnibench.discover.selection.detectability import Detectability
 from omnibench.discover.selection.model_selection import CHANCE, SURE, Selection
-from omnibench.discover.selection.named_effects import candidates_of
 from omnibench.discover.selection.screening import Screening
 from omnibench.fit.sessions import SessionComparison
 from omnibench.robot.kinematics import Array
@@ -93,7 +94,7 @@ def headline_of(
     stand before these. untested: True if sessions could not be compared.
     """
     names = "; ".join(" or ".join((effect.name, *effect.confusable_with)) for effect in effects)
-    with_weights = " and ".join(f"{effect.name} ({_percent(effect.weight)})" for effect in effects)
+    with_weights = " and ".join(f"{effect.name} ({weight_in_words(effect.weight)})" for effect in effects)
     where, left = [each for each in where if _counts(each)], [each for each in left if _counts(each)]
     of_odometry = [each for each in where if each.stage != "actuator"]
     surest = _places(of_odometry or where)
@@ -132,8 +133,8 @@ def _places(dependences: _Dependences) -> str:
     if len(likeliest) < _PLACES:
         return likeliest[0].description if likeliest else ""
     first, second = likeliest
-    other = f"on {second.description.partition('depends on ')[2]} ({_percent(second.weight)})"
-    return f"{first.description} ({_percent(first.weight)}) or {other}"
+    other = f"on {second.description.partition('depends on ')[2]} ({weight_in_words(second.weight)})"
+    return f"{first.description} ({weight_in_words(first.weight)}) or {other}"
 
 
 def worn(comparison: SessionComparison, trained: Collection[str | None]) -> bool:
@@ -171,12 +172,6 @@ def sessions_in_words(
             f"runs, Eq. (6) of the held-out runs goes from {of_split[0].after:.3g} to {eq6_of_sessions:.3g}{floor}."
         )
     return sentences
-
-
-def _percent(weight: float) -> str:
-    if weight < 0.001:
-        return "< 0.1 %"
-    return "> 99.9 %" if weight > 0.999 else f"{100 * weight:.1f} %"
 
 
 _WORSE = 1.05  # times the plain matrix's error; nothing but a warning hangs on it

@@ -16,8 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from omnibench.discover.regressors.columns import Group
-from omnibench.discover.regressors.significance import Significance
+from omnibench.discover.regressors.significance import Group, Significance
 from omnibench.discover.result import CovariateDependence
 from omnibench.discover.selection.evidence import log_evidence
 from omnibench.discover.selection.model_selection import Selection

@@ -22,6 +22,8 @@ from omnibench.discover.held_out import (
     compare_held_out,
     compare_with_validation,
     eq6_with_changes,
+    extrapolations_of,
+    faded,
     noise_runs,
     random_folds_of_repetitions,
     validation_runs,
@@ -31,13 +33,11 @@ from omnibench.discover.output import Request
 from omnibench.discover.regressors.fine_structure import fine_structure
 from omnibench.discover.regressors.significance import Significance, together
 from omnibench.discover.result import Discovery
-from omnibench.discover.selection.competing_models import averaged, competing_models, with_fitted_forms
+from omnibench.discover.selection.competing_models import averaged, competing_models, named_effects, with_fitted_forms
 from omnibench.discover.selection.detectability import detectability_of
 from omnibench.discover.selection.evidence import check_names
-from omnibench.discover.selection.extrapolation import extrapolations_of, faded
 from omnibench.discover.selection.model_selection import Selection, select_effects
 from omnibench.discover.selection.motor_effects import select_motor_effects
-from omnibench.discover.selection.named_effects import named_effects
 from omnibench.discover.selection.screening import (
     Screening,
     screen_again,

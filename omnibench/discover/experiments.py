@@ -50,7 +50,7 @@ from scipy.stats import norm
 from omnibench.config import to_yaml
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.discover.fitting import Extended, Fit, at_runs, columns_of
-from omnibench.discover.regressors.columns import Group
+from omnibench.discover.regressors.significance import Group
 from omnibench.discover.result import Experiment, ExperimentCommand, NamedEffect
 from omnibench.discover.selection.evidence import DISCREPANCY, log_evidence
 from omnibench.discover.selection.model_selection import SURE
@@ -494,7 +494,17 @@ def plan_config(
             "sample_period": dataset.sample_period,
             "pose_period": max(between, dataset.sample_period, _SHORTEST_POSES),
             "commands": {
-                "listed": [_listed(candidate, count) for candidate, count in chosen],
+                "listed": [
+                    {
+                        "speed": candidate.timed.command.speed,
+                        "direction_deg": round(math.degrees(candidate.timed.command.direction), 6),
+                        "turn_rate": round(candidate.timed.command.turn_rate, 4),
+                        "duration": candidate.timed.duration,
+                        "repetitions": count,
+                        "heading_deg": candidate.heading,
+                    }
+                    for candidate, count in chosen
+                ],
                 "ramp": RAMP,
             }
             | ({} if variation.is_none else {"variation": variation}),
@@ -519,18 +529,6 @@ def plan_config(
             "datasets": {"experiment": {"simulate": config.model_dump(mode="json", exclude_defaults=True)}},
         }
     )
-
-
-def _listed(candidate: CandidateRun, count: int) -> dict[str, float | int | None]:
-    command = candidate.timed.command
-    return {
-        "speed": command.speed,
-        "direction_deg": round(math.degrees(command.direction), 6),
-        "turn_rate": round(command.turn_rate, 4),
-        "duration": candidate.timed.duration,
-        "repetitions": count,
-        "heading_deg": candidate.heading,
-    }
 
 
 def _in_words(candidate: CandidateRun) -> str:

@@ -17,7 +17,7 @@ The covariance of matrix elements and parameters is that of every trajectory fit
 
 from __future__ import annotations
 
-from collections.abc import Collection, Hashable, Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -25,9 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
-from omnibench.discover.regressors.columns import Group
-from omnibench.discover.regressors.effect_slopes import slopes_by
-from omnibench.discover.regressors.paths import Paths, blocks_of, make_paths
+from omnibench.discover.regressors.paths import Paths, blocks_of, make_paths, slopes_by
+from omnibench.discover.regressors.significance import Group
 from omnibench.fit.calibrators.trajectory_ml import FitCovariance
 from omnibench.fit.information import EstimatedCovariance
 from omnibench.fit.noise import (
@@ -84,28 +83,26 @@ def _windows(run: Trajectory, count: int) -> Iterator[Trajectory]:
         begin, end = float(run.pose_times[first]), float(run.pose_times[last])
         driven = slice(*np.searchsorted(run.times, [begin, end], side="right").tolist())
         driven = slice(driven.start, min(driven.stop + 1, len(run.times)))
-        if last - first > 1 and driven.stop > driven.start:
-            yield _part(run, driven, slice(first, last + 1), begin, end)
-
-
-def _part(run: Trajectory, driven: slice, seen: slice, begin: float, end: float) -> Trajectory:
-    fields = {
-        name: value[driven]
-        for name in ("rates", "angles", "targets", "steering", "odometry")
-        if (value := getattr(run, name)) is not None
-    }
-    return replace(
-        run,
-        id=f"{run.id} ({begin:.1f} to {end:.1f} s)",
-        times=run.times[driven] - begin,
-        pose_times=run.pose_times[seen] - begin,
-        poses=run.poses[seen],
-        pose_covariances=None if run.pose_covariances is None else run.pose_covariances[seen],
-        started_at=None if run.started_at is None else run.started_at + begin,
-        command=None,
-        sent=None,
-        **fields,
-    )
+        if last - first <= 1 or driven.stop <= driven.start:
+            continue
+        seen = slice(first, last + 1)
+        fields = {
+            name: value[driven]
+            for name in ("rates", "angles", "targets", "steering", "odometry")
+            if (value := getattr(run, name)) is not None
+        }
+        yield replace(
+            run,
+            id=f"{run.id} ({begin:.1f} to {end:.1f} s)",
+            times=run.times[driven] - begin,
+            pose_times=run.pose_times[seen] - begin,
+            poses=run.poses[seen],
+            pose_covariances=None if run.pose_covariances is None else run.pose_covariances[seen],
+            started_at=None if run.started_at is None else run.started_at + begin,
+            command=None,
+            sent=None,
+            **fields,
+        )
 
 
 _UNKNOWN_NOISE = NoiseEstimate(FIRST_NOISE, "within runs", 1, "")
@@ -257,14 +254,6 @@ def paths_of(fit: Fit, coarse: float = 0.0) -> Paths:
     together = max(1, int(coarse / fit.model.sample_period))
     logs = [_coarser(log, together) for log in fit.logs]
     return make_paths(fit.model.robot, fit.model.matrix, logs, together * fit.model.sample_period)
-
-
-def paths_in_parts(fit: Fit, needs: Collection[str]) -> Iterator[Paths]:
-    """The paths of some of the fit's runs at a time, by its matrix alone. needs: as for ``make_paths``."""
-    assert fit.model.sample_period is not None
-    for first, last in blocks_of([len(log.times) for log in fit.logs], _TOGETHER):
-        logs = fit.logs[first:last]
-        yield make_paths(fit.model.robot, fit.model.matrix, logs, fit.model.sample_period, needs, first)
 
 
 def _coarser(log: WheelLog, together: int) -> WheelLog:
@@ -535,10 +524,18 @@ def columns_of(fit: Fit, groups: Sequence[Group]) -> tuple[Array, ...]:
     if not groups:
         return tuple(columns)
     needs = frozenset().union(*(group.effect.needs for group in groups if group.effect is not None))
+    assert fit.model.sample_period is not None
     of_groups: list[Array] = []
-    for paths in paths_in_parts(fit, needs):
-        slopes = np.concatenate(list(_of_groups(paths, groups)), axis=2)
-        of_groups += split_by(slopes, [log.stamps for log in paths.logs])
+    # The paths of some runs at a time, by the matrix alone.
+    for first, last in blocks_of([len(log.times) for log in fit.logs], _TOGETHER):
+        logs = fit.logs[first:last]
+        paths = make_paths(fit.model.robot, fit.model.matrix, logs, fit.model.sample_period, needs, first)
+        slopes = []
+        for group in groups:
+            assert isinstance(group.effect, MotionEffect | ReferenceEffect)
+            base = {each.name: 0.0 for each in group.parameters} | dict(group.shapes)
+            slopes.append(slopes_by(paths, group.effect, [each.name for each in group.parameters], base))
+        of_groups += split_by(np.concatenate(slopes, axis=2), [log.stamps for log in paths.logs])
     return tuple(np.concatenate(both, axis=2) for both in zip(columns, of_groups, strict=True))
 
 
@@ -547,13 +544,6 @@ def columns_at(extended: Extended, runs: Sequence[Trajectory]) -> list[Array]:
     ordered = sorted(range(len(runs)), key=lambda index: str(runs[index].session))
     parts = columns_of(at_runs(extended.fit, [runs[index] for index in ordered]), extended.groups)
     return [part for _, part in sorted(zip(ordered, parts, strict=True), key=lambda pair: pair[0])]
-
-
-def _of_groups(paths: Paths, groups: Sequence[Group]) -> Iterator[Array]:
-    for group in groups:
-        assert isinstance(group.effect, MotionEffect | ReferenceEffect)
-        base = {each.name: 0.0 for each in group.parameters} | dict(group.shapes)
-        yield slopes_by(paths, group.effect, [each.name for each in group.parameters], base)
 
 
 def _descend(fit: Fit, groups: Sequence[Group], values: Array) -> tuple[Fit, Array, Whitened, tuple[Array, ...]]:

@@ -1,4 +1,4 @@
-"""Held-out runs: cross-validation of a fit, errors of the validation split, and the gap that a model leaves.
+"""Held-out runs: cross-validation of a fit, errors of the validation split, the gap of a model, and extrapolation.
 
 Cross-validation predicts runs of a fit from the runs of the other folds. With I the information X'X and s the scores
 X'e of whitened columns X against whitened residuals e, summed over all runs, and I_f, s_f those over the runs of fold
@@ -26,6 +26,18 @@ gap, its standard error and the share that is closed are
 
 Where G is within two standard errors of nothing, no share is closed. Where a model errs less than the differences
 scatter, by chance or because the repetitions were no repetitions, their mean is no floor, and all of a gap is closed.
+
+Extrapolation: held-out runs drive motions outside the training domain. The models c that the data cannot tell apart
+have weights w_c, which add up to 1, and predict that a run ends at e_c; the model in use, which is their average and
+fades outside the training domain, predicts e. With S_c the mean square error of the final positions of commands that
+were held out of the fit of c, and J_c, C_c the derivatives of e_c by the numbers of c and their covariance, the mean
+square error of the prediction is
+
+    V = sum of w_c |e_c - e|^2 + sum of w_c (S_c + tr(J_c C_c J_c')).                                               (5)
+
+The circle that holds 95 % of normal errors of variance V / 2 in each coordinate has the radius
+
+    sqrt(-2 ln 0.05) sqrt(V / 2).                                                                                   (6)
 """
 
 from __future__ import annotations
@@ -38,9 +50,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.discover.fitting import Extended, Fit, at_runs, extend, inliers_of, model_with
-from omnibench.discover.regressors.columns import Group
-from omnibench.discover.result import Gap, HeldOut, Step
+from omnibench.discover.fitting import Extended, Fit, at_runs, columns_at, extend, inliers_of, model_with
+from omnibench.discover.regressors.significance import Group
+from omnibench.discover.result import Extrapolation, Gap, HeldOut, Step
 from omnibench.errors import DataError
 from omnibench.fit.evaluate import final_errors
 from omnibench.fit.noise import grouped, repeating_runs, whiteners
@@ -53,7 +65,7 @@ from omnibench.fit.trajectory_fit import (
     usable_runs,
     whitened,
 )
-from omnibench.robot.corrections import kinds_of_motion
+from omnibench.robot.corrections import Fade, extrapolated_share, kinds_of_motion, motions_of, representatives
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 
@@ -254,11 +266,6 @@ def left_by(extended: Extended, values: Array) -> list[Array]:
     ]
 
 
-def held_out_squares(data: Whitened, index: Sequence[int], folds: NDArray[np.intp]) -> Array:
-    """Chi-square (Z,) of each run by the columns ``index`` as fitted to all folds but the run's own."""
-    return squares_left_by(data, index, values_of_other_folds(data, index, folds))
-
-
 def squares_left_by(data: Whitened, index: Sequence[int], values: Array) -> Array:
     """Chi-square (Z,) of each run by values (Z, n) of the columns ``index``, others for each run."""
     of_runs = zip(data.residuals, data.columns, values, strict=True)
@@ -270,7 +277,8 @@ def held_out_chi_square(data: Whitened, before: Sequence[int], after: Sequence[i
     """Chi-square difference (Z,) of each run between the columns ``before`` and ``after``, its fold held out."""
     every = sorted({*before, *after})
     few, place = data.only(every), {column: row for row, column in enumerate(every)}
-    first, last = (held_out_squares(few, [place[each] for each in index], folds) for index in (before, after))
+    places = [[place[each] for each in index] for index in (before, after)]
+    first, last = (squares_left_by(few, index, values_of_other_folds(few, index, folds)) for index in places)
     return first - last
 
 
@@ -444,3 +452,67 @@ def _step(name: str, fit: Fit, extended: Fit, validation: ValidationRuns) -> Ste
         float(np.mean([np.linalg.norm(values[-1]) for values in fit.nuisance_free_residuals])),
         None if errors is None else float(errors.eq6.mean()),
     )
+
+
+_QUANTILE = 2.45  # sqrt(-2 ln 0.05), Eq. (6)
+
+
+def training_domain(extended: Extended) -> Array:
+    """Representative motions (k, 3) of the runs of a fit, m/s, m/s, rad/s."""
+    model = extended.fit.model
+    motions = [motions_of(model.matrix, run.times, run.signals) for run in extended.fit.runs]
+    return representatives(model.robot, np.concatenate(motions))
+
+
+def faded(extended: Extended, baseline: Extended) -> Extended:
+    """The fit with a model whose corrections fade outside the training domain. baseline: the plain matrix, fitted."""
+    model = extended.fit.model
+    if not model.terms:
+        return extended
+    change, domain = model.matrix - baseline.fit.model.matrix, training_domain(extended)
+    fade = Fade(model.robot, change, domain, model.terms, extended.covariance_of_terms)
+    return replace(extended, fit=replace(extended.fit, model=replace(model, fade=fade)))
+
+
+def extrapolations_of(
+    runs: Sequence[Trajectory], plain: Extended, extended: Extended, members: Sequence[tuple[float, Extended]]
+) -> tuple[Extrapolation, ...]:
+    """One entry for every command of ``runs`` that leaves the training domain.
+
+    members: the models of which the extended one is the average, with their weights; where these disagree the bound is
+    wide.
+    """
+    model, domain = plain.fit.model, training_domain(plain)
+    extrapolations = []
+    for repetitions in grouped([run.command or run.id for run in runs]):
+        of_command = [runs[index] for index in repetitions]
+        motions = np.concatenate([motions_of(model.matrix, run.times, run.signals) for run in of_command])
+        share, words = extrapolated_share(model.robot, domain, motions)
+        if share:
+            extrapolations.append(
+                Extrapolation(
+                    of_command[0].command or of_command[0].id,
+                    f"{100 * share:.0f} % of its time it drives what no training run drove, such as {words}",
+                    _bound(of_command, plain, [(1.0, plain)]),
+                    _bound(of_command, extended, members),
+                )
+            )
+    return tuple(extrapolations)
+
+
+def _bound(runs: Sequence[Trajectory], used: Extended, members: Sequence[tuple[float, Extended]]) -> float:
+    """95 % bound on the error of the final positions of some runs by a model, m, Eq. (6) with their mean V."""
+    end, squares = _ends(used, runs), np.zeros(len(runs))
+    for weight, model in members:
+        residuals = held_out_residuals(model, folds_of_commands(model.fit.runs))
+        scatter = float(np.mean([np.square(of_run[-1, :2]).sum() for of_run in residuals]))
+        squares += weight * (np.square(_ends(model, runs) - end).sum(axis=1) + scatter)
+        for row, columns in enumerate(columns_at(model, runs)):
+            last = columns[-1, :2]
+            squares[row] += weight * float(np.trace(last @ model.covariance.matrix @ last.T))  # Eq. (5)
+    return float(_QUANTILE * np.sqrt(np.mean(squares) / 2))  # Eq. (6)
+
+
+def _ends(model: Extended, runs: Sequence[Trajectory]) -> Array:
+    """Final positions (R, 2) of runs by a model, m."""
+    return np.array([poses[-1, :2] for poses in model.fit.model.reported([run.reference_log for run in runs])])

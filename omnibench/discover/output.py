@@ -13,9 +13,9 @@ import polars as pl
 from omnibench.config import Model, to_json, to_yaml
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.discover.fitting import Extended
+from omnibench.discover.held_out import training_domain
 from omnibench.discover.report.discovery_report import discovery_report
 from omnibench.discover.result import CALIBRATION_FILES, Discovery, discovery_document, experiment_file
-from omnibench.discover.selection.extrapolation import training_domain
 from omnibench.environment import package_versions
 from omnibench.errors import DataError
 from omnibench.files import (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 
@@ -17,13 +17,8 @@ from omnibench.live.wheels.wheel_input import WheelSettings
 from omnibench.live.wire.outputs import Frames
 from omnibench.live.wire.topics import Profile
 
-
-def _form(value: Any) -> str:
-    """The form of a choice, a name or settings, so that a mistake in one is not explained as one in the other."""
-    return "settings" if isinstance(value, Mapping | Model) else "name"
-
-
-_Form = Discriminator(_form)
+# The form of a choice, a name or settings, so that a mistake in one is not explained as one in the other.
+_Form = Discriminator(lambda value: "settings" if isinstance(value, Mapping | Model) else "name")
 FusionChoice = Annotated[
     Annotated[Literal["none", "ekf"], Tag("name")] | Annotated[FusionSettings, Tag("settings")], _Form
 ]

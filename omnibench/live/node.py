@@ -1,7 +1,8 @@
 """The node: every step from a config to robots whose samples become odometry on a Zenoh session.
 
 While it runs, the interpreter's garbage collector and thread switching are set for wheel samples of low latency, and
-the diagnostics of all its robots are published once a second.
+the diagnostics of all its robots are published once a second. Each robot's service holds its inputs, its outputs, and
+the token that shows that it is alive.
 """
 
 from __future__ import annotations
@@ -12,28 +13,298 @@ import math
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from queue import SimpleQueue
+from typing import Any, Final
+
+import zenoh
 
 from omnibench.environment import package_versions
 from omnibench.errors import one_line, require_type
 from omnibench.live.config import LiveConfig, RobotConfig, robot_called
 from omnibench.live.control.query_server import QueryServer
-from omnibench.live.estimation.health import Health
-from omnibench.live.estimation.saved_state import RobotMemory
+from omnibench.live.estimation.health import Health, anomalies_in_words, diagnostic
+from omnibench.live.estimation.robot_state import RobotMemory
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.network.presence import Claim
 from omnibench.live.network.session import close_session, open_session
-from omnibench.live.robot_service import Intake, RobotService
 from omnibench.live.stopping import Closing, RateLimiter, Stop
-from omnibench.live.wire.foxglove import PORT, FoxgloveServer
-from omnibench.live.wire.recorder import Recorder, free_path
-from omnibench.live.wire.topics import TOPICS, GraphNode, KeySpace
+from omnibench.live.wire.messages import Diagnostics, MissedMessages, flow_of
+from omnibench.live.wire.outputs import OUTPUTS, Update
+from omnibench.live.wire.recorder import PORT, FoxgloveServer, Recorder, free_path
+from omnibench.live.wire.topics import TOPICS, AcknowledgedFlows, GraphNode, KeySpace
 from omnibench.registry import load_plugins
 from omnibench.robot.calibration import read_calibration
 from omnibench.words import plural
+
+LOG = logging.getLogger("omnibench.live")
+_PAUSE: Final = 0.002  # s between turns while the thread is busy; chosen
+_BUSY: Final = 0.5  # share of the time in which it works, from which on it pauses; chosen
+_SMOOTHING: Final = 0.1  # share of the latest turn in the mean; chosen
+
+
+class Intake(Closing):
+    """Runs the work that is handed to ``ready``, in turn, in a thread of its own until ``close``.
+
+    Zenoh's threads are then free to receive, and what waits can be seen. Where the thread is busy it pauses for a
+    moment between turns, so that messages come together: to hand the interpreter over for each one costs as much as
+    to take it.
+    """
+
+    def __init__(self) -> None:
+        self._work: SimpleQueue[Callable[[], object] | None] = SimpleQueue()
+        self._thread = threading.Thread(target=self._run, name="intake", daemon=True)
+        self._thread.start()
+
+    def ready(self, work: Callable[[], object]) -> None:
+        """Queue a piece of work, which must not raise. From any thread."""
+        self._work.put(work)
+
+    def close(self) -> None:
+        """Do what is queued, and no more."""
+        self._work.put(None)
+        self._thread.join()
+
+    def _run(self) -> None:
+        worked = spent = 0.0  # s, recent turns weighing most
+        last = time.perf_counter()
+        while (work := self._work.get()) is not None:
+            began = time.perf_counter()
+            try:
+                work()
+            except Exception as error:  # one robot must not silence the others
+                LOG.error("intake: %s: %s", type(error).__name__, one_line(str(error)))
+            now = time.perf_counter()
+            worked += _SMOOTHING * (now - began - worked)
+            spent += _SMOOTHING * (now - last - spent)
+            last = now
+            if worked > _BUSY * spent:
+                time.sleep(_PAUSE)
+
+
+LATE: Final = 0.1  # s that a sample has waited; chosen
+_FAST: Final = 2.0  # time by the stamps per time of arrival, from which on samples are those of a replay; chosen
+_SECOND: Final = 1e9  # ns
+
+
+class LateUpdates:
+    """The late updates of one robot that are not published yet. unpublished: those that never will be, so far.
+
+    Only the newest one of a robot in real time is published, and all of a replay. A late pose of a robot is of use to
+    nobody once a newer one is known, and to publish it makes the node later still. The samples of a replay are late by
+    themselves, and whoever plays them wants every pose.
+    """
+
+    def __init__(self, publish: Callable[[Update], None]) -> None:
+        self.unpublished = 0
+        self._publish = publish
+        self._waiting: list[Update] = []
+        self._first: tuple[float, int] | None = None  # arrival (s) and stamp (ns) of the first since one was on time
+        self._replayed = False  # since then samples have come much faster than they were measured
+
+    def take(self, arrival: float, updates: list[Update]) -> None:
+        """Keep the updates of a late sample. arrival: s, monotonic."""
+        for update in updates:
+            if self._first is None:
+                self._first = arrival, update.stamp
+            measured = (update.stamp - self._first[1]) / _SECOND
+            self._replayed = measured > _FAST * (arrival - self._first[0])
+            self._waiting.append(update)
+
+    def on_time(self) -> None:
+        """Publish what waits before an update that is on time."""
+        self.publish_waiting(newer_follows=True)
+        self._first = None
+
+    def publish_waiting(self, *, newer_follows: bool = False) -> None:
+        """Publish what waits, at the end of a turn or before a newer update."""
+        waiting, self._waiting = self._waiting, []
+        if waiting and not self._replayed:
+            last = len(waiting) - (not newer_follows)
+            self.unpublished += last
+            waiting = waiting[last:]
+        for update in waiting:
+            self._publish(update)
+
+
+_LONGEST_QUEUE: Final = 20_000  # messages that wait for one robot, 200 s at 100 Hz; chosen
+_LARGEST_QUEUE: Final = 32_000_000  # bytes that wait for one robot: 20,000 messages of 60 wheels; chosen
+_BATCH: Final = 500  # messages of one robot until the others have their turn; chosen
+
+
+@dataclass(frozen=True, slots=True)
+class _Message:
+    """A message that waits. arrival: s, monotonic."""
+
+    is_pose: bool
+    arrival: float
+    payload: bytes
+    attachment: bytes | None
+
+
+class RobotService:
+    """Subscribes to a robot's wheels and SLAM, hands them to its tracker, and publishes the updates.
+
+    Messages are queued in Zenoh's threads and taken in that of ``intake``, in the order in which they came. Where they
+    come faster than they can be taken, all are integrated and only the newest of the late ones is published
+    (`LateUpdates`), but for those of an acknowledged flow, whose sender waits. A message that fails is counted and
+    logged.
+    """
+
+    def __init__(self, graph: GraphNode, tracker: RobotTracker, intake: Intake) -> None:
+        name = tracker.name
+        self.tracker = tracker
+        tracker.waiting_since = self._waiting_since
+        self._intake = intake
+        self._waiting: deque[_Message] = deque()
+        self._waiting_bytes = 0
+        self._counting = threading.Lock()  # held while those bytes change
+        self._scheduled = False  # a turn is queued, or has not yet looked at what waits
+        self._working = threading.Lock()  # held while messages are taken
+        self._late = LateUpdates(self._publish)
+        self._missed = MissedMessages()  # among the robot's own wheel messages, which are in no flow
+        self._flows = AcknowledgedFlows(graph.session, name, tracker.flows)
+        self._rate_limiter = RateLimiter()
+        self._logged_anomalies: dict[str, int] = {}
+        self._logged_refusals = 0
+        self._logged_status = ""
+        self._outputs = [
+            (graph.publisher(name, output.topic), output.encoding(tracker.frames))
+            for output in OUTPUTS
+            if tracker.fusing or not output.fused
+        ]
+        self._diagnostics = graph.publisher(name, "diagnostics")
+        self._graph = graph
+        # before the inputs, by which a replay knows that it may begin, and then looks for the token
+        self._token = graph.session.liveliness().declare_token(f"omnibench/{name}/alive")
+        self._inputs: dict[str, zenoh.Subscriber[None]] = {}
+        if tracker.fusing:
+            self._receive_poses()
+        self._inputs["joint_states"] = graph.subscribe(name, "joint_states", partial(self._queue, False))
+
+    def publish_diagnostics(self) -> None:
+        """Publish the diagnostics and log what has changed; called once a second."""
+        health = self.tracker.health(time.monotonic())
+        status = diagnostic(health, hardware=self.tracker.calibration.robot.name)
+        self._diagnostics.put(Diagnostics(time.time_ns(), (status,)))
+        # Log a new status, and anomalies that were counted since they were last logged.
+        if health.status != self._logged_status:
+            self._logged_status = health.status
+            LOG.info("%s: %s (%s)", health.robot, health.status, health.message)
+        anomalies = self.tracker.counts.anomalies()
+        new = {kind: count - self._logged_anomalies.get(kind, 0) for kind, count in anomalies.items()}
+        in_words = anomalies_in_words({kind: count for kind, count in new.items() if count})
+        if in_words and self._rate_limiter.allows("anomalies"):
+            self._logged_anomalies = anomalies
+            refused = self.tracker.refusals != self._logged_refusals
+            self._logged_refusals = self.tracker.refusals
+            last = f"; the last: {health.last_refusal}" if refused and health.last_refusal else ""
+            LOG.warning("%s: %s%s", health.robot, in_words, last)
+
+    def close(self) -> None:
+        """Take what waits, nothing more, and leave."""
+        for subscriber in list(self._inputs.values()):
+            subscriber.undeclare()
+        while self._waiting:
+            self._take_turn()
+        with self._working:  # a turn that is under way ends first
+            self.tracker.close()
+            self._flows.close()
+        self._token.undeclare()
+
+    def _receive_poses(self) -> None:
+        """Subscribe to the poses of SLAM: without fusion only because a replay counts them in its flow."""
+        if "slam_pose" not in self._inputs:
+            self._inputs["slam_pose"] = self._graph.subscribe(
+                self.tracker.name, "slam_pose", partial(self._queue, True)
+            )
+
+    def _queue(self, is_pose: bool, sample: zenoh.Sample) -> None:
+        """Queue a message; in Zenoh's thread."""
+        size = len(sample.payload)
+        with self._counting:
+            full = len(self._waiting) >= _LONGEST_QUEUE or self._waiting_bytes + size > _LARGEST_QUEUE
+            self._waiting_bytes += 0 if full else size
+        if full:
+            self.tracker.count_overflow()
+            return
+        attachment = sample.attachment
+        content = None if attachment is None else attachment.to_bytes()
+        self._waiting.append(_Message(is_pose, time.monotonic(), sample.payload.to_bytes(), content))
+        if not self._scheduled:
+            self._scheduled = True
+            self._intake.ready(self._take_turn)
+
+    def _waiting_since(self) -> float | None:
+        """When the oldest message that waits came, s, monotonic; None if none waits, or if its sender waits, too."""
+        try:
+            oldest = self._waiting[0]
+        except IndexError:
+            return None
+        return oldest.arrival if flow_of(oldest.attachment) is None else None
+
+    def _take_turn(self) -> None:
+        """Take the messages that wait, at most a batch."""
+        with self._working:
+            self._scheduled = False  # before the first look: what comes from now on may schedule a turn in vain
+            behind, unpublished = 0.0, self._late.unpublished
+            for _ in range(min(len(self._waiting), _BATCH)):
+                message = self._waiting.popleft()
+                with self._counting:
+                    self._waiting_bytes -= len(message.payload)
+                flow = flow_of(message.attachment)
+                if flow is None:
+                    waited = time.monotonic() - message.arrival
+                    behind = max(behind, waited)
+                    skipped = 0 if message.is_pose else self._missed.take(message.attachment) or 0
+                    self._take(message, late=waited > LATE, skipped=skipped)
+                    continue
+                self._receive_poses()
+                if self._flows.accepts(flow):
+                    self._take(message, late=False, published=self._flows.inherited(flow), replayed=True)
+            self._late.publish_waiting()
+            if self._flows.heard:  # the sender forgets what is acknowledged: the state has to hold it before
+                self.tracker.save()
+                self._flows.acknowledge()
+            self.tracker.record_backlog(behind, self._late.unpublished - unpublished)
+            if self._waiting and not self._scheduled:
+                self._scheduled = True
+                self._intake.ready(self._take_turn)
+
+    def _take(
+        self, message: _Message, *, late: bool, published: bool = False, skipped: int = 0, replayed: bool = False
+    ) -> None:
+        """Take a message, and publish its updates unless it is late, or they may be published already.
+
+        skipped: messages before it that never came, by the sender's numbers. replayed: it comes in a flow.
+        """
+        try:
+            if message.is_pose:
+                self.tracker.take_pose(message.payload, message.arrival, replayed=replayed)
+                return
+            updates = self.tracker.take_wheels(message.payload, message.arrival, skipped, replayed=replayed)
+            if published:
+                self._late.unpublished += len(updates)
+            elif late:
+                self._late.take(message.arrival, updates)
+            elif updates:
+                self._late.on_time()
+                for update in updates:
+                    self._publish(update)
+        except Exception as error:  # the stream has to go on
+            input_name = "pose" if message.is_pose else "wheels"
+            self.tracker.count_failure()
+            if self._rate_limiter.allows(input_name):
+                LOG.error("%s: a %s message failed: %s: %s", self.tracker.name, input_name, type(error).__name__, error)
+
+    def _publish(self, update: Update) -> None:
+        for publisher, encoded in self._outputs:
+            publisher.put_encoded(encoded(update))
+
 
 _SWITCH_INTERVAL = 0.0005  # s that a busy thread keeps the interpreter while others wait; Python's own is 0.005
 
@@ -63,9 +334,6 @@ def low_latency() -> Iterator[None]:
             if not _running:
                 gc.unfreeze()
                 sys.setswitchinterval(_usual_interval)
-
-
-LOG = logging.getLogger("omnibench.live")
 
 
 def make_tracker(config: LiveConfig, robot: RobotConfig, memory: RobotMemory | None) -> RobotTracker:
@@ -140,13 +408,29 @@ class LiveNode(Closing):
         self.keys = KeySpace(config.profile, config.domain)
         load_effects(config)
         with ExitStack() as started:  # closes the parts in reverse order of their start
-            memories = self._open_memories(started) if remember else {}
+            # Each robot's memory: the files of its saved state, locked for this node; none without a ``state`` folder.
+            memories: dict[str, RobotMemory] = {}
+            if remember and config.state is not None:
+                for robot in config.robots:
+                    memories[robot.name] = memory = RobotMemory(config.state, robot.name)
+                    started.callback(memory.close)
             self.trackers = {
                 robot.name: make_tracker(config, robot, memories.get(robot.name)) for robot in config.robots
             }
             self.session = open_session(config.zenoh, f"node {config.name}", stop)
             started.callback(close_session, self.session)
-            self._claim_robots(started)
+            # Refuse a robot that another node runs, and warn of tf frames that another node may publish too.
+            claim = Claim(self.session, self.trackers.keys(), _PRESENCE_TIMEOUT)
+            started.callback(claim.close)
+            # All robots share the topic tf: two on frames of the same names overwrite each other's transforms.
+            robots = config.on_common_frames()
+            if robots and claim.others:
+                name = robots[0]
+                LOG.warning(
+                    "robot %s publishes tf between map, odom and base_link, and so may %s on the same network; "
+                    "`frames: prefixed` makes them %s/odom and %s/base_link",
+                    *(name, ", ".join(claim.others), name, name),
+                )
             intake = Intake()
             started.callback(intake.close)
             listeners = started.enter_context(ExitStack())  # closed after the services, to have their last messages
@@ -157,12 +441,22 @@ class LiveNode(Closing):
                 started.callback(service.close)
             self._services = services
             # after the services: a replay begins with the first subscriber, and the samples are for these
-            self._serve_foxglove(listeners)
-            self._record(listeners)
+            if config.foxglove is not False:
+                server = listeners.enter_context(
+                    FoxgloveServer(port=PORT if config.foxglove is True else config.foxglove)
+                )
+                server.forward(self.session, self.keys, list(self.trackers))
+                listeners.callback(lambda: _tell_missed("Foxglove", server.missed))
+                LOG.warning("Foxglove: open %s", server.address)
+            if config.record is not None:  # in a new file where the config's is there already
+                path = free_path(config.record)
+                recorder = Recorder(self.session, self.keys, list(self.trackers), path, on_failure=LOG.error)
+                listeners.enter_context(recorder)
+                listeners.callback(lambda: _tell_missed(f"the recording {path}", recorder.missed.total()))
+                LOG.warning("recording to %s", path)
             queries = QueryServer(self.session, self.trackers, partial(robot_info, config, self.keys), memories)
             started.callback(queries.close)
-            diagnostics = DiagnosticsTimer(self._services)
-            started.callback(diagnostics.close)
+            started.callback(DiagnosticsTimer(services).close)
             started.enter_context(low_latency())
             self._started = started.pop_all()
 
@@ -173,50 +467,6 @@ class LiveNode(Closing):
     def health(self, robot: str) -> Health:
         """A robot's health now."""
         return self.trackers[robot].health(time.monotonic())
-
-    def _open_memories(self, started: ExitStack) -> dict[str, RobotMemory]:
-        """Each robot's memory: the files of its saved state, locked for this node; none without a ``state`` folder."""
-        memories: dict[str, RobotMemory] = {}
-        if self.config.state is not None:
-            for robot in self.config.robots:
-                memories[robot.name] = memory = RobotMemory(self.config.state, robot.name)
-                started.callback(memory.close)
-        return memories
-
-    def _claim_robots(self, started: ExitStack) -> None:
-        """Refuse a robot that another node runs, and warn of tf frames that another node may publish too."""
-        claim = Claim(self.session, self.trackers.keys(), _PRESENCE_TIMEOUT)
-        started.callback(claim.close)
-        # All robots share the topic tf: two on frames of the same names overwrite each other's transforms.
-        robots = self.config.on_common_frames()
-        if robots and claim.others:
-            name = robots[0]
-            LOG.warning(
-                "robot %s publishes tf between map, odom and base_link, and so may %s on the same network; "
-                "`frames: prefixed` makes them %s/odom and %s/base_link",
-                *(name, ", ".join(claim.others), name, name),
-            )
-
-    def _serve_foxglove(self, listeners: ExitStack) -> None:
-        """Serve the robots' topics to Foxglove, if the config asks for it."""
-        if self.config.foxglove is False:
-            return
-        server = listeners.enter_context(
-            FoxgloveServer(port=PORT if self.config.foxglove is True else self.config.foxglove)
-        )
-        server.forward(self.session, self.keys, list(self.trackers))
-        listeners.callback(lambda: _tell_missed("Foxglove", server.missed))
-        LOG.warning("Foxglove: open %s", server.address)
-
-    def _record(self, listeners: ExitStack) -> None:
-        """Record the robots' topics, if the config asks for it; in a new file where the config's is there already."""
-        if self.config.record is None:
-            return
-        path = free_path(self.config.record)
-        recorder = Recorder(self.session, self.keys, list(self.trackers), path, on_failure=LOG.error)
-        listeners.enter_context(recorder)
-        listeners.callback(lambda: _tell_missed(f"the recording {path}", recorder.missed.total()))
-        LOG.warning("recording to %s", path)
 
 
 def load_effects(config: LiveConfig) -> None:

@@ -7,6 +7,7 @@ import math
 import time
 from collections import deque
 from dataclasses import dataclass
+from functools import partial
 from threading import Event, Lock
 from typing import Any, Final, Literal
 
@@ -15,7 +16,7 @@ from pydantic_core import to_jsonable_python
 
 from omnibench.errors import DataError
 from omnibench.live.control.request_queue import source_of
-from omnibench.live.estimation.counts import anomalies_among
+from omnibench.live.estimation.health import anomalies_among
 from omnibench.live.network.presence import Presence, checked_robot, nothing_received
 from omnibench.live.stopping import Closing, direct, wait_until
 from omnibench.live.wire.messages import DIAGNOSTICS, ODOMETRY, MessageError, MissedMessages, Odometry
@@ -126,7 +127,10 @@ class RobotMonitor(Closing):
         self._queried_at = -math.inf
         self._presence = Presence(session)
         names = robot or "*"
-        self._subscribers = [self._subscribe(keys.expression(names, topic), topic) for topic in ("odom", _FUSED)]
+        self._subscribers: list[zenoh.Subscriber[None]] = []
+        for topic in ("odom", _FUSED):
+            take = direct(partial(self._take_odometry, topic))
+            self._subscribers.append(session.declare_subscriber(keys.expression(names, topic), take))
         expression = keys.expression(names, "diagnostics")
         self._subscribers.append(session.declare_subscriber(expression, direct(self._take_diagnostics)))
 
@@ -174,15 +178,12 @@ class RobotMonitor(Closing):
         for subscriber in self._subscribers:
             subscriber.undeclare()
 
-    def _subscribe(self, expression: str, topic: str) -> zenoh.Subscriber[None]:
-        def take_odometry(sample: zenoh.Sample) -> None:
-            if sample.kind == zenoh.SampleKind.PUT:
-                key = self._name(sample), topic
-                with self._lock:
-                    stream = self._streams.setdefault(key, _Stream())
-                stream.take(sample)
-
-        return self._session.declare_subscriber(expression, direct(take_odometry))
+    def _take_odometry(self, topic: str, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.PUT:
+            key = self._name(sample), topic
+            with self._lock:
+                stream = self._streams.setdefault(key, _Stream())
+            stream.take(sample)
 
     def _take_answer(self, reply: zenoh.Reply) -> None:
         if reply.ok is None:

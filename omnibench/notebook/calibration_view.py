@@ -13,8 +13,8 @@ from omnibench.data.dataset import Dataset
 from omnibench.errors import DataError, require_type
 from omnibench.fit.calibrate import CalibrationRun
 from omnibench.fit.evaluate import Evaluation, SplitErrors
-from omnibench.notebook.single_figure import drawn
 from omnibench.report.blocks import LegendItem
+from omnibench.report.figures import drawn
 from omnibench.report.path_pictures import CALIBRATED, DESIGN_ITEM, paths_before_after
 from omnibench.report.style import PALETTE, plot, text
 from omnibench.robot.calibration import Calibration

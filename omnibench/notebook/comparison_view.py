@@ -13,7 +13,7 @@ from omnibench.compare.report.headline import entry_chart
 from omnibench.compare.report.view import views
 from omnibench.compare.result import ComparisonResult
 from omnibench.errors import DataError, UnknownNameError
-from omnibench.notebook.single_figure import drawn
+from omnibench.report.figures import drawn
 from omnibench.views import View
 from omnibench.words import plural
 

@@ -11,7 +11,7 @@ from omnibench.discover.output import residual_table
 from omnibench.discover.report.evidence_figures import gap_grid
 from omnibench.discover.report.tables import effect_in_words, verdict_in_words
 from omnibench.discover.result import Discovery
-from omnibench.notebook.single_figure import drawn
+from omnibench.report.figures import drawn
 from omnibench.views import View
 
 _COLUMNS = {

@@ -1,4 +1,4 @@
-"""A data set and one of its runs in a notebook."""
+"""A data set, one of its runs, and its robot in a notebook."""
 
 from __future__ import annotations
 
@@ -11,15 +11,47 @@ import plotly.graph_objects as go
 import polars as pl
 
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.data.references import References
 from omnibench.data.tables import reference_frame, tables_of
-from omnibench.notebook.single_figure import drawn
+from omnibench.errors import DataError
 from omnibench.report.blocks import Figure, FigureGrid
-from omnibench.report.figures import START, marks, path
+from omnibench.report.figures import START, drawn, is_drawn, marks, motion_system, path
 from omnibench.report.recording.recording_figures import REFERENCE_ITEM, all_runs
 from omnibench.report.style import plan
+from omnibench.robot.kinematics import Robot
 from omnibench.views import View
 from omnibench.words import plural
+
+_SHOWN = 12  # wheels
+
+
+class RobotView(View):
+    """A robot: a line for each wheel."""
+
+    shown: Robot
+
+    def lines(self) -> Iterator[str]:
+        robot = self.shown
+        mount = "" if robot.mount is None else f", tracked point at {robot.mount.x:g}, {robot.mount.y:g} m"
+        yield f"Robot {robot.name!r}: {len(robot.wheels)} wheels{', skid steering' if robot.skid else ''}{mount}"
+        for wheel in robot.wheels[:_SHOWN]:
+            said = wheel.model_dump(exclude_none=True, exclude_defaults=True, exclude={"name", "type", "radius"})
+            place = ", ".join(f"{name} {value:g}" for name, value in said.items())
+            yield f"  {wheel.name}: {wheel.kind}, radius {wheel.radius:g} m, {place}"
+
+    def tables(self) -> Mapping[str, Callable[[], pl.DataFrame]]:
+        return {"wheels": self._wheels}
+
+    def _wheels(self) -> pl.DataFrame:
+        rows = [{"kind": wheel.kind, **wheel.model_dump(exclude={"type"})} for wheel in self.shown.wheels]
+        frame = pl.DataFrame(rows, infer_schema_length=None)
+        return frame.select(column for column in frame.iter_columns() if column.null_count() < len(frame))
+
+    def figure(self) -> go.Figure:
+        if not is_drawn(self.shown):
+            raise DataError(f"robot {self.shown.name}: where its wheels stand is not said, so that it cannot be drawn")
+        figure, items = motion_system(self.shown)
+        return drawn(FigureGrid((figure,), tuple(items), 1))
+
 
 _WARNINGS = 5  # shown of a data set
 
@@ -60,10 +92,6 @@ def _table(dataset: Dataset, name: str) -> pl.DataFrame:
     return frame.select(column for column in frame.iter_columns() if column.null_count() < len(frame))
 
 
-def _reference_table(references: References) -> pl.DataFrame:
-    return reference_frame([("", references)]).drop("trajectory")
-
-
 class TrajectoryView(View):
     """A run: how long, how far, and its reference path."""
 
@@ -87,8 +115,10 @@ class TrajectoryView(View):
 
     def tables(self) -> Mapping[str, Callable[[], pl.DataFrame]]:
         references = self.shown.references
-        named = {} if references is None else {"references": partial(_reference_table, references)}
-        return {"wheels": self._wheels, "poses": self._poses, **named}
+        tables: dict[str, Callable[[], pl.DataFrame]] = {"wheels": self._wheels, "poses": self._poses}
+        if references is not None:
+            tables["references"] = lambda: reference_frame([("", references)]).drop("trajectory")
+        return tables
 
     def _wheels(self) -> pl.DataFrame:
         run = self.shown

@@ -9,9 +9,8 @@ import shutil
 import subprocess
 import tempfile
 import unicodedata
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 from omnibench.errors import DataError
 from omnibench.files import write_files
@@ -44,7 +43,20 @@ def write_figures(document: Document, folder: Path) -> list[str]:
         return []
     with tempfile.TemporaryDirectory() as scratch:
         page = Path(scratch, "figures.html")
-        page.write_text(figures_page([_described(name, grid) for name, grid in grids.items()]), encoding="utf-8")
+        # The content of each grid for figures.js.
+        described = [
+            {
+                "name": name,
+                "columns": grid.columns,
+                "legend": [{"label": item.label, "colour": item.colour, "dash": item.dash} for item in grid.legend],
+                "figures": [
+                    {"title": each.title, "height": each.height, **json.loads(each.plot.to_json())}
+                    for each in grid.figures
+                ],
+            }
+            for name, grid in grids.items()
+        ]
+        page.write_text(figures_page(described), encoding="utf-8")
         command = [program, *_FLAGS, f"--user-data-dir={scratch}/profile", page.as_uri()]
         try:
             done = subprocess.run(command, capture_output=True, text=True, timeout=_PATIENCE, check=False)
@@ -101,15 +113,3 @@ def _of_blocks(blocks: Sequence[Block], titles: tuple[str, ...]) -> Iterator[tup
 def _slug(words: str) -> str:
     plain = unicodedata.normalize("NFKD", words.replace("ω", "w").replace("−", "-")).encode("ascii", "ignore").decode()
     return re.sub(r"[^a-z0-9.]+", "-", plain.lower())[:_LONGEST].strip("-.") or "figure"
-
-
-def _described(name: str, grid: FigureGrid) -> Mapping[str, Any]:
-    """The content of a grid for figures.js."""
-    return {
-        "name": name,
-        "columns": grid.columns,
-        "legend": [{"label": item.label, "colour": item.colour, "dash": item.dash} for item in grid.legend],
-        "figures": [
-            {"title": each.title, "height": each.height, **json.loads(each.plot.to_json())} for each in grid.figures
-        ],
-    }

@@ -1,4 +1,4 @@
-"""The traces that figures are made of, in the style of an item of the legend; and the drawing of a robot."""
+"""The traces that figures are made of, in the style of a legend's items; a robot from above; single figures."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
+from plotly.subplots import make_subplots
 
-from omnibench.report.blocks import Figure, LegendItem
+from omnibench.report.blocks import Figure, FigureGrid, LegendItem
 from omnibench.report.numbers import fixed, plain
 from omnibench.report.style import INK, PALETTE, QUIET, THEORETICAL, plan, text
 from omnibench.robot.kinematics import Array, Robot, Wheel
@@ -230,4 +231,50 @@ def _seen_from_above(traces: Sequence[go.Scatter], labels: list[dict[str, Any]],
         "ticktext": [fixed(-float(tick), max(0, -round(math.log10(step)))) for tick in ticks],
     }
     figure.update_layout(annotations=labels, xaxis=axis, yaxis_tickvals=ticks.tolist())
+    return figure
+
+
+_MARGIN = 60  # px above and below
+
+
+def drawn(grid: FigureGrid) -> go.Figure:
+    """The plots of a grid side by side in one figure, with its legend."""
+    if len(grid.figures) == 1:
+        (figure,) = grid.figures
+        alone = go.Figure(figure.plot)
+        alone.update_layout(title_text=text(figure.title), title_x=0.02)
+        return _with_legend(alone, grid, figure.height)
+    titles = [text(figure.title) for figure in grid.figures]
+    columns = min(grid.columns, len(grid.figures))
+    rows = -(-len(grid.figures) // columns)
+    whole = make_subplots(rows=rows, cols=columns, subplot_titles=titles)
+    for number, figure in enumerate(grid.figures):
+        row, column = number // columns + 1, number % columns + 1
+        for trace in figure.plot.data:
+            whole.add_trace(trace, row=row, col=column)
+        axis = "" if number == 0 else str(number + 1)
+        for letter in "xy":
+            given = figure.plot.layout[f"{letter}axis"].to_plotly_json()
+            if given.get("scaleanchor"):
+                given["scaleanchor"] = f"x{axis}"
+            kept = {key: value for key, value in given.items() if key not in ("anchor", "domain")}
+            whole.layout[f"{letter}axis{axis}"].update(kept)
+    whole.update_layout(template=grid.figures[0].plot.layout.template)
+    return _with_legend(whole, grid, rows * max(figure.height for figure in grid.figures))
+
+
+def _with_legend(figure: go.Figure, grid: FigureGrid, height: int) -> go.Figure:
+    """The figure with a line of the legend for each item, at its first trace."""
+    labels = {item.key: item.label for item in grid.legend if item.key}
+    for trace in figure.data:
+        label = labels.pop(trace.legendgroup, None) if trace.legendgroup else None
+        trace.showlegend = label is not None
+        if label is not None:
+            trace.name = text(label)
+    figure.update_layout(
+        showlegend=bool(grid.legend),
+        legend={"orientation": "h", "y": -0.2},
+        margin={"t": _MARGIN, "b": _MARGIN},
+        height=height + 2 * _MARGIN,
+    )
     return figure

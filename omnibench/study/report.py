@@ -37,7 +37,7 @@ from omnibench.report.blocks import (
 )
 from omnibench.report.figures import joined, line, marks
 from omnibench.report.numbers import NOTHING, count, fixed, listing, seconds, significant
-from omnibench.report.reproduction import reproduction_section
+from omnibench.report.render import reproduction_section
 from omnibench.report.style import INK, PALETTE, QUIET, THEORETICAL, colours, logarithmic, plot, text, wrapped
 from omnibench.robot.kinematics import Robot
 from omnibench.study.study_plan import AS_RECORDED

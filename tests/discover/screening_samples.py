@@ -11,8 +11,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from omnibench.discover.regressors.columns import ColumnStore, Group
 from omnibench.discover.regressors.covariate_bases import Basis
+from omnibench.discover.regressors.significance import ColumnStore, Group
 from omnibench.discover.selection.evidence import Groups
 from omnibench.discover.selection.screening import Screening
 from omnibench.fit.trajectory_fit import Whitened

@@ -14,7 +14,7 @@ import zenoh
 from rosbags.highlevel import AnyReader
 from sessions import Loopback, until
 
-from omnibench.live.estimation.counts import Counts
+from omnibench.live.estimation.health import Counts
 from omnibench.live.wire.messages import Diagnostic, Diagnostics, JointState, Odometry, PoseEstimate, Transform
 from omnibench.live.wire.topics import TOPICS, GraphNode, KeySpace, Profile, Publisher
 

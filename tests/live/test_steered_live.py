@@ -19,12 +19,12 @@ from omnibench.config import validate
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.errors import DataError
 from omnibench.live.config import LiveConfig
-from omnibench.live.estimation.saved_state import RobotMemory, SavedState
+from omnibench.live.estimation.robot_state import RobotMemory, SavedState
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.fusion.pose_fusion import FusionSettings
 from omnibench.live.replay.concatenated_drive import ConcatenatedDrive, Recording, ReplayConfig, concatenate_recording
 from omnibench.live.replay.demonstration import demonstrate
-from omnibench.live.replay.replay_player import events
+from omnibench.live.replay.replay_player import ReplayMessages
 from omnibench.live.wheels.wheel_input import WheelSettings
 from omnibench.live.wire.messages import JOINT_STATE, ODOMETRY, JointState
 from omnibench.robot.calibration import Calibration, EffectTerm, Noise, covariance_rows, matrix_rows, write_calibration
@@ -277,7 +277,7 @@ class TestCentre:
 
 def played(drive: ConcatenatedDrive, names: tuple[str, ...] | None = None, **changes: Any) -> list[JointState]:
     config = validate(ReplayConfig, changes, "test")
-    messages = (each.message for each in events(drive, config, origin=ORIGIN, names=names))
+    messages = (each.message for each in ReplayMessages(drive, config, names=names).stamped_from(ORIGIN))
     return [each for each in messages if isinstance(each, JointState)]
 
 

@@ -14,7 +14,6 @@ from wheeled_samples import ROBOTS, driven
 
 from omnibench.data.scans import Mount, Scanner, ScansInMemory, TrajectoryScans
 from omnibench.report.figures import is_placed
-from omnibench.report.recording.player import player
 from omnibench.report.recording.recording_figures import (
     ODOMETRY_ITEM,
     all_runs,
@@ -24,6 +23,7 @@ from omnibench.report.recording.recording_figures import (
     thinned,
     wheel_rates,
 )
+from omnibench.report.recording.section import player
 from omnibench.robot.kinematics import Robot, Wheel
 from omnibench.robot.model import OdometryModel
 from omnibench.slam.slam_request import run_errors

@@ -32,8 +32,7 @@ from omnibench.report.blocks import (
     Section,
     Table,
 )
-from omnibench.report.glossary import Glossary
-from omnibench.report.render import render, write_document
+from omnibench.report.render import Glossary, render, write_document
 from omnibench.report.style import plot
 
 HOSTILE = "</script><script>alert('x')</script><img src=x onerror=alert(1)> & \"quoted\""

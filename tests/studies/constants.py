@@ -35,10 +35,10 @@ SURE = 0.95  # weight from which on a name is stated with confidence: the verdic
 FRONT = ("usable_runs", "_start_matrix", "fit_matrix", "screen_plain", "screen_extended", "screen_again", "extend",
          "without_effects")  # fmt: skip
 TAIL = ("validation_runs", "compare_held_out", "waterfall_steps", "extrapolations_of", "calibration_of")
-OF_FRONT = ("fitting", "regressors.covariate_bases", "regressors.effect_slopes", "regressors.paths",
+OF_FRONT = ("fitting", "regressors.covariate_bases", "regressors.paths",
             "selection.screening", "selection.candidate_groups", "selection.encoder_quantisation", "conclude",
             RUNS)  # fmt: skip
-OF_TAIL = ("held_out", "selection.extrapolation")
+OF_TAIL = ("held_out",)
 
 
 class Set(Model):

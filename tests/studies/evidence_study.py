@@ -27,8 +27,7 @@ from hidden.sets import LEVELS, FormName, Kind, make_set
 
 from omnibench.config import Model
 from omnibench.discover.fitting import extend, fit_matrix
-from omnibench.discover.regressors.columns import Group
-from omnibench.discover.regressors.significance import significance_of
+from omnibench.discover.regressors.significance import Group, significance_of
 from omnibench.discover.selection.evidence import credibility_of, effect_sets, indices_of, joint_share
 from omnibench.discover.selection.model_selection import ABSORBED, SURE
 from omnibench.discover.selection.screening import Screening, screen_again, screen_plain

@@ -42,7 +42,7 @@ from scipy.stats import binomtest
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.discover.fitting import extend, fit_matrix
-from omnibench.discover.regressors.columns import Group
+from omnibench.discover.regressors.significance import Group
 from omnibench.fit import sandwich
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.problem import Budget

@@ -23,7 +23,7 @@ from omnibench.live.replay.concatenated_drive import (
     concatenated_truth,
     load_recording,
 )
-from omnibench.live.replay.replay_player import events
+from omnibench.live.replay.replay_player import ReplayMessages
 from omnibench.live.wire.messages import JOINT_STATE, POSE_ESTIMATE, JointState, PoseEstimate
 from omnibench.robot.calibration import Calibration, read_calibration
 from omnibench.robot.model import OdometryModel
@@ -39,7 +39,7 @@ def fused(
     tracker = RobotTracker("apr02", calibration, fusion=FusionSettings())
     config = ReplayConfig.model_validate({"slam": {"delay": delay, "jitter": 0.0, "period": 0.25}})
     poses, newest = [], ORIGIN
-    for event in events(drive, config, origin=ORIGIN, noise=calibration.noise):
+    for event in ReplayMessages(drive, config, noise=calibration.noise).stamped_from(ORIGIN):
         message = event.message
         if isinstance(message, JointState):
             newest = message.stamp

@@ -23,7 +23,7 @@ from hidden.session_sets import session_set
 
 from omnibench.data.dataset import Dataset
 from omnibench.discover.fitting import extend, fit_matrix
-from omnibench.discover.regressors.columns import Group
+from omnibench.discover.regressors.significance import Group
 from omnibench.fit.sessions import SessionComparison, compare_sessions
 from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.processes import one_thread

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -106,7 +106,11 @@ def _matrix_table(run: CalibrationRun) -> Table:
     labels = ("x (m/rad)", "y (m/rad)", "w (rad/rad)")
     touched = np.any([np.abs(each.rates) > _TOUCHED for each in run.kept], axis=0) if run.kept else []
     marks = ["*" if touch else "" for touch in touched] or [""] * len(calibration.matrix[0])
-    notes, listed = [], list(_intervals(run))
+    notes, listed = [], list[tuple[str, ElementIntervals]]()
+    if run.uncertainty is not None:
+        listed.append(("95 %", run.uncertainty.intervals))
+    if run.intervals is not None:
+        listed.append(("95 %, resampled", run.intervals))
     if run.kept:
         motions = " and ".join(f"{each.words} ({each.motion})" for each in run.kept)
         only = f"* only if the design values are right along {motions}: these data say nothing of it, and they are kept"
@@ -151,20 +155,14 @@ def _interval(low: float, high: float, mark: str) -> str:
     return _NONE if math.isnan(low) else f"{low:+.7f} to {high:+.7f}{mark}"
 
 
-def _intervals(run: CalibrationRun) -> Iterator[tuple[str, ElementIntervals]]:
-    if run.uncertainty is not None:
-        yield "95 %", run.uncertainty.intervals
-    if run.intervals is not None:
-        yield "95 %, resampled", run.intervals
-
-
 def print_evaluation(console: Console, evaluation: Evaluation) -> None:
     """Print cost and final errors on every split, beside those of the design values."""
     rows = []
     for split in evaluation.splits:
         title = f"{split}: {plural(evaluation.splits[split].trajectories, 'run')}"
         if evaluation.unfitted is not None:
-            title += f", {_of_all(evaluation.unfitted[split], evaluation.splits[split].trajectories)} held out"
+            part, whole = evaluation.unfitted[split], evaluation.splits[split].trajectories
+            title += f", { {0: 'none', whole: 'all'}.get(part, f'{part:,}') } held out"
         if (outside := evaluation.splits[split].outside) is not None:
             title += f", {100 * outside:.0f} % of the time outside of what it was fitted to"
         rows.append(Row.of(title, role="group"))
@@ -187,23 +185,19 @@ def print_evaluation(console: Console, evaluation: Evaluation) -> None:
     kind = " (simulated data)" if evaluation.simulated else ""
     note = f"fitted with the loss {evaluation.loss}; cost and errors are without it" if evaluation.loss else ""
     print_table(console, Table(f"{evaluation.dataset}{kind}", columns, tuple(rows), note))
-    _print_references(console, evaluation)
-
-
-def _print_references(console: Console, evaluation: Evaluation) -> None:
-    """Print the errors at references other than poses, by kind, of the calibration and of the design values."""
-    rows = []
+    # Errors at references other than poses, by kind, of the calibration and of the design values.
+    at_references = []
     for split, errors in evaluation.splits.items():
         if not errors.references:
             continue
-        rows.append(Row.of(split, role="group"))
+        at_references.append(Row.of(split, role="group"))
         for fitted, before in zip(errors.references, evaluation.design[split].references, strict=True):
-            figures = (
+            sizes = (
                 _size(each, of_model.unit) for of_model in (fitted, before) for each in (of_model.mean, of_model.max)
             )
             ratios = (f"{fitted.in_sigmas:.1f}", f"{before.in_sigmas:.1f}")
-            rows.append(Row.of(fitted.kind, str(fitted.references), *figures, *ratios))
-    columns = (
+            at_references.append(Row.of(fitted.kind, str(fitted.references), *sizes, *ratios))
+    headings = (
         Column("reference", numeric=False),
         Column("number"),
         Column("mean"),
@@ -213,11 +207,11 @@ def _print_references(console: Console, evaluation: Evaluation) -> None:
         Column("in sigmas"),
         Column("design: in sigmas", priority=1),
     )
-    if rows:
+    if at_references:
         note = (
             "in sigmas: root mean square of errors in the references' own standard deviations, 1 if the model is right"
         )
-        print_table(console, Table("errors by kind of reference", columns, tuple(rows), note))
+        print_table(console, Table("errors by kind of reference", headings, tuple(at_references), note))
 
 
 def _size(value: float, unit: str) -> str:
@@ -246,16 +240,13 @@ def how_to_use(calibration: Calibration, file: Path) -> tuple[str, ...]:
     """The next step with a calibration in words, then the words to type: an export, or a node if none holds it."""
     if left_out(calibration):
         return "name it in the config of a live node, which alone has its effects", "omnibench", "guide", "live"
-    return "use it on the robot", "omnibench", "export", str(file), "--to", _format_for(calibration)
-
-
-def _format_for(calibration: Calibration) -> str:
-    """The export format to try first: parameters of a ROS 2 controller where one suits the robot."""
+    # The format to try first: parameters of a ROS 2 controller where one suits the robot.
+    form = "ros2_controllers"
     try:
-        export_calibration(calibration, "ros2_controllers")
+        export_calibration(calibration, form)
     except ConfigError:
-        return "c_header"
-    return "ros2_controllers"
+        form = "c_header"
+    return "use it on the robot", "omnibench", "export", str(file), "--to", form
 
 
 def print_certificate_ending(certified: CertifiedCalibration, file: Path, datasets: Sequence[Path]) -> None:
@@ -270,10 +261,6 @@ def print_certificate_ending(certified: CertifiedCalibration, file: Path, datase
     else:
         exact = ("omnibench", "calibrate", *datasets, "-o", "better.yaml")
         print_ending(f"a better matrix may save up to {gap:.1%} of the cost", "search for it", *exact)
-
-
-def _of_all(part: int, count: int) -> str:
-    return {0: "none", count: "all"}.get(part, f"{part:,}")
 
 
 def _deviation(share: float) -> str:

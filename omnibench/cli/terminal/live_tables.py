@@ -20,7 +20,7 @@ from rich.text import Text
 from omnibench.cli.terminal.progress_display import ProgressDisplay
 from omnibench.cli.terminal.tables import print_table, render_table
 from omnibench.errors import DataError, one_line
-from omnibench.live.estimation.counts import anomalies_in_words
+from omnibench.live.estimation.health import anomalies_in_words
 from omnibench.live.network.presence import alive_robots, nothing_received
 from omnibench.live.robot_monitor import OdometryStatus, RobotMonitor, RobotStatus, json_document
 from omnibench.live.stopping import ticks
@@ -306,6 +306,8 @@ def _cells(robot: str, stream: OdometryStatus | None, by_stamp: bool) -> list[st
     x, y, heading = stream.message.pose.tolist()
     vx, vy, w = stream.message.twist.tolist()
     silent = stream.age >= _SILENCE
+    # since its stamp, ms, where the clocks agree
+    since_stamp = f"/{stream.stamp_age * 1e3:.0f}" if by_stamp and stream.stamp_age is not None else ""
     return [
         stream.message.frame.removeprefix(f"{robot}/"),  # in a node of several robots frames carry the robot's name
         _digits(x, 3),
@@ -317,7 +319,7 @@ def _cells(robot: str, stream: OdometryStatus | None, by_stamp: bool) -> list[st
         f"{vy:.2f}",
         _digits(math.degrees(w), 1),
         "-" if silent or stream.rate is None else f"{stream.rate:.0f}",
-        "-" if silent else _age(stream, by_stamp),
+        "-" if silent else f"{stream.age * 1e3:.0f}{since_stamp}",
     ]
 
 
@@ -325,12 +327,6 @@ def _digits(value: float, decimals: int) -> str:
     """A value with fewer decimals the larger it is, so that a column stays narrow."""
     digits = len(f"{abs(value):.0f}")
     return f"{value:.{max(decimals - max(digits - 2, 0), 0)}f}"
-
-
-def _age(stream: OdometryStatus, by_stamp: bool) -> str:
-    """Time since the message arrived and, where the clocks agree, since its stamp; ms."""
-    since_stamp = f"/{stream.stamp_age * 1e3:.0f}" if by_stamp and stream.stamp_age is not None else ""
-    return f"{stream.age * 1e3:.0f}{since_stamp}"
 
 
 def _streams(status: RobotStatus) -> tuple[OdometryStatus, ...]:

@@ -48,7 +48,7 @@ from omnibench.report.figures import DESIGN, START, is_drawn, joined, line, mark
 from omnibench.report.numbers import MOST_MOTIONS, NOTHING, count, fixed, listing, motion_items, motion_of, significant
 from omnibench.report.recording.recording_figures import evenly
 from omnibench.report.recording.section import has_recording, recording_section
-from omnibench.report.reproduction import reproduction_section
+from omnibench.report.render import reproduction_section
 from omnibench.report.style import INK, PALETTE, plan
 from omnibench.robot.kinematics import Array, Robot, Wheel, seen_from
 from omnibench.words import plural

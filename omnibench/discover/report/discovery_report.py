@@ -205,16 +205,10 @@ def sure_blocks(discovery: Discovery) -> Iterator[Block]:
         yield Callout(
             "What these data cannot tell apart", tuple(" or ".join(names) for names in discovery.classes), "plain"
         )
-    yield from _hidden(discovery)
-
-
-def _hidden(discovery: Discovery) -> Iterator[Block]:
-    if not discovery.hidden:
-        return
-    grid = hidden_grid(discovery.hidden)
-    if grid is not None:
-        yield grid
-    yield Details(f"These effects in numbers ({len(discovery.hidden)})", (hidden_table(discovery.hidden),))
+    if discovery.hidden:
+        if (grid := hidden_grid(discovery.hidden)) is not None:
+            yield grid
+        yield Details(f"These effects in numbers ({len(discovery.hidden)})", (hidden_table(discovery.hidden),))
 
 
 def _how_much_better(discovery: Discovery) -> Iterator[Block]:

@@ -37,7 +37,7 @@ from omnibench.discover.report.tables import (
     weight_in_words,
     worst_of_each,
 )
-from omnibench.discover.result import Candidate, Discovery, Gap, Hidden, Step
+from omnibench.discover.result import Discovery, Gap, Hidden, Step
 from omnibench.report.blocks import Block, Figure, FigureGrid, LegendItem, Paragraph
 from omnibench.report.figures import ORIGIN, area, arrows, coordinates, joined, line, marks
 from omnibench.report.numbers import (
@@ -76,7 +76,8 @@ def candidate_grid(discovery: Discovery) -> FigureGrid | None:
         shown = sorted((each for each in tried if each.chi_square > 0), key=lambda each: -each.chi_square)[:_CANDIDATES]
         if not shown:
             continue
-        chosen = next((each.name for each in shown if each.name in found and _is_step(discovery, number, each)), None)
+        step = added(discovery.steps[number]) if number < len(discovery.steps) else None
+        chosen = next((each.name for each in shown if each.name in found and each.name == step), None)
         title = f"Step {number}: {f'{chosen} is added' if chosen else 'nothing is added'}"
         bars = [
             _Bar(
@@ -108,13 +109,6 @@ def candidate_grid(discovery: Discovery) -> FigureGrid | None:
         "By how much each candidate would lower the whitened χ² of the training runs, the "
         f"{_CANDIDATES} largest; at the bars, the weight of the name and the degrees of freedom.",
     )
-
-
-def _is_step(discovery: Discovery, number: int, candidate: Candidate) -> bool:
-    """True if a candidate is the effect that the step added."""
-    if number < len(discovery.steps):
-        return added(discovery.steps[number]) == candidate.name
-    return False
 
 
 @dataclass(frozen=True)
@@ -215,7 +209,14 @@ def gap_grid(discovery: Discovery) -> FigureGrid:
     figures = tuple(
         Figure(
             _gap_title(discovery, gap, name),
-            _gap_bars(gap, discovery.extends),
+            _bars(
+                [
+                    _Bar(bar, 0.0, value, fixed(value, gap_decimals(gap)), item)
+                    for bar, value, item in _gap_values(gap, discovery.extends)
+                ],
+                METRICS[gap.metric],
+                1.25,
+            ),
             f"{METRICS[gap.metric]} on {name}: "
             + ", ".join(f"{bar} {value:.4g}" for bar, value, _ in _gap_values(gap, discovery.extends)),
             190 if discovery.extends else 150,
@@ -244,12 +245,6 @@ def _gap_values(gap: Gap, extends: bool) -> tuple[tuple[str, float, LegendItem],
     if not extends:
         return ("plain matrix", gap.before, ALONE), *floor
     return ("before", gap.before, PLAIN), ("after", gap.after, EXTENDED), *floor
-
-
-def _gap_bars(gap: Gap, extends: bool) -> go.Figure:
-    decimals = gap_decimals(gap)
-    bars = [_Bar(name, 0.0, value, fixed(value, decimals), item) for name, value, item in _gap_values(gap, extends)]
-    return _bars(bars, METRICS[gap.metric], 1.25)
 
 
 def hidden_grid(hidden: Sequence[Hidden]) -> FigureGrid | None:
@@ -301,11 +296,11 @@ def drawn(figures: Sequence[EvidenceFigure], discovery: Discovery) -> tuple[Figu
 def command_maps(commands: Sequence[CommandResidual], styles: Sequence[ModelStyle]) -> FigureGrid:
     """The residual of each command as an arrow at its end, enlarged."""
     reach = float(np.median([np.hypot(*each.end[:2]) for each in commands]))
-    sizes = [np.hypot(*mean_of(each, style)[:2]) for each in commands for style in styles]
+    sizes = [np.hypot(*each.means[style.index][:2]) for each in commands for style in styles]
     circle = CIRCLE_95 * float(np.median([each.error[0] for each in commands]))
     # A step of 1, 2 or 5: the longest arrow is about a third of the way to the ends.
     factor = round_down(0.35 * reach / max(float(np.quantile(sizes, 0.95)), circle, 1e-6))
-    tips = [each.end[:2] + factor * mean_of(each, style)[:2] for each in commands for style in styles]
+    tips = [each.end[:2] + factor * each.means[style.index][:2] for each in commands for style in styles]
     points = np.array([*tips, *(each.end[:2] for each in commands), np.zeros(2)])
     margin = 0.04 * float(np.ptp(points, axis=0).max()) + factor * circle / 2
     window = np.column_stack([points.min(axis=0) - margin, points.max(axis=0) + margin])
@@ -330,7 +325,7 @@ def _map(commands: Sequence[CommandResidual], style: ModelStyle, factor: float, 
     turn = np.linspace(0, 2 * np.pi, 33)
     circle = CIRCLE_95 * factor * np.column_stack([np.cos(turn), np.sin(turn)])
     circles = joined([each.end[:2] + each.error[0] * circle for each in commands])
-    residuals = [mean_of(each, style) for each in commands]
+    residuals = [each.means[style.index] for each in commands]
     words = [
         f"{command_in_words(each)}\n{_in_words(residual)}\n{plural(each.runs, 'run')}"
         for each, residual in zip(commands, residuals, strict=True)
@@ -345,12 +340,6 @@ def _map(commands: Sequence[CommandResidual], style: ModelStyle, factor: float, 
         marks(ORIGIN, 7, [0], [0], hover="start"),
         window=window,
     )
-
-
-def mean_of(each: CommandResidual, style: ModelStyle) -> Array:
-    """The mean final residual (3,) of one model."""
-    mean: Array = each.means[style.index]
-    return mean
 
 
 def command_in_words(each: CommandResidual) -> str:
@@ -401,10 +390,21 @@ def _headings_by_direction(commands: Sequence[CommandResidual], styles: Sequence
         (item, [each for each in moving if motion_of(each.run) == motion])
         for motion, item in zip(motions, items, strict=True)
     ]
-    panels = [_heading_plot(curves, style, moving) for style in styles]
-    reach = max(panel[1] for panel in panels)
+    half = math.degrees(NORMAL_95 * float(np.median([each.error[2] for each in moving])))
+    low, high = min(directions) - 10, max(directions) + 10
+    panels, reach = [], 1.4 * half
+    for style in styles:
+        traces = [area(NOISE.key, BAND, [low, high, high, low], [half, half, -half, -half])]
+        for item, own in curves:
+            values = np.degrees([each.means[style.index][2] for each in own])
+            reach = max(reach, 1.1 * float(np.abs(values).max()))
+            x, words = [direction_of(each.run) for each in own], [command_in_words(each) for each in own]
+            traces.append(line(item, 2.0, x, values, hover="%{text}<br>%{y:.3f}°", words=words, mode="lines+markers"))
+        panels.append(plot(*traces, x_title="commanded direction α (°)", y_title="heading residual (°)"))
     figures = []
-    for style, (figure, _) in zip(styles, panels, strict=True):
+    for style, figure in zip(styles, panels, strict=True):
+        figure.update_xaxes(range=[low, high], dtick=60)
+        figure.add_hline(y=0, line={"color": QUIET, "width": 1})
         figure.update_yaxes(range=[-reach, reach])
         figures.append(
             Figure(
@@ -418,39 +418,14 @@ def _headings_by_direction(commands: Sequence[CommandResidual], styles: Sequence
         tuple(figures), (*items, NOISE), 2,
         "Mean over the runs of each command; the band holds 95 % of what noise alone would do.",
     )  # fmt: skip
-    return (grid, *_turns_on_the_spot(still, styles))
-
-
-def _heading_plot(
-    curves: Sequence[tuple[LegendItem, Sequence[CommandResidual]]],
-    style: ModelStyle,
-    commands: Sequence[CommandResidual],
-) -> tuple[go.Figure, float]:
-    half = math.degrees(NORMAL_95 * float(np.median([each.error[2] for each in commands])))
-    ends = [direction_of(each.run) for each in commands]
-    low, high = min(ends) - 10, max(ends) + 10
-    traces = [area(NOISE.key, BAND, [low, high, high, low], [half, half, -half, -half])]
-    reach = 1.4 * half
-    for item, own in curves:
-        values = np.degrees([mean_of(each, style)[2] for each in own])
-        reach = max(reach, 1.1 * float(np.abs(values).max()))
-        x, words = [direction_of(each.run) for each in own], [command_in_words(each) for each in own]
-        traces.append(line(item, 2.0, x, values, hover="%{text}<br>%{y:.3f}°", words=words, mode="lines+markers"))
-    figure = plot(*traces, x_title="commanded direction α (°)", y_title="heading residual (°)")
-    figure.update_xaxes(range=[low, high], dtick=60)
-    figure.add_hline(y=0, line={"color": QUIET, "width": 1})
-    return figure, reach
-
-
-def _turns_on_the_spot(still: Sequence[CommandResidual], styles: Sequence[ModelStyle]) -> tuple[Block, ...]:
     if not still:
-        return ()
+        return (grid,)
     parts = []
     for each in sorted(still, key=lambda each: motion_of(each.run)):
-        values = " → ".join(f"{fixed(math.degrees(mean_of(each, style)[2]), 2, signed=True)}°" for style in styles)
+        turns = " → ".join(f"{fixed(math.degrees(each.means[s.index][2]), 2, signed=True)}°" for s in styles)
         noise = fixed(math.degrees(NORMAL_95 * each.error[2]), 2)
-        parts.append(f"{command_in_words(each)}: {values} (noise ±{noise}°)")
-    return (Paragraph(f"Turns on the spot, mean heading residual: {'; '.join(parts)}.", "note"),)
+        parts.append(f"{command_in_words(each)}: {turns} (noise ±{noise}°)")
+    return grid, Paragraph(f"Turns on the spot, mean heading residual: {'; '.join(parts)}.", "note")
 
 
 def _rows(commands: Sequence[CommandResidual], styles: Sequence[ModelStyle]) -> FigureGrid:
@@ -477,7 +452,7 @@ def _rows(commands: Sequence[CommandResidual], styles: Sequence[ModelStyle]) -> 
             )
         ]
         for style in styles:
-            values = factor * np.array([mean_of(each, style)[axis] for each in shown])
+            values = factor * np.array([each.means[style.index][axis] for each in shown])
             traces.append(marks(style, 9, values, names, hover=f"{text(style.label)}: %{{x:.3g}} {unit}"))
         figure = plot(*traces, x_title=f"residual ({unit})")
         figure.update_yaxes(autorange="reversed", ticks="", tickfont_color=INK)

@@ -252,22 +252,21 @@ def decisive(discovery: Discovery) -> HeldOut | None:
 
 def extrapolations_in_words(extrapolations: tuple[Extrapolation, ...]) -> tuple[str, ...]:
     """Motions of held-out runs on which the extended model extrapolates, a sentence each."""
-    return tuple(
-        f"{each.command}: {each.description}. Final position within {_millimetres(each.before_m)} by the plain matrix, "
-        f"{_by_extended(each)}."
-        for each in extrapolations
-    )
+    sentences = []
+    for each in extrapolations:
+        extended = f"within {_millimetres(each.after_m)} by the extended model (95 %)"
+        if is_unbounded(each):
+            extended = "by the extended model it cannot be said (95 %)"
+        before = _millimetres(each.before_m)
+        sentences.append(
+            f"{each.command}: {each.description}. Final position within {before} by the plain matrix, {extended}."
+        )
+    return tuple(sentences)
 
 
 def is_unbounded(extrapolation: Extrapolation) -> bool:
     """True if the models that the data cannot tell apart say nothing of where the run ends."""
     return not extrapolation.after_m <= _UNBOUNDED * extrapolation.before_m
-
-
-def _by_extended(extrapolation: Extrapolation) -> str:
-    if is_unbounded(extrapolation):
-        return "by the extended model it cannot be said (95 %)"
-    return f"within {_millimetres(extrapolation.after_m)} by the extended model (95 %)"
 
 
 def _millimetres(metres: float) -> str:

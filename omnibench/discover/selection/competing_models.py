@@ -1,4 +1,4 @@
-"""Competing models: those that the recordings cannot tell apart, and which of them is used.
+"""Competing models: those that the recordings cannot tell apart, which of them is used, and the effects that it names.
 
 Where several effects explain the same residuals, each in its place makes a model of its own. The one that best predicts
 commands that its fit did not see, in the paper's cost, is used; what the models disagree on is not known.
@@ -21,6 +21,8 @@ covariance S_c where both are one vector t_c that is 0 for what a member does no
 all, and with the first two moments of the mixture:
 
     t = sum of w_c t_c,    S = sum of w_c (S_c + (t_c - t)(t_c - t)').                                              (2)
+
+Named effects have 95 % intervals by the fit's covariance and Student's t, fit/information.py.
 """
 
 from __future__ import annotations
@@ -32,12 +34,15 @@ import numpy as np
 
 from omnibench.discover.fitting import Extended, Fit, at_model, columns_of, extend, model_with, terms_of
 from omnibench.discover.held_out import folds_of_commands, held_out_residuals, is_gain
-from omnibench.discover.regressors.columns import Group
-from omnibench.discover.selection.model_selection import Selection
+from omnibench.discover.regressors.significance import Group
+from omnibench.discover.result import Candidate, EstimatedParameter, NamedEffect
+from omnibench.discover.selection.model_selection import SURE, Selection
+from omnibench.discover.selection.motor_effects import MotorEffects
 from omnibench.discover.selection.screening import Screening
 from omnibench.fit.information import EstimatedCovariance
 from omnibench.fit.trajectory_fit import given
-from omnibench.robot.kinematics import Array
+from omnibench.robot.effects.effect import form_in_words
+from omnibench.robot.kinematics import Array, Robot
 
 # Share of a column that must be left beyond the others, as in unknown_term.py: much of a form is another matrix.
 _DETERMINED = 0.01
@@ -112,21 +117,21 @@ def competing_models(plain: Fit, selection: Selection, extended: Extended) -> Co
             if difference.mean() > 0:
                 others.append((selection.weights.get(chosen[position].name, 0.0), used))
                 preferred[position] = _reason(stand_in, difference)
-                selection, used = _exchanged(selection, position, stand_in), model
+                # The stand-in takes the place, and the effect that stood there is among the stand-ins.
+                exchanged = tuple(
+                    chosen[position] if group is stand_in else group for group in selection.stand_ins[position]
+                )
+                selection = replace(
+                    selection,
+                    chosen=(*chosen[:position], stand_in, *chosen[position + 1 :]),
+                    stand_ins=(*selection.stand_ins[:position], exchanged, *selection.stand_ins[position + 1 :]),
+                )
+                used = model
             else:
                 others.append((weight, model))
                 preferred[position] = preferred[position] or _reason(chosen[position], -difference)
     weight = min((selection.weights.get(group.name, 0.0) for group in selection.chosen), default=1.0)
     return CompetingModels(used, selection, ((weight, used), *others), tuple(preferred))
-
-
-def _exchanged(selection: Selection, position: int, stand_in: Group) -> Selection:
-    """The selection with a stand-in at one position, and the effect that stood there among the stand-ins."""
-    before = selection.chosen[position]
-    chosen = (*selection.chosen[:position], stand_in, *selection.chosen[position + 1 :])
-    exchanged = tuple(before if group is stand_in else group for group in selection.stand_ins[position])
-    stand_ins = (*selection.stand_ins[:position], exchanged, *selection.stand_ins[position + 1 :])
-    return replace(selection, chosen=chosen, stand_ins=stand_ins)
 
 
 def _reason(group: Group, difference: Array) -> str:
@@ -235,3 +240,81 @@ def _own_names(model: Extended, members: Sequence[tuple[float, Extended]]) -> st
     others = [other for _, other in members if other is not model]
     shared = [group for group in model.groups if all(any(group is each for each in other.groups) for other in others)]
     return " with ".join(group.name for group in model.groups if not any(group is each for each in shared))
+
+
+def named_effects(models: CompetingModels, motors: MotorEffects | None) -> tuple[NamedEffect, ...]:
+    """The effects of the model that is used, then those of the motors."""
+    used, model = models.used, models.used.fit.model
+    effects = _effects(models.selection, model.robot, used.values, used.covariance.reach[model.matrix.size :])
+    effects = tuple(
+        replace(effect, in_doubt="; ".join(filter(None, (effect.in_doubt, reason))))
+        if effect.confusable_with
+        else effect
+        for effect, reason in zip(effects, models.preferred, strict=True)
+    )
+    if motors is None:
+        return effects
+    return effects + _effects(motors.selection, model.robot, motors.values, motors.covariance.reach)
+
+
+def candidates_of(selection: Selection) -> tuple[tuple[Candidate, ...], ...]:
+    """The effects that were tried at each step, each in its best shape, the largest chi-square difference first."""
+    candidates = []
+    for step in selection.steps:
+        ordered = sorted(step.best_shapes, key=lambda index: -step.chi_square[index])
+        names = [step.groups[index].name for index in ordered]
+        of_step = (
+            Candidate(name, float(step.chi_square[index]), int(step.rank[index]), selection.weights.get(name, 0.0))
+            for name, index in zip(names, ordered, strict=True)
+        )
+        candidates.append(tuple(of_step))
+    return tuple(candidates)
+
+
+def _effects(selection: Selection, robot: Robot, values: Array, reach: Array) -> tuple[NamedEffect, ...]:
+    """The chosen effects. reach (n,): half-widths of the intervals of their linear parameters."""
+    tried = {
+        group.name: (chi_square, rank)
+        for step in selection.steps[::-1]
+        for group, chi_square, rank in zip(step.groups, step.chi_square, step.rank, strict=True)
+        if any(group.index[:1] == each.index[:1] for each in selection.chosen)
+    }
+    doubt = ""
+    if not selection.known > SURE:
+        doubt = (
+            f"generic bases still find {selection.left_share:.0%} of what was there, which a right name seldom leaves"
+        )
+    effects, row = [], 0
+    for group, confusable in zip(selection.chosen, selection.confusable, strict=True):
+        assert group.effect is not None
+        rows = slice(row, row + len(group.parameters))
+        row = rows.stop
+        weight = selection.weights.get(group.name, 0.0)
+        chi_square, rank = tried.get(group.name, (0.0, 0.0))
+        names = [parameter.name for parameter in group.parameters]
+        estimates = [
+            EstimatedParameter(each.name, float(value), each.unit, float(value - margin), float(value + margin))
+            for each, value, margin in zip(group.parameters, values[rows], reach[rows], strict=True)
+        ]
+        shapes = []
+        for each in group.effect.parameters(robot):
+            if each.name in group.shapes:
+                value = group.shapes[each.name]
+                shapes.append(EstimatedParameter(each.name, value, each.unit, value, value, shape=True))
+        effects.append(
+            NamedEffect(
+                name=group.name,
+                stage=group.effect.stage,
+                weight=weight,
+                form=form_in_words(dict(group.shapes) | dict(zip(names, values[rows].tolist(), strict=True))),
+                parameters=(*estimates, *shapes),
+                confusable_with=confusable,
+                physics=group.effect.physics,
+                source=group.effect.source,
+                chi_square=float(chi_square),
+                degrees_of_freedom=int(rank),
+                in_doubt=doubt,
+                class_weight=weight + sum(selection.weights.get(name, 0.0) for name in confusable),
+            )
+        )
+    return tuple(effects)

@@ -27,7 +27,7 @@ from itertools import combinations
 
 import numpy as np
 
-from omnibench.discover.regressors.columns import Group, best_shapes
+from omnibench.discover.regressors.significance import Group, best_shapes
 from omnibench.discover.result import Absorbed, Hidden
 from omnibench.discover.selection.evidence import Missing
 from omnibench.discover.selection.model_selection import ABSORBED, Selection

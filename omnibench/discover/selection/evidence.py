@@ -81,11 +81,9 @@ import numpy as np
 from scipy.integrate import quad
 
 from omnibench.data.dataset import Trajectory
-from omnibench.discover.regressors.columns import ColumnStore, Group
 from omnibench.discover.regressors.covariate_bases import Columns, generic_bases
-from omnibench.discover.regressors.effect_slopes import correction_along, slopes_by, slopes_by_corrections
-from omnibench.discover.regressors.paths import Paths
-from omnibench.discover.regressors.significance import Significance
+from omnibench.discover.regressors.paths import Paths, correction_along, slopes_by, slopes_by_corrections
+from omnibench.discover.regressors.significance import ColumnStore, Group, Significance
 from omnibench.fit.trajectory_fit import Given
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import (
@@ -97,7 +95,7 @@ from omnibench.robot.effects.effect import (
     form_profile,
     forms_of,
 )
-from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.kinematics import Array
 
 # Shapes of an effect: with more of them, one comes near enough to any other form. tests/studies/constants.py varies
 # it by 0.5 and 2: on a small set with heading drift no verdict and no name changes.
@@ -134,7 +132,13 @@ def make_groups(paths: Paths, trajectories: Sequence[Trajectory], without: Seque
     sources: list[Columns] = [_of_matrix]
     not_looked_for: list[tuple[str, Missing]] = []
     sessions = tuple(dict.fromkeys(run.session for run in trajectories if run.session is not None))
-    for effect in _candidates(paths.robot, without):
+    for effect in catalogue(without):
+        if (
+            not isinstance(effect, MotionEffect | ReferenceEffect)
+            or effect.run_nuisance
+            or not effect.applies(paths.robot)
+        ):
+            continue
         if missing := _lacks(effect, paths, sessions):
             not_looked_for.append((effect.name, missing))
             continue
@@ -200,14 +204,10 @@ def _of_matrix(paths: Paths) -> Array:
     return np.concatenate([paths.of_twist(np.tile(row, (len(driven), 1)), driven) for row in np.eye(3)], axis=2)
 
 
-def _candidates(robot: Robot, without: Sequence[str]) -> Iterator[MotionEffect | ReferenceEffect]:
+def catalogue(without: Sequence[str]) -> Iterator[Effect]:
+    """The effects of the catalogue but for some of these names."""
     for entry in effects.entries():
-        if entry.name in without:
-            continue
-        effect: Effect = effects.create(entry.name)
-        if not isinstance(effect, MotionEffect | ReferenceEffect) or effect.run_nuisance:
-            continue
-        if effect.in_catalogue and effect.applies(robot):
+        if entry.name not in without and (effect := effects.create(entry.name)).in_catalogue:
             yield effect
 
 

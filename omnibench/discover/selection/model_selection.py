@@ -15,8 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from omnibench.discover.regressors.columns import Group, best_shapes
-from omnibench.discover.regressors.significance import Significance, significance_of
+from omnibench.discover.regressors.significance import Group, Significance, best_shapes, significance_of
 from omnibench.discover.selection.evidence import (
     DISCREPANCY,
     credibility_of,
@@ -85,12 +84,18 @@ class Selection:
 def select_effects(screening: Screening, rng: np.random.Generator) -> Selection:
     """Select the effects that explain what was screened, less those that encoder quantisation could explain."""
     search = _search(screening, screening.groups.effects, rng)
-    if doubtful := _within_quantisation(screening, (*search.chosen, *search.tentative)):
+    start, doubtful = screening.beyond_matrix(), set[str]()
+    if screening.quantisation is not None:
+        doubtful = {
+            group.name
+            for group in (*search.chosen, *search.tentative)
+            if start.chi_square(group.index) <= screening.quantisation_chi_square(group)
+        }
+    if doubtful:
         others = [group for group in screening.groups.effects if group.name not in doubtful]
         search = _search(screening, others, rng)
     where = significance_of(screening.data, screening.groups.matrix.index, screening.groups.bases, rng)
     # The weights of all names, and the names that could take the place of each chosen one
-    start = screening.beyond_matrix()
     chosen = tuple(sorted(search.chosen, key=lambda group: -start.chi_square(group.index)))
     of_positions = [
         _probabilities(start, search.pool, chosen, position, search.discrepancy) for position in range(len(chosen))
@@ -195,14 +200,6 @@ def _explains_what_is_left(
         for groups in (chosen, larger)
     )
     return bool(chosen) and before > _CLEARLY * scatter and after < _MOSTLY * before
-
-
-def _within_quantisation(screening: Screening, groups: Sequence[Group]) -> set[str]:
-    """Names of groups that explain no more than encoder quantisation can make."""
-    if screening.quantisation is None:
-        return set()
-    start = screening.beyond_matrix()
-    return {group.name for group in groups if start.chi_square(group.index) <= screening.quantisation_chi_square(group)}
 
 
 def _probabilities(

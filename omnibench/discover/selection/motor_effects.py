@@ -18,14 +18,13 @@ from scipy.optimize import least_squares
 
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.held_out import folds_of_repetitions
-from omnibench.discover.regressors.columns import ColumnStore, Group
 from omnibench.discover.regressors.covariate_bases import Basis
-from omnibench.discover.selection.evidence import Groups
+from omnibench.discover.regressors.significance import ColumnStore, Group
+from omnibench.discover.selection.evidence import Groups, catalogue
 from omnibench.discover.selection.model_selection import Selection, select_effects
 from omnibench.discover.selection.screening import Screening
 from omnibench.fit.information import EstimatedCovariance
 from omnibench.fit.trajectory_fit import Whitened
-from omnibench.registry import effects
 from omnibench.robot.effects.effect import ActuatorEffect, Parameter
 from omnibench.robot.kinematics import Array, Robot
 
@@ -101,7 +100,9 @@ def _groups(runs: Sequence[Trajectory], robot: Robot, without: Sequence[str]) ->
         count += width
         return tuple(range(count - width, count))
 
-    for effect in _candidates(without):
+    for effect in catalogue(without):
+        if not isinstance(effect, ActuatorEffect):
+            continue
         parameters = effect.parameters(robot)
         named.append(Group("effect", effect.name, add(_slopes_of(effect, parameters)), effect, parameters))
     for covariate, detail, slopes in _bases(runs):
@@ -116,14 +117,6 @@ def _slopes_of(effect: ActuatorEffect, parameters: Sequence[Parameter]) -> _Slop
     return lambda run: np.stack(
         [_change(effect, run, {**nothing, name: step}) / step for name, step in steps.items()], axis=-1
     )
-
-
-def _candidates(without: Sequence[str]) -> Iterator[ActuatorEffect]:
-    for entry in effects.entries():
-        if entry.name not in without:
-            effect = effects.create(entry.name)
-            if isinstance(effect, ActuatorEffect) and effect.in_catalogue:
-                yield effect
 
 
 def _change(effect: ActuatorEffect, run: Trajectory, values: Mapping[str, float]) -> Array:

@@ -28,8 +28,7 @@ from numpy.typing import NDArray
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.fitting import Extended, Fit, paths_of
 from omnibench.discover.held_out import folds_of_repetitions, is_confirmed, kinds_of_runs
-from omnibench.discover.regressors.columns import ColumnStore, Group
-from omnibench.discover.regressors.significance import Significance, significance_of
+from omnibench.discover.regressors.significance import ColumnStore, Group, Significance, significance_of
 from omnibench.discover.selection.evidence import Groups, make_groups
 from omnibench.fit.noise import grouped
 from omnibench.fit.trajectory_fit import Given, Whitened, given
@@ -111,9 +110,12 @@ def _quarter_ticks(run: Trajectory, poses: Array, matrix: Array, ticks: Array) -
         moments = ((first, run.times[first - 1] if first else 0.0), (last, run.times[last]))
         for column, (sample, moment) in zip((wheel, wheel + len(ticks)), moments, strict=True):
             later = stamps > moment - 1e-9
-            place = [float(np.interp(moment, run.pose_times, values)) for values in known.T]
+            x, y, heading = (float(np.interp(moment, run.pose_times, values)) for values in known.T)
             moved = _column(run, matrix, int(wheel), int(sample))
-            columns[later, :, column] = _MEAN * ticks[wheel] * _turned(moved, place, poses[later])
+            # Later poses by a radian more of the wheel at the place (x, y, heading).
+            turn = moved[2] * np.column_stack([y - poses[later, 1], poses[later, 0] - x])
+            changes = np.column_stack([rotated(moved, heading) + turn, np.full(len(turn), moved[2])])
+            columns[later, :, column] = _MEAN * ticks[wheel] * changes
     return columns
 
 
@@ -128,14 +130,6 @@ def _column(run: Trajectory, matrix: Array, wheel: int, sample: int) -> Array:
         by_rate, _ = run.drive.slopes(run.rates[part], in_the_middle(run.steering)[part])
         column = matrix @ by_rate[0, :, wheel]
     return column
-
-
-def _turned(wheel: Array, place: Sequence[float], poses: Array) -> Array:
-    """Changes (K, 3) of later poses by a radian more of a wheel that moves the robot by (3,), at a place."""
-    x, y, heading = place
-    step = rotated(wheel, heading)
-    turn = wheel[2] * np.column_stack([y - poses[:, 1], poses[:, 0] - x])
-    return np.column_stack([step + turn, np.full(len(poses), wheel[2])])
 
 
 # s: shorter wheel samples are merged up to this duration, as covariates vary more slowly. tests/studies/constants.py

@@ -28,9 +28,8 @@ from numpy.typing import NDArray
 from omnibench.discover.covariate_dependence import weights_of_covariates
 from omnibench.discover.fitting import Extended, Fit, columns_of, extend
 from omnibench.discover.held_out import folds_of_kinds, is_gain, without_runs
-from omnibench.discover.regressors.columns import Group, best_shapes
 from omnibench.discover.regressors.covariate_bases import Basis
-from omnibench.discover.regressors.significance import Significance
+from omnibench.discover.regressors.significance import Group, Significance, best_shapes
 from omnibench.discover.selection.competing_models import CompetingModels
 from omnibench.discover.selection.model_selection import CHANCE
 from omnibench.discover.selection.screening import Screening

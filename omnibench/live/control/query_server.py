@@ -8,6 +8,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from typing import Any, Final, cast
 
 import numpy as np
@@ -25,15 +26,15 @@ from omnibench.live.control.request_queue import (
     read_sent_calibration,
     read_time,
 )
-from omnibench.live.estimation.saved_state import RobotMemory
+from omnibench.live.estimation.robot_state import RobotMemory
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.stopping import RateLimiter, direct
-from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
 
 LOG = logging.getLogger("omnibench.live")
 _READING: Final = ("info", "calibration", "health", "pose")
 _ORDERS: Final = ("set_pose", "reset", "swap")
+_NO_STATE: Final = "the node has no `state`, so that its next start is with the config's calibration"
 _CLOSE_TIMEOUT: Final = 6.0  # s to wait for a request under way: longer than Zenoh waits for a client, 5 s
 
 
@@ -66,7 +67,12 @@ class QueryServer:
         self._thread = threading.Thread(target=self._run, name="query server", daemon=True)
         self._declarations: list[Any] = []
         for name in trackers:
-            self._declarations += self._declare(session, name)
+            # declared one by one, so that access control can tell them apart
+            for service in _READING + _ORDERS:
+                handler = direct(partial(self._take_query, name, service))
+                self._declarations.append(session.declare_queryable(f"omnibench/{name}/{service}", handler))
+            put = direct(partial(self._take_sample, name))
+            self._declarations.append(session.declare_subscriber(f"omnibench/{name}/calibration", put))
         self._thread.start()
 
     def close(self) -> None:
@@ -75,18 +81,6 @@ class QueryServer:
             declaration.undeclare()
         self._requests.close()
         self._thread.join(_CLOSE_TIMEOUT)
-
-    def _declare(self, session: zenoh.Session, name: str) -> list[Any]:
-        def handler(service: str) -> Callable[[zenoh.Query], None]:
-            return lambda query: self._take_query(name, service, query)
-
-        # declared one by one, so that access control can tell them apart
-        services: list[Any] = [
-            session.declare_queryable(f"omnibench/{name}/{service}", direct(handler(service)))
-            for service in _READING + _ORDERS
-        ]
-        put = direct(lambda sample: self._take_sample(name, sample))
-        return [*services, session.declare_subscriber(f"omnibench/{name}/calibration", put)]
 
     def _take_query(self, name: str, service: str, query: zenoh.Query) -> None:
         if service in _ORDERS and str(query.key_expr) != f"omnibench/{name}/{service}":
@@ -216,24 +210,20 @@ class QueryServer:
             self._log_refusal(tracker, error)
             raise
         LOG.info("%s: calibration %r runs", name, calibration.name)
-        answer = {"robot": name, "accepted": True, "calibration": calibration.name, "kept": True}
-        reason = self._not_kept(name, calibration)
-        return answer if reason is None else answer | {"kept": False, "reason": reason}
+        # Save it; the reason where the node's next start will not use it.
+        reason = None if name in self._memories else _NO_STATE
+        if name in self._memories:
+            try:
+                self._memories[name].keep_calibration(calibration)
+            except OmnibenchError as error:
+                LOG.warning("%s: calibration %r runs, but not after a restart: %s", name, calibration.name, error)
+                reason = str(error)
+        answer = {"robot": name, "accepted": True, "calibration": calibration.name, "kept": reason is None}
+        return answer if reason is None else answer | {"reason": reason}
 
     def _log_refusal(self, tracker: RobotTracker, error: DataError) -> None:
         if self._rate_limiter.allows(f"calibration of {tracker.name}"):
             LOG.warning("%s: calibration refused, %s runs on: %s", tracker.name, tracker.calibration.name, error)
-
-    def _not_kept(self, name: str, calibration: Calibration) -> str | None:
-        """Save a calibration that runs; None, or the reason why the node's next start will not use it."""
-        if name not in self._memories:
-            return "the node has no `state`, so that its next start is with the config's calibration"
-        try:
-            self._memories[name].keep_calibration(calibration)
-        except OmnibenchError as error:
-            LOG.warning("%s: calibration %r runs, but not after a restart: %s", name, calibration.name, error)
-            return str(error)
-        return None
 
 
 def _size(content: zenoh.ZBytes | None) -> int:

@@ -1,4 +1,4 @@
-"""Requests to a node, and their fair queue: every client has a lane of its own, and the lanes are served in turn."""
+"""Requests to a node, their fair queue, in which every client has a lane of its own, and a client's request to swap."""
 
 from __future__ import annotations
 
@@ -8,13 +8,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from itertools import chain, zip_longest
+from pathlib import Path
 from typing import Final
 
 import zenoh
-from pydantic import Field, FiniteFloat
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
 from omnibench.config import Model, parse_yaml, validate
 from omnibench.errors import ConfigError, DataError
+from omnibench.files import read_bytes
+from omnibench.live.network.presence import alive_robots, checked_robot, nothing_received
 from omnibench.robot.calibration import Calibration, parse_calibration
 
 LONGEST: Final = 1 << 17  # bytes of a request: 48 KiB of weights, in base64, and 60 KB of driven motions beside them
@@ -136,3 +139,47 @@ class RequestQueue:
         with self._changed:
             self._closed = True
             self._changed.notify()
+
+
+_LONGEST_TEXT = 2000  # characters; names have some 400, reasons are one line
+
+
+class SwapReply(BaseModel):
+    """A node's answer. kept: whether the calibration is kept for the node's next start; reason: why not."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    accepted: bool
+    calibration: str = Field(max_length=_LONGEST_TEXT)
+    kept: bool = True
+    reason: str = Field("", max_length=_LONGEST_TEXT)
+
+
+class _Refusal(BaseModel):
+    """A node's answer that refuses a calibration."""
+
+    error: str
+
+
+def swap_calibration(session: zenoh.Session, robot: str, file: Path, timeout: float = 10.0) -> SwapReply:
+    """Send a calibration file to the node that runs ``robot``, and return its answer.
+
+    DataError: the file is no calibration, no node answers (the message names the robots alive), or the node refuses.
+    """
+    payload, key = read_bytes(file, LONGEST), f"omnibench/{checked_robot(robot)}/swap"
+    read_sent_calibration(payload, str(file))
+    for reply in session.get(key, payload=payload, timeout=timeout, source_info=source_of(session)):
+        try:
+            if reply.ok is not None:
+                return SwapReply.model_validate_json(reply.ok.payload.to_bytes())
+            if reply.err is not None and (refusal := reply.err.payload.to_bytes()) != b"Timeout":
+                raise DataError(f"robot {robot!r} refuses {file}: {_Refusal.model_validate_json(refusal).error}")
+        except ValidationError:
+            raise DataError(f"robot {robot!r}: cannot read its node's answer; is it an omnibench node?") from None
+    alive = alive_robots(session)
+    if robot in alive:
+        raise DataError(
+            f"robot {robot!r} is alive, but its node did not answer in {timeout:.0f} s; the `access` of its router may "
+            "not let us swap, which only operators may, or the node is too busy"
+        )
+    raise DataError(nothing_received(robot, timeout, alive))

@@ -220,18 +220,26 @@ class LiveOdometry:
             twist_now = self._stream.matrix @ rates if step.blind else moved / step.duration
             self.twist = twist_now if self._centre is None else self._centre.of_twist @ twist_now
             self._duration = step.duration
-            self._matrix_variances = ((self._blocks @ rates) @ rates + self._doubtful_variances(step.duration)).tolist()
+            variances = (self._blocks @ rates) @ rates
+            if (extrapolated := self._stream.doubts) is not None:
+                variances = variances + np.square(extrapolated / step.duration).sum(axis=1)
+            self._matrix_variances = variances.tolist()
         position, heading = self._walk_variances(step, moved, twist)
-        self._propagate(before, self._stream.driven, position, heading)
+        # Eq. (L2) and (L3)
+        x, y, start = before.tolist()
+        to_x, to_y, end = self._stream.pose.tolist()
+        self._walk.carry(to_x - x, to_y - y)
+        self._walk.add(position, heading)
+        if self._elements is not None:
+            self._jacobian.add(self._stream.driven, to_x - x, to_y - y, start, end)
+        if (doubts := self._stream.doubts) is not None or self._doubts is not None:
+            self._add_doubts(doubts, (to_x - x, to_y - y), start, end)
         moved, integration = self._centre_moved()
-        return Motion(
-            step.stamp,
-            step.duration,
-            moved,
-            integration,
-            *self._filter_variances(step.duration, position, heading),
-            step.restarted,
-        )
+        # A filter has no state for the matrix: the matrix's error counts as noise.
+        along_x, along_y, turning = self._matrix_variances
+        time = _CORRELATION * step.duration
+        position, heading = position + time * (along_x + along_y) / 2, heading + time * turning
+        return Motion(step.stamp, step.duration, moved, integration, position, heading, step.restarted)
 
     def _signal_rates(self, step: WheelStep) -> Array:
         """Drive signals (M,) at the end of a step, rad/s."""
@@ -286,23 +294,6 @@ class LiveOdometry:
             self._unsteered += length
         return position, heading
 
-    def _filter_variances(self, duration: float, position: float, heading: float) -> tuple[float, float]:
-        """Variances for a filter, which has no state for the matrix: the matrix's error counts as noise."""
-        along_x, along_y, turning = self._matrix_variances
-        time = _CORRELATION * duration
-        return position + time * (along_x + along_y) / 2, heading + time * turning
-
-    def _propagate(self, before: Array, driven: Array, position: float, heading: float) -> None:
-        """Eq. (L2) and (L3) for the step from the pose ``before``; position (m2), heading (rad2): Q of the step."""
-        x, y, start = before.tolist()
-        to_x, to_y, end = self._stream.pose.tolist()
-        self._walk.carry(to_x - x, to_y - y)
-        self._walk.add(position, heading)
-        if self._elements is not None:
-            self._jacobian.add(driven, to_x - x, to_y - y, start, end)
-        if (doubts := self._stream.doubts) is not None or self._doubts is not None:
-            self._add_doubts(doubts, (to_x - x, to_y - y), start, end)
-
     def _add_doubts(self, moved: Array | None, along: tuple[float, float], start: float, end: float) -> None:
         """Eq. (L4) for a step along (x, y), m, from heading to heading, rad, whose motion has deviations (3, r)."""
         if self._doubts is None:
@@ -312,11 +303,6 @@ class LiveOdometry:
         self._doubts[1] += along[0] * self._doubts[2]
         if moved is not None:
             self._doubts += _slopes(self._stream.integration == "arc", *along, start, end) @ moved
-
-    def _doubtful_variances(self, duration: float) -> Array:
-        """Variances (3,) of the last step's twist by what effects extrapolate."""
-        doubts = self._stream.doubts
-        return np.zeros(3) if doubts is None else np.square(doubts / duration).sum(axis=1)
 
 
 class _RandomWalk:

@@ -6,7 +6,7 @@ reference (latency, lever arm of the LIDAR), and fused at its own time; the chan
 wheel sample. There is no network here, and any thread may call.
 
 Another calibration of the same robot takes over at the next wheel sample. A query asks where the robot was at a time of
-the last seconds.
+the last seconds. The health is reported from the state: status, rate, age and standard deviations.
 """
 
 from __future__ import annotations
@@ -20,16 +20,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from omnibench.errors import DataError, OmnibenchError
-from omnibench.live.estimation.counts import Counts
-from omnibench.live.estimation.extrapolation_monitor import ExtrapolationMonitor
-from omnibench.live.estimation.health import Health, SwapRecord
-from omnibench.live.estimation.health_report import HealthReporter
+from omnibench.live.estimation.health import Counts, FusionHealth, Health, Status, SwapRecord
 from omnibench.live.estimation.live_odometry import Motion
-from omnibench.live.estimation.robot_state import RobotState, new_state, wheel_angle_effects
-from omnibench.live.estimation.saved_state import RobotMemory, SavedState, StateWriter, resume_state
-from omnibench.live.fusion.pose_fusion import Fusion, FusionSettings, Outcome
-from omnibench.live.fusion.pose_input import PoseInput
-from omnibench.live.fusion.timeline import Entry
+from omnibench.live.estimation.robot_state import (
+    ExtrapolationMonitor,
+    RobotMemory,
+    RobotState,
+    SavedState,
+    StateWriter,
+    new_state,
+    resume_state,
+    wheel_angle_effects,
+)
+from omnibench.live.fusion.pose_fusion import Entry, Fusion, FusionSettings, Outcome, PoseInput
 from omnibench.live.wheels.wheel_input import WheelSettings, WheelStep
 from omnibench.live.wire.messages import JointState, MessageError, arrival_stamp
 from omnibench.live.wire.outputs import Frames, JointStateDecoder, Update
@@ -37,7 +40,98 @@ from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
 from omnibench.robot.signals import of_centre
 
+_RATE_WINDOW = 0.9  # s, over which samples are counted at least; below the period of the diagnostics, 1 s
+_BEHIND = 0.1  # s that samples may wait; a node whose samples wait for longer cannot keep up; chosen
 _SECOND = 1e9  # ns
+
+
+class HealthReporter:
+    """Reports one robot's health. stale_after: s without wheel samples after which the stream counts as stale."""
+
+    def __init__(self, stale_after: float) -> None:
+        self._stale_after = stale_after
+        self._counted = (time.monotonic(), 0)  # when samples were counted last, and how many there were
+        self._rate = 0.0  # Hz
+        self._behind = 0.0  # s, in the last whole window
+
+    def report(self, state: RobotState, now: float, waiting_since: float | None = None) -> Health:
+        """The health at ``now`` (s, monotonic). waiting_since: when the oldest message that waits came."""
+        # Rate and waiting time of samples, measured once a window.
+        since, counted = self._counted
+        if now - since >= _RATE_WINDOW:
+            self._rate = (state.counts.samples - counted) / (now - since)
+            self._counted = now, state.counts.samples
+            self._behind, state.behind = state.behind, 0.0
+        if waiting_since is not None:
+            state.behind = max(state.behind, now - waiting_since)
+        age = None if state.arrival is None else now - state.arrival
+        behind = max(self._behind, state.behind)
+        status, message = self._status(state, now, age, behind)
+        covariance = _covariance(state, age if status == "stale" else None)
+        provenance, fusion, fusion_health = state.calibration.provenance, state.fusion, None
+        if fusion is not None:
+            fusion_health = FusionHealth(
+                located=fusion.located,
+                pose_age_s=None if fusion.fused_at is None else now - fusion.fused_at,
+                last_outcome=fusion.outcome,
+                rejected_in_a_row=fusion.rejected_in_a_row,
+            )
+        return Health(
+            robot=state.name,
+            status=status,
+            message=message,
+            calibration=state.calibration.name,
+            simulated=provenance is not None and provenance.simulated,
+            rate_hz=self._rate,
+            age_s=age,
+            behind_s=behind,
+            last_stamp=state.timeline.newest / _SECOND if state.timeline.entries else None,
+            position_sigma_m=float(np.sqrt((covariance[0, 0] + covariance[1, 1]) / 2)),
+            heading_sigma_rad=float(np.sqrt(covariance[2, 2])),
+            fusion=fusion_health,
+            counts=state.counts.as_dict(),
+            last_refusal=state.last_refusal,
+            last_swap=state.last_swap,
+            unfitted_motion_s=state.monitor.seconds,
+        )
+
+    def _status(self, state: RobotState, now: float, age: float | None, behind: float) -> tuple[Status, str]:
+        """The status and its reason in words.
+
+        age: of the last wheel sample, s; None before the first. behind: longest time that samples waited, s.
+        """
+        if age is None:
+            return "waiting", f"no wheel sample yet{f': {state.last_refusal}' if state.last_refusal else ''}"
+        if age > self._stale_after + behind:
+            wheels = state.wheel_input
+            if wheels.repeats and now - wheels.repeated_at <= self._stale_after + behind:
+                repeated = f"{wheels.repeats} wheel samples have the stamp {state.timeline.newest / _SECOND:.3f} s"
+                return "stale", f"stamps stand still: {repeated}; `wheels: {{stamps: arrival}}` takes times of arrival"
+            return "stale", f"no wheel sample for {age:.1f} s"
+        if behind > _BEHIND:
+            return "degraded", f"behind by {behind:.1f} s: samples come faster than they can be taken"
+        if old := state.wheel_input.old_steering:
+            return "degraded", f"no steering angles for {old:.1f} s: the last ones are held"
+        fusion = state.fusion
+        if fusion is None:
+            return "ok", "odometry"
+        if not fusion.located:
+            return "degraded", "no pose of SLAM yet"
+        silent = None if fusion.fused_at is None else now - fusion.fused_at
+        if silent is None or silent > fusion.settings.stale_after:
+            rejected = f", {fusion.rejected_in_a_row} rejected" if fusion.rejected_in_a_row else ""
+            return "degraded", "no pose of SLAM" + ("" if silent is None else f" fused for {silent:.1f} s") + rejected
+        return "ok", "odometry and SLAM"
+
+
+def _covariance(state: RobotState, silence: float | None) -> Array:
+    """Covariance (3, 3) of the fused pose, or of odometry's; it grows in a silence of the wheels (s)."""
+    odometry, fusion = state.odometry, state.fusion
+    if fusion is None:
+        return odometry.covariance if silence is None else odometry.covariance_after_silence(silence)
+    if silence is None:
+        return fusion.covariance
+    return fusion.covariance + (odometry.covariance_after_silence(silence) - odometry.covariance)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,19 +141,6 @@ class PoseAt:
     stamp: int
     odometry: Array
     in_map: tuple[Array, Array] | None
-
-
-def pose_at(state: RobotState, stamp: int | None = None) -> PoseAt:
-    """The pose at a time (ns; default: of the last sample). DataError: nothing is remembered of that time."""
-    timeline = state.timeline
-    if not timeline.entries:
-        raise DataError(f"robot {state.name!r} has sent no wheel sample yet")
-    chosen = timeline.newest if stamp is None else stamp
-    odometry = timeline.odometry_at(chosen)
-    if odometry is None:
-        oldest, newest = timeline.oldest / _SECOND, timeline.newest / _SECOND
-        raise DataError(f"at: {chosen / _SECOND:.6f} s is not within {oldest:.6f} to {newest:.6f} s")
-    return PoseAt(chosen, odometry, state.fusion.at(chosen) if state.fusion else None)
 
 
 _OTHER_ROBOT = 0.5  # share of a row's largest element; chosen: no calibration moves a matrix so far from its design
@@ -270,7 +351,15 @@ class RobotTracker:
     def pose_at(self, stamp: int | None = None) -> PoseAt:
         """The pose at a time (ns; default: of the last sample). DataError: nothing is remembered of that time."""
         with self._state_lock:
-            return pose_at(self._state, stamp)
+            timeline, fusion = self._state.timeline, self._state.fusion
+            if not timeline.entries:
+                raise DataError(f"robot {self.name!r} has sent no wheel sample yet")
+            chosen = timeline.newest if stamp is None else stamp
+            odometry = timeline.odometry_at(chosen)
+            if odometry is None:
+                oldest, newest = timeline.oldest / _SECOND, timeline.newest / _SECOND
+                raise DataError(f"at: {chosen / _SECOND:.6f} s is not within {oldest:.6f} to {newest:.6f} s")
+            return PoseAt(chosen, odometry, fusion.at(chosen) if fusion else None)
 
     def swap(self, calibration: Calibration) -> None:
         """Continue with another calibration from the next sample on. DataError: it is not this robot's."""

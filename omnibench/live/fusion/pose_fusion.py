@@ -2,13 +2,18 @@
 
 A pose that comes late is inserted where it belongs, and the motions and poses after it are filtered again. A gate
 refuses poses whose normalised innovation is too large; several refused poses that agree replace the filter's.
+
+The timeline holds a robot's last seconds: its motions, the poses after them, and poses measured in between, corrected.
+A message that cannot be a pose in the map is refused and counted.
 """
 
 from __future__ import annotations
 
+import logging
 import math
+from bisect import bisect_left
 from collections import deque
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -17,11 +22,177 @@ from pydantic import Field
 from scipy.special import gammaincinv
 
 from omnibench.config import Model, Positive
-from omnibench.live.estimation.counts import Counts
-from omnibench.live.estimation.live_odometry import Motion
-from omnibench.live.fusion.timeline import Entry, PoseMeasurement, Timeline, of_centre, turned
-from omnibench.robot.kinematics import Array, compose, relative
+from omnibench.live.estimation.health import Counts
+from omnibench.live.estimation.live_odometry import UNKNOWN_NOISE, Motion, RobotCentre, carried
+from omnibench.live.wire.messages import POSE_ESTIMATE, MessageError, PoseEstimate, arrival_stamp
+from omnibench.robot.calibration import Calibration
+from omnibench.robot.effects.effect import ReferenceEffect, Values
+from omnibench.robot.kinematics import Array, Mount, compose, pose_covariance, relative, usable_covariances
+from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import advance
+
+_SECOND = 1e9  # ns
+_MOST_A_SECOND = 2000  # samples that are kept, whatever the stamps say, so that wrong ones cannot fill the memory
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseMeasurement:
+    """Measurement of a pose (3,) in the map, m, m, rad, at ``stamp`` (ns), with its covariance (3, 3).
+
+    arrival: s, monotonic. absolute: it replaces the filter's pose instead of correcting it. heading_stamp: when its
+    heading was measured (ns), if that is another time. mount: the point of the robot that it is of; None: its centre.
+    """
+
+    stamp: int
+    pose: Array
+    covariance: Array
+    arrival: float = 0.0
+    absolute: bool = False
+    heading_stamp: int | None = None
+    mount: Mount | None = None
+
+    @property
+    def latest(self) -> int:
+        """The later of its two times, ns: from there on odometry is known for all of it."""
+        return self.stamp if self.heading_stamp is None else max(self.stamp, self.heading_stamp)
+
+    @property
+    def earliest(self) -> int:
+        """The earlier of its two times, ns."""
+        return self.stamp if self.heading_stamp is None else min(self.stamp, self.heading_stamp)
+
+
+@dataclass(slots=True, eq=False)
+class Entry:
+    """One wheel sample: the motion up to it, and after it odometry's pose (3,), the filter's pose and covariance.
+
+    measurements: poses whose time lies within the motion, in the order of time.
+    """
+
+    stamp: int
+    motion: Motion
+    odometry: Array
+    pose: Array
+    covariance: Array
+    measurements: tuple[PoseMeasurement, ...] = ()
+
+
+class Timeline:
+    """Entries of at least the last ``seconds`` (up to 2 kHz), by stamp; one at least, once one was added."""
+
+    def __init__(self, seconds: float) -> None:
+        self._length = int(seconds * _SECOND)
+        self._most = int(seconds * _MOST_A_SECOND)
+        self.entries: list[Entry] = []
+        self._stamps: list[int] = []
+
+    @property
+    def oldest(self) -> int:
+        return self._stamps[0]
+
+    @property
+    def newest(self) -> int:
+        return self._stamps[-1]
+
+    def append(self, entry: Entry) -> None:
+        """Add the newest entry and forget what is too old."""
+        self.entries.append(entry)
+        self._stamps.append(entry.stamp)
+        first = 0
+        if self._stamps[0] < entry.stamp - 2 * self._length:  # seldom, and then many at once, which is fast
+            first = bisect_left(self._stamps, entry.stamp - self._length) - 1
+        elif len(self._stamps) > 2 * self._most:
+            first = self._most
+        if first > 0:
+            del self.entries[:first], self._stamps[:first]
+
+    def restart(self, stamp: int) -> None:
+        """Keep the newest entry alone, at another stamp: the clock jumped, and the times before have no meaning."""
+        newest = self.entries[-1]
+        newest.stamp, newest.measurements = stamp, ()
+        self.entries, self._stamps = [newest], [stamp]
+
+    def index(self, stamp: int) -> int:
+        """The first entry at or after ``stamp``; as many as there are entries where there is none."""
+        return bisect_left(self._stamps, stamp)
+
+    def share(self, index: int, stamp: int) -> float:
+        """Share (0 to 1) of an entry's motion that lies before ``stamp``."""
+        begin, end = self._stamps[index - 1], self._stamps[index]
+        return (stamp - begin) / (end - begin)
+
+    def odometry_at(self, stamp: int) -> Array | None:
+        """Odometry's pose (3,) at a time (ns), between samples at constant twist; None outside the timeline."""
+        index = self.index(stamp)
+        if not self.entries or index == len(self.entries) or stamp < self.oldest:
+            return None
+        entry = self.entries[index]
+        if entry.stamp == stamp:
+            return np.array(entry.odometry)
+        part = entry.motion.part(self.share(index, stamp))
+        return advance(self.entries[index - 1].odometry, part.moved, part.integration)
+
+
+class ReferenceCorrection:
+    """Undoes a model's effects of the reference.
+
+    start: the first pose of a run, from which some effects act on; None: the next pose that comes.
+    """
+
+    def __init__(self, model: OdometryModel, start: PoseMeasurement | None = None) -> None:
+        self._mount = model.robot.mount
+        self._terms: list[tuple[ReferenceEffect, Values]] = [
+            (term.effect, term.values) for term in model.reference_terms if isinstance(term.effect, ReferenceEffect)
+        ]
+        self._start = start
+
+    def continued(self, model: OdometryModel) -> ReferenceCorrection:
+        """The correction by another model, from the same start on."""
+        return ReferenceCorrection(model, self._start)
+
+    def restart(self) -> None:
+        """The next pose is the first of another run."""
+        self._start = None
+
+    def corrected(self, measurement: PoseMeasurement) -> PoseMeasurement:
+        """The tracked point's true pose when its position was measured; its heading may be of another time."""
+        if self._start is None:
+            self._start = measurement
+        if self._mount is not None:
+            measurement = replace(measurement, mount=self._mount)
+        if not self._terms:
+            return measurement
+        stamps = np.array([(measurement.stamp - self._start.stamp) / _SECOND])
+        delays = [effect.delays(stamps, values) for effect, values in self._terms]
+        of_position, of_heading = (sum(float(delay[kind][0]) for delay in delays) for kind in range(2))
+        poses = measurement.pose[None]
+        for effect, values in reversed(self._terms):
+            poses = effect.corrected(poses, self._start.pose, values)
+        return replace(
+            measurement,
+            stamp=measurement.stamp - round(_SECOND * of_position),
+            heading_stamp=measurement.stamp - round(_SECOND * of_heading),
+            pose=np.array(poses[0]),
+        )
+
+
+def turned(measurement: PoseMeasurement, before: Array, after: Array) -> PoseMeasurement:
+    """A pose whose heading was measured at another time, with its heading turned to the time of the position.
+
+    before, after: odometry's poses (3,) at the time of the heading and at that of the position.
+    """
+    pose: Array = measurement.pose + np.array([0.0, 0.0, after[2] - before[2]])
+    return replace(measurement, pose=pose, heading_stamp=None)
+
+
+def of_centre(measurement: PoseMeasurement) -> PoseMeasurement:
+    """The pose of the robot's centre, from that of a point of the robot."""
+    if measurement.mount is None:
+        return measurement
+    pose = RobotCentre(measurement.mount).pose(measurement.pose)
+    covariance = carried(measurement.covariance, (pose - measurement.pose)[:2])
+    return replace(measurement, pose=pose, covariance=covariance, mount=None)
+
 
 _TURN = 2 * math.pi
 _POSE = np.eye(3)  # measurement matrix: SLAM measures the pose itself
@@ -122,7 +293,6 @@ class Rejections:
         return float(innovation @ np.linalg.solve(spread, innovation)) <= self._limit
 
 
-_SECOND = 1e9  # ns
 _NOWHERE = np.diag([100.0**2, 100.0**2, math.pi**2])  # m, rad: covariance before the robot is located; chosen
 _WAITING = 16  # poses that may wait for the wheel samples of their time; chosen
 _EVER = -(2**63)  # ns, before every stamp
@@ -350,3 +520,69 @@ class Fusion:
         if to > done:
             self._filter.predict(entry.motion.part(to - done))
         return to
+
+
+LOG = logging.getLogger("omnibench.live")
+_FARTHEST = 1e7  # m; chosen: no robot drives as far from its map's origin
+
+
+class PoseInput:
+    """Reads geometry_msgs/PoseWithCovarianceStamped messages whose poses are in the frame ``frame``."""
+
+    def __init__(self, frame: str, settings: FusionSettings, counts: Counts) -> None:
+        self._frame = frame
+        self._settings = settings
+        self._counts = counts
+
+    def read(
+        self, payload: bytes, arrival: float, calibration: Calibration, *, replayed: bool = False
+    ) -> PoseMeasurement:
+        """The measurement in a payload that came at ``arrival`` (s, monotonic). MessageError: why it is refused.
+
+        calibration: its noise model gives the covariance of a pose that comes without one, unless the settings do.
+        replayed: its stamp counts in any case.
+        """
+        try:
+            message = POSE_ESTIMATE.decode(payload)
+        except MessageError:
+            self._counts.pose_undecodable += 1
+            raise
+        try:
+            if message.frame not in ("", self._frame):
+                raise MessageError(f"the pose is in frame {message.frame!r}, not in {self._frame!r}")
+            if not np.isfinite(message.pose).all():
+                raise MessageError("the pose is not finite")
+            if np.abs(message.pose[:2]).max() > _FARTHEST:
+                raise MessageError(f"the pose lies {np.abs(message.pose[:2]).max():.3g} m away")
+        except MessageError:
+            self._counts.pose_invalid += 1
+            raise
+        by_arrival = self._settings.stamps == "arrival" and not replayed
+        stamp = arrival_stamp(arrival) if by_arrival else message.stamp
+        return PoseMeasurement(stamp, message.pose, self._covariance(message, calibration), arrival)
+
+    def _covariance(self, message: PoseEstimate, calibration: Calibration) -> Array:
+        """The covariance (3, 3) of a message, or the default where that says that it is unknown, with a warning."""
+        if usable_covariances(message.covariance):
+            return message.covariance
+        sigma = self._settings.pose_sigma
+        covariance = _usual_covariance(calibration) if sigma is None else pose_covariance(*sigma)
+        if not self._counts.pose_default_covariance:
+            LOG.warning(
+                "slam_pose: the covariance of a pose is unknown (variances %s); standard deviations of %.3g m and "
+                "%.3g deg count, by %s",
+                ", ".join(f"{variance:.3g}" for variance in np.diagonal(message.covariance)),
+                math.sqrt(covariance[0, 0]),
+                math.degrees(math.sqrt(covariance[2, 2])),
+                "the calibration; `fusion: {pose_sigma: [m, deg]}` sets others" if sigma is None else "pose_sigma",
+            )
+        self._counts.pose_default_covariance += 1
+        return covariance
+
+
+def _usual_covariance(calibration: Calibration) -> Array:
+    """Covariance (3, 3) of the reference's white noise and bias together, as the calibration knows them."""
+    noise = calibration.noise or UNKNOWN_NOISE
+    position = noise.pose_position**2 + noise.bias_position**2 or UNKNOWN_NOISE.pose_position**2
+    heading = noise.pose_heading**2 + noise.bias_heading**2 or UNKNOWN_NOISE.pose_heading**2
+    return np.diag([position, position, heading])

@@ -72,7 +72,12 @@ def make_keys(
         raise ConfigError(f"a name is given twice: {', '.join(names)}")
     if not 1 <= days <= 36500:
         raise ConfigError(f"{days} days: a certificate is valid for 1 to 36500 days")
-    router = _checked_router(router, names, needed=bool(hosts))
+    # The router's certificate: the named one, or that of ``node`` if there is one.
+    chosen = router or _ROUTER
+    if chosen not in names and (router is not None or hosts):
+        raise ConfigError(
+            f"{chosen!r}, whose certificate would be the router's, is not among {', '.join(names)}; say --router NAME"
+        )
     served = [_general_name(host) for host in dict.fromkeys((*_LOOPBACK, *hosts))]
     until = datetime.now(UTC) + timedelta(days=days)
     made: dict[str, _Pair] = {}
@@ -84,14 +89,26 @@ def make_keys(
         # The number tells two CAs apart.
         made["ca"] = authority = _signed(f"omnibench test CA {secrets.token_hex(4)}", until, extensions)
     else:
-        authority = _existing_authority(folder)
-    made |= {name: _member(name, served if name == router else (), until, authority) for name in names}
+        certificate = read_certificate(folder / "ca.pem")
+        if not (folder / "ca.key").exists():
+            raise ConfigError(f"{folder}/ca.key is missing, without which ca.pem cannot sign; choose another folder")
+        key = read_key(folder / "ca.key")
+        if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
+            raise ConfigError(f"{folder}/ca.key is not the key of ca.pem; choose another folder")
+        authority = _Pair(certificate, key)
+    made |= {name: _member(name, served if name == chosen else (), until, authority) for name in names}
     contents: dict[Path, bytes] = {}
     for name, (certificate, key) in made.items():
         contents[folder / f"{name}.pem"] = certificate.public_bytes(Encoding.PEM)
         contents[folder / f"{name}.key"] = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
     if users:
-        contents |= _passwords(folder, names, keep=not overwrite)
+        # A password for each name, and the router's file with all, beside those that it holds already.
+        path = folder / "users.txt"
+        passwords = {name: secrets.token_urlsafe(18) for name in names}
+        lines = read_text(path).splitlines() if not overwrite and path.exists() else []
+        lines += [f"{name}:{password}" for name, password in passwords.items()]
+        contents |= {folder / f"{name}.password": f"{password}\n".encode() for name, password in passwords.items()}
+        contents[path] = "".join(f"{line}\n" for line in lines).encode()
     existing = [path for path in contents if path.exists() and path.name != "users.txt"]
     if existing and not overwrite:
         raise ConfigError(f"{existing[0]}: is there already; choose other names, or --force to replace all in {folder}")
@@ -103,18 +120,6 @@ def make_keys(
             with os.fdopen(descriptor, "wb") as file:
                 file.write(content)
     return list(contents)
-
-
-def _checked_router(router: str | None, names: Sequence[str], *, needed: bool) -> str | None:
-    """The name of the router's certificate among ``names``, or None. ConfigError: there is none and one is needed."""
-    chosen = router or _ROUTER
-    if chosen in names:
-        return chosen
-    if router is not None or needed:
-        raise ConfigError(
-            f"{chosen!r}, whose certificate would be the router's, is not among {', '.join(names)}; say --router NAME"
-        )
-    return None
 
 
 def _member(name: str, served: Sequence[x509.GeneralName], until: datetime, authority: _Pair) -> _Pair:
@@ -165,23 +170,3 @@ def _general_name(host: str) -> x509.GeneralName:
     if len(host) > _LONGEST_HOST or not _HOST.fullmatch(host) or host.replace(".", "").isdigit():
         raise ConfigError(f"--host: {host!r} is neither a host's name nor an address; write base.local or 192.168.0.2")
     return x509.DNSName(host)
-
-
-def _existing_authority(folder: Path) -> _Pair:
-    certificate = read_certificate(folder / "ca.pem")
-    if not (folder / "ca.key").exists():
-        raise ConfigError(f"{folder}/ca.key is missing, without which ca.pem cannot sign; choose another folder")
-    key = read_key(folder / "ca.key")
-    if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
-        raise ConfigError(f"{folder}/ca.key is not the key of ca.pem; choose another folder")
-    return _Pair(certificate, key)
-
-
-def _passwords(folder: Path, names: Sequence[str], *, keep: bool) -> dict[Path, bytes]:
-    """Files with a password for each name, and the router's file with all; ``keep`` the passwords it holds already."""
-    path = folder / "users.txt"
-    passwords = {name: secrets.token_urlsafe(18) for name in names}
-    lines = read_text(path).splitlines() if keep and path.exists() else []
-    lines += [f"{name}:{password}" for name, password in passwords.items()]
-    files = {folder / f"{name}.password": f"{password}\n".encode() for name, password in passwords.items()}
-    return files | {path: "".join(f"{line}\n" for line in lines).encode()}

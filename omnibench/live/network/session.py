@@ -356,7 +356,11 @@ def zenoh_config(config: SessionConfig) -> zenoh.Config:
         try:
             settings.insert_json5(key, json.dumps(value))
         except (zenoh.ZError, TypeError, ValueError) as error:
-            raise ConfigError(_wrong_setting(key, error)) from None
+            text = _SOURCE.sub("", str(error)).strip()
+            if "unknown key" not in text:
+                raise ConfigError(f"extra: {key}: {text}") from None
+            near = nearest(key, list(_keys(json.loads(str(zenoh.Config())))))
+            raise ConfigError(f"extra: Zenoh has no setting {key!r}; {near}see its DEFAULT_CONFIG.json5") from None
     return settings
 
 
@@ -397,13 +401,10 @@ def _settings(config: SessionConfig) -> Iterator[tuple[str, Any]]:
                 settings[f"{side}_certificate"], settings[f"{side}_private_key"] = str(tls.certificate), str(tls.key)
         yield "transport/link/tls", settings
     if config.access is not None:
-        yield "access_control", _access_settings(config.access, config)
-
-
-def _access_settings(access: Access, config: SessionConfig) -> Mapping[str, Any]:
-    if config.tls is not None and config.tls.mutual and config.tls.certificate is not None:
-        return access_control(access, by_certificate=True, own_name=common_name(config.tls.certificate))
-    return access_control(access, by_certificate=False, own_name=config.user.name if config.user else None)
+        certificate = config.tls.certificate if config.tls is not None and config.tls.mutual else None
+        login = config.user.name if config.user else None
+        own_name = login if certificate is None else common_name(certificate)
+        yield "access_control", access_control(config.access, by_certificate=certificate is not None, own_name=own_name)
 
 
 def _password(user: User) -> str:
@@ -441,14 +442,6 @@ def _why_not_open(config: SessionConfig, error: zenoh.ZError) -> str:
     if reason is None and config.mode == "client" and config.scouting:
         return f"no router was found by scouting; start omnibench live, or give connect ({text})"
     return reason or text
-
-
-def _wrong_setting(key: str, error: Exception) -> str:
-    text = _SOURCE.sub("", str(error)).strip()
-    if "unknown key" not in text:
-        return f"extra: {key}: {text}"
-    known = list(_keys(json.loads(str(zenoh.Config()))))
-    return f"extra: Zenoh has no setting {key!r}; {nearest(key, known)}see its DEFAULT_CONFIG.json5"
 
 
 def _keys(tree: Mapping[str, Any], above: str = "") -> Iterator[str]:

@@ -193,18 +193,15 @@ class SessionConfig(Model):
         if self.tls and self.listening and self.tls.certificate is None:
             raise ValueError("tls: a session that listens needs a certificate and its key")
         for endpoint in (*(self.listen or ()), *self.connect):
-            self._check_protocol(endpoint)
+            address = address_of(endpoint)
+            if address is None:
+                continue
+            encrypted = address[0] in _ENCRYPTED
+            if encrypted and not self.tls:
+                raise ValueError(f"{endpoint}: give tls: {{ca: ..., certificate: ..., key: ...}}")
+            if self.tls and not encrypted:
+                raise ValueError(f"{endpoint}: is not encrypted although tls is given; write tls/...")
         return self
-
-    def _check_protocol(self, endpoint: str) -> None:
-        address = address_of(endpoint)
-        if address is None:
-            return
-        encrypted = address[0] in _ENCRYPTED
-        if encrypted and not self.tls:
-            raise ValueError(f"{endpoint}: give tls: {{ca: ..., certificate: ..., key: ...}}")
-        if self.tls and not encrypted:
-            raise ValueError(f"{endpoint}: is not encrypted although tls is given; write tls/...")
 
     @property
     def listening(self) -> tuple[str, ...]:
@@ -257,7 +254,16 @@ def check_files(tls: Tls, *, listening: bool = False) -> None:
             f"tls: {tls.certificate} is a client's, and all that connect would refuse us; listen with the router's, "
             "which omnibench keys DIR NAME --router NAME makes"
         )
-    _check_issuer(certificate, authority, tls)
+    # A certificate that the authority did not issue is a warning; chains of several certificates are not checked.
+    chains = (x509.load_pem_x509_certificates(_content(path)) for path in (tls.ca, tls.certificate))
+    if any(len(chain) > 1 for chain in chains):
+        return
+    try:
+        certificate.verify_directly_issued_by(authority)
+    except (ValueError, TypeError, InvalidSignature):
+        LOG.warning(
+            "tls: %s was not issued by %s; peers that trust only that authority refuse us", tls.certificate, tls.ca
+        )
 
 
 def _may_serve(certificate: x509.Certificate) -> bool:
@@ -267,19 +273,6 @@ def _may_serve(certificate: x509.Certificate) -> bool:
     except (x509.ExtensionNotFound, ValueError):
         return True
     return ExtendedKeyUsageOID.SERVER_AUTH in usages or ExtendedKeyUsageOID.ANY_EXTENDED_KEY_USAGE in usages
-
-
-def _check_issuer(certificate: x509.Certificate, authority: x509.Certificate, tls: Tls) -> None:
-    """Log a warning if the authority did not issue the certificate; chains of several certificates are not checked."""
-    chains = (x509.load_pem_x509_certificates(_content(path)) for path in (tls.ca, tls.certificate) if path is not None)
-    if any(len(chain) > 1 for chain in chains):
-        return
-    try:
-        certificate.verify_directly_issued_by(authority)
-    except (ValueError, TypeError, InvalidSignature):
-        LOG.warning(
-            "tls: %s was not issued by %s; peers that trust only that authority refuse us", tls.certificate, tls.ca
-        )
 
 
 def common_name(path: Path) -> str | None:

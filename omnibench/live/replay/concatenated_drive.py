@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -389,14 +389,15 @@ class SlamChannel(Channel):
     )
 
 
-def _speed(value: Any) -> Any:
-    return math.inf if value == "max" else value
+_Speed = BeforeValidator(
+    lambda value: math.inf if value == "max" else value, json_schema_input_type=float | Literal["max"]
+)
 
 
 class ReplayConfig(Model):
     """Settings of a replay of a recording."""
 
-    speed: Annotated[float, BeforeValidator(_speed, json_schema_input_type=float | Literal["max"])] = Field(
+    speed: Annotated[float, _Speed] = Field(
         1.0,
         ge=1e-3,
         description="1: real time; 10: ten times as fast; max: as fast as possible without losing messages",

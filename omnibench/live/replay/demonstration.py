@@ -23,8 +23,7 @@ from omnibench.live.replay.concatenated_drive import (
     concatenate_recording,
     concatenated_truth,
 )
-from omnibench.live.replay.delivery import WINDOW, DeliveryError
-from omnibench.live.replay.replay_player import Player, PlayReport
+from omnibench.live.replay.replay_player import WINDOW, DeliveryError, Player, PlayReport
 from omnibench.live.stopping import wait_until
 from omnibench.live.wheels.wheel_input import joints_of
 from omnibench.live.wire.messages import Odometry
@@ -170,68 +169,54 @@ def demonstrate(
             report = player.play(stop, with_health, results.behind, seconds)
             results.wait_for_the_last()
             health = node.health(robot.name)
-            _check_alone(robot.name, report, health, tracker)
+            # Samples that the replay did not send are another sender's.
+            others = health.counts["samples"] - report.sent["joint_states"]
+            if others > 0 or len(tracker.flows) > 1:
+                raise DeliveryError(
+                    f"another sender wrote to robot {robot.name!r} meanwhile: its odometry is not that of the "
+                    "recording; end the other one, or listen at another port"
+                )
             for collector in (odometry, fused):
                 if collector is not None:
                     collector.close()
         finally:
             if not guarded:
                 close_session(session)
-        return _evaluated(drive, recording, tracker.calibration, report, odometry, fused, health)
-
-
-def _check_alone(robot: str, report: PlayReport, health: Health, tracker: RobotTracker) -> None:
-    """DeliveryError: the node also took samples that the replay did not send."""
-    others = health.counts["samples"] - report.sent["joint_states"]
-    if others > 0 or len(tracker.flows) > 1:
-        raise DeliveryError(
-            f"another sender wrote to robot {robot!r} meanwhile: its odometry is not that of the recording; end the "
-            "other one, or listen at another port"
+        # The node's output against the batch odometry, and all odometry against the truth or the reference.
+        calibration = tracker.calibration
+        drive = replace(drive, robot=calibration.robot)  # whose drive signals the node took
+        times = drive.wheel_times
+        batch = calibration.model.poses([drive.log(session=calibration.session)])[0]
+        design = OdometryModel.of_design(calibration.robot, calibration.integration).poses([drive.log()])[0]
+        origin = odometry.stamps[0] if odometry.stamps else 0
+        rows = _rows(odometry.stamps, origin, times)
+        # odom begins at the origin, the drive at its start pose; the drive's poses are of the tracked point
+        published = _tracked(calibration, odometry.poses)
+        if odometry.stamps:
+            published = moved_to(drive.start_poses[0], published)
+        if recording.truth is not None:
+            against, reference = "the simulated truth", concatenated_truth(drive, recording)
+            chosen = rows
+        else:
+            against, reference = (
+                "the reference poses of the recording",
+                interpolated(times, drive.slam_times, drive.slam_poses),
+            )
+            chosen = rows[(times[rows] >= drive.slam_times[0]) & (times[rows] <= drive.slam_times[-1])]
+        return Demonstration(
+            robot=health.robot,
+            calibration=calibration.name,
+            simulated=recording.dataset.simulated,
+            report=report,
+            against=against,
+            theoretical=_deviation(design[chosen], reference[chosen]),
+            calibrated=_deviation(batch[chosen], reference[chosen]),
+            fused=None
+            if fused is None
+            else _fused_deviation(fused.stamps, _tracked(calibration, fused.poses), origin, drive, reference, chosen),
+            batch_difference=float(np.abs(published - batch[rows]).max()) if len(rows) else math.nan,
+            health=health,
         )
-
-
-def _evaluated(
-    drive: ConcatenatedDrive,
-    recording: Recording,
-    calibration: Calibration,
-    report: PlayReport,
-    odometry: _Collector,
-    fused: _Collector | None,
-    health: Health,
-) -> Demonstration:
-    drive = replace(drive, robot=calibration.robot)  # whose drive signals the node took
-    times = drive.wheel_times
-    batch = calibration.model.poses([drive.log(session=calibration.session)])[0]
-    design = OdometryModel.of_design(calibration.robot, calibration.integration).poses([drive.log()])[0]
-    origin = odometry.stamps[0] if odometry.stamps else 0
-    rows = _rows(odometry.stamps, origin, times)
-    # odom begins at the origin, the drive at its start pose; the drive's poses are of the tracked point
-    published = _tracked(calibration, odometry.poses)
-    if odometry.stamps:
-        published = moved_to(drive.start_poses[0], published)
-    if recording.truth is not None:
-        against, reference = "the simulated truth", concatenated_truth(drive, recording)
-        chosen = rows
-    else:
-        against, reference = (
-            "the reference poses of the recording",
-            interpolated(times, drive.slam_times, drive.slam_poses),
-        )
-        chosen = rows[(times[rows] >= drive.slam_times[0]) & (times[rows] <= drive.slam_times[-1])]
-    return Demonstration(
-        robot=health.robot,
-        calibration=calibration.name,
-        simulated=recording.dataset.simulated,
-        report=report,
-        against=against,
-        theoretical=_deviation(design[chosen], reference[chosen]),
-        calibrated=_deviation(batch[chosen], reference[chosen]),
-        fused=None
-        if fused is None
-        else _fused_deviation(fused.stamps, _tracked(calibration, fused.poses), origin, drive, reference, chosen),
-        batch_difference=float(np.abs(published - batch[rows]).max()) if len(rows) else math.nan,
-        health=health,
-    )
 
 
 def _rows(stamps: list[int], origin: int, times: Array) -> Array:

@@ -1,22 +1,33 @@
-"""Replaying a recording on Zenoh as the robot and its SLAM would have sent it, at any speed."""
+"""Replaying a recording on Zenoh as the robot and its SLAM would have sent it, at any speed.
+
+A bounded number of messages is under way at any speed, and it is known what arrived. An omnibench node acknowledges
+what it has taken (``AcknowledgedFlows``): what is lost with a link or with a node that starts again is sent once more,
+and a node that is gone is waited for. Other subscribers acknowledge nothing: there a round trip to the next Zenoh
+router, behind the messages, bounds how many are under way, and empties the queue at the end.
+"""
 
 from __future__ import annotations
 
 import json
 import math
+import secrets
+import struct
 import threading
 import time
-from collections import Counter
+from abc import abstractmethod
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any, Final
 
 import numpy as np
 import zenoh
 
 from omnibench.errors import ConfigError, OmnibenchError
 from omnibench.live.control.request_queue import source_of
-from omnibench.live.estimation.counts import anomalies_among
+from omnibench.live.estimation.health import anomalies_among
 from omnibench.live.network.presence import alive_robots, checked_robot
+from omnibench.live.network.session import is_connected
 from omnibench.live.replay.concatenated_drive import (
     TOPICS_PLAYED,
     WHEELS,
@@ -26,15 +37,213 @@ from omnibench.live.replay.concatenated_drive import (
     SlamChannel,
     make_schedule,
 )
-from omnibench.live.replay.delivery import AcknowledgedDelivery, Delivery, DeliveryError, UnconfirmedDelivery
-from omnibench.live.stopping import answers, wait_until
+from omnibench.live.stopping import Closing, answers, direct, wait_until
 from omnibench.live.wheels.wheel_input import check_joints, joints_of
 from omnibench.live.wire.messages import JointState, PoseEstimate
-from omnibench.live.wire.topics import GraphNode
+from omnibench.live.wire.topics import GraphNode, Publisher, acknowledgement_key, read_acknowledgement
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 from omnibench.words import plural
+
+WINDOW: Final = 256  # messages under way at most, some 90 kB: less than Zenoh's queue holds; chosen
+_POLL_PERIOD: Final = 0.05  # s between two looks at whether a signal came; chosen
+_LONGEST_POLL: Final = 0.5  # s; a look that takes longer is one at which this process stood still; chosen
+_FIRST_RETRY: Final = 0.5  # s without an acknowledgement after which messages are sent again; chosen
+_LAST_RETRY: Final = 4.0  # s, to which this time doubles; chosen
+_GAP_RETRY: Final = 0.1  # s in which one gap is reported by many acknowledgements; chosen
+
+
+class DeliveryError(OmnibenchError):
+    """Messages did not reach their receiver."""
+
+    exit_code = 1
+
+
+class Delivery(Closing):
+    """Publishes messages and waits where too many are under way.
+
+    taken: messages that the receiver has taken; None where that is not known. passed: messages that are known to have
+    reached the receiver or, where that is not known, the next router. paused: s that it has waited for a receiver.
+    restarts: how often another node went on in the receiver's place.
+    stop: ends any waiting. wait: s without any sign of the receiver after which it is given up, of which those do not
+    count in which this process itself was suspended.
+    """
+
+    def __init__(self, stop: threading.Event, wait: float) -> None:
+        self.taken: int | None = None
+        self.passed = 0
+        self.paused = 0.0
+        self.restarts = 0
+        self._stop, self._patience = stop, wait
+        self._heard = threading.Event()
+        self._waited = 0.0  # s without any sign of the receiver
+
+    def _poll(self, sign: threading.Event) -> bool:
+        """Wait for a sign of the receiver for a moment; True if there is one."""
+        began = time.monotonic()
+        there = sign.wait(_POLL_PERIOD)
+        self._waited += min(time.monotonic() - began, _LONGEST_POLL)
+        return there
+
+    @abstractmethod
+    def put(self, publisher: Publisher[Any], payload: bytes) -> bool:
+        """Publish a payload as soon as there is room for it; False if ``stop`` was set before.
+
+        DeliveryError: the receiver is given up.
+        """
+
+    @abstractmethod
+    def finish(self) -> None:
+        """Wait until all has arrived, or a short time if ``stop`` is set. DeliveryError: the receiver is given up."""
+
+
+class AcknowledgedDelivery(Delivery):
+    """Delivery to the omnibench node of a robot."""
+
+    def __init__(self, session: zenoh.Session, robot: str, stop: threading.Event, wait: float) -> None:
+        super().__init__(stop, wait)
+        self._robot = robot
+        self._flow = secrets.randbits(64)
+        self._lock = threading.Lock()
+        self._under_way: deque[tuple[Publisher[Any], bytes, int]] = deque()  # from number ``passed`` on
+        self._sent = self.taken = 0
+        self._gap = False
+        self._node: str | None = None  # the node's session, as its acknowledgements name it
+        self._progress_at = self._sent_again_at = -math.inf
+        self._retry = _FIRST_RETRY
+        key = acknowledgement_key(robot, self._flow)
+        self._subscriber = session.declare_subscriber(key, direct(self._acknowledged))
+
+    def put(self, publisher: Publisher[Any], payload: bytes) -> bool:
+        # Wait while the window is full, or while the node has been silent for long.
+        began = time.monotonic()
+        while not self._stop.is_set() and (
+            len(self._under_way) >= WINDOW or self._gap or (bool(self._under_way) and self._silence() >= _FIRST_RETRY)
+        ):
+            self._wait()
+        waited = time.monotonic() - began
+        self.paused += waited if waited > _FIRST_RETRY else 0.0
+        if self._stop.is_set():
+            return False
+        number = publisher.next_number()
+        with self._lock:
+            if not self._under_way:
+                self._progress_at, self._waited = time.monotonic(), 0.0
+            self._under_way.append((publisher, payload, number))
+            place = self._flow, self._sent, self.passed, False
+            self._sent += 1
+        publisher.put_numbered(payload, number, place)
+        return True
+
+    def finish(self) -> None:
+        while self._under_way and not self._stop.is_set():
+            self._wait()
+        end = time.monotonic() + _FIRST_RETRY
+        while self._under_way and time.monotonic() < end:  # after a stop what is under way may still arrive
+            self._heard.wait(_POLL_PERIOD)
+            self._heard.clear()
+
+    def close(self) -> None:
+        self._subscriber.undeclare()
+
+    def _silence(self) -> float:
+        """Time since the last progress, s."""
+        return time.monotonic() - self._progress_at
+
+    def _wait(self) -> None:
+        """Wait for an acknowledgement, and send again what seems lost. DeliveryError: none came for too long."""
+        self._poll(self._heard)
+        self._heard.clear()
+        silence, now = self._silence(), time.monotonic()
+        if self._waited > self._patience:
+            key = acknowledgement_key(self._robot, "*")
+            rights = "" if self.passed else f" (may this session read {key}?)"
+            raise DeliveryError(f"its node has taken nothing for {silence:.0f} s{rights}; `wait` says how long to wait")
+        again = now - self._sent_again_at
+        if (self._gap and again > _GAP_RETRY) or (silence > self._retry and again > self._retry):
+            self._retry = min(2 * self._retry, _LAST_RETRY) if silence > self._retry else self._retry
+            # Send all that is under way once more.
+            with self._lock:
+                self._gap = False
+                first, messages = self.passed, list(self._under_way)
+            self._sent_again_at = time.monotonic()
+            for place, (publisher, payload, number) in enumerate(messages, first):
+                if self._stop.is_set():
+                    return
+                publisher.put_numbered(payload, number, (self._flow, place, self.passed, True))
+
+    def _acknowledged(self, sample: zenoh.Sample) -> None:
+        try:
+            expected, gap = read_acknowledgement(sample.payload.to_bytes())
+        except struct.error:
+            return
+        with self._lock:
+            expected = min(expected, self.passed + len(self._under_way))
+            if expected > self.passed:
+                for _ in range(expected - self.passed):
+                    self._under_way.popleft()
+                self.taken = self.passed = expected
+                self._progress_at, self._waited = time.monotonic(), 0.0
+                self._retry = _FIRST_RETRY
+            self._gap |= gap and bool(self._under_way)
+            if sample.timestamp is not None and (node := str(sample.timestamp.get_id())) != self._node:
+                self.restarts += self._node is not None
+                self._node = node
+        self._heard.set()
+
+
+class UnconfirmedDelivery(Delivery):
+    """Delivery to subscribers that acknowledge nothing."""
+
+    def __init__(self, session: zenoh.Session, robot: str, stop: threading.Event, wait: float) -> None:
+        super().__init__(stop, wait)
+        self._session = session
+        self._key = acknowledgement_key(robot, "nobody")
+        self._arrived = threading.Event()  # the round trip under way has come back
+        self._arrived.set()
+        self._linked = is_connected(session)  # otherwise all subscribers are in this session
+        self._sent = 0
+        self._before = 0  # messages before the last round trip
+
+    def put(self, publisher: Publisher[Any], payload: bytes) -> bool:
+        if self._sent - self._before >= WINDOW:
+            self._round_trip_over()
+            self._begin_round_trip()
+        if self._stop.is_set():
+            return False
+        publisher.put_encoded(payload)
+        self._sent += 1
+        return True
+
+    def finish(self) -> None:
+        self._round_trip_over()
+        self._begin_round_trip()
+        self._round_trip_over()
+
+    def close(self) -> None:
+        pass
+
+    def _begin_round_trip(self) -> None:
+        """Query a key that nobody answers: the router closes the query once all messages before it have passed."""
+        self._before = self._sent
+        self._arrived.clear()
+        handler: Any = zenoh.handlers.Callback(lambda _: None, self._arrived.set, indirect=False)
+        # Zenoh closes the query at its timeout too, which must come after our patience
+        self._session.get(self._key, handler, timeout=2 * self._patience, priority=zenoh.Priority.BACKGROUND)
+
+    def _round_trip_over(self) -> None:
+        began, self._waited = time.monotonic(), 0.0
+        while not self._poll(self._arrived) and not self._stop.is_set():
+            if self._waited > self._patience:
+                raise DeliveryError(f"the router has taken nothing for {self._patience:g} s")
+        if self._arrived.is_set() and not self._stop.is_set() and self._linked and not is_connected(self._session):
+            raise DeliveryError("the link to the router was lost")  # which closes a query, too
+        if self._arrived.is_set():
+            self.passed = self._before
+        waited = time.monotonic() - began
+        self.paused += waited if waited > _FIRST_RETRY else 0.0
+
 
 MAP = "map"
 _LEAST_DEVIATION = 1e-4  # m, rad; least standard deviation, so that no covariance is singular; chosen
@@ -54,28 +263,19 @@ class Event:
     message: JointState | PoseEstimate
 
 
-def events(
-    drive: ConcatenatedDrive,
-    config: ReplayConfig,
-    *,
-    origin: int | None = None,
-    noise: Noise | None = None,
-    names: Sequence[str] | None = None,
-) -> Iterator[Event]:
-    """The messages of a drive, by time of arrival.
+class ReplayMessages:
+    """All messages of a drive without stamps, prepared so that a replay starts without delay.
 
-    origin: stamp of the drive's start, ns (default: the config's, or now). noise: noise model of the reference, for
-    poses whose covariance neither the data set nor the config gives. names (N + S,): names of the joints, those
-    that steer after those of the wheels; default: the usual ones.
+    noise: noise model of the reference, for poses whose covariance neither the data set nor the config gives. names
+    (N + S,): names of the joints, those that steer after those of the wheels; default: the usual ones.
     """
-    return _Messages(drive, config, noise, names).stamped_from(origin)
-
-
-class _Messages:
-    """All messages of a drive without stamps, prepared so that a replay starts without delay."""
 
     def __init__(
-        self, drive: ConcatenatedDrive, config: ReplayConfig, noise: Noise | None, names: Sequence[str] | None
+        self,
+        drive: ConcatenatedDrive,
+        config: ReplayConfig,
+        noise: Noise | None = None,
+        names: Sequence[str] | None = None,
     ) -> None:
         self._drive = drive
         self._origin = config.stamp_origin
@@ -91,21 +291,19 @@ class _Messages:
     def __len__(self) -> int:
         return len(self._schedule)
 
-    def stamped_from(self, origin: int | None) -> Iterator[Event]:
-        start = origin or self._origin or time.time_ns()
-        schedule = self._schedule
-        return (
-            Event(float(arrival), TOPICS_PLAYED[topic], (self._sample if topic == WHEELS else self._pose)(start, row))
-            for arrival, topic, row in zip(schedule.arrivals, schedule.topics, schedule.rows, strict=True)
-        )
-
-    def _sample(self, start: int, row: int) -> JointState:
-        positions = None if self._positions is None else self._positions[row]
-        velocities = None if self._velocities is None else self._velocities[row]
-        return JointState(start + int(self._sampled[row]), self._joints, positions, velocities)
-
-    def _pose(self, start: int, row: int) -> PoseEstimate:
-        return PoseEstimate(start + int(self._posed[row]), MAP, self._drive.slam_poses[row], self._covariances[row])
+    def stamped_from(self, origin: int | None = None) -> Iterator[Event]:
+        """The messages by time of arrival. origin: stamp of the drive's start, ns (default: the config's, or now)."""
+        start, schedule = origin or self._origin or time.time_ns(), self._schedule
+        for arrival, topic, row in zip(schedule.arrivals, schedule.topics, schedule.rows, strict=True):
+            message: JointState | PoseEstimate
+            if topic == WHEELS:
+                positions = None if self._positions is None else self._positions[row]
+                velocities = None if self._velocities is None else self._velocities[row]
+                message = JointState(start + int(self._sampled[row]), self._joints, positions, velocities)
+            else:
+                stamp, pose = start + int(self._posed[row]), self._drive.slam_poses[row]
+                message = PoseEstimate(stamp, MAP, pose, self._covariances[row])
+            yield Event(float(arrival), TOPICS_PLAYED[topic], message)
 
 
 @dataclass(frozen=True)
@@ -145,8 +343,8 @@ class Player:
 
     A node that runs the robot acknowledges what it takes: nothing is lost at any speed, the node is waited for while it
     is gone, and is given up after the config's ``wait``. Other subscribers confirm nothing; a slow one delays the
-    replay. names, noise: as for ``events``. ConfigError: the robot's name is not valid, or the names are not one for
-    each wheel.
+    replay. names, noise: as for ``ReplayMessages``. ConfigError: the robot's name is not valid, or the names are not
+    one for each wheel.
     """
 
     def __init__(
@@ -160,7 +358,7 @@ class Player:
     ) -> None:
         self._robot = checked_robot(robot)
         self._config = config
-        self._messages = _Messages(drive, config, noise, names)
+        self._messages = ReplayMessages(drive, config, noise, names)
         self._session = graph.session
         self._publishers = {topic: graph.publisher(robot, topic, lossless=True) for topic in TOPICS_PLAYED}
 
@@ -184,10 +382,14 @@ class Player:
         before, anomalies = Counter[str](), Counter[str]()
         try:
             self._wait_for_subscriber(stop)
-            delivery = self._delivery(stop)
+            # To the robot's node, if there is one, or else to whoever subscribes.
+            patience = max(self._config.wait, _LEAST_PATIENCE)
+            running = self._robot in alive_robots(self._session, patience, stop)
+            kind = AcknowledgedDelivery if running else UnconfirmedDelivery
+            delivery = kind(self._session, self._robot, stop, patience)
             before = self._anomalies(delivery, stop)
             begin = reported_at = time.perf_counter()
-            for number, event in enumerate(self._messages.stamped_from(None), 1):
+            for number, event in enumerate(self._messages.stamped_from(), 1):
                 due = begin + delivery.paused + event.arrival / self._config.speed
                 now = time.perf_counter()
                 if due > now:
@@ -216,7 +418,9 @@ class Player:
             if not stop.is_set():  # otherwise the session was closed after stopping
                 raise OmnibenchError(f"replay of {self._robot}: cannot publish any more: {error}") from None
         except DeliveryError as error:
-            raise self._not_delivered(error, delivery) from None
+            total = len(self._messages)
+            missing = f"{total - (0 if delivery is None else delivery.passed):,} of {plural(total, 'message')}"
+            raise DeliveryError(f"{missing} did not reach robot {self._robot!r}: {error}") from None
         finally:
             if delivery is not None:
                 delivery.close()
@@ -226,13 +430,6 @@ class Player:
         late = 0.0 if math.isinf(self._config.speed) else late
         return PlayReport(sent, len(self._messages), taken, restarts, arrival, wall, late, interrupted, anomalies)
 
-    def _delivery(self, stop: threading.Event) -> Delivery:
-        """Delivery to the robot's node, if there is one, or else to whoever subscribes."""
-        patience = max(self._config.wait, _LEAST_PATIENCE)
-        if self._robot in alive_robots(self._session, patience, stop):
-            return AcknowledgedDelivery(self._session, self._robot, stop, patience)
-        return UnconfirmedDelivery(self._session, self._robot, stop, patience)
-
     def _anomalies(self, delivery: Delivery, stop: threading.Event) -> Counter[str]:
         """The counters of the robot's node above 0 of what should not happen; none if there is none, or no answer."""
         if delivery.taken is None:
@@ -241,12 +438,6 @@ class Player:
         healths = answers(lambda do, s: self._session.get(key, do, timeout=s, source_info=source), _HEALTH_WAIT, stop)
         counts = json.loads(healths[0].payload.to_bytes()).get("counts", {}) if healths else {}
         return Counter({name: n for name, n in anomalies_among(counts).items() if name != "irregular"})
-
-    def _not_delivered(self, error: DeliveryError, delivery: Delivery | None) -> DeliveryError:
-        """The error with the number of messages that are not known to have arrived."""
-        total = len(self._messages)
-        missing = f"{total - (0 if delivery is None else delivery.passed):,} of {plural(total, 'message')}"
-        return DeliveryError(f"{missing} did not reach robot {self._robot!r}: {error}")
 
     def _progress(self, sent: int, seconds: float) -> Progress:
         """Messages sent, and how many ``seconds`` of the recording they are."""

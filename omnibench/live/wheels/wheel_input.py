@@ -13,7 +13,7 @@ from pydantic import Field
 
 from omnibench.config import Model, Positive
 from omnibench.errors import ConfigError
-from omnibench.live.estimation.counts import Counts
+from omnibench.live.estimation.health import Counts
 from omnibench.live.wire.messages import JointState, MessageError
 from omnibench.robot.joint_choice import JointChoice
 from omnibench.robot.kinematics import FASTEST, FASTEST_RIM, Array, Robot, fastest_rates
@@ -401,7 +401,9 @@ class WheelInput:
         MessageError: a wheel is not there.
         """
         chosen = self._choice.places(names)
-        missing = [] if chosen else [joint for joint in self._joints if not self._has(joint, names)]
+        missing = [] if chosen else [joint for joint in self._joints if joint not in names]
+        if not self._choice.asked:
+            missing = [joint for joint in missing if not self._choice.matching(joint, names)]
         alone = len(missing) == len(self._joints) and self._steering is not None and self._steering.tells(names)
         if chosen is None and not alone:
             self._counts.wrong_joints += 1
@@ -413,9 +415,6 @@ class WheelInput:
             self._places.clear()
         places = self._places[names] = None if chosen is None else np.array(chosen)
         return places
-
-    def _has(self, joint: str, names: tuple[str, ...]) -> bool:
-        return joint in names or (not self._choice.asked and bool(self._choice.matching(joint, names)))
 
     def _first(self, sample: _Sample) -> WheelStep:
         """The first step, which has no duration; from here on angles are counted if there are any, else rates."""

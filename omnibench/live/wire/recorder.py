@@ -1,16 +1,20 @@
-"""Recording of live topics into an MCAP file that Foxglove, rosbags and mcap-ros2-support open.
+"""Live topics for other programs: recorded into an MCAP file that Foxglove, rosbags and mcap-ros2-support open.
 
 `McapFile` can be read at any time, even if its writer was killed or the disk was full. Each ``flush`` writes a chunk
 followed by the end of a file without an index, in one call; the next chunk overwrites that end. The file is therefore
 valid after each flush, and rosbags, mcap and Foxglove open it whatever happens to the writer. ``complete`` adds the
 index.
+
+`FoxgloveServer` serves the same topics to the Foxglove application (foxglove-sdk, the extra ``foxglove``).
 """
 
 from __future__ import annotations
 
+import errno
 import itertools
 import logging
 import os
+import socket
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -18,16 +22,20 @@ from contextlib import suppress
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from threading import Event, Thread
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import zenoh
 from mcap.data_stream import RecordBuilder
 from mcap.records import DataEnd, Footer
 from mcap.writer import MCAP0_MAGIC, Writer
 
-from omnibench.errors import DataError
+from omnibench.errors import ConfigError, DataError
+from omnibench.live.stopping import Closing
 from omnibench.live.wire.messages import MessageError, MessageType
 from omnibench.live.wire.topics import TOPICS, Arrival, KeySpace, TopicListener
+
+if TYPE_CHECKING:
+    from foxglove import Channel
 
 
 class McapFile:
@@ -52,7 +60,9 @@ class McapFile:
     def write(self, name: str, kind: MessageType[Any], payload: bytes, *, log_time: int, publish_time: int) -> None:
         """Add a message of the ROS topic ``name`` in CDR. Times in ns, >= 0; log_time must not decrease."""
         if name not in self._channels:
-            self._channels[name] = self._writer.register_channel(name, "cdr", self._schema(kind))
+            if kind.name not in self._schemas:
+                self._schemas[kind.name] = self._writer.register_schema(kind.name, "ros2msg", kind.definition.encode())
+            self._channels[name] = self._writer.register_channel(name, "cdr", self._schemas[kind.name])
         self._writer.add_message(self._channels[name], log_time, payload, publish_time)
         if self._stream.waiting:  # a chunk was full
             self._writer.flush()
@@ -73,11 +83,6 @@ class McapFile:
     def close(self) -> None:
         """Close the file as the last flush left it, without an index."""
         self._stream.close()
-
-    def _schema(self, kind: MessageType[Any]) -> int:
-        if kind.name not in self._schemas:
-            self._schemas[kind.name] = self._writer.register_schema(kind.name, "ros2msg", kind.definition.encode())
-        return self._schemas[kind.name]
 
 
 def _ending() -> bytes:
@@ -261,20 +266,17 @@ class Recorder:
         stopping = False
         while not stopping:
             stopping = self._stopping.wait(_POLL_PERIOD)
-            self._add_all(file)
+            for count in itertools.count(1):
+                try:
+                    arrival = self._waiting.get_nowait()
+                except Empty:
+                    break
+                self._add(file, arrival)
+                if count % _BATCH == 0:
+                    time.sleep(0)  # lets the node's other threads run
             if time.monotonic() >= flush_at:
                 file.flush()
                 flush_at = time.monotonic() + _FLUSH_PERIOD
-
-    def _add_all(self, file: McapFile) -> None:
-        for count in itertools.count(1):
-            try:
-                arrival = self._waiting.get_nowait()
-            except Empty:
-                return
-            self._add(file, arrival)
-            if count % _BATCH == 0:
-                time.sleep(0)  # lets the node's other threads run
 
     def _add(self, file: McapFile, arrival: Arrival) -> None:
         kind = TOPICS[arrival.topic]
@@ -309,3 +311,80 @@ def _stamp(kind: MessageType[Any], payload: bytes) -> int | None:
         content = content.transforms[0]
     stamp = content.header.stamp
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+PORT: Final = 8765  # the application's default
+STOPPING_S: Final = 5.0  # how long ``close`` waits for its port; without load it is free after some milliseconds
+
+
+class FoxgloveServer(Closing):
+    """Serves the topics given to ``forward`` on ``host`` and ``port`` (0: any free port), until ``close``.
+
+    By default only programs on this machine can connect, because the protocol has no password. A client that is too
+    slow loses messages and delays no other.
+
+    ConfigError: foxglove-sdk is not installed, the port is in use, or the host is not an address of this machine.
+    """
+
+    def __init__(self, host: str = "127.0.0.1", port: int = PORT) -> None:
+        try:
+            import foxglove
+        except ImportError:
+            raise ConfigError(
+                'the Foxglove server needs the package foxglove-sdk: pip install "foxglove-sdk"'
+            ) from None
+        if not 0 <= port <= 65535:
+            raise ConfigError(f"Foxglove server: port {port}: expected 0 to 65535")
+        self._context = foxglove.Context()
+        try:
+            self._server = foxglove.start_server(name="omnibench", host=host, port=port, context=self._context)
+        except (RuntimeError, OSError) as error:
+            reason = str(error).removeprefix("FoxgloveError: ")
+            raise ConfigError(
+                f"Foxglove server on {host}:{port}: {reason}; close what uses it or choose another host or port"
+            ) from None
+        self._host, self._port = host, int(self._server.port)
+        self.address = f"ws://{host}:{self._port}"
+        self._channels: dict[str, Channel] = {}
+        self._listeners: list[TopicListener] = []
+
+    def forward(
+        self, session: zenoh.Session, keys: KeySpace, robots: Sequence[str], topics: Sequence[str] = tuple(TOPICS)
+    ) -> None:
+        """Serve the robots' topics from now on, payloads unchanged. ConfigError: no such topic."""
+        import foxglove
+
+        listener = TopicListener(session, keys, robots, topics, self._forward)
+        for name, topic in listener.topics.items():
+            kind = TOPICS[topic]
+            schema = foxglove.Schema(name=kind.name, encoding="ros2msg", data=kind.definition.encode())
+            self._channels[name] = foxglove.Channel(name, schema=schema, message_encoding="cdr", context=self._context)
+        self._listeners.append(listener)
+
+    @property
+    def missed(self) -> int:
+        """Messages that were published and never came here, so that no client got them."""
+        return sum(sum(listener.missed.values()) for listener in self._listeners)
+
+    def close(self) -> None:
+        """Stop serving, and return when another server can have the port."""
+        for listener in self._listeners:
+            listener.close()
+        self._server.stop()  # asks the server's threads to stop, and does not wait for them
+        end = time.monotonic() + STOPPING_S
+        while _in_use(self._host, self._port) and time.monotonic() < end:
+            time.sleep(0.002)
+
+    def _forward(self, arrival: Arrival) -> None:
+        channel = self._channels.get(arrival.name)
+        if channel is not None:
+            channel.log(arrival.payload, log_time=arrival.time)
+
+
+def _in_use(host: str, port: int) -> bool:
+    """True if a program listens there, whatever the state of the connections that it had."""
+    try:
+        socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET).close()
+    except OSError as error:
+        return error.errno == errno.EADDRINUSE
+    return False

@@ -62,8 +62,7 @@ def motion_titles(runs: Sequence[Trajectory]) -> dict[str, Trajectory]:
 
 def spread(runs: Sequence[Trajectory], number: int = _SHOWN) -> list[Trajectory]:
     """Some runs, evenly spaced, the first and the last among them."""
-    picks = np.unique(np.linspace(0, len(runs) - 1, min(number, len(runs))).round().astype(int))
-    return [runs[index] for index in picks]
+    return [runs[index] for index in evenly(len(runs), number)]
 
 
 def kinds_of(runs: Sequence[Trajectory]) -> dict[str, list[Trajectory]]:

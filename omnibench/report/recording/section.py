@@ -1,12 +1,15 @@
 """The report on a recording, and the section on it that other reports include.
 
-Figures of the errors of reference poses against the truth: over time and distance, at the end, and their NEES.
+Figures of the errors of reference poses against the truth: over time and distance, at the end, and their NEES. Tables
+of reference poses by SLAM, which are the terminal's, too. The document that templates/player.js plays: poses, wheel
+rates and scans of a run, rounded.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import plotly.graph_objects as go
@@ -27,29 +30,256 @@ from omnibench.report.blocks import (
     Figure,
     FigureGrid,
     LegendItem,
+    Player,
     Row,
     Section,
     Table,
     answer_section,
     simulated_badge,
 )
-from omnibench.report.figures import coordinates, joined, line
-from omnibench.report.numbers import NOTHING, count, fixed, significant
-from omnibench.report.recording.player import player
+from omnibench.report.figures import coordinates, is_placed, joined, line
+from omnibench.report.numbers import NOTHING, count, fixed, listing, significant
 from omnibench.report.recording.recording_figures import (
+    ODOMETRY_ITEM,
+    PLAN_ITEM,
+    REFERENCE_ITEM,
+    SCANS,
+    SCANS_ITEM,
+    TRUTH_ITEM,
     all_runs,
     evenly,
     one_run,
+    poses_at,
     rate_step,
     representative_runs,
+    scan_points,
     wheel_rates,
 )
-from omnibench.report.recording.slam_tables import accuracy_tiles, bias_table, error_table, errors_in_words
 from omnibench.report.style import INK, PALETTE, QUIET, plot
-from omnibench.robot.kinematics import Array, placed, seen_from
+from omnibench.robot.kinematics import Array, compose, interpolated, placed, seen_from
 from omnibench.robot.model import OdometryModel
-from omnibench.slam.slam_request import RunErrors, SlamAccuracy, run_errors, slam_accuracy
+from omnibench.slam.slam_request import ErrorSummary, RunErrors, SlamAccuracy, SlamSummary, run_errors, slam_accuracy
 from omnibench.words import plural
+
+_FRAMES = 240  # frames drawn of a run (chosen: steps of the slider that can be told apart)
+_MEAN_OVER = 0.1  # s; wheel rates are means over this time before each frame
+_SCANS = 60  # scans drawn of a run (chosen: keeps the file small)
+_RAYS = 270  # rays drawn of a scan (chosen: keeps the file small)
+_MARGIN = 0.4  # m around everything that is drawn
+_SEEN = LegendItem("scan", "this moment's scan", "#d97706")
+
+
+def player(
+    dataset: Dataset,
+    runs: Mapping[str, Trajectory],
+    odometry: OdometryModel,
+    truth: Mapping[str, TruePath],
+    outlines: Mapping[str, Sequence[Array]],
+) -> Player:
+    """A player for these runs, chosen by the menu's names and moved through with a slider.
+
+    outlines: for each run the walls of the floor plan in the frame of its reference poses, each (n, 2), m.
+    """
+    shown = ["the robot"]
+    shown += ["its last scan, and what it saw before"] if dataset.scans is not None else []
+    shown += ["the path so far and its wheel rates"]
+    return Player(
+        {name: _run(dataset, run, odometry, truth.get(run.id), outlines.get(run.id, ())) for name, run in runs.items()},
+        f"A plan of the room with {listing(shown)}, at the time that the slider names",
+        "Between reference poses the robot is drawn on a straight line; wheel rates are means over the 100 ms before. "
+        "With the slider in focus the arrow keys go step by step.",
+    )
+
+
+def _run(
+    dataset: Dataset, run: Trajectory, odometry: OdometryModel, truth: TruePath | None, outlines: Sequence[Array]
+) -> dict[str, Any]:
+    end, steered = run.end, dataset.robot.drive.steered
+    times = np.linspace(0.0, end, min(_FRAMES, max(2, round(end / 0.02) + 1)))
+    poses = poses_at(run, times)
+    (driven,) = odometry.poses([run.log(times)])
+    true_poses = None if truth is None else placed(run.start, truth.at(times))
+    scans = _played_scans(dataset, run)
+    rates = _means(run, run.rates, times)
+    targets = None if run.targets is None else _means(run, run.targets, times)
+    everything = [rates] if targets is None else [rates, targets]
+    drawn = [poses[:, :2], driven[:, :2], *outlines, *(np.reshape(scan["points"], (-1, 2)) for scan in scans)]
+    # Left, bottom, right and top of the picture, m; the farthest 0.5 % of the points on each side are cut off
+    points = np.vstack(drawn)
+    low, high = np.quantile(points, 0.005, axis=0) - _MARGIN, np.quantile(points, 0.995, axis=0) + _MARGIN
+    return {
+        "times": _rounded(times),
+        "poses": _rounded(poses, 4),
+        "odometry": _rounded(driven[:, :2]),
+        "truth": None if true_poses is None else _rounded(true_poses),
+        "rates": _rounded(rates),
+        "targets": None if targets is None else _rounded(targets),
+        "rate_limit": round(1.05 * max(float(np.abs(np.vstack(everything)).max()), 1e-3), 3),
+        "scans": scans,
+        "plan": [_rounded(outline) for outline in outlines],
+        "window": _rounded(np.concatenate([low, high])),
+        "rated": dataset.robot.wheel_names,
+        "steering": None if run.steering is None else _rounded(interpolated(times, run.times, run.steering)),
+        # Radius and place, m, direction of rolling, rad, index of the angle that steers it, of the wheels drawn.
+        "wheels": [
+            {
+                "radius": wheel.radius,
+                "at": _rounded(np.array(wheel.position), 6),
+                "rolling": wheel.rolling,
+                "steered": steered.index(wheel.name) if wheel.has_steering else None,
+            }
+            for wheel in dataset.robot.wheels
+            if is_placed(wheel)
+        ],
+        "radius": max(math.hypot(wheel.reach, wheel.radius) for wheel in dataset.robot.wheels),
+        "colours": {
+            "reference": REFERENCE_ITEM.colour,
+            "odometry": ODOMETRY_ITEM.colour,
+            "truth": TRUTH_ITEM.colour,
+            "plan": PLAN_ITEM.colour,
+            "map": SCANS + "66",
+            "scan": _SEEN.colour,
+            "ray": _SEEN.colour + "44",
+            "whole": REFERENCE_ITEM.colour + "55",
+            "robot": INK,
+        },
+        "key": _key(bool(scans), truth is not None, bool(outlines)),
+    }
+
+
+def _played_scans(dataset: Dataset, run: Trajectory) -> list[dict[str, Any]]:
+    """Some scans of a run: stamp, scanner position, and points as x, y, x, y, ..., m."""
+    if dataset.scans is None or run.id not in dataset.scans.trajectories:
+        return []
+    scanner, scans = dataset.scans.scanner, dataset.scans.of(run.id)
+    stride = -(-scanner.rays // _RAYS)
+    documents = []
+    for scan in evenly(len(scans.times), _SCANS):
+        stamp = scans.times[scan]
+        origin = compose(poses_at(run, stamp), scanner.mount.pose)
+        points = scan_points(run, scanner, scans, int(scan), stride)
+        documents.append(
+            {"t": round(float(stamp), 4), "from": _rounded(origin[:2]), "points": _rounded(points.ravel())}
+        )
+    return documents
+
+
+def _means(run: Trajectory, values: Array, times: Array) -> Array:
+    """Mean rates (n, N) over the 0.1 s before each of ``times`` (n,), s; values (F, N): the rate of each sample."""
+    ends = np.append(0.0, run.times)
+    durations = np.diff(ends)[:, None]
+    angles = np.vstack([np.zeros(values.shape[1]), np.cumsum(values * durations, axis=0)])
+    late = np.clip(times, _MEAN_OVER / 2, ends[-1])
+    early = np.maximum(late - _MEAN_OVER, 0.0)
+    driven = interpolated(late, ends, angles) - interpolated(early, ends, angles)
+    means: Array = driven / (late - early)[:, None]
+    return means
+
+
+def _key(scans: bool, truth: bool, plan: bool) -> list[dict[str, Any]]:
+    items = [REFERENCE_ITEM, ODOMETRY_ITEM] + [TRUTH_ITEM] * truth + [PLAN_ITEM] * plan
+    points = [_SEEN, LegendItem("map", "earlier scans", SCANS_ITEM.colour)] * scans
+    entries: list[dict[str, Any]] = [{"label": item.label, "colour": item.colour, "points": False} for item in items]
+    return entries + [{"label": item.label, "colour": item.colour, "points": True} for item in points]
+
+
+def _rounded(values: Array, decimals: int = 3) -> Any:
+    return np.round(values, decimals).tolist()
+
+
+def accuracy_tiles(accuracy: SlamAccuracy) -> tuple[Fact, ...]:
+    """The errors of reference poses against the truth as a few figures."""
+    final = accuracy.final
+    position, heading = _mm(final.position_mean_m), _degrees(final.heading_mean_rad)
+    drift, turn = _mm(accuracy.drift_position), _degrees(accuracy.drift_heading)
+    return (
+        Fact("Final position error, mean", f"{position} mm", f"95 % below {_mm(final.position_p95_m)} mm"),
+        Fact("Final heading error, mean", f"{heading}°", f"95 % below {_degrees(final.heading_p95_rad)}°"),
+        Fact("Drift", f"{drift} mm per metre", f"heading {turn}° per metre"),
+        Fact("NEES, mean of all poses", _nees(accuracy.every), "3 where covariances are right"),
+    )
+
+
+def error_table(accuracy: SlamAccuracy) -> Table:
+    """The errors of the last pose of each run, and of all poses."""
+    rows = []
+    for name, summary in _summaries(accuracy):
+        positions = (summary.position_mean_m, summary.position_p95_m, summary.position_max_m)
+        headings = (summary.heading_mean_rad, summary.heading_p95_rad, summary.heading_max_rad)
+        rows.append(Row.of(Cell(name, plural(summary.poses, "pose")), *_figures(positions, headings), _nees(summary)))
+    return Table(
+        caption="Errors of the reference poses against the truth",
+        columns=(*_FIGURES, Column("NEES, mean")),
+        rows=tuple(rows),
+        note=f"{plural(accuracy.runs, 'run')}, {significant(accuracy.distance_m, 4)} m in all. Drift: the "
+        "growth k of the error over the distance s, from error² = noise² + (k s)²; 0 where it does not grow.",
+    )
+
+
+def bias_table(accuracy: SlamAccuracy) -> Table:
+    """The mean errors along the robot's axes."""
+    rows = []
+    for name, summary in _summaries(accuracy):
+        lengths = (_mm(v, signed=True) for v in (summary.bias_forward_m, summary.bias_left_m))
+        rows.append(Row.of(name, *lengths, _degrees(summary.bias_heading_rad, signed=True)))
+    return Table(
+        caption="Mean error along the robot's axes",
+        columns=(
+            Column("Poses", numeric=False),
+            Column("forward", "mm"),
+            Column("to the left", "mm"),
+            Column("heading", "°"),
+        ),
+        rows=tuple(rows),
+        note="The signed mean of the errors: 0 for a reference without bias.",
+    )
+
+
+def summary_table(summary: SlamSummary) -> Table:
+    """The deviations that SLAM states, and the distances from the reference poses that were recorded."""
+    deviations = _figures(
+        (summary.position_deviation_mean_m, None, summary.position_deviation_max_m),
+        (summary.heading_deviation_mean_rad, None, summary.heading_deviation_max_rad),
+    )
+    rows = [Row.of("deviation stated at the end of a run", *deviations)]
+    if summary.recorded is not None:
+        recorded = summary.recorded
+        name = Cell("distance from the recorded reference", plural(recorded.poses, "pose"))
+        distances = _figures(
+            (recorded.position_mean_m, recorded.position_p95_m, None),
+            (recorded.heading_mean_rad, recorded.heading_p95_rad, None),
+        )
+        rows.append(Row.of(name, *distances))
+    return Table("Reference poses from the scans", _FIGURES, tuple(rows))
+
+
+_FIGURES = (
+    Column("Poses", numeric=False),
+    *(Column(f"position, {which}", "mm") for which in ("mean", "95 %", "worst")),
+    *(Column(f"heading, {which}", "°") for which in ("mean", "95 %", "worst")),
+)
+
+
+def _figures(metres: Sequence[float | None], radians: Sequence[float | None]) -> list[str]:
+    """Mean, 95th percentile and maximum of positions in mm, then of headings in degrees."""
+    lengths = [NOTHING if value is None else _mm(value) for value in metres]
+    return lengths + [NOTHING if value is None else _degrees(value) for value in radians]
+
+
+def _summaries(accuracy: SlamAccuracy) -> tuple[tuple[str, ErrorSummary], ...]:
+    return (("last of each run", accuracy.final), ("all after the first", accuracy.every))
+
+
+def _mm(metres: float, signed: bool = False) -> str:
+    return significant(1e3 * metres, 2, signed)
+
+
+def _degrees(angle: float, signed: bool = False) -> str:
+    return significant(math.degrees(angle), 2, signed)
+
+
+def _nees(summary: ErrorSummary) -> str:
+    return NOTHING if summary.nees_mean is None else significant(summary.nees_mean, 3)
 
 
 def contents_table(dataset: Dataset) -> Table:
@@ -358,7 +588,9 @@ def _answer(dataset: Dataset, notes: Sequence[str], accuracy: SlamAccuracy | Non
         Fact("Reference poses", count(sum(len(run.poses) for run in runs))),
     )
     if accuracy is not None:
-        sentence += f". Their reference poses end {errors_in_words(accuracy)} from the truth on average"
+        final = accuracy.final
+        errors = f"{_mm(final.position_mean_m)} mm and {_degrees(final.heading_mean_rad)}°"
+        sentence += f". Their reference poses end {errors} from the truth on average"
         tiles = accuracy_tiles(accuracy)
     return answer_section(
         f"{sentence}.",

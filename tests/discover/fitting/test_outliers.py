@@ -13,7 +13,7 @@ from outlier_study import simulated as with_directions
 
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.discover.fitting import Extended, Fit, InlierWhitener, extend, fit_matrix, inliers_of, with_noise
-from omnibench.discover.regressors.columns import Group
+from omnibench.discover.regressors.significance import Group
 from omnibench.fit.noise import Whitener
 from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.registry import effects

@@ -17,9 +17,8 @@ from screening_samples import FIRST, SECOND, THIRD, screening
 from omnibench.config import validate
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.fitting import Fit, fit_matrix, paths_of
-from omnibench.discover.regressors.columns import Group
-from omnibench.discover.regressors.effect_slopes import slopes_by
-from omnibench.discover.regressors.significance import Family, Significance, significance_of, together
+from omnibench.discover.regressors.paths import slopes_by
+from omnibench.discover.regressors.significance import Family, Group, Significance, significance_of, together
 from omnibench.discover.report.residuals import EXTENDED, NORMAL_95, PLAIN, Residuals, shares
 from omnibench.discover.report.where_section import motor_grid
 from omnibench.fit.trajectory_fit import Whitened, usable_runs

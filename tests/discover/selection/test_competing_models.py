@@ -9,7 +9,7 @@ import pytest
 from discovery_samples import COUPLING, simulated
 
 from omnibench.discover.fitting import Extended, Fit, extend, fit_matrix
-from omnibench.discover.regressors.columns import Group
+from omnibench.discover.regressors.significance import Group
 from omnibench.discover.selection.competing_models import CompetingModels, averaged, competing_models
 from omnibench.discover.selection.model_selection import Selection, select_effects
 from omnibench.discover.selection.screening import screen_plain

@@ -7,8 +7,7 @@ import pytest
 from scipy.stats import ncx2
 from screening_samples import FIRST, PARAMETER, POSITIVE, SECOND, THIRD, screening
 
-from omnibench.discover.regressors.columns import Group
-from omnibench.discover.regressors.significance import Family, Significance
+from omnibench.discover.regressors.significance import Family, Group, Significance
 from omnibench.discover.selection.evidence import Credibility, bayes_factor, credibility_of, effect_sets, log_evidence
 from omnibench.robot.effects.effect import Parameter
 

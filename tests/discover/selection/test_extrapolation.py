@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from extended_samples import FORWARD, MATRIX, SECONDS, SIDEWAYS, TURN, extended_of, run_of
 
-from omnibench.discover.selection.extrapolation import extrapolations_of, training_domain
+from omnibench.discover.held_out import extrapolations_of, training_domain
 
 TRAINING = [run_of(FORWARD, "go", f"go {number}") for number in (1, 2)]
 NOTHING = [np.zeros((2, 3)) for _ in TRAINING]

@@ -12,9 +12,8 @@ from screening_samples import FIRST, FOURTH, MATRIX, POSITIVE, SECOND, THIRD, sc
 
 from omnibench.discover.covariate_dependence import Dependences, covariate_dependences, weights_of_covariates
 from omnibench.discover.fitting import Extended, Fit, extend, fit_matrix
-from omnibench.discover.regressors.columns import Group
 from omnibench.discover.regressors.covariate_bases import Basis
-from omnibench.discover.regressors.significance import Family, Significance, together
+from omnibench.discover.regressors.significance import Family, Group, Significance, together
 from omnibench.discover.selection.detectability import Detectability, detectability_of
 from omnibench.discover.selection.evidence import Missing
 from omnibench.discover.selection.model_selection import Selection, select_effects

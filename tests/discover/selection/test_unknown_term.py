@@ -14,8 +14,8 @@ from hidden.sets import Truth, make_set
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.fitting import Extended, extend, fit_matrix
 from omnibench.discover.held_out import group_counts, step_name
-from omnibench.discover.regressors.columns import Group
 from omnibench.discover.regressors.covariate_bases import Basis
+from omnibench.discover.regressors.significance import Group
 from omnibench.discover.selection.competing_models import CompetingModels
 from omnibench.discover.selection.model_selection import Selection, select_effects
 from omnibench.discover.selection.screening import Screening, screen_plain

@@ -34,8 +34,7 @@ from timing import PATIENCE
 
 from omnibench.errors import DataError
 from omnibench.live.control.query_server import QueryServer
-from omnibench.live.control.request_queue import MOST_WAITING, Request, RequestQueue, source_of
-from omnibench.live.control.swap import swap_calibration
+from omnibench.live.control.request_queue import MOST_WAITING, Request, RequestQueue, source_of, swap_calibration
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.network.presence import alive_robots
 from omnibench.live.wire.messages import JOINT_STATE, ODOMETRY

@@ -333,7 +333,7 @@ class TestSessions:
         assert turned["morning"] == turned[None] == pytest.approx(path.poses[-1, 2])
 
     def test_a_node_that_starts_again_goes_on_in_its_session(self, tmp_path: Path) -> None:
-        from omnibench.live.estimation.saved_state import RobotMemory
+        from omnibench.live.estimation.robot_state import RobotMemory
 
         using = with_effects(term("thermal_radius_drift", k=1e-3))
         path = drive(4.0, using=using)

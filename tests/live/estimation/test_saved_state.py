@@ -19,8 +19,7 @@ from hypothesis import strategies as st
 from nodes import as_text
 
 from omnibench.errors import DataError
-from omnibench.live.estimation.robot_state import PublishedStamps
-from omnibench.live.estimation.saved_state import RobotMemory, SavedState
+from omnibench.live.estimation.robot_state import PublishedStamps, RobotMemory, SavedState
 from omnibench.robot.calibration import write_calibration
 
 STATE: dict[str, Any] = {

@@ -16,10 +16,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from omnibench.errors import ConfigError, DataError
-from omnibench.live.estimation.counts import Counts, anomalies_in_words
-from omnibench.live.estimation.extrapolation_monitor import ExtrapolationMonitor
-from omnibench.live.estimation.health import diagnostic
-from omnibench.live.estimation.saved_state import RobotMemory
+from omnibench.live.estimation.health import Counts, anomalies_in_words, diagnostic
+from omnibench.live.estimation.robot_state import ExtrapolationMonitor, RobotMemory
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.fusion.pose_fusion import FusionSettings
 from omnibench.live.wheels.wheel_input import WheelSettings, WheelStep

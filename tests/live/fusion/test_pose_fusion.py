@@ -8,11 +8,18 @@ from drives import EXACT, ORIGIN, PERIOD, SECOND, calibration, drive, fed, motio
 from hypothesis import given
 from hypothesis import strategies as st
 
-from omnibench.live.estimation.counts import Counts
+from omnibench.live.estimation.health import Counts
 from omnibench.live.estimation.live_odometry import Motion
 from omnibench.live.estimation.tracker import RobotTracker
-from omnibench.live.fusion.pose_fusion import Fusion, FusionSettings, PoseFilter, innovation_of
-from omnibench.live.fusion.timeline import Entry, PoseMeasurement, Timeline
+from omnibench.live.fusion.pose_fusion import (
+    Entry,
+    Fusion,
+    FusionSettings,
+    PoseFilter,
+    PoseMeasurement,
+    Timeline,
+    innovation_of,
+)
 from omnibench.robot.calibration import Calibration, EffectTerm
 from omnibench.robot.kinematics import Array, compose, moved_to
 from omnibench.robot.odometry import advance

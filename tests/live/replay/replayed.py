@@ -10,7 +10,7 @@ from recordings import random_dataset
 
 from omnibench.config import validate
 from omnibench.live.replay.concatenated_drive import ConcatenatedDrive, ReplayConfig, concatenate_runs
-from omnibench.live.replay.replay_player import Event, events
+from omnibench.live.replay.replay_player import Event, ReplayMessages
 from omnibench.live.wire.messages import JointState, PoseEstimate
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
@@ -25,7 +25,7 @@ def config(**changes: Any) -> ReplayConfig:
 
 
 def played(drive: ConcatenatedDrive = DRIVE, *, noise: Noise | None = None, **changes: Any) -> list[Event]:
-    return list(events(drive, config(**changes), noise=noise))
+    return list(ReplayMessages(drive, config(**changes), noise=noise).stamped_from())
 
 
 def of(played_events: list[Event], topic: str) -> list[Event]:

@@ -25,8 +25,7 @@ from timing import load
 from omnibench.data.storage import save_dataset
 from omnibench.live.config import read_live_config
 from omnibench.live.replay.concatenated_drive import concatenate_runs
-from omnibench.live.replay.delivery import WINDOW, DeliveryError
-from omnibench.live.replay.replay_player import Player
+from omnibench.live.replay.replay_player import WINDOW, DeliveryError, Player
 from omnibench.live.wire.messages import JOINT_STATE, packed
 from omnibench.live.wire.topics import GraphNode, KeySpace
 from omnibench.robot.kinematics import relative

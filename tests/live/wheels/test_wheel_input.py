@@ -15,7 +15,7 @@ from steered import CAR, SWERVE, TRICYCLE, calibration, only
 from steered import drive as steered_drive
 
 from omnibench.errors import ConfigError
-from omnibench.live.estimation.counts import Counts
+from omnibench.live.estimation.health import Counts
 from omnibench.live.estimation.robot_state import new_state
 from omnibench.live.wheels.wheel_input import WheelAngles, WheelInput, WheelSettings, WheelStep, joints_of
 from omnibench.live.wire.messages import JointState

@@ -40,9 +40,8 @@ from timing import PATIENCE
 
 from omnibench.errors import ConfigError, DataError, UnknownNameError
 from omnibench.live.robot_monitor import HealthSummary, RobotMonitor, RobotStatus
-from omnibench.live.wire.foxglove import FoxgloveServer
 from omnibench.live.wire.messages import JOINT_STATE, Diagnostic, Diagnostics, Odometry
-from omnibench.live.wire.recorder import Recorder
+from omnibench.live.wire.recorder import FoxgloveServer, Recorder
 from omnibench.live.wire.subscriber import Subscription, subscribe
 from omnibench.live.wire.topics import TOPICS, GraphNode, KeySpace, Profile, Publisher
 
