@@ -35,8 +35,8 @@ from omnibench.registry import import_copies
 
 _MEGABYTE = 1_000_000  # bytes
 # s after its start in which a process takes further jobs: to start one costs 20 ms (tests/studies/job_overhead.py),
-# 2 % of that; what jobs leave behind in it (memory, caches) is that of a second. The time in which jobs are unpacked is
-# not counted: the first imports their modules, which may take longer than all of them, and every new process again.
+# 2 % of that; what jobs leave behind in it (memory, caches) is that of a second. What unpacking jobs takes and changes
+# does not count: the first imports their modules, as it would in every new process, too.
 _YOUNG = 1.0
 _OWN = 60.0  # s, for jobs of our own code, which leave nothing behind but what they share: data need not go again
 # What every process of jobs needs; pydantic imports these when a result is first written, which takes 60 ms.
@@ -47,7 +47,8 @@ _FROM_OUTSIDE = (SIGKILL, SIGTERM, SIGHUP, SIGINT)  # signals by which people an
 
 _KEPT: dict[str, Any] = {}  # objects that the last job of this process shared, by their names
 _in_job = False  # True in a process of jobs
-_working_since = 0.0  # s, by time.monotonic, when the last job of this process had been unpacked
+# When the last job of this process had been unpacked (s, by time.monotonic), and what its condition was then.
+_unpacked: tuple[float, tuple[Any, ...]] = (0.0, ())
 
 
 @contextmanager
@@ -127,7 +128,7 @@ class Packer:
 
 def run_packed(packed: PackedJob, report: Reporter) -> Any:
     """Unpack a job in its process and run it."""
-    global _working_since
+    global _unpacked
     import_copies(packed.plugins)
     shared = {name: pickle.loads(content) for name, content in packed.shared.items()}
     if packed.kept:
@@ -137,7 +138,7 @@ def run_packed(packed: PackedJob, report: Reporter) -> Any:
     unpickler = pickle.Unpickler(BytesIO(packed.content))
     unpickler.persistent_load = shared.__getitem__  # type: ignore[method-assign]
     function, argument = unpickler.load()
-    _working_since = time.monotonic()
+    _unpacked = time.monotonic(), _condition()
     return function(argument, report)
 
 
@@ -151,7 +152,7 @@ class JobEnd:
     """The end of a job, in parts that any process can read.
 
     answer: what ``keep`` returned. error: what the job raised, pickled. lost: why it has neither, as its process died
-    or was ended. reusable: the process is as it was before the job. unpacking: s that it took.
+    or was ended. reusable: the process is as it was when the job had been unpacked, which took ``unpacking`` s.
     """
 
     answer: Any = None
@@ -271,13 +272,13 @@ def release(process: JobProcess, end: JobEnd, idle: list[JobProcess]) -> None:
 
 def _serve(connection: Connection) -> None:
     """Do the jobs that come through the connection."""
-    global _in_job, _working_since
+    global _in_job, _unpacked
     _in_job = True
     signal.signal(SIGINT, SIG_IGN)  # the parent ends it
     signal.signal(SIGTERM, SIG_DFL)  # end at once: Python's handlers would wait for compiled code
     os.setpgid(0, 0)  # all that a plug-in starts can be ended with the process
     threading.Thread(target=end_with_parent, daemon=True).start()
-    process, before = os.getpid(), _condition()
+    process = os.getpid()
     with one_thread():
         while True:
             try:
@@ -285,19 +286,20 @@ def _serve(connection: Connection) -> None:
                     return
                 came = time.monotonic()
                 job, keep = connection.recv()
-                _working_since = time.monotonic()
+                _unpacked = time.monotonic(), _condition()
             except EOFError:
                 return
             except Exception as error:  # whatever unpickling raises: a module that is missing here
                 connection.send(JobEnd(error=_sendable(error)))
                 return
             end = _do(job, keep, connection, process)
-            reusable = end.error is None and not job.limited and _condition() == before
+            unpacked_at, condition = _unpacked
+            reusable = end.error is None and not job.limited and _condition() == condition
             for stream in (sys.stdout, sys.stderr):
                 with suppress(OSError, ValueError):  # closed by a plug-in
                     stream.flush()
             try:
-                connection.send(replace(end, reusable=reusable, unpacking=_working_since - came))
+                connection.send(replace(end, reusable=reusable, unpacking=unpacked_at - came))
             except OSError:  # a plug-in has closed it
                 os._exit(1)
 

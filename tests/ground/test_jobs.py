@@ -241,13 +241,14 @@ def test_quick_jobs_share_a_process_while_it_is_young(tmp_path: Path, monkeypatc
     assert len(set(processes_of(run(tmp_path, jobs_of(squared, range(9)), Processes(2))))) == 2
 
 
-def test_the_time_in_which_a_process_imports_what_jobs_need_does_not_make_it_old(
+def test_what_jobs_import_makes_their_process_neither_old_nor_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(job_process, "_YOUNG", 3.0)
     monkeypatch.syspath_prepend(tmp_path)
     sleeps = "import multiprocessing, time\nif multiprocessing.parent_process(): time.sleep(3.5)\n"
-    (tmp_path / "slow_to_import.py").write_text(sleeps + "class Place: pass\n")
+    sets = "import os\nif multiprocessing.parent_process(): os.environ['SET_BY'] = 'an import, as polars does'\n"
+    (tmp_path / "slow_to_import.py").write_text(sleeps + sets + "class Place: pass\n")
     place = importlib.import_module("slow_to_import").Place()
     notes = run(tmp_path, jobs_of(process_of_a_job, [place, place]), Processes(1))
     assert len(set(processes_of(notes))) == 1
