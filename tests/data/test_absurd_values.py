@@ -60,9 +60,7 @@ def folder(tmp_path: Path) -> Path:
     ("far", "message"),
     [(1e200, r"poses.parquet, row 2: x is 1e\+200"), *((far, "the pose at .* m from") for far in (1e9, 1e6, 1e5))],
 )
-def test_a_pose_that_no_robot_can_reach_or_far_beyond_what_the_wheels_rolled_is_refused(
-    folder: Path, far: float, message: str
-) -> None:
+def test_a_pose_beyond_all_reach_or_what_the_wheels_rolled_is_refused(folder: Path, far: float, message: str) -> None:
     table = pl.read_parquet(folder / "poses.parquet")
     moved = pl.when(pl.int_range(pl.len()) == 1).then(far).otherwise(pl.col("x")).alias("x")
     table.with_columns(moved).write_parquet(folder / "poses.parquet")

@@ -92,9 +92,7 @@ def test_scans_that_are_many_row_groups_long_come_back(tmp_path: Path) -> None:
         assert_same(scans_of(tmp_path / "data").of(trajectory), expected)
 
 
-def test_a_part_of_a_data_set_is_saved_with_its_own_scans_and_without_scans_without_a_scanner(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_a_part_is_saved_with_its_own_scans_and_without_scans_without_a_scanner(folder: Path, tmp_path: Path) -> None:
     data = load_dataset(folder)
     save_dataset(replace(data, trajectories=data.trajectories[1:]), tmp_path / "part")
     assert scans_of(tmp_path / "part").trajectories == ("run-2",)

@@ -315,9 +315,7 @@ def test_refused_in_one_line_that_names_file_row_and_reason(
 
 @pytest.mark.parametrize("fmt", ["csv", "parquet"])
 @pytest.mark.parametrize(("change", "place", "reason"), REFUSED_STEERING)
-def test_steering_angles_that_cannot_be_read_are_refused(
-    tmp_path: Path, change: Change, place: str, reason: str, fmt: Format
-) -> None:
+def test_unreadable_steering_is_refused(tmp_path: Path, change: Change, place: str, reason: str, fmt: Format) -> None:
     save_dataset(driven(TRICYCLE, runs=1, samples=5), tmp_path / "d", fmt)
     change(tmp_path / "d")
     assert_refused(tmp_path / "d", place, reason, fmt)

@@ -297,9 +297,7 @@ def test_final_poses_of_full_turns_are_said_to_leave_the_matrix_undetermined(tmp
         ({}, {"command": "only"}, "only is its only command"),
     ],
 )
-def test_recordings_that_leave_no_choice_are_refused(
-    changes: dict[str, Any], fields: dict[str, Any], words: str
-) -> None:
+def test_recordings_without_a_choice_are_refused(changes: dict[str, Any], fields: dict[str, Any], words: str) -> None:
     with pytest.raises(DataError, match=words):
         candidates_of_dataset(without(simulated(**changes), **fields))
 
@@ -453,9 +451,7 @@ def test_a_design_config_lists_commands_for_a_robot_that_steers_within_its_limit
         ("car", {"area": "2x2"}, "no curve that it can drive"),
     ],
 )
-def test_what_cannot_be_is_refused_by_the_name_of_its_option(
-    name: str, given: dict[str, object], words: str, tmp_path: Path
-) -> None:
+def test_what_cannot_be_is_refused_by_name(name: str, given: dict[str, object], words: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError) as refusal:
         design_source(None, file_of(tmp_path, name), RobotOptions(**given))  # type: ignore[arg-type]
     assert words in str(refusal.value)
@@ -470,8 +466,6 @@ def test_what_cannot_be_is_refused_by_the_name_of_its_option(
         (None, None, RobotOptions(), "--robot FILE"),
     ],
 )
-def test_a_robot_and_a_recording_exclude_each_other(
-    data: str | None, file: str | None, options: RobotOptions, name: str
-) -> None:
+def test_a_robot_excludes_a_recording(data: str | None, file: str | None, options: RobotOptions, name: str) -> None:
     with pytest.raises(ConfigError, match=name):
         design_source(data and Path(data), file and Path(file), options)

@@ -238,9 +238,7 @@ def step_to(corners: Array, shares: Sequence[float], low: float | Array = -2.0, 
         (np.array([[-1.0, 0.0], [1.0, 0.5], [0.3, 1.0]]), [0.0, 2.0, 1.0], [1.0, 0.5]),  # a point without a share
     ],
 )
-def test_the_weighted_geometric_median_minimises_the_sum_of_distances(
-    corners: Array, shares: list[float], expected: Array
-) -> None:
+def test_a_geometric_median_minimises_sums_of_distances(corners: Array, shares: list[float], expected: Array) -> None:
     np.testing.assert_allclose(step_to(corners, shares), expected, atol=1e-9)
 
 

@@ -61,9 +61,7 @@ def test_nothing_is_evaluated_when_the_time_is_spent() -> None:
 @pytest.mark.parametrize("wheels", [3, 4])
 @pytest.mark.parametrize("parameterisation", ["matrix", "geometry"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 0.0, 1e300])
-def test_a_candidate_that_cannot_be_evaluated_leaves_the_others_alone(
-    wheels: Any, parameterisation: Any, value: float
-) -> None:
+def test_a_candidate_without_a_cost_leaves_the_others_alone(wheels: Any, parameterisation: Any, value: float) -> None:
     problem = make_problem(wheels=wheels, parameterisation=parameterisation)
     candidates = np.tile(problem.start, (3, 1))
     candidates[1] = value

@@ -182,9 +182,7 @@ def test_a_coupling_beyond_what_is_searched_is_warned_of() -> None:
 
 @pytest.mark.parametrize("cost", ["trajectory", "final_pose"])
 @pytest.mark.parametrize("jumped", [(), (1, 4)])
-def test_the_slopes_of_the_search_are_those_of_its_cost_where_starts_have_jumped_too(
-    cost: str, jumped: tuple[int, ...]
-) -> None:
+def test_slopes_of_a_search_are_those_of_its_cost_where_starts_jumped_too(cost: str, jumped: tuple[int, ...]) -> None:
     runs = list(weaving(0.4).trajectories)
     for place in jumped:
         poses = runs[place].poses.copy()

@@ -76,9 +76,7 @@ row = st.tuples(number, number, number)
 
 
 @given(matrix=st.tuples(row, row, row).filter(np.any), period=st.floats(1e-6, 3600))
-def test_matrix_and_period_come_back_to_the_last_bit(
-    tmp_path_factory: pytest.TempPathFactory, matrix: Any, period: float
-) -> None:
+def test_matrix_and_period_keep_every_bit(tmp_path_factory: pytest.TempPathFactory, matrix: Any, period: float) -> None:
     file = tmp_path_factory.getbasetemp() / "bits.yaml"
     write_calibration(a_calibration(matrix=matrix, sample_period=period), file)
     found = read_calibration(file)

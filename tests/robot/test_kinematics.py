@@ -103,9 +103,7 @@ def test_mecanum_wheels_give_the_matrix_of_the_textbooks() -> None:
 
 
 @given(wheels=many_wheels, angle=st.floats(-3, 3))
-def test_a_robot_with_its_wheels_turned_about_its_centre_drives_in_the_turned_direction(
-    wheels: tuple[Wheel, ...], angle: float
-) -> None:
+def test_a_robot_with_turned_wheels_drives_in_the_turned_direction(wheels: tuple[Wheel, ...], angle: float) -> None:
     turned = tuple(wheel.model_copy(update={"angle": wheel.angle + angle}) for wheel in wheels)
     rotation = np.array([[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1]])
     np.testing.assert_allclose(wheel_equations(turned) @ rotation, wheel_equations(wheels), rtol=1e-9, atol=1e-10)

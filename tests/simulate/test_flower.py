@@ -361,7 +361,7 @@ def test_a_cars_rear_wheels_turn_at_different_rates_in_a_curve() -> None:
         np.testing.assert_allclose(turn, run.omega, atol=1e-9)
 
 
-def test_an_effect_on_the_steering_angle_is_hidden_in_the_motion_and_not_in_what_is_measured(
+def test_an_effect_on_the_steering_angle_hides_in_the_motion_and_not_in_what_is_measured(
     misread_steering: str,
 ) -> None:
     hidden = [{"name": misread_steering, "parameters": {"g": 0.05}}]

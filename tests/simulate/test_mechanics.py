@@ -205,9 +205,7 @@ def test_wheels_as_designed_move_the_robot_by_the_design_matrix(design: Robot) -
 
 
 @given(rates_of_wheels, st.floats(-1.3, 1.3), st.floats(-0.1, 0.1), st.floats(-0.1, 0.1))
-def test_no_wheel_of_a_tricycle_slides_whatever_its_front_wheel_is_off(
-    rate: float, angle: float, aside: float, offset: float
-) -> None:
+def test_no_wheel_of_a_tricycle_ever_slides(rate: float, angle: float, aside: float, offset: float) -> None:
     design = robot("tricycle")
     front, *rear = design.wheels
     contacts = WheelContacts(design, [front.model_copy(update={"y": aside}), *rear], [offset])
@@ -240,9 +238,7 @@ def test_the_axles_of_a_car_meet_in_one_point_and_its_rear_wheels_turn_as_they_r
 
 @pytest.mark.parametrize("integration", ["arc", "euler"])
 @given(twists=st.lists(st.tuples(*[st.floats(-3, 3)] * 5), min_size=1, max_size=5))
-def test_the_true_motion_is_that_of_the_odometry_on_other_code(
-    integration: str, twists: list[tuple[float, ...]]
-) -> None:
+def test_the_true_motion_is_that_of_odometry_on_other_code(integration: str, twists: list[tuple[float, ...]]) -> None:
     moved, drift = np.array(twists)[:, :3], np.array(twists)[:, 3:]
     times = 0.3 * np.arange(1, len(twists) + 1)
     start, stamps = np.array([1.0, -2.0, 0.5]), np.linspace(-0.1, times[-1] + 0.1, 11)

@@ -78,9 +78,7 @@ TURN = 2 * math.pi
         (INCREMENTS * 4096 / TURN, {"wheel_unit": "ticks/sample", "ticks_per_turn": 4096}),
     ],
 )
-def test_positions_rates_and_increments_of_wheel_or_motor_in_any_unit_are_the_same_and_positions_are_kept(
-    tmp_path: Path, angle: Array, options: dict[str, Any]
-) -> None:
+def test_positions_rates_and_steps_in_any_unit_agree(tmp_path: Path, angle: Array, options: dict[str, Any]) -> None:
     data = read(log(tmp_path, angle=angle), **options)
     assert odometry_error(data) < 1e-8
     kept, positions = data.trajectories[0].angles, options.get("wheel_unit") in ("rev", "deg", "ticks", None)
@@ -182,9 +180,7 @@ def test_a_recording_is_cut_into_equal_runs_and_the_robot_s_own_odometry_is_warn
         ({"wheel_columns": "angle", "steering_columns": 9}, r"column '9' is missing; found: t, angle, phi"),
     ],
 )
-def test_a_foreign_table_is_refused_with_the_options_that_describe_it(
-    tmp_path: Path, options: dict[str, Any], message: str
-) -> None:
+def test_a_foreign_table_is_refused_with_its_options(tmp_path: Path, options: dict[str, Any], message: str) -> None:
     unnamed = {"wheel_columns": None, "steering_columns": None, "wheel_unit": None}
     with pytest.raises(DataError, match=message) as caught:
         read(log(tmp_path), **(unnamed | options))

@@ -171,9 +171,7 @@ def test_without_a_log_angles_are_left_out_and_a_command_is_named_after_the_moti
         ("", "10.08,100,", "10.08,99,", r"does not hold the ticks of s1_run-01\.csv; .* log: false"),
     ],
 )
-def test_what_is_wrong_is_named_with_its_file_and_row(
-    tmp_path: Path, file: str, old: str, new: str, message: str
-) -> None:
+def test_what_is_wrong_is_named_with_file_and_row(tmp_path: Path, file: str, old: str, new: str, message: str) -> None:
     path = write_session(tmp_path) / f"s1{file}.csv"
     path.write_text(path.read_text().replace(old, new))
     with pytest.raises(DataError, match=rf"s1{file}\.csv[:,] {message}"):
@@ -231,9 +229,7 @@ def group(dataset: Dataset, name: str) -> list[Trajectory]:
     ],
     indirect=["dataset"],
 )
-def test_the_design_matrix_leaves_the_known_errors(
-    dataset: Dataset, name: str, runs: int, metres: float, degrees: float
-) -> None:
+def test_the_design_leaves_known_errors(dataset: Dataset, name: str, runs: int, metres: float, degrees: float) -> None:
     found = group(dataset, name)
     assert len(found) == runs
     errors = final_errors(dataset.robot.inverse_kinematic_matrix, found)
@@ -277,9 +273,7 @@ def test_the_design_matrix_is_that_of_the_authors(dataset: Dataset, expected: Ar
     ],
     indirect=["dataset"],
 )
-def test_what_was_chosen_is_said_and_nothing_else_looks_wrong(
-    dataset: Dataset, period: float, parts: tuple[str, ...]
-) -> None:
+def test_the_choice_is_said_and_nothing_looks_wrong(dataset: Dataset, period: float, parts: tuple[str, ...]) -> None:
     assert len(dataset.warnings) == bool(parts)
     for part in parts:
         assert part in dataset.warnings[0]

@@ -56,9 +56,7 @@ from omnibench.testing import ImporterConformance
 
 
 @FORMATS
-def test_every_format_gives_back_wheels_and_poses_exactly(
-    tmp_path: Path, write: Callable[[Path, Sequence[Sent]], Path]
-) -> None:
+def test_every_format_keeps_wheels_and_poses(tmp_path: Path, write: Callable[[Path, Sequence[Sent]], Path]) -> None:
     data = read(write(tmp_path / "drive", messages(DRIVE)))
     assert len(data.trajectories) == len(DRIVE.begins)
     assert data.warnings == ()
@@ -230,9 +228,7 @@ def test_several_candidates_are_listed(tmp_path: Path) -> None:
         (["gripper", "c", "b", "a", "a_steering"], [None, 2, 1, 0, None]),
     ],
 )
-def test_joints_are_recognised_by_usual_names_in_any_order(
-    tmp_path: Path, names: list[str], where: list[int | None]
-) -> None:
+def test_joints_with_usual_names_are_found_anywhere(tmp_path: Path, names: list[str], where: list[int | None]) -> None:
     def renamed(each: Sent) -> Sent:
         angles = each.content["position"]
         return changed(each, name=names, position=[7.0 if i is None else angles[i] for i in where])
@@ -396,9 +392,7 @@ def test_a_folder_of_bags_has_a_session_each(tmp_path: Path) -> None:
     first=st.floats(0, 0.5),
     period=st.floats(0.05, 2.0),
 )
-def test_pieces_between_rests_follow_one_another_and_hold_their_drives(
-    lengths: list[tuple[float, float]], first: float, period: float
-) -> None:
+def test_pieces_between_rests_hold_drives(lengths: list[tuple[float, float]], first: float, period: float) -> None:
     times, angles = moving(lengths)
     rests = find_rests(times, angles, 0.5, 0.025)
     assert len(rests) == len(lengths) + 1

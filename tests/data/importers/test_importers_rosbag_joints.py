@@ -215,9 +215,7 @@ def no_steering(each: Sent) -> Sent:
         (BOTH, {"steering_topic": "/robot/joint_state"}, "steering_topic: .*did you mean '/robot/joint_states'"),
     ],
 )
-def test_joints_that_are_not_measured_or_not_there_are_refused_with_the_options_that_choose_others(
-    tmp_path: Path, sent: list[Sent], options: dict[str, Any], message: str
-) -> None:
+def test_missing_joints_are_refused(tmp_path: Path, sent: list[Sent], options: dict[str, Any], message: str) -> None:
     with pytest.raises((ConfigError, DataError), match=message):
         read_steered(tmp_path, sent, **options)
 
@@ -373,9 +371,7 @@ def test_an_empty_topic_is_named(tmp_path: Path) -> None:
 
 
 @FORMATS
-def test_a_bag_that_was_cut_off_is_refused_in_one_line(
-    tmp_path: Path, write: Callable[[Path, Sequence[Sent]], Path]
-) -> None:
+def test_a_bag_cut_off_is_refused_in_one_line(tmp_path: Path, write: Callable[[Path, Sequence[Sent]], Path]) -> None:
     source = write(tmp_path / "drive", part(7))
     file = source if source.is_file() else max(source.iterdir(), key=lambda each: each.stat().st_size)
     content = file.read_bytes()
@@ -460,9 +456,7 @@ def test_odometry_is_no_reference_unless_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("late", [0, 7_000_000, 20_000_000])
 @pytest.mark.parametrize("integration", ["euler", "arc"])
-def test_odometry_that_the_robot_made_of_its_wheels_is_refused(
-    tmp_path: Path, late: int, integration: Integration
-) -> None:
+def test_odometry_that_the_robot_made_itself_is_refused(tmp_path: Path, late: int, integration: Integration) -> None:
     wrong = TRUTH * np.array([[1.1], [1.1], [0.9]])  # radii and distances that the driver was told
     log = WheelLog(
         (DRIVE.stamps[1:] - DRIVE.stamps[0]) / 1e9,

@@ -238,9 +238,7 @@ def test_a_malformed_scan_file_is_named(tmp_path: Path, changes: dict[str, Any],
         ("odometry.csv", None, "t,x,y,theta\n0.1,0,0,0\n", r"odometry\.csv: its times t are not those of wheels\.csv"),
     ],
 )
-def test_a_malformed_file_is_named_with_its_row(
-    tmp_path: Path, file: str, old: str | None, new: str, message: str
-) -> None:
+def test_a_broken_file_is_named_with_a_row(tmp_path: Path, file: str, old: str | None, new: str, message: str) -> None:
     path = write_trajectory(tmp_path / "t01") / file
     path.write_text(new if old is None else path.read_text().replace(old, new, 1))
     with pytest.raises(DataError, match=message):

@@ -102,9 +102,7 @@ def test_poses_that_no_tum_file_can_hold_are_refused(tmp_path: Path) -> None:
 @given(
     heading=st.floats(-math.pi + 1e-9, math.pi - 1e-9), length=st.floats(0.991, 1.009), sign=st.sampled_from([-1, 1])
 )
-def test_neither_sign_nor_a_length_that_is_nearly_one_changes_the_heading(
-    heading: float, length: float, sign: int
-) -> None:
+def test_neither_sign_nor_a_length_near_one_changes_the_heading(heading: float, length: float, sign: int) -> None:
     quaternion = sign * length * np.array([0.0, 0.0, math.sin(heading / 2), math.cos(heading / 2)])
     found = planar_headings(quaternion[None])
     assert found.headings[0] == pytest.approx(heading, abs=1e-12)
@@ -134,9 +132,7 @@ def drive(seed: int, longest: float) -> Array:
 
 
 @given(st.integers(0, 10**6), st.integers(8, 48), st.floats(0.01, 0.24), st.booleans(), st.floats(0, 1))
-def test_a_counter_of_any_bits_is_recognised_and_counted_on(
-    seed: int, bits: int, longest: float, signed: bool, start: float
-) -> None:
+def test_a_counter_of_any_bits_is_counted_on(seed: int, bits: int, longest: float, signed: bool, start: float) -> None:
     wrap = 2.0**bits
     counts = drive(seed, longest * wrap) + np.round(start * wrap)
     shown = counts % wrap - (wrap / 2 if signed else 0)

@@ -54,9 +54,7 @@ BOXES: dict[str, Callable[[Any], Box]] = {
 @pytest.mark.parametrize("integration", BOTH)
 @pytest.mark.parametrize("cost", ["final_pose", "trajectory"])
 @pytest.mark.parametrize("wheels", [3, 4])
-def test_runs_without_noise_give_the_hidden_matrix_on_the_span_that_was_driven(
-    wheels: Any, cost: str, integration: Any
-) -> None:
+def test_runs_without_noise_give_a_hidden_matrix_on_the_driven_span(wheels: Any, cost: str, integration: Any) -> None:
     robot = synthetic_robot(wheels)
     problem = make_problem(
         synthetic_trajectories(robot, integration), wheels=wheels, cost=cost, integration=integration

@@ -162,9 +162,7 @@ def test_nothing_that_is_kept_grows_with_the_sampling_rate() -> None:
     place=st.lists(st.floats(-1, 1), min_size=3, max_size=3),
     tolerance=st.sampled_from([1e-3, 1e-8, 1e-12]),
 )
-def test_an_expanded_exponential_is_right_to_the_bound(
-    angles: list[float], place: list[float], tolerance: float
-) -> None:
+def test_an_expanded_exponential_keeps_to_the_bound(angles: list[float], place: list[float], tolerance: float) -> None:
     z, d = np.array(angles), np.array(place)
     degree, left_out = degree_for(np.abs(z).sum(keepdims=True), np.ones(1), np.array([0]), tolerance, 3)
     basis = Basis.make(degree, np.ones(3, dtype=bool))

@@ -57,9 +57,7 @@ def dense(white: float, walk: float, bias: float, stamps: Array) -> Array:
 
 
 @given(noise=NOISES, stamps=STAMPS, seed=st.integers(0, 2**31))
-def test_whitened_residuals_have_the_chi_square_and_the_determinant_of_the_dense_covariance(
-    noise: Noise, stamps: Array, seed: int
-) -> None:
+def test_whitened_residuals_are_those_of_the_dense_covariance(noise: Noise, stamps: Array, seed: int) -> None:
     residuals = np.random.default_rng(seed).standard_normal((len(stamps), 3))
     whitener = Whitener(noise, stamps)
     position = dense(noise.pose_position, noise.walk_position, noise.bias_position, stamps)

@@ -225,9 +225,7 @@ class TestWarnings:
 class TestRecordings:
     """The Robotino's table recordings translate only; omni3 drives everything."""
 
-    def test_inspection_of_the_table_recordings_names_the_turn_and_omni3_leaves_nothing_open(
-        self, robotino: Dataset, omni3: Dataset
-    ) -> None:
+    def test_table_recordings_leave_the_turn_open_and_omni3_nothing(self, robotino: Dataset, omni3: Dataset) -> None:
         found = inspect_dataset(robotino)
         turning = found.findings[0]
         assert turning.startswith("these recordings hardly turn the robot: they drive the wheels along 1 + 2 + 3")

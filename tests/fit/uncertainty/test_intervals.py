@@ -298,9 +298,7 @@ def fitted(columns: Sequence[Array], values: Sequence[Array], commands: Sequence
 
 @pytest.mark.parametrize("commands", [[None] * 8, ["turn", *"aabbccd"]])
 @pytest.mark.parametrize("weak", [0.0, 0.05])
-def test_a_direction_that_one_run_alone_determines_has_the_variance_of_the_noise(
-    commands: Sequence[str | None], weak: float
-) -> None:
+def test_a_direction_of_one_run_alone_has_the_variance_of_noise(commands: Sequence[str | None], weak: float) -> None:
     """Unit noise: the mean of the stated variances is that of least squares, with and without a bounded correction."""
     rng = np.random.default_rng(7)
     columns = [np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 1.0]])] + [np.array([[1.0, 0.0], [1.0, weak]])] * 7

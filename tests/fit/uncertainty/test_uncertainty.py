@@ -179,9 +179,7 @@ class TestCovariance:
         assert untold == ["distance_a", "distance_b", "distance_c"]
 
     @pytest.mark.parametrize(("freedom", "quantile"), [(None, 1.960), (np.full(9, 4.0), 2.776)])
-    def test_the_calibrator_s_own_covariance_and_degrees_of_freedom_are_taken(
-        self, freedom: Array | None, quantile: float
-    ) -> None:
+    def test_a_calibrator_s_own_covariance_and_freedom_are_taken(self, freedom: Array | None, quantile: float) -> None:
         problem, deviations = make_problem(driven(FLOWER)), np.sqrt(np.arange(1.0, 10.0)) * 1e-4
         own = replace(solved(problem), covariance=np.diag(deviations**2), degrees_of_freedom=freedom, noise=NOISE)
         uncertainty = uncertainty_of(problem, own)
@@ -236,9 +234,7 @@ class TestBasis:
             ([replace(run, rates=0 * run.rates) for run in driven(FLOWER)], "final_pose", "free"),
         ],
     )
-    def test_too_few_runs_without_error_or_motion_have_no_covariance(
-        self, runs: list[Trajectory], cost: str, reason: str
-    ) -> None:
+    def test_few_still_or_exact_runs_have_no_covariance(self, runs: list[Trajectory], cost: str, reason: str) -> None:
         with pytest.raises(NoCovarianceError, match=reason):
             found(runs, cost=cost)
 

@@ -120,9 +120,7 @@ def test_an_effect_that_another_matrix_absorbs_says_how_it_is_measured(name: str
 
 @pytest.mark.parametrize("name", EVERY_MOTION)
 @given(data=st.data(), seed=st.integers(0, 2**32 - 1), factor=st.floats(-3, 3))
-def test_a_correction_is_linear_in_its_parameters_and_vanishes_with_them(
-    name: str, data: st.DataObject, seed: int, factor: float
-) -> None:
+def test_corrections_are_linear_and_vanish_at_zero(name: str, data: st.DataObject, seed: int, factor: float) -> None:
     chosen = EVERY[data.draw(st.sampled_from([robot for applied, robot in APPLIED if applied == name]))]
     effect, log = effects.create(name), a_drive(seed, 12, chosen)
     given_signals = signals_of(log, chosen, chosen.inverse_kinematic_matrix, 0.02, effect.needs)
@@ -257,9 +255,7 @@ def shift(log: WheelLog, *terms: Term) -> Array:
     ],
     ids=lambda value: value.name if isinstance(value, Term) else "",
 )
-def test_a_late_reference_moves_a_steady_run_back_by_its_way(
-    late: Term, twist: list[float], expected: list[float]
-) -> None:
+def test_a_late_reference_moves_a_steady_run_back(late: Term, twist: list[float], expected: list[float]) -> None:
     np.testing.assert_allclose(shift(constant(twist, 5.0), late), expected, rtol=0, atol=1e-12)
 
 

@@ -165,9 +165,7 @@ def test_the_course_is_heading_and_direction_of_travel() -> None:
 
 
 @pytest.mark.parametrize(("name", "knots"), [("smooth_wheel_rate", 8), ("smooth_common_rate", 33)])
-def test_a_function_of_the_wheel_rate_is_linear_between_knots_held_beyond_and_nothing_at_rest(
-    name: str, knots: int
-) -> None:
+def test_a_function_of_the_wheel_rate_is_linear_between_knots_held_beyond_and_0_at_rest(name: str, knots: int) -> None:
     each = ("_a", "_b", "_c") if name == "smooth_wheel_rate" else ("",)
     spread = {f"change_{knot}{wheel}": 0.01 * (2 * knot / (knots - 1) - 1) for knot in range(knots) for wheel in each}
     found = added(name, signals(rates=np.array([[1.3, -50.0, 5e-4]])), top=2.0, **spread)

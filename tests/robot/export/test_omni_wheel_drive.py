@@ -96,9 +96,7 @@ class TestRos2Controllers:
         distance=st.floats(0.05, 1),
         count=st.integers(3, 8),
     )
-    def test_a_matrix_of_the_controller_gives_its_parameters_back(
-        self, offset: float, radius: float, distance: float, count: int
-    ) -> None:
+    def test_a_matrix_gives_parameters_back(self, offset: float, radius: float, distance: float, count: int) -> None:
         angles = math.degrees(offset) + 360 * np.arange(count) / count
         machine = robot(*angles, radius=radius, distance=distance)
         fitted = closest_omni_wheel_drive(machine, machine.inverse_kinematic_matrix)

@@ -223,9 +223,7 @@ def test_what_is_said_to_remain_is_what_the_controller_computes_wrongly(name: st
     separation=st.floats(0.05, 2),
     wheels=st.sampled_from([DIFF, SKID]),
 )
-def test_the_three_multipliers_give_two_radii_and_a_separation_back(
-    left: float, right: float, separation: float, wheels: Robot
-) -> None:
+def test_multipliers_give_radii_and_track_back(left: float, right: float, separation: float, wheels: Robot) -> None:
     on_left = np.array([(wheel.y or 0) > 0 for wheel in wheels.wheels])
     radii = np.where(on_left, left, right) * 2 / len(on_left)
     matrix = np.array([radii / 2, 0 * radii, radii / separation * np.where(on_left, -1, 1)])

@@ -117,9 +117,7 @@ def test_a_trapezoid_rises_with_the_limit_of_what_is_slower_and_an_s_curve_takes
     st.one_of(st.just(math.inf), st.floats(1, 500)),
     st.lists(st.floats(1e-3, 0.5), min_size=1, max_size=12),
 )
-def test_phases_of_a_set_point_sent_to_and_fro_join_and_stay_between_rest_and_full_speed(
-    slope: float, jerk: float, pauses: list[float]
-) -> None:
+def test_phases_of_set_points_join_between_rest_and_full_speed(slope: float, jerk: float, pauses: list[float]) -> None:
     course, time = SetPoint(SlewLimits(slope, jerk)), 0.0
     for number, pause in enumerate(pauses):
         course = course.towards((number + 1) % 2, time)
@@ -178,9 +176,7 @@ def test_a_planner_that_loses_commands_goes_on_until_the_distance_is_covered(
 
 
 @given(travels, profiles, st.floats(0.01, 3))
-def test_a_stalled_computer_leaves_the_robot_braking_within_half_a_second(
-    command: Command, profile: MotionProfile, stalls_at: float
-) -> None:
+def test_a_stalled_computer_leaves_a_braking_robot(command: Command, profile: MotionProfile, stalls_at: float) -> None:
     driven = motion(command, 50.0, profile, CommandLink(stalls_at=stalls_at))
     (stop,) = driven.stopped_by_watchdog
     assert stop[0] <= stalls_at + 0.5

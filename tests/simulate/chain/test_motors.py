@@ -197,9 +197,7 @@ def test_a_wheel_at_rest_moves_only_when_the_torque_beats_static_friction(motor:
 
 
 @given(rates, st.floats(0.3, 1), st.floats(0.05, 0.3), st.floats(0, 0.5))
-def test_friction_brings_a_wheel_to_rest_and_never_turns_it_round(
-    rate: float, static: float, coulomb: float, viscous: float
-) -> None:
+def test_friction_stops_a_wheel_and_never_turns_it(rate: float, static: float, coulomb: float, viscous: float) -> None:
     motor = Motor(static_friction=static, coulomb_friction=coulomb, viscous_friction=viscous)
     run = drive((rate, 0.5), (0.0, 1.0), motor=motor)
     braked = 10 * (np.flatnonzero(run.voltages[:, 0])[-1] + 2)  # ms; 10 ms later no current is left of the voltage
@@ -257,9 +255,7 @@ def test_every_run_starts_from_rest_whatever_came_before_and_has_its_true_angles
 
 
 @given(st.floats(0.05, 4), st.floats(-math.pi, math.pi), st.floats(-5, 5))
-def test_the_speed_that_is_proposed_fits_and_little_more_does_not(
-    speed: float, direction: float, turn_rate: float
-) -> None:
+def test_the_proposed_speed_fits_and_little_more_does_not(speed: float, direction: float, turn_rate: float) -> None:
     command = Command(speed, direction, turn_rate)
     try:
         check_reach(APR_02, [command], Motor())

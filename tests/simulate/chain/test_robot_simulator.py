@@ -85,9 +85,7 @@ class TestWhatIsRecorded:
         for before, after in pairwise(runs):
             np.testing.assert_allclose(after.angles[0] - 0.01 * after.rates[0], before.angles[-1], atol=1e-9)
 
-    def test_targets_are_the_commands_by_the_design_matrix_and_measured_rates_whole_ticks_that_follow(
-        self, simulation: Simulation
-    ) -> None:
+    def test_targets_are_commands_by_the_design_and_measured_rates_whole_ticks(self, simulation: Simulation) -> None:
         tick = 2 * np.pi / 12800
         for run in simulation.dataset.trajectories:
             ticks = run.rates * 0.01 / tick
@@ -107,9 +105,7 @@ class TestWhatIsRecorded:
                 pose = pose + 0.01 * np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ design @ rates
                 np.testing.assert_allclose(run.odometry[number], pose, atol=1e-9)
 
-    def test_commands_are_sent_every_300_ms_and_the_last_is_valid_until_the_way_is_driven(
-        self, simulation: Simulation
-    ) -> None:
+    def test_commands_are_sent_every_300_ms_and_the_last_is_valid_to_the_end(self, simulation: Simulation) -> None:
         for run in simulation.dataset.trajectories:
             times, *command, validity = run.sent.T
             np.testing.assert_allclose(times, 0.3 * np.arange(len(times)), atol=1e-12)
