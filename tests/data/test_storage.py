@@ -299,13 +299,7 @@ def assert_refused(folder: Path, place: str, reason: str, fmt: Format, most_in_m
 @pytest.mark.parametrize(("fmt", "most_in_memory"), [("csv", 100), ("parquet", 100), ("parquet", 0)])
 @pytest.mark.parametrize(("change", "place", "reason"), REFUSED)
 def test_refused_in_one_line_that_names_file_row_and_reason(
-    good: dict[Format, Path],
-    tmp_path: Path,
-    change: Change,
-    place: str,
-    reason: str,
-    fmt: Format,
-    most_in_memory: int,
+    good: dict[Format, Path], tmp_path: Path, change: Change, place: str, reason: str, fmt: Format, most_in_memory: int
 ) -> None:
     folder = tmp_path / "dataset"
     shutil.copytree(good[fmt], folder)

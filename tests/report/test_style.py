@@ -40,10 +40,7 @@ def test_up_to_thirty_entries_look_different(wanted: list[str | None]) -> None:
     assert not {REFERENCE, THEORETICAL} & {colour for colour, _ in styles.values()}
 
 
-@given(
-    st.floats(min_value=-12, max_value=6),
-    st.floats(min_value=0, max_value=14),
-)
+@given(st.floats(min_value=-12, max_value=6), st.floats(min_value=0, max_value=14))
 def test_a_logarithmic_axis_holds_its_data_and_has_labels(low: float, decades: float) -> None:
     figure = plot()
     logarithmic(figure, "y", 10**low, 10 ** (low + decades))

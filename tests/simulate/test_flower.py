@@ -220,11 +220,7 @@ def test_listed_commands_are_driven_as_long_as_often_and_from_where_each_says() 
     given = small(commands={"listed": LISTED, "ramp": 0.3}, noise=QUIET)
     runs = simulate_dataset(given).dataset.trajectories
     driven = sorted((run.command, float(run.times[-1]), round(math.degrees(run.start[2]))) for run in runs)
-    assert driven == [
-        *[("v0.1_a0_w0_t6", 6.0, 0)] * 2,
-        ("v0.1_a0_w0_t9_h90", 9.0, 90),
-        *[("v0_a0_w0.5", 4.0, 0)] * 3,
-    ]
+    assert driven == [*[("v0.1_a0_w0_t6", 6.0, 0)] * 2, ("v0.1_a0_w0_t9_h90", 9.0, 90), *[("v0_a0_w0.5", 4.0, 0)] * 3]
     assert given.runs == len(runs)
     (northward,) = (run for run in runs if run.command == "v0.1_a0_w0_t9_h90")
     assert northward.poses[-1, 1] > 0.8 > 0.1 > abs(northward.poses[-1, 0])
@@ -361,9 +357,7 @@ def test_a_cars_rear_wheels_turn_at_different_rates_in_a_curve() -> None:
         np.testing.assert_allclose(turn, run.omega, atol=1e-9)
 
 
-def test_an_effect_on_the_steering_angle_hides_in_the_motion_and_not_in_what_is_measured(
-    misread_steering: str,
-) -> None:
+def test_an_effect_on_the_steering_angle_hides_in_the_motion_and_not_in_what_is_measured(misread_steering: str) -> None:
     hidden = [{"name": misread_steering, "parameters": {"g": 0.05}}]
     plain, made = (
         simulate_dataset(experiment("tricycle", truth={"tolerances": {}, "effects": effect})) for effect in ([], hidden)

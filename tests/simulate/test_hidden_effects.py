@@ -162,11 +162,7 @@ class TestRamps:
             heading = published_matrix(PUBLISHED)[2] @ wheel_equations(few().robot.wheels)[:, 2] * (run.omega or 0) * 2
             assert run.poses[-1, 2] == pytest.approx(heading)
 
-    @given(
-        st.floats(0.05, 2.0),
-        st.floats(0.5, 5.0),
-        st.lists(st.floats(1e-3, 0.3), min_size=1, max_size=40),
-    )
+    @given(st.floats(0.05, 2.0), st.floats(0.5, 5.0), st.lists(st.floats(1e-3, 0.3), min_size=1, max_size=40))
     def test_samples_of_any_length_add_up_to_the_same_way(self, ramp: float, full: float, lengths: list[float]) -> None:
         end = 2 * ramp + full
         times = np.append(np.cumsum(lengths)[np.cumsum(lengths) < end - 1e-3], end)

@@ -129,11 +129,7 @@ def test_the_design_drives_the_recorded_path(tmp_path: Path) -> None:
 def test_every_second_run_of_a_command_validates_when_there_is_one_group(tmp_path: Path) -> None:
     write_session(tmp_path, runs=3)
     data = import_dataset("optiodom", tmp_path)
-    assert [(run.split, run.repetition) for run in data.trajectories] == [
-        ("train", 1),
-        ("validation", 2),
-        ("train", 3),
-    ]
+    assert [(run.split, run.repetition) for run in data.trajectories] == [("train", 1), ("validation", 2), ("train", 3)]
 
 
 def test_groups_that_neither_side_names_are_left_out_and_one_on_both_is_refused(tmp_path: Path) -> None:
@@ -251,10 +247,7 @@ def test_a_free_matrix_of_the_mecanum_base_is_far_better(omni4: Dataset) -> None
     [
         ("diff", [[0.021, 0.021], [0, 0], [0.21, -0.21]]),
         ("tricyc", [[0.0325, 0], [0, 0], [0, 0.0325 / 0.15]]),
-        (
-            "omni4",
-            0.03 / 4 * np.array([[1, 1, 1, 1], [-1, 1, 1, -1], np.array([-1, 1, -1, 1]) / 0.2]),
-        ),
+        ("omni4", 0.03 / 4 * np.array([[1, 1, 1, 1], [-1, 1, 1, -1], np.array([-1, 1, -1, 1]) / 0.2])),
     ],
     indirect=["dataset"],
 )

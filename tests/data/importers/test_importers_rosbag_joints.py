@@ -307,11 +307,7 @@ def test_repeated_messages_are_left_out_and_counted(tmp_path: Path) -> None:
         (SLAM, lambda each: changed(each, header=header(0)), "without a header stamp"),
         (SLAM, lambda each: changed(each, pose={"pose": pose((math.inf, 0, 0))}), "without a finite position"),
         (SLAM, lambda each: changed(each, pose={}), "with a wrong orientation, as quaternion has length 0"),
-        (
-            SLAM,
-            lambda each: changed(each, pose={"pose": {"orientation": TILTED}}),
-            "with a wrong orientation, .*90 ",
-        ),
+        (SLAM, lambda each: changed(each, pose={"pose": {"orientation": TILTED}}), "with a wrong orientation, .*90 "),
     ],
 )
 def test_useless_messages_are_left_out_and_too_many_are_refused(

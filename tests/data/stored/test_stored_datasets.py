@@ -280,9 +280,7 @@ class Sampled:
     times: np.ndarray
 
 
-def test_the_usual_period_of_many_samples_is_that_of_the_run_in_their_middle(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_usual_period_of_many_samples_is_that_of_the_run_in_their_middle(monkeypatch: pytest.MonkeyPatch) -> None:
     runs = [Sampled(np.arange(1, 1 + count) * period) for count, period in ((400, 0.1), (900, 0.01), (600, 0.02))]
     monkeypatch.setattr(periods, "MOST_IN_MEMORY", 0)
     assert median_period(runs) == pytest.approx(0.02)

@@ -77,9 +77,7 @@ class TestGenetic:
         assert averages[-1] <= 1e-6 < averages[:-1].min()
         assert averages[0] > 1e-4
 
-    def test_the_population_is_200_above_five_variables_and_50_below_and_the_elite_not_evaluated_again(
-        self,
-    ) -> None:
+    def test_the_population_is_200_above_five_variables_and_50_below_and_the_elite_not_evaluated_again(self) -> None:
         design = synthetic_robot().inverse_kinematic_matrix
         width = np.zeros((3, 3))
         width[2] = 0.02

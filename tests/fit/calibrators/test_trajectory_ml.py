@@ -62,13 +62,7 @@ def with_poses(problem: CalibrationProblem, change: Callable[[Trajectory], Array
 def changed(problem: CalibrationProblem, runs: list[Trajectory]) -> CalibrationProblem:
     """The same problem on other runs."""
     return CalibrationProblem(
-        problem.robot,
-        runs,
-        problem.objective,
-        problem.parameterisation,
-        integration="arc",
-        budget=Budget(),
-        seed=0,
+        problem.robot, runs, problem.objective, problem.parameterisation, integration="arc", budget=Budget(), seed=0
     )
 
 

@@ -95,10 +95,7 @@ BY_HAND: dict[str, tuple[dict[str, float], list[float]]] = {
     "quadratic_rotation_slip": ({"k": 0.1}, [0.0, 0.0, -0.1 * W * W]),
     "heading_drift": ({"b": 0.005}, [0.0, 0.0, 0.005]),
     "body_velocity_bias": ({"bx": 0.005, "by": -0.003}, [0.005, -0.003, 0.0]),
-    "start_transient": (
-        {"k": 0.2, "length": 0.05},
-        [-0.2 * VX * math.exp(-2), -0.2 * VY * math.exp(-2), 0.0],
-    ),
+    "start_transient": ({"k": 0.2, "length": 0.05}, [-0.2 * VX * math.exp(-2), -0.2 * VY * math.exp(-2), 0.0]),
     "floor_drift": ({"dx": 0.02, "dy": -0.01}, [0.02 * SPEED, -0.01 * SPEED]),
 }
 

@@ -87,10 +87,7 @@ def test_the_compiled_step_equals_the_stream(tmp_path: Path, integration: Integr
     np.testing.assert_allclose(poses, expected, rtol=0, atol=1e-12)
 
 
-STEERING = [
-    {"name": "steering_gain", "parameters": {"g": 4.8}},
-    {"name": "steering_offset", "parameters": {"c": 0.02}},
-]
+STEERING = [{"name": "steering_gain", "parameters": {"g": 4.8}}, {"name": "steering_offset", "parameters": {"c": 0.02}}]
 
 
 @needs_compiler

@@ -91,10 +91,7 @@ class TestRos2Controllers:
         np.testing.assert_allclose(closest_omni_wheel_drive(machine, matrix).matrix, matrix, atol=1e-12)
 
     @given(
-        offset=st.floats(-3.1, 3.1),
-        radius=st.floats(0.01, 0.5),
-        distance=st.floats(0.05, 1),
-        count=st.integers(3, 8),
+        offset=st.floats(-3.1, 3.1), radius=st.floats(0.01, 0.5), distance=st.floats(0.05, 1), count=st.integers(3, 8)
     )
     def test_a_matrix_gives_parameters_back(self, offset: float, radius: float, distance: float, count: int) -> None:
         angles = math.degrees(offset) + 360 * np.arange(count) / count

@@ -68,11 +68,7 @@ def mecanum_drive(values: dict[str, Any], joints: Rates) -> Array:
     cosine, sine = math.cos(-theta), math.sin(-theta)
     lever_x, lever_y = cosine * -x - sine * -y, sine * -x + cosine * -y
     return np.column_stack(
-        [
-            cosine * along_x - sine * along_y + lever_y * turn,
-            sine * along_x + cosine * along_y - lever_x * turn,
-            turn,
-        ]
+        [cosine * along_x - sine * along_y + lever_y * turn, sine * along_x + cosine * along_y - lever_x * turn, turn]
     )
 
 
@@ -168,10 +164,7 @@ def held_matrix(name: str) -> Array:
     """A matrix (3, M) of the robot's centre that its controller holds: that of another robot of the kind."""
     robots = {
         "diff": (fixed("right", 0, -0.21, radius=0.079), fixed("left", 0, 0.21, radius=0.083)),
-        "odd": (
-            fixed("l", -0.1, 0.27, radius=0.083),
-            fixed("r", -0.1, -0.17, radius=0.079, angle=math.pi),
-        ),
+        "odd": (fixed("l", -0.1, 0.27, radius=0.083), fixed("r", -0.1, -0.17, radius=0.079, angle=math.pi)),
         "skid": tuple(wheel.model_copy(update={"y": 1.6 * (wheel.y or 0)}) for wheel in SKID.wheels),
         "mecanum": tuple(mecanum(w.name, 1.1 * (w.x or 0), 0.9 * (w.y or 0)) for w in MECANUM.wheels),
         "tricycle": (steered("front", 0.83, 0), *TRICYCLE.wheels[1:]),

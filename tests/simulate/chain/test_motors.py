@@ -39,10 +39,7 @@ motors = st.builds(
 
 
 def drive(
-    *pieces: tuple[float, float],
-    start: float = 0.0,
-    motor: Motor | None = None,
-    controller: Controller | None = None,
+    *pieces: tuple[float, float], start: float = 0.0, motor: Motor | None = None, controller: Controller | None = None
 ) -> DrivenRun:
     """One wheel that is told rates, each for so many s."""
     told = np.concatenate([np.full(round(seconds / PERIOD), rate) for rate, seconds in pieces])
