@@ -332,7 +332,7 @@ class TestRosbagWithScansConforms(ImporterConformance):
 FIX, IMU = "/gps/fix", "/imu/data"
 NAVSAT, INERTIAL = "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Imu"
 LATITUDE, LONGITUDE, HEIGHT = 41.617, 0.628, 160.0
-WHEELS_ONLY = [each for each in messages(DRIVE) if each.topic != SLAM]
+WITHOUT_POSES = [each for each in messages(DRIVE) if each.topic != SLAM]
 
 
 def degrees_at(places: Array) -> tuple[Array, Array]:
@@ -398,7 +398,7 @@ def at(run: Trajectory) -> Array:
 
 
 def test_fixes_are_positions_east_and_north_of_the_first(tmp_path: Path) -> None:
-    data = read(write_mcap(tmp_path / "drive", WHEELS_ONLY + fixes()))
+    data = read(write_mcap(tmp_path / "drive", WITHOUT_POSES + fixes()))
     assert len(data.trajectories) == 12
     for run in data.trajectories:
         assert not run.has_poses
@@ -408,7 +408,7 @@ def test_fixes_are_positions_east_and_north_of_the_first(tmp_path: Path) -> None
 
 
 def test_one_fix_a_period_is_taken(tmp_path: Path) -> None:
-    source = write_mcap(tmp_path / "drive", WHEELS_ONLY + fixes())
+    source = write_mcap(tmp_path / "drive", WITHOUT_POSES + fixes())
     each, every = (read(source, reference_period=period).trajectories[0].references for period in (1.0, 0.25))
     assert (np.diff(each.t1) > 0.7).all()
     assert len(every) > 3 * len(each)
@@ -417,7 +417,7 @@ def test_one_fix_a_period_is_taken(tmp_path: Path) -> None:
 def test_messages_without_a_fix_are_left_out(tmp_path: Path) -> None:
     sent = fixes()
     lost = [changed(each, status={"status": -1, "service": 1}, latitude=0.0) for each in sent[5:25]]
-    data = read(write_mcap(tmp_path / "drive", WHEELS_ONLY + sent[:5] + lost + sent[25:]))
+    data = read(write_mcap(tmp_path / "drive", WITHOUT_POSES + sent[:5] + lost + sent[25:]))
     assert any("20 without a fix (status -1)" in warning for warning in data.warnings)
     assert all(np.abs(run.references.values).max() < 10 for run in data.trajectories if run.references is not None)
 
@@ -432,7 +432,7 @@ def test_messages_without_a_fix_are_left_out(tmp_path: Path) -> None:
 def test_sensors_without_a_covariance_need_the_option(
     tmp_path: Path, sent: list[Sent], asked: str, option: dict[str, Any], sigma: float
 ) -> None:
-    source = write_mcap(tmp_path / "drive", WHEELS_ONLY + sent)
+    source = write_mcap(tmp_path / "drive", WITHOUT_POSES + sent)
     with pytest.raises(DataError, match=asked):
         read(source)
     references = read(source, **option).trajectories[0].references
@@ -440,7 +440,7 @@ def test_sensors_without_a_covariance_need_the_option(
 
 
 def test_an_orientation_is_a_heading_with_its_covariance(tmp_path: Path) -> None:
-    data = read(write_mcap(tmp_path / "drive", WHEELS_ONLY + compass()))
+    data = read(write_mcap(tmp_path / "drive", WITHOUT_POSES + compass()))
     for run in data.trajectories:
         assert set(run.references.kinds) == {"heading"}
         assert run.references.fixed_frame.all()
@@ -451,7 +451,7 @@ def test_an_orientation_is_a_heading_with_its_covariance(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("offset", [pytest.param(0.0, marks=pytest.mark.slow), 0.02])
 def test_a_gyro_gives_turned_angles_without_its_offset_at_rest(tmp_path: Path, offset: float) -> None:
-    data = read(write_rosbag2(tmp_path / "drive", WHEELS_ONLY + gyro(offset)), gyro_noise_deg=0.2)
+    data = read(write_rosbag2(tmp_path / "drive", WITHOUT_POSES + gyro(offset)), gyro_noise_deg=0.2)
     times = (DRIVE.pose_stamps - EPOCH) / 1e9
     for run in data.trajectories:
         assert set(run.references.kinds) == {"turn"}
@@ -466,7 +466,7 @@ def test_a_gyro_gives_turned_angles_without_its_offset_at_rest(tmp_path: Path, o
 
 
 def test_a_gyro_that_never_rests_needs_the_size_of_its_offset(tmp_path: Path) -> None:
-    sent = part(4.0, WHEELS_ONLY + gyro(0.0))
+    sent = part(4.0, WITHOUT_POSES + gyro(0.0))
     source = write_mcap(tmp_path / "drive", sent)
     options = {"least_rest": 100.0, "cut": "none"}
     with pytest.raises(DataError, match=r"never rests.*--set gyro_offset_deg=0\.5"):
@@ -476,7 +476,7 @@ def test_a_gyro_that_never_rests_needs_the_size_of_its_offset(tmp_path: Path) ->
 
 
 def test_a_sensor_mounted_upside_down_is_turned_by_the_signs(tmp_path: Path) -> None:
-    source = write_mcap(tmp_path / "drive", part(20.0, WHEELS_ONLY + gyro(0.0)))
+    source = write_mcap(tmp_path / "drive", part(20.0, WITHOUT_POSES + gyro(0.0)))
     upright, turned = (read(source, **options).trajectories for options in ({}, {"pose_signs": (1, 1, -1)}))
     for one, other in zip(upright, turned, strict=True):
         assert (one.references.values[:, 0] == -other.references.values[:, 0]).all()
@@ -491,21 +491,21 @@ def test_sensors_count_beside_poses_only_where_they_are_named(tmp_path: Path) ->
 
 
 def test_a_bag_with_fixes_and_a_gyro_calibrates_to_the_truth(tmp_path: Path) -> None:
-    data = read(write_mcap(tmp_path / "drive", WHEELS_ONLY + fixes() + gyro(0.005)), validation=("012",))
+    data = read(write_mcap(tmp_path / "drive", WITHOUT_POSES + fixes() + gyro(0.005)), validation=("012",))
     matrix = calibrate(data).calibration.matrix
     error = np.abs(matrix[2] / TRUTH[2] - 1).max()
     assert error < np.abs(ROBOT.inverse_kinematic_matrix[2] / TRUTH[2] - 1).max()
 
 
 def test_references_that_are_not_there_or_several_are_asked_for(tmp_path: Path) -> None:
-    source = write_mcap(tmp_path / "drive", part(10.0, WHEELS_ONLY + fixes()))
+    source = write_mcap(tmp_path / "drive", part(10.0, WITHOUT_POSES + fixes()))
     with pytest.raises(ConfigError, match="did you mean '/gps/fix'"):
         read(source, references=("/gps/fixs",))
     others = [Sent("/gps2/fix", each.kind, each.content, each.logged) for each in fixes()]
     with pytest.raises(ConfigError, match=r"--set references=\[/gps/fix\]"):
-        read(write_mcap(tmp_path / "two", WHEELS_ONLY + fixes() + others))
+        read(write_mcap(tmp_path / "two", WITHOUT_POSES + fixes() + others))
     with pytest.raises(DataError, match=r"NavSatFix or Imu"):
-        read(write_mcap(tmp_path / "none", part(10.0, WHEELS_ONLY)))
+        read(write_mcap(tmp_path / "none", part(10.0, WITHOUT_POSES)))
 
 
 def test_the_plane_keeps_distances_and_directions_near_its_origin() -> None:
