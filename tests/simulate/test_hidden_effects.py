@@ -22,17 +22,10 @@ from omnibench.robot.calibration import EffectTerm
 from omnibench.robot.kinematics import Array, Mount, Robot, Wheel, moved_to, published_matrix, wheel_equations
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Path
+from omnibench.simulate import mechanics
 from omnibench.simulate.commands import Command, Variation
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.flower import commanded_rates, true_steering
-from omnibench.simulate.mechanics import (
-    TrueMotion,
-    WheelContacts,
-    body_truth,
-    lost_by_light_wheels,
-    steering_truth,
-    turned_by_steering,
-)
 from omnibench.simulate.simulate import simulate_dataset
 from omnibench.simulate.truth import Simulation
 
@@ -268,7 +261,7 @@ def test_an_effect_of_another_kind_of_robot_is_refused() -> None:
 
 
 def of_steering(name: str, ends: list[float], duration: float = 0.1, **values: float) -> Array:
-    return steering_truth(name, values, np.array(ends)[:, None], np.full(len(ends), duration))[:, 0]
+    return mechanics.steering_truth(name, values, np.array(ends)[:, None], np.full(len(ends), duration))[:, 0]
 
 
 def test_a_flank_of_the_gear_pushes_the_wheel_and_the_other_one_comes_after_the_play() -> None:
@@ -287,9 +280,9 @@ def test_a_wheel_follows_a_ramp_late_by_the_time_constant_and_comes_to_rest_expo
 
 def test_a_module_turns_its_own_wheel_only() -> None:
     ends = np.array([[0.0, 0.0, 0.0, 0.0], [0.1, 0.0, -0.2, 0.0]])
-    found = turned_by_steering({"k": 0.5}, SWERVE.wheels, ends, np.array([0.1, 0.1]))
+    found = mechanics.turned_by_steering({"k": 0.5}, SWERVE.wheels, ends, np.array([0.1, 0.1]))
     np.testing.assert_allclose(found, [[0, 0, 0, 0], [0.5, 0, -1.0, 0]])
-    alone = turned_by_steering({"k": 0.5}, TRICYCLE.wheels, ends[:, :1], np.array([0.1, 0.1]))
+    alone = mechanics.turned_by_steering({"k": 0.5}, TRICYCLE.wheels, ends[:, :1], np.array([0.1, 0.1]))
     np.testing.assert_allclose(alone, [[0.0], [0.5]])
 
 
@@ -297,7 +290,7 @@ def test_a_robot_on_a_circle_is_accelerated_towards_its_centre() -> None:
     twists = np.tile([0.5, 0.0, 1.0], (4000, 1))
     values = {f"k_{name}": 0.1 for name in SWERVE.wheel_names}
     steering = np.tile([0.0, math.pi / 2, math.pi, 0.0], (4000, 1))
-    lost = lost_by_light_wheels(values, SWERVE.wheels, steering, twists, np.full(4000, 0.001))
+    lost = mechanics.lost_by_light_wheels(values, SWERVE.wheels, steering, twists, np.full(4000, 0.001))
     np.testing.assert_allclose(lost[-1], [0, 0.1 * 0.5 / 0.05, 0, 0], atol=1e-3)
 
 
@@ -306,7 +299,7 @@ def test_a_robot_on_a_circle_is_accelerated_towards_its_centre() -> None:
 def test_a_caster_hands_on_its_whole_swing_when_the_robot_turns_back(turn: float) -> None:
     ahead, back = np.tile([0.3, 0.0, turn], (400, 1)), np.tile([-0.3, 0.0, turn], (2000, 1))
     twists = np.vstack([ahead, back])
-    added = body_truth("caster_pull", {"k": 0.01}, DIFFERENTIAL, twists, np.full(2400, 0.005))[:, 2]
+    added = mechanics.body_truth("caster_pull", {"k": 0.01}, DIFFERENTIAL, twists, np.full(2400, 0.005))[:, 2]
     swung = (added[400:] - added[399]).sum() * 0.005
     # From trailing behind one course it goes to trail behind the other, by the side on which the turn lies.
     lag = math.asin(0.05 * turn / math.hypot(0.3, 0.15 * turn))
@@ -382,7 +375,7 @@ rates_of_wheels = st.floats(-10, 10).filter(lambda rate: abs(rate) > 0.1)
 
 @pytest.mark.parametrize("design", [*map(robot, NAMES), APR_02, REAR], ids=lambda design: design.name)
 def test_wheels_as_designed_move_the_robot_by_the_design_matrix(design: Robot) -> None:
-    matrix = WheelContacts(design, design.wheels, (), design.mount).matrix
+    matrix = mechanics.WheelContacts(design, design.wheels, (), design.mount).matrix
     np.testing.assert_allclose(matrix, design.inverse_kinematic_matrix, atol=1e-9)
 
 
@@ -390,7 +383,7 @@ def test_wheels_as_designed_move_the_robot_by_the_design_matrix(design: Robot) -
 def test_no_wheel_of_a_tricycle_ever_slides(rate: float, angle: float, aside: float, offset: float) -> None:
     design = robot("tricycle")
     front, *rear = design.wheels
-    contacts = WheelContacts(design, [front.model_copy(update={"y": aside}), *rear], [offset])
+    contacts = mechanics.WheelContacts(design, [front.model_copy(update={"y": aside}), *rear], [offset])
     vx, vy, turn = contacts.twists(np.array([[rate]]), np.array([[angle]]))[0]
     assert vy == pytest.approx(0, abs=1e-12)
     over_front = complex(vx - aside * turn, 0.6 * turn)
@@ -401,14 +394,14 @@ def test_no_wheel_of_a_tricycle_ever_slides(rate: float, angle: float, aside: fl
 def test_lateral_friction_widens_the_track_of_a_skid_steered_robot(friction: float) -> None:
     design = robot("skid")
     rates = np.array([[-1.0, 1.0, -1.0, 1.0]])  # on the spot, at 0.1 m/s on each side
-    turn = WheelContacts(design, design.wheels, lateral_friction=friction).twists(rates, None)[0, 2]
+    turn = mechanics.WheelContacts(design, design.wheels, lateral_friction=friction).twists(rates, None)[0, 2]
     assert turn == pytest.approx(0.1 / (0.25 + friction * 0.2**2 / 0.25), rel=1e-8)
 
 
 @given(st.floats(0.1, 10), st.floats(-0.5, 0.5))
 def test_the_axles_of_a_car_meet_in_one_point_and_its_rear_wheels_turn_as_they_roll(rate: float, turned: float) -> None:
     design = robot("car")
-    contacts = WheelContacts(design, design.wheels)
+    contacts = mechanics.WheelContacts(design, design.wheels)
     signals = np.array([[rate, rate * math.tan(turned), 0.0]])
     rates, steering = design.drive.commands(signals)
     (twist,) = contacts.twists(rates, steering)
@@ -425,11 +418,13 @@ def test_the_true_motion_is_that_of_odometry_on_other_code(integration: str, twi
     times = 0.3 * np.arange(1, len(twists) + 1)
     start, stamps = np.array([1.0, -2.0, 0.5]), np.linspace(-0.1, times[-1] + 0.1, 11)
     way = "arc" if integration == "arc" else "euler"
-    true = TrueMotion(times, start, moved, way, drift).poses(stamps)
+    true = mechanics.TrueMotion(times, start, moved, way, drift).poses(stamps)
     np.testing.assert_allclose(true, Path(times, start, 0.3 * moved, way, 0.3 * drift).poses(stamps), atol=1e-12)
 
 
 @given(st.floats(-1e-3, 1e-3))
 def test_a_slow_turn_loses_no_digits(turn: float) -> None:
-    (pose,) = TrueMotion(np.array([1.0]), np.zeros(3), np.array([[1.0, 0.0, turn]]), "arc").poses(np.array([1.0]))
+    (pose,) = mechanics.TrueMotion(np.array([1.0]), np.zeros(3), np.array([[1.0, 0.0, turn]]), "arc").poses(
+        np.array([1.0])
+    )
     assert pose == pytest.approx([1 - turn**2 / 6 + turn**4 / 120, turn / 2 - turn**3 / 24, turn], abs=1e-15, rel=1e-14)

@@ -16,16 +16,8 @@ from learned_samples import a_learned_calibration, a_network, a_weighted_term, a
 from sample_robots import APR_02
 
 from omnibench.errors import DataError
+from omnibench.robot import corrections
 from omnibench.robot.calibration import EffectTerm, extended_model, read_calibration, write_calibration
-from omnibench.robot.corrections import (
-    Fade,
-    TrainingDomain,
-    extrapolated_share,
-    extrapolation_consequence,
-    kinds_of_motion,
-    motions_of,
-    representatives,
-)
 from omnibench.robot.effects.effect import MOST_BYTES, decode_weights, make_term
 from omnibench.robot.effects.learned import unpacked
 from omnibench.robot.export.c_header import c_header
@@ -175,8 +167,8 @@ STANDING = np.zeros(3)
 _twists = st.integers(1, 30).flatmap(lambda count: arrays(float, (count, 3), elements=st.floats(-1, 1)))
 
 
-def known(*motions: Array) -> TrainingDomain:
-    return TrainingDomain(APR_02, motions)
+def known(*motions: Array) -> corrections.TrainingDomain:
+    return corrections.TrainingDomain(APR_02, motions)
 
 
 def at_wheels(robot: Robot, motions: Array) -> Array:
@@ -185,7 +177,7 @@ def at_wheels(robot: Robot, motions: Array) -> Array:
 
 @given(_twists, st.sampled_from(sorted(ROBOTS)))
 def test_a_few_representatives_are_near_every_motion(motions: Array, robot: str) -> None:
-    few = representatives(ROBOTS[robot], motions)
+    few = corrections.representatives(ROBOTS[robot], motions)
     own, kept = at_wheels(ROBOTS[robot], motions), at_wheels(ROBOTS[robot], few)
     away = np.linalg.norm(own[:, None] - kept, axis=2).min(axis=1)
     largest = np.linalg.norm(own, axis=1).max()
@@ -198,7 +190,7 @@ def test_a_few_representatives_are_near_every_motion(motions: Array, robot: str)
 def test_motions_of_a_kind_are_near_its_first_one_and_those_are_far_from_each_other(motions: Array, robot: str) -> None:
     spreads = np.abs(motions[::-1]) / 2
     own = np.hstack([at_wheels(ROBOTS[robot], each) for each in (motions, spreads)])
-    kinds = kinds_of_motion(ROBOTS[robot], motions, spreads)
+    kinds = corrections.kinds_of_motion(ROBOTS[robot], motions, spreads)
     near = 0.15 * np.linalg.norm(own, axis=1).max()
     firsts = np.array([own[kinds == kind][0] for kind in range(kinds.max() + 1)])
     assert (np.linalg.norm(own - firsts[kinds], axis=1) <= near + 1e-9).all()
@@ -209,23 +201,23 @@ def test_motions_of_a_kind_are_near_its_first_one_and_those_are_far_from_each_ot
 def test_the_directions_and_turns_of_a_flower_are_kinds_of_their_own() -> None:
     flower = [[0.2 * np.cos(angle), 0.2 * np.sin(angle), turn]
               for angle in np.radians(np.arange(0, 360, 30)) for turn in (-0.35, 0.0, 0.35)]  # fmt: skip
-    assert len(set(kinds_of_motion(APR_02, np.array(flower), np.zeros((36, 3))).tolist())) == 36
+    assert len(set(corrections.kinds_of_motion(APR_02, np.array(flower), np.zeros((36, 3))).tolist())) == 36
 
 
 def test_paths_that_end_where_they_began_are_of_as_many_kinds_as_they_swing_differently() -> None:
     swings = np.array([[0.2, 0.0, 0.0], [0.2, 0.0, 0.01], [0.0, 0.0, 1.0], [0.2, 0.0, 1.0]])
-    assert kinds_of_motion(APR_02, 1e-4 * swings, swings).tolist() == [0, 0, 1, 2]
+    assert corrections.kinds_of_motion(APR_02, 1e-4 * swings, swings).tolist() == [0, 0, 1, 2]
 
 
 @given(_twists, st.sampled_from(sorted(ROBOTS)))
 def test_what_was_driven_is_never_new(motions: Array, robot: str) -> None:
-    few = TrainingDomain(ROBOTS[robot], representatives(ROBOTS[robot], motions))
+    few = corrections.TrainingDomain(ROBOTS[robot], corrections.representatives(ROBOTS[robot], motions))
     assert not few.outside(motions).any()
 
 
 @given(_twists, _twists, st.sampled_from(sorted(ROBOTS)))
 def test_a_live_node_judges_one_motion_as_all_are_judged_together(driven: Array, others: Array, robot: str) -> None:
-    chosen = TrainingDomain(ROBOTS[robot], driven)
+    chosen = corrections.TrainingDomain(ROBOTS[robot], driven)
     assert [chosen.is_outside(motion) for motion in others] == chosen.outside(others).tolist()
 
 
@@ -262,8 +254,8 @@ def test_new_motions_in_passing_do_not_make_a_run_new() -> None:
 )
 def test_new_motions_are_told_in_words_with_their_share(motion: Array, words: str) -> None:
     run = np.array([*[FORWARDS] * 3, motion])
-    assert extrapolated_share(APR_02, FORWARDS[None], run) == (0.25, words)
-    assert extrapolated_share(APR_02, FORWARDS[None], run[:3]) == (0.0, "")
+    assert corrections.extrapolated_share(APR_02, FORWARDS[None], run) == (0.25, words)
+    assert corrections.extrapolated_share(APR_02, FORWARDS[None], run[:3]) == (0.0, "")
 
 
 def test_motions_of_a_run_are_its_twists_smoothed() -> None:
@@ -271,16 +263,18 @@ def test_motions_of_a_run_are_its_twists_smoothed() -> None:
     twist = np.array([0.1, -0.2, 0.3])
     times = 0.01 * np.arange(1, 201)
     rates = np.linalg.solve(matrix, twist) + np.where(np.arange(200) % 2, 1.0, -1.0)[:, None]
-    found = motions_of(matrix, times, rates)
+    found = corrections.motions_of(matrix, times, rates)
     assert len(found) > 10
     assert np.abs(found - twist).max() < 0.05 * np.abs(rates @ matrix.T - twist).max()
     shorter = np.tile(np.linalg.solve(matrix, twist), (5, 1))  # than the smoothing
-    np.testing.assert_allclose(motions_of(matrix, times[:5], shorter), twist[None], atol=1e-12)
+    np.testing.assert_allclose(corrections.motions_of(matrix, times[:5], shorter), twist[None], atol=1e-12)
 
 
 def test_it_is_told_what_is_not_known() -> None:
-    assert extrapolation_consequence(["a"]).startswith("a is not known")
-    assert "a, b are not known to hold there, fade" in extrapolation_consequence(["a", "b", "a"], fading=True)
+    assert corrections.extrapolation_consequence(["a"]).startswith("a is not known")
+    assert "a, b are not known to hold there, fade" in corrections.extrapolation_consequence(
+        ["a", "b", "a"], fading=True
+    )
 
 
 GROWN = term("speed_dependent_radius", k=0.01)
@@ -291,7 +285,7 @@ def unsure(deviation: float) -> OdometryModel:
     """A model with a radius that grows with the rate, fitted to driving forwards; deviation of its k, s/rad."""
     matrix, covariance = APR_02.inverse_kinematic_matrix, np.zeros((10, 10))
     covariance[9, 9] = deviation**2
-    return replace(model(GROWN), fade=Fade(APR_02, matrix - PLAIN, FORWARDS[None], [GROWN], covariance))
+    return replace(model(GROWN), fade=corrections.Fade(APR_02, matrix - PLAIN, FORWARDS[None], [GROWN], covariance))
 
 
 def log_of(twist: Array) -> WheelLog:
@@ -319,9 +313,9 @@ def test_a_stream_fades_as_a_batch_does(seed: int, robot: str, samples: int) -> 
               for name, value in one.values.items()]  # fmt: skip
     deviations = np.append(np.full(whole.matrix.size, 1e-4), 0.2 * np.abs(values))
     root = deviations[:, None] * rng.normal(size=(len(deviations), 3))
-    driven = representatives(EVERY[robot], motions_of(whole.matrix, log.times, log.signals)[:1])
+    driven = corrections.representatives(EVERY[robot], corrections.motions_of(whole.matrix, log.times, log.signals)[:1])
     change = 1e-3 * rng.normal(size=whole.matrix.shape)
-    chosen = replace(whole, fade=Fade(EVERY[robot], change, driven, terms, root @ root.T))
+    chosen = replace(whole, fade=corrections.Fade(EVERY[robot], change, driven, terms, root @ root.T))
     stream = chosen.stream(log.start, log.session, log.started_at or 0.0)
     np.testing.assert_allclose(streamed(stream, log), chosen.poses([log])[0], rtol=0, atol=1e-12)
 
@@ -353,6 +347,6 @@ def test_the_matrix_errs_along_with_the_parameters_that_it_was_fitted_with() -> 
     matrix, covariance = APR_02.inverse_kinematic_matrix, np.zeros((10, 10))
     along = np.append(-matrix.ravel() / 1.02, 1.0)  # what leaves the motion as it is
     covariance[:] = 0.1**2 * np.outer(along, along)
-    fade = Fade(APR_02, matrix - PLAIN, FORWARDS[None], [scale], covariance)
+    fade = corrections.Fade(APR_02, matrix - PLAIN, FORWARDS[None], [scale], covariance)
     kept = moved(replace(model(scale), fade=fade), SIDEWAYS)
     np.testing.assert_allclose(kept, moved(model(scale), SIDEWAYS), rtol=1e-2)
