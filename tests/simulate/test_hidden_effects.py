@@ -60,53 +60,59 @@ def test_the_benchmark_stays_what_it_was() -> None:
     assert drawn == pytest.approx(BENCHMARK, rel=1e-12)
 
 
-class TestEffects:
-    def test_motors_with_a_wrong_gain_turn_wheels_by_as_much_faster(self) -> None:
-        for run in runs({"motor_gain": {"g": 0.04}}):
-            np.testing.assert_allclose(run.rates, 1.04 * run.targets, rtol=1e-12)
+# Effects
 
-    def test_what_motors_lag_behind_is_seen_by_encoders_and_reference(self) -> None:
-        for lagging, plain in zip(runs({"motor_lag": {"tau": 0.2}}), runs(), strict=True):
-            missing = (plain.rates - lagging.rates).sum(axis=0) * 0.01
-            np.testing.assert_allclose(missing, 0.2 * plain.rates[0], rtol=1e-5)
-            turned = published_matrix(PUBLISHED)[2] @ missing
-            assert plain.poses[-1, 2] - lagging.poses[-1, 2] == pytest.approx(turned, rel=1e-6)
 
-    @pytest.mark.parametrize(
-        "effects",
-        [
-            {"wheel_eccentricity": {"a_a": 0.02, "b_c": -0.01}},
-            {"acceleration_slip": {"k": 0.05}, "heading_latency": {"tau": 0.05}},
-            {"floor_drift": {"dx": 0.02, "dy": -0.01}, "thermal_radius_drift": {"k": 1e-5}},
-            {"start_transient": {"k": 0.2, "length": 0.1}, "lidar_lever_arm": {"x": 0.05, "y": 0.02}},
-            {"motor_lag": {"tau": 0.1}, "tyre_wear": {"radius_validation": 0.01}},
-            {"heading_drift": {"b": 0.01}, "reference_time_offset": {"tau": 0.1}},
-        ],
-    )
-    def test_without_noise_the_recording_is_what_the_true_model_reports(self, effects: dict[str, Any]) -> None:
-        shape = {"start": "random", "commands": {"ramp": 0.3}, "validation": {"seed": 2, "distance": 0.5}}
-        made = simulate_dataset(few(effects, **shape))
-        model = made.truth.true_robot().model
-        assert {term.name for term in model.terms} == set(effects)
-        found = model.reported([run.reference_log for run in made.dataset.trajectories])
-        for run, poses in zip(made.dataset.trajectories, found, strict=True):
-            np.testing.assert_allclose(run.poses[1:], poses, atol=1e-12)
+def test_motors_with_a_wrong_gain_turn_wheels_by_as_much_faster() -> None:
+    for run in runs({"motor_gain": {"g": 0.04}}):
+        np.testing.assert_allclose(run.rates, 1.04 * run.targets, rtol=1e-12)
 
-    def test_encoder_noise_does_not_move_the_wheels_away_from_their_recorded_angles(self) -> None:
-        noisy = {"noise": QUIET | {"encoder": 0.02}, "repetitions": 20}
-        errors = []
-        for effects in ({"wheel_eccentricity": {"a_a": 0.02}}, {}):
-            made = simulate_dataset(few(effects, **noisy))
-            errors.append(final_errors(made.truth.true_robot().model, made.dataset.trajectories))
-        assert np.abs(errors[1]).max() > 1e-3  # what the noise itself does
-        assert np.abs(errors[0] - errors[1]).max() < 5e-5
 
-    def test_what_is_hidden_is_in_the_truth_with_all_its_parameters_and_not_in_the_data(self) -> None:
-        made = simulate_dataset(few({"wheel_eccentricity": {"a_b": 0.02}}))
-        zeros = dict.fromkeys(("a_a", "b_a", "a_b", "b_b", "a_c", "b_c"), 0.0)
-        assert made.truth.effects == (EffectTerm(name="wheel_eccentricity", parameters=zeros | {"a_b": 0.02}),)
-        said = (made.dataset.name, made.dataset.description, made.dataset.source, *made.dataset.warnings)
-        assert not any("eccentric" in text for text in said)
+def test_what_motors_lag_behind_is_seen_by_encoders_and_reference() -> None:
+    for lagging, plain in zip(runs({"motor_lag": {"tau": 0.2}}), runs(), strict=True):
+        missing = (plain.rates - lagging.rates).sum(axis=0) * 0.01
+        np.testing.assert_allclose(missing, 0.2 * plain.rates[0], rtol=1e-5)
+        turned = published_matrix(PUBLISHED)[2] @ missing
+        assert plain.poses[-1, 2] - lagging.poses[-1, 2] == pytest.approx(turned, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [
+        {"wheel_eccentricity": {"a_a": 0.02, "b_c": -0.01}},
+        {"acceleration_slip": {"k": 0.05}, "heading_latency": {"tau": 0.05}},
+        {"floor_drift": {"dx": 0.02, "dy": -0.01}, "thermal_radius_drift": {"k": 1e-5}},
+        {"start_transient": {"k": 0.2, "length": 0.1}, "lidar_lever_arm": {"x": 0.05, "y": 0.02}},
+        {"motor_lag": {"tau": 0.1}, "tyre_wear": {"radius_validation": 0.01}},
+        {"heading_drift": {"b": 0.01}, "reference_time_offset": {"tau": 0.1}},
+    ],
+)
+def test_without_noise_the_recording_is_what_the_true_model_reports(effects: dict[str, Any]) -> None:
+    shape = {"start": "random", "commands": {"ramp": 0.3}, "validation": {"seed": 2, "distance": 0.5}}
+    made = simulate_dataset(few(effects, **shape))
+    model = made.truth.true_robot().model
+    assert {term.name for term in model.terms} == set(effects)
+    found = model.reported([run.reference_log for run in made.dataset.trajectories])
+    for run, poses in zip(made.dataset.trajectories, found, strict=True):
+        np.testing.assert_allclose(run.poses[1:], poses, atol=1e-12)
+
+
+def test_encoder_noise_does_not_move_the_wheels_away_from_their_recorded_angles() -> None:
+    noisy = {"noise": QUIET | {"encoder": 0.02}, "repetitions": 20}
+    errors = []
+    for effects in ({"wheel_eccentricity": {"a_a": 0.02}}, {}):
+        made = simulate_dataset(few(effects, **noisy))
+        errors.append(final_errors(made.truth.true_robot().model, made.dataset.trajectories))
+    assert np.abs(errors[1]).max() > 1e-3  # what the noise itself does
+    assert np.abs(errors[0] - errors[1]).max() < 5e-5
+
+
+def test_what_is_hidden_is_in_the_truth_with_all_its_parameters_and_not_in_the_data() -> None:
+    made = simulate_dataset(few({"wheel_eccentricity": {"a_b": 0.02}}))
+    zeros = dict.fromkeys(("a_a", "b_a", "a_b", "b_b", "a_c", "b_c"), 0.0)
+    assert made.truth.effects == (EffectTerm(name="wheel_eccentricity", parameters=zeros | {"a_b": 0.02}),)
+    said = (made.dataset.name, made.dataset.description, made.dataset.source, *made.dataset.warnings)
+    assert not any("eccentric" in text for text in said)
 
 
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
@@ -147,54 +153,60 @@ def test_effects_given_twice_ramps_longer_than_a_run_and_unknown_starts_are_refu
         few(**changes)
 
 
-class TestRamps:
-    def test_wheels_rise_linearly_to_their_speed_take_longer_and_keep_their_way(self) -> None:
-        for run, plain in zip(runs(commands={"ramp": 0.5}), runs(), strict=True):
-            full = plain.rates[0]
-            np.testing.assert_allclose(run.rates[0], 0.01 * full, rtol=1e-9)  # mean of the first of 50 samples
-            np.testing.assert_allclose(run.rates[-1], 0.01 * full, rtol=1e-9)
-            np.testing.assert_allclose(run.rates[50:-50], np.tile(full, (len(run.rates) - 100, 1)), rtol=1e-9)
-            steps = np.diff(run.rates[:50], axis=0)
-            np.testing.assert_allclose(steps, np.tile(steps[0], (49, 1)), rtol=1e-6)
-            assert run.times[-1] == pytest.approx(plain.times[-1] + 0.5)
-            np.testing.assert_allclose((run.rates * 0.01).sum(axis=0), (plain.rates * 0.01).sum(axis=0), rtol=1e-9)
-            assert (run.distance, run.duration) == (pytest.approx(0.6), run.times[-1])
-
-    def test_turns_on_the_spot_are_ramped_too(self) -> None:
-        commands = {"speeds": [0.0], "turn_duration": 2.0, "ramp": 1.0}
-        for run in runs(commands=commands):
-            assert run.times[-1] == pytest.approx(3.0)
-            assert abs(run.omega or 0) == 0.35
-            heading = published_matrix(PUBLISHED)[2] @ wheel_equations(few().robot.wheels)[:, 2] * (run.omega or 0) * 2
-            assert run.poses[-1, 2] == pytest.approx(heading)
-
-    @given(st.floats(0.05, 2.0), st.floats(0.5, 5.0), st.lists(st.floats(1e-3, 0.3), min_size=1, max_size=40))
-    def test_samples_of_any_length_add_up_to_the_same_way(self, ramp: float, full: float, lengths: list[float]) -> None:
-        end = 2 * ramp + full
-        times = np.append(np.cumsum(lengths)[np.cumsum(lengths) < end - 1e-3], end)
-        robot = few().robot
-        command = Command(0.2, 0.3, 0.1)
-        rates = commanded_rates(robot, command, times, ramp)
-        driven = (rates * np.diff(times, prepend=0.0)[:, None]).sum(axis=0)
-        np.testing.assert_allclose(driven, (full + ramp) * wheel_equations(robot.wheels) @ command.twist, rtol=1e-9)
+# Ramps
 
 
-class TestRandomStarts:
-    def test_starts_lie_anywhere_in_the_square_with_any_heading(self) -> None:
-        starts = np.array([run.start for run in runs(repetitions=60, start="random", start_area=3.0)])
-        assert np.abs(starts[:, :2]).max() <= 1.5
-        assert (np.abs(starts[:, :2]).max(axis=0) > 1.4).all()
-        assert [starts[:, 2].min(), starts[:, 2].max()] == pytest.approx([-math.pi, math.pi], abs=0.15)
+def test_wheels_rise_linearly_to_their_speed_take_longer_and_keep_their_way() -> None:
+    for run, plain in zip(runs(commands={"ramp": 0.5}), runs(), strict=True):
+        full = plain.rates[0]
+        np.testing.assert_allclose(run.rates[0], 0.01 * full, rtol=1e-9)  # mean of the first of 50 samples
+        np.testing.assert_allclose(run.rates[-1], 0.01 * full, rtol=1e-9)
+        np.testing.assert_allclose(run.rates[50:-50], np.tile(full, (len(run.rates) - 100, 1)), rtol=1e-9)
+        steps = np.diff(run.rates[:50], axis=0)
+        np.testing.assert_allclose(steps, np.tile(steps[0], (49, 1)), rtol=1e-6)
+        assert run.times[-1] == pytest.approx(plain.times[-1] + 0.5)
+        np.testing.assert_allclose((run.rates * 0.01).sum(axis=0), (plain.rates * 0.01).sum(axis=0), rtol=1e-9)
+        assert (run.distance, run.duration) == (pytest.approx(0.6), run.times[-1])
 
-    def test_a_run_is_the_same_from_wherever_it_starts(self) -> None:
-        for moved, plain in zip(runs(start="random"), runs(), strict=True):
-            np.testing.assert_allclose(moved.poses, moved_to(moved.start, plain.poses), atol=1e-9)
 
-    def test_starts_are_those_of_the_seed(self) -> None:
-        again = [
-            simulate_dataset(few(start="random", train={"seed": seed, "distance": 0.6})).dataset for seed in (1, 1, 2)
-        ]
-        assert again[0].hash == again[1].hash != again[2].hash
+def test_turns_on_the_spot_are_ramped_too() -> None:
+    commands = {"speeds": [0.0], "turn_duration": 2.0, "ramp": 1.0}
+    for run in runs(commands=commands):
+        assert run.times[-1] == pytest.approx(3.0)
+        assert abs(run.omega or 0) == 0.35
+        heading = published_matrix(PUBLISHED)[2] @ wheel_equations(few().robot.wheels)[:, 2] * (run.omega or 0) * 2
+        assert run.poses[-1, 2] == pytest.approx(heading)
+
+
+@given(st.floats(0.05, 2.0), st.floats(0.5, 5.0), st.lists(st.floats(1e-3, 0.3), min_size=1, max_size=40))
+def test_samples_of_any_length_add_up_to_the_same_way(ramp: float, full: float, lengths: list[float]) -> None:
+    end = 2 * ramp + full
+    times = np.append(np.cumsum(lengths)[np.cumsum(lengths) < end - 1e-3], end)
+    robot = few().robot
+    command = Command(0.2, 0.3, 0.1)
+    rates = commanded_rates(robot, command, times, ramp)
+    driven = (rates * np.diff(times, prepend=0.0)[:, None]).sum(axis=0)
+    np.testing.assert_allclose(driven, (full + ramp) * wheel_equations(robot.wheels) @ command.twist, rtol=1e-9)
+
+
+# Random starts
+
+
+def test_starts_lie_anywhere_in_the_square_with_any_heading() -> None:
+    starts = np.array([run.start for run in runs(repetitions=60, start="random", start_area=3.0)])
+    assert np.abs(starts[:, :2]).max() <= 1.5
+    assert (np.abs(starts[:, :2]).max(axis=0) > 1.4).all()
+    assert [starts[:, 2].min(), starts[:, 2].max()] == pytest.approx([-math.pi, math.pi], abs=0.15)
+
+
+def test_a_run_is_the_same_from_wherever_it_starts() -> None:
+    for moved, plain in zip(runs(start="random"), runs(), strict=True):
+        np.testing.assert_allclose(moved.poses, moved_to(moved.start, plain.poses), atol=1e-9)
+
+
+def test_starts_are_those_of_the_seed() -> None:
+    again = [simulate_dataset(few(start="random", train={"seed": seed, "distance": 0.6})).dataset for seed in (1, 1, 2)]
+    assert again[0].hash == again[1].hash != again[2].hash
 
 
 def test_a_record_of_the_truth_says_what_it_lacks() -> None:
@@ -307,59 +319,67 @@ def test_a_caster_hands_on_its_whole_swing_when_the_robot_turns_back(turn: float
     assert swung == pytest.approx(-0.01 * math.copysign(whole, turn), abs=0.01 * (2 * abs(lag) + 1e-3))
 
 
-class TestVariation:
-    def test_a_weave_swings_the_rate_of_turn_about_the_commands(self) -> None:
-        commands = settings("diff")["commands"] | {"variation": {"weave": 0.3, "period": 2.0}}
-        for run in simulate_dataset(experiment("diff", commands=commands)).dataset.trajectories:
-            turns = run.rates @ experiment("diff").robot.inverse_kinematic_matrix[2]
-            middles = run.times - 0.5 * run.times[0]
-            np.testing.assert_allclose(turns, (run.omega or 0) + 0.3 * np.sin(math.pi * middles), atol=1e-12)
+# Variation
 
-    def test_the_speed_is_reversed_and_the_turn_goes_on(self) -> None:
-        commands = settings("diff")["commands"] | {"variation": {"reversals": 2}}
-        for run in simulate_dataset(experiment("diff", commands=commands)).dataset.trajectories:
-            twists = run.rates @ experiment("diff").robot.inverse_kinematic_matrix.T
-            ahead = (run.v or 0.0) * math.cos(run.alpha or 0.0)
-            third = len(twists) // 3
-            for row, sign in ((0, 1), (third + 2, -1), (len(twists) - 1, 1)):
-                np.testing.assert_allclose(twists[row], [sign * ahead, 0.0, run.omega or 0.0], atol=1e-12)
 
-    @pytest.mark.parametrize("name", NAMES)
-    def test_without_noise_the_truth_still_scores_nothing(self, name: str) -> None:
-        commands = settings(name)["commands"] | {"variation": {"weave": 0.1, "reversals": 1}}
-        made = simulate_dataset(experiment(name, commands=commands, truth={"tolerances": {}}))
-        # An angle in the middle of a sample is the mean of those at its ends, which differ where the speed is reversed.
-        missed = {"car": 2e-6, "swerve": 2e-3}.get(name, 1e-8)
-        runs = made.dataset.trajectories
-        assert ModelErrors.of(OdometryModel.of_design(made.dataset.robot, "arc"), runs).on(runs).cost < missed
+def test_a_weave_swings_the_rate_of_turn_about_the_commands() -> None:
+    commands = settings("diff")["commands"] | {"variation": {"weave": 0.3, "period": 2.0}}
+    for run in simulate_dataset(experiment("diff", commands=commands)).dataset.trajectories:
+        turns = run.rates @ experiment("diff").robot.inverse_kinematic_matrix[2]
+        middles = run.times - 0.5 * run.times[0]
+        np.testing.assert_allclose(turns, (run.omega or 0) + 0.3 * np.sin(math.pi * middles), atol=1e-12)
 
-    @pytest.mark.parametrize("name", ["tricycle", "swerve"])
-    def test_steering_angles_can_be_told_again_from_the_truth(self, name: str) -> None:
-        commands = settings(name)["commands"] | {"variation": {"weave": 0.1, "period": 2.5, "reversals": 1}}
-        made = simulate_dataset(experiment(name, commands=commands))
-        for run in made.dataset.trajectories:
-            np.testing.assert_array_equal(true_steering(made.dataset.robot, run, made.truth.variation), run.steering)
 
-    def test_between_reversals_a_module_turns_on_past_a_right_angle(self) -> None:
-        times = 0.02 * np.arange(1, 201)
-        _, steering = Variation(weave=1.0).wheels(SWERVE, Command(0.3, math.pi / 2, 0.0), times, ends=True)
-        assert np.abs(np.diff(steering, axis=0)).max() < 0.1
-        assert np.abs(steering).max() > math.pi / 2
+def test_the_speed_is_reversed_and_the_turn_goes_on() -> None:
+    commands = settings("diff")["commands"] | {"variation": {"reversals": 2}}
+    for run in simulate_dataset(experiment("diff", commands=commands)).dataset.trajectories:
+        twists = run.rates @ experiment("diff").robot.inverse_kinematic_matrix.T
+        ahead = (run.v or 0.0) * math.cos(run.alpha or 0.0)
+        third = len(twists) // 3
+        for row, sign in ((0, 1), (third + 2, -1), (len(twists) - 1, 1)):
+            np.testing.assert_allclose(twists[row], [sign * ahead, 0.0, run.omega or 0.0], atol=1e-12)
 
-    def test_commands_that_weave_beyond_the_steering_limit_are_left_out(self) -> None:
-        commands = {"speeds": [0.5], "turn_rates": [0.0, 0.4], "variation": {"weave": 0.2}}
-        given_config = experiment("car", commands=commands)
-        assert [each.name for each in given_config.driven] == ["v0.5_a0_w0", "v0.5_a180_w0"]
-        (warning,) = given_config.left_out
-        assert warning.startswith("2 of 4 commands")
-        assert "v0.5_a0_w0.6" in warning
-        with pytest.raises(ConfigError, match=r"v0.5_a0_w0.6 .*steering_limit_deg"):
-            experiment("car", commands=commands | {"turn_rates": [0.4]})
 
-    @pytest.mark.parametrize("wrong", [{"weave": -1}, {"period": 0}, {"reversals": -1}, {"reversals": 0.5}])
-    def test_a_variation_that_cannot_be_is_refused(self, wrong: dict[str, float]) -> None:
-        with pytest.raises(ConfigError, match=r"commands.variation"):
-            experiment("diff", commands=settings("diff")["commands"] | {"variation": wrong})
+@pytest.mark.parametrize("name", NAMES)
+def test_without_noise_the_truth_still_scores_nothing(name: str) -> None:
+    commands = settings(name)["commands"] | {"variation": {"weave": 0.1, "reversals": 1}}
+    made = simulate_dataset(experiment(name, commands=commands, truth={"tolerances": {}}))
+    # An angle in the middle of a sample is the mean of those at its ends, which differ where the speed is reversed.
+    missed = {"car": 2e-6, "swerve": 2e-3}.get(name, 1e-8)
+    runs = made.dataset.trajectories
+    assert ModelErrors.of(OdometryModel.of_design(made.dataset.robot, "arc"), runs).on(runs).cost < missed
+
+
+@pytest.mark.parametrize("name", ["tricycle", "swerve"])
+def test_steering_angles_can_be_told_again_from_the_truth(name: str) -> None:
+    commands = settings(name)["commands"] | {"variation": {"weave": 0.1, "period": 2.5, "reversals": 1}}
+    made = simulate_dataset(experiment(name, commands=commands))
+    for run in made.dataset.trajectories:
+        np.testing.assert_array_equal(true_steering(made.dataset.robot, run, made.truth.variation), run.steering)
+
+
+def test_between_reversals_a_module_turns_on_past_a_right_angle() -> None:
+    times = 0.02 * np.arange(1, 201)
+    _, steering = Variation(weave=1.0).wheels(SWERVE, Command(0.3, math.pi / 2, 0.0), times, ends=True)
+    assert np.abs(np.diff(steering, axis=0)).max() < 0.1
+    assert np.abs(steering).max() > math.pi / 2
+
+
+def test_commands_that_weave_beyond_the_steering_limit_are_left_out() -> None:
+    commands = {"speeds": [0.5], "turn_rates": [0.0, 0.4], "variation": {"weave": 0.2}}
+    given_config = experiment("car", commands=commands)
+    assert [each.name for each in given_config.driven] == ["v0.5_a0_w0", "v0.5_a180_w0"]
+    (warning,) = given_config.left_out
+    assert warning.startswith("2 of 4 commands")
+    assert "v0.5_a0_w0.6" in warning
+    with pytest.raises(ConfigError, match=r"v0.5_a0_w0.6 .*steering_limit_deg"):
+        experiment("car", commands=commands | {"turn_rates": [0.4]})
+
+
+@pytest.mark.parametrize("wrong", [{"weave": -1}, {"period": 0}, {"reversals": -1}, {"reversals": 0.5}])
+def test_a_variation_that_cannot_be_is_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(ConfigError, match=r"commands.variation"):
+        experiment("diff", commands=settings("diff")["commands"] | {"variation": wrong})
 
 
 REAR = Robot(
