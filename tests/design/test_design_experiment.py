@@ -321,11 +321,8 @@ def test_arguments_that_cannot_be_are_refused(tmp_path: Path, arguments: dict[st
 
 
 def test_a_source_must_be_there_and_one_with_several_data_sets_needs_a_choice(tmp_path: Path) -> None:
-    config = {
-        "name": "two",
-        "datasets": {name: {"simulate": flower()} for name in ("one", "two")},
-        "calibrators": ["theoretical"],
-    }
+    sets = {name: {"simulate": flower()} for name in ("one", "two")}
+    config = {"name": "two", "datasets": sets, "calibrators": ["theoretical"]}
     (tmp_path / "two.yaml").write_text(yaml.safe_dump(config), encoding="utf-8")
     with pytest.raises(OmnibenchError, match="no such file"):
         design_experiment(tmp_path / "nothing")
@@ -384,9 +381,7 @@ def test_a_few_runs_are_chosen_and_told_as_a_person_drives_them(name: str) -> No
     assert not design.recorded
     assert design.parameters == 6
     plan = plan_in_words(design, chosen)
-    assert any(
-        line.startswith("forward ") and ", turning left by " in line and " with radius " in line for line in plan
-    )
+    assert any(row.startswith("forward ") and ", turning left by " in row and " with radius " in row for row in plan)
     assert any(line.startswith("backward ") for line in plan)
     assert any(line.startswith("on the spot 3 full turns to the ") for line in plan) == (name == "diff")
     assert all(line.endswith((" time", " times")) for line in plan)

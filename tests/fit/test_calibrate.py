@@ -113,9 +113,7 @@ def test_parametric_searches_the_geometry_without_being_told_and_any_search_can(
 
 def test_many_runs_of_two_commands_have_no_resampled_intervals_and_it_is_said(dataset: Dataset) -> None:
     runs = dataset.split("train")
-    two, three = (
-        [replace(run, command=f"{index % commands}") for index, run in enumerate(runs)] for commands in (2, 3)
-    )
+    two, three = ([replace(run, command=f"{k % commands}") for k, run in enumerate(runs)] for commands in (2, 3))
     run = calibrate(make_dataset("two", ROBOT, 0.2, two), intervals=True)
     assert run.intervals is None
     assert any("2 commands" in warning for warning in run.warnings)

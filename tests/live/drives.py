@@ -97,11 +97,7 @@ def motion(stamp: int, moved: Array, duration: float = PERIOD, variance: float =
 
 def fed(robot: RobotTracker, payloads: list[bytes], begin: float = 0.0) -> list[Update]:
     """What a robot publishes of wheel messages that arrive one every period, from ``begin`` s on."""
-    return [
-        update
-        for index, payload in enumerate(payloads)
-        for update in robot.take_wheels(payload, begin + PERIOD * index)
-    ]
+    return [each for k, payload in enumerate(payloads) for each in robot.take_wheels(payload, begin + PERIOD * k)]
 
 
 def odometry(updates: list[Update]) -> Array:

@@ -301,10 +301,8 @@ def test_the_relative_pose_leads_from_the_first_to_the_second(first: np.ndarray,
 
 
 @given(POSES, POSES, POSES)
-def test_composing_is_associative(first: np.ndarray, second: np.ndarray, third: np.ndarray) -> None:
-    np.testing.assert_allclose(
-        compose(compose(first, second), third), compose(first, compose(second, third)), atol=1e-9
-    )
+def test_composing_is_associative(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> None:
+    np.testing.assert_allclose(compose(compose(a, b), c), compose(a, compose(b, c)), atol=1e-9)
 
 
 @given(POSES, POSES)
@@ -316,10 +314,8 @@ def test_the_correction_takes_odom_to_the_map(in_map: np.ndarray, in_odom: np.nd
 def test_a_path_that_is_moved_begins_there_and_keeps_its_shape(start: np.ndarray, path: np.ndarray) -> None:
     moved = moved_to(start, path)
     np.testing.assert_allclose(moved[0], start, atol=1e-9)
-    for before, after in ((0, 1), (1, 3)):
-        np.testing.assert_allclose(
-            relative(moved[before], moved[after]), relative(path[before], path[after]), atol=1e-9
-        )
+    for one, other in ((0, 1), (1, 3)):
+        np.testing.assert_allclose(relative(moved[one], moved[other]), relative(path[one], path[other]), atol=1e-9)
 
 
 @given(st.floats(-2, 2), st.floats(-2, 2), st.floats(-np.pi, np.pi))

@@ -187,9 +187,7 @@ def write_rosbag2_mcap(path: Path, sent: Sequence[Sent]) -> Path:
 def write_rosbag1(path: Path, sent: Sequence[Sent]) -> Path:
     path = path.with_suffix(".bag")
     with Rosbag1Writer(path) as writer:
-        connections = {
-            topic: writer.add_connection(topic, kind, typestore=ROS1) for topic, kind in _topics(sent).items()
-        }
+        connections = {name: writer.add_connection(name, kind, typestore=ROS1) for name, kind in _topics(sent).items()}
         for each in _recorded(sent):
             writer.write(connections[each.topic], each.logged, encoded(each, ROS1))
     return path

@@ -206,9 +206,7 @@ def test_topics_are_found_among_others(tmp_path: Path) -> None:
         for stamp in DRIVE.pose_stamps
     ]
     goals = [Sent("/goal", each.kind, each.content, each.logged) for each in messages(DRIVE) if each.topic == SLAM][:2]
-    arms = [
-        Sent("/arm/states", each.kind, each.content, each.logged) for each in messages(DRIVE) if each.topic == WHEELS
-    ]
+    arms = [replace(each, topic="/arm/states") for each in messages(DRIVE) if each.topic == WHEELS]
     elbow = [joint_state(each.logged, [1.0], names=["elbow"]) for each in messages(DRIVE) if each.topic == WHEELS]
     data = read(write_mcap(tmp_path / "drive", [*messages(DRIVE), *odometry, *goals, *arms, *elbow]))
     assert data.warnings == ()
@@ -305,9 +303,7 @@ def test_the_messages_of_a_topic_begin_runs_and_name_their_commands(tmp_path: Pa
     offset = 4 * 10**9  # the recorder's clock is not that of the robot
     sent = [Sent(each.topic, each.kind, each.content, each.logged + offset) for each in messages(DRIVE)]
     words = ["left", "right", "left", "right", "", "left"] * 2
-    sent += [
-        text(word, EPOCH + offset + int((begin - 0.1) * 1e9)) for word, begin in zip(words, DRIVE.begins, strict=True)
-    ]
+    sent += [text(word, EPOCH + offset + int((at - 0.1) * 1e9)) for word, at in zip(words, DRIVE.begins, strict=True)]
     data = read(write_mcap(tmp_path / "drive", sent), cut="topic", cut_topic="/robot/command")
     assert [run.command for run in data.trajectories] == [word or None for word in words]
     assert [run.id for run in data.trajectories][:5] == ["001-left", "002-right", "003-left", "004-right", "005"]
@@ -843,12 +839,8 @@ def test_odometry_is_no_reference_unless_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize("integration", ["euler", "arc"])
 def test_odometry_that_the_robot_made_itself_is_refused(tmp_path: Path, late: int, integration: Integration) -> None:
     wrong = TRUTH * np.array([[1.1], [1.1], [0.9]])  # radii and distances that the driver was told
-    log = WheelLog(
-        (DRIVE.stamps[1:] - DRIVE.stamps[0]) / 1e9,
-        DRIVE.rates,
-        np.zeros(3),
-        (DRIVE.stamps[1::3] - DRIVE.stamps[0]) / 1e9,
-    )
+    seconds = (DRIVE.stamps - DRIVE.stamps[0]) / 1e9
+    log = WheelLog(seconds[1:], DRIVE.rates, np.zeros(3), seconds[1::3])
     (poses,) = OdometryModel(ROBOT, wrong, integration).poses([log])
     source = write_mcap(tmp_path / "drive", [*WHEELS_ONLY, *odometry(poses, DRIVE.stamps[1::3] + late)])
     with pytest.raises(DataError, match=f"/tracker {OWN}"):

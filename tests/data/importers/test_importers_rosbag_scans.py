@@ -210,9 +210,7 @@ def test_a_chain_of_fixed_transforms_is_followed(tmp_path: Path) -> None:
         transform("/robot/base_link", "top", 0.2, 0.3, math.pi / 2),
         transform("map", "robot/base_link", 9.0, 9.0, 1.0),
     )
-    sent = edited(
-        with_scans(extra=[chain]), SCAN, lambda each: changed(each, header=header(_stamp(each), "robot/laser"))
-    )
+    sent = edited(with_scans([chain]), SCAN, lambda each: changed(each, header=header(_stamp(each), "robot/laser")))
     mount = scanner_of(read(write_mcap(tmp_path / "drive", sent))).mount
     np.testing.assert_allclose((mount.x, mount.y, mount.yaw), (0.2, 0.4, math.pi / 2 + 0.5), rtol=0, atol=1e-9)
     ring = tf_static(transform("a", "laser", 0, 0, 0), transform("laser", "a", 0, 0, 0))

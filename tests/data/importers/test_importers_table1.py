@@ -177,9 +177,7 @@ def write_scans(folder: Path, stamps: list[float], rays: int = 1080, metre: floa
     """A lidar.csv of walls between 1 and 4 m, with one ray that saw nothing; its ranges in m."""
     ranges = np.round(np.random.default_rng(0).uniform(1.0, 4.0, (len(stamps), rays)), 3)
     ranges[:, 7] = 0.0
-    rows = [
-        f"{t:g}," + ",".join(f"{metre * value:.0f}" for value in row) for t, row in zip(stamps, ranges, strict=True)
-    ]
+    rows = [f"{t:g}," + ",".join(f"{metre * each:.0f}" for each in row) for t, row in zip(stamps, ranges, strict=True)]
     head = "t," + ",".join(f"d{ray}" for ray in range(1, rays + 1))
     (folder / "lidar.csv").write_text("\n".join([head, *rows]) + "\n")
     return np.where(ranges > 0, ranges, np.inf)

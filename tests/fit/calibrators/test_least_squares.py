@@ -168,9 +168,8 @@ BOXES: dict[str, Callable[[Any], Box]] = {
 @pytest.mark.parametrize("wheels", [3, 4])
 def test_runs_without_noise_give_a_hidden_matrix_on_the_driven_span(wheels: Any, cost: str, integration: Any) -> None:
     robot = synthetic_robot(wheels)
-    problem = make_problem(
-        synthetic_trajectories(robot, integration), wheels=wheels, cost=cost, integration=integration
-    )
+    runs = synthetic_trajectories(robot, integration)
+    problem = make_problem(runs, wheels=wheels, cost=cost, integration=integration)
     result = closed_form(problem)
     assert result.outcome is Outcome.CONVERGED
     null = problem.parameterisation.null

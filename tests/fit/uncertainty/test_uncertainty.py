@@ -281,9 +281,7 @@ class TestParameters:
         geometry = geometry_of(TRUTH, ROBOT)
         step = 1e-6 * np.random.default_rng(0).standard_normal((3, 3))
         moved = geometry_of(TRUTH + step, ROBOT) - geometry_of(TRUTH - step, ROBOT)
-        np.testing.assert_allclose(
-            WheelGeometry(ROBOT).slopes(geometry) @ moved / 2, step.ravel(), rtol=1e-5, atol=1e-12
-        )
+        np.testing.assert_allclose(WheelGeometry(ROBOT).slopes(geometry) @ moved / 2, step.flat, rtol=1e-5, atol=1e-12)
 
     @pytest.mark.parametrize("matrix", [np.zeros((3, 3)), np.ones((3, 3))])
     def test_a_matrix_that_no_wheels_have_is_refused(self, matrix: Array) -> None:

@@ -448,9 +448,8 @@ def test_the_largest_weights_with_many_motions_fit_in_a_request() -> None:
     motions = tuple((-0.123456789, 0.123456789, -0.123456789) for _ in range(600))
     (term,) = learned().effects
     weights = encode_weights(np.ones(MOST_BYTES // 4))
-    largest = learned().model_copy(
-        update={"driven": motions, "effects": (term.model_copy(update={"weights": weights}),)}
-    )
+    heaviest = term.model_copy(update={"weights": weights})
+    largest = learned().model_copy(update={"driven": motions, "effects": (heaviest,)})
     assert len(to_yaml(largest).encode()) < LONGEST
 
 
@@ -460,9 +459,7 @@ def test_a_swap_to_a_learned_calibration_is_read_from_its_message_and_does_not_j
     payloads = path.payloads()
     before = fed(robot, payloads[:100])
     robot.swap(parse_calibration(text, "request"))
-    after = [
-        update for index, each in enumerate(payloads[100:], 100) for update in robot.take_wheels(each, 0.01 * index)
-    ]
+    after = fed(robot, payloads[100:], 1.0)
     assert np.abs(after[0].pose - before[-1].pose).max() < 0.1
     stayed = fed(RobotTracker("apr", calibration()), payloads)
     assert np.abs(after[-1].pose - stayed[-1].pose).max() > 1e-4

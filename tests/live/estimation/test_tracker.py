@@ -84,9 +84,7 @@ def test_odom_never_jumps_and_no_stamp_comes_twice_whatever_happens(data: st.Dat
             robot.set_pose(np.array([9.0, 9.0, 1.0]), 0.01 * np.eye(3))
         elif event == "reset" and updates:
             robot.reset()
-        sent = {"lose": [], "twice": [sample, sample], "late": [sample, samples[max(index - 3, 0)]]}.get(
-            event, [sample]
-        )
+        sent = {"lose": [], "twice": [sample] * 2, "late": [sample, samples[max(index - 3, 0)]]}.get(event, [sample])
         for each in sent:
             chosen = replace(each, stamp=each.stamp + shift, positions=None if rates else each.positions)
             new = robot.take_wheels(JOINT_STATE.encode(chosen), arrival)

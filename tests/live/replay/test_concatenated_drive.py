@@ -68,9 +68,7 @@ def test_reference_poses_are_those_composed_by_hand(seed: int, count: int, pause
     dataset = random_dataset(seed, count)
     drive = concatenate_runs(dataset, pause=pause)
     by_hand = composed_by_hand(dataset.trajectories)
-    np.testing.assert_allclose(
-        [homogeneous(pose) for pose in drive.start_poses], [each[0] for each in by_hand], atol=1e-9
-    )
+    np.testing.assert_allclose([homogeneous(at) for at in drive.start_poses], [each[0] for each in by_hand], atol=1e-9)
     measured = [by_hand[0], *(each[1:] for each in by_hand[1:])]
     found = [homogeneous(pose) for pose in drive.slam_poses]
     np.testing.assert_allclose(found, np.concatenate(measured), atol=1e-9)
@@ -105,9 +103,7 @@ def test_covariances_turn_with_their_runs_and_are_none_where_one_run_has_none() 
     rng = np.random.default_rng(1)
     plain = [random_run(f"{n}", rng) for n in range(3)]
     halves = [rng.normal(size=(len(run.poses), 3, 3)) for run in plain]
-    runs = [
-        replace(run, pose_covariances=half @ np.swapaxes(half, 1, 2)) for run, half in zip(plain, halves, strict=True)
-    ]
+    runs = [replace(run, pose_covariances=h @ np.swapaxes(h, 1, 2)) for run, h in zip(plain, halves, strict=True)]
     drive = concatenate_runs(make_dataset("covariances", ROBOT, PERIOD, runs))
     last = runs[2]
     turn = homogeneous(np.array([0.0, 0.0, drive.start_poses[2, 2] - last.poses[0, 2]]))

@@ -248,10 +248,8 @@ def test_a_clock_that_is_set_by_less_than_a_second_neither_adds_nor_loses_motion
     receiver = Receiver()
     values = [(2.0, 1.0, 0.0) if rates else (100 + 0.02 * k, 0.01 * k, 0.0) for k in range(200)]
     receiver.take(*[at(PERIOD * k, *values[k], rates=rates) for k in range(100)])
-    after = range(100, 200)
-    receiver.take(
-        *[at(PERIOD * k + jump, *values[k], rates=rates) for k in after], arrivals=[PERIOD * k for k in after]
-    )
+    late = range(100, 200)
+    receiver.take(*[at(PERIOD * k + jump, *values[k], rates=rates) for k in late], arrivals=[PERIOD * k for k in late])
     np.testing.assert_allclose(receiver.driven, [3.98, 1.99, 0], atol=0.25 if rates else 1e-9)
     assert receiver.counts.clock_jumps == 1
     unsure = rates and jump > -0.2  # a clock that goes back by more is no other explanation's

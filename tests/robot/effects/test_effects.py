@@ -440,7 +440,5 @@ def test_a_stream_takes_steering_angles_that_take_no_time(seed: int) -> None:
     before = stream.drive(log.rates[0] * 0.1, 0.1, steering=log.steering[0])
     np.testing.assert_array_equal(stream.drive(np.zeros(1), 0.0, steering=log.steering[1]), before)
     plain = replace(log, times=np.array([0.1]), rates=log.rates[:1], steering=log.steering[:1], stamps=np.array([0.1]))
-    expected = OdometryModel(TRICYCLE, TRICYCLE.inverse_kinematic_matrix, "arc").poses(
-        [replace(plain, start=np.zeros(3))]
-    )
+    expected = OdometryModel.of_design(TRICYCLE, "arc").poses([replace(plain, start=np.zeros(3))])
     np.testing.assert_allclose(before, expected[0][0], atol=1e-12)  # nothing is known of a rate in the first sample

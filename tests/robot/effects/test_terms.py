@@ -379,12 +379,7 @@ def test_a_bent_map_agrees_at_the_start_is_held_beyond_what_was_seen_and_a_patch
 def test_delays_alternate_grow_and_swing_with_the_stamps() -> None:
     stamps = np.array([0.25, 0.5, 8.0])
     stamped, wave = effects.create("smooth_stamps"), effects.create("smooth_stamp_wave")
-    values = usual("smooth_stamps") | {
-        "position_late": 0.1,
-        "heading_alternating": 0.05,
-        "duration": 1.0,
-        "period": 0.25,
-    }
+    values = usual("smooth_stamps") | {"position_late": 0.1, "heading_alternating": 0.05, "duration": 1, "period": 0.25}
     position, heading = stamped.delays(stamps, values)
     np.testing.assert_allclose(position, [0.025, 0.05, 0.1])
     np.testing.assert_allclose(heading, [-0.05, 0.05, 0.05])

@@ -268,9 +268,8 @@ def test_parameters_come_with_what_they_cannot_hold_and_what_the_robot_needs(sna
 
 
 TWO_LEFT = Robot(name="r", wheels=(*DIFF.wheels, fixed("second", 0, 0.1)))
-SIDEWAYS = Robot(
-    name="r", wheels=(fixed("a", 0.27**0.5, -0.3, angle_deg=60), fixed("b", -(0.27**0.5), 0.3, angle_deg=60))
-)
+ASIDE = 0.27**0.5  # m
+SIDEWAYS = Robot(name="r", wheels=(fixed("a", ASIDE, -0.3, angle_deg=60), fixed("b", -ASIDE, 0.3, angle_deg=60)))
 TURNED_ROLLERS = Robot(
     name="r",
     wheels=tuple(wheel.model_copy(update={"roller_angle": math.pi / 4}) for wheel in MECANUM.wheels[:3])
@@ -391,9 +390,7 @@ def test_a_wheel_that_turns_the_robot_clockwise_keeps_its_sign() -> None:
 
 
 @given(offset=st.floats(-3.1, 3.1), radius=st.floats(0.01, 0.5), distance=st.floats(0.05, 1), count=st.integers(3, 8))
-def test_a_matrix_of_omni_wheels_gives_parameters_back(
-    offset: float, radius: float, distance: float, count: int
-) -> None:
+def test_omni_wheels_give_their_parameters_back(offset: float, radius: float, distance: float, count: int) -> None:
     angles = math.degrees(offset) + 360 * np.arange(count) / count
     machine = robot(*angles, radius=radius, distance=distance)
     fitted = closest_omni_wheel_drive(machine, machine.inverse_kinematic_matrix)
