@@ -14,7 +14,7 @@ import numpy as np
 import polars as pl
 import pytest
 import yaml
-from sample_robots import APR_02
+from sample_robots import APR_02, DIFFERENTIAL
 from storage_samples import (
     FORMATS,
     Change,
@@ -37,7 +37,7 @@ from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.references import Reference, References
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import DataError
-from omnibench.robot.kinematics import Robot, wheel_equations
+from omnibench.robot.kinematics import wheel_equations
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
 
@@ -381,14 +381,11 @@ def test_a_table_may_say_a_sigma_for_both_axes_and_leave_out_the_times_of_the_wh
 
 
 def test_a_data_set_without_references_keeps_hash_and_fingerprint_to_the_bit() -> None:
-    sides = {"left": 0.15, "right": -0.15}
-    wheels = [{"name": name, "type": "fixed", "radius": 0.05, "x": 0.0, "y": y} for name, y in sides.items()]
-    robot = Robot.model_validate({"name": "diff", "wheels": wheels})
     rates, poses = np.array([[1.0, 1.0], [2.0, 1.5]]), np.array([[0.0, 0.0, 0.0], [0.0625, 0.0, -0.125]])
     run = Trajectory("run-1", "train", np.array([0.5, 1.0]), rates, np.array([0.0, 1.0]), poses)
     # By the version before there were references.
     assert run.fingerprint == "76cfe729fb32936f"
-    assert make_dataset("plain", robot, 0.5, [run]).hash.startswith("009e3e0aa644d6a83e59c5d2da3b502c")
+    assert make_dataset("plain", DIFFERENTIAL, 0.5, [run]).hash.startswith("009e3e0aa644d6a83e59c5d2da3b502c")
 
 
 REFUSED_REFERENCES = [

@@ -11,7 +11,7 @@ import pytest
 import yaml
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from sample_robots import APR_02, CAR, DIFFERENTIAL, SKID, SWERVE, TRICYCLE, WHEELED
+from sample_robots import APR_02, CAR, DIFFERENTIAL, SKID, SWERVE, TRICYCLE, WHEELED, fixed, steered
 
 from omnibench.config import read_model, to_yaml, validate
 from omnibench.errors import ConfigError
@@ -178,14 +178,6 @@ SPEEDS = st.floats(-2.0, 2.0)
 def a_robot(*wheels: dict[str, Any], **more: Any) -> Robot:
     """A robot by its document, as files give it. ConfigError in one line."""
     return validate(Robot, {"name": "r", "wheels": wheels, **more}, "robot.yaml")
-
-
-def fixed(name: str, x: float, y: float, **more: Any) -> dict[str, Any]:
-    return {"name": name, "type": "fixed", "radius": 0.05, "x": x, "y": y, **more}
-
-
-def steered(name: str, x: float, y: float, **more: Any) -> dict[str, Any]:
-    return {"name": name, "type": "steered", "radius": 0.05, "x": x, "y": y, **more}
 
 
 def velocity(twist: Array, x: float, y: float) -> Array:

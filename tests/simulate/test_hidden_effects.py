@@ -13,13 +13,13 @@ from config_robots import NAMES, QUIET, apr02, experiment, robot, settings
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
-from sample_robots import APR_02, DIFFERENTIAL, SWERVE, TRICYCLE
+from sample_robots import APR_02, DIFFERENTIAL, SWERVE, TRICYCLE, fixed, make_robot
 
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import ConfigError, DataError, OmnibenchError
 from omnibench.fit.evaluate import ModelErrors, final_errors
 from omnibench.robot.calibration import EffectTerm
-from omnibench.robot.kinematics import Array, Mount, Robot, Wheel, moved_to, published_matrix, wheel_equations
+from omnibench.robot.kinematics import Array, Mount, Robot, moved_to, published_matrix, wheel_equations
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Path
 from omnibench.simulate import mechanics
@@ -382,12 +382,9 @@ def test_a_variation_that_cannot_be_is_refused(wrong: dict[str, float]) -> None:
         experiment("diff", commands=settings("diff")["commands"] | {"variation": wrong})
 
 
-REAR = Robot(
-    name="behind its centre, and rolling to its side",
-    wheels=tuple(
-        Wheel(name=name, type="fixed", radius=0.05, x=x, y=-0.3, angle=math.pi / 2)
-        for name, x in (("a", 0.2), ("b", -0.2))
-    ),
+REAR = make_robot(
+    "behind its centre, and rolling to its side",
+    *(fixed(name, x, -0.3, angle=math.pi / 2) for name, x in (("a", 0.2), ("b", -0.2))),
     mount=Mount(x=0.1, y=-0.05, yaw=0.3),
 )
 rates_of_wheels = st.floats(-10, 10).filter(lambda rate: abs(rate) > 0.1)
