@@ -33,6 +33,7 @@ from bag_samples import (
     header,
     joint_state,
     messages,
+    odometry,
     odometry_error,
     part,
     pose,
@@ -196,25 +197,17 @@ class TestRosbagConforms(ImporterConformance):
 
 
 def test_topics_are_found_among_others(tmp_path: Path) -> None:
-    odometry = [
-        Sent(
-            "/robot/odom",
-            "nav_msgs/msg/Odometry",
-            {"header": header(stamp), "pose": {"pose": pose((0, 0, 0))}},
-            int(stamp),
-        )
-        for stamp in DRIVE.pose_stamps
-    ]
-    goals = [Sent("/goal", each.kind, each.content, each.logged) for each in messages(DRIVE) if each.topic == SLAM][:2]
+    resting = odometry(np.zeros((len(DRIVE.pose_stamps), 3)), DRIVE.pose_stamps, "/robot/odom")
+    goals = [replace(each, topic="/goal") for each in messages(DRIVE) if each.topic == SLAM][:2]
     arms = [replace(each, topic="/arm/states") for each in messages(DRIVE) if each.topic == WHEELS]
     elbow = [joint_state(each.logged, [1.0], names=["elbow"]) for each in messages(DRIVE) if each.topic == WHEELS]
-    data = read(write_mcap(tmp_path / "drive", [*messages(DRIVE), *odometry, *goals, *arms, *elbow]))
+    data = read(write_mcap(tmp_path / "drive", [*messages(DRIVE), *resting, *goals, *arms, *elbow]))
     assert data.warnings == ()
     assert odometry_error(data) < 1e-9
 
 
 def test_several_candidates_are_listed(tmp_path: Path) -> None:
-    two = [Sent(each.topic.replace("robot", "r2"), each.kind, each.content, each.logged) for each in part(7)]
+    two = [replace(each, topic=each.topic.replace("robot", "r2")) for each in part(7)]
     source = write_mcap(tmp_path / "drive", [*part(7), *two])
     with pytest.raises(ConfigError) as caught:
         read(source)
@@ -301,7 +294,7 @@ def test_short_drives_are_left_out_and_counted(tmp_path: Path) -> None:
 
 def test_the_messages_of_a_topic_begin_runs_and_name_their_commands(tmp_path: Path) -> None:
     offset = 4 * 10**9  # the recorder's clock is not that of the robot
-    sent = [Sent(each.topic, each.kind, each.content, each.logged + offset) for each in messages(DRIVE)]
+    sent = [replace(each, logged=each.logged + offset) for each in messages(DRIVE)]
     words = ["left", "right", "left", "right", "", "left"] * 2
     sent += [text(word, EPOCH + offset + int((at - 0.1) * 1e9)) for word, at in zip(words, DRIVE.begins, strict=True)]
     data = read(write_mcap(tmp_path / "drive", sent), cut="topic", cut_topic="/robot/command")
@@ -542,8 +535,7 @@ def read_steered(tmp_path: Path, sent: Sequence[Sent], **options: Any) -> Datase
 
 def steered_error(data: Dataset) -> float:
     """Largest difference of the design's odometry from the reference."""
-    model = OdometryModel.of_design(data.robot, "arc")
-    return max(float(np.abs(model.poses([run.reference_log])[0] - run.poses[1:]).max()) for run in data.trajectories)
+    return odometry_error(data, OdometryModel.of_design(data.robot, "arc"))
 
 
 def test_a_steering_joint_is_known_by_its_name_and_comes_back_from_disk(tmp_path: Path) -> None:
@@ -652,10 +644,7 @@ def test_odometry_that_a_robot_made_of_its_steering_is_refused(tmp_path: Path) -
     heading = np.append(0.0, np.cumsum(0.097 * rates * np.sin(phi) / 1.3))
     steps = 0.097 * rates * np.cos(phi) * np.exp(1j * heading[:-1])
     place = np.append(0.0, np.cumsum(steps))
-    own = [
-        Sent("/odom", "nav_msgs/msg/Odometry", {"header": header(stamp), "pose": {"pose": pose(row)}}, int(stamp))
-        for stamp, row in zip(STAMPS, np.column_stack([place.real, place.imag, heading]), strict=True)
-    ]
+    own = odometry(np.column_stack([place.real, place.imag, heading]), STAMPS, "/odom")
     with pytest.raises(ConfigError, match=r"the only poses are /odom .*pose_t"):
         read_steered(tmp_path, [*JOINTS, *own])
     with pytest.raises(DataError, match=r"/odom is the robot's own odometry: .*--set pose_topic=NAME"):
@@ -666,9 +655,7 @@ TILTED = {"x": 0.5**0.5, "w": 0.5**0.5}
 
 
 def test_messages_recorded_out_of_order_are_sorted_and_counted(tmp_path: Path) -> None:
-    late = edited(
-        part(12.4), WHEELS, lambda each: Sent(each.topic, each.kind, each.content, each.logged + 50_000_000), every=9
-    )
+    late = edited(part(12.4), WHEELS, lambda each: replace(each, logged=each.logged + 50_000_000), every=9)
     data = read(write_mcap(tmp_path / "drive", late))
     count = sum(each.topic == WHEELS for each in part(12.4)) // 9
     assert f"topic {WHEELS}: {count} messages were recorded late and sorted" in data.warnings[0]
@@ -805,13 +792,6 @@ WHEELS_ONLY = [each for each in messages(DRIVE) if each.topic == WHEELS]
 OWN = "is the robot's own odometry: .* --set pose_topic=NAME"
 
 
-def odometry(poses: Array, stamps: Array = DRIVE.pose_stamps) -> list[Sent]:
-    return [
-        Sent("/tracker", "nav_msgs/msg/Odometry", {"header": header(stamp), "pose": {"pose": pose(place)}}, int(stamp))
-        for stamp, place in zip(stamps, poses, strict=True)
-    ]
-
-
 def transforms(parent: str, child: str, stamps: Array, poses: Array, topic: str = "/tf") -> list[Sent]:
     return [
         Sent(
@@ -829,7 +809,7 @@ def noisy(poses: Array) -> Array:
 
 
 def test_odometry_is_no_reference_unless_named(tmp_path: Path) -> None:
-    source = write_mcap(tmp_path / "drive", [*WHEELS_ONLY, *odometry(noisy(DRIVE.poses))])
+    source = write_mcap(tmp_path / "drive", [*WHEELS_ONLY, *odometry(noisy(DRIVE.poses), DRIVE.pose_stamps)])
     with pytest.raises(ConfigError, match=r"the only poses are /tracker .* set pose_topic"):
         read(source)
     assert odometry_error(read(source, pose_topic="tracker")) < 0.05

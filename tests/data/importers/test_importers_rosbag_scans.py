@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -138,7 +139,7 @@ def test_scans_can_be_left_out(tmp_path: Path) -> None:
 
 def test_messages_that_are_recorded_late_or_twice_come_in_order(tmp_path: Path) -> None:
     sent = with_scans()
-    late = edited(sent, SCAN, lambda each: Sent(each.topic, each.kind, each.content, each.logged + 450_000_000), 4)
+    late = edited(sent, SCAN, lambda each: replace(each, logged=each.logged + 450_000_000), 4)
     twice = [*late, *scans(SECONDS)[10:13]]
     data = read(write_mcap(tmp_path / "late", twice))
     plain = read(write_mcap(tmp_path / "plain", sent))
@@ -499,7 +500,7 @@ def test_references_that_are_not_there_or_several_are_asked_for(tmp_path: Path) 
     source = write_mcap(tmp_path / "drive", part(10.0, WITHOUT_POSES + fixes()))
     with pytest.raises(ConfigError, match="did you mean '/gps/fix'"):
         read(source, references=("/gps/fixs",))
-    others = [Sent("/gps2/fix", each.kind, each.content, each.logged) for each in fixes()]
+    others = [replace(each, topic="/gps2/fix") for each in fixes()]
     with pytest.raises(ConfigError, match=r"--set references=\[/gps/fix\]"):
         read(write_mcap(tmp_path / "two", WITHOUT_POSES + fixes() + others))
     with pytest.raises(DataError, match=r"NavSatFix or Imu"):

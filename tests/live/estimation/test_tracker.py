@@ -18,8 +18,8 @@ from commands import disk_that_takes
 from drives import NOISE, ORIGIN, PERIOD, SECOND, calibration, drive, fed, odometry, slam
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from nodes import as_text
 
+from omnibench.config import to_yaml
 from omnibench.errors import ConfigError, DataError
 from omnibench.live.estimation.counts import Counts, anomalies_in_words
 from omnibench.live.estimation.extrapolation_monitor import ExtrapolationMonitor
@@ -579,7 +579,7 @@ def test_a_calibration_that_the_disk_refuses_or_has_damaged_is_named(tmp_path: P
     with pytest.raises(DataError, match=re.escape(kept.name)):
         memory.keep_calibration(calibration())
     kept.rmdir()
-    file.write_text(as_text(calibration()))
+    file.write_text(to_yaml(calibration()))
     kept.write_text("instead_of: 1\n")
     with pytest.raises(DataError, match=rf"remove {re.escape(str(kept))} .*{re.escape(str(file))}"):
         memory.calibration(file)
