@@ -41,7 +41,7 @@ from omnibench.fit.identifiability import (
 from omnibench.fit.information import EstimatedCovariance, information_of_run, information_of_runs
 from omnibench.fit.inspect import inspect_dataset
 from omnibench.fit.parameterisation import ExplicitBox
-from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
+from omnibench.fit.problem import Budget, CalibrationProblem
 from omnibench.fit.ratio_intervals import Bootstrap, RatioIntervals, Units, units_of
 from omnibench.fit.sandwich import Scores, sandwich, scores_of_runs
 from omnibench.fit.span import aligned, driven_span, unidentified_directions
@@ -76,15 +76,7 @@ def flower_problem(repetitions: int | None = None) -> tuple[CalibrationProblem, 
     flower = read_simulation(uncertainty_coverage.CONFIG).config
     changes = {"validation": None} | ({} if repetitions is None else {"repetitions": repetitions})
     dataset = simulate_dataset(flower.model_copy(update=changes)).dataset
-    problem = CalibrationProblem(
-        dataset.robot,
-        dataset.split("train"),
-        costs.create("final_pose"),
-        make_parameterisation("matrix", dataset.robot, dataset.split("train"), box="row"),
-        integration="euler",
-        budget=Budget(),
-        seed=1,
-    )
+    problem = make_problem(dataset.split("train"), robot=dataset.robot, integration="euler")
     return problem, solved(problem)
 
 
