@@ -25,6 +25,7 @@ from omnibench.robot.calibration import (
     EffectTerm,
     Noise,
     Provenance,
+    covariance_rows,
     matrix_rows,
     read_calibration,
     write_calibration,
@@ -90,7 +91,7 @@ def test_everything_in_a_calibration_comes_back(tmp_path: Path) -> None:
         integration="arc",
         created=datetime(2023, 1, 12, 13, 14, 15, tzinfo=UTC),
         noise=Noise(pose_position=0.0055, walk_heading=1 / 3),
-        covariance=tuple(tuple(values) for values in (covariance @ covariance.T).tolist()),
+        covariance=covariance_rows(covariance @ covariance.T),
         session="2023-01-12",
         provenance=PROVENANCE,
     )
@@ -127,9 +128,7 @@ TERMS = (
 def test_effects_come_back_with_their_parameters_in_their_order_and_the_same_poses(tmp_path: Path) -> None:
     size = 9 + 6 + 7 + 1 + 1
     covariance = np.random.default_rng(0).normal(size=(size, size))
-    written = a_calibration(
-        effects=TERMS, covariance=tuple(tuple(values) for values in (covariance @ covariance.T).tolist())
-    )
+    written = a_calibration(effects=TERMS, covariance=covariance_rows(covariance @ covariance.T))
     write_calibration(written, tmp_path / "calibration.yaml")
     found, log = read_calibration(tmp_path / "calibration.yaml"), a_drive(1)
     assert found == written
@@ -161,7 +160,7 @@ def test_the_model_of_a_calibration_has_its_matrix_integration_and_effects() -> 
 
 def test_a_file_with_the_plain_matrix_comes_back_and_its_effects_fade(tmp_path: Path) -> None:
     slip = EffectTerm(name="centripetal_slip", parameters={"k": 0.05})
-    covariance = tuple(map(tuple, np.diag([1e-9] * 9 + [0.1**2]).tolist()))
+    covariance = covariance_rows(np.diag([1e-9] * 9 + [0.1**2]))
     shared = {"effects": (slip,), "covariance": covariance, "driven": ((0.01, 0.0, 0.0),)}
     fading, before = a_calibration(**shared, plain=matrix_rows(1.1 * APR_MATRIX)), a_calibration(**shared)
     write_calibration(fading, tmp_path / "calibration.yaml")

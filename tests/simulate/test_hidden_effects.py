@@ -441,7 +441,6 @@ def test_the_true_motion_is_that_of_odometry_on_other_code(integration: str, twi
 
 @given(st.floats(-1e-3, 1e-3))
 def test_a_slow_turn_loses_no_digits(turn: float) -> None:
-    (pose,) = mechanics.TrueMotion(np.array([1.0]), np.zeros(3), np.array([[1.0, 0.0, turn]]), "arc").poses(
-        np.array([1.0])
-    )
+    second = np.array([1.0])
+    (pose,) = mechanics.TrueMotion(second, np.zeros(3), np.array([[1.0, 0.0, turn]]), "arc").poses(second)
     assert pose == pytest.approx([1 - turn**2 / 6 + turn**4 / 120, turn / 2 - turn**3 / 24, turn], abs=1e-15, rel=1e-14)

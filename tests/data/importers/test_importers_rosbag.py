@@ -345,12 +345,8 @@ def test_drivers_that_are_silent_at_rest_leave_no_hole(tmp_path: Path) -> None:
     moving = [DRIVE.rates[min(row, len(DRIVE.rates) - 1)].any() for row in range(len(DRIVE.stamps))]
     loud = dict(zip(DRIVE.stamps.tolist(), moving, strict=True))
     sent = [each for each in messages(DRIVE) if each.topic == SLAM or loud[each.logged - 3_000_000]]
-    sent += [
-        joint_state(
-            DRIVE.stamps[round((begin + RUN) * 1e9) // PERIOD], DRIVE.angles[round((begin + RUN) * 1e9) // PERIOD]
-        )
-        for begin in DRIVE.begins
-    ]
+    stops = [round((begin + RUN) * 1e9) // PERIOD for begin in DRIVE.begins]
+    sent += [joint_state(DRIVE.stamps[row], DRIVE.angles[row]) for row in stops]
     data = read(write_mcap(tmp_path / "drive", sent))
     assert len(data.trajectories) == 12
     assert data.warnings == ()

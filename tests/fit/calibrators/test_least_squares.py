@@ -515,9 +515,7 @@ def test_a_shifted_clock_of_the_reference_does_not_spoil_the_matrix(clock: str) 
 
 def with_starts_off(problem: CalibrationProblem, deviations: Sequence[float], seed: int) -> CalibrationProblem:
     rng = np.random.default_rng(seed)
-    return with_poses(
-        problem, lambda run: np.vstack([run.poses[0] + deviations * rng.standard_normal(3), run.poses[1:]])
-    )
+    return with_poses(problem, lambda run: np.vstack([run.start + deviations * rng.standard_normal(3), run.poses[1:]]))
 
 
 def test_start_poses_that_are_off_are_taken_for_nuisances() -> None:

@@ -244,9 +244,8 @@ def test_odom_fades_outside_the_training_domain_as_the_batch_does() -> None:
     using = fading(term("heading_drift", b=0.05), deviation=0.02)
     path = drive(1.0, using=using)
     whole = using.model_copy(update={"plain": None})
-    np.testing.assert_allclose(
-        odometry(fed(RobotTracker("apr", using), path.payloads()))[1:], batch(path, using), atol=1e-9
-    )
+    updates = fed(RobotTracker("apr", using), path.payloads())
+    np.testing.assert_allclose(odometry(updates)[1:], batch(path, using), atol=1e-9)
     assert np.abs(batch(path, using) - batch(path, whole)).max() > 1e-3
 
 

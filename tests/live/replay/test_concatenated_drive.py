@@ -171,9 +171,8 @@ def test_odometry_of_the_drive_is_that_of_the_runs_composed(seed: int, count: in
     dataset = random_dataset(seed, count)
     drive = concatenate_runs(dataset, pause=pause)
     at = homogeneous(drive.start_poses[0])
-    for run, odometry in zip(
-        dataset.trajectories, MODEL.poses([t.final_log for t in dataset.trajectories]), strict=True
-    ):
+    ends = MODEL.poses([run.final_log for run in dataset.trajectories])
+    for run, odometry in zip(dataset.trajectories, ends, strict=True):
         at = at @ np.linalg.inv(homogeneous(run.start)) @ homogeneous(odometry[0])
     (poses,) = MODEL.poses([drive.log()])
     np.testing.assert_allclose(homogeneous(poses[-1]), at, atol=1e-9)
