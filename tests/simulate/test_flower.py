@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 import pytest
+from commands import refused
 from config_robots import NAMES, QUIET, apr02, apr02_settings, experiment, robot
 
 from omnibench.data.dataset import Dataset, Split
@@ -282,12 +283,8 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
 @pytest.mark.parametrize("case", REFUSED)
 def test_a_config_that_is_wrong_is_refused_in_one_line(case: str) -> None:
     changes, words = REFUSED[case]
-    with pytest.raises(ConfigError) as refusal:
+    with refused(ConfigError, words, start="flower.yaml: "):
         apr02(**changes)
-    message = str(refusal.value)
-    assert words in message
-    assert message.startswith("flower.yaml: ")
-    assert "\n" not in message
 
 
 @pytest.fixture
@@ -408,7 +405,5 @@ MANY: dict[str, tuple[str, dict[str, Any], str]] = {
 @pytest.mark.parametrize("case", MANY)
 def test_what_a_robot_cannot_do_is_refused_in_one_line(case: str) -> None:
     name, changes, words = MANY[case]
-    with pytest.raises(ConfigError) as refusal:
+    with refused(ConfigError, words):
         experiment(name, **changes)
-    assert words in str(refusal.value)
-    assert "\n" not in str(refusal.value)

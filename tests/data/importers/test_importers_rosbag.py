@@ -45,7 +45,7 @@ from bag_samples import (
     write_rosbag1,
     write_rosbag2,
 )
-from commands import Command
+from commands import Command, refused
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.writer import IndexType
@@ -270,9 +270,8 @@ def test_joints_can_be_named(tmp_path: Path) -> None:
     ],
 )
 def test_wrong_options_are_refused_in_one_line(bag: Path, options: dict[str, Any], message: str) -> None:
-    with pytest.raises(ConfigError, match=message) as caught:
+    with refused(ConfigError, match=message):
         read(bag, **options)
-    assert "\n" not in str(caught.value)
 
 
 def test_runs_keep_a_little_rest_with_a_reference_pose_at_both_ends(bag: Path) -> None:
@@ -741,9 +740,8 @@ def test_a_bag_cut_off_is_refused_in_one_line(tmp_path: Path, write: Callable[[P
     content = file.read_bytes()
     for length in (0, 20, len(content) // 3, len(content) * 9 // 10):
         file.write_bytes(content[:length])
-        with pytest.raises(DataError, match=r"drive\S*: cannot be read as a bag: .*broke off") as caught:
+        with refused(DataError, match=r"drive\S*: cannot be read as a bag: .*broke off"):
             read(source)
-        assert "\n" not in str(caught.value)
 
 
 @pytest.mark.slow

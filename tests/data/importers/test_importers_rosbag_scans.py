@@ -28,6 +28,7 @@ from bag_samples import (
     write_mcap,
     write_rosbag2,
 )
+from commands import refused
 from scan_samples import (
     ANGLE_MIN,
     INCREMENT,
@@ -169,9 +170,8 @@ def test_messages_that_are_recorded_late_or_twice_come_in_order(tmp_path: Path) 
 )
 def test_scans_that_cannot_be_are_refused(tmp_path: Path, every: int, change: dict[str, Any], message: str) -> None:
     sent = edited(with_scans(), SCAN, lambda each: changed(each, **change), every)
-    with pytest.raises(DataError, match=rf"topic {SCAN}{message}") as told:
+    with refused(DataError, match=rf"topic {SCAN}{message}"):
         read(write_mcap(tmp_path / "drive", sent))
-    assert "\n" not in str(told.value)
 
 
 def test_scans_by_another_clock_are_refused(tmp_path: Path) -> None:
