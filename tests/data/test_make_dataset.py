@@ -18,7 +18,7 @@ from wheeled_samples import DIFF, TRICYCLE, driven
 
 import omnibench
 from omnibench.config import validate
-from omnibench.data.dataset import Trajectory, make_dataset
+from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.splits import divided, division_in_words
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import ConfigError, DataError, OmnibenchError
@@ -236,6 +236,11 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "data"
 
 
+@pytest.fixture
+def dataset(folder: Path) -> Dataset:
+    return load_dataset(folder)
+
+
 @pytest.mark.parametrize(
     ("far", "message"),
     [(1e200, r"poses.parquet, row 2: x is 1e\+200"), *((far, "the pose at .* m from") for far in (1e9, 1e6, 1e5))],
@@ -257,8 +262,7 @@ def test_a_sample_period_far_from_that_of_the_stamps_is_refused(folder: Path, pe
 
 
 @pytest.mark.parametrize("factor", [1e-7, 1e6])
-def test_a_sample_period_that_no_calibration_file_takes_is_refused(folder: Path, factor: float) -> None:
-    dataset = load_dataset(folder)
+def test_a_sample_period_that_no_calibration_file_takes_is_refused(factor: float, dataset: Dataset) -> None:
     runs = [
         replace(run, times=factor * run.times, rates=run.rates / factor, pose_times=factor * run.pose_times)
         for run in dataset.trajectories
@@ -267,8 +271,7 @@ def test_a_sample_period_that_no_calibration_file_takes_is_refused(folder: Path,
         make_dataset("x", dataset.robot, factor * dataset.sample_period, runs)
 
 
-def test_standstill_between_runs_is_bounded(folder: Path) -> None:
-    dataset = load_dataset(folder)
+def test_standstill_between_runs_is_bounded(dataset: Dataset) -> None:
     short = replace(dataset, sample_period=dataset.sample_period / 1000)  # within what is only warned of
     drive = concatenate_runs(short, pause=10.0)
     assert len(drive.wheel_times) < 3 * len(concatenate_runs(dataset, pause=10.0).wheel_times)
@@ -339,16 +342,14 @@ def test_tables_that_can_be_read_in_two_ways_are_refused(folder: Path, tmp_path:
         load_dataset(folder)
 
 
-def test_a_sample_period_that_the_stamps_contradict_is_told(folder: Path) -> None:
-    dataset = load_dataset(folder)
+def test_a_sample_period_that_the_stamps_contradict_is_told(dataset: Dataset) -> None:
     assert dataset.warnings == ()
     again = make_dataset("d", dataset.robot, 100 * dataset.sample_period, dataset.trajectories)
     assert any(warning.startswith("sample_period is") for warning in again.warnings)
 
 
 @pytest.mark.parametrize("item", ["rates", "poses", "targets", "times"])
-def test_an_array_of_another_shape_is_refused_with_its_trajectory(folder: Path, item: str) -> None:
-    dataset = load_dataset(folder)
+def test_an_array_of_another_shape_is_refused_with_its_trajectory(item: str, dataset: Dataset) -> None:
     first, *others = dataset.trajectories
     spoiled = replace(first, **{item: getattr(first, item)[:, None]})
     with pytest.raises(DataError, match=f"trajectory {first.id}: .* has shape .*, expected"):

@@ -39,6 +39,11 @@ def tracker(**options: Any) -> RobotTracker:
     return RobotTracker("apr", calibration(), **{"fusion": FusionSettings(), **options})
 
 
+@pytest.fixture
+def robot() -> RobotTracker:
+    return tracker()
+
+
 @pytest.mark.parametrize("integration", ["euler", "arc"])
 @pytest.mark.parametrize("wheels", [3, 4])
 def test_odom_is_the_batch_odometry_until_it_is_closed(integration: Integration, wheels: int) -> None:
@@ -100,9 +105,8 @@ def test_odom_never_jumps_and_no_stamp_comes_twice_whatever_happens(data: st.Dat
     assert (np.abs(moved[:, 2]) < 1.6 * 1.3 * elapsed).all()
 
 
-def test_a_correction_of_slam_moves_the_filtered_pose_and_leaves_odom_alone() -> None:
+def test_a_correction_of_slam_moves_the_filtered_pose_and_leaves_odom_alone(robot: RobotTracker) -> None:
     path = drive(1.0)
-    robot = tracker()
     before = fed(robot, path.payloads()[:60])[-1]
     robot.take_pose(slam(path.stamps[50], [4.0, 5.0, 2.0]), 0.6)
     (after,) = fed(robot, path.payloads()[60:61], 0.6)
@@ -110,9 +114,8 @@ def test_a_correction_of_slam_moves_the_filtered_pose_and_leaves_odom_alone() ->
     assert np.linalg.norm(after.in_map[0][:2] - before.in_map[0][:2]) > 1
 
 
-def test_time_backwards_is_counted_and_the_stream_goes_on() -> None:
+def test_time_backwards_is_counted_and_the_stream_goes_on(robot: RobotTracker) -> None:
     path = drive(1.0)
-    robot = tracker()
     fed(robot, path.payloads()[:50])
     back = [JOINT_STATE.encode(replace(each, stamp=each.stamp - 100 * SECOND)) for each in path.samples()[50:]]
     updates = fed(robot, back, 0.5)
@@ -179,10 +182,9 @@ def test_a_full_disk_costs_the_state_and_no_odometry(tmp_path: Path) -> None:
     assert "File too large" in robot.health(1.0).last_refusal
 
 
-def test_poses_that_wait_and_are_then_rejected_are_told() -> None:
+def test_poses_that_wait_and_are_then_rejected_are_told(robot: RobotTracker) -> None:
     """SLAM whose stamps are always a little ahead of the wheels', a kilometre off."""
     path = drive(3.0)
-    robot = tracker()
     for index, payload in enumerate(path.payloads()):
         robot.take_wheels(payload, 0.01 * index)
         if index % 25 == 0:
@@ -194,9 +196,8 @@ def test_poses_that_wait_and_are_then_rejected_are_told() -> None:
     assert health.fusion.last_outcome in ("rejected", "waiting")
 
 
-def test_every_pose_that_waits_in_vain_is_counted() -> None:
+def test_every_pose_that_waits_in_vain_is_counted(robot: RobotTracker) -> None:
     path = drive(1.0)
-    robot = tracker()
     fed(robot, path.payloads()[:50])
     for number in range(40):
         robot.take_pose(slam(path.stamps[50] + 10_000_000 * number, [0, 0, 0]), 0.5)
@@ -295,9 +296,8 @@ def test_a_stale_stream_says_so_and_is_less_and_less_certain() -> None:
     assert sigmas[0] < sigmas[1] < sigmas[2]
 
 
-def test_health_says_when_slam_is_silent() -> None:
+def test_health_says_when_slam_is_silent(robot: RobotTracker) -> None:
     path = drive(3.0)
-    robot = tracker()
     fed(robot, path.payloads()[:10])
     assert robot.health(0.1).message == "no pose of SLAM yet"
     robot.take_pose(slam(path.stamps[5], [0, 0, 0]), 0.1)
@@ -306,9 +306,8 @@ def test_health_says_when_slam_is_silent() -> None:
     assert robot.health(3.0).status == "degraded"
 
 
-def test_poses_between_samples_are_at_constant_twist_and_others_are_refused() -> None:
+def test_poses_between_samples_are_at_constant_twist_and_others_are_refused(robot: RobotTracker) -> None:
     path = drive(1.0)
-    robot = tracker()
     with pytest.raises(DataError, match="has sent no wheel sample yet"):
         robot.pose_at()
     fed(robot, path.payloads())
