@@ -519,13 +519,10 @@ def test_a_longer_wheelbase_turns_a_car_less() -> None:
     np.testing.assert_allclose(longer, CAR.inverse_kinematic_matrix * [[1.0], [1.0], [0.8]], rtol=0, atol=1e-15)
 
 
-def none_kept(robot: Robot) -> Array:
-    return np.zeros((0, len(robot.drive.names)))
-
-
 def test_the_side_of_a_tracked_point_is_not_told_apart_from_that_of_the_wheels() -> None:
     geometry = WheelGeometry(TRICYCLE, fitted_mount=True)
-    told = dict(zip(geometry.names, identified_parameters(geometry, none_kept(TRICYCLE)), strict=True))
+    none_kept = np.zeros((0, len(TRICYCLE.drive.names)))
+    told = dict(zip(geometry.names, identified_parameters(geometry, none_kept), strict=True))
     assert [name for name, known in told.items() if not known] == ["y_front", "mount_y"]
 
 

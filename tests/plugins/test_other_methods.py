@@ -6,7 +6,6 @@ import math
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,7 +23,6 @@ from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, OdometryBatch
 from omnibench.testing import (
     CalibratorConformance,
-    load_plugin,
     synthetic_problem,
     synthetic_robot,
     synthetic_trajectories,
@@ -32,13 +30,8 @@ from omnibench.testing import (
 from omnibench.testing.synthetic import synthetic_robots
 
 ROBOTS = {robot.name.removeprefix("synthetic "): robot for robot in synthetic_robots()}
+PLUGINS = ("optiodom", "kallasi", "lin", "maddahi")
 FITTED = ("omni", "mecanum", "differential", "tricycle")
-
-
-@pytest.fixture(autouse=True, scope="module")
-def plugins(registries_as_before_the_module: None) -> None:  # noqa: ARG001
-    for name in ("optiodom", "kallasi", "lin", "maddahi"):
-        load_plugin(Path(__file__).parents[2] / "plugins" / f"{name}.py")
 
 
 class TestOptiOdom(CalibratorConformance):

@@ -188,10 +188,6 @@ def term(name: str, **parameters: float) -> EffectTerm:
     return EffectTerm(name=name, parameters=parameters)
 
 
-def every_effect() -> list[EffectTerm]:
-    return [term(name, **values) for name, values in EFFECTS.items()]
-
-
 def with_effects(*terms: EffectTerm, plain: Calibration | None = None, **changes: Any) -> Calibration:
     given_changes = {"effects": terms, "covariance": None, "session": "evening"}
     return (plain or calibration()).model_copy(update=given_changes | changes)
@@ -221,7 +217,7 @@ def test_odom_with_effects_is_that_of_the_batch(names: set[str], seed: int, inte
 
 
 def test_motions_lead_the_filter_along_odom_with_effects_too() -> None:
-    using = with_effects(*every_effect())
+    using = with_effects(*(term(name, **values) for name, values in EFFECTS.items()))
     path = drive(2.0, using=using)
     robot = RobotTracker("apr", using, fusion=FusionSettings())
     robot.take_wheels(path.payloads()[0], 0.0)

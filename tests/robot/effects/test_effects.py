@@ -239,11 +239,6 @@ def end(log: WheelLog, *terms: Term) -> Array:
     return model(*terms).reported([log])[0][-1]
 
 
-def shift(log: WheelLog, *terms: Term) -> Array:
-    """By how much effects move the last pose."""
-    return end(log, *terms) - end(log)
-
-
 @pytest.mark.parametrize(
     ("late", "twist", "expected"),
     [
@@ -254,7 +249,8 @@ def shift(log: WheelLog, *terms: Term) -> Array:
     ids=lambda value: value.name if isinstance(value, Term) else "",
 )
 def test_a_late_reference_moves_a_steady_run_back(late: Term, twist: list[float], expected: list[float]) -> None:
-    np.testing.assert_allclose(shift(constant(twist, 5.0), late), expected, rtol=0, atol=1e-12)
+    log = constant(twist, 5.0)
+    np.testing.assert_allclose(end(log, late) - end(log), expected, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize(("name", "harmonic"), [("wheel_eccentricity", 1), ("roller_ripple", 9)])

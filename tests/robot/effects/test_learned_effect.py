@@ -288,15 +288,11 @@ def unsure(deviation: float) -> OdometryModel:
     return replace(model(GROWN), fade=corrections.Fade(APR_02, matrix - PLAIN, FORWARDS[None], [GROWN], covariance))
 
 
-def log_of(twist: Array) -> WheelLog:
-    """Two seconds of a twist by the design values."""
+def moved(chosen: OdometryModel, twist: Array) -> Array:
+    """The pose after two seconds of a twist by the design values."""
     times = 0.1 * np.arange(1, 21)
     rates = np.tile(np.linalg.solve(APR_02.inverse_kinematic_matrix, twist), (20, 1))
-    return WheelLog(times, rates, np.zeros(3), times)
-
-
-def moved(chosen: OdometryModel, twist: Array) -> Array:
-    return chosen.poses([log_of(twist)])[0][-1]
+    return chosen.poses([WheelLog(times, rates, np.zeros(3), times)])[0][-1]
 
 
 def by_plain_matrix(twist: Array) -> Array:

@@ -135,10 +135,6 @@ ROBOTS = {
 }
 
 
-def controller_of(export: Export) -> str:
-    return next(name for name in CONTROLLERS if f"\n{name}:\n" in export.text)
-
-
 def driven_by(export: Export, robot: Robot, signals: Array) -> Array:
     """Twists (F, 3) that the controller computes of drive signals (F, M), joints reversed as the export says."""
     rates, angles = robot.drive.commands(signals)
@@ -152,7 +148,7 @@ def driven_by(export: Export, robot: Robot, signals: Array) -> Array:
         )
         for name, values in zip(names, columns, strict=True)
     }
-    controller = controller_of(export)
+    controller = next(name for name in CONTROLLERS if f"\n{name}:\n" in export.text)
     return CONTROLLERS[controller](parameters(export, controller), joints)
 
 
