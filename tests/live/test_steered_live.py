@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zenoh
-from drives import EXACT, ORIGIN, PERIOD, fed, odometry, slam
+from drives import EXACT, ORIGIN, PERIOD, fed, odometry, slam, with_effects
 from nodes import ReceivedMessages, asked, config_of, running, sent_one_by_one, wheels_of
 from samples import messages_of
 from steered import CAR, DIFFERENTIAL, SKID, SWERVE, TRICYCLE, calibration, drive, only, recording
@@ -56,16 +56,12 @@ def retracked(one: Calibration, robot: Robot) -> Array:
     return centred if robot.mount is None else robot.mount.twist @ centred
 
 
-def with_effects(plain: Calibration) -> Calibration:
-    return plain.model_copy(update={"effects": EFFECTS, "covariance": None, "session": "evening"})
-
-
 @pytest.mark.parametrize("robot", [SWERVE, TRICYCLE, CAR], ids=lambda robot: robot.name)
 @pytest.mark.parametrize("integration", ["euler", "arc"])
 @pytest.mark.parametrize("effects", [False, True])
 def test_odom_is_the_batch_odometry(robot: Robot, integration: Integration, effects: bool) -> None:
     plain = calibration(robot, integration=integration)
-    path = drive(using=with_effects(plain) if effects else plain)
+    path = drive(using=with_effects(*EFFECTS, plain=plain) if effects else plain)
     updates = fed(RobotTracker("base", path.using), path.payloads())
     np.testing.assert_allclose(odometry(updates), path.poses, atol=1e-12)
 
@@ -191,7 +187,8 @@ def test_a_state_of_a_robot_with_other_steered_wheels_is_refused() -> None:
 @pytest.mark.parametrize("effects", [False, True])
 def test_the_next_sample_steers_by_the_angle_before_the_swap(place: int, effects: bool) -> None:
     plain = calibration()
-    path, other = drive(), with_effects(plain) if effects else plain.model_copy(update={"name": "other"})
+    path = drive()
+    other = with_effects(*EFFECTS, plain=plain) if effects else plain.model_copy(update={"name": "other"})
     robot = RobotTracker("base", plain)
     fed(robot, path.payloads()[: place + 1])
     robot.swap(other)
@@ -242,7 +239,7 @@ def test_the_tracked_point_may_move_and_the_centre_does_not_jump() -> None:
 @pytest.mark.parametrize("effects", [False, True])
 def test_the_pose_is_of_the_point_from_which_the_tracked_one_is_mounted(effects: bool) -> None:
     plain = calibration(mounted(SWERVE))
-    path = drive(using=with_effects(plain) if effects else plain)
+    path = drive(using=with_effects(*EFFECTS, plain=plain) if effects else plain)
     updates = fed(RobotTracker("base", path.using), path.payloads())
     np.testing.assert_allclose(updates[0].pose, np.zeros(3), atol=1e-15)
     tracked = compose(odometry(updates), np.array([MOUNT.x, MOUNT.y, MOUNT.yaw]))

@@ -6,13 +6,12 @@ import logging
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from commands import Command as InProcess
 from commands import assert_refused, flower, succeeded, write_config
-from drives import NOISE, ORIGIN, PERIOD, Drive, calibration, drive, fed, odometry, slam
+from drives import NOISE, ORIGIN, PERIOD, Drive, calibration, drive, fed, odometry, slam, term, with_effects
 from hypothesis import given
 from hypothesis import strategies as st
 from learned_samples import a_learned_calibration
@@ -182,15 +181,6 @@ EFFECTS: dict[str, dict[str, float]] = {
     "sample_period_scale": {"s": 0.01},
     "tyre_wear": {"radius_evening": 0.01},
 }
-
-
-def term(name: str, **parameters: float) -> EffectTerm:
-    return EffectTerm(name=name, parameters=parameters)
-
-
-def with_effects(*terms: EffectTerm, plain: Calibration | None = None, **changes: Any) -> Calibration:
-    given_changes = {"effects": terms, "covariance": None, "session": "evening"}
-    return (plain or calibration()).model_copy(update=given_changes | changes)
 
 
 def batch(path: Drive, using: Calibration) -> Array:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import disk_that_takes
-from drives import NOISE, ORIGIN, PERIOD, SECOND, calibration, drive, fed, odometry, slam
+from drives import NOISE, ORIGIN, PERIOD, SECOND, calibration, drive, fed, odometry, slam, term, with_effects
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -31,8 +31,10 @@ from omnibench.live.fusion.pose_fusion import FusionSettings
 from omnibench.live.wheels.wheel_input import WheelSettings, WheelStep
 from omnibench.live.wire.messages import JOINT_STATE, JointState
 from omnibench.live.wire.outputs import Update
-from omnibench.robot.calibration import Calibration, EffectTerm, matrix_rows, write_calibration
+from omnibench.robot.calibration import Calibration, matrix_rows, write_calibration
 from omnibench.robot.odometry import Integration
+
+DRIVE = drive(1.0)
 
 
 def tracker(**options: Any) -> RobotTracker:
@@ -106,22 +108,20 @@ def test_odom_never_jumps_and_no_stamp_comes_twice_whatever_happens(data: st.Dat
 
 
 def test_a_correction_of_slam_moves_the_filtered_pose_and_leaves_odom_alone(robot: RobotTracker) -> None:
-    path = drive(1.0)
-    before = fed(robot, path.payloads()[:60])[-1]
-    robot.take_pose(slam(path.stamps[50], [4.0, 5.0, 2.0]), 0.6)
-    (after,) = fed(robot, path.payloads()[60:61], 0.6)
-    np.testing.assert_allclose(after.pose, path.poses[60], atol=1e-9)
+    before = fed(robot, DRIVE.payloads()[:60])[-1]
+    robot.take_pose(slam(DRIVE.stamps[50], [4.0, 5.0, 2.0]), 0.6)
+    (after,) = fed(robot, DRIVE.payloads()[60:61], 0.6)
+    np.testing.assert_allclose(after.pose, DRIVE.poses[60], atol=1e-9)
     assert np.linalg.norm(after.in_map[0][:2] - before.in_map[0][:2]) > 1
 
 
 def test_time_backwards_is_counted_and_the_stream_goes_on(robot: RobotTracker) -> None:
-    path = drive(1.0)
-    fed(robot, path.payloads()[:50])
-    back = [JOINT_STATE.encode(replace(each, stamp=each.stamp - 100 * SECOND)) for each in path.samples()[50:]]
+    fed(robot, DRIVE.payloads()[:50])
+    back = [JOINT_STATE.encode(replace(each, stamp=each.stamp - 100 * SECOND)) for each in DRIVE.samples()[50:]]
     updates = fed(robot, back, 0.5)
     assert robot.counts.clock_jumps == 1
-    np.testing.assert_allclose(updates[-1].pose, path.poses[-1], atol=1e-9)
-    assert robot.take_pose(slam(path.stamps[-1] - 100 * SECOND, path.poses[-1]), 1.0) == "located"
+    np.testing.assert_allclose(updates[-1].pose, DRIVE.poses[-1], atol=1e-9)
+    assert robot.take_pose(slam(DRIVE.stamps[-1] - 100 * SECOND, DRIVE.poses[-1]), 1.0) == "located"
 
 
 def giant() -> Calibration:
@@ -138,10 +138,7 @@ def giant() -> Calibration:
         (calibration(wheels=4), "wheels fl, fr, rl, rr, .* a, b, c"),
         (calibration(scale=30.0), "off the design"),
         (giant(), "off the design"),
-        (
-            calibration().model_copy(update={"effects": (EffectTerm(name="heading_drft", parameters={"b": 0.1}),)}),
-            "heading_drift",
-        ),
+        (with_effects(term("heading_drft", b=0.1)), "heading_drift"),
     ],
     ids=["another robot", "absurd", "giant", "unknown effect"],
 )
@@ -173,10 +170,9 @@ def test_after_a_silence_of_a_sender_of_rates_the_twist_is_true_and_the_pose_unc
 
 
 def test_a_full_disk_costs_the_state_and_no_odometry(tmp_path: Path) -> None:
-    path = drive(1.0)
     robot = tracker(memory=RobotMemory(tmp_path, "apr"))
     with disk_that_takes(0):
-        updates = fed(robot, path.payloads())
+        updates = fed(robot, DRIVE.payloads())
     assert len(updates) == 101
     assert robot.counts.failures > 0
     assert "File too large" in robot.health(1.0).last_refusal
@@ -197,11 +193,10 @@ def test_poses_that_wait_and_are_then_rejected_are_told(robot: RobotTracker) -> 
 
 
 def test_every_pose_that_waits_in_vain_is_counted(robot: RobotTracker) -> None:
-    path = drive(1.0)
-    fed(robot, path.payloads()[:50])
+    fed(robot, DRIVE.payloads()[:50])
     for number in range(40):
-        robot.take_pose(slam(path.stamps[50] + 10_000_000 * number, [0, 0, 0]), 0.5)
-    fed(robot, path.payloads()[50:], 0.5)
+        robot.take_pose(slam(DRIVE.stamps[50] + 10_000_000 * number, [0, 0, 0]), 0.5)
+    fed(robot, DRIVE.payloads()[50:], 0.5)
     counts = robot.counts
     assert counts.poses + counts.pose_rejected + counts.pose_ahead == 40
 
@@ -286,10 +281,9 @@ def test_joints_called_like_the_wheels_are_found_as_in_a_bag() -> None:
 
 
 def test_a_stale_stream_says_so_and_is_less_and_less_certain() -> None:
-    path = drive(1.0)
     robot = tracker(fusion=None, stale_after=0.5)
     assert robot.health(0.0).status == "waiting"
-    fed(robot, path.payloads())
+    fed(robot, DRIVE.payloads())
     healths = [robot.health(1.0 + seconds) for seconds in (0.1, 1.0, 5.0)]
     assert [health.status for health in healths] == ["ok", "stale", "stale"]
     sigmas = [health.position_sigma_m for health in healths]
@@ -307,12 +301,11 @@ def test_health_says_when_slam_is_silent(robot: RobotTracker) -> None:
 
 
 def test_poses_between_samples_are_at_constant_twist_and_others_are_refused(robot: RobotTracker) -> None:
-    path = drive(1.0)
     with pytest.raises(DataError, match="has sent no wheel sample yet"):
         robot.pose_at()
-    fed(robot, path.payloads())
+    fed(robot, DRIVE.payloads())
     middle = robot.pose_at(ORIGIN + round(0.505 * SECOND)).odometry
-    np.testing.assert_allclose(middle[2], path.poses[50:52, 2].mean(), atol=1e-9)
+    np.testing.assert_allclose(middle[2], DRIVE.poses[50:52, 2].mean(), atol=1e-9)
     with pytest.raises(DataError, match=r"is not within 1800000000\.\d+ to 1800000001\.000000 s"):
         robot.pose_at(ORIGIN - SECOND)
 
@@ -357,7 +350,7 @@ def test_every_anomaly_is_told_in_words_that_agree_with_its_number() -> None:
 
 
 FORWARDS, SIDEWAYS, STANDING = (0.2, 0.0, 0.0), (0.0, 0.2, 0.0), (0.0, 0.0, 0.0)
-SLIP = EffectTerm(name="centripetal_slip", parameters={"k": 0.03})
+SLIP = term("centripetal_slip", k=0.03)
 Twist = tuple[float, float, float]
 
 
