@@ -51,11 +51,8 @@ def made() -> Sample:
 
 @pytest.fixture(scope="module")
 def report(made: Sample, tmp_path_factory: pytest.TempPathFactory) -> Page:
-    file = tmp_path_factory.mktemp("recording") / "report.html"
-    notes = ("Made for a test.",)
-    document = recording_document(made.dataset, truth=made.truth, plan=made.plan, starts=made.starts, notes=notes)
-    write_document(document, file)
-    return Page(file.read_text(encoding="utf-8"))
+    known = {"truth": made.truth, "plan": made.plan, "starts": made.starts, "notes": ("Made for a test.",)}
+    return page(made.dataset, tmp_path_factory.mktemp("recording"), **known)
 
 
 def page(dataset: Dataset, folder: Path, **options: Any) -> Page:

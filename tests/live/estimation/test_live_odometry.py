@@ -38,13 +38,6 @@ def driven(odometry: LiveOdometry, angles: np.ndarray, durations: np.ndarray) ->
     return odometry
 
 
-@given(st.integers(0, 10_000), st.sampled_from(["euler", "arc"]), st.sampled_from([3, 4]))
-def test_poses_are_those_of_the_batch(seed: int, integration: Integration, wheels: int) -> None:
-    path = drive(1.0, seed=seed, using=calibration(integration=integration, wheels=wheels))
-    live = driven(LiveOdometry(path.calibration), path.angles, np.full(100, 0.01))
-    np.testing.assert_allclose(live.pose, path.poses[-1], atol=1e-12)
-
-
 @pytest.mark.parametrize("integration", ["euler", "arc"])
 def test_the_covariance_of_the_matrix_spreads_as_the_batch_derivatives_say(integration: Integration) -> None:
     path = drive(4.0, using=calibration(integration=integration))
@@ -194,7 +187,7 @@ def batch(path: Drive, using: Calibration) -> Array:
 
 
 @given(
-    st.sets(st.sampled_from(sorted(EFFECTS)), min_size=1, max_size=4),
+    st.sets(st.sampled_from(sorted(EFFECTS)), max_size=4),
     st.integers(0, 1000),
     st.sampled_from(["euler", "arc"]),
 )
