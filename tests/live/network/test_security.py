@@ -19,7 +19,7 @@ import pytest
 import zenoh
 from commands import ENVIRONMENT
 from drives import drive
-from nodes import Command, peak_memory, sent, write_node
+from nodes import Command, peak_memory, sent, wheels_of, write_node
 from pydantic import ValidationError
 from recordings import random_dataset
 from sessions import free_port, until
@@ -332,8 +332,7 @@ def test_large_messages_of_a_viewer_cost_a_node_no_memory_and_no_odometry(keys: 
         with robot, viewer:
             odometry: list[zenoh.Sample] = []
             subscriber = robot.declare_subscriber("apr02/odom", odometry.append)
-            publisher = robot.declare_publisher("apr02/joint_states")
-            until(lambda: publisher.matching_status.matching, "the node's subscriber")
+            publisher = wheels_of(robot, "apr02")
             samples = drive(1.0).samples()
             sent(publisher, samples[:50])
             until(lambda: odometry, "odometry")
