@@ -19,7 +19,10 @@ from omnibench.study.config import StudyConfig
 from omnibench.study.study import read_study_config
 
 PERIOD, SAMPLES = 0.1, 40
-TWISTS = {"line": ((0.3, 0.0, 0.0), (-0.3, 0.0, 0.0)), "arc": ((0.3, 0.0, 0.5), (0.3, 0.0, -0.5))}
+TWISTS = {
+    "line": ((0.3, 0.0, 0.0), (-0.3, 0.0, 0.0)),
+    "arc": ((0.3, 0.0, 0.5), (0.3, 0.0, -0.5)),
+}
 METHODS: tuple[dict[str, Any], ...] = (
     {"name": "theoretical", "label": "design", "family": "baseline"},
     {"name": "closed_form", "label": "default", "family": "ours"},

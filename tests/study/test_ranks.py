@@ -40,7 +40,9 @@ def test_a_method_without_an_answer_in_one_cell_has_no_rank_but_a_profile() -> N
     ranked = ranking(cells, ("a", "b", "c", "d"))
     assert ranked is not None
     assert set(ranked.methods) == {"a", "b", "c"}
-    shares = {one.method: (one.share(1.0), one.share(2.0), one.share(100.0)) for one in profiles(cells, ("a", "d"))}
+    shares = {
+        each.method: (each.share(1.0), each.share(2.0), each.share(100.0)) for each in profiles(cells, ("a", "d"))
+    }
     assert shares == {"a": (0.5, 0.5, 1.0), "d": (0.5, 0.5, 0.5)}
 
 

@@ -72,7 +72,9 @@ def test_every_method_is_fitted_to_the_same_runs_and_judged_on_the_same_others(s
     assert of_cells["rows"].to_list() == [3] * len(of_cells)
 
 
-def test_a_calibration_on_arcs_beats_the_design_on_lines_and_the_design_is_one_times_itself(studied: Studied) -> None:
+def test_a_calibration_on_arcs_is_better_than_the_design_on_lines_and_the_design_is_one_times_itself(
+    studied: Studied,
+) -> None:
     (row,) = studied.rows(robot="two", training="arc", judged="line", method="default", regime="as recorded").to_dicts()
     assert row["ratio"] < 0.5
     assert row["family_high"] < 1
