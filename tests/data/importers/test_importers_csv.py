@@ -207,9 +207,9 @@ def test_wheels_without_poses_and_poses_without_wheels_are_named(tmp_path: Path)
         read(tmp_path)
     (tmp_path / "run2_poses.csv").unlink()
     later(poses(1), 1e9).write_csv(tmp_path / "run1_poses.csv")
-    with pytest.raises(DataError, match=r"no two poses while the wheels were recorded") as refused:
+    with pytest.raises(DataError, match=r"no two poses while the wheels were recorded") as told:
         read(tmp_path)
-    offset = str(refused.value).partition("--set pose_time_offset=")[2].split()[0]
+    offset = str(told.value).partition("--set pose_time_offset=")[2].split()[0]
     assert read(tmp_path, pose_time_offset=float(offset)).trajectories[0].has_poses
     (tmp_path / "run1_poses.csv").rename(tmp_path / "run_1_poses.csv")
     with pytest.raises(DataError, match=r"run 'run1' has no run1_poses\.csv or run1_poses\.tum"):
@@ -652,6 +652,12 @@ def wheel_table(zero: float = 0.0, rates: tuple[float, float] = (4.0, 4.0)) -> s
     return "\n".join(["t,omega_left,omega_right", *rows]) + "\n"
 
 
+def of_two_runs(column: str) -> str:
+    """One table of the wheels of runs a and b, which a column names."""
+    header, *rows = wheel_table().splitlines()
+    return "\n".join([f"{column},{header}", *(f"{run},{row}" for run in "ab" for row in rows)])
+
+
 def write(folder: Path, **tables: str) -> Path:
     """A folder with tables by their names without .csv."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -687,21 +693,17 @@ def test_a_run_with_references_needs_no_poses_and_one_table_holds_those_of_all_r
 
 
 def test_references_may_stand_beside_one_table_of_the_wheels_of_all_runs(tmp_path: Path) -> None:
-    header, *rows = wheel_table().splitlines()
-    table = "\n".join([f"run,{header}", *(f"{run},{row}" for run in "ab" for row in rows)])
     told = "run,kind,value,sigma\na,distance,1.0,0.003\nb,distance,1.1,0.003\n"
-    runs = read_tables(write(tmp_path, log=table, references=told)).trajectories
+    runs = read_tables(write(tmp_path, log=of_two_runs("run"), references=told)).trajectories
     assert [(run.id, measured(run)[0][3]) for run in runs] == [("a", 1.0), ("b", 1.1)]
 
 
 def test_references_that_do_not_name_their_run_are_not_taken_for_those_of_every_run(tmp_path: Path) -> None:
-    header, *rows = wheel_table().splitlines()
-    table = "\n".join([f"Lauf,{header}", *(f"{run},{row}" for run in "ab" for row in rows)])
     told = "Name,Kind,Value,Sigma\na,distance,1.0,0.003\nb,distance,1.1,0.003\n"
-    source = write(tmp_path, log=table, references=told)
+    source = write(tmp_path, log=of_two_runs("Lauf"), references=told)
     with pytest.raises(DataError, match=r"references\.csv: column 'Lauf' is missing; .* --set run_column=NAME"):
         read_tables(source, run_column="Lauf")
-    write(tmp_path, log=table.replace("Lauf,", "run,"))
+    write(tmp_path, log=of_two_runs("run"))
     with pytest.raises(DataError, match=r"references\.csv: column 'run' is missing, .*; --set run_column=NAME"):
         read_tables(source)
     runs = read_tables(write(tmp_path, references=told.replace("Name", "Run"))).trajectories
