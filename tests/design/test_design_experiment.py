@@ -257,10 +257,8 @@ def star(*commands: dict[str, Any], **others: Any) -> dict[str, Any]:
     ],
 )
 def test_a_config_that_cannot_be_is_refused_in_a_line(tmp_path: Path, changes: dict[str, Any], parts: str) -> None:
-    with pytest.raises(ConfigError) as refused:
+    with refused(ConfigError, str(tmp_path / "small.yaml"), *parts.split()):
         design_experiment(written(tmp_path, **changes))
-    for part in (str(tmp_path / "small.yaml"), *parts.split()):
-        assert part in str(refused.value)
 
 
 def test_final_poses_of_full_turns_are_said_to_leave_the_matrix_undetermined(tmp_path: Path) -> None:
@@ -315,9 +313,8 @@ def test_runs_without_a_command_are_left_out_and_said_so() -> None:
     ],
 )
 def test_arguments_that_cannot_be_are_refused(tmp_path: Path, arguments: dict[str, Any], parts: str) -> None:
-    with pytest.raises(OmnibenchError) as refused:
+    with refused(OmnibenchError, *parts.split()):
         design_experiment(written(tmp_path), **arguments)
-    assert all(part in str(refused.value) for part in parts.split())
 
 
 def test_a_source_must_be_there_and_one_with_several_data_sets_needs_a_choice(tmp_path: Path) -> None:

@@ -184,8 +184,8 @@ def test_arguments_that_do_not_go_together_are_refused(
     arguments: list[str], words: str, command: Command, prepared: Prepared
 ) -> None:
     names = {"CONFIG": prepared.config, "DATA": prepared.data, "CALIBRATION": prepared.calibration}
-    refused = command("simulate", *(names.get(each, each) for each in arguments), "-o", "made")
-    assert_refused(refused, words)
+    printed = command("simulate", *(names.get(each, each) for each in arguments), "-o", "made")
+    assert_refused(printed, words)
     assert not Path("made").exists()
 
 

@@ -749,7 +749,7 @@ def test_a_bag_cut_off_is_refused_in_one_line(tmp_path: Path, write: Callable[[P
 def test_damage_never_shows_as_a_traceback(tmp_path: Path, write: Callable[[Path, Sequence[Sent]], Path]) -> None:
     source = write(tmp_path / "drive", part(7))
     files = [source] if source.is_file() else sorted(source.iterdir())
-    rng, refused = random.Random(7), 0
+    rng, told = random.Random(7), 0
     for _ in range(25):
         file = rng.choice(files)
         content = file.read_bytes()
@@ -760,9 +760,9 @@ def test_damage_never_shows_as_a_traceback(tmp_path: Path, write: Callable[[Path
         try:
             read(source)
         except OmnibenchError:
-            refused += 1
+            told += 1
         file.write_bytes(content)
-    assert refused
+    assert told
 
 
 def test_an_mcap_whose_recorder_was_killed_is_read_without_its_index(tmp_path: Path) -> None:
