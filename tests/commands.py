@@ -86,6 +86,18 @@ def assert_refused(run: Printed | subprocess.CompletedProcess[str], *parts: str)
         assert part in run.stderr
 
 
+@contextmanager
+def refused(error: Any, *parts: str, start: str = "", match: str | None = None) -> Iterator[None]:
+    """What is done inside must be refused in one line with all ``parts``."""
+    with pytest.raises(error, match=match) as refusal:
+        yield
+    told = str(refusal.value)
+    assert told.startswith(start)
+    assert "\n" not in told
+    for part in parts:
+        assert part in told
+
+
 def succeeded(run: Any) -> Any:
     """What a command printed that must have ended well."""
     assert run.returncode == 0, run.stderr

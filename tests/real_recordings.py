@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
 import pytest
 from commands import RECORDINGS, ROOT
 from shared_results import made_once
 
-from omnibench.data.dataset import Dataset
+from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.registry import load_plugin_file
+from omnibench.robot.kinematics import Array
+from omnibench.robot.odometry import OdometryBatch
 from omnibench.slam.import_dataset import import_dataset
 
 OPTIODOM = RECORDINGS / "optiodom"
@@ -52,3 +57,10 @@ def robotino() -> Dataset:
         pytest.skip(f"the recordings are not at {ROBOTINO}")
     assert load_plugin_file(ROOT / "plugins" / "robotino.py") is None
     return import_dataset("robotino", ROBOTINO)
+
+
+def mean_errors(matrix: Array, runs: Sequence[Trajectory]) -> tuple[float, float]:
+    """Mean errors of the final pose by a matrix, m and degrees."""
+    batch = OdometryBatch([run.final_log for run in runs], "arc")
+    errors = batch.poses(matrix[None])[0] - np.array([run.final_pose for run in runs])
+    return float(np.hypot(errors[:, 0], errors[:, 1]).mean()), float(np.degrees(np.abs(errors[:, 2])).mean())

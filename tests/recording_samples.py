@@ -13,7 +13,7 @@ from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.scans import ScansInMemory
 from omnibench.data.true_poses import TruePath
 from omnibench.robot.kinematics import Array, wheel_equations
-from omnibench.robot.odometry import Path
+from omnibench.robot.odometry import DrivenPath
 from omnibench.simulate.floor_plan import FloorPlan, RoomPlan, make_plan
 from omnibench.simulate.lidar import Lidar, measure_scans, scan_stamps
 
@@ -55,7 +55,7 @@ def sample(repetitions: int = 2, duration: float = 3.0, rays: int = 90) -> Sampl
             target = np.tile(wheel_equations(APR_02.wheels) @ twist, (len(times), 1))
             true = 1.02 * target
             ticks = np.floor(np.cumsum(true, axis=0) / TICK)
-            path = Path(times, np.zeros(3), true @ APR_02.inverse_kinematic_matrix.T * PERIOD, "arc")
+            path = DrivenPath(times, np.zeros(3), true @ APR_02.inverse_kinematic_matrix.T * PERIOD, "arc")
             dense = np.append(0.0, times)
             truth[name] = TruePath(dense, path.poses(dense))
             starts[name] = plan.start + np.array([0.05, -0.03, 0.04]) * rng.standard_normal(3)

@@ -26,23 +26,24 @@ LEVER_MECANUM = {
 }
 
 
-def _robot(name: str, *wheels: dict[str, object], **more: object) -> Robot:
+def make_robot(name: str, *wheels: dict[str, object], **more: object) -> Robot:
+    """A robot of wheels that the functions below describe."""
     return Robot.model_validate({"name": name, "wheels": wheels, **more})
 
 
-def _fixed(name: str, x: float, y: float, **more: object) -> dict[str, object]:
+def fixed(name: str, x: float, y: float, **more: object) -> dict[str, object]:
     return {"name": name, "type": "fixed", "radius": 0.05, "x": x, "y": y, **more}
 
 
-def _steered(name: str, x: float, y: float, **more: object) -> dict[str, object]:
+def steered(name: str, x: float, y: float, **more: object) -> dict[str, object]:
     return {"name": name, "type": "steered", "radius": 0.05, "x": x, "y": y, **more}
 
 
-def _mecanum(name: str, x: float, y: float, rollers: float) -> dict[str, object]:
+def mecanum(name: str, x: float, y: float, rollers: float) -> dict[str, object]:
     return {"name": name, "type": "mecanum", "radius": 0.05, "x": x, "y": y, "roller_angle_deg": rollers}
 
 
-_REAR = (_fixed("rear_left", 0.0, 0.2, measured=False), _fixed("rear_right", 0.0, -0.2, measured=False))
+_REAR = (fixed("rear_left", 0.0, 0.2, measured=False), fixed("rear_right", 0.0, -0.2, measured=False))
 _CORNERS = {
     "front_left": (0.2, 0.15),
     "front_right": (0.2, -0.15),
@@ -51,19 +52,19 @@ _CORNERS = {
 }
 
 # One robot of every other class (m).
-DIFFERENTIAL = _robot("diff", _fixed("left", 0.0, 0.15), _fixed("right", 0.0, -0.15))
-SKID = _robot("skid", *(_fixed(name, *place) for name, place in _CORNERS.items()), skid=True)
-MECANUM = _robot(
+DIFFERENTIAL = make_robot("diff", fixed("left", 0.0, 0.15), fixed("right", 0.0, -0.15))
+SKID = make_robot("skid", *(fixed(name, *place) for name, place in _CORNERS.items()), skid=True)
+MECANUM = make_robot(
     "mecanum",
-    *(_mecanum(name, *place, 45 * (-1) ** (number in (1, 2))) for number, (name, place) in enumerate(_CORNERS.items())),
+    *(mecanum(name, *place, 45 * (-1) ** (number in (1, 2))) for number, (name, place) in enumerate(_CORNERS.items())),
 )
-TRICYCLE = _robot("tricycle", _steered("front", 0.5, 0.0), *_REAR)
-CAR = _robot(
+TRICYCLE = make_robot("tricycle", steered("front", 0.5, 0.0), *_REAR)
+CAR = make_robot(
     "car",
-    _fixed("left", 0.0, 0.2),
-    _fixed("right", 0.0, -0.2),
-    _steered("front_left", 0.5, 0.2, driven=False),
-    _steered("front_right", 0.5, -0.2, driven=False),
+    fixed("left", 0.0, 0.2),
+    fixed("right", 0.0, -0.2),
+    steered("front_left", 0.5, 0.2, driven=False),
+    steered("front_right", 0.5, -0.2, driven=False),
 )
-SWERVE = _robot("swerve", *(_steered(name, *place) for name, place in _CORNERS.items()))
+SWERVE = make_robot("swerve", *(steered(name, *place) for name, place in _CORNERS.items()))
 WHEELED = (DIFFERENTIAL, SKID, MECANUM, TRICYCLE, CAR, SWERVE)

@@ -6,43 +6,25 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from sample_robots import fixed, make_robot, steered
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.robot.kinematics import Array, Robot, Wheel
+from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
 
-DIFF = Robot(
-    name="diff",
-    wheels=(
-        Wheel(name="right", type="fixed", radius=0.042, x=0, y=-0.1),
-        Wheel(name="left", type="fixed", radius=0.042, x=0, y=0.1),
-    ),
+DIFF = make_robot("diff", *(fixed(name, 0, y, radius=0.042) for name, y in (("right", -0.1), ("left", 0.1))))
+TRICYCLE = make_robot(
+    "tricycle",
+    steered("front", 0.15, 0, radius=0.0325),
+    *(fixed(name, 0, y, radius=0.0325, measured=False) for name, y in (("left", 0.08), ("right", -0.08))),
 )
-TRICYCLE = Robot(
-    name="tricycle",
-    wheels=(
-        Wheel(name="front", type="steered", radius=0.0325, x=0.15, y=0),
-        Wheel(name="left", type="fixed", radius=0.0325, x=0, y=0.08, measured=False),
-        Wheel(name="right", type="fixed", radius=0.0325, x=0, y=-0.08, measured=False),
-    ),
+CAR = make_robot(
+    "car",
+    *(fixed(name, 0, y, radius=0.03) for name, y in (("rl", 0.1), ("rr", -0.1))),
+    *(steered(name, 0.3, y, radius=0.03, driven=False) for name, y in (("fl", 0.1), ("fr", -0.1))),
 )
-CAR = Robot(
-    name="car",
-    wheels=(
-        Wheel(name="rl", type="fixed", radius=0.03, x=0, y=0.1),
-        Wheel(name="rr", type="fixed", radius=0.03, x=0, y=-0.1),
-        Wheel(name="fl", type="steered", radius=0.03, x=0.3, y=0.1, driven=False),
-        Wheel(name="fr", type="steered", radius=0.03, x=0.3, y=-0.1, driven=False),
-    ),
-)
-SWERVE = Robot(
-    name="swerve",
-    wheels=tuple(
-        Wheel(name=name, type="steered", radius=0.05, x=x, y=y)
-        for name, x, y in (("fl", 0.2, 0.2), ("fr", 0.2, -0.2), ("rear", -0.2, 0.0))
-    ),
-)
+SWERVE = make_robot("swerve", steered("fl", 0.2, 0.2), steered("fr", 0.2, -0.2), steered("rear", -0.2, 0.0))
 ROBOTS = (DIFF, TRICYCLE, CAR, SWERVE)
 _PERIOD = 0.1  # s
 

@@ -78,8 +78,7 @@ def test_a_sound_recording_is_misread_in_nothing(robot: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "robot"),
-    [(change, NAMES[index % len(NAMES)]) for index, change in enumerate(CHANGES)],
+    ("change", "robot"), [(change, NAMES[index % len(NAMES)]) for index, change in enumerate(CHANGES)]
 )
 def test_a_mistake_is_named(change: str, robot: str) -> None:
     made, kind = CHANGES[change]

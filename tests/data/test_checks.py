@@ -152,9 +152,7 @@ def arrangements(wheels: int) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
 
 
 @pytest.mark.parametrize(("order", "signs"), arrangements(3))
-def test_every_exchange_of_three_wheels_is_told_with_the_way_back(
-    order: tuple[int, ...], signs: tuple[int, ...]
-) -> None:
+def test_an_exchange_of_three_wheels_is_told_with_the_way_back(order: tuple[int, ...], signs: tuple[int, ...]) -> None:
     names = "abc"
     # Recorded column i holds signs[i] * wheel order[i]; the warning names the column that each wheel is found in.
     found_in = {wheel: (column, sign) for column, (wheel, sign) in enumerate(zip(order, signs, strict=True))}

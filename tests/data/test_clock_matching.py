@@ -9,20 +9,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sample_robots import APR_02
+from sample_robots import APR_02, fixed, make_robot
 
 from omnibench.data.clock_matching import ClockMatch, Streams, align, match_clocks, median_period
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset, unwrap
-from omnibench.robot.kinematics import Array, Robot, Wheel, wheel_equations
+from omnibench.robot.kinematics import Array, wheel_equations
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import DrivenPath, WheelLog
 
-ROBOT = Robot(
-    name="base",
-    wheels=tuple(
-        Wheel(name=name, type="fixed", radius=0.05, x=0.0, y=side) for name, side in (("l", 0.1), ("r", -0.1))
-    ),
-)
+ROBOT = make_robot("base", fixed("l", 0.0, 0.1), fixed("r", 0.0, -0.1))
 OFFSET, DRIFT = 0.12, 0.002  # s, s per s, to be added to the poses' times
 LENGTH = 40.0  # s
 

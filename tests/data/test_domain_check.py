@@ -50,9 +50,8 @@ def test_repetitions_of_a_command_are_named_once_and_of_many_commands_three() ->
     told = str(extrapolation_warning(calibration(), runs))
     assert "4 of 4 runs" in told
     assert "(turn), such as turning" in told
-    assert "(a, b, c and 2 more)" in str(
-        extrapolation_warning(calibration(), [run(name, SIDEWAYS) for name in "abcde"])
-    )
+    aside = [run(name, SIDEWAYS) for name in "abcde"]
+    assert "(a, b, c and 2 more)" in str(extrapolation_warning(calibration(), aside))
 
 
 @pytest.mark.parametrize(

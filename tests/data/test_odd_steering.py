@@ -100,9 +100,7 @@ def test_a_steering_column_in_degrees_is_named(robot: str) -> None:
         (times(-1), "looks counted clockwise", "steering_signs=[-1{}], times the present ones"),
     ],
 )
-def test_a_zero_and_a_sense_of_all_steering_angles_are_named(
-    robot: str, change: Change, words: str, option: str
-) -> None:
+def test_zero_and_sense_of_all_steering_angles_are_named(robot: str, change: Change, words: str, option: str) -> None:
     (warning,) = warnings_of(robot, steering=change)
     first = option.partition("[")[2].partition("{")[0]
     assert words in warning

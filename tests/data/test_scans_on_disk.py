@@ -13,6 +13,7 @@ import numpy as np
 import polars as pl
 import pytest
 import yaml
+from commands import refused
 from storage_samples import FORMATS, Format, everything_known, read_frame, table_file, write_frame
 
 from omnibench.data.dataset import Dataset
@@ -92,9 +93,7 @@ def test_scans_that_are_many_row_groups_long_come_back(tmp_path: Path) -> None:
         assert_same(scans_of(tmp_path / "data").of(trajectory), expected)
 
 
-def test_a_part_of_a_data_set_is_saved_with_its_own_scans_and_without_scans_without_a_scanner(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_a_part_is_saved_with_its_own_scans_and_without_scans_without_a_scanner(folder: Path, tmp_path: Path) -> None:
     data = load_dataset(folder)
     save_dataset(replace(data, trajectories=data.trajectories[1:]), tmp_path / "part")
     assert scans_of(tmp_path / "part").trajectories == ("run-2",)
@@ -147,9 +146,8 @@ def test_a_full_disk_is_told_in_one_line(tmp_path: Path) -> None:
     save_dataset(scanned(), tmp_path / "data")
     (tmp_path / "data" / "scans.parquet").unlink()
     (tmp_path / "data" / "scans.parquet").symlink_to("/dev/full")
-    with pytest.raises(DataError, match=r"cannot be written: .*No space left on device") as told:
+    with refused(DataError, match=r"cannot be written: .*No space left on device"):
         save_dataset(scanned(), tmp_path / "data")
-    assert "\n" not in str(told.value)
 
 
 def with_cell(row: int, column: str, value: Any) -> Callable[[pl.DataFrame], pl.DataFrame]:
@@ -205,9 +203,8 @@ BROKEN_PARQUET: list[tuple[Change, str]] = [
 def test_a_broken_table_is_refused_in_one_line(tmp_path: Path, fmt: Format, change: Change, message: str) -> None:
     save_dataset(scanned(), tmp_path, fmt)
     write_frame(tmp_path, "scans", change(read_frame(tmp_path, "scans")))
-    with pytest.raises(DataError, match=rf"scans\.\w+[:,] {message}") as told:
+    with refused(DataError, match=rf"scans\.\w+[:,] {message}"):
         list(scans_of(tmp_path))
-    assert "\n" not in str(told.value)
 
 
 @pytest.mark.parametrize(
@@ -267,11 +264,11 @@ def test_damage_never_shows_as_a_traceback(folder: Path) -> None:
         for _ in range(3):
             damaged[rng.randrange(len(damaged))] = rng.randrange(256)
         damages.append(bytes(damaged))
-    refused = 0
+    told = 0
     for damage in damages:
         file.write_bytes(damage)
         try:
             list(scans_of(folder))
         except OmnibenchError:
-            refused += 1
-    assert refused > 5
+            told += 1
+    assert told > 5

@@ -10,22 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from commands import CONFIGS, RECORDINGS, Command
+from commands import CONFIGS, RECORDINGS, Command, refused
 from config_robots import NAMES, robot, settings
 from report_samples import APR02, flower
 
 from omnibench.config import validate
 from omnibench.data.dataset import Dataset, make_dataset
 from omnibench.data.storage import save_dataset
-from omnibench.design.candidates import (
-    CandidatePool,
-    RobotCommands,
-    RobotOptions,
-    candidates_of_config,
-    candidates_of_dataset,
-    design_source,
-    read_candidates,
-)
+from omnibench.design import candidates
 from omnibench.design.config import DesignConfig
 from omnibench.design.design import design_experiment
 from omnibench.design.report import equal_in_words, plan_in_words
@@ -98,7 +90,7 @@ def papers() -> Design:
 
 def information_of(path: Path, names: tuple[str, ...]) -> Array:
     """Information (C, 9, 9) of a run of some candidates, from every reference pose."""
-    pool = read_candidates(path)
+    pool = candidates.read_candidates(path)
     runs = {each.name: each.runs[0] for each in pool.candidates}
     matrix = pool.robot.inverse_kinematic_matrix
     return information_of_runs([runs[name] for name in names], matrix, pool.integration, pool.noise)
@@ -156,7 +148,7 @@ def test_deviations_are_those_of_the_covariance_of_the_elements(papers: Design) 
     information = information_of(CONFIGS / "design.yaml", tuple(counts))
     covariance = np.linalg.inv(np.tensordot(list(counts.values()), information, 1))
     deviations = np.sqrt(np.diagonal(covariance)).reshape(3, 3).max(axis=1)
-    largest = np.abs(read_candidates(CONFIGS / "design.yaml").robot.inverse_kinematic_matrix).max(axis=1)
+    largest = np.abs(candidates.read_candidates(CONFIGS / "design.yaml").robot.inverse_kinematic_matrix).max(axis=1)
     assert found.step.row_percent == pytest.approx(100 * deviations / largest, rel=1e-6)
 
 
@@ -265,10 +257,8 @@ def star(*commands: dict[str, Any], **others: Any) -> dict[str, Any]:
     ],
 )
 def test_a_config_that_cannot_be_is_refused_in_a_line(tmp_path: Path, changes: dict[str, Any], parts: str) -> None:
-    with pytest.raises(ConfigError) as refused:
+    with refused(ConfigError, str(tmp_path / "small.yaml"), *parts.split()):
         design_experiment(written(tmp_path, **changes))
-    for part in (str(tmp_path / "small.yaml"), *parts.split()):
-        assert part in str(refused.value)
 
 
 def test_final_poses_of_full_turns_are_said_to_leave_the_matrix_undetermined(tmp_path: Path) -> None:
@@ -297,17 +287,15 @@ def test_final_poses_of_full_turns_are_said_to_leave_the_matrix_undetermined(tmp
         ({}, {"command": "only"}, "only is its only command"),
     ],
 )
-def test_recordings_that_leave_no_choice_are_refused(
-    changes: dict[str, Any], fields: dict[str, Any], words: str
-) -> None:
+def test_recordings_without_a_choice_are_refused(changes: dict[str, Any], fields: dict[str, Any], words: str) -> None:
     with pytest.raises(DataError, match=words):
-        candidates_of_dataset(without(simulated(**changes), **fields))
+        candidates.candidates_of_dataset(without(simulated(**changes), **fields))
 
 
 def test_runs_without_a_command_are_left_out_and_said_so() -> None:
     dataset = simulated()
     runs = [replace(run, command=None) if index < 2 else run for index, run in enumerate(dataset.trajectories)]
-    pool = candidates_of_dataset(make_dataset("some", dataset.robot, dataset.sample_period, runs))
+    pool = candidates.candidates_of_dataset(make_dataset("some", dataset.robot, dataset.sample_period, runs))
     assert pool.baseline.sum() == len(runs) - 2
     assert any("2 of 24 training runs" in note for note in pool.notes)
 
@@ -325,17 +313,13 @@ def test_runs_without_a_command_are_left_out_and_said_so() -> None:
     ],
 )
 def test_arguments_that_cannot_be_are_refused(tmp_path: Path, arguments: dict[str, Any], parts: str) -> None:
-    with pytest.raises(OmnibenchError) as refused:
+    with refused(OmnibenchError, *parts.split()):
         design_experiment(written(tmp_path), **arguments)
-    assert all(part in str(refused.value) for part in parts.split())
 
 
 def test_a_source_must_be_there_and_one_with_several_data_sets_needs_a_choice(tmp_path: Path) -> None:
-    config = {
-        "name": "two",
-        "datasets": {name: {"simulate": flower()} for name in ("one", "two")},
-        "calibrators": ["theoretical"],
-    }
+    sets = {name: {"simulate": flower()} for name in ("one", "two")}
+    config = {"name": "two", "datasets": sets, "calibrators": ["theoretical"]}
     (tmp_path / "two.yaml").write_text(yaml.safe_dump(config), encoding="utf-8")
     with pytest.raises(OmnibenchError, match="no such file"):
         design_experiment(tmp_path / "nothing")
@@ -361,8 +345,8 @@ def file_of(folder: Path, name: str) -> Path:
     return file
 
 
-def pool_of(name: str, **limits: object) -> CandidatePool:
-    return RobotCommands.model_validate({"robot": robot(name), "area": AREA, **limits}).pool(name)
+def pool_of(name: str, **limits: object) -> candidates.CandidatePool:
+    return candidates.RobotCommands.model_validate({"robot": robot(name), "area": AREA, **limits}).pool(name)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -394,9 +378,7 @@ def test_a_few_runs_are_chosen_and_told_as_a_person_drives_them(name: str) -> No
     assert not design.recorded
     assert design.parameters == 6
     plan = plan_in_words(design, chosen)
-    assert any(
-        line.startswith("forward ") and ", turning left by " in line and " with radius " in line for line in plan
-    )
+    assert any(row.startswith("forward ") and ", turning left by " in row and " with radius " in row for row in plan)
     assert any(line.startswith("backward ") for line in plan)
     assert any(line.startswith("on the spot 3 full turns to the ") for line in plan) == (name == "diff")
     assert all(line.endswith((" time", " times")) for line in plan)
@@ -435,7 +417,7 @@ def test_a_design_config_lists_commands_for_a_robot_that_steers_within_its_limit
         "sets": {"curves": {"speeds": [0.5], "turn_rates": [-0.3, 0, 0.3], "distance": 2}},
         "baseline": {"set": "curves"},
     }
-    design = design_experiment(candidates_of_config(DesignConfig.model_validate(given)))
+    design = design_experiment(candidates.candidates_of_config(DesignConfig.model_validate(given)))
     assert (len(design.candidates), design.parameters) == (6, 6)
     with pytest.raises(ConfigError, match=r"sets.curves: v0.5_a0_w-0.3 needs more than steering_limit_deg 15"):
         validate(DesignConfig, given | {"steering_limit_deg": 15}, "car.yaml")
@@ -453,25 +435,21 @@ def test_a_design_config_lists_commands_for_a_robot_that_steers_within_its_limit
         ("car", {"area": "2x2"}, "no curve that it can drive"),
     ],
 )
-def test_what_cannot_be_is_refused_by_the_name_of_its_option(
-    name: str, given: dict[str, object], words: str, tmp_path: Path
-) -> None:
-    with pytest.raises(ConfigError) as refusal:
-        design_source(None, file_of(tmp_path, name), RobotOptions(**given))  # type: ignore[arg-type]
-    assert words in str(refusal.value)
-    assert "\n" not in str(refusal.value)
+def test_what_cannot_be_is_refused_by_name(name: str, given: dict[str, object], words: str, tmp_path: Path) -> None:
+    with refused(ConfigError, words):
+        candidates.design_source(None, file_of(tmp_path, name), candidates.RobotOptions(**given))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
     ("data", "file", "options", "name"),
     [
-        ("data", "robot.yaml", RobotOptions(), "--robot robot.yaml"),
-        ("data", None, RobotOptions(max_speed=1.0), "--max-speed"),
-        (None, None, RobotOptions(), "--robot FILE"),
+        ("data", "robot.yaml", candidates.RobotOptions(), "--robot robot.yaml"),
+        ("data", None, candidates.RobotOptions(max_speed=1.0), "--max-speed"),
+        (None, None, candidates.RobotOptions(), "--robot FILE"),
     ],
 )
-def test_a_robot_and_a_recording_exclude_each_other(
-    data: str | None, file: str | None, options: RobotOptions, name: str
+def test_a_robot_excludes_a_recording(
+    data: str | None, file: str | None, options: candidates.RobotOptions, name: str
 ) -> None:
     with pytest.raises(ConfigError, match=name):
-        design_source(data and Path(data), file and Path(file), options)
+        candidates.design_source(data and Path(data), file and Path(file), options)

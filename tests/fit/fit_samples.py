@@ -16,7 +16,7 @@ from omnibench.fit.parameterisation import Box, ExplicitBox, ParameterisationNam
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
 from omnibench.progress import Reporter, no_progress
 from omnibench.registry import Options, costs
-from omnibench.robot.kinematics import Array
+from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import Integration
 from omnibench.testing.synthetic import synthetic_robot, synthetic_trajectories
 
@@ -43,6 +43,7 @@ def make_problem(
     trajectories: Sequence[Trajectory] | None = None,
     *,
     wheels: Wheels = 3,
+    robot: Robot | None = None,
     cost: str = "final_pose",
     loss: LossName = "squares",
     parameterisation: ParameterisationName = "matrix",
@@ -54,14 +55,14 @@ def make_problem(
     seed: int = 1,
     watch: Reporter = no_progress,
 ) -> CalibrationProblem:
-    """A problem on ``trajectories``, by default noisy ones."""
-    robot = synthetic_robot(wheels)
+    """A problem on ``trajectories``, by default noisy ones of the synthetic robot with so many wheels."""
+    chosen = robot or synthetic_robot(wheels)
     runs = noisy_trajectories(wheels, integration=integration) if trajectories is None else trajectories
     return CalibrationProblem(
-        robot,
+        chosen,
         runs,
         with_loss(costs.create(cost), loss),
-        make_parameterisation(parameterisation, robot, runs, box=box, limits=limits),
+        make_parameterisation(parameterisation, chosen, runs, box=box, limits=limits),
         integration=integration,
         budget=Budget(evaluations=evaluations, seconds=seconds),
         seed=seed,

@@ -91,9 +91,7 @@ def best_found(problem: CalibrationProblem, rng: np.random.Generator) -> float:
     wheels=st.sampled_from([3, 4]),
     stopped=st.booleans(),
 )
-def test_no_matrix_of_the_box_costs_less_than_the_bound(
-    seed: int, cost: str, integration: Integration, wheels: int, stopped: bool
-) -> None:
+def test_no_matrix_beats_the_bound(seed: int, cost: str, integration: Integration, wheels: int, stopped: bool) -> None:
     problem = random_problem(seed, cost, integration, wheels)
     proof = prove(problem, problem.start, gap=1e-2, seconds=np.inf, parts=1 if stopped else 15)
     assert 0 <= proof.lower_bound <= best_found(problem, np.random.default_rng(seed))
@@ -255,9 +253,7 @@ def box_about_the_design(*widths: tuple[int, int, float]) -> Box:
 
 @pytest.mark.parametrize("corner", list(product((-1, 1), repeat=3)))
 @pytest.mark.parametrize("integration", ["euler", "arc"])
-def test_a_box_that_holds_the_true_matrix_in_any_corner_is_bounded_by_no_cost_above_zero(
-    corner: tuple[int, int, int], integration: Integration
-) -> None:
+def test_a_box_with_the_truth_has_no_bound_above_zero(corner: tuple[int, int, int], integration: Integration) -> None:
     """Poses without noise: positions bend with row 3, and a bound by slopes in the middle alone exceeds 0."""
     robot, width = synthetic_robot(), 0.06
     truth = robot.inverse_kinematic_matrix + width * np.outer([0.0, 0.0, 1.0], corner)
@@ -390,9 +386,7 @@ def only_started(run: Trajectory) -> Trajectory:
         ("final_pose", [only_started(run) if run.id == "04" else run for run in noisy_trajectories(noise=0.02)]),
     ],
 )
-def test_poses_after_the_last_wheel_sample_or_at_the_start_alone_do_not_stop_a_proof(
-    cost: str, runs: Sequence[Trajectory]
-) -> None:
+def test_poses_after_the_wheels_or_at_the_start_alone_stop_no_proof(cost: str, runs: Sequence[Trajectory]) -> None:
     problem = make_problem(runs, cost=cost)
     proof = prove(problem, problem.start, gap=0.1, seconds=np.inf, parts=500)
     vectors: Array = np.random.default_rng(0).uniform(problem.lower, problem.upper, (500, problem.size))

@@ -264,10 +264,8 @@ def test_a_recording_without_turns_lacks_them_in_words() -> None:
         assert kept.any()
         return replace(run, rates=rates, poses=moved.poses(run.pose_times) + noise)
 
-    findings = [finding for finding in check(changed(straight)).findings if finding.kind == "motion_missing"]
-    assert [(finding.what, finding.fix[:17]) for finding in findings] == [
-        ("the robot never turned", "drive three turns")
-    ]
+    (finding,) = [finding for finding in check(changed(straight)).findings if finding.kind == "motion_missing"]
+    assert (finding.what, finding.fix[:17]) == ("the robot never turned", "drive three turns")
 
 
 def test_json_holds_verdict_need_and_findings_alone() -> None:

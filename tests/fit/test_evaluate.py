@@ -62,9 +62,8 @@ def test_every_split_that_is_there_is_evaluated_and_all_together() -> None:
     assert costs["all"] == pytest.approx((8 * costs["train"] + 4 * costs["validation"]) / 12)
     assert (found.dataset, found.simulated, found.trajectories) == ("synthetic", True, 12)
     assert set(evaluate(calibration(), recordings(validating=0)).splits) == {"train", "all"}
-    design = ModelErrors.of(OdometryModel.of_design(ROBOT, "arc"), recordings().trajectories).on(
-        recordings().trajectories
-    )
+    every = recordings().trajectories
+    design = ModelErrors.of(OdometryModel.of_design(ROBOT, "arc"), every).on(every)
     assert found.design["all"] == design
     assert costs["all"] < 0.5 * design.cost
     euler = evaluate(calibration(integration="euler"), recordings())  # the calibration's own

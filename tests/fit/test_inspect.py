@@ -141,8 +141,7 @@ def test_a_real_recording_of_hours_is_inspected(omni3: Dataset) -> None:
 
 
 @pytest.mark.parametrize(
-    ("left", "beginning"),
-    [(0.05, "these recordings hardly turn the robot: they drive"), (0.25, "the runs drive")],
+    ("left", "beginning"), [(0.05, "these recordings hardly turn the robot: they drive"), (0.25, "the runs drive")]
 )
 def test_a_motion_that_is_hardly_driven_is_told_with_its_share(left: float, beginning: str) -> None:
     runs = [replace(run, rates=run.rates - (1 - left) * run.rates.mean(axis=1, keepdims=True)) for run in commanded()]

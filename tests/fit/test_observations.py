@@ -51,9 +51,7 @@ def every_kind(seed: int) -> list[Reference]:
     ]
 
 
-def test_references_of_samples_that_stay_in_their_file_are_predicted_alike(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_references_of_stored_samples_are_predicted_alike(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     held = [a_run(seed, every_kind(seed)) for seed in range(3)]
     save_dataset(make_dataset("measured", APR_02, 0.1, held), tmp_path / "saved")
     batches = []

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from corelli import corelli_dataset, half
 from numpy.typing import NDArray
+from real_recordings import mean_errors
 from sample_robots import CAR, DIFFERENTIAL, TRICYCLE, WHEELED
 from wheeled_recordings import PERIOD, path, recorded
 
@@ -16,13 +16,11 @@ from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrate import CalibrationRun, calibrate
 from omnibench.fit.cost import Cost
-from omnibench.fit.evaluate import final_errors
 from omnibench.fit.geometry import WheelGeometry
 from omnibench.fit.settings import CompleteSettings
 from omnibench.fit.steering_fit import SteeringFit
 from omnibench.registry import costs
 from omnibench.robot.kinematics import Array, Mount, Robot
-from omnibench.robot.model import OdometryModel
 
 EVERY = [pytest.param(robot, id=robot.name) for robot in WHEELED]
 
@@ -76,12 +74,6 @@ def test_the_geometry_is_found_by_a_search(robot: Robot) -> None:
     )
 
 
-def mean_errors(matrix: Array, robot: Robot, runs: Sequence[Trajectory]) -> Array:
-    """Mean errors of the final pose, m and degrees."""
-    errors = final_errors(OdometryModel(robot, matrix, "arc"), runs)
-    return np.array([np.hypot(*errors[:, :2].T).mean(), np.degrees(np.abs(errors[:, 2]).mean())])
-
-
 def of_group(dataset: Dataset, *groups: str) -> Dataset:
     """The runs of some groups, to train."""
     runs = (run for run in dataset.trajectories if run.id.startswith(groups))
@@ -103,7 +95,7 @@ def test_a_real_robot_errs_less_than_by_published_methods(
     dataset = request.getfixturevalue(name)
     matrix = calibrate(of_group(dataset, trained)).calibration.matrix_array
     for judged, limits in published.items():
-        assert (mean_errors(matrix, dataset.robot, of_group(dataset, judged).trajectories) <= limits).all()
+        assert (np.array(mean_errors(matrix, of_group(dataset, judged).trajectories)) <= limits).all()
 
 
 def misread(robot: Robot, gain: float = 1.0, zero: float = 0.0) -> Dataset:
@@ -183,9 +175,7 @@ def test_a_coupling_beyond_what_is_searched_is_warned_of() -> None:
 
 @pytest.mark.parametrize("cost", ["trajectory", "final_pose"])
 @pytest.mark.parametrize("jumped", [(), (1, 4)])
-def test_the_slopes_of_the_search_are_those_of_its_cost_where_starts_have_jumped_too(
-    cost: str, jumped: tuple[int, ...]
-) -> None:
+def test_slopes_of_a_search_are_those_of_its_cost_where_starts_jumped_too(cost: str, jumped: tuple[int, ...]) -> None:
     runs = list(weaving(0.4).trajectories)
     for place in jumped:
         poses = runs[place].poses.copy()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from omnibench.live.estimation.live_odometry import Motion
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.wire.messages import JOINT_STATE, POSE_ESTIMATE, JointState, PoseEstimate
 from omnibench.live.wire.outputs import Update
-from omnibench.robot.calibration import Calibration, Noise, covariance_rows, matrix_rows
+from omnibench.robot.calibration import Calibration, EffectTerm, Noise, covariance_rows, matrix_rows
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, WheelLog
 from omnibench.testing.synthetic import synthetic_robot, true_robot
@@ -37,6 +38,16 @@ def calibration(
         noise=NOISE,
         covariance=None if deviation is None else covariance_rows(deviation**2 * np.eye(3 * wheels)),
     )
+
+
+def term(name: str, **parameters: float) -> EffectTerm:
+    return EffectTerm(name=name, parameters=parameters)
+
+
+def with_effects(*terms: EffectTerm, plain: Calibration | None = None, **changes: Any) -> Calibration:
+    """A calibration with effects, of the session of the evening, without a covariance."""
+    given_changes = {"effects": terms, "covariance": None, "session": "evening"}
+    return (plain or calibration()).model_copy(update=given_changes | changes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,11 +108,7 @@ def motion(stamp: int, moved: Array, duration: float = PERIOD, variance: float =
 
 def fed(robot: RobotTracker, payloads: list[bytes], begin: float = 0.0) -> list[Update]:
     """What a robot publishes of wheel messages that arrive one every period, from ``begin`` s on."""
-    return [
-        update
-        for index, payload in enumerate(payloads)
-        for update in robot.take_wheels(payload, begin + PERIOD * index)
-    ]
+    return [each for k, payload in enumerate(payloads) for each in robot.take_wheels(payload, begin + PERIOD * k)]
 
 
 def odometry(updates: list[Update]) -> Array:

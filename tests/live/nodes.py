@@ -18,11 +18,10 @@ from drives import calibration
 from sessions import free_port, raw_session, until
 from timing import PATIENCE
 
-from omnibench.config import to_yaml
 from omnibench.live.config import LiveConfig, read_live_config
 from omnibench.live.node import LiveNode
 from omnibench.live.wire.messages import JOINT_STATE, JointState, Odometry
-from omnibench.robot.calibration import Calibration, write_calibration
+from omnibench.robot.calibration import write_calibration
 
 
 def write_node(folder: Path, *robots: str, port: int | None = None, **changes: Any) -> Path:
@@ -129,11 +128,6 @@ def sent_one_by_one(publisher: zenoh.Publisher, samples: list[JointState], heard
     for sample in samples:
         sent(publisher, [sample])
         until(lambda stamp=sample.stamp: heard and heard[-1].stamp == stamp, "odometry")
-
-
-def as_text(chosen: Calibration) -> str:
-    """A calibration file's content."""
-    return to_yaml(chosen)
 
 
 def peak_memory(process: int) -> int:

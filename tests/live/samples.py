@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import resource
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import zenoh
+from commands import disk_that_takes as disk_with_room_for  # noqa: F401 (for those who import it from here)
 from rosbags.highlevel import AnyReader
 from sessions import Loopback, until
 
@@ -99,14 +97,3 @@ def messages_of(path: Path) -> dict[str, list[bytes]]:
         for connection, _, payload in reader.messages():
             payloads.setdefault(connection.topic, []).append(bytes(payload))
     return payloads
-
-
-@contextmanager
-def disk_with_room_for(size: int) -> Iterator[None]:
-    """Files of this process cannot grow beyond ``size`` bytes: writing more fails, as on a full disk."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))

@@ -7,6 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 from drives import NOISE, ORIGIN, PERIOD, SECOND
+from sample_robots import fixed, make_robot, steered
 
 from omnibench.data.dataset import Trajectory, make_dataset
 from omnibench.live.replay.concatenated_drive import Recording
@@ -19,25 +20,15 @@ from omnibench.robot.odometry import WheelLog
 _CORNERS = {"fl": (0.2, 0.15), "fr": (0.2, -0.15), "rl": (-0.2, 0.15), "rr": (-0.2, -0.15)}
 
 
-def _wheel(name: str, kind: str, x: float, y: float, **more: Any) -> dict[str, Any]:
-    return {"name": name, "type": kind, "radius": 0.05, "x": x, "y": y} | more
-
-
-def _robot(name: str, *wheels: dict[str, Any], **more: Any) -> Robot:
-    return Robot.model_validate({"name": name, "wheels": wheels} | more)
-
-
-SWERVE: Final = _robot("swerve", *(_wheel(name, "steered", *place) for name, place in _CORNERS.items()))
-TRICYCLE: Final = _robot(
-    "tricycle", _wheel("front", "steered", 0.4, 0.0), _wheel("back", "fixed", 0.0, 0.2, measured=False)
-)
-CAR: Final = _robot(
+SWERVE: Final = make_robot("swerve", *(steered(name, *place) for name, place in _CORNERS.items()))
+TRICYCLE: Final = make_robot("tricycle", steered("front", 0.4, 0.0), fixed("back", 0.0, 0.2, measured=False))
+CAR: Final = make_robot(
     "car",
-    *(_wheel(f"rear_{side}", "fixed", 0.0, y) for side, y in (("left", 0.2), ("right", -0.2))),
-    *(_wheel(f"front_{side}", "steered", 0.5, y, driven=False) for side, y in (("left", 0.2), ("right", -0.2))),
+    *(fixed(f"rear_{side}", 0.0, y) for side, y in (("left", 0.2), ("right", -0.2))),
+    *(steered(f"front_{side}", 0.5, y, driven=False) for side, y in (("left", 0.2), ("right", -0.2))),
 )
-SKID: Final = _robot("skid", *(_wheel(name, "fixed", *place) for name, place in _CORNERS.items()), skid=True)
-DIFFERENTIAL: Final = _robot("differential", _wheel("left", "fixed", 0.0, 0.1), _wheel("right", "fixed", 0.0, -0.1))
+SKID: Final = make_robot("skid", *(fixed(name, *place) for name, place in _CORNERS.items()), skid=True)
+DIFFERENTIAL: Final = make_robot("differential", fixed("left", 0.0, 0.1), fixed("right", 0.0, -0.1))
 
 
 def calibration(robot: Robot = SWERVE, **changes: Any) -> Calibration:

@@ -19,10 +19,11 @@ import yaml
 import zenoh
 from chaos.run import run
 from drives import SECOND, calibration, drive, slam
-from nodes import Command, as_text, asked, config_of, connected, running, sent, sent_one_by_one, wheels_of, write_node
+from nodes import Command, asked, config_of, connected, running, sent, sent_one_by_one, wheels_of, write_node
 from sessions import free_port, until
 from timing import PATIENCE
 
+from omnibench.config import to_yaml
 from omnibench.live.wire.messages import JOINT_STATE, ODOMETRY, JointState, Odometry
 
 pytestmark = pytest.mark.slow  # processes that are killed, stopped or frozen
@@ -152,10 +153,9 @@ def test_a_killed_node_goes_on_with_its_pose_and_calibration(tmp_path: Path) -> 
         session = connected(port)
         heard = heard_odometry(session)
         wheels = wheels_of(session)
-        poses = session.declare_publisher("apr/slam_pose")
-        assert asked(session, "omnibench/apr/swap", as_text(other))["accepted"]
+        poses = wheels_of(session, topic="slam_pose")
+        assert asked(session, "omnibench/apr/swap", to_yaml(other))["accepted"]
         sent_one_by_one(wheels, path.samples()[:150], heard)
-        until(lambda: poses.matching_status.matching, "the node's subscription")
         poses.put(slam(path.stamps[140], [7.0, 8.0, 0.5]))
         until(lambda: asked(session, "omnibench/apr/health")["counts"]["poses"] == 1, "the pose")
         time.sleep(0.15)  # a sample is saved when the last one that was is 0.1 s old, or older

@@ -58,8 +58,7 @@ def test_slam_poses_locate_the_robot_in_the_map(tmp_path: Path) -> None:
     path = drive(1.0)
     with running(config_of(tmp_path)) as (node, session):
         heard = ReceivedMessages(session, apr__odometry__filtered=ODOMETRY)
-        wheels, poses = (session.declare_publisher(f"apr/{topic}") for topic in ("joint_states", "slam_pose"))
-        until(lambda: wheels.matching_status.matching and poses.matching_status.matching, "subscriptions")
+        wheels, poses = wheels_of(session), wheels_of(session, topic="slam_pose")
         sent(wheels, path.samples()[:80])
         until(lambda: node.health("apr").counts["samples"] == 80, "the samples")
         poses.put(slam(path.stamps[60], path.poses[60] + [2.0, 0, 0]))
@@ -100,9 +99,7 @@ def test_many_robots_in_one_node_do_not_meet(tmp_path: Path) -> None:
     with running(config_of(tmp_path, *names)) as (node, session):
         heard = ReceivedMessages(session, **{f"{name}__odom": ODOMETRY for name in names})
         for name in names:
-            publisher = session.declare_publisher(f"{name}/joint_states")
-            until(lambda each=publisher: each.matching_status.matching, "a subscription")
-            sent(publisher, paths[name].samples())
+            sent(wheels_of(session, name), paths[name].samples())
         for name in names:
             came, last = heard[f"{name}__odom"], paths[name].samples()[-1].stamp  # of late ones only the newest comes
             until(lambda came=came, last=last: came and came[-1].stamp == last, "the last odometry")

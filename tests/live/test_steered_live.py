@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zenoh
-from drives import EXACT, ORIGIN, PERIOD, fed, odometry, slam
+from drives import EXACT, ORIGIN, PERIOD, fed, odometry, slam, with_effects
 from nodes import ReceivedMessages, asked, config_of, running, sent_one_by_one, wheels_of
 from samples import messages_of
 from steered import CAR, DIFFERENTIAL, SKID, SWERVE, TRICYCLE, calibration, drive, only, recording
@@ -56,16 +56,12 @@ def retracked(one: Calibration, robot: Robot) -> Array:
     return centred if robot.mount is None else robot.mount.twist @ centred
 
 
-def with_effects(plain: Calibration) -> Calibration:
-    return plain.model_copy(update={"effects": EFFECTS, "covariance": None, "session": "evening"})
-
-
 @pytest.mark.parametrize("robot", [SWERVE, TRICYCLE, CAR], ids=lambda robot: robot.name)
 @pytest.mark.parametrize("integration", ["euler", "arc"])
 @pytest.mark.parametrize("effects", [False, True])
 def test_odom_is_the_batch_odometry(robot: Robot, integration: Integration, effects: bool) -> None:
     plain = calibration(robot, integration=integration)
-    path = drive(using=with_effects(plain) if effects else plain)
+    path = drive(using=with_effects(*EFFECTS, plain=plain) if effects else plain)
     updates = fed(RobotTracker("base", path.using), path.payloads())
     np.testing.assert_allclose(odometry(updates), path.poses, atol=1e-12)
 
@@ -145,134 +141,146 @@ def test_what_is_driven_by_old_angles_makes_the_pose_as_uncertain_as_the_way_is_
     assert deviations[-1] > 0.3 * rolled > 0.02
 
 
-class TestRestarts:
-    @staticmethod
-    def saved(**state: Any) -> SavedState:
-        covariance = (1e-4 * np.eye(3)).ravel().tolist()
-        return SavedState(sequence=5, stamp=ORIGIN, wall=1.8e9, pose=[1.0, 2.0, 0.3], covariance=covariance, **state)
-
-    @pytest.mark.parametrize("robot", [SWERVE, mounted(CAR)], ids=["swerve", "car with a mount"])
-    def test_a_node_that_starts_again_goes_on_exactly(self, tmp_path: Path, robot: Robot) -> None:
-        path = drive(using=calibration(robot))
-        memory = RobotMemory(tmp_path, "base")
-        first = RobotTracker("base", path.using, memory=memory)
-        before = fed(first, path.payloads()[:51])
-        first.close()
-        saved = RobotMemory(tmp_path, "base").load()
-        second = RobotTracker("base", path.using)
-        second.resume(saved, 0.5, saved.wall)
-        found = odometry(before + fed(second, path.payloads()[51:], 0.51))
-        uninterrupted = odometry(fed(RobotTracker("base", path.using), path.payloads()))
-        np.testing.assert_allclose(found, uninterrupted, atol=1e-12)
-
-    def test_a_robot_whose_saved_state_has_no_steering_waits_for_it(self) -> None:
-        path = drive(0.1)
-        robot = RobotTracker("base", path.using)
-        robot.resume(self.saved(positions=path.angles[0].tolist()), 0.0, 1.8e9)
-        bare = path.samples()[1]
-        assert robot.take_wheels(JOINT_STATE.encode(only(bare, *bare.names[:4])), PERIOD) == []
-        updates = fed(robot, path.payloads()[2:], 2 * PERIOD)
-        held = replace(path, angles=path.angles[[0, *range(2, 11)]], steering=path.steering[[0, *range(2, 11)]])
-        np.testing.assert_allclose(odometry(updates)[-1], compose(np.array([1.0, 2.0, 0.3]), held.poses[-1]), atol=1e-9)
-
-    def test_a_state_of_a_robot_with_other_steered_wheels_is_refused(self) -> None:
-        with pytest.raises(DataError, match="1 steered wheel"):
-            RobotTracker("base", calibration(CAR)).resume(self.saved(positions=[0.0] * 2, steering=[0.1]), 0.0, 1.8e9)
+# Restarts
 
 
-class TestSwaps:
-    @pytest.mark.parametrize("place", [0, 50])
-    @pytest.mark.parametrize("effects", [False, True])
-    def test_the_next_sample_steers_by_the_angle_before_the_swap(self, place: int, effects: bool) -> None:
-        plain = calibration()
-        path, other = drive(), with_effects(plain) if effects else plain.model_copy(update={"name": "other"})
-        robot = RobotTracker("base", plain)
-        fed(robot, path.payloads()[: place + 1])
-        robot.swap(other)
-        after = fed(robot, path.payloads()[place + 1 :], PERIOD * (place + 1))
-        if not effects:
-            np.testing.assert_allclose(odometry(after), path.poses[place + 1 :], atol=1e-12)
-        assert len(after) == 100 - place
-        assert np.abs(odometry(after)[0] - path.poses[place + 1]).max() < 2e-3
+def saved(**state: Any) -> SavedState:
+    covariance = (1e-4 * np.eye(3)).ravel().tolist()
+    return SavedState(sequence=5, stamp=ORIGIN, wall=1.8e9, pose=[1.0, 2.0, 0.3], covariance=covariance, **state)
 
-    @pytest.mark.parametrize(
-        ("robot", "reason"),
-        [
-            (TRICYCLE, "is for wheels front, this robot has fl, fr, rl, rr"),
-            (SKID, "is for steered wheels none, this robot has fl, fr, rl, rr"),
-        ],
-    )
-    def test_a_calibration_of_other_wheels_is_refused(self, robot: Robot, reason: str) -> None:
-        with pytest.raises(DataError, match=reason):
-            RobotTracker("base", calibration()).swap(calibration(robot))
 
-    def test_a_matrix_row_without_design_is_compared_with_the_size_of_the_other(self) -> None:
-        robot = RobotTracker("base", calibration(DIFFERENTIAL))
-        slid = robot.calibration.matrix_array
-        slid[1] = 0.1 * slid[0]
+@pytest.mark.parametrize("robot", [SWERVE, mounted(CAR)], ids=["swerve", "car with a mount"])
+def test_a_node_that_starts_again_goes_on_exactly(tmp_path: Path, robot: Robot) -> None:
+    path = drive(using=calibration(robot))
+    memory = RobotMemory(tmp_path, "base")
+    first = RobotTracker("base", path.using, memory=memory)
+    before = fed(first, path.payloads()[:51])
+    first.close()
+    saved = RobotMemory(tmp_path, "base").load()
+    second = RobotTracker("base", path.using)
+    second.resume(saved, 0.5, saved.wall)
+    found = odometry(before + fed(second, path.payloads()[51:], 0.51))
+    uninterrupted = odometry(fed(RobotTracker("base", path.using), path.payloads()))
+    np.testing.assert_allclose(found, uninterrupted, atol=1e-12)
+
+
+def test_a_robot_whose_saved_state_has_no_steering_waits_for_it() -> None:
+    path = drive(0.1)
+    robot = RobotTracker("base", path.using)
+    robot.resume(saved(positions=path.angles[0].tolist()), 0.0, 1.8e9)
+    bare = path.samples()[1]
+    assert robot.take_wheels(JOINT_STATE.encode(only(bare, *bare.names[:4])), PERIOD) == []
+    updates = fed(robot, path.payloads()[2:], 2 * PERIOD)
+    held = replace(path, angles=path.angles[[0, *range(2, 11)]], steering=path.steering[[0, *range(2, 11)]])
+    np.testing.assert_allclose(odometry(updates)[-1], compose(np.array([1.0, 2.0, 0.3]), held.poses[-1]), atol=1e-9)
+
+
+def test_a_state_of_a_robot_with_other_steered_wheels_is_refused() -> None:
+    with pytest.raises(DataError, match="1 steered wheel"):
+        RobotTracker("base", calibration(CAR)).resume(saved(positions=[0.0] * 2, steering=[0.1]), 0.0, 1.8e9)
+
+
+# Swaps
+
+
+@pytest.mark.parametrize("place", [0, 50])
+@pytest.mark.parametrize("effects", [False, True])
+def test_the_next_sample_steers_by_the_angle_before_the_swap(place: int, effects: bool) -> None:
+    plain = calibration()
+    path = drive()
+    other = with_effects(*EFFECTS, plain=plain) if effects else plain.model_copy(update={"name": "other"})
+    robot = RobotTracker("base", plain)
+    fed(robot, path.payloads()[: place + 1])
+    robot.swap(other)
+    after = fed(robot, path.payloads()[place + 1 :], PERIOD * (place + 1))
+    if not effects:
+        np.testing.assert_allclose(odometry(after), path.poses[place + 1 :], atol=1e-12)
+    assert len(after) == 100 - place
+    assert np.abs(odometry(after)[0] - path.poses[place + 1]).max() < 2e-3
+
+
+@pytest.mark.parametrize(
+    ("robot", "reason"),
+    [
+        (TRICYCLE, "is for wheels front, this robot has fl, fr, rl, rr"),
+        (SKID, "is for steered wheels none, this robot has fl, fr, rl, rr"),
+    ],
+)
+def test_a_calibration_of_other_wheels_is_refused(robot: Robot, reason: str) -> None:
+    with pytest.raises(DataError, match=reason):
+        RobotTracker("base", calibration()).swap(calibration(robot))
+
+
+def test_a_matrix_row_without_design_is_compared_with_the_size_of_the_other() -> None:
+    robot = RobotTracker("base", calibration(DIFFERENTIAL))
+    slid = robot.calibration.matrix_array
+    slid[1] = 0.1 * slid[0]
+    robot.swap(calibration(DIFFERENTIAL, matrix=matrix_rows(slid)))
+    slid[1] = slid[0]
+    with pytest.raises(DataError, match=r"row 2 of the matrix is 10.% off the design of robot 'differential'"):
         robot.swap(calibration(DIFFERENTIAL, matrix=matrix_rows(slid)))
-        slid[1] = slid[0]
-        with pytest.raises(DataError, match=r"row 2 of the matrix is 10.% off the design of robot 'differential'"):
-            robot.swap(calibration(DIFFERENTIAL, matrix=matrix_rows(slid)))
-
-    def test_the_tracked_point_may_move_and_the_centre_does_not_jump(self) -> None:
-        path = drive(using=calibration(mounted(SWERVE)))
-        other = calibration(mounted(SWERVE, Mount(x=-0.5, y=0.4, yaw=2.0)))
-        other = other.model_copy(update={"matrix": matrix_rows(retracked(path.using, other.robot))})
-        robot = RobotTracker("base", path.using)
-        before = fed(robot, path.payloads()[:51])
-        robot.swap(other)
-        found = odometry(before + fed(robot, path.payloads()[51:], 0.51))
-        alone = fed(RobotTracker("base", path.using), path.payloads())
-        np.testing.assert_allclose(found, odometry(alone), atol=1e-12)
 
 
-class TestCentre:
-    """A calibration moves the tracked point; what a node tells is of the robot's centre."""
+def test_the_tracked_point_may_move_and_the_centre_does_not_jump() -> None:
+    path = drive(using=calibration(mounted(SWERVE)))
+    other = calibration(mounted(SWERVE, Mount(x=-0.5, y=0.4, yaw=2.0)))
+    other = other.model_copy(update={"matrix": matrix_rows(retracked(path.using, other.robot))})
+    robot = RobotTracker("base", path.using)
+    before = fed(robot, path.payloads()[:51])
+    robot.swap(other)
+    found = odometry(before + fed(robot, path.payloads()[51:], 0.51))
+    alone = fed(RobotTracker("base", path.using), path.payloads())
+    np.testing.assert_allclose(found, odometry(alone), atol=1e-12)
 
-    @pytest.mark.parametrize("effects", [False, True])
-    def test_the_pose_is_of_the_point_from_which_the_tracked_one_is_mounted(self, effects: bool) -> None:
-        plain = calibration(mounted(SWERVE))
-        path = drive(using=with_effects(plain) if effects else plain)
-        updates = fed(RobotTracker("base", path.using), path.payloads())
-        np.testing.assert_allclose(updates[0].pose, np.zeros(3), atol=1e-15)
-        tracked = compose(odometry(updates), np.array([MOUNT.x, MOUNT.y, MOUNT.yaw]))
-        if not effects:
-            np.testing.assert_allclose(moved_to(np.zeros(3), tracked), path.poses, atol=1e-12)
-        log = replace(path.log, start=tracked[0])
-        np.testing.assert_allclose(tracked, path.using.model.poses([log])[0], atol=1e-12)
 
-    def test_twist_and_covariances_are_those_of_a_calibration_of_the_centre_itself(self) -> None:
-        mount, noise = mounted(SWERVE), Noise(walk_position=1e-9, walk_heading=1e-9)
-        path = drive(using=calibration(mount, noise=noise))
-        carry = np.kron(np.linalg.inv(MOUNT.twist), np.eye(8))
-        centred = calibration(
-            SWERVE,
-            noise=noise,
-            matrix=matrix_rows(retracked(path.using, SWERVE)),
-            covariance=covariance_rows(carry @ np.array(path.using.covariance) @ carry.T),
-        )
-        (found, expected) = (fed(RobotTracker("base", each), path.payloads())[-1] for each in (path.using, centred))
-        np.testing.assert_allclose(found.pose, expected.pose, atol=1e-12)
-        np.testing.assert_allclose(found.twist, expected.twist, atol=1e-12)
-        np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-3, atol=1e-10)
-        np.testing.assert_allclose(np.diag(found.twist_covariance), np.diag(expected.twist_covariance), rtol=0.5)
+# A calibration moves the tracked point; what a node tells is of the robot's centre.
 
-    @pytest.mark.parametrize("late", [0.0, 0.1])
-    def test_poses_of_the_tracked_point_locate_the_centre(self, late: float) -> None:
-        terms = (EffectTerm(name="reference_time_offset", parameters={"tau": late}),) if late else ()
-        path = drive(3.0, using=calibration(mounted(SWERVE), effects=terms, covariance=None))
-        at = np.array([2.0, -1.0, 0.7])
-        tracked = moved_to(at, path.poses)
-        robot = RobotTracker("base", path.using, fusion=FusionSettings())
-        behind = round(late / PERIOD)
-        for number, payload in enumerate(path.payloads()):
-            updates = robot.take_wheels(payload, PERIOD * number)
-            if number % 25 == 20:
-                seen = slam(path.samples()[number].stamp, tracked[number - behind], 1e-2 * EXACT)
-                robot.take_pose(seen, PERIOD * number)
-        np.testing.assert_allclose(updates[-1].in_map[0], centre_of(tracked[-1]), atol=1e-6)
-        assert robot.counts.anomalies() == {}
+
+@pytest.mark.parametrize("effects", [False, True])
+def test_the_pose_is_of_the_point_from_which_the_tracked_one_is_mounted(effects: bool) -> None:
+    plain = calibration(mounted(SWERVE))
+    path = drive(using=with_effects(*EFFECTS, plain=plain) if effects else plain)
+    updates = fed(RobotTracker("base", path.using), path.payloads())
+    np.testing.assert_allclose(updates[0].pose, np.zeros(3), atol=1e-15)
+    tracked = compose(odometry(updates), np.array([MOUNT.x, MOUNT.y, MOUNT.yaw]))
+    if not effects:
+        np.testing.assert_allclose(moved_to(np.zeros(3), tracked), path.poses, atol=1e-12)
+    log = replace(path.log, start=tracked[0])
+    np.testing.assert_allclose(tracked, path.using.model.poses([log])[0], atol=1e-12)
+
+
+def test_twist_and_covariances_are_those_of_a_calibration_of_the_centre_itself() -> None:
+    mount, noise = mounted(SWERVE), Noise(walk_position=1e-9, walk_heading=1e-9)
+    path = drive(using=calibration(mount, noise=noise))
+    carry = np.kron(np.linalg.inv(MOUNT.twist), np.eye(8))
+    centred = calibration(
+        SWERVE,
+        noise=noise,
+        matrix=matrix_rows(retracked(path.using, SWERVE)),
+        covariance=covariance_rows(carry @ np.array(path.using.covariance) @ carry.T),
+    )
+    (found, expected) = (fed(RobotTracker("base", each), path.payloads())[-1] for each in (path.using, centred))
+    np.testing.assert_allclose(found.pose, expected.pose, atol=1e-12)
+    np.testing.assert_allclose(found.twist, expected.twist, atol=1e-12)
+    np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-3, atol=1e-10)
+    np.testing.assert_allclose(np.diag(found.twist_covariance), np.diag(expected.twist_covariance), rtol=0.5)
+
+
+@pytest.mark.parametrize("late", [0.0, 0.1])
+def test_poses_of_the_tracked_point_locate_the_centre(late: float) -> None:
+    terms = (EffectTerm(name="reference_time_offset", parameters={"tau": late}),) if late else ()
+    path = drive(3.0, using=calibration(mounted(SWERVE), effects=terms, covariance=None))
+    at = np.array([2.0, -1.0, 0.7])
+    tracked = moved_to(at, path.poses)
+    robot = RobotTracker("base", path.using, fusion=FusionSettings())
+    behind = round(late / PERIOD)
+    for number, payload in enumerate(path.payloads()):
+        updates = robot.take_wheels(payload, PERIOD * number)
+        if number % 25 == 20:
+            seen = slam(path.samples()[number].stamp, tracked[number - behind], 1e-2 * EXACT)
+            robot.take_pose(seen, PERIOD * number)
+    np.testing.assert_allclose(updates[-1].in_map[0], centre_of(tracked[-1]), atol=1e-6)
+    assert robot.counts.anomalies() == {}
 
 
 def played(drive: ConcatenatedDrive, names: tuple[str, ...] | None = None, **changes: Any) -> list[JointState]:

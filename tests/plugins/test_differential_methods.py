@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import published_methods
@@ -19,7 +17,7 @@ from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import calibrators
 from omnibench.robot.kinematics import Array, Mount, Robot, Wheel
 from omnibench.robot.model import OdometryModel
-from omnibench.testing import CalibratorConformance, load_plugin, synthetic_problem, synthetic_trajectories
+from omnibench.testing import CalibratorConformance, synthetic_problem, synthetic_trajectories
 from omnibench.testing.synthetic import synthetic_robots
 
 LEFT, RIGHT, OMNI = synthetic_robots()[2].wheels[0], synthetic_robots()[2].wheels[1], synthetic_robots()[0]
@@ -77,20 +75,9 @@ def ratios(matrix: Array, design: Robot = ROBOT) -> tuple[float, float]:
     return float(wheelbase / sum(abs(wheel.position[1]) for wheel in design.wheels)), float(matrix[0, 1] / matrix[0, 0])
 
 
-def in_sessions(runs: Sequence[Trajectory], *sessions: str) -> tuple[Trajectory, ...]:
-    """The runs in sessions by turns."""
-    return tuple(replace(run, session=sessions[number % len(sessions)]) for number, run in enumerate(runs))
-
-
 ARTICLES = ("ivanjko", "jung_chung", "umbmark")  # which calibrate from the runs of one session
-METHODS = ("censi", *ARTICLES)
+PLUGINS = METHODS = ("censi", *ARTICLES)
 factors = st.floats(0.95, 1.05)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def plugins(registries_as_before_the_module: None) -> None:  # noqa: ARG001
-    for name in METHODS:
-        load_plugin(Path(__file__).parents[2] / "plugins" / f"{name}.py")
 
 
 class TestCensi(CalibratorConformance):
@@ -255,7 +242,7 @@ def test_other_robots_parameterisations_and_runs_of_several_sessions_are_refused
     result = solved(method, synthetic_problem("geometry", robot=ROBOT))
     assert (result.outcome, f"{method} gives a matrix" in result.reason) == (Outcome.FAILED, True)
     if method in ARTICLES:
-        runs = in_sessions(runs_of(ROBOT, ROBOT), "morning", "evening")
+        runs = [replace(run, session=f"session {number % 2}") for number, run in enumerate(runs_of(ROBOT, ROBOT))]
         assert_not_for(solved(method, synthetic_problem(robot=ROBOT, trajectories=runs)), "one session", "these are 2")
 
 

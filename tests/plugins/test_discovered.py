@@ -17,12 +17,8 @@ from omnibench.fit.calibrator import Outcome
 from omnibench.fit.evaluate import evaluate
 from omnibench.fit.problem import Budget
 from omnibench.robot.calibration import read_calibration, write_calibration
-from omnibench.testing import load_plugin
 
-
-@pytest.fixture(autouse=True, scope="module")
-def plugin(registries_as_before_the_module: None) -> None:  # noqa: ARG001
-    load_plugin(Path(__file__).parents[2] / "plugins" / "discovered.py")
+PLUGINS = ("discovered",)
 
 
 @cache

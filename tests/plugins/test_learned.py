@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import python
+from commands import ROOT, python
 from slipping_robot import PERIOD, slipping
 
 from omnibench.data.dataset import Dataset, make_dataset
@@ -22,16 +22,11 @@ from omnibench.progress import Progress
 from omnibench.robot.calibration import read_calibration, write_calibration
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
-from omnibench.testing import CalibratorConformance, load_plugin
+from omnibench.testing import CalibratorConformance
 
-PLUGIN = Path(__file__).parents[2] / "plugins" / "learned.py"
+PLUGINS = ("learned",)
 pytestmark = pytest.mark.slow
 SMALL = {"layers": (8,), "epochs": 60, "decays": (0.3,)}
-
-
-@pytest.fixture(autouse=True, scope="module")
-def plugin(registries_as_before_the_module: None) -> None:  # noqa: ARG001
-    load_plugin(PLUGIN)
 
 
 class TestLearned(CalibratorConformance):
@@ -162,7 +157,7 @@ sys.path.insert(0, {str(Path(__file__).parent)!r})
 from slipping_robot import slipping
 from omnibench import calibrate
 from omnibench.registry import load_plugins
-assert not load_plugins({str(PLUGIN.parent)!r})
+assert not load_plugins({str(ROOT / "plugins")!r})
 try:
     calibrate(slipping(), calibrator="learned")
 except Exception as error:

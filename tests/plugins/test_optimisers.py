@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,9 @@ import pytest
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import Outcome, run_calibrator
 from omnibench.registry import calibrators
-from omnibench.testing import CalibratorConformance, load_plugin, synthetic_problem
+from omnibench.testing import CalibratorConformance, synthetic_problem
+
+PLUGINS = ("cmaes", "differential_evolution")
 
 
 @pytest.mark.slow
@@ -21,12 +22,6 @@ class TestCmaes(CalibratorConformance):
 
     name = "cmaes"
     solved = 1e-7
-
-
-@pytest.fixture(autouse=True, scope="module")
-def plugins(registries_as_before_the_module: None) -> None:  # noqa: ARG001
-    for name in ("cmaes", "differential_evolution"):
-        load_plugin(Path(__file__).parents[2] / "plugins" / f"{name}.py")
 
 
 def test_cmaes_says_which_package_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:

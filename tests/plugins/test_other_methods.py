@@ -6,14 +6,13 @@ import math
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from real_recordings import diff, omni3, omni4, tricyc
+from real_recordings import diff, mean_errors, omni3, omni4, tricyc
 
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.fit.calibrator import Outcome, RunResult, run_calibrator
@@ -24,7 +23,6 @@ from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, OdometryBatch
 from omnibench.testing import (
     CalibratorConformance,
-    load_plugin,
     synthetic_problem,
     synthetic_robot,
     synthetic_trajectories,
@@ -32,13 +30,8 @@ from omnibench.testing import (
 from omnibench.testing.synthetic import synthetic_robots
 
 ROBOTS = {robot.name.removeprefix("synthetic "): robot for robot in synthetic_robots()}
+PLUGINS = ("optiodom", "kallasi", "lin", "maddahi")
 FITTED = ("omni", "mecanum", "differential", "tricycle")
-
-
-@pytest.fixture(autouse=True, scope="module")
-def plugins(registries_as_before_the_module: None) -> None:  # noqa: ARG001
-    for name in ("optiodom", "kallasi", "lin", "maddahi"):
-        load_plugin(Path(__file__).parents[2] / "plugins" / f"{name}.py")
 
 
 class TestOptiOdom(CalibratorConformance):
@@ -81,13 +74,6 @@ def fit(calibrator: str, robot: Robot, runs: Sequence[Trajectory], seconds: floa
     return run_calibrator(calibrators.create(calibrator, options), problem)
 
 
-def errors(runs: Sequence[Trajectory], matrix: Array) -> tuple[float, float]:
-    """Mean final error, m and degrees."""
-    batch = OdometryBatch([run.final_log for run in runs], "arc")
-    off = batch.poses(matrix[None])[0] - np.array([run.final_pose for run in runs])
-    return float(np.hypot(off[:, 0], off[:, 1]).mean()), float(np.degrees(np.abs(off[:, 2])).mean())
-
-
 @settings(max_examples=3, deadline=None)
 @given(st.lists(st.floats(-0.03, 0.03), min_size=5, max_size=5))
 @pytest.mark.parametrize("name", FITTED)
@@ -97,7 +83,7 @@ def test_length_diameters_and_offset_are_found_to_some_of_the_smallest_steps(nam
     truth = np.where(geometry.start == 0, change, geometry.start * (1 + change))
     runs = driven(ROBOTS[name], geometry.matrix(truth)[0], every=True)[::2]
     result = fit("optiodom", ROBOTS[name], runs)
-    before, after = errors(runs, geometry.design)[0], errors(runs, result.matrix)[0]
+    before, after = mean_errors(geometry.design, runs)[0], mean_errors(result.matrix, runs)[0]
     assert after < 0.002 + 0.1 * before  # the steps of a tricycle are 0.1 mm and 1 mrad at least
 
 
@@ -168,9 +154,9 @@ def test_the_figures_of_the_authors_of_optiodom_are_reached(
     data = dataset()
     matrix = fit(calibrator, data.robot, of_kind(data, "circular")).matrix
     rests_early = calibrator == "optiodom" and dataset is not diff
-    assert errors(of_kind(data, "circular"), matrix) == pytest.approx(circles, rel=0.07 if rests_early else 0.02)
+    assert mean_errors(matrix, of_kind(data, "circular")) == pytest.approx(circles, rel=0.07 if rests_early else 0.02)
     if squares is not None:
-        assert errors(of_kind(data, "square"), matrix) == pytest.approx(squares, rel=0.02)
+        assert mean_errors(matrix, of_kind(data, "square")) == pytest.approx(squares, rel=0.02)
 
 
 @pytest.mark.parametrize(
@@ -257,7 +243,7 @@ def test_four_mecanum_wheels_keep_the_design_where_no_path_drives_them(shares: l
     robot = synthetic_robot(4)
     runs = driven(robot, robot.inverse_kinematic_matrix * shares)
     result = fit("lin", robot, runs)
-    assert errors(runs, result.matrix) == pytest.approx((0.0, 0.0), abs=1e-3)
+    assert mean_errors(result.matrix, runs) == pytest.approx((0.0, 0.0), abs=1e-3)
 
 
 def test_runs_without_reference_poses_are_refused() -> None:

@@ -15,12 +15,7 @@ from wheeled_samples import DIFF
 
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.fit.inspect import inspect_dataset
-from omnibench.report.recording.inspection_report import (
-    driven_motions,
-    inspection_document,
-    missing_in_words,
-    motion_table,
-)
+from omnibench.report.recording import inspection_report
 from omnibench.report.render import write_document
 from omnibench.robot.kinematics import Robot
 
@@ -58,22 +53,22 @@ OMNI = sample().dataset.robot
     ],
 )
 def test_a_motion_is_known_by_its_direction_and_turn(twist: tuple[float, float, float], kinds: set[str]) -> None:
-    found = driven_motions(driving(OMNI, twist), OMNI)
+    found = inspection_report.driven_motions(driving(OMNI, twist), OMNI)
     assert {motion.name for motion in found if motion.driven} == kinds
     assert all(motion.share in (0.0, 1.0) for motion in found)
 
 
 def test_time_at_rest_is_no_motion() -> None:
-    found = driven_motions(driving(OMNI, (0.2, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.5)), OMNI)
+    found = inspection_report.driven_motions(driving(OMNI, (0.2, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.5)), OMNI)
     shares = {motion.name: motion.share for motion in found}
     assert shares["straight"] == pytest.approx(0.5) == shares["on the spot to the left"]
-    assert "×" not in repr(motion_table(found).rows)  # a speed that is rounding is zero
-    on_two_wheels = driven_motions(driving(DIFF, (0.2, 0.0, 0.0)), DIFF)
+    assert "×" not in repr(inspection_report.motion_table(found).rows)  # a speed that is rounding is zero
+    on_two_wheels = inspection_report.driven_motions(driving(DIFF, (0.2, 0.0, 0.0)), DIFF)
     assert not [motion for motion in on_two_wheels if motion.name.startswith("sideways")]
 
 
 def test_motions_that_are_missing_on_both_sides_are_named_once() -> None:
-    missing = missing_in_words(driven_motions(driving(OMNI, (0.2, 0.0, 0.0)), OMNI))
+    missing = inspection_report.missing_in_words(inspection_report.driven_motions(driving(OMNI, (0.2, 0.0, 0.0)), OMNI))
     assert missing == "in curves to the left, in curves to the right, on the spot, backward or sideways"
 
 
@@ -85,7 +80,7 @@ def recorded() -> Dataset:
 @pytest.fixture(scope="module")
 def file(recorded: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     file = tmp_path_factory.mktemp("inspection") / "report.html"
-    write_document(inspection_document(recorded, inspect_dataset(recorded)), file)
+    write_document(inspection_report.inspection_document(recorded, inspect_dataset(recorded)), file)
     return file
 
 
@@ -115,7 +110,7 @@ def test_the_paths_stand_in_the_first_900_pixels(file: Path) -> None:
 def test_runs_that_are_all_alike_leave_motions_open(recorded: Dataset, tmp_path: Path) -> None:
     only = [replace(run, split="train") for run in recorded.trajectories if run.command == "straight"]
     few = replace(recorded, trajectories=tuple(only), scans=None)
-    write_document(inspection_document(few, inspect_dataset(few)), tmp_path / "report.html")
+    write_document(inspection_report.inspection_document(few, inspect_dataset(few)), tmp_path / "report.html")
     told = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
     assert "To train, it was never driven in curves to the left" in told.text
     assert "Part of the matrix stays open" in told.text

@@ -13,25 +13,7 @@ import pytest
 from report_page import Page
 
 from omnibench.errors import DataError
-from omnibench.report.blocks import (
-    Badge,
-    Block,
-    Callout,
-    Cell,
-    Code,
-    Column,
-    Details,
-    Document,
-    Fact,
-    Facts,
-    Figure,
-    FigureGrid,
-    LegendItem,
-    Paragraph,
-    Row,
-    Section,
-    Table,
-)
+from omnibench.report import blocks
 from omnibench.report.render import Glossary, render, write_document
 from omnibench.report.style import plot
 
@@ -67,20 +49,31 @@ class Reader(HTMLParser):
             self.scripts[self._script] = self.scripts.get(self._script, "") + data
 
 
-def document(*blocks: Block, title: str = "A report") -> Document:
-    return Document(title, "of something", (Section("part", "A part", blocks),), (Badge("SIMULATED DATA", "warning"),))
+def document(*parts: blocks.Block, title: str = "A report") -> blocks.Document:
+    return blocks.Document(
+        title, "of something", (blocks.Section("part", "A part", parts),), (blocks.Badge("SIMULATED DATA", "warning"),)
+    )
 
 
-def grid(name: str = "curve", values: tuple[float, ...] = (1.0, 2.0)) -> FigureGrid:
+def grid(name: str = "curve", values: tuple[float, ...] = (1.0, 2.0)) -> blocks.FigureGrid:
     curve = go.Scatter(x=[0, 1], y=list(values), name=name, legendgroup="one")
-    return FigureGrid((Figure(name, plot(curve), name),), (LegendItem("one", name, "#0072b2"),))
+    return blocks.FigureGrid((blocks.Figure(name, plot(curve), name),), (blocks.LegendItem("one", name, "#0072b2"),))
 
 
-def every_block(words: str) -> tuple[Block, ...]:
+def every_block(words: str) -> tuple[blocks.Block, ...]:
     """One block of each kind, all of them made of the same words."""
-    table = Table(words, (Column(words, words),), (Row((Cell(words, words, "#0072b2"),)), Row((Cell(words),), "group")))
-    inner: tuple[Block, ...] = (Paragraph(words), Callout(words, (words,)), Facts((Fact(words, words, words),)), table)
-    return (*inner, Code(words, words), Details(words, inner), grid(words))
+    table = blocks.Table(
+        words,
+        (blocks.Column(words, words),),
+        (blocks.Row((blocks.Cell(words, words, "#0072b2"),)), blocks.Row((blocks.Cell(words),), "group")),
+    )
+    inner: tuple[blocks.Block, ...] = (
+        blocks.Paragraph(words),
+        blocks.Callout(words, (words,)),
+        blocks.Facts((blocks.Fact(words, words, words),)),
+        table,
+    )
+    return (*inner, blocks.Code(words, words), blocks.Details(words, inner), grid(words))
 
 
 def test_hostile_words_stay_words_in_every_block() -> None:
@@ -109,7 +102,7 @@ def test_plotly_is_embedded_once_however_many_plots_there_are() -> None:
 
 
 def test_every_plot_has_data_of_its_own() -> None:
-    reader = Reader(render(document(grid("a"), Details("more", (grid("b"),)))))
+    reader = Reader(render(document(grid("a"), blocks.Details("more", (grid("b"),)))))
     wanted = [attrs["data-source"] for tag, attrs in reader.tags if tag == "div" and "data-source" in attrs]
     assert len(wanted) == len(set(wanted)) == 2
     assert set(wanted) == set(reader.scripts)
@@ -121,8 +114,8 @@ def test_missing_values_of_a_plot_are_valid_json() -> None:
 
 
 def test_the_table_of_contents_leads_to_every_section() -> None:
-    inner = Section("inner", "Inner", (Paragraph("text"),))
-    reader = Reader(render(Document("t", "s", (Section("outer", "Outer", (), (inner,)),))))
+    inner = blocks.Section("inner", "Inner", (blocks.Paragraph("text"),))
+    reader = Reader(render(blocks.Document("t", "s", (blocks.Section("outer", "Outer", (), (inner,)),))))
     links = [attrs["href"] for tag, attrs in reader.tags if tag == "a"]
     assert links == ["#outer", "#inner"]
     assert {attrs.get("id") for tag, attrs in reader.tags if tag == "section"} == {"outer", "inner"}
@@ -131,12 +124,12 @@ def test_the_table_of_contents_leads_to_every_section() -> None:
 def test_a_report_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("not a folder")
     with pytest.raises(DataError, match=r"report\.html: cannot be written"):
-        write_document(document(Paragraph("text")), tmp_path / "file" / "report.html")
+        write_document(document(blocks.Paragraph("text")), tmp_path / "file" / "report.html")
 
 
 def test_a_written_report_is_what_was_rendered(tmp_path: Path) -> None:
-    write_document(document(Paragraph("text")), tmp_path / "deep" / "report.html")
-    assert (tmp_path / "deep" / "report.html").read_text(encoding="utf-8") == render(document(Paragraph("text")))
+    write_document(document(blocks.Paragraph("text")), tmp_path / "deep" / "report.html")
+    assert (tmp_path / "deep" / "report.html").read_text(encoding="utf-8") == render(document(blocks.Paragraph("text")))
 
 
 def test_a_word_is_explained_where_it_first_occurs_and_only_there() -> None:
@@ -159,10 +152,10 @@ def test_hostile_words_stay_words() -> None:
 
 def test_the_meanings_stand_below_the_section_that_first_uses_the_words() -> None:
     sections = (
-        Section("a", "One", (Paragraph("The cost fell."),)),
-        Section("b", "Two", (Paragraph("The cost rose."),)),
+        blocks.Section("a", "One", (blocks.Paragraph("The cost fell."),)),
+        blocks.Section("b", "Two", (blocks.Paragraph("The cost rose."),)),
     )
-    html = render(Document("t", "s", sections))
+    html = render(blocks.Document("t", "s", sections))
     assert html.count("<dfn ") == 1
     told = Page(html).text
     assert told.index("The cost fell.") < told.index("what a calibration makes small") < told.index("The cost rose.")

@@ -9,20 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from omnibench.report import numbers
 from omnibench.report.blocks import LegendItem
 from omnibench.report.figures import area, arrows, coordinates, joined, line, marks, path
-from omnibench.report.numbers import (
-    NOTHING,
-    decimals_for,
-    fixed,
-    listing,
-    power_of_ten,
-    round_down,
-    seconds,
-    significant,
-    typeset,
-    with_unit,
-)
 from omnibench.report.style import PALETTE, REFERENCE, THEORETICAL, colours, logarithmic, plan, plot, text, wrapped
 from omnibench.words import noun_for, plural
 
@@ -40,10 +29,7 @@ def test_up_to_thirty_entries_look_different(wanted: list[str | None]) -> None:
     assert not {REFERENCE, THEORETICAL} & {colour for colour, _ in styles.values()}
 
 
-@given(
-    st.floats(min_value=-12, max_value=6),
-    st.floats(min_value=0, max_value=14),
-)
+@given(st.floats(min_value=-12, max_value=6), st.floats(min_value=0, max_value=14))
 def test_a_logarithmic_axis_holds_its_data_and_has_labels(low: float, decades: float) -> None:
     figure = plot()
     logarithmic(figure, "y", 10**low, 10 ** (low + decades))
@@ -136,13 +122,13 @@ def test_arrows_point_from_start_to_tip() -> None:
         (-0.5, "−0.5000"),
         (12345.0, "12,345.0000"),
         (-1e-9, "0.0000"),
-        (None, NOTHING),
-        (math.nan, NOTHING),
+        (None, numbers.NOTHING),
+        (math.nan, numbers.NOTHING),
         (math.inf, "∞"),
     ],
 )
 def test_a_fixed_number_has_its_decimals_and_a_true_minus(value: float | None, text: str) -> None:
-    assert fixed(value, 4) == text
+    assert numbers.fixed(value, 4) == text
 
 
 @pytest.mark.parametrize(
@@ -157,12 +143,12 @@ def test_a_fixed_number_has_its_decimals_and_a_true_minus(value: float | None, t
     ],
 )
 def test_significant_digits_use_powers_of_ten_where_zeros_would_be_counted(value: float, text: str) -> None:
-    assert significant(value, 3) == text
+    assert numbers.significant(value, 3) == text
 
 
 @given(st.floats(min_value=-1e12, max_value=1e12, allow_nan=False).filter(lambda value: abs(value) > 1e-300))
 def test_significant_digits_read_back_to_the_same_value(value: float) -> None:
-    words = significant(value, 4).replace("−", "-").replace(",", "")
+    words = numbers.significant(value, 4).replace("−", "-").replace(",", "")
     if " × 10" in words:
         mantissa, exponent = words.split(" × 10")
         power = exponent.translate(str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789"))
@@ -172,28 +158,32 @@ def test_significant_digits_read_back_to_the_same_value(value: float) -> None:
 
 @given(st.floats(min_value=1e-6, max_value=1e6))
 def test_decimals_show_the_digits_that_were_asked_for(value: float) -> None:
-    assert float(fixed(value, decimals_for(value, 3)).replace(",", "")) == pytest.approx(value, rel=6e-3)
+    assert float(numbers.fixed(value, numbers.decimals_for(value, 3)).replace(",", "")) == pytest.approx(
+        value, rel=6e-3
+    )
 
 
 @pytest.mark.parametrize(("value", "text"), [(5e-5, "< 1 ms"), (0.0823, "82 ms"), (26.54, "26.5 s"), (637.2, "637 s")])
 def test_a_duration_has_a_unit_that_suits_it(value: float, text: str) -> None:
-    assert seconds(value) == text
+    assert numbers.seconds(value) == text
 
 
 def test_a_listing_ends_with_and_and_counts_what_it_leaves_out() -> None:
-    assert listing(["a"]) == "a"
-    assert listing(["a", "b", "c"]) == "a, b and c"
-    assert listing(["a", "b", "c", "d"], limit=2) == "a, b and 2 more"
-    assert listing(["a", "b", "c"], last="or") == "a, b or c"
+    assert numbers.listing(["a"]) == "a"
+    assert numbers.listing(["a", "b", "c"]) == "a, b and c"
+    assert numbers.listing(["a", "b", "c", "d"], limit=2) == "a, b and 2 more"
+    assert numbers.listing(["a", "b", "c"], last="or") == "a, b or c"
 
 
 def test_sentences_of_the_terminal_get_arrows_minus_and_degree_signs() -> None:
     words = "held out: 52 mm -> 14 mm, 4.4 deg -> 1.0 deg (95 % interval -3.2 to 7.3 %); run-01, turn-360"
-    assert typeset(words) == "held out: 52 mm → 14 mm, 4.4° → 1.0° (95 % interval −3.2 to 7.3 %); run-01, turn-360"
+    assert (
+        numbers.typeset(words) == "held out: 52 mm → 14 mm, 4.4° → 1.0° (95 % interval −3.2 to 7.3 %); run-01, turn-360"
+    )
 
 
 def test_the_degree_sign_alone_follows_without_a_space() -> None:
-    assert [with_unit("3", unit) for unit in ("mm", "°", "°/s", "")] == ["3 mm", "3°", "3°/s", "3"]
+    assert [numbers.with_unit("3", unit) for unit in ("mm", "°", "°/s", "")] == ["3 mm", "3°", "3°/s", "3"]
 
 
 def test_plurals_are_english() -> None:
@@ -203,9 +193,9 @@ def test_plurals_are_english() -> None:
 
 
 def test_powers_of_ten_are_set_as_such() -> None:
-    assert [power_of_ten(exponent) for exponent in (-10, -1, 0, 3, 4)] == ["10⁻¹⁰", "0.1", "1", "1,000", "10⁴"]
+    assert [numbers.power_of_ten(exponent) for exponent in (-10, -1, 0, 3, 4)] == ["10⁻¹⁰", "0.1", "1", "1,000", "10⁴"]
 
 
 @pytest.mark.parametrize(("value", "step"), [(7.3, 5), (5.0, 5), (1.0, 1), (0.37, 0.2), (99.0, 50)])
 def test_enlargements_are_round(value: float, step: float) -> None:
-    assert round_down(value) == pytest.approx(step)
+    assert numbers.round_down(value) == pytest.approx(step)

@@ -239,9 +239,7 @@ def test_a_stream_equals_a_batch_with_every_effect(
 
 @pytest.mark.parametrize("integration", BOTH)
 @given(seed=seeds, robot=st.sampled_from(sorted(EVERY)), samples=st.integers(1, 60))
-def test_a_stream_equals_a_batch_with_any_mixture_of_effects(
-    integration: Integration, seed: int, robot: str, samples: int
-) -> None:
+def test_streams_equal_batches_with_any_mixture(integration: Integration, seed: int, robot: str, samples: int) -> None:
     log = at_every_sample(a_drive(seed, samples, EVERY[robot]))
     chosen = model(*mixture(seed, EVERY[robot]), robot=EVERY[robot], integration=integration)
     np.testing.assert_allclose(streamed(stream_of(chosen, log), log), chosen.poses([log])[0], rtol=0, atol=1e-12)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from commands import CONFIGS, Command, Prepared, assert_refused, flower, small
+from commands import CONFIGS, Command, Prepared, assert_refused, flower, refused, small
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.storage import load_dataset
@@ -55,133 +55,145 @@ def only(folder: Path, **changes: Any) -> Path:
     return write(folder, name="mine", description="Hidden.", datasets={"flower": {"simulate": flower(**changes)}})
 
 
-class TestReading:
-    def test_a_comparison_and_a_config_of_data_sets_alone_are_read_alike(self, tmp_path: Path) -> None:
-        alone = read_simulation(only(tmp_path))
-        compared = read_simulation(write(tmp_path, **small(description="Hidden.")))
-        assert (alone.name, alone.description) == ("flower", "Hidden.")
-        assert alone == compared
-
-    def test_one_of_several_is_chosen_by_its_name(self, tmp_path: Path) -> None:
-        sets = {name: {"simulate": flower(train={"seed": 1, "distance": way})} for name, way in (("a", 1), ("b", 2))}
-        file = write(tmp_path, datasets=sets)
-        assert [read_simulation(file, name).config.train.distance for name in "ab"] == [1, 2]
-        with pytest.raises(ConfigError, match="several simulated data sets; choose one with --dataset: a, b"):
-            read_simulation(file)
-
-    def test_a_misspelt_key_of_a_config_without_a_comparison_is_refused(self, tmp_path: Path) -> None:
-        file = write(tmp_path, descripton="x", datasets={"flower": {"simulate": flower()}})
-        with pytest.raises(ConfigError, match=r"unknown key 'descripton'; did you mean 'description'\?"):
-            read_simulation(file)
-
-    def test_folders_of_plugins_are_beside_the_config_and_matter_for_effects_alone(self, tmp_path: Path) -> None:
-        file = write(tmp_path, plugins=["mine"], datasets={"flower": {"simulate": flower()}})
-        source = read_simulation(file)
-        assert source.effect_plugins == ()
-        assert source.with_effects([DRIFT]).effect_plugins == (tmp_path.resolve() / "mine",)
-
-    @pytest.mark.parametrize(
-        ("config", "name"), [("apr02", "flower"), ("mecanum", "mecanum"), ("hidden_effect", "hidden")]
-    )
-    def test_the_simulated_data_sets_of_the_configs_are_found(self, config: str, name: str) -> None:
-        assert read_simulation(CONFIGS / f"{config}.yaml").name == name
+# Reading
 
 
-class TestEffectsOfTheCommandLine:
-    def test_they_are_hidden_beside_those_of_the_config(self, tmp_path: Path) -> None:
-        hidden = {"published": "palacin2023_eq8", "effects": [{"name": "floor_drift", "parameters": {"dx": 0.01}}]}
-        source = read_simulation(only(tmp_path, truth=hidden)).with_effects([DRIFT, "motor_gain: {g: 0.1}"])
-        assert [term.name for term in source.config.truth.effects] == ["floor_drift", "heading_drift", "motor_gain"]
-        assert source.simulate().truth.effects[1] == EffectTerm(name="heading_drift", parameters={"b": 0.01})
-
-    @pytest.mark.parametrize(
-        ("given", "words"),
-        [
-            ("heading_drift", "--effect heading_drift: "),
-            ("heading_drift: 0.1", "{parameter: value}"),
-            ("{a: {b: 1}, c: {d: 1}}", "{parameter: value}"),
-            ("heading_drift: {b", "--effect heading_drift: {b: not valid YAML"),
-            ("heading_drift: {b: fast}", "--effect heading_drift: {b: fast}: parameters.b: "),
-            ("heading_drift: {b: .nan}", "parameters.b: "),
-            ("3: {b: 1}", "--effect 3: {b: 1}: name: "),
-        ],
-    )
-    def test_one_that_cannot_be_read_is_refused_in_one_line(self, given: str, words: str, tmp_path: Path) -> None:
-        with pytest.raises(OmnibenchError) as refusal:
-            read_simulation(only(tmp_path)).with_effects([given])
-        assert words in str(refusal.value)
-        assert "\n" not in str(refusal.value)
-
-    def test_one_given_twice_is_refused_and_without_any_nothing_changes(self, tmp_path: Path) -> None:
-        source = read_simulation(only(tmp_path))
-        with pytest.raises(ConfigError, match=r"--effect: .*heading_drift"):
-            source.with_effects([DRIFT, DRIFT])
-        assert source.with_effects([]) == source
+def test_a_comparison_and_a_config_of_data_sets_alone_are_read_alike(tmp_path: Path) -> None:
+    alone = read_simulation(only(tmp_path))
+    compared = read_simulation(write(tmp_path, **small(description="Hidden.")))
+    assert (alone.name, alone.description) == ("flower", "Hidden.")
+    assert alone == compared
 
 
-class TestTheCommand:
-    def test_it_hides_an_effect_and_writes_the_truth_elsewhere(self, command: Command, tmp_path: Path) -> None:
-        made = command("simulate", only(tmp_path), "-o", "data", "--truth", "truth", "--effect", DRIFT)
-        assert made.returncode == 0, made.stderr
-        assert made.stdout == "truth: truth/truth.yaml\n12 simulated trajectories: data\n"
-        truth = yaml.safe_load(Path("truth/truth.yaml").read_text())
-        assert truth["effects"] == [{"name": "heading_drift", "parameters": {"b": 0.01}}]
-        assert not any(b"drift" in file.read_bytes() for file in Path("data").iterdir())
+def test_one_of_several_data_sets_is_chosen_by_its_name(tmp_path: Path) -> None:
+    sets = {name: {"simulate": flower(train={"seed": 1, "distance": way})} for name, way in (("a", 1), ("b", 2))}
+    file = write(tmp_path, datasets=sets)
+    assert [read_simulation(file, name).config.train.distance for name in "ab"] == [1, 2]
+    with pytest.raises(ConfigError, match="several simulated data sets; choose one with --dataset: a, b"):
+        read_simulation(file)
 
-    def test_it_hides_an_effect_of_a_plugin(self, command: Command, tmp_path: Path) -> None:
-        (tmp_path / "mine").mkdir()
-        (tmp_path / "mine" / "side_wind.py").write_text(PLUGIN)
-        wind = [{"name": "side_wind", "parameters": {"v": 0.005}}]
-        sets = {"flower": {"simulate": flower(truth={"published": "palacin2023_eq8", "effects": wind}, noise={})}}
-        by_config = write(tmp_path, plugins=["mine"], datasets=sets)
-        assert command("simulate", by_config, "-o", "one").returncode == 0
-        plain = write(tmp_path, datasets={"flower": {"simulate": flower(noise={})}})
-        asked = ("--effect", "side_wind: {v: 0.005}", "--plugins", "mine")
-        assert command("simulate", plain, "-o", "two", *asked).returncode == 0
-        assert command("simulate", plain, "-o", "three").returncode == 0
-        one, two, three = (load_dataset(Path(name)) for name in ("one", "two", "three"))
-        assert one.hash == two.hash
-        moved = one.trajectories[0].final_pose - three.trajectories[0].final_pose
-        assert moved == pytest.approx([0.0, 0.005 * one.trajectories[0].times[-1], 0.0], abs=1e-9)
 
-    def test_it_drives_a_recording_again(self, command: Command, prepared: Prepared) -> None:
-        asked = ("simulate", "--like", prepared.data, "--model", prepared.calibration, "-o", "like")
-        made = command(*asked, "--format", "csv")
-        assert made.stdout == "12 simulated trajectories: like\n", made.stderr
-        evaluated = command("evaluate", prepared.calibration, "like", "--json")
-        assert yaml.safe_load(evaluated.stdout)["splits"]["all"]["cost"] < 1e-9
+def test_a_misspelt_key_of_a_config_without_a_comparison_is_refused(tmp_path: Path) -> None:
+    file = write(tmp_path, descripton="x", datasets={"flower": {"simulate": flower()}})
+    with pytest.raises(ConfigError, match=r"unknown key 'descripton'; did you mean 'description'\?"):
+        read_simulation(file)
 
-    @pytest.mark.parametrize(
-        ("arguments", "words"),
-        [
-            ([], "CONFIG"),
-            (["--like", "DATA"], "--model CALIBRATION"),
-            (["--model", "CALIBRATION"], "--like DATASET"),
-            (["CONFIG", *AGAIN], "--like"),
-            ([*AGAIN, "--truth", "t"], "--truth: "),
-            ([*AGAIN, "--dataset", "t"], "--dataset: "),
-            ([*AGAIN, "--effect", DRIFT], "--effect: "),
-            ([*AGAIN, "--seed", "3"], "--seed: "),
-            (["CONFIG", "--noise"], "--noise: "),
-            (["CONFIG", "--seed", "1"], "--seed: "),
-            (["--like", "CONFIG", "--model", "CALIBRATION"], "folder"),
-            (["--like", "DATA", "--model", "CONFIG"], "calibration file"),
-            (["CONFIG", "--effect", "heading_drft: {b: 1}"], "unknown effect 'heading_drft'"),
-        ],
-    )
-    def test_what_does_not_go_together_is_refused(
-        self, arguments: list[str], words: str, command: Command, prepared: Prepared
-    ) -> None:
-        names = {"CONFIG": prepared.config, "DATA": prepared.data, "CALIBRATION": prepared.calibration}
-        refused = command("simulate", *(names.get(each, each) for each in arguments), "-o", "made")
-        assert_refused(refused, words)
-        assert not Path("made").exists()
 
-    def test_a_recording_is_not_written_over_by_its_own_simulation(self, command: Command, prepared: Prepared) -> None:
-        before = load_dataset(prepared.data).hash
-        asked = ("simulate", "--like", prepared.data, "--model", prepared.calibration, "-o", prepared.data)
-        assert_refused(command(*asked), "is the recording itself; name another folder")
-        assert load_dataset(prepared.data).hash == before
+def test_folders_of_plugins_are_beside_the_config_and_matter_for_effects_alone(tmp_path: Path) -> None:
+    file = write(tmp_path, plugins=["mine"], datasets={"flower": {"simulate": flower()}})
+    source = read_simulation(file)
+    assert source.effect_plugins == ()
+    assert source.with_effects([DRIFT]).effect_plugins == (tmp_path.resolve() / "mine",)
+
+
+@pytest.mark.parametrize(("config", "name"), [("apr02", "flower"), ("mecanum", "mecanum"), ("hidden_effect", "hidden")])
+def test_the_simulated_data_sets_of_the_configs_are_found(config: str, name: str) -> None:
+    assert read_simulation(CONFIGS / f"{config}.yaml").name == name
+
+
+# Effects of the command line
+
+
+def test_effects_of_the_command_line_are_hidden_beside_those_of_the_config(tmp_path: Path) -> None:
+    hidden = {"published": "palacin2023_eq8", "effects": [{"name": "floor_drift", "parameters": {"dx": 0.01}}]}
+    source = read_simulation(only(tmp_path, truth=hidden)).with_effects([DRIFT, "motor_gain: {g: 0.1}"])
+    assert [term.name for term in source.config.truth.effects] == ["floor_drift", "heading_drift", "motor_gain"]
+    assert source.simulate().truth.effects[1] == EffectTerm(name="heading_drift", parameters={"b": 0.01})
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("heading_drift", "--effect heading_drift: "),
+        ("heading_drift: 0.1", "{parameter: value}"),
+        ("{a: {b: 1}, c: {d: 1}}", "{parameter: value}"),
+        ("heading_drift: {b", "--effect heading_drift: {b: not valid YAML"),
+        ("heading_drift: {b: fast}", "--effect heading_drift: {b: fast}: parameters.b: "),
+        ("heading_drift: {b: .nan}", "parameters.b: "),
+        ("3: {b: 1}", "--effect 3: {b: 1}: name: "),
+    ],
+)
+def test_an_effect_that_cannot_be_read_is_refused_in_one_line(given: str, words: str, tmp_path: Path) -> None:
+    with refused(OmnibenchError, words):
+        read_simulation(only(tmp_path)).with_effects([given])
+
+
+def test_an_effect_given_twice_is_refused_and_without_any_nothing_changes(tmp_path: Path) -> None:
+    source = read_simulation(only(tmp_path))
+    with pytest.raises(ConfigError, match=r"--effect: .*heading_drift"):
+        source.with_effects([DRIFT, DRIFT])
+    assert source.with_effects([]) == source
+
+
+# The command
+
+
+def test_the_command_hides_an_effect_and_writes_the_truth_elsewhere(command: Command, tmp_path: Path) -> None:
+    made = command("simulate", only(tmp_path), "-o", "data", "--truth", "truth", "--effect", DRIFT)
+    assert made.returncode == 0, made.stderr
+    assert made.stdout == "truth: truth/truth.yaml\n12 simulated trajectories: data\n"
+    truth = yaml.safe_load(Path("truth/truth.yaml").read_text())
+    assert truth["effects"] == [{"name": "heading_drift", "parameters": {"b": 0.01}}]
+    assert not any(b"drift" in file.read_bytes() for file in Path("data").iterdir())
+
+
+def test_the_command_hides_an_effect_of_a_plugin(command: Command, tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "side_wind.py").write_text(PLUGIN)
+    wind = [{"name": "side_wind", "parameters": {"v": 0.005}}]
+    sets = {"flower": {"simulate": flower(truth={"published": "palacin2023_eq8", "effects": wind}, noise={})}}
+    by_config = write(tmp_path, plugins=["mine"], datasets=sets)
+    assert command("simulate", by_config, "-o", "one").returncode == 0
+    plain = write(tmp_path, datasets={"flower": {"simulate": flower(noise={})}})
+    asked = ("--effect", "side_wind: {v: 0.005}", "--plugins", "mine")
+    assert command("simulate", plain, "-o", "two", *asked).returncode == 0
+    assert command("simulate", plain, "-o", "three").returncode == 0
+    one, two, three = (load_dataset(Path(name)) for name in ("one", "two", "three"))
+    assert one.hash == two.hash
+    moved = one.trajectories[0].final_pose - three.trajectories[0].final_pose
+    assert moved == pytest.approx([0.0, 0.005 * one.trajectories[0].times[-1], 0.0], abs=1e-9)
+
+
+def test_the_command_drives_a_recording_again(command: Command, prepared: Prepared) -> None:
+    asked = ("simulate", "--like", prepared.data, "--model", prepared.calibration, "-o", "like")
+    made = command(*asked, "--format", "csv")
+    assert made.stdout == "12 simulated trajectories: like\n", made.stderr
+    evaluated = command("evaluate", prepared.calibration, "like", "--json")
+    assert yaml.safe_load(evaluated.stdout)["splits"]["all"]["cost"] < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], "CONFIG"),
+        (["--like", "DATA"], "--model CALIBRATION"),
+        (["--model", "CALIBRATION"], "--like DATASET"),
+        (["CONFIG", *AGAIN], "--like"),
+        ([*AGAIN, "--truth", "t"], "--truth: "),
+        ([*AGAIN, "--dataset", "t"], "--dataset: "),
+        ([*AGAIN, "--effect", DRIFT], "--effect: "),
+        ([*AGAIN, "--seed", "3"], "--seed: "),
+        (["CONFIG", "--noise"], "--noise: "),
+        (["CONFIG", "--seed", "1"], "--seed: "),
+        (["--like", "CONFIG", "--model", "CALIBRATION"], "folder"),
+        (["--like", "DATA", "--model", "CONFIG"], "calibration file"),
+        (["CONFIG", "--effect", "heading_drft: {b: 1}"], "unknown effect 'heading_drft'"),
+    ],
+)
+def test_arguments_that_do_not_go_together_are_refused(
+    arguments: list[str], words: str, command: Command, prepared: Prepared
+) -> None:
+    names = {"CONFIG": prepared.config, "DATA": prepared.data, "CALIBRATION": prepared.calibration}
+    printed = command("simulate", *(names.get(each, each) for each in arguments), "-o", "made")
+    assert_refused(printed, words)
+    assert not Path("made").exists()
+
+
+def test_a_recording_is_not_written_over_by_its_own_simulation(command: Command, prepared: Prepared) -> None:
+    before = load_dataset(prepared.data).hash
+    asked = ("simulate", "--like", prepared.data, "--model", prepared.calibration, "-o", prepared.data)
+    assert_refused(command(*asked), "is the recording itself; name another folder")
+    assert load_dataset(prepared.data).hash == before
 
 
 ROBOT = synthetic_robot()

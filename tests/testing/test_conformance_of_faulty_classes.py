@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from commands import refused
 from pydantic import Field
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
@@ -29,16 +30,10 @@ from omnibench.testing import (
     ImporterConformance,
     Nonconformance,
     run_cases,
+    synthetic,
     synthetic_problem,
     synthetic_robot,
     synthetic_trajectories,
-)
-from omnibench.testing.synthetic import (
-    PERIOD,
-    synthetic_dataset,
-    synthetic_robots,
-    synthetic_wheeled_robots,
-    true_robot,
 )
 
 
@@ -274,10 +269,8 @@ def test_an_honest_calibrator_passes_every_case() -> None:
 
 @pytest.mark.parametrize(("cls", "case", "message"), CASES_OF_CALIBRATORS)
 def test_a_calibrator_fails_the_case_it_breaks(cls: type[Calibrator], case: str, message: str) -> None:
-    with pytest.raises((Nonconformance, PluginError)) as failure:
+    with refused((Nonconformance, PluginError), message):
         getattr(suite(CalibratorConformance, cls), f"test_{case.replace(' ', '_')}")()
-    assert message in str(failure.value)
-    assert "\n" not in str(failure.value)
 
 
 def test_a_claim_of_convergence_is_measured_by_the_share_that_the_author_sets() -> None:
@@ -316,7 +309,7 @@ def test_the_calibrators_own_parameterisation_is_used() -> None:
 @pytest.mark.parametrize("fixed", [False, True])
 def test_the_synthetic_problem_can_be_solved_to_zero_within_its_box(parameterisation, wheels, fixed) -> None:
     problem = synthetic_problem(parameterisation, wheels=wheels, fixed=fixed)
-    true = true_robot(synthetic_robot(wheels))
+    true = synthetic.true_robot(synthetic_robot(wheels))
     kinds = ("radius", "distance", "angle")
     geometry = np.array([getattr(wheel, kind) for kind in kinds for wheel in true.wheels])
     vector = true.inverse_kinematic_matrix.ravel() if parameterisation == "matrix" else geometry
@@ -326,14 +319,14 @@ def test_the_synthetic_problem_can_be_solved_to_zero_within_its_box(parameterisa
     assert (problem.free.sum() < problem.size) == (fixed and (parameterisation, wheels) != ("matrix", 4))
 
 
-@pytest.mark.parametrize("robot", synthetic_wheeled_robots(), ids=lambda robot: robot.name)
+@pytest.mark.parametrize("robot", synthetic.synthetic_wheeled_robots(), ids=lambda robot: robot.name)
 def test_the_problem_on_fixed_and_steered_wheels_can_be_solved_to_zero_within_its_box(robot: Robot) -> None:
     problem = synthetic_problem(robot=robot)
-    vector = true_robot(robot).inverse_kinematic_matrix.ravel()
+    vector = synthetic.true_robot(robot).inverse_kinematic_matrix.ravel()
     assert problem.inside(vector[None]).all()
     assert problem.values(vector[None])[0] < 1e-12
     assert problem.values(problem.start[None])[0] > 0.02
-    assert make_dataset("synthetic", robot, PERIOD, problem.trajectories).warnings == ()
+    assert make_dataset("synthetic", robot, synthetic.PERIOD, problem.trajectories).warnings == ()
 
 
 OTHER_CLASSES = ("mecanum", "differential", "skid", "car", "swerve")
@@ -377,7 +370,7 @@ def test_a_calibrator_for_no_synthetic_robot_or_path_fails_in_one_line() -> None
 
 
 def test_a_differential_drive_is_driven_along_lines_turns_and_squares_both_ways() -> None:
-    robot = next(robot for robot in synthetic_robots() if class_of(robot) == "differential")
+    robot = next(robot for robot in synthetic.synthetic_robots() if class_of(robot) == "differential")
     ends = {run.command: run.poses[-1] for run in synthetic_trajectories(robot) if run.repetition == 1}
     for sign, line, side in ((1, "forward", "left"), (-1, "backward", "right")):
         assert ends[line] == pytest.approx([sign, 0, 0], abs=0.1)
@@ -512,7 +505,7 @@ CASES_OF_IMPORTERS = [
 
 @pytest.fixture
 def sample(tmp_path: Path) -> Path:
-    save_dataset(synthetic_dataset(), tmp_path / "sample")
+    save_dataset(synthetic.synthetic_dataset(), tmp_path / "sample")
     return tmp_path / "sample"
 
 

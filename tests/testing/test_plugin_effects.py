@@ -59,9 +59,7 @@ def test_it_is_found_by_name_where_it_was_hidden(work: Path) -> None:
     assert abs(found_k["value"] - TRUE_K) < 3 * standard_error  # one 95 % interval in twenty misses
 
 
-def test_evaluate_takes_the_plugins(
-    command: Command, work: Path, extended: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_evaluate_takes_plugins(command: Command, work: Path, extended: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = succeeded(command("evaluate", extended, work / "data", "--json", "--plugins", work / "plugins"))
     with_it = json.loads(run.stdout)
     without = json.loads(succeeded(command("evaluate", work / "out" / "plain.yaml", work / "data", "--json")).stdout)

@@ -187,9 +187,7 @@ def write_rosbag2_mcap(path: Path, sent: Sequence[Sent]) -> Path:
 def write_rosbag1(path: Path, sent: Sequence[Sent]) -> Path:
     path = path.with_suffix(".bag")
     with Rosbag1Writer(path) as writer:
-        connections = {
-            topic: writer.add_connection(topic, kind, typestore=ROS1) for topic, kind in _topics(sent).items()
-        }
+        connections = {name: writer.add_connection(name, kind, typestore=ROS1) for name, kind in _topics(sent).items()}
         for each in _recorded(sent):
             writer.write(connections[each.topic], each.logged, encoded(each, ROS1))
     return path
@@ -261,10 +259,17 @@ def part(seconds: float, sent: Sequence[Sent] | None = None) -> list[Sent]:
     return [each for each in sent or messages(DRIVE) if each.logged < EPOCH + seconds * 1e9]
 
 
-def odometry_error(data: Dataset) -> float:
-    """Largest difference of the true odometry from the reference at any pose of any run."""
-    model = OdometryModel(ROBOT, TRUTH, "arc")
-    return max(float(np.abs(model.poses([run.reference_log])[0] - run.poses[1:]).max()) for run in data.trajectories)
+def odometry_error(data: Dataset, model: OdometryModel | None = None) -> float:
+    """Largest difference of a model's odometry (the true one's) from the reference at any pose of any run."""
+    chosen = model or OdometryModel(ROBOT, TRUTH, "arc")
+    return max(float(np.abs(chosen.poses([run.reference_log])[0] - run.poses[1:]).max()) for run in data.trajectories)
+
+
+def odometry(poses: Array, stamps: Array, topic: str = "/tracker") -> list[Sent]:
+    return [
+        Sent(topic, "nav_msgs/msg/Odometry", {"header": header(stamp), "pose": {"pose": pose(place)}}, int(stamp))
+        for stamp, place in zip(stamps, poses, strict=True)
+    ]
 
 
 def edited(sent: Sequence[Sent], topic: str, edit: Callable[[Sent], Sent | None], every: int = 1) -> list[Sent]:

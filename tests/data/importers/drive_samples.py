@@ -6,20 +6,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from sample_robots import DIFFERENTIAL as ROBOT
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
 
-DIFF: dict[str, Any] = {
-    "name": "two wheels",
-    "wheels": [
-        {"name": "left", "type": "fixed", "radius": 0.05, "x": 0.0, "y": 0.15},
-        {"name": "right", "type": "fixed", "radius": 0.05, "x": 0.0, "y": -0.15},
-    ],
-}
-ROBOT = Robot.model_validate(DIFF)
+DIFF: dict[str, Any] = ROBOT.model_dump(mode="json")  # as a file has it
 MODEL = OdometryModel.of_design(ROBOT, "arc")
 PERIOD, POSE_PERIOD = 0.02, 0.1  # s
 

@@ -112,10 +112,9 @@ def test_a_run_is_cut_where_the_reference_jumps(tmp_path: Path) -> None:
     jumped = whole.poses + np.array([[0.4, 0, 0]]) * (whole.pose_times > 10.05)[:, None]
     data = again(saved(tmp_path / "data", replace(whole, poses=jumped), drive(2)), jumps="cut")
     assert [run.id for run in data.trajectories] == ["run1#1", "run1#2", "run2"]
-    assert [(run.session, run.started_at) for run in data.trajectories[:2]] == [
-        ("run1", 0.0),
-        ("run1", pytest.approx(10.1)),
-    ]
+    first, second = data.trajectories[:2]
+    assert (first.session, first.started_at) == ("run1", 0.0)
+    assert (second.session, second.started_at) == ("run1", pytest.approx(10.1))
     assert odometry_error(data) < FITS
 
 
@@ -170,11 +169,8 @@ def test_a_data_set_keeps_how_it_was_imported(tmp_path: Path) -> None:
     folder = saved(tmp_path / "data", drive(1))
     save_dataset(again(folder, wheel_signs=[1, -1]), tmp_path / "new")
     loaded = load_dataset(tmp_path / "new")
-    assert loaded.imported.model_dump() == {
-        "importer": "dataset",
-        "source": str(folder),
-        "options": {"wheel_signs": [1, -1]},
-    }
+    how = {"importer": "dataset", "source": str(folder), "options": {"wheel_signs": [1, -1]}}
+    assert loaded.imported.model_dump() == how
     assert loaded.hash == replace(loaded, imported=None).hash
     assert load_dataset(folder).imported is None
 
@@ -186,11 +182,8 @@ def recording(seed: int, **changes: str) -> Dataset:
 
 def test_runs_and_sessions_of_the_same_name_stay_apart() -> None:
     both = joined(recording(1, session="s1"), [recording(2, session="s1"), recording(3)])
-    assert [(run.id, run.session) for run in both.trajectories] == [
-        ("run1", "s1"),
-        ("day2/run1", "day2/s1"),
-        ("day3/run1", "day3"),
-    ]
+    assert [run.id for run in both.trajectories] == ["run1", "day2/run1", "day3/run1"]
+    assert [run.session for run in both.trajectories] == ["s1", "day2/s1", "day3"]
     assert both.name == "day1"
 
 

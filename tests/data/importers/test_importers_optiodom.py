@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
-from real_recordings import OMNI3
+from real_recordings import OMNI3, mean_errors
 
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.errors import ConfigError, DataError
@@ -20,13 +19,6 @@ from omnibench.slam.import_dataset import import_dataset
 
 needs_recordings = pytest.mark.skipif(not OMNI3.is_dir(), reason=f"the OptiOdom recordings are not at {OMNI3}")
 TICK = 2 * math.pi / (12 * 1024)
-
-
-def final_errors(matrix: Array, runs: Sequence[Trajectory]) -> tuple[float, float]:
-    """Mean final error of a matrix: m and degrees."""
-    batch = OdometryBatch([run.final_log for run in runs], "arc")
-    errors = batch.poses(matrix[None])[0] - np.array([run.final_pose for run in runs])
-    return float(np.hypot(errors[:, 0], errors[:, 1]).mean()), float(np.degrees(np.abs(errors[:, 2]).mean()))
 
 
 @needs_recordings
@@ -123,17 +115,13 @@ def test_ticks_are_negated_and_the_row_at_zero_gives_the_start_only(tmp_path: Pa
 def test_the_design_drives_the_recorded_path(tmp_path: Path) -> None:
     write_session(tmp_path)
     data = import_dataset("optiodom", tmp_path)
-    assert final_errors(data.robot.inverse_kinematic_matrix, data.trajectories) == pytest.approx((0, 0), abs=1e-7)
+    assert mean_errors(data.robot.inverse_kinematic_matrix, data.trajectories) == pytest.approx((0, 0), abs=1e-7)
 
 
 def test_every_second_run_of_a_command_validates_when_there_is_one_group(tmp_path: Path) -> None:
     write_session(tmp_path, runs=3)
     data = import_dataset("optiodom", tmp_path)
-    assert [(run.split, run.repetition) for run in data.trajectories] == [
-        ("train", 1),
-        ("validation", 2),
-        ("train", 3),
-    ]
+    assert [(run.split, run.repetition) for run in data.trajectories] == [("train", 1), ("validation", 2), ("train", 3)]
 
 
 def test_groups_that_neither_side_names_are_left_out_and_one_on_both_is_refused(tmp_path: Path) -> None:
@@ -171,9 +159,7 @@ def test_without_a_log_angles_are_left_out_and_a_command_is_named_after_the_moti
         ("", "10.08,100,", "10.08,99,", r"does not hold the ticks of s1_run-01\.csv; .* log: false"),
     ],
 )
-def test_what_is_wrong_is_named_with_its_file_and_row(
-    tmp_path: Path, file: str, old: str, new: str, message: str
-) -> None:
+def test_what_is_wrong_is_named_with_file_and_row(tmp_path: Path, file: str, old: str, new: str, message: str) -> None:
     path = write_session(tmp_path) / f"s1{file}.csv"
     path.write_text(path.read_text().replace(old, new))
     with pytest.raises(DataError, match=rf"s1{file}\.csv[:,] {message}"):
@@ -231,12 +217,10 @@ def group(dataset: Dataset, name: str) -> list[Trajectory]:
     ],
     indirect=["dataset"],
 )
-def test_the_design_matrix_leaves_the_known_errors(
-    dataset: Dataset, name: str, runs: int, metres: float, degrees: float
-) -> None:
+def test_the_design_leaves_known_errors(dataset: Dataset, name: str, runs: int, metres: float, degrees: float) -> None:
     found = group(dataset, name)
     assert len(found) == runs
-    errors = final_errors(dataset.robot.inverse_kinematic_matrix, found)
+    errors = mean_errors(dataset.robot.inverse_kinematic_matrix, found)
     assert errors == (pytest.approx(metres, abs=6e-5), pytest.approx(degrees, abs=0.006))
 
 
@@ -246,7 +230,7 @@ def test_a_free_matrix_of_the_mecanum_base_is_far_better(omni4: Dataset) -> None
     odometry = OdometryBatch([run.final_log for run in runs], "arc")
     finals = np.array([run.final_pose for run in runs])
     matrix = linear_fit(odometry, runs, finals, omni4.robot.inverse_kinematic_matrix, np.eye(4))
-    assert final_errors(matrix, runs) == (pytest.approx(0.0323, abs=6e-5), pytest.approx(3.20, abs=0.006))
+    assert mean_errors(matrix, runs) == (pytest.approx(0.0323, abs=6e-5), pytest.approx(3.20, abs=0.006))
 
 
 @needs_recordings
@@ -255,10 +239,7 @@ def test_a_free_matrix_of_the_mecanum_base_is_far_better(omni4: Dataset) -> None
     [
         ("diff", [[0.021, 0.021], [0, 0], [0.21, -0.21]]),
         ("tricyc", [[0.0325, 0], [0, 0], [0, 0.0325 / 0.15]]),
-        (
-            "omni4",
-            0.03 / 4 * np.array([[1, 1, 1, 1], [-1, 1, 1, -1], np.array([-1, 1, -1, 1]) / 0.2]),
-        ),
+        ("omni4", 0.03 / 4 * np.array([[1, 1, 1, 1], [-1, 1, 1, -1], np.array([-1, 1, -1, 1]) / 0.2])),
     ],
     indirect=["dataset"],
 )
@@ -277,9 +258,7 @@ def test_the_design_matrix_is_that_of_the_authors(dataset: Dataset, expected: Ar
     ],
     indirect=["dataset"],
 )
-def test_what_was_chosen_is_said_and_nothing_else_looks_wrong(
-    dataset: Dataset, period: float, parts: tuple[str, ...]
-) -> None:
+def test_the_choice_is_said_and_nothing_looks_wrong(dataset: Dataset, period: float, parts: tuple[str, ...]) -> None:
     assert len(dataset.warnings) == bool(parts)
     for part in parts:
         assert part in dataset.warnings[0]

@@ -30,6 +30,7 @@ from bag_samples import (
     header,
     joint_state,
     messages,
+    odometry,
     odometry_error,
     part,
     pose,
@@ -41,7 +42,7 @@ from bag_samples import (
     write_rosbag1,
     write_rosbag2,
 )
-from commands import Command
+from commands import Command, refused
 from hypothesis import given
 from hypothesis import strategies as st
 from timing import PATIENCE
@@ -56,9 +57,7 @@ from omnibench.testing import ImporterConformance
 
 
 @FORMATS
-def test_every_format_gives_back_wheels_and_poses_exactly(
-    tmp_path: Path, write: Callable[[Path, Sequence[Sent]], Path]
-) -> None:
+def test_every_format_keeps_wheels_and_poses(tmp_path: Path, write: Callable[[Path, Sequence[Sent]], Path]) -> None:
     data = read(write(tmp_path / "drive", messages(DRIVE)))
     assert len(data.trajectories) == len(DRIVE.begins)
     assert data.warnings == ()
@@ -190,27 +189,17 @@ class TestRosbagConforms(ImporterConformance):
 
 
 def test_topics_are_found_among_others(tmp_path: Path) -> None:
-    odometry = [
-        Sent(
-            "/robot/odom",
-            "nav_msgs/msg/Odometry",
-            {"header": header(stamp), "pose": {"pose": pose((0, 0, 0))}},
-            int(stamp),
-        )
-        for stamp in DRIVE.pose_stamps
-    ]
-    goals = [Sent("/goal", each.kind, each.content, each.logged) for each in messages(DRIVE) if each.topic == SLAM][:2]
-    arms = [
-        Sent("/arm/states", each.kind, each.content, each.logged) for each in messages(DRIVE) if each.topic == WHEELS
-    ]
+    resting = odometry(np.zeros((len(DRIVE.pose_stamps), 3)), DRIVE.pose_stamps, "/robot/odom")
+    goals = [replace(each, topic="/goal") for each in messages(DRIVE) if each.topic == SLAM][:2]
+    arms = [replace(each, topic="/arm/states") for each in messages(DRIVE) if each.topic == WHEELS]
     elbow = [joint_state(each.logged, [1.0], names=["elbow"]) for each in messages(DRIVE) if each.topic == WHEELS]
-    data = read(write_mcap(tmp_path / "drive", [*messages(DRIVE), *odometry, *goals, *arms, *elbow]))
+    data = read(write_mcap(tmp_path / "drive", [*messages(DRIVE), *resting, *goals, *arms, *elbow]))
     assert data.warnings == ()
     assert odometry_error(data) < 1e-9
 
 
 def test_several_candidates_are_listed(tmp_path: Path) -> None:
-    two = [Sent(each.topic.replace("robot", "r2"), each.kind, each.content, each.logged) for each in part(7)]
+    two = [replace(each, topic=each.topic.replace("robot", "r2")) for each in part(7)]
     source = write_mcap(tmp_path / "drive", [*part(7), *two])
     with pytest.raises(ConfigError) as caught:
         read(source)
@@ -230,9 +219,7 @@ def test_several_candidates_are_listed(tmp_path: Path) -> None:
         (["gripper", "c", "b", "a", "a_steering"], [None, 2, 1, 0, None]),
     ],
 )
-def test_joints_are_recognised_by_usual_names_in_any_order(
-    tmp_path: Path, names: list[str], where: list[int | None]
-) -> None:
+def test_joints_with_usual_names_are_found_anywhere(tmp_path: Path, names: list[str], where: list[int | None]) -> None:
     def renamed(each: Sent) -> Sent:
         angles = each.content["position"]
         return changed(each, name=names, position=[7.0 if i is None else angles[i] for i in where])
@@ -275,9 +262,8 @@ def test_joints_can_be_named(tmp_path: Path) -> None:
     ],
 )
 def test_wrong_options_are_refused_in_one_line(bag: Path, options: dict[str, Any], message: str) -> None:
-    with pytest.raises(ConfigError, match=message) as caught:
+    with refused(ConfigError, match=message):
         read(bag, **options)
-    assert "\n" not in str(caught.value)
 
 
 def test_runs_keep_a_little_rest_with_a_reference_pose_at_both_ends(bag: Path) -> None:
@@ -299,11 +285,9 @@ def test_short_drives_are_left_out_and_counted(tmp_path: Path) -> None:
 
 def test_the_messages_of_a_topic_begin_runs_and_name_their_commands(tmp_path: Path) -> None:
     offset = 4 * 10**9  # the recorder's clock is not that of the robot
-    sent = [Sent(each.topic, each.kind, each.content, each.logged + offset) for each in messages(DRIVE)]
+    sent = [replace(each, logged=each.logged + offset) for each in messages(DRIVE)]
     words = ["left", "right", "left", "right", "", "left"] * 2
-    sent += [
-        text(word, EPOCH + offset + int((begin - 0.1) * 1e9)) for word, begin in zip(words, DRIVE.begins, strict=True)
-    ]
+    sent += [text(word, EPOCH + offset + int((at - 0.1) * 1e9)) for word, at in zip(words, DRIVE.begins, strict=True)]
     data = read(write_mcap(tmp_path / "drive", sent), cut="topic", cut_topic="/robot/command")
     assert [run.command for run in data.trajectories] == [word or None for word in words]
     assert [run.id for run in data.trajectories][:5] == ["001-left", "002-right", "003-left", "004-right", "005"]
@@ -352,12 +336,8 @@ def test_drivers_that_are_silent_at_rest_leave_no_hole(tmp_path: Path) -> None:
     moving = [DRIVE.rates[min(row, len(DRIVE.rates) - 1)].any() for row in range(len(DRIVE.stamps))]
     loud = dict(zip(DRIVE.stamps.tolist(), moving, strict=True))
     sent = [each for each in messages(DRIVE) if each.topic == SLAM or loud[each.logged - 3_000_000]]
-    sent += [
-        joint_state(
-            DRIVE.stamps[round((begin + RUN) * 1e9) // PERIOD], DRIVE.angles[round((begin + RUN) * 1e9) // PERIOD]
-        )
-        for begin in DRIVE.begins
-    ]
+    stops = [round((begin + RUN) * 1e9) // PERIOD for begin in DRIVE.begins]
+    sent += [joint_state(DRIVE.stamps[row], DRIVE.angles[row]) for row in stops]
     data = read(write_mcap(tmp_path / "drive", sent))
     assert len(data.trajectories) == 12
     assert data.warnings == ()
@@ -396,9 +376,7 @@ def test_a_folder_of_bags_has_a_session_each(tmp_path: Path) -> None:
     first=st.floats(0, 0.5),
     period=st.floats(0.05, 2.0),
 )
-def test_pieces_between_rests_follow_one_another_and_hold_their_drives(
-    lengths: list[tuple[float, float]], first: float, period: float
-) -> None:
+def test_pieces_between_rests_hold_drives(lengths: list[tuple[float, float]], first: float, period: float) -> None:
     times, angles = moving(lengths)
     rests = find_rests(times, angles, 0.5, 0.025)
     assert len(rests) == len(lengths) + 1

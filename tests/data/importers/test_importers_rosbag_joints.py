@@ -26,6 +26,7 @@ from bag_samples import (
     header,
     joint_state,
     messages,
+    odometry,
     odometry_error,
     part,
     pose,
@@ -36,6 +37,7 @@ from bag_samples import (
     write_rosbag1,
     write_rosbag2,
 )
+from commands import refused
 from mcap.writer import IndexType
 from tricycle_samples import TRICYCLE, tricycle_drive
 
@@ -157,8 +159,7 @@ def read_steered(tmp_path: Path, sent: Sequence[Sent], **options: Any) -> Datase
 
 def steered_error(data: Dataset) -> float:
     """Largest difference of the design's odometry from the reference."""
-    model = OdometryModel.of_design(data.robot, "arc")
-    return max(float(np.abs(model.poses([run.reference_log])[0] - run.poses[1:]).max()) for run in data.trajectories)
+    return odometry_error(data, OdometryModel.of_design(data.robot, "arc"))
 
 
 def test_a_steering_joint_is_known_by_its_name_and_comes_back_from_disk(tmp_path: Path) -> None:
@@ -215,9 +216,7 @@ def no_steering(each: Sent) -> Sent:
         (BOTH, {"steering_topic": "/robot/joint_state"}, "steering_topic: .*did you mean '/robot/joint_states'"),
     ],
 )
-def test_joints_that_are_not_measured_or_not_there_are_refused_with_the_options_that_choose_others(
-    tmp_path: Path, sent: list[Sent], options: dict[str, Any], message: str
-) -> None:
+def test_missing_joints_are_refused(tmp_path: Path, sent: list[Sent], options: dict[str, Any], message: str) -> None:
     with pytest.raises((ConfigError, DataError), match=message):
         read_steered(tmp_path, sent, **options)
 
@@ -269,10 +268,7 @@ def test_odometry_that_a_robot_made_of_its_steering_is_refused(tmp_path: Path) -
     heading = np.append(0.0, np.cumsum(0.097 * rates * np.sin(phi) / 1.3))
     steps = 0.097 * rates * np.cos(phi) * np.exp(1j * heading[:-1])
     place = np.append(0.0, np.cumsum(steps))
-    own = [
-        Sent("/odom", "nav_msgs/msg/Odometry", {"header": header(stamp), "pose": {"pose": pose(row)}}, int(stamp))
-        for stamp, row in zip(STAMPS, np.column_stack([place.real, place.imag, heading]), strict=True)
-    ]
+    own = odometry(np.column_stack([place.real, place.imag, heading]), STAMPS, "/odom")
     with pytest.raises(ConfigError, match=r"the only poses are /odom .*pose_t"):
         read_steered(tmp_path, [*JOINTS, *own])
     with pytest.raises(DataError, match=r"/odom is the robot's own odometry: .*--set pose_topic=NAME"):
@@ -283,9 +279,7 @@ TILTED = {"x": 0.5**0.5, "w": 0.5**0.5}
 
 
 def test_messages_recorded_out_of_order_are_sorted_and_counted(tmp_path: Path) -> None:
-    late = edited(
-        part(12.4), WHEELS, lambda each: Sent(each.topic, each.kind, each.content, each.logged + 50_000_000), every=9
-    )
+    late = edited(part(12.4), WHEELS, lambda each: replace(each, logged=each.logged + 50_000_000), every=9)
     data = read(write_mcap(tmp_path / "drive", late))
     count = sum(each.topic == WHEELS for each in part(12.4)) // 9
     assert f"topic {WHEELS}: {count} messages were recorded late and sorted" in data.warnings[0]
@@ -309,11 +303,7 @@ def test_repeated_messages_are_left_out_and_counted(tmp_path: Path) -> None:
         (SLAM, lambda each: changed(each, header=header(0)), "without a header stamp"),
         (SLAM, lambda each: changed(each, pose={"pose": pose((math.inf, 0, 0))}), "without a finite position"),
         (SLAM, lambda each: changed(each, pose={}), "with a wrong orientation, as quaternion has length 0"),
-        (
-            SLAM,
-            lambda each: changed(each, pose={"pose": {"orientation": TILTED}}),
-            "with a wrong orientation, .*90 ",
-        ),
+        (SLAM, lambda each: changed(each, pose={"pose": {"orientation": TILTED}}), "with a wrong orientation, .*90 "),
     ],
 )
 def test_useless_messages_are_left_out_and_too_many_are_refused(
@@ -373,17 +363,14 @@ def test_an_empty_topic_is_named(tmp_path: Path) -> None:
 
 
 @FORMATS
-def test_a_bag_that_was_cut_off_is_refused_in_one_line(
-    tmp_path: Path, write: Callable[[Path, Sequence[Sent]], Path]
-) -> None:
+def test_a_bag_cut_off_is_refused_in_one_line(tmp_path: Path, write: Callable[[Path, Sequence[Sent]], Path]) -> None:
     source = write(tmp_path / "drive", part(7))
     file = source if source.is_file() else max(source.iterdir(), key=lambda each: each.stat().st_size)
     content = file.read_bytes()
     for length in (0, 20, len(content) // 3, len(content) * 9 // 10):
         file.write_bytes(content[:length])
-        with pytest.raises(DataError, match=r"drive\S*: cannot be read as a bag: .*broke off") as caught:
+        with refused(DataError, match=r"drive\S*: cannot be read as a bag: .*broke off"):
             read(source)
-        assert "\n" not in str(caught.value)
 
 
 @pytest.mark.slow
@@ -391,7 +378,7 @@ def test_a_bag_that_was_cut_off_is_refused_in_one_line(
 def test_damage_never_shows_as_a_traceback(tmp_path: Path, write: Callable[[Path, Sequence[Sent]], Path]) -> None:
     source = write(tmp_path / "drive", part(7))
     files = [source] if source.is_file() else sorted(source.iterdir())
-    rng, refused = random.Random(7), 0
+    rng, told = random.Random(7), 0
     for _ in range(25):
         file = rng.choice(files)
         content = file.read_bytes()
@@ -402,9 +389,9 @@ def test_damage_never_shows_as_a_traceback(tmp_path: Path, write: Callable[[Path
         try:
             read(source)
         except OmnibenchError:
-            refused += 1
+            told += 1
         file.write_bytes(content)
-    assert refused
+    assert told
 
 
 def test_an_mcap_whose_recorder_was_killed_is_read_without_its_index(tmp_path: Path) -> None:
@@ -428,13 +415,6 @@ WHEELS_ONLY = [each for each in messages(DRIVE) if each.topic == WHEELS]
 OWN = "is the robot's own odometry: .* --set pose_topic=NAME"
 
 
-def odometry(poses: Array, stamps: Array = DRIVE.pose_stamps) -> list[Sent]:
-    return [
-        Sent("/tracker", "nav_msgs/msg/Odometry", {"header": header(stamp), "pose": {"pose": pose(place)}}, int(stamp))
-        for stamp, place in zip(stamps, poses, strict=True)
-    ]
-
-
 def transforms(parent: str, child: str, stamps: Array, poses: Array, topic: str = "/tf") -> list[Sent]:
     return [
         Sent(
@@ -452,7 +432,7 @@ def noisy(poses: Array) -> Array:
 
 
 def test_odometry_is_no_reference_unless_named(tmp_path: Path) -> None:
-    source = write_mcap(tmp_path / "drive", [*WHEELS_ONLY, *odometry(noisy(DRIVE.poses))])
+    source = write_mcap(tmp_path / "drive", [*WHEELS_ONLY, *odometry(noisy(DRIVE.poses), DRIVE.pose_stamps)])
     with pytest.raises(ConfigError, match=r"the only poses are /tracker .* set pose_topic"):
         read(source)
     assert odometry_error(read(source, pose_topic="tracker")) < 0.05
@@ -460,16 +440,10 @@ def test_odometry_is_no_reference_unless_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("late", [0, 7_000_000, 20_000_000])
 @pytest.mark.parametrize("integration", ["euler", "arc"])
-def test_odometry_that_the_robot_made_of_its_wheels_is_refused(
-    tmp_path: Path, late: int, integration: Integration
-) -> None:
+def test_odometry_that_the_robot_made_itself_is_refused(tmp_path: Path, late: int, integration: Integration) -> None:
     wrong = TRUTH * np.array([[1.1], [1.1], [0.9]])  # radii and distances that the driver was told
-    log = WheelLog(
-        (DRIVE.stamps[1:] - DRIVE.stamps[0]) / 1e9,
-        DRIVE.rates,
-        np.zeros(3),
-        (DRIVE.stamps[1::3] - DRIVE.stamps[0]) / 1e9,
-    )
+    seconds = (DRIVE.stamps - DRIVE.stamps[0]) / 1e9
+    log = WheelLog(seconds[1:], DRIVE.rates, np.zeros(3), seconds[1::3])
     (poses,) = OdometryModel(ROBOT, wrong, integration).poses([log])
     source = write_mcap(tmp_path / "drive", [*WHEELS_ONLY, *odometry(poses, DRIVE.stamps[1::3] + late)])
     with pytest.raises(DataError, match=f"/tracker {OWN}"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -27,6 +28,7 @@ from bag_samples import (
     write_mcap,
     write_rosbag2,
 )
+from commands import refused
 from scan_samples import (
     ANGLE_MIN,
     INCREMENT,
@@ -66,9 +68,7 @@ def scanner_of(data: Dataset) -> Scanner:
 
 
 @FORMATS
-def test_scans_come_with_the_runs_from_every_format(
-    tmp_path: Path, write: Callable[[Path, Sequence[Sent]], Path]
-) -> None:
+def test_scans_come_with_runs_from_every_format(tmp_path: Path, write: Callable[[Path, Sequence[Sent]], Path]) -> None:
     data = read(write(tmp_path / "drive", with_scans(noise=0.0)))
     assert data.warnings == ()
     assert data.scans.trajectories == ("001", "002")
@@ -140,7 +140,7 @@ def test_scans_can_be_left_out(tmp_path: Path) -> None:
 
 def test_messages_that_are_recorded_late_or_twice_come_in_order(tmp_path: Path) -> None:
     sent = with_scans()
-    late = edited(sent, SCAN, lambda each: Sent(each.topic, each.kind, each.content, each.logged + 450_000_000), 4)
+    late = edited(sent, SCAN, lambda each: replace(each, logged=each.logged + 450_000_000), 4)
     twice = [*late, *scans(SECONDS)[10:13]]
     data = read(write_mcap(tmp_path / "late", twice))
     plain = read(write_mcap(tmp_path / "plain", sent))
@@ -168,13 +168,10 @@ def test_messages_that_are_recorded_late_or_twice_come_in_order(tmp_path: Path) 
         (1, {"header": header(0)}, ".*without a header stamp.*scans=false"),
     ],
 )
-def test_scans_of_two_shapes_and_a_scanner_that_cannot_be_are_refused(
-    tmp_path: Path, every: int, change: dict[str, Any], message: str
-) -> None:
+def test_scans_that_cannot_be_are_refused(tmp_path: Path, every: int, change: dict[str, Any], message: str) -> None:
     sent = edited(with_scans(), SCAN, lambda each: changed(each, **change), every)
-    with pytest.raises(DataError, match=rf"topic {SCAN}{message}") as told:
+    with refused(DataError, match=rf"topic {SCAN}{message}"):
         read(write_mcap(tmp_path / "drive", sent))
-    assert "\n" not in str(told.value)
 
 
 def test_scans_by_another_clock_are_refused(tmp_path: Path) -> None:
@@ -214,9 +211,7 @@ def test_a_chain_of_fixed_transforms_is_followed(tmp_path: Path) -> None:
         transform("/robot/base_link", "top", 0.2, 0.3, math.pi / 2),
         transform("map", "robot/base_link", 9.0, 9.0, 1.0),
     )
-    sent = edited(
-        with_scans(extra=[chain]), SCAN, lambda each: changed(each, header=header(_stamp(each), "robot/laser"))
-    )
+    sent = edited(with_scans([chain]), SCAN, lambda each: changed(each, header=header(_stamp(each), "robot/laser")))
     mount = scanner_of(read(write_mcap(tmp_path / "drive", sent))).mount
     np.testing.assert_allclose((mount.x, mount.y, mount.yaw), (0.2, 0.4, math.pi / 2 + 0.5), rtol=0, atol=1e-9)
     ring = tf_static(transform("a", "laser", 0, 0, 0), transform("laser", "a", 0, 0, 0))
@@ -336,7 +331,7 @@ class TestRosbagWithScansConforms(ImporterConformance):
 FIX, IMU = "/gps/fix", "/imu/data"
 NAVSAT, INERTIAL = "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Imu"
 LATITUDE, LONGITUDE, HEIGHT = 41.617, 0.628, 160.0
-WHEELS_ONLY = [each for each in messages(DRIVE) if each.topic != SLAM]
+WITHOUT_POSES = [each for each in messages(DRIVE) if each.topic != SLAM]
 
 
 def degrees_at(places: Array) -> tuple[Array, Array]:
@@ -402,7 +397,7 @@ def at(run: Trajectory) -> Array:
 
 
 def test_fixes_are_positions_east_and_north_of_the_first(tmp_path: Path) -> None:
-    data = read(write_mcap(tmp_path / "drive", WHEELS_ONLY + fixes()))
+    data = read(write_mcap(tmp_path / "drive", WITHOUT_POSES + fixes()))
     assert len(data.trajectories) == 12
     for run in data.trajectories:
         assert not run.has_poses
@@ -412,7 +407,7 @@ def test_fixes_are_positions_east_and_north_of_the_first(tmp_path: Path) -> None
 
 
 def test_one_fix_a_period_is_taken(tmp_path: Path) -> None:
-    source = write_mcap(tmp_path / "drive", WHEELS_ONLY + fixes())
+    source = write_mcap(tmp_path / "drive", WITHOUT_POSES + fixes())
     each, every = (read(source, reference_period=period).trajectories[0].references for period in (1.0, 0.25))
     assert (np.diff(each.t1) > 0.7).all()
     assert len(every) > 3 * len(each)
@@ -421,7 +416,7 @@ def test_one_fix_a_period_is_taken(tmp_path: Path) -> None:
 def test_messages_without_a_fix_are_left_out(tmp_path: Path) -> None:
     sent = fixes()
     lost = [changed(each, status={"status": -1, "service": 1}, latitude=0.0) for each in sent[5:25]]
-    data = read(write_mcap(tmp_path / "drive", WHEELS_ONLY + sent[:5] + lost + sent[25:]))
+    data = read(write_mcap(tmp_path / "drive", WITHOUT_POSES + sent[:5] + lost + sent[25:]))
     assert any("20 without a fix (status -1)" in warning for warning in data.warnings)
     assert all(np.abs(run.references.values).max() < 10 for run in data.trajectories if run.references is not None)
 
@@ -436,7 +431,7 @@ def test_messages_without_a_fix_are_left_out(tmp_path: Path) -> None:
 def test_sensors_without_a_covariance_need_the_option(
     tmp_path: Path, sent: list[Sent], asked: str, option: dict[str, Any], sigma: float
 ) -> None:
-    source = write_mcap(tmp_path / "drive", WHEELS_ONLY + sent)
+    source = write_mcap(tmp_path / "drive", WITHOUT_POSES + sent)
     with pytest.raises(DataError, match=asked):
         read(source)
     references = read(source, **option).trajectories[0].references
@@ -444,7 +439,7 @@ def test_sensors_without_a_covariance_need_the_option(
 
 
 def test_an_orientation_is_a_heading_with_its_covariance(tmp_path: Path) -> None:
-    data = read(write_mcap(tmp_path / "drive", WHEELS_ONLY + compass()))
+    data = read(write_mcap(tmp_path / "drive", WITHOUT_POSES + compass()))
     for run in data.trajectories:
         assert set(run.references.kinds) == {"heading"}
         assert run.references.fixed_frame.all()
@@ -455,7 +450,7 @@ def test_an_orientation_is_a_heading_with_its_covariance(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("offset", [pytest.param(0.0, marks=pytest.mark.slow), 0.02])
 def test_a_gyro_gives_turned_angles_without_its_offset_at_rest(tmp_path: Path, offset: float) -> None:
-    data = read(write_rosbag2(tmp_path / "drive", WHEELS_ONLY + gyro(offset)), gyro_noise_deg=0.2)
+    data = read(write_rosbag2(tmp_path / "drive", WITHOUT_POSES + gyro(offset)), gyro_noise_deg=0.2)
     times = (DRIVE.pose_stamps - EPOCH) / 1e9
     for run in data.trajectories:
         assert set(run.references.kinds) == {"turn"}
@@ -470,7 +465,7 @@ def test_a_gyro_gives_turned_angles_without_its_offset_at_rest(tmp_path: Path, o
 
 
 def test_a_gyro_that_never_rests_needs_the_size_of_its_offset(tmp_path: Path) -> None:
-    sent = part(4.0, WHEELS_ONLY + gyro(0.0))
+    sent = part(4.0, WITHOUT_POSES + gyro(0.0))
     source = write_mcap(tmp_path / "drive", sent)
     options = {"least_rest": 100.0, "cut": "none"}
     with pytest.raises(DataError, match=r"never rests.*--set gyro_offset_deg=0\.5"):
@@ -480,7 +475,7 @@ def test_a_gyro_that_never_rests_needs_the_size_of_its_offset(tmp_path: Path) ->
 
 
 def test_a_sensor_mounted_upside_down_is_turned_by_the_signs(tmp_path: Path) -> None:
-    source = write_mcap(tmp_path / "drive", part(20.0, WHEELS_ONLY + gyro(0.0)))
+    source = write_mcap(tmp_path / "drive", part(20.0, WITHOUT_POSES + gyro(0.0)))
     upright, turned = (read(source, **options).trajectories for options in ({}, {"pose_signs": (1, 1, -1)}))
     for one, other in zip(upright, turned, strict=True):
         assert (one.references.values[:, 0] == -other.references.values[:, 0]).all()
@@ -495,21 +490,21 @@ def test_sensors_count_beside_poses_only_where_they_are_named(tmp_path: Path) ->
 
 
 def test_a_bag_with_fixes_and_a_gyro_calibrates_to_the_truth(tmp_path: Path) -> None:
-    data = read(write_mcap(tmp_path / "drive", WHEELS_ONLY + fixes() + gyro(0.005)), validation=("012",))
+    data = read(write_mcap(tmp_path / "drive", WITHOUT_POSES + fixes() + gyro(0.005)), validation=("012",))
     matrix = calibrate(data).calibration.matrix
     error = np.abs(matrix[2] / TRUTH[2] - 1).max()
     assert error < np.abs(ROBOT.inverse_kinematic_matrix[2] / TRUTH[2] - 1).max()
 
 
 def test_references_that_are_not_there_or_several_are_asked_for(tmp_path: Path) -> None:
-    source = write_mcap(tmp_path / "drive", part(10.0, WHEELS_ONLY + fixes()))
+    source = write_mcap(tmp_path / "drive", part(10.0, WITHOUT_POSES + fixes()))
     with pytest.raises(ConfigError, match="did you mean '/gps/fix'"):
         read(source, references=("/gps/fixs",))
-    others = [Sent("/gps2/fix", each.kind, each.content, each.logged) for each in fixes()]
+    others = [replace(each, topic="/gps2/fix") for each in fixes()]
     with pytest.raises(ConfigError, match=r"--set references=\[/gps/fix\]"):
-        read(write_mcap(tmp_path / "two", WHEELS_ONLY + fixes() + others))
+        read(write_mcap(tmp_path / "two", WITHOUT_POSES + fixes() + others))
     with pytest.raises(DataError, match=r"NavSatFix or Imu"):
-        read(write_mcap(tmp_path / "none", part(10.0, WHEELS_ONLY)))
+        read(write_mcap(tmp_path / "none", part(10.0, WITHOUT_POSES)))
 
 
 def test_the_plane_keeps_distances_and_directions_near_its_origin() -> None:

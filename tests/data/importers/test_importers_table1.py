@@ -177,9 +177,7 @@ def write_scans(folder: Path, stamps: list[float], rays: int = 1080, metre: floa
     """A lidar.csv of walls between 1 and 4 m, with one ray that saw nothing; its ranges in m."""
     ranges = np.round(np.random.default_rng(0).uniform(1.0, 4.0, (len(stamps), rays)), 3)
     ranges[:, 7] = 0.0
-    rows = [
-        f"{t:g}," + ",".join(f"{metre * value:.0f}" for value in row) for t, row in zip(stamps, ranges, strict=True)
-    ]
+    rows = [f"{t:g}," + ",".join(f"{metre * each:.0f}" for each in row) for t, row in zip(stamps, ranges, strict=True)]
     head = "t," + ",".join(f"d{ray}" for ray in range(1, rays + 1))
     (folder / "lidar.csv").write_text("\n".join([head, *rows]) + "\n")
     return np.where(ranges > 0, ranges, np.inf)
@@ -238,9 +236,7 @@ def test_a_malformed_scan_file_is_named(tmp_path: Path, changes: dict[str, Any],
         ("odometry.csv", None, "t,x,y,theta\n0.1,0,0,0\n", r"odometry\.csv: its times t are not those of wheels\.csv"),
     ],
 )
-def test_a_malformed_file_is_named_with_its_row(
-    tmp_path: Path, file: str, old: str | None, new: str, message: str
-) -> None:
+def test_a_broken_file_is_named_with_a_row(tmp_path: Path, file: str, old: str | None, new: str, message: str) -> None:
     path = write_trajectory(tmp_path / "t01") / file
     path.write_text(new if old is None else path.read_text().replace(old, new, 1))
     with pytest.raises(DataError, match=message):

@@ -79,9 +79,7 @@ def test_what_stays_in_its_file_is_the_data_set_that_was_saved(robot: Robot, tmp
     [SWERVE, *(pytest.param(robot, marks=pytest.mark.slow) for robot in (APR_02, MECANUM, DIFF, CAR))],
     ids=lambda robot: robot.name,
 )
-def test_calibrated_evaluated_checked_and_inspected_as_in_memory(
-    robot: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_fits_errors_and_checks_are_as_in_memory(robot: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     save_dataset(recorded(robot), tmp_path / "saved")
     stored = load_dataset(tmp_path / "saved", most_in_memory=0)
     found = calibrate(stored).calibration
@@ -138,9 +136,7 @@ def problem_of(dataset: Dataset, cost: str, budget: Budget | None = None) -> Cal
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("nothing_held")
-def test_a_search_by_the_evaluators_of_parts_finds_what_it_finds_by_one(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_search_by_evaluators_of_parts_finds_what_one_finds(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("omnibench.fit.problem._WORTH_BUILDING_OF_STORED", 0)
     options = {"budget": None, "seed": 3}
     stored = calibrate(load_dataset(folder, most_in_memory=0), "genetic", **options).result
@@ -163,9 +159,7 @@ def test_an_evaluator_of_parts_is_built_where_the_time_left_is_enough(
 
 
 @pytest.mark.usefixtures("nothing_held")
-def test_a_population_that_takes_longer_than_the_time_left_is_cut_there(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_population_that_takes_too_long_is_cut_there(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("omnibench.fit.problem._WORTH_BUILDING_OF_STORED", 10**9)
     problem = problem_of(load_dataset(folder, most_in_memory=0), "final_pose", Budget(seconds=0.5))
     alone = [problem.cost(problem.start * scale)[0] for scale in (0.98, 0.99)]
@@ -175,9 +169,7 @@ def test_a_population_that_takes_longer_than_the_time_left_is_cut_there(
     assert problem.best_cost < min(alone)
 
 
-def test_costs_of_candidates_whose_poses_are_held_in_parts_are_the_same(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_costs_of_poses_that_are_held_in_parts_are_the_same(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     problem = problem_of(load_dataset(folder), "trajectory")
     candidates = problem.start * np.linspace(0.98, 1.02, 7)[:, None]
     whole = problem.values(candidates)
@@ -288,9 +280,7 @@ class Sampled:
     times: np.ndarray
 
 
-def test_the_usual_period_of_very_many_samples_is_that_of_the_run_in_their_middle(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_usual_period_of_many_samples_is_that_of_the_run_in_their_middle(monkeypatch: pytest.MonkeyPatch) -> None:
     runs = [Sampled(np.arange(1, 1 + count) * period) for count, period in ((400, 0.1), (900, 0.01), (600, 0.02))]
     monkeypatch.setattr(periods, "MOST_IN_MEMORY", 0)
     assert median_period(runs) == pytest.approx(0.02)

@@ -75,9 +75,7 @@ def on_clean(robot: Robot, calibrator: str, cost: str, seed: int = 1) -> float:
         pytest.param("crs", "trajectory", DIFF, id="crs", marks=pytest.mark.slow),
     ],
 )
-def test_five_percent_of_poses_off_by_a_metre_cost_five_percent_at_most(
-    robot: Robot, calibrator: str, cost: str, loss: LossName
-) -> None:
+def test_bad_poses_cost_at_most_their_share(robot: Robot, calibrator: str, cost: str, loss: LossName) -> None:
     errors, of_clean = 0.0, 0.0
     for seed in range(1, 1 + SETS[calibrator]):
         _, jumping, judged = recording(robot, seed)

@@ -19,7 +19,6 @@ from drives import ORIGIN, SECOND, calibration, drive
 from nodes import (
     Command,
     ReceivedMessages,
-    as_text,
     asked,
     config_of,
     peak_memory,
@@ -32,6 +31,7 @@ from nodes import (
 from sessions import Loopback, free_port, raw_session, until
 from timing import PATIENCE
 
+from omnibench.config import to_yaml
 from omnibench.errors import DataError
 from omnibench.live.control.query_server import QueryServer
 from omnibench.live.control.request_queue import MOST_WAITING, Request, RequestQueue, source_of, swap_calibration
@@ -90,7 +90,7 @@ def test_the_pose_at_a_time_is_interpolated(driven: Any, form: str) -> None:
         ("swap", "- " * 30_000, "nested too deeply"),
         ("swap", "a: [" + "1, " * 20_000 + "1]", "5000 values"),
         ("swap", "a: &a [1, 1]\nb: &b [*a, *a]\nc: [*b, *b]", "*a"),
-        ("swap", as_text(calibration()).replace("session: null", r'session: "\ud800"'), "Unicode"),
+        ("swap", to_yaml(calibration()).replace("session: null", r'session: "\ud800"'), "Unicode"),
         ("swap", "#" * 140_000, "140000 bytes"),
         ("swap", "#" * 10_000_000, "10000000 bytes"),
         ("health?" + "x" * 140_000, None, "140000 bytes"),
@@ -259,7 +259,7 @@ def test_a_calibration_that_is_put_runs_from_the_next_sample_on_and_odom_does_no
         received = ReceivedMessages(session, apr__odom=ODOMETRY)
         wheels = wheels_of(session)
         sent_one_by_one(wheels, path.samples()[:51], received["apr__odom"])
-        session.put("omnibench/apr/calibration", as_text(other))
+        session.put("omnibench/apr/calibration", to_yaml(other))
         until(lambda: node.health("apr").counts["swaps"] == 1, "the swap")
         sent_one_by_one(wheels, path.samples()[51:], received["apr__odom"])
     poses = np.array([each.pose for each in received["apr__odom"]])
@@ -272,7 +272,7 @@ def test_a_calibration_that_is_put_runs_from_the_next_sample_on_and_odom_does_no
 @pytest.mark.parametrize(
     ("put", "named"),
     [
-        (as_text(calibration(wheels=4)), "fl, fr, rl, rr"),
+        (to_yaml(calibration(wheels=4)), "fl, fr, rl, rr"),
         ("#" * 140_000, "140000 bytes"),
         ("format: something", "format"),
     ],
@@ -295,7 +295,7 @@ def test_a_swap_is_kept_although_the_configs_file_went_elsewhere(tmp_path: Path)
     file = tmp_path / "calibration.yaml"
     with running(config) as (_, session):
         file.rename(tmp_path / "old.yaml")
-        answer = asked(session, "omnibench/apr/swap", as_text(calibration(scale=1.1)))
+        answer = asked(session, "omnibench/apr/swap", to_yaml(calibration(scale=1.1)))
         assert answer == {"robot": "apr", "accepted": True, "calibration": "synthetic 1.1", "kept": True}
     (tmp_path / "old.yaml").rename(file)
     with running(config) as (_, session):
@@ -306,7 +306,7 @@ def test_a_swap_is_kept_although_the_configs_file_went_elsewhere(tmp_path: Path)
 def test_a_lost_swap_says_so(tmp_path: Path, caplog: pytest.LogCaptureFixture, state: str | None, named: str) -> None:
     with running(config_of(tmp_path, state=state)) as (node, session):
         (tmp_path / "state" / "apr.calibration.yaml").mkdir(parents=True)
-        answer = asked(session, "omnibench/apr/swap", as_text(calibration(scale=1.1)))
+        answer = asked(session, "omnibench/apr/swap", to_yaml(calibration(scale=1.1)))
         assert node.trackers["apr"].calibration.name == "synthetic 1.1"
     assert (answer["accepted"], answer["kept"]) == (True, False)
     assert named in answer["reason"]

@@ -6,13 +6,12 @@ import logging
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from commands import Command as InProcess
 from commands import assert_refused, flower, succeeded, write_config
-from drives import NOISE, ORIGIN, PERIOD, Drive, calibration, drive, fed, odometry, slam
+from drives import NOISE, ORIGIN, PERIOD, Drive, calibration, drive, fed, odometry, slam, term, with_effects
 from hypothesis import given
 from hypothesis import strategies as st
 from learned_samples import a_learned_calibration
@@ -37,13 +36,6 @@ def driven(odometry: LiveOdometry, angles: np.ndarray, durations: np.ndarray) ->
     for turned, duration in zip(np.diff(angles, axis=0), durations, strict=True):
         odometry.step(WheelStep(0, float(duration), turned, turned / duration))
     return odometry
-
-
-@given(st.integers(0, 10_000), st.sampled_from(["euler", "arc"]), st.sampled_from([3, 4]))
-def test_poses_are_those_of_the_batch(seed: int, integration: Integration, wheels: int) -> None:
-    path = drive(1.0, seed=seed, using=calibration(integration=integration, wheels=wheels))
-    live = driven(LiveOdometry(path.calibration), path.angles, np.full(100, 0.01))
-    np.testing.assert_allclose(live.pose, path.poses[-1], atol=1e-12)
 
 
 @pytest.mark.parametrize("integration", ["euler", "arc"])
@@ -184,19 +176,6 @@ EFFECTS: dict[str, dict[str, float]] = {
 }
 
 
-def term(name: str, **parameters: float) -> EffectTerm:
-    return EffectTerm(name=name, parameters=parameters)
-
-
-def every_effect() -> list[EffectTerm]:
-    return [term(name, **values) for name, values in EFFECTS.items()]
-
-
-def with_effects(*terms: EffectTerm, plain: Calibration | None = None, **changes: Any) -> Calibration:
-    given_changes = {"effects": terms, "covariance": None, "session": "evening"}
-    return (plain or calibration()).model_copy(update=given_changes | changes)
-
-
 def batch(path: Drive, using: Calibration) -> Array:
     """Batch odometry at every sample from the origin, with angles as the wheels count them."""
     rates = np.diff(path.angles, axis=0) / np.diff(path.times, prepend=0.0)[:, None]
@@ -204,54 +183,59 @@ def batch(path: Drive, using: Calibration) -> Array:
     return using.model.poses([log])[0]
 
 
-class TestAgreesWithTheBatch:
-    @given(
-        st.sets(st.sampled_from(sorted(EFFECTS)), min_size=1, max_size=4),
-        st.integers(0, 1000),
-        st.sampled_from(["euler", "arc"]),
-    )
-    def test_odom_with_effects_is_that_of_the_batch(self, names: set[str], seed: int, integration: Integration) -> None:
-        plain = calibration(integration=integration)
-        using = with_effects(*(term(name, **EFFECTS[name]) for name in names), plain=plain)
-        path = drive(1.0, seed=seed, using=using)
-        updates = fed(RobotTracker("apr", using), path.payloads())
-        np.testing.assert_allclose(odometry(updates)[1:], batch(path, using), atol=1e-9)
+# Agrees with the batch
 
-    def test_motions_lead_the_filter_along_odom_with_effects_too(self) -> None:
-        using = with_effects(*every_effect())
-        path = drive(2.0, using=using)
-        robot = RobotTracker("apr", using, fusion=FusionSettings())
-        robot.take_wheels(path.payloads()[0], 0.0)
-        robot.take_pose(slam(ORIGIN, [0.0, 0.0, 0.0]), 0.0)
-        updates = fed(robot, path.payloads()[1:])
-        for update in updates:
-            np.testing.assert_allclose(update.in_map[0], update.pose, atol=1e-9)
 
-    def test_the_covariance_of_the_matrix_is_used_though_that_of_effects_follows_it(self) -> None:
-        plain, nothing = calibration(), term("heading_drift", b=0.0)
-        spread = np.diag([1e-8] * 9 + [1e-4])
-        using = with_effects(nothing, plain=plain, covariance=covariance_rows(spread))
-        path = drive(1.0)
-        last, last_with_effect = (fed(RobotTracker("apr", each), path.payloads())[-1] for each in (plain, using))
-        np.testing.assert_allclose(last_with_effect.covariance, last.covariance, rtol=1e-9)
+@given(
+    st.sets(st.sampled_from(sorted(EFFECTS)), max_size=4),
+    st.integers(0, 1000),
+    st.sampled_from(["euler", "arc"]),
+)
+def test_odom_with_effects_is_that_of_the_batch(names: set[str], seed: int, integration: Integration) -> None:
+    plain = calibration(integration=integration)
+    using = with_effects(*(term(name, **EFFECTS[name]) for name in names), plain=plain)
+    path = drive(1.0, seed=seed, using=using)
+    updates = fed(RobotTracker("apr", using), path.payloads())
+    np.testing.assert_allclose(odometry(updates)[1:], batch(path, using), atol=1e-9)
 
-    def test_odom_fades_outside_the_training_domain_as_the_batch_does(self) -> None:
-        using = fading(term("heading_drift", b=0.05), deviation=0.02)
-        path = drive(1.0, using=using)
-        whole = using.model_copy(update={"plain": None})
-        np.testing.assert_allclose(
-            odometry(fed(RobotTracker("apr", using), path.payloads()))[1:], batch(path, using), atol=1e-9
-        )
-        assert np.abs(batch(path, using) - batch(path, whole)).max() > 1e-3
 
-    def test_the_covariance_grows_by_what_effects_extrapolate_and_only_there(self) -> None:
-        """A heading that drifts by an unsure rate displaces the robot sideways of its way by half of what it turns."""
-        using, speed, seconds = fading(term("heading_drift", b=0.05), deviation=0.02), 0.2, 2.0
-        known, new = (driven_for(using, seconds, twist).covariance for twist in ((speed, 0.0, 0.0), (0.0, speed, 0.0)))
-        assert np.abs(known).max() < 1e-12
-        assert new[2, 2] > (0.02 * seconds) ** 2
-        assert new[0, 2] == pytest.approx(-speed * seconds / 2 * new[2, 2], rel=0.02)
-        assert new[0, 0] == pytest.approx((speed * seconds / 2) ** 2 * new[2, 2], rel=0.04)
+def test_motions_lead_the_filter_along_odom_with_effects_too() -> None:
+    using = with_effects(*(term(name, **values) for name, values in EFFECTS.items()))
+    path = drive(2.0, using=using)
+    robot = RobotTracker("apr", using, fusion=FusionSettings())
+    robot.take_wheels(path.payloads()[0], 0.0)
+    robot.take_pose(slam(ORIGIN, [0.0, 0.0, 0.0]), 0.0)
+    updates = fed(robot, path.payloads()[1:])
+    for update in updates:
+        np.testing.assert_allclose(update.in_map[0], update.pose, atol=1e-9)
+
+
+def test_the_covariance_of_the_matrix_is_used_though_that_of_effects_follows_it() -> None:
+    plain, nothing = calibration(), term("heading_drift", b=0.0)
+    spread = np.diag([1e-8] * 9 + [1e-4])
+    using = with_effects(nothing, plain=plain, covariance=covariance_rows(spread))
+    path = drive(1.0)
+    last, last_with_effect = (fed(RobotTracker("apr", each), path.payloads())[-1] for each in (plain, using))
+    np.testing.assert_allclose(last_with_effect.covariance, last.covariance, rtol=1e-9)
+
+
+def test_odom_fades_outside_the_training_domain_as_the_batch_does() -> None:
+    using = fading(term("heading_drift", b=0.05), deviation=0.02)
+    path = drive(1.0, using=using)
+    whole = using.model_copy(update={"plain": None})
+    updates = fed(RobotTracker("apr", using), path.payloads())
+    np.testing.assert_allclose(odometry(updates)[1:], batch(path, using), atol=1e-9)
+    assert np.abs(batch(path, using) - batch(path, whole)).max() > 1e-3
+
+
+def test_the_covariance_grows_by_what_effects_extrapolate_and_only_there() -> None:
+    """A heading that drifts by an unsure rate displaces the robot sideways of its way by half of what it turns."""
+    using, speed, seconds = fading(term("heading_drift", b=0.05), deviation=0.02), 0.2, 2.0
+    known, new = (driven_for(using, seconds, twist).covariance for twist in ((speed, 0.0, 0.0), (0.0, speed, 0.0)))
+    assert np.abs(known).max() < 1e-12
+    assert new[2, 2] > (0.02 * seconds) ** 2
+    assert new[0, 2] == pytest.approx(-speed * seconds / 2 * new[2, 2], rel=0.02)
+    assert new[0, 0] == pytest.approx((speed * seconds / 2) ** 2 * new[2, 2], rel=0.04)
 
 
 def fading(effect: EffectTerm, deviation: float) -> Calibration:
@@ -270,96 +254,106 @@ def driven_for(using: Calibration, seconds: float, twist: tuple[float, float, fl
     return live
 
 
-class TestSwaps:
-    @given(
-        st.sets(st.sampled_from(sorted(EFFECTS.keys() - {"floor_drift"})), max_size=3),
-        st.integers(0, 99),
-        st.booleans(),
-    )
-    def test_odom_goes_on_from_where_it_was_as_with_the_other(self, names: set[str], place: int, there: bool) -> None:
-        path, both = drive(1.0), [calibration(), with_effects(*(term(name, **EFFECTS[name]) for name in names))]
-        first, second = both if there else both[::-1]
-        robot = RobotTracker("apr", first)
-        before = odometry(fed(robot, path.payloads()[: place + 1]))[-1]
-        robot.swap(second)
-        after = odometry(fed(robot, path.payloads()[place + 1 :]))[0]
-        all_the_time = odometry(fed(RobotTracker("apr", second), path.payloads()))
-        expected = relative(all_the_time[place], all_the_time[place + 1])
-        np.testing.assert_allclose(relative(before, after), expected, atol=1e-9)
-
-    def test_a_floor_that_carries_the_robot_does_not_move_it_at_once(self) -> None:
-        path, using = drive(1.0), with_effects(term("floor_drift", dx=0.02, dy=-0.01))
-        robot = RobotTracker("apr", calibration())
-        before = odometry(fed(robot, path.payloads()[:51]))[-1]
-        robot.swap(using)
-        moved = odometry(fed(robot, path.payloads()[51:]))[0] - before
-        plain = path.poses[51] - path.poses[50]
-        np.testing.assert_allclose(moved, plain, atol=0.03 * np.hypot(plain[0], plain[1]))
-
-    def test_a_swap_while_driving_is_not_taken_for_a_start_from_rest(self) -> None:
-        using = with_effects(term("acceleration_slip", k=0.1), term("start_transient", k=0.2, length=0.05))
-        step = np.array([0.05, -0.02, 0.01])
-        live = LiveOdometry(calibration())
-        for _ in range(300):
-            live.step(WheelStep(0, PERIOD, step, step / PERIOD))
-        swapped = live.continued(using)
-        for _ in range(10):
-            moved = swapped.step(WheelStep(0, PERIOD, step, step / PERIOD)).moved
-            np.testing.assert_allclose(moved, using.matrix_array @ step, atol=1e-6)
-        started = LiveOdometry(using).step(WheelStep(0, PERIOD, step, step / PERIOD)).moved
-        assert np.abs(started - using.matrix_array @ step).max() > 1e-3  # which the same effects would have made of one
-
-    @pytest.mark.parametrize("effect", ["wheel_eccentricity", "thermal_radius_drift"])
-    def test_counted_angles_and_the_sessions_time_go_on_over_a_swap(self, effect: str) -> None:
-        using = with_effects(term(effect, **EFFECTS[effect]))
-        path = drive(6.0, using=using)
-        live = LiveOdometry(using)
-        for number, turned in enumerate(np.diff(path.angles, axis=0)):
-            if number == 500:
-                live = live.continued(using)
-            live.step(WheelStep(0, PERIOD, turned, turned / PERIOD))
-        from_zero = replace(path, angles=path.angles - path.angles[0])
-        np.testing.assert_allclose(live.pose, batch(from_zero, using)[-1], atol=1e-9)
+# Swaps
 
 
-class TestSessions:
-    def test_a_session_is_the_one_that_the_calibration_names(self) -> None:
-        worn, path = term("tyre_wear", radius_evening=0.01), drive(1.0)
-        turned = {
-            session: odometry(fed(RobotTracker("apr", with_effects(worn, session=session)), path.payloads()))[-1, 2]
-            for session in ("evening", "morning", None)
-        }
-        assert turned["evening"] == pytest.approx(1.01 * turned["morning"])
-        assert turned["morning"] == turned[None] == pytest.approx(path.poses[-1, 2])
-
-    def test_a_node_that_starts_again_goes_on_in_its_session(self, tmp_path: Path) -> None:
-        from omnibench.live.estimation.robot_state import RobotMemory
-
-        using = with_effects(term("thermal_radius_drift", k=1e-3))
-        path = drive(4.0, using=using)
-        memory = RobotMemory(tmp_path, "apr")
-        first = RobotTracker("apr", using, memory=memory)
-        fed(first, path.payloads()[:201])
-        first.close()
-        saved = RobotMemory(tmp_path, "apr").load()
-        assert saved.session_time == pytest.approx(2.0)
-        second = RobotTracker("apr", using)
-        second.resume(saved, 0.0, saved.wall)
-        updates = fed(second, path.payloads()[201:])
-        np.testing.assert_allclose(odometry(updates), batch(path, using)[200:], atol=1e-9)
+@given(
+    st.sets(st.sampled_from(sorted(EFFECTS.keys() - {"floor_drift"})), max_size=3),
+    st.integers(0, 99),
+    st.booleans(),
+)
+def test_odom_goes_on_after_a_swap_as_with_the_other(names: set[str], place: int, there: bool) -> None:
+    path, both = drive(1.0), [calibration(), with_effects(*(term(name, **EFFECTS[name]) for name in names))]
+    first, second = both if there else both[::-1]
+    robot = RobotTracker("apr", first)
+    before = odometry(fed(robot, path.payloads()[: place + 1]))[-1]
+    robot.swap(second)
+    after = odometry(fed(robot, path.payloads()[place + 1 :]))[0]
+    all_the_time = odometry(fed(RobotTracker("apr", second), path.payloads()))
+    expected = relative(all_the_time[place], all_the_time[place + 1])
+    np.testing.assert_allclose(relative(before, after), expected, atol=1e-9)
 
 
-class TestAngles:
-    @pytest.mark.parametrize("effect", ["heading_drift", "wheel_eccentricity"])
-    @pytest.mark.parametrize("missing", [False, True])
-    def test_missing_angles_are_told(self, effect: str, missing: bool, caplog: pytest.LogCaptureFixture) -> None:
-        using = with_effects(term(effect, **EFFECTS[effect]))
-        samples = [replace(each, positions=None) if missing else each for each in drive(0.2, using=using).samples()]
-        with caplog.at_level(logging.WARNING, "omnibench.live"):
-            fed(RobotTracker("apr", using), [JOINT_STATE.encode(each) for each in samples])
-        told = [record.getMessage() for record in caplog.records]
-        assert len(told) == (missing and effect == "wheel_eccentricity")
-        assert all(message.startswith("apr: wheel_eccentricity ") for message in told)
+def test_a_floor_that_carries_the_robot_does_not_move_it_at_once() -> None:
+    path, using = drive(1.0), with_effects(term("floor_drift", dx=0.02, dy=-0.01))
+    robot = RobotTracker("apr", calibration())
+    before = odometry(fed(robot, path.payloads()[:51]))[-1]
+    robot.swap(using)
+    moved = odometry(fed(robot, path.payloads()[51:]))[0] - before
+    plain = path.poses[51] - path.poses[50]
+    np.testing.assert_allclose(moved, plain, atol=0.03 * np.hypot(plain[0], plain[1]))
+
+
+def test_a_swap_while_driving_is_not_taken_for_a_start_from_rest() -> None:
+    using = with_effects(term("acceleration_slip", k=0.1), term("start_transient", k=0.2, length=0.05))
+    step = np.array([0.05, -0.02, 0.01])
+    live = LiveOdometry(calibration())
+    for _ in range(300):
+        live.step(WheelStep(0, PERIOD, step, step / PERIOD))
+    swapped = live.continued(using)
+    for _ in range(10):
+        moved = swapped.step(WheelStep(0, PERIOD, step, step / PERIOD)).moved
+        np.testing.assert_allclose(moved, using.matrix_array @ step, atol=1e-6)
+    started = LiveOdometry(using).step(WheelStep(0, PERIOD, step, step / PERIOD)).moved
+    assert np.abs(started - using.matrix_array @ step).max() > 1e-3  # which the same effects would have made of one
+
+
+@pytest.mark.parametrize("effect", ["wheel_eccentricity", "thermal_radius_drift"])
+def test_counted_angles_and_the_sessions_time_go_on_over_a_swap(effect: str) -> None:
+    using = with_effects(term(effect, **EFFECTS[effect]))
+    path = drive(6.0, using=using)
+    live = LiveOdometry(using)
+    for number, turned in enumerate(np.diff(path.angles, axis=0)):
+        if number == 500:
+            live = live.continued(using)
+        live.step(WheelStep(0, PERIOD, turned, turned / PERIOD))
+    from_zero = replace(path, angles=path.angles - path.angles[0])
+    np.testing.assert_allclose(live.pose, batch(from_zero, using)[-1], atol=1e-9)
+
+
+# Sessions
+
+
+def test_a_session_is_the_one_that_the_calibration_names() -> None:
+    worn, path = term("tyre_wear", radius_evening=0.01), drive(1.0)
+    turned = {
+        session: odometry(fed(RobotTracker("apr", with_effects(worn, session=session)), path.payloads()))[-1, 2]
+        for session in ("evening", "morning", None)
+    }
+    assert turned["evening"] == pytest.approx(1.01 * turned["morning"])
+    assert turned["morning"] == turned[None] == pytest.approx(path.poses[-1, 2])
+
+
+def test_a_node_that_starts_again_goes_on_in_its_session(tmp_path: Path) -> None:
+    from omnibench.live.estimation.robot_state import RobotMemory
+
+    using = with_effects(term("thermal_radius_drift", k=1e-3))
+    path = drive(4.0, using=using)
+    memory = RobotMemory(tmp_path, "apr")
+    first = RobotTracker("apr", using, memory=memory)
+    fed(first, path.payloads()[:201])
+    first.close()
+    saved = RobotMemory(tmp_path, "apr").load()
+    assert saved.session_time == pytest.approx(2.0)
+    second = RobotTracker("apr", using)
+    second.resume(saved, 0.0, saved.wall)
+    updates = fed(second, path.payloads()[201:])
+    np.testing.assert_allclose(odometry(updates), batch(path, using)[200:], atol=1e-9)
+
+
+# Angles
+
+
+@pytest.mark.parametrize("effect", ["heading_drift", "wheel_eccentricity"])
+@pytest.mark.parametrize("missing", [False, True])
+def test_missing_angles_are_told(effect: str, missing: bool, caplog: pytest.LogCaptureFixture) -> None:
+    using = with_effects(term(effect, **EFFECTS[effect]))
+    samples = [replace(each, positions=None) if missing else each for each in drive(0.2, using=using).samples()]
+    with caplog.at_level(logging.WARNING, "omnibench.live"):
+        fed(RobotTracker("apr", using), [JOINT_STATE.encode(each) for each in samples])
+    told = [record.getMessage() for record in caplog.records]
+    assert len(told) == (missing and effect == "wheel_eccentricity")
+    assert all(message.startswith("apr: wheel_eccentricity ") for message in told)
 
 
 PLUGIN = '''
@@ -432,9 +426,8 @@ def test_the_largest_weights_with_many_motions_fit_in_a_request() -> None:
     motions = tuple((-0.123456789, 0.123456789, -0.123456789) for _ in range(600))
     (term,) = learned().effects
     weights = encode_weights(np.ones(MOST_BYTES // 4))
-    largest = learned().model_copy(
-        update={"driven": motions, "effects": (term.model_copy(update={"weights": weights}),)}
-    )
+    heaviest = term.model_copy(update={"weights": weights})
+    largest = learned().model_copy(update={"driven": motions, "effects": (heaviest,)})
     assert len(to_yaml(largest).encode()) < LONGEST
 
 
@@ -444,9 +437,7 @@ def test_a_swap_to_a_learned_calibration_is_read_from_its_message_and_does_not_j
     payloads = path.payloads()
     before = fed(robot, payloads[:100])
     robot.swap(parse_calibration(text, "request"))
-    after = [
-        update for index, each in enumerate(payloads[100:], 100) for update in robot.take_wheels(each, 0.01 * index)
-    ]
+    after = fed(robot, payloads[100:], 1.0)
     assert np.abs(after[0].pose - before[-1].pose).max() < 0.1
     stayed = fed(RobotTracker("apr", calibration()), payloads)
     assert np.abs(after[-1].pose - stayed[-1].pose).max() > 1e-4

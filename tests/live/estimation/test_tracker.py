@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import re
 import time
+import zlib
+from collections.abc import Iterable, Iterator
 from contextlib import closing
 from dataclasses import fields, replace
 from pathlib import Path
@@ -11,24 +15,32 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import disk_that_takes
-from drives import NOISE, ORIGIN, PERIOD, SECOND, calibration, drive, fed, odometry, slam
+from drives import NOISE, ORIGIN, PERIOD, SECOND, calibration, drive, fed, odometry, slam, term, with_effects
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from omnibench.config import to_yaml
 from omnibench.errors import ConfigError, DataError
 from omnibench.live.estimation.health import Counts, anomalies_in_words, diagnostic
-from omnibench.live.estimation.robot_state import ExtrapolationMonitor, RobotMemory
+from omnibench.live.estimation.robot_state import ExtrapolationMonitor, PublishedStamps, RobotMemory, SavedState
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.fusion.pose_fusion import FusionSettings
 from omnibench.live.wheels.wheel_input import WheelSettings, WheelStep
 from omnibench.live.wire.messages import JOINT_STATE, JointState
 from omnibench.live.wire.outputs import Update
-from omnibench.robot.calibration import Calibration, EffectTerm, matrix_rows
+from omnibench.robot.calibration import Calibration, matrix_rows, write_calibration
 from omnibench.robot.odometry import Integration
+
+DRIVE = drive(1.0)
 
 
 def tracker(**options: Any) -> RobotTracker:
     return RobotTracker("apr", calibration(), **{"fusion": FusionSettings(), **options})
+
+
+@pytest.fixture
+def robot() -> RobotTracker:
+    return tracker()
 
 
 @pytest.mark.parametrize("integration", ["euler", "arc"])
@@ -76,9 +88,7 @@ def test_odom_never_jumps_and_no_stamp_comes_twice_whatever_happens(data: st.Dat
             robot.set_pose(np.array([9.0, 9.0, 1.0]), 0.01 * np.eye(3))
         elif event == "reset" and updates:
             robot.reset()
-        sent = {"lose": [], "twice": [sample, sample], "late": [sample, samples[max(index - 3, 0)]]}.get(
-            event, [sample]
-        )
+        sent = {"lose": [], "twice": [sample] * 2, "late": [sample, samples[max(index - 3, 0)]]}.get(event, [sample])
         for each in sent:
             chosen = replace(each, stamp=each.stamp + shift, positions=None if rates else each.positions)
             new = robot.take_wheels(JOINT_STATE.encode(chosen), arrival)
@@ -94,25 +104,21 @@ def test_odom_never_jumps_and_no_stamp_comes_twice_whatever_happens(data: st.Dat
     assert (np.abs(moved[:, 2]) < 1.6 * 1.3 * elapsed).all()
 
 
-def test_a_correction_of_slam_moves_the_filtered_pose_and_leaves_odom_alone() -> None:
-    path = drive(1.0)
-    robot = tracker()
-    before = fed(robot, path.payloads()[:60])[-1]
-    robot.take_pose(slam(path.stamps[50], [4.0, 5.0, 2.0]), 0.6)
-    (after,) = fed(robot, path.payloads()[60:61], 0.6)
-    np.testing.assert_allclose(after.pose, path.poses[60], atol=1e-9)
+def test_a_correction_of_slam_moves_the_filtered_pose_and_leaves_odom_alone(robot: RobotTracker) -> None:
+    before = fed(robot, DRIVE.payloads()[:60])[-1]
+    robot.take_pose(slam(DRIVE.stamps[50], [4.0, 5.0, 2.0]), 0.6)
+    (after,) = fed(robot, DRIVE.payloads()[60:61], 0.6)
+    np.testing.assert_allclose(after.pose, DRIVE.poses[60], atol=1e-9)
     assert np.linalg.norm(after.in_map[0][:2] - before.in_map[0][:2]) > 1
 
 
-def test_time_backwards_is_counted_and_the_stream_goes_on() -> None:
-    path = drive(1.0)
-    robot = tracker()
-    fed(robot, path.payloads()[:50])
-    back = [JOINT_STATE.encode(replace(each, stamp=each.stamp - 100 * SECOND)) for each in path.samples()[50:]]
+def test_time_backwards_is_counted_and_the_stream_goes_on(robot: RobotTracker) -> None:
+    fed(robot, DRIVE.payloads()[:50])
+    back = [JOINT_STATE.encode(replace(each, stamp=each.stamp - 100 * SECOND)) for each in DRIVE.samples()[50:]]
     updates = fed(robot, back, 0.5)
     assert robot.counts.clock_jumps == 1
-    np.testing.assert_allclose(updates[-1].pose, path.poses[-1], atol=1e-9)
-    assert robot.take_pose(slam(path.stamps[-1] - 100 * SECOND, path.poses[-1]), 1.0) == "located"
+    np.testing.assert_allclose(updates[-1].pose, DRIVE.poses[-1], atol=1e-9)
+    assert robot.take_pose(slam(DRIVE.stamps[-1] - 100 * SECOND, DRIVE.poses[-1]), 1.0) == "located"
 
 
 def giant() -> Calibration:
@@ -129,10 +135,7 @@ def giant() -> Calibration:
         (calibration(wheels=4), "wheels fl, fr, rl, rr, .* a, b, c"),
         (calibration(scale=30.0), "off the design"),
         (giant(), "off the design"),
-        (
-            calibration().model_copy(update={"effects": (EffectTerm(name="heading_drft", parameters={"b": 0.1}),)}),
-            "heading_drift",
-        ),
+        (with_effects(term("heading_drft", b=0.1)), "heading_drift"),
     ],
     ids=["another robot", "absurd", "giant", "unknown effect"],
 )
@@ -164,19 +167,17 @@ def test_after_a_silence_of_a_sender_of_rates_the_twist_is_true_and_the_pose_unc
 
 
 def test_a_full_disk_costs_the_state_and_no_odometry(tmp_path: Path) -> None:
-    path = drive(1.0)
     robot = tracker(memory=RobotMemory(tmp_path, "apr"))
     with disk_that_takes(0):
-        updates = fed(robot, path.payloads())
+        updates = fed(robot, DRIVE.payloads())
     assert len(updates) == 101
     assert robot.counts.failures > 0
     assert "File too large" in robot.health(1.0).last_refusal
 
 
-def test_poses_that_wait_and_are_then_rejected_are_told() -> None:
+def test_poses_that_wait_and_are_then_rejected_are_told(robot: RobotTracker) -> None:
     """SLAM whose stamps are always a little ahead of the wheels', a kilometre off."""
     path = drive(3.0)
-    robot = tracker()
     for index, payload in enumerate(path.payloads()):
         robot.take_wheels(payload, 0.01 * index)
         if index % 25 == 0:
@@ -188,13 +189,11 @@ def test_poses_that_wait_and_are_then_rejected_are_told() -> None:
     assert health.fusion.last_outcome in ("rejected", "waiting")
 
 
-def test_every_pose_that_waits_in_vain_is_counted() -> None:
-    path = drive(1.0)
-    robot = tracker()
-    fed(robot, path.payloads()[:50])
+def test_every_pose_that_waits_in_vain_is_counted(robot: RobotTracker) -> None:
+    fed(robot, DRIVE.payloads()[:50])
     for number in range(40):
-        robot.take_pose(slam(path.stamps[50] + 10_000_000 * number, [0, 0, 0]), 0.5)
-    fed(robot, path.payloads()[50:], 0.5)
+        robot.take_pose(slam(DRIVE.stamps[50] + 10_000_000 * number, [0, 0, 0]), 0.5)
+    fed(robot, DRIVE.payloads()[50:], 0.5)
     counts = robot.counts
     assert counts.poses + counts.pose_rejected + counts.pose_ahead == 40
 
@@ -279,19 +278,17 @@ def test_joints_called_like_the_wheels_are_found_as_in_a_bag() -> None:
 
 
 def test_a_stale_stream_says_so_and_is_less_and_less_certain() -> None:
-    path = drive(1.0)
     robot = tracker(fusion=None, stale_after=0.5)
     assert robot.health(0.0).status == "waiting"
-    fed(robot, path.payloads())
+    fed(robot, DRIVE.payloads())
     healths = [robot.health(1.0 + seconds) for seconds in (0.1, 1.0, 5.0)]
     assert [health.status for health in healths] == ["ok", "stale", "stale"]
     sigmas = [health.position_sigma_m for health in healths]
     assert sigmas[0] < sigmas[1] < sigmas[2]
 
 
-def test_health_says_when_slam_is_silent() -> None:
+def test_health_says_when_slam_is_silent(robot: RobotTracker) -> None:
     path = drive(3.0)
-    robot = tracker()
     fed(robot, path.payloads()[:10])
     assert robot.health(0.1).message == "no pose of SLAM yet"
     robot.take_pose(slam(path.stamps[5], [0, 0, 0]), 0.1)
@@ -300,14 +297,12 @@ def test_health_says_when_slam_is_silent() -> None:
     assert robot.health(3.0).status == "degraded"
 
 
-def test_poses_between_samples_are_at_constant_twist_and_others_are_refused() -> None:
-    path = drive(1.0)
-    robot = tracker()
+def test_poses_between_samples_are_at_constant_twist_and_others_are_refused(robot: RobotTracker) -> None:
     with pytest.raises(DataError, match="has sent no wheel sample yet"):
         robot.pose_at()
-    fed(robot, path.payloads())
+    fed(robot, DRIVE.payloads())
     middle = robot.pose_at(ORIGIN + round(0.505 * SECOND)).odometry
-    np.testing.assert_allclose(middle[2], path.poses[50:52, 2].mean(), atol=1e-9)
+    np.testing.assert_allclose(middle[2], DRIVE.poses[50:52, 2].mean(), atol=1e-9)
     with pytest.raises(DataError, match=r"is not within 1800000000\.\d+ to 1800000001\.000000 s"):
         robot.pose_at(ORIGIN - SECOND)
 
@@ -352,7 +347,7 @@ def test_every_anomaly_is_told_in_words_that_agree_with_its_number() -> None:
 
 
 FORWARDS, SIDEWAYS, STANDING = (0.2, 0.0, 0.0), (0.0, 0.2, 0.0), (0.0, 0.0, 0.0)
-SLIP = EffectTerm(name="centripetal_slip", parameters={"k": 0.03})
+SLIP = term("centripetal_slip", k=0.03)
 Twist = tuple[float, float, float]
 
 
@@ -440,3 +435,208 @@ def test_health_and_diagnostics_show_the_seconds_of_each_calibration(caplog: pyt
     robot.swap(calibration())
     assert robot.health(6.0).unfitted_motion_s is None
     assert "unfitted_motion_s" not in dict(diagnostic(robot.health(6.0), "").values)
+
+
+# What a node remembers of a robot, on a real disk, and of the stamps that it has published.
+
+STATE: dict[str, Any] = {
+    "sequence": 5,
+    "stamp": 10**18,
+    "wall": 1.8e9,
+    "positions": [1.0, 2.0, 3.0],
+    "pose": [1.0, 2.0, 0.3],
+    "covariance": [1e-4, 0, 0, 0, 1e-4, 0, 0, 0, 1e-5],
+}
+
+
+@pytest.fixture
+def memory(tmp_path: Path) -> Iterator[RobotMemory]:
+    opened = RobotMemory(tmp_path, "apr")
+    yield opened
+    opened.close()
+
+
+def loaded(folder: Path, content: bytes) -> SavedState | None:
+    """What a node makes of such a file."""
+    (folder / "apr.state.json").write_bytes(content)
+    memory = RobotMemory(folder, "apr")
+    try:
+        return memory.load()
+    finally:
+        memory.close()
+
+
+def with_checksum(document: dict[str, Any]) -> bytes:
+    """The line of a state."""
+    text = json.dumps(document).encode()
+    return b"%08x %s\n" % (zlib.crc32(text), text)
+
+
+@pytest.mark.parametrize("wheels", [3, 12, 200, 2000])
+def test_the_newest_state_of_any_number_of_wheels_comes_back_as_it_was(memory: RobotMemory, wheels: int) -> None:
+    angles = tuple((np.pi * 10.0 ** np.arange(wheels).clip(max=9)).tolist())
+    for stamp in range(3):
+        state = SavedState(**STATE | {"stamp": stamp, "positions": angles})
+        memory.save(state)
+        assert memory.load() == state.model_copy(update={"sequence": memory.load().sequence})
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"\x00" * 8192, b"[" * 4096, b"00000000 {", with_checksum({}) * 2, json.dumps(STATE).encode().ljust(4095) + b"\n"],
+    ids=["zeros", "brackets", "torn", "nothing in it", "of a version without checksums"],
+)
+def test_what_is_no_state_is_left_aside(tmp_path: Path, caplog: pytest.LogCaptureFixture, content: bytes) -> None:
+    assert loaded(tmp_path, content) is None
+    assert ("earlier version" in caplog.text) == (b"positions" in content)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"covariance": [1e-4] * 8},
+        {"covariance": [float("nan")] * 9},
+        {"covariance": [-1e-4, 0, 0, 0, 1e-4, 0, 0, 0, 1e-5]},
+        {"map_covariance": [1e-4] * 10},
+        {"pose": [1.0, float("inf"), 0.3]},
+        {"pose": [1.0, 2.0]},
+        {"map_pose": [float("nan"), 0.0, 0.0]},
+        {"positions": [1.0, float("nan"), 3.0]},
+        {"stamp": 10**30},
+        {"wall": float("nan")},
+        {"more": 1},
+        {"pose": [1e300, 2.0, 0.3]},
+        {"pose": [1.0, 2.0, 1e10]},
+        {"map_pose": [0.0, -1e10, 0.0]},
+        {"covariance": [1e300, 0, 0, 0, 1e-4, 0, 0, 0, 1e-5]},
+        {"positions": [1.0, 1e300, 3.0]},
+        {"steering": [1e300]},
+        {"wall": 1e300},
+        {"session_time": 1e300},
+        {"sequence": 2**64},
+        {"flows": {"1": 2**64}},
+    ],
+)
+def test_a_damaged_state_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture, change: dict[str, Any]) -> None:
+    assert loaded(tmp_path, with_checksum(STATE)) is not None
+    assert not caplog.text
+    assert loaded(tmp_path, with_checksum(STATE | change)) is None
+    assert "apr.state.json: damaged" in caplog.text
+
+
+@pytest.mark.parametrize("wheels", [3, 12, 200])
+def test_no_part_of_a_write_torn_at_any_sector_is_taken(tmp_path: Path, memory: RobotMemory, wheels: int) -> None:
+    def save(step: int) -> bytes:
+        place, angles = [np.pi * step] * 3, (np.pi * (np.arange(wheels) + step)).tolist()
+        covariance = (1e-4 * np.pi * step * (np.eye(3) + 0.1)).ravel().tolist()
+        poses = {"pose": place, "covariance": covariance, "map_pose": place, "map_covariance": covariance}
+        memory.save(SavedState(**STATE | poses | {"stamp": step, "positions": angles}))
+        return (tmp_path / "apr.state.json").read_bytes()
+
+    for step in range(1, 9):
+        before = save(step)
+    after = save(9)
+    memory.close()
+    taken = []
+    for sector in range(0, len(after) + 512, 512):
+        for torn in (after[:sector] + before[sector:], before[:sector] + after[sector:]):
+            state = loaded(tmp_path, torn)
+            taken.append((torn == after, torn == before, state.stamp))
+            assert state.pose == state.map_pose == (np.pi * state.stamp,) * 3
+    assert {stamp for whole, _, stamp in taken if whole} == {9}
+    assert {stamp for whole, _, stamp in taken if not whole} == {8}
+    assert sum(not whole and not untouched for whole, untouched, _ in taken) >= 2
+
+
+@pytest.mark.parametrize(("file_changes", "runs"), [(False, "synthetic 1.1"), (True, "synthetic 0.9")])
+def test_a_swap_is_kept_until_the_first_file_changes(tmp_path: Path, file_changes: bool, runs: str) -> None:
+    file, elsewhere = tmp_path / "calibration.yaml", tmp_path / "elsewhere.yaml"
+    write_calibration(calibration(), file)
+    with closing(RobotMemory(tmp_path / "state", "apr")) as memory:
+        memory.calibration(file)
+        file.rename(elsewhere)  # while the node runs
+        memory.keep_calibration(calibration(scale=1.1))
+        elsewhere.rename(file)
+        if file_changes:
+            write_calibration(calibration(scale=0.9), file)
+        assert memory.calibration(file).name == runs
+
+
+def test_a_calibration_that_the_disk_refuses_or_has_damaged_is_named(tmp_path: Path, memory: RobotMemory) -> None:
+    kept, file = tmp_path / "apr.calibration.yaml", tmp_path / "calibration.yaml"
+    kept.mkdir()
+    with pytest.raises(DataError, match=re.escape(kept.name)):
+        memory.keep_calibration(calibration())
+    kept.rmdir()
+    file.write_text(to_yaml(calibration()))
+    kept.write_text("instead_of: 1\n")
+    with pytest.raises(DataError, match=rf"remove {re.escape(str(kept))} .*{re.escape(str(file))}"):
+        memory.calibration(file)
+
+
+def test_a_closed_memory_writes_nothing_more(tmp_path: Path) -> None:
+    memory = RobotMemory(tmp_path, "apr")
+    memory.save(SavedState(**STATE))
+    memory.close()
+    memory.close()
+    before = (tmp_path / "apr.state.json").read_bytes()
+    memory.save(SavedState(**STATE))  # of a sample that was on its way
+    assert (tmp_path / "apr.state.json").read_bytes() == before
+
+
+STAMP_PERIOD = 10**7  # ns
+
+
+@given(st.lists(st.integers(0, 300), max_size=300), st.lists(st.integers(0, 10**18), unique=True, max_size=100))
+def test_no_stamp_comes_twice_and_one_that_is_new_stays_as_it_is(stamps: list[int], new: list[int]) -> None:
+    published = PublishedStamps()
+    given_out = [published.unique(stamp) for stamp in stamps]
+    assert len(set(given_out)) == len(given_out)
+    for order in (new, sorted(new)):
+        published = PublishedStamps()
+        assert [published.unique(stamp) for stamp in order] == order
+
+
+@given(st.lists(st.integers(0, 60), max_size=300), st.integers(1, 40))
+def test_no_stamp_comes_twice_among_those_that_are_remembered(stamps: list[int], remembered: int) -> None:
+    published = PublishedStamps(remembered)
+    given_out = [published.unique(stamp) for stamp in stamps]
+    for begin in range(len(given_out)):
+        latest = given_out[begin : begin + remembered + 1]
+        assert len(set(latest)) == len(latest)
+
+
+def test_a_clock_that_jumps_back_over_and_over_repeats_no_stamp() -> None:
+    published = PublishedStamps(remembered=1000)
+    given_out = [published.unique(STAMP_PERIOD * (k % 100)) for k in range(900)]
+    assert len(set(given_out)) == 900
+    assert max(abs(out - STAMP_PERIOD * (k % 100)) for k, out in enumerate(given_out)) <= 9  # ns
+
+
+def test_old_stamps_are_forgotten_and_memory_stays_flat() -> None:
+    published = PublishedStamps(remembered=1000)
+    for stamp in range(20_000):
+        published.unique(stamp)
+    assert len(published) == 1000
+    assert published.unique(19_500) != 19_500  # among the latest thousand
+
+
+@pytest.mark.parametrize(
+    "stamps",
+    [
+        pytest.param(
+            [STAMP_PERIOD * (k // 2) - 10 * SECOND * (k % 2) for k in range(30_000)], id="two clocks, 10 s apart"
+        ),
+        pytest.param([STAMP_PERIOD * (k % 1000) for k in range(30_000)], id="a recording of 10 s in a loop"),
+        pytest.param([STAMP_PERIOD * (k % 3) for k in range(30_000)], id="three stamps in a loop"),
+        pytest.param([STAMP_PERIOD * (k % 3) - SECOND * (k // 3) for k in range(30_000)], id="ever further back"),
+        pytest.param([STAMP_PERIOD * (k * 7919 % 29_989) for k in range(30_000)], id="no order at all"),
+    ],
+)
+def test_a_clock_gone_wild_costs_a_sample_no_more_than_20_us(stamps: Iterable[int]) -> None:
+    published = PublishedStamps()
+    begin = time.thread_time()
+    given_out = [published.unique(stamp) for stamp in stamps]
+    seconds = time.thread_time() - begin
+    assert seconds / len(given_out) < 20e-6
+    assert len(set(given_out)) == len(given_out)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from drives import EXACT, ORIGIN, PERIOD, SECOND, calibration, drive, fed, motion, odometry, slam
+from drives import EXACT, ORIGIN, PERIOD, SECOND, calibration, drive, fed, motion, odometry, slam, term, with_effects
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -264,15 +264,7 @@ def test_the_timeline_keeps_what_it_promises_and_little_more() -> None:
     assert 3.0 <= held <= 6.1
 
 
-LATE = EffectTerm(name="reference_time_offset", parameters={"tau": 0.12})
-
-
-def term(name: str, **parameters: float) -> EffectTerm:
-    return EffectTerm(name=name, parameters=parameters)
-
-
-def with_effects(*terms: EffectTerm) -> Calibration:
-    return calibration(deviation=None).model_copy(update={"effects": terms})
+LATE = term("reference_time_offset", tau=0.12)
 
 
 def seen(using: Calibration, tau: tuple[float, float], arm: Array | None = None) -> tuple[Array, int]:

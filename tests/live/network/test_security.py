@@ -19,7 +19,7 @@ import pytest
 import zenoh
 from commands import ENVIRONMENT
 from drives import drive
-from nodes import Command, peak_memory, sent, write_node
+from nodes import Command, peak_memory, sent, wheels_of, write_node
 from pydantic import ValidationError
 from recordings import random_dataset
 from sessions import free_port, until
@@ -152,143 +152,157 @@ def users(keys: Path) -> Iterator[Router]:
         yield router
 
 
-class TestAccess:
-    def test_tokens_of_ros_nodes_pass(self, fleet: Router, keys: Path) -> None:
-        key = "@ros2_lv/0/abc/0/1/MP/%/%/apr02/%apr02%joint_states/sensor_msgs::msg::dds_::JointState_/hash/qos"
-        with (
-            open_session(member(fleet, keys, "apr02"), "robot") as robot,
-            open_session(member(fleet, keys, "viewer"), "viewer") as viewer,
-        ):
-            token = robot.liveliness().declare_token(key)
-            until(lambda: alive(viewer, "@ros2_lv/0/**") == [key], "the token")
-            token.undeclare()
+# Access
 
-    def test_advanced_publishers_are_heard(self, fleet: Router, keys: Path) -> None:
-        from zenoh.ext import CacheConfig, HistoryConfig, declare_advanced_publisher, declare_advanced_subscriber
 
-        with (
-            open_session(member(fleet, keys, "remote"), "node") as node,
-            open_session(member(fleet, keys, "viewer"), "viewer") as viewer,
-        ):
-            publisher = declare_advanced_publisher(
-                node, "apr07/odom", cache=CacheConfig(max_samples=1), publisher_detection=True
-            )
-            publisher.put(b"before")
-            received: list[bytes] = []
-            subscriber = declare_advanced_subscriber(
-                viewer,
-                "apr07/odom",
-                lambda each: received.append(bytes(each.payload)),
-                history=HistoryConfig(detect_late_publishers=True),
-            )
-            until(lambda: received, "what was published before")
-            assert received == [b"before"]
-            subscriber.undeclare()
-            publisher.undeclare()
+def test_tokens_of_ros_nodes_pass(fleet: Router, keys: Path) -> None:
+    key = "@ros2_lv/0/abc/0/1/MP/%/%/apr02/%apr02%joint_states/sensor_msgs::msg::dds_::JointState_/hash/qos"
+    with (
+        open_session(member(fleet, keys, "apr02"), "robot") as robot,
+        open_session(member(fleet, keys, "viewer"), "viewer") as viewer,
+    ):
+        token = robot.liveliness().declare_token(key)
+        until(lambda: alive(viewer, "@ros2_lv/0/**") == [key], "the token")
+        token.undeclare()
 
-    @pytest.mark.parametrize("domain", ["0", "232"])
-    def test_a_robots_keys_in_any_domain_are_not_the_keys_of_its_services(self, domain: str) -> None:
-        rights = rights_of(Access.model_validate({"robots": {"apr02": "robot 2"}}))["robot 2"]
 
-        def may(right: Right, key: str) -> bool:
-            return any(zenoh.KeyExpr(each).includes(zenoh.KeyExpr(key)) for each in rights[right])
+def test_advanced_publishers_are_heard(fleet: Router, keys: Path) -> None:
+    from zenoh.ext import CacheConfig, HistoryConfig, declare_advanced_publisher, declare_advanced_subscriber
 
-        assert may("read", f"{domain}/apr02/odom/nav_msgs::msg::dds_::Odometry_/*")
-        assert may("read", f"{domain}/apr02/odometry/filtered/nav_msgs::msg::dds_::Odometry_/RIHS01_a13e")
-        for service in ("set_pose", "reset", "swap", "calibration", "*", "**"):
-            assert not may("read", f"omnibench/apr02/{service}")
-            assert may("ask", f"omnibench/apr02/{service}") == (service == "calibration")
+    with (
+        open_session(member(fleet, keys, "remote"), "node") as node,
+        open_session(member(fleet, keys, "viewer"), "viewer") as viewer,
+    ):
+        publisher = declare_advanced_publisher(
+            node, "apr07/odom", cache=CacheConfig(max_samples=1), publisher_detection=True
+        )
+        publisher.put(b"before")
+        received: list[bytes] = []
+        subscriber = declare_advanced_subscriber(
+            viewer,
+            "apr07/odom",
+            lambda each: received.append(bytes(each.payload)),
+            history=HistoryConfig(detect_late_publishers=True),
+        )
+        until(lambda: received, "what was published before")
+        assert received == [b"before"]
+        subscriber.undeclare()
+        publisher.undeclare()
 
-    def test_a_robot_cannot_have_the_name_that_begins_the_services(self) -> None:
-        with pytest.raises(ValidationError, match="omnibench begins the keys of the services"):
-            Access.model_validate({"robots": ["omnibench"]})
+
+@pytest.mark.parametrize("domain", ["0", "232"])
+def test_a_robots_keys_in_any_domain_are_not_the_keys_of_its_services(domain: str) -> None:
+    rights = rights_of(Access.model_validate({"robots": {"apr02": "robot 2"}}))["robot 2"]
+
+    def may(right: Right, key: str) -> bool:
+        return any(zenoh.KeyExpr(each).includes(zenoh.KeyExpr(key)) for each in rights[right])
+
+    assert may("read", f"{domain}/apr02/odom/nav_msgs::msg::dds_::Odometry_/*")
+    assert may("read", f"{domain}/apr02/odometry/filtered/nav_msgs::msg::dds_::Odometry_/RIHS01_a13e")
+    for service in ("set_pose", "reset", "swap", "calibration", "*", "**"):
+        assert not may("read", f"omnibench/apr02/{service}")
+        assert may("ask", f"omnibench/apr02/{service}") == (service == "calibration")
+
+
+def test_a_robot_cannot_have_the_name_that_begins_the_services() -> None:
+    with pytest.raises(ValidationError, match="omnibench begins the keys of the services"):
+        Access.model_validate({"robots": ["omnibench"]})
 
 
 def alive(session: zenoh.Session, key: str) -> list[str]:
     return [str(reply.ok.key_expr) for reply in session.liveliness().get(key) if reply.ok is not None]
 
 
-class TestMutualTls:
-    @pytest.mark.parametrize(
-        ("who", "reason"),
-        [
-            ("another authority", "our certificate is not from its authority"),
-            ("no certificate", "asks for a certificate"),
-            ("no encryption", "asks for TLS"),
-            ("another router", "we refuse its certificate"),
-            ("a router of another name", "nothing listens there|IP address mismatch"),
-        ],
-    )
-    def test_an_intruder_or_a_false_router_is_refused(self, fleet: Router, keys: Path, who: str, reason: str) -> None:
-        without = Tls(ca=keys / "ca.pem", mutual=False)
-        intruders = {
-            "another authority": foreign(fleet, keys),
-            "no certificate": SessionConfig(mode="client", connect=(fleet.address,), tls=without),
-            "no encryption": SessionConfig(mode="client", connect=(fleet.address.replace("tls", "tcp"),)),
-            "another router": member(fleet, keys, "apr02", ca=keys / "other" / "ca.pem"),
-            "a router of another name": member(fleet.address.replace("127.0.0.1", "127.0.0.2"), keys, "apr02"),
-        }
-        assert re.search(reason, refusal(intruders[who]))
+# Mutual tls
 
-    def test_a_member_cannot_pose_as_the_router(self, fleet: Router, keys: Path) -> None:
-        config = mutual(keys)
-        settings = zenoh_config(SessionConfig.model_validate(config))
-        for side in ("listen", "connect"):  # omnibench itself would not start with a client's certificate
-            settings.insert_json5(f"transport/link/tls/{side}_certificate", json.dumps(str(keys / "apr02.pem")))
-            settings.insert_json5(f"transport/link/tls/{side}_private_key", json.dumps(str(keys / "apr02.key")))
-        victim = member(fleet, keys, "apr03").model_copy(update={"connect": (config["listen"],)})
-        with zenoh.open(settings):
-            for verify_name in (True, False):
-                tls = victim.tls.model_copy(update={"verify_name": verify_name})
-                text = refusal(victim.model_copy(update={"tls": tls}))
-                assert "we refuse its certificate: unsuitable certificate purpose" in text
 
-    def test_a_refused_peer_opens_but_nothing_of_it_passes(self, fleet: Router, keys: Path) -> None:
-        settings = zenoh_config(foreign(fleet, keys))
-        settings.insert_json5("mode", '"peer"')
-        settings.insert_json5("connect/timeout_ms", "-1")
-        with zenoh.open(settings) as session:
-            publisher = session.declare_publisher("apr03/joint_states")
-            for _ in range(20):
-                publisher.put(b"forged")
-                time.sleep(0.005)
-                assert not session.info.routers_zid()
-        assert fleet.got("apr03/joint_states") == 0
+@pytest.mark.parametrize(
+    ("who", "reason"),
+    [
+        ("another authority", "our certificate is not from its authority"),
+        ("no certificate", "asks for a certificate"),
+        ("no encryption", "asks for TLS"),
+        ("another router", "we refuse its certificate"),
+        ("a router of another name", "nothing listens there|IP address mismatch"),
+    ],
+)
+def test_an_intruder_or_a_false_router_is_refused(fleet: Router, keys: Path, who: str, reason: str) -> None:
+    without = Tls(ca=keys / "ca.pem", mutual=False)
+    intruders = {
+        "another authority": foreign(fleet, keys),
+        "no certificate": SessionConfig(mode="client", connect=(fleet.address,), tls=without),
+        "no encryption": SessionConfig(mode="client", connect=(fleet.address.replace("tls", "tcp"),)),
+        "another router": member(fleet, keys, "apr02", ca=keys / "other" / "ca.pem"),
+        "a router of another name": member(fleet.address.replace("127.0.0.1", "127.0.0.2"), keys, "apr02"),
+    }
+    assert re.search(reason, refusal(intruders[who]))
 
-    def test_a_refused_router_does_not_open(self, fleet: Router, keys: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("omnibench.live.network.session._CONNECT_TIMEOUT", 0.5)
-        refused = foreign(fleet, keys)
-        upstream = SessionConfig(listen=(f"tls/127.0.0.1:{free_port()}",), connect=refused.connect, tls=refused.tls)
-        assert "our certificate is not from its authority" in refusal(upstream)
 
-    @pytest.mark.parametrize("declared", [False, pytest.param(True, marks=pytest.mark.slow)])
-    def test_a_member_works_beside_intruders_without_forging(self, fleet: Router, keys: Path, declared: bool) -> None:
-        with open_session(member(fleet, keys, "apr02"), "apr02") as session:
+def test_a_member_cannot_pose_as_the_router(fleet: Router, keys: Path) -> None:
+    config = mutual(keys)
+    settings = zenoh_config(SessionConfig.model_validate(config))
+    for side in ("listen", "connect"):  # omnibench itself would not start with a client's certificate
+        settings.insert_json5(f"transport/link/tls/{side}_certificate", json.dumps(str(keys / "apr02.pem")))
+        settings.insert_json5(f"transport/link/tls/{side}_private_key", json.dumps(str(keys / "apr02.key")))
+    victim = member(fleet, keys, "apr03").model_copy(update={"connect": (config["listen"],)})
+    with zenoh.open(settings):
+        for verify_name in (True, False):
+            tls = victim.tls.model_copy(update={"verify_name": verify_name})
+            text = refusal(victim.model_copy(update={"tls": tls}))
+            assert "we refuse its certificate: unsuitable certificate purpose" in text
+
+
+def test_a_refused_peer_opens_but_nothing_of_it_passes(fleet: Router, keys: Path) -> None:
+    settings = zenoh_config(foreign(fleet, keys))
+    settings.insert_json5("mode", '"peer"')
+    settings.insert_json5("connect/timeout_ms", "-1")
+    with zenoh.open(settings) as session:
+        publisher = session.declare_publisher("apr03/joint_states")
+        for _ in range(20):
+            publisher.put(b"forged")
+            time.sleep(0.005)
+            assert not session.info.routers_zid()
+    assert fleet.got("apr03/joint_states") == 0
+
+
+def test_a_refused_router_does_not_open(fleet: Router, keys: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("omnibench.live.network.session._CONNECT_TIMEOUT", 0.5)
+    refused = foreign(fleet, keys)
+    upstream = SessionConfig(listen=(f"tls/127.0.0.1:{free_port()}",), connect=refused.connect, tls=refused.tls)
+    assert "our certificate is not from its authority" in refusal(upstream)
+
+
+@pytest.mark.parametrize("declared", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_member_works_beside_intruders_without_forging(fleet: Router, keys: Path, declared: bool) -> None:
+    with open_session(member(fleet, keys, "apr02"), "apr02") as session:
+        works(session, fleet)
+        refusal(foreign(fleet, keys))
+        with open_session(member(fleet, keys, "stranger"), "stranger") as stranger:
+            for forger, key in product((session, stranger), ("apr03/joint_states", "apr03/slam_pose")):
+                publisher = forger.declare_publisher(key)
+                for _ in range(100):
+                    publisher.put(b"forged") if declared else forger.put(key, b"forged")
+                publisher.undeclare()
             works(session, fleet)
-            refusal(foreign(fleet, keys))
-            with open_session(member(fleet, keys, "stranger"), "stranger") as stranger:
-                for forger, key in product((session, stranger), ("apr03/joint_states", "apr03/slam_pose")):
-                    publisher = forger.declare_publisher(key)
-                    for _ in range(100):
-                        publisher.put(b"forged") if declared else forger.put(key, b"forged")
-                    publisher.undeclare()
-                works(session, fleet)
-        assert fleet.got("apr03/joint_states") == fleet.got("apr03/slam_pose") == 0
+    assert fleet.got("apr03/joint_states") == fleet.got("apr03/slam_pose") == 0
 
 
-class TestUsers:
-    def test_a_user_has_no_others_rights(self, users: Router, keys: Path, caplog: pytest.LogCaptureFixture) -> None:
-        with open_session(user(users, keys, "apr02"), "apr02") as session:
-            session.put("apr03/joint_states", b"forged")
-            works(session, users)
-        assert users.got("apr03/joint_states") == 0
-        assert not caplog.messages
+# Users
 
-    @pytest.mark.parametrize("who", ["apr02", pytest.param("nobody", marks=pytest.mark.slow), None])
-    def test_wrong_ones_are_refused(self, users: Router, who: str | None) -> None:
-        shown = None if who is None else User.model_validate({"name": who, "password": "guessed"})
-        text = refusal(SessionConfig(mode="client", connect=(users.address,), user=shown))
-        assert "may ask for a user and password" in text if who is None else f"refuses user '{who}'" in text
+
+def test_a_user_has_no_others_rights(users: Router, keys: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with open_session(user(users, keys, "apr02"), "apr02") as session:
+        session.put("apr03/joint_states", b"forged")
+        works(session, users)
+    assert users.got("apr03/joint_states") == 0
+    assert not caplog.messages
+
+
+@pytest.mark.parametrize("who", ["apr02", pytest.param("nobody", marks=pytest.mark.slow), None])
+def test_wrong_users_and_passwords_are_refused(users: Router, who: str | None) -> None:
+    shown = None if who is None else User.model_validate({"name": who, "password": "guessed"})
+    text = refusal(SessionConfig(mode="client", connect=(users.address,), user=shown))
+    assert "may ask for a user and password" in text if who is None else f"refuses user '{who}'" in text
 
 
 @pytest.mark.slow
@@ -318,8 +332,7 @@ def test_large_messages_of_a_viewer_cost_a_node_no_memory_and_no_odometry(keys: 
         with robot, viewer:
             odometry: list[zenoh.Sample] = []
             subscriber = robot.declare_subscriber("apr02/odom", odometry.append)
-            publisher = robot.declare_publisher("apr02/joint_states")
-            until(lambda: publisher.matching_status.matching, "the node's subscriber")
+            publisher = wheels_of(robot, "apr02")
             samples = drive(1.0).samples()
             sent(publisher, samples[:50])
             until(lambda: odometry, "odometry")

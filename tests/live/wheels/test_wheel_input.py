@@ -48,6 +48,11 @@ class Receiver:
         return np.sum([step.angles for step in self.steps], axis=0)
 
 
+@pytest.fixture
+def receiver() -> Receiver:
+    return Receiver()
+
+
 def at(time: float, *values: float, rates: bool = False) -> JointState:
     """A message ``time`` s after the origin, with wheel angles or rates."""
     stamp = ORIGIN + round(time * SECOND)
@@ -76,15 +81,13 @@ def test_angles_hold_the_whole_motion_whatever_is_lost_or_comes_twice_or_in_anot
     assert stamps == sorted(set(stamps))
 
 
-def test_a_sample_that_never_came_is_counted_by_the_stamps_of_the_others_which_are_not_irregular() -> None:
-    receiver = Receiver()
+def test_a_sample_that_never_came_is_counted_by_stamps_of_others_which_are_not_irregular(receiver: Receiver) -> None:
     first, *_ = receiver.take(*[at(PERIOD * k, 5.0 + k, k, k) for k in range(50) if k not in (20, 31, 32)])
     assert (first.angles.tolist(), first.duration) == ([0, 0, 0], 0)  # counting begins there
     assert (receiver.counts.missing, receiver.counts.irregular) == (3, 0)
 
 
-def test_a_duplicate_and_a_late_sample_make_no_step() -> None:
-    receiver = Receiver()
+def test_a_duplicate_and_a_late_sample_make_no_step(receiver: Receiver) -> None:
     receiver.take(at(0, 0, 0, 0), at(0.01, 1, 1, 1), at(0.03, 3, 3, 3))
     assert receiver.take(at(0.03, 3, 3, 3)) == []
     assert receiver.take(at(0.02, 2, 2, 2)) == []
@@ -115,8 +118,7 @@ def test_messages_that_arrive_at_once_add_no_turns_and_are_not_missing(every: in
     assert receiver.counts.missing == receiver.counts.counter_restarts == 0
 
 
-def test_a_counter_that_starts_again_costs_one_sample_at_the_rate_before() -> None:
-    receiver = Receiver()
+def test_a_counter_that_starts_again_costs_one_sample_at_the_rate_before(receiver: Receiver) -> None:
     receiver.take(*[at(PERIOD * k, 500 + 0.02 * k, 0.02 * k, 0.02 * k) for k in range(10)])
     (step,) = receiver.take(at(0.1, 0.0, 0.2, 0.2))
     np.testing.assert_allclose(step.angles, [0.02, 0.02, 0.02], atol=1e-9)
@@ -150,8 +152,7 @@ def both(time: float, angle: float, rate: float) -> JointState:
     ],
     ids=["rates over the time", "rates and then angles", "rates between angles", "rates first", "a restarted counter"],
 )
-def test_angles_and_rates_of_one_sender_make_one_motion(messages: list[Any], driven: float) -> None:
-    receiver = Receiver()
+def test_angles_and_rates_of_one_sender_make_one_motion(messages: list[Any], driven: float, receiver: Receiver) -> None:
     for message in messages:
         receiver.take(
             message if isinstance(message, JointState) else at(message[0], *[message[1]] * 3, rates=len(message) > 2)
@@ -161,8 +162,7 @@ def test_angles_and_rates_of_one_sender_make_one_motion(messages: list[Any], dri
 
 
 @pytest.mark.parametrize("jump", [-3600.0, -5.0, 5.0, 86400.0])
-def test_a_clock_that_jumps_is_followed_after_three_samples_and_no_motion_is_lost(jump: float) -> None:
-    receiver = Receiver()
+def test_a_clock_that_jumps_is_followed_after_three_samples_without_loss(jump: float, receiver: Receiver) -> None:
     receiver.take(*[at(PERIOD * k, k * 0.02, k * 0.01, 0) for k in range(10)])
     after = range(10, 20)
     made = receiver.take(
@@ -175,8 +175,7 @@ def test_a_clock_that_jumps_is_followed_after_three_samples_and_no_motion_is_los
 
 
 @pytest.mark.parametrize("jump", [-3600.0, 3600.0])
-def test_one_stamp_far_away_is_not_believed(jump: float) -> None:
-    receiver = Receiver()
+def test_one_stamp_far_away_is_not_believed(jump: float, receiver: Receiver) -> None:
     receiver.take(at(0, 0, 0, 0), at(0.01, 0.1, 0, 0))
     assert receiver.take(at(0.02 + jump, 0.2, 0, 0), arrivals=[0.02]) == []
     (step,) = receiver.take(at(0.03, 0.3, 0, 0))
@@ -185,8 +184,7 @@ def test_one_stamp_far_away_is_not_believed(jump: float) -> None:
     assert receiver.counts.late + receiver.counts.bad_stamps == 1
 
 
-def test_a_long_silence_is_a_gap_and_its_path_is_unknown() -> None:
-    receiver = Receiver()
+def test_a_long_silence_is_a_gap_and_its_path_is_unknown(receiver: Receiver) -> None:
     receiver.take(*[at(PERIOD * k, 100 + 0.02 * k, 100, 100) for k in range(10)])
     made = receiver.take(*[at(5 + PERIOD * k, 103 + 0.02 * k, 100, 100) for k in range(5)])
     assert receiver.counts.gaps == 1
@@ -206,9 +204,8 @@ def test_whole_turns_may_be_lost_in_a_silence_of_counters_that_wrap(settings: di
 
 
 @pytest.mark.parametrize("silence", [0.5, 10.0, 36000.0])
-def test_a_counter_that_begins_at_zero_again_after_a_silence_is_no_motion(silence: float) -> None:
+def test_a_counter_that_begins_at_zero_again_after_a_silence_is_no_motion(silence: float, receiver: Receiver) -> None:
     """A controller that was switched off and on again."""
-    receiver = Receiver()
     receiver.take(*[at(PERIOD * k, 5000 + 0.02 * k, 4200.0, 3900.0) for k in range(10)])
     receiver.take(at(silence, 0.0, 0.0, 0.0))
     assert np.abs(receiver.driven).max() < 0.18 + 2.1 * 0.5
@@ -216,8 +213,7 @@ def test_a_counter_that_begins_at_zero_again_after_a_silence_is_no_motion(silenc
     assert not receiver.steps[-1].counted
 
 
-def test_a_restarted_counter_is_found_out_by_a_node_that_was_itself_restarted() -> None:
-    receiver = Receiver()
+def test_a_restarted_counter_is_found_out_by_a_node_that_was_itself_restarted(receiver: Receiver) -> None:
     receiver.input.resume(ORIGIN - 36_000 * SECOND, np.array([5000.0, 4200.0, 3900.0]), arrival=-36_000.0)
     (step,) = receiver.take(at(0, 0.1, 0.0, 0.2))
     assert step.angles.tolist() == [0, 0, 0]
@@ -248,10 +244,8 @@ def test_a_clock_that_is_set_by_less_than_a_second_neither_adds_nor_loses_motion
     receiver = Receiver()
     values = [(2.0, 1.0, 0.0) if rates else (100 + 0.02 * k, 0.01 * k, 0.0) for k in range(200)]
     receiver.take(*[at(PERIOD * k, *values[k], rates=rates) for k in range(100)])
-    after = range(100, 200)
-    receiver.take(
-        *[at(PERIOD * k + jump, *values[k], rates=rates) for k in after], arrivals=[PERIOD * k for k in after]
-    )
+    late = range(100, 200)
+    receiver.take(*[at(PERIOD * k + jump, *values[k], rates=rates) for k in late], arrivals=[PERIOD * k for k in late])
     np.testing.assert_allclose(receiver.driven, [3.98, 1.99, 0], atol=0.25 if rates else 1e-9)
     assert receiver.counts.clock_jumps == 1
     unsure = rates and jump > -0.2  # a clock that goes back by more is no other explanation's
@@ -259,11 +253,10 @@ def test_a_clock_that_is_set_by_less_than_a_second_neither_adds_nor_loses_motion
 
 
 @pytest.mark.parametrize("begin", [1, 100])
-def test_samples_lost_after_a_late_one_are_missing_and_no_way_is_lost_with_them(begin: int) -> None:
+def test_samples_lost_after_a_late_one_are_missing_and_no_way_is_lost_with_them(begin: int, receiver: Receiver) -> None:
     lost = range(begin + 1, begin + 20)
     times = [PERIOD * k for k in range(200) if k not in lost]
     arrivals = [time + 0.15 * (time == PERIOD * begin) for time in times]
-    receiver = Receiver()
     receiver.take(*[at(time, 2.0, 1.0, 0.0, rates=True) for time in times], arrivals=arrivals)
     np.testing.assert_allclose(receiver.driven, [3.98, 1.99, 0], atol=1e-9)
     assert receiver.counts.clock_jumps == 0
@@ -281,16 +274,14 @@ def test_the_period_is_learnt_from_the_sender(period: float, learnt: float) -> N
     assert receiver.input.period == pytest.approx(learnt)
 
 
-def test_a_replay_at_ten_times_the_speed_may_have_gaps() -> None:
-    receiver = Receiver()
+def test_a_replay_at_ten_times_the_speed_may_have_gaps(receiver: Receiver) -> None:
     times = [*np.arange(0, 10, 0.01), *np.arange(15, 17, 0.01)]
     receiver.take(*[at(float(t), 100 + 0.5 * float(t), 100, 100) for t in times], arrivals=[t / 10 for t in times])
     assert receiver.counts.clock_jumps == 0
     assert receiver.counts.gaps == 1
 
 
-def test_a_rate_says_nothing_of_a_long_silence_before_it() -> None:
-    receiver = Receiver()
+def test_a_rate_says_nothing_of_a_long_silence_before_it(receiver: Receiver) -> None:
     receiver.take(*[at(PERIOD * k, 1, 1, 1, rates=True) for k in range(10)])
     made = receiver.take(*[at(5 + PERIOD * k, 1, 1, 1, rates=True) for k in range(3)])
     np.testing.assert_allclose(made[0].angles, PERIOD * np.ones(3), rtol=0.01)
@@ -299,8 +290,7 @@ def test_a_rate_says_nothing_of_a_long_silence_before_it() -> None:
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("rates", [True, False])
-def test_what_is_not_finite_is_refused_and_the_next_sample_goes_on(value: float, rates: bool) -> None:
-    receiver = Receiver()
+def test_what_is_not_finite_is_refused_and_the_next_goes_on(value: float, rates: bool, receiver: Receiver) -> None:
     receiver.take(at(0, 0, 0, 0, rates=rates), at(0.01, 0.01, 0, 0, rates=rates))
     assert receiver.take(at(0.02, 0.02, value, 0, rates=rates)) == []
     assert receiver.counts.not_finite == 1
@@ -325,10 +315,9 @@ def test_joints_are_found_by_name_in_any_order_and_among_others_and_a_missing_on
     assert receiver.input.last_refusal == "no joint 'left' among a, b, c; set wheels.joints"
 
 
-def test_irregular_periods_are_taken_as_they_are_stamped() -> None:
+def test_irregular_periods_are_taken_as_they_are_stamped(receiver: Receiver) -> None:
     rng = np.random.default_rng(3)
     times = np.cumsum(rng.uniform(0.002, 0.05, 100))
-    receiver = Receiver()
     receiver.take(*[at(float(t), 0.5 * float(t), 0, 0) for t in times])
     for step in receiver.steps[1:]:
         assert step.angles[0] / step.duration == pytest.approx(0.5, rel=1e-5)
@@ -336,17 +325,15 @@ def test_irregular_periods_are_taken_as_they_are_stamped() -> None:
 
 
 @pytest.mark.parametrize("share", [0.02, 0.2, 0.5])
-def test_missing_samples_are_all_counted_however_many_they_are(share: float) -> None:
+def test_missing_samples_are_all_counted_however_many_they_are(share: float, receiver: Receiver) -> None:
     rng = np.random.default_rng(1)
     kept = [0, *(k for k in range(1, 2999) if k < 20 or rng.random() > share), 2999]
-    receiver = Receiver()
     receiver.take(*(at(k * PERIOD, 0.01 * k, 0.0, 0.0) for k in kept))
     assert receiver.counts.missing == 3000 - len(kept)
 
 
-def test_a_robot_that_sends_more_rarely_from_now_on_misses_nothing_after_a_while() -> None:
+def test_a_robot_that_sends_more_rarely_from_now_on_misses_nothing_after_a_while(receiver: Receiver) -> None:
     times = [*(k * PERIOD for k in range(200)), *(2.0 + 2 * k * PERIOD for k in range(400))]
-    receiver = Receiver()
     receiver.take(*(at(time, time, 0.0, 0.0) for time in times))
     assert receiver.counts.missing <= 50
     assert receiver.input.period == pytest.approx(2 * PERIOD)
@@ -359,10 +346,9 @@ def test_of_a_link_that_loses_every_second_sample_all_are_counted_where_they_are
     assert receiver.input.period == pytest.approx(PERIOD)
 
 
-def test_numbered_samples_that_are_lost_from_a_burst_are_missing_and_no_clock_has_jumped() -> None:
+def test_numbered_samples_that_are_lost_from_a_burst_are_missing_and_no_clock_has_jumped(receiver: Receiver) -> None:
     kept = [*range(100), *range(150, 200)]
     arrivals = [PERIOD * min(k, 100) for k in kept]  # the link stood still, and then delivered all at once
-    receiver = Receiver()
     receiver.take(
         *(at(PERIOD * k, 0.01 * k, 0.0, 0.0) for k in kept),
         arrivals=arrivals,

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zenoh
+from commands import refused
 from mcap.reader import make_reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from samples import (
@@ -231,9 +232,8 @@ def test_its_own_session_closes_with_it_and_another_stays_open(loopback: Loopbac
     ],
 )
 def test_an_argument_that_cannot_be_is_named_in_one_line(robot: str, options: dict[str, Any], named: str) -> None:
-    with pytest.raises(ConfigError, match=named) as refused:
+    with refused(ConfigError, match=named):
         subscribe(robot, **options)
-    assert "\n" not in str(refused.value)
 
 
 WAITING_PROCESS = """

@@ -142,9 +142,7 @@ def tilted(pitch_deg: float, height: float = 0.5, yaw_deg: float = 0.0) -> Lidar
 @given(
     pitch=st.floats(-60, 60), height=st.floats(0.1, 2), yaw=st.floats(-180, 180), x=st.floats(-3, 3), y=st.floats(-3, 3)
 )  # fmt: skip
-def test_a_tilted_scanner_meets_walls_and_floor_where_its_rays_do_in_space(
-    pitch: float, height: float, yaw: float, x: float, y: float
-) -> None:
+def test_a_tilted_scanner_meets_walls_and_floor(pitch: float, height: float, yaw: float, x: float, y: float) -> None:
     lidar = tilted(pitch, height, yaw)
     found = look(square(4), lidar, standing(x, y, 0.3)).ranges[0].astype(float)
     flat = np.column_stack([np.cos(lidar.scanner.angles), np.sin(lidar.scanner.angles), np.zeros(lidar.rays)])
@@ -225,18 +223,14 @@ def test_what_is_too_near_or_too_far_is_not_seen() -> None:
 
 def test_rays_are_lost_by_chance_and_the_same_seed_gives_the_same_scans() -> None:
     plan, stamps = square(3), np.arange(200) * 0.25
-    first, again, other = (
-        look(plan, Lidar(dropouts=0.02), standing(0, 0, 0), stamps, seed).ranges for seed in (1, 1, 2)
-    )
-    assert np.isposinf(first).mean() == pytest.approx(0.02, abs=5 * math.sqrt(0.02 / first.size))
-    assert (first == again).all()
-    assert (first != other).mean() > 0.5
+    one, again, other = (look(plan, Lidar(dropouts=0.02), standing(0, 0, 0), stamps, seed).ranges for seed in (1, 1, 2))
+    assert np.isposinf(one).mean() == pytest.approx(0.02, abs=5 * math.sqrt(0.02 / one.size))
+    assert (one == again).all()
+    assert (one != other).mean() > 0.5
 
 
 @given(low=st.floats(0.02, 1), longer=st.floats(0, 1), end=st.floats(0.02, 30), latency=st.floats(0, 0.1), seed=seeds)
-def test_scans_follow_each_other_within_their_period_to_the_end(
-    low: float, longer: float, end: float, latency: float, seed: int
-) -> None:
+def test_scans_follow_within_their_period(low: float, longer: float, end: float, latency: float, seed: int) -> None:
     lidar = Lidar(period=(low, low + longer), latency=latency)
     stamps = scan_stamps(lidar, end, np.random.default_rng(seed))
     assert stamps[0] == 0
