@@ -25,7 +25,7 @@ from timing import PATIENCE
 from omnibench.config import parse_yaml, to_yaml, validate
 from omnibench.errors import ConfigError
 from omnibench.live.replay.concatenated_drive import ConcatenatedDrive, ReplayConfig, concatenate_runs
-from omnibench.live.replay.replay_player import Player, PlayReport
+from omnibench.live.replay.replay_player import Player, PlayReport, ReplayMessages
 from omnibench.live.wire.messages import JOINT_STATE, POSE_ESTIMATE
 from omnibench.live.wire.topics import GraphNode, KeySpace, Profile
 from omnibench.progress import Progress
@@ -131,19 +131,19 @@ def test_wheel_messages_hold_what_is_asked_for(use: str, held: tuple[int, int]) 
 
 
 def test_joints_are_the_robots_wheels_or_as_named() -> None:
-    assert next(events(DRIVE, config())).message.names == ("a", "b", "c")
-    named = next(events(DRIVE, config(), names=("left", "right", "rear")))
+    assert next(ReplayMessages(DRIVE, config()).stamped_from()).message.names == ("a", "b", "c")
+    named = next(ReplayMessages(DRIVE, config(), names=("left", "right", "rear")).stamped_from())
     assert named.message.names == ("left", "right", "rear")
     for names in (("left", "right"), ("left", "left", "rear"), ()):
         with pytest.raises(ConfigError, match="a, b, c"):
-            events(DRIVE, config(), names=names)
+            ReplayMessages(DRIVE, config(), names=names)
 
 
 def test_stamps_begin_with_the_time_of_the_replay_unless_given() -> None:
     before = time.time_ns()
-    first = next(events(DRIVE, ReplayConfig()))
+    first = next(ReplayMessages(DRIVE, ReplayConfig()).stamped_from())
     assert before <= first.message.stamp <= time.time_ns()
-    assert next(events(DRIVE, config(), origin=5)).message.stamp == 5
+    assert next(ReplayMessages(DRIVE, config()).stamped_from(5)).message.stamp == 5
 
 
 # Covariances
