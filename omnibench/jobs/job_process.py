@@ -36,7 +36,8 @@ from omnibench.registry import import_copies
 _MEGABYTE = 1_000_000  # bytes
 # s after its start in which a process takes further jobs: to start one costs 20 ms (tests/studies/job_overhead.py),
 # 2 % of that; what jobs leave behind in it (memory, caches) is that of a second. What unpacking jobs takes and changes
-# does not count: the first imports their modules, as it would in every new process, too.
+# does not count: the first imports their modules, as it would in every new process, too. The working folder does: by
+# it later jobs find their files.
 _YOUNG = 1.0
 _OWN = 60.0  # s, for jobs of our own code, which leave nothing behind but what they share: data need not go again
 # What every process of jobs needs; pydantic imports these when a result is first written, which takes 60 ms.
@@ -152,7 +153,8 @@ class JobEnd:
     """The end of a job, in parts that any process can read.
 
     answer: what ``keep`` returned. error: what the job raised, pickled. lost: why it has neither, as its process died
-    or was ended. reusable: the process is as it was when the job had been unpacked, which took ``unpacking`` s.
+    or was ended. reusable: the process is as it was when the job had been unpacked, which took ``unpacking`` s, and in
+    the working folder in which it began.
     """
 
     answer: Any = None
@@ -278,7 +280,7 @@ def _serve(connection: Connection) -> None:
     signal.signal(SIGTERM, SIG_DFL)  # end at once: Python's handlers would wait for compiled code
     os.setpgid(0, 0)  # all that a plug-in starts can be ended with the process
     threading.Thread(target=end_with_parent, daemon=True).start()
-    process = os.getpid()
+    process, home = os.getpid(), _folder()
     with one_thread():
         while True:
             try:
@@ -294,7 +296,8 @@ def _serve(connection: Connection) -> None:
                 return
             end = _do(job, keep, connection, process)
             unpacked_at, condition = _unpacked
-            reusable = end.error is None and not job.limited and _condition() == condition
+            unchanged = _condition() == condition and _folder() == home
+            reusable = end.error is None and not job.limited and unchanged
             for stream in (sys.stdout, sys.stderr):
                 with suppress(OSError, ValueError):  # closed by a plug-in
                     stream.flush()
@@ -323,19 +326,23 @@ def _do(job: Job[Any], keep: Callable[[str, Any], Any], connection: Connection, 
         return JobEnd(error=_sendable(error))
 
 
-def _condition() -> tuple[Any, ...]:
-    """What a job may change in its process for those that follow."""
+def _folder() -> str:
+    """The working folder, empty if it has been removed."""
     try:
-        folder = os.getcwd()
-    except OSError:  # it has been removed
-        folder = ""
+        return os.getcwd()
+    except OSError:
+        return ""
+
+
+def _condition() -> tuple[Any, ...]:
+    """What a job may change in its process for those that follow, beside the working folder."""
     try:
         os.waitpid(-1, os.WNOHANG)
         has_children = True
     except ChildProcessError:
         has_children = False
     handlers = [signal.getsignal(number) for number in signal.valid_signals()]
-    return folder, has_children, dict(os.environ), handlers, threading.active_count(), list(sys.path)
+    return has_children, dict(os.environ), handlers, threading.active_count(), list(sys.path)
 
 
 class _InWordsError(Exception):
@@ -394,9 +401,9 @@ class InPlace:
 class Processes:
     """Runs jobs in processes of one thread, up to ``workers`` of them at a time.
 
-    A job with a limit of time or memory, one that begins when a process is a second old, and one after a job that
-    raised or left something behind (a working folder, threads, children) has a fresh process; quick jobs share one, and
-    those of our own code share it for a minute.
+    A job with a limit of time or memory, one that begins when a process is a second old (imports do not count), and one
+    after a job that raised or left something behind (a working folder, threads, children) has a fresh process; quick
+    jobs share one, and those of our own code share it for a minute.
     preload: modules that the processes share, so that they need not be imported for every job. Within a job there are
     no further processes: it runs its jobs itself. lasting: processes that have nothing to do wait for the next run,
     until ``close``.

@@ -254,6 +254,17 @@ def test_what_jobs_import_makes_their_process_neither_old_nor_another(
     assert len(set(processes_of(notes))) == 1
 
 
+def test_a_process_that_imports_have_moved_to_another_folder_does_no_further_job(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    moves = "import multiprocessing, os\nif multiprocessing.parent_process(): os.chdir('/')\n"
+    (tmp_path / "moves_when_imported.py").write_text(moves + "class Place: pass\n")
+    place = importlib.import_module("moves_when_imported").Place()
+    notes = run(tmp_path, jobs_of(process_of_a_job, [place, None]), Processes(1))
+    assert len(set(processes_of(notes))) == 2
+
+
 def process_of_a_job(_: object, __: Reporter) -> Answer:
     return Answer(0, os.getpid())
 
