@@ -4,16 +4,13 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
 from omnibench.cli.options import Force, Plugins, load_given_plugins, output_option, plugin_folders
 from omnibench.cli.terminal.console import make_console, print_ending, warn
 from omnibench.errors import ConfigError
-
-if TYPE_CHECKING:
-    pass
 
 live_app = typer.Typer()
 _LISTENING = 0.2  # s between two looks at whether a signal came; chosen

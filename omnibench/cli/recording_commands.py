@@ -285,7 +285,6 @@ def check(
 
     Nothing is changed. Exit 0 whatever the verdict; 2 where the source cannot be read.
     """
-
     from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.config import parse_settings
     from omnibench.errors import PluginError

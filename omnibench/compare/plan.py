@@ -134,7 +134,7 @@ class PlannedRun:
     """One run: an entry of the config on one data set with one seed.
 
     config: where the run's plug-ins, timing and memory are from. training: the data set's training runs, the same
-    object for all runs on it. settings: a geometry does not use their box. box_name: the name of the bounds
+    object for all runs on it. settings: of the fit; a geometry does not use their box. box_name: the name of the bounds
     that are searched, or ``UNBOUNDED``.
     """
 

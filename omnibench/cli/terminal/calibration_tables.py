@@ -162,7 +162,8 @@ def print_evaluation(console: Console, evaluation: Evaluation) -> None:
         title = f"{split}: {plural(evaluation.splits[split].trajectories, 'run')}"
         if evaluation.unfitted is not None:
             part, whole = evaluation.unfitted[split], evaluation.splits[split].trajectories
-            title += f", { {0: 'none', whole: 'all'}.get(part, f'{part:,}') } held out"
+            held_out = {0: "none", whole: "all"}.get(part, f"{part:,}")
+            title += f", {held_out} held out"
         if (outside := evaluation.splits[split].outside) is not None:
             title += f", {100 * outside:.0f} % of the time outside of what it was fitted to"
         rows.append(Row.of(title, role="group"))

@@ -6,7 +6,7 @@ pose at time t, to first order, by
     d theta(t) = int dw dt',    d z(t) = int (exp(i theta) dv - i z dw) dt' + i z(t) d theta(t),                    (1)
 
 integrals from 0 to t: a turn by dw at t' swings the rest of the path, z(t) - z(t'), about where the robot is then. One
-sum over the samples is enough for each change. So are found the slopes by the parameters of effects.
+sum over the samples is enough for each change. ``slopes_by``: those by the parameters of an effect.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Competing models: those that the recordings cannot tell apart, which of them is used, and the effects that it names.
+"""Competing models: those that the recordings cannot tell apart, which of them is used, and its named effects.
 
 Where several effects explain the same residuals, each in its place makes a model of its own. The one that best predicts
 commands that its fit did not see, in the paper's cost, is used; what the models disagree on is not known.

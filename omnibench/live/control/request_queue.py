@@ -1,4 +1,4 @@
-"""Requests to a node, their fair queue, in which every client has a lane of its own, and a client's request to swap."""
+"""Requests to a node and their fair queue, in which every client has a lane; the request of a client to swap."""
 
 from __future__ import annotations
 

@@ -422,7 +422,7 @@ def _named(bag: Bag, name: str, key: str, types: Sequence[str], words: str = "")
 def _only(
     bag: Bag, key: str, candidates: Sequence[Topic], ending: str, types: Sequence[str], wheels: Topic | None = None
 ) -> Topic:
-    """The only topic with messages, or that ends so; of several that do the one in the namespace of the wheels."""
+    """The only topic with messages, or the only one of them with this ending, at best in the wheels' namespace."""
     if not candidates:
         known = ", ".join(map(str, bag.topics)) or "none"
         others = f", nor another reference ({_REFERENCES})" if key == "pose_topic" else ""
