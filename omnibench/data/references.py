@@ -118,6 +118,10 @@ class References(Brief):
         t0, t1, values, sigmas = (array[order] for array in (self.t0, self.t1, self.values, self.sigmas))
         return replace(self, kinds=self.kinds[order], t0=t0, t1=t1, values=values, sigmas=sigmas)
 
+    def with_values(self, values: Array) -> References:
+        """These measurements with other values (R, 2)."""
+        return replace(self, values=values)
+
     def of_run(self, zero: float, end: float, kept: NDArray[np.bool_] | slice = slice(None)) -> References:
         """These measurements, or those kept (R,), by the time of a run that began at ``zero`` and lasted ``end`` s.
 
@@ -261,7 +265,7 @@ def with_whole_turns(robot: Robot, log: WheelLog, references: References) -> Ref
             steps = np.diff(headings, prepend=before[0])
             turns = np.round((np.diff(driven, prepend=before[1]) - steps) / TURN)
             values[chosen, 0] = headings + TURN * np.cumsum(turns)
-    return replace(references, values=values)
+    return references.with_values(values)
 
 
 # How many times too large references in another unit are, and that unit.
