@@ -103,13 +103,16 @@ def test_exchanged_wheels_come_with_the_way_back(robot: str) -> None:
     assert {"wheel_order": order} in changes
 
 
-@pytest.mark.parametrize("robot", ["tricycle", "car", "swerve"])
 @pytest.mark.parametrize(
-    ("change", "kind"),
+    ("change", "kind", "robot"),
     [
-        (steering(np.negative), "steering_sign"),
-        (steering(np.degrees), "steering_unit"),
-        (steering(lambda angles: angles + math.radians(14)), "steering_zero"),
+        pytest.param(change, kind, robot, id=f"{kind}-{robot}", marks=[pytest.mark.slow] * (robot != quick))
+        for quick, kind, change in (
+            ("tricycle", "steering_sign", steering(np.negative)),
+            ("car", "steering_unit", steering(np.degrees)),
+            ("tricycle", "steering_zero", steering(lambda angles: angles + math.radians(14))),
+        )
+        for robot in ("tricycle", "car", "swerve")
     ],
 )
 def test_misread_steering_angles_are_named(change: Change, kind: str, robot: str) -> None:

@@ -108,9 +108,8 @@ def test_exact_references_give_the_true_matrix(calibrator: str, monkeypatch: pyt
     np.testing.assert_allclose(run.calibration.matrix_array, truth, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    "kind", ["displacement", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("distance", "turn", "position"))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["displacement", "distance", "turn", "position"])
 def test_intervals_hold_the_truth(kind: str) -> None:
     found = [study.covered(study.Case("diff", kind), seed) for seed in range(6)]
     errors = np.concatenate([each.combinations for each in found])

@@ -106,7 +106,8 @@ def test_headings_that_jump_cost_five_percent_at_most(loss: LossName) -> None:
 
 
 @pytest.mark.parametrize(
-    "calibrator", ["least_squares", pytest.param("trajectory_ml", marks=pytest.mark.slow), "closed_form"]
+    "calibrator",
+    ["closed_form", *(pytest.param(name, marks=pytest.mark.slow) for name in ("least_squares", "trajectory_ml"))],
 )
 def test_real_recordings_with_jumps_are_calibrated_as_without(calibrator: str) -> None:
     if not RECORDINGS.exists():
@@ -132,7 +133,8 @@ def test_closed_form_reaches_what_a_long_search_finds(loss: LossName) -> None:
     assert found["closed_form"] == pytest.approx(found["crs"], rel=1e-6)
 
 
-@pytest.mark.parametrize("loss", ["huber", pytest.param("student_t", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("loss", ["huber", "student_t"])
 def test_intervals_of_a_robust_fit_are_about_as_wide_as_those_of_squares_on_normal_errors(loss: LossName) -> None:
     clean, jumping, _ = recording(DIFF)
     usual = calibrate(clean, "trajectory_ml", unidentified="keep").uncertainty
