@@ -364,9 +364,8 @@ class DrivableCommands:
         for radius in self._radii(direction, pivot):
             for side in (1.0, -1.0):
                 if arc := self._drivable(direction, side / radius, pivot, pace):
-                    yield from self._of_length(
-                        arc, [math.radians(turn) * radius / arc.speed for turn in self.shapes.turns]
-                    )
+                    durations = [math.radians(turn) * radius / arc.speed for turn in self.shapes.turns]
+                    yield from self._of_length(arc, durations)
 
     def _spins(self, pivot: tuple[float, float], pace: float) -> Iterator[TimedCommand]:
         """Turns on the spot."""
@@ -374,8 +373,7 @@ class DrivableCommands:
             turn_rate = side * pace * self._slower(Command(0.0, 0.0, side, pivot))
             spin = Command(0.0, 0.0, turn_rate, pivot)
             if is_within(self.robot, spin, self.steering_limit):
-                durations = [math.radians(turn) / abs(spin.turn_rate) for turn in self.shapes.spins]
-                yield from self._of_length(spin, durations)
+                yield from self._of_length(spin, [math.radians(turn) / abs(turn_rate) for turn in self.shapes.spins])
 
     def _radii(self, direction: float, pivot: tuple[float, float]) -> list[float]:
         """Radii of arcs, m: shares of the area, and a little more than the smallest that a robot steers."""
