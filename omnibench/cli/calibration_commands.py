@@ -37,6 +37,7 @@ from omnibench.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
     from omnibench.compare.config import CompareConfig
+    from omnibench.study.config import StudyConfig
 
 
 calibration_app = typer.Typer()
@@ -88,32 +89,17 @@ def compare(
     from omnibench.compare.report.comparison_report import comparison_document
     from omnibench.compare.run import run_comparison
     from omnibench.progress import Progress
+    from omnibench.study.study import is_study, read_study_config
 
     refuse_figures_without_browser(figures)
     asked = plugin_folders(plugins or [])
     given = {"backend": backend, "workers": workers, "tls": tls_files(tls_ca, tls_cert, tls_key)}
     given = {name: value for name, value in given.items() if value is not None}
-    from omnibench.study.study import is_study, read_study_config, run_study
-
     if len(config) == 1 and config[0].is_file() and is_study(config[0]):
-        # The exit code is 1 if a recording of a study cannot be read, or no method answered.
-        from omnibench.cli.terminal.comparison_tables import print_study, print_study_ending
-        from omnibench.study.report import study_document
-
         study = read_study_config(config[0], _named_paths(data))
         folders = [*study.plugins, *(folder.resolve() for folder in asked)]
         study = study.model_copy(update={"plugins": tuple(dict.fromkeys(folders))} | given)
-        with ProgressDisplay() as watch:
-            answer = run_study(study, output, watch, force=force)
-            if figures is not None:
-                watch(Progress("drawing the figures"))
-                write_asked_figures(study_document(answer), figures)
-        warn(answer.warnings)
-        print_study(make_console(), answer)
-        typer.echo(f"report: {answer.output / 'report.html'}")
-        if not print_study_ending(answer):
-            raise typer.Exit(1)
-        return None
+        return _run_study(study, output, figures, force)
     comparison = _asked_comparison(config, data, asked)
     folders = [*comparison.plugins, *(folder.resolve() for folder in asked)]
     comparison = comparison.model_copy(update={"plugins": tuple(dict.fromkeys(folders))} | given)
@@ -133,6 +119,26 @@ def compare(
         )
         raise typer.Exit(1)
     return print_comparison_ending(result)
+
+
+def _run_study(config: "StudyConfig", output: Path | None, figures: Path | None, force: bool) -> None:
+    """Run a study and print its answer. The exit code is 1 if a recording cannot be read, or no method answered."""
+    from omnibench.cli.terminal.comparison_tables import print_study, print_study_ending
+    from omnibench.cli.terminal.progress_display import ProgressDisplay
+    from omnibench.progress import Progress
+    from omnibench.study.report import study_document
+    from omnibench.study.study import run_study
+
+    with ProgressDisplay() as watch:
+        answer = run_study(config, output, watch, force=force)
+        if figures is not None:
+            watch(Progress("drawing the figures"))
+            write_asked_figures(study_document(answer), figures)
+    warn(answer.warnings)
+    print_study(make_console(), answer)
+    typer.echo(f"report: {answer.output / 'report.html'}")
+    if not print_study_ending(answer):
+        raise typer.Exit(1)
 
 
 def _asked_comparison(given: Sequence[Path], data: list[str] | None, plugins: Sequence[Path]) -> "CompareConfig":

@@ -351,7 +351,7 @@ def fetch_recording(
     asked = find_recording(name)
     # The folder that was named, or one below it for each of several data sets.
     names = [dataset.name for dataset in asked.datasets] or [asked.repository.partition("/")[2]]
-    folders = [(output or DATA) / each for each in names]
+    folders = [(output or DATA) / dataset_name for dataset_name in names]
     if output is not None and len(names) == 1:
         folders = [output]
     for folder in folders:
@@ -381,31 +381,37 @@ def fetch_recording(
             report(Progress("importing", result=""))
         _save(fetched, dataset, folder, force)
         return replace(fetched, datasets={folder: dataset})
-    # The data sets of a recording of the catalogue, by its plug-in unless an importer of that name is there.
+    return _import_catalogued(clone, recording, dict(zip(folders, asked.datasets, strict=True)), force, report)
+
+
+def _import_catalogued(
+    clone: Clone, recording: PublicRecording, datasets: Mapping[Path, PublicDataset], force: bool, report: Reporter
+) -> Fetched:
+    """Import data sets of a recording of the catalogue, by its plug-in unless an importer of that name is there."""
     if recording.plugin and recording.importer not in [entry.name for entry in importers.entries()]:
         failure = load_plugin_file(bundled_folder() / "plugins" / recording.plugin)
         if failure is not None:
             raise PluginError(f"plug-in {failure.origin} cannot be imported: {failure.error}")
     cite = recording.article or f"{GITHUB}/{clone.repository}"
     fetched = Fetched(clone, cite, recording.licence, _licence_file(clone.folder), {})
-    datasets = {}
-    for folder, wanted in zip(folders, asked.datasets, strict=True):
-        source = clone.folder / wanted.path
+    imported = {}
+    for folder, dataset in datasets.items():
+        source = clone.folder / dataset.path
         if not source.exists():
             raise DataError(f"{source} is not in commit {clone.commit[:8]}; leave --commit out to take the one tested")
-        report(Progress(f"importing {wanted.name}"))
-        datasets[folder] = _imported(fetched, recording.importer, source, folder, wanted.options)
-        _save(fetched, datasets[folder], folder, force)
-        report(Progress(f"importing {wanted.name}", result=""))
-    return replace(fetched, datasets=datasets)
+        report(Progress(f"importing {dataset.name}"))
+        imported[folder] = _imported(fetched, recording.importer, source, folder, dataset.options)
+        _save(fetched, imported[folder], folder, force)
+        report(Progress(f"importing {dataset.name}", result=""))
+    return replace(fetched, datasets=imported)
 
 
 def _imported(fetched: Fetched, importer: str, source: Path, folder: Path, options: Mapping[str, Any]) -> Dataset:
     """A data set that says its origin and licence. The importer's options hold them where they can, to be kept when
     the recording is imported again."""
     fields = importers.entry(importer).options.model_fields
-    said = {"name": folder.resolve().name, "source": fetched.source, "licence": fetched.licence}
-    given = {key: text for key, text in said.items() if key in fields and text and text.isprintable()}
+    origin = {"name": folder.resolve().name, "source": fetched.source, "licence": fetched.licence}
+    given = {key: text for key, text in origin.items() if key in fields and text and text.isprintable()}
     dataset = import_dataset(importer, source, {**given, **options})
     return replace(dataset, source=fetched.source, licence=fetched.licence or dataset.licence)
 

@@ -4,13 +4,16 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from omnibench.cli.options import Force, Plugins, load_given_plugins, output_option, plugin_folders
 from omnibench.cli.terminal.console import make_console, print_ending, warn
 from omnibench.errors import ConfigError
+
+if TYPE_CHECKING:
+    from omnibench.live.config import LiveConfig
 
 live_app = typer.Typer()
 _LISTENING = 0.2  # s between two looks at whether a signal came; chosen
@@ -50,13 +53,7 @@ def live(
 
     With --replay it needs no robot: a recording is played to the node.
     """
-    from omnibench.cli.terminal.live_tables import node_log, print_demonstration
-    from omnibench.cli.terminal.progress_display import ProgressDisplay
-    from omnibench.config import validate
     from omnibench.live.config import read_live_config
-    from omnibench.live.node import LiveNode
-    from omnibench.live.replay.concatenated_drive import ReplayConfig, load_recording
-    from omnibench.live.stopping import stop_on_signals, ticks
 
     if replay and config.is_dir() and dataset is not None:  # --replay DATASET before CONFIG
         config, dataset = dataset, config
@@ -67,42 +64,56 @@ def live(
     if not replay:
         if dataset is not None or speed is not None:
             raise ConfigError(f"{dataset or '--speed'}: is for a replay only; add --replay")
-        with (
-            node_log(make_console(error=True)) as log,
-            stop_on_signals() as stop,
-            LiveNode(chosen, stop=stop) as node,
-        ):
-            for robot in chosen.robots:
-                fused = "fused with SLAM" if chosen.fusion_of(robot) else "without fusion"
-                log.info("%s: %r runs, %s", robot.name, node.trackers[robot.name].calibration.name, fused)
-            if not chosen.robots:
-                log.info("no robots in the config: only a router")
-            verb = "listens on" if chosen.zenoh.listening else "is connected to"
-            place = ", ".join(chosen.zenoh.listening or chosen.zenoh.connecting)
-            log.info("node %s %s %s; Ctrl-C ends it", chosen.name, verb, place)
-            for _ in ticks(stop, _LISTENING, seconds):  # a signal that reaches a thread of Zenoh's wakes nobody here
-                pass
-        return print_ending(
-            f"node {chosen.name} has ended, and sends nothing more", "start it again", "omnibench", "live", config
-        )
-    # A recording is played to the node.
-    from omnibench.live.replay.demonstration import demonstrate
+        return _run_node(chosen, config, seconds)
+    return _replay_to_node(chosen, dataset, speed, config, seconds)
 
-    source = dataset or chosen.replay.dataset
+
+def _run_node(config: "LiveConfig", file: Path, seconds: float | None) -> None:
+    """Run the node until a signal comes, or for ``seconds``."""
+    from omnibench.cli.terminal.live_tables import node_log
+    from omnibench.live.node import LiveNode
+    from omnibench.live.stopping import stop_on_signals, ticks
+
+    with node_log(make_console(error=True)) as log, stop_on_signals() as stop, LiveNode(config, stop=stop) as node:
+        for robot in config.robots:
+            fused = "fused with SLAM" if config.fusion_of(robot) else "without fusion"
+            log.info("%s: %r runs, %s", robot.name, node.trackers[robot.name].calibration.name, fused)
+        if not config.robots:
+            log.info("no robots in the config: only a router")
+        verb = "listens on" if config.zenoh.listening else "is connected to"
+        place = ", ".join(config.zenoh.listening or config.zenoh.connecting)
+        log.info("node %s %s %s; Ctrl-C ends it", config.name, verb, place)
+        for _ in ticks(stop, _LISTENING, seconds):  # a signal that reaches a thread of Zenoh's wakes nobody here
+            pass
+    print_ending(f"node {config.name} has ended, and sends nothing more", "start it again", "omnibench", "live", file)
+
+
+def _replay_to_node(
+    config: "LiveConfig", dataset: Path | None, speed: str | None, file: Path, seconds: float | None
+) -> None:
+    """Play a recording to a node of this process, and show the errors of its odometry."""
+    from omnibench.cli.terminal.live_tables import node_log, print_demonstration
+    from omnibench.cli.terminal.progress_display import ProgressDisplay
+    from omnibench.config import validate
+    from omnibench.live.replay.concatenated_drive import ReplayConfig, load_recording
+    from omnibench.live.replay.demonstration import demonstrate
+    from omnibench.live.stopping import stop_on_signals
+
+    source = dataset or config.replay.dataset
     if source is None:
-        raise ConfigError(f"{config}: replay.dataset names no recording; say --replay DATASET")
+        raise ConfigError(f"{file}: replay.dataset names no recording; say --replay DATASET")
     if speed is not None:
         checked = validate(ReplayConfig, {"speed": _speed(speed)}, "--speed")
-        chosen = chosen.model_copy(update={"replay": chosen.replay.model_copy(update={"speed": checked.speed})})
+        config = config.model_copy(update={"replay": config.replay.model_copy(update={"speed": checked.speed})})
     with ProgressDisplay() as watch:
         recording = load_recording(source, watch=watch)
     with ProgressDisplay() as watch, node_log(watch.console, warnings_only=True), stop_on_signals() as stop:
-        shown = demonstrate(chosen, recording, stop, watch, math.inf if seconds is None else seconds)
-    print_demonstration(make_console(), shown)
-    if shown.report.interrupted:
+        demonstration = demonstrate(config, recording, stop, watch, math.inf if seconds is None else seconds)
+    print_demonstration(make_console(), demonstration)
+    if demonstration.report.interrupted:
         raise typer.Exit(130)
-    return print_ending(
-        "the node computed what the batch odometry computes", "run it for the robot", "omnibench", "live", config
+    print_ending(
+        "the node computed what the batch odometry computes", "run it for the robot", "omnibench", "live", file
     )
 
 

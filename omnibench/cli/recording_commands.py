@@ -116,23 +116,12 @@ def import_(
     load_given_plugins(plugins, plugin_files)
     entry, given = importers.entry(importer, "import"), parse_settings(settings)
     if template is not None:
-        # Write tables and robot.yaml to fill in, and say what to type then.
-        from omnibench.data.importers.csv_tables.csv_template import write_template
-
         if importer != "csv":
             raise ConfigError(f"--template is for csv, not for {importer}: omnibench import csv --template {template}")
         if source is not None or output is not None:
             raise ConfigError("--template DIR writes tables to fill in; leave SOURCE and -o out")
         refuse_existing(template, force=force, folders=True)
-        files = write_template(template, robot_type or "diff", references=references)
-        typer.echo(f"{plural(len(files), 'file')}: {template}")
-        for file in files:
-            typer.echo(f"  {file.name}", err=True)
-        return print_ending(
-            f"{template} holds robot.yaml and {plural(len(files) - 1, 'table')} to fill in",
-            "put your robot and your samples into them, and import them",
-            *("omnibench", "import", "csv", template, "-o", f"data/{template.resolve().name}"),
-        )
+        return _write_template(template, robot_type or "diff", references)
     if references:
         raise ConfigError("--references is for --template DIR; a references.csv among the tables is read by itself")
     if robot_type is not None:
@@ -150,41 +139,63 @@ def import_(
     dataset = import_dataset(importer, source, options)
     read = RecordingSource(dataset, importer, source, given, output)
     report = None if no_check else _checked(read)
+    findings = [warning for warning in dataset.warnings if isinstance(warning, FindingWarning)]
     if not accept_units:
         # Units that cannot be right are refused, with what to type.
-        wrong: list[str] = [each for each in dataset.warnings if isinstance(each, FindingWarning) and each.unit]
+        wrong: list[str] = [warning for warning in findings if warning.unit]
         if not wrong and report is not None:
-            wrong = [each.what for each in report.findings if each.kind in UNITS and each.severity == "error"]
+            errors = [finding for finding in report.findings if finding.severity == "error"]
+            wrong = [error.what for error in errors if error.kind in UNITS]
         if wrong:
             mended = (report or _checked(read)).command
             way = f"type {mended}, or " if mended else ""
             raise DataError(f"{'; '.join(wrong)}; {output} is not written: {way}--accept-units to write it as it is")
     dataset = replace(dataset, imported=Imported.of(importer, source, given))
     save_dataset(dataset, output, table_format, overwrite=force)
-    said = "" if report is None else report.sentence  # the findings that the check's sentence names
-    warn([each for each in dataset.warnings if not (isinstance(each, FindingWarning) and each.finding.what in said)])
+    summarised = [warning for warning in findings if report is not None and warning.finding.what in report.sentence]
+    warn(warning for warning in dataset.warnings if warning not in summarised)
     typer.echo(f"{plural(len(dataset.trajectories), 'trajectory')}: {output}")
     way = " (other: --set validation=PATTERN)" if "validation" in entry.cls.Options.model_fields else ""
     divided = f"{division_in_words(dataset.trajectories, options)}{way}"
     make_console(error=True).print(divided, soft_wrap=True)
-    then: tuple[str, tuple[object, ...]] = ("see what they tell", ("omnibench", "inspect", output))
     if report is not None:
-        from omnibench.fit.check.checking import mending
-
         make_console(error=True).print(f"check: {report.sentence}.", soft_wrap=True)
-        then = "see what is missing", ("omnibench", "check", output)
-        if typed := mending(read, report):
-            then = "mend it", tuple(shlex.split(typed))
-        elif report.verdict == "ready":
-            then = "calibrate it", ("omnibench", "calibrate", output, "-o", "calibration.yaml")
     holds = f"{output} holds {plural(len(dataset.trajectories), 'run')} of {dataset.robot.name}"
-    return print_ending(holds, then[0], *then[1])
+    return print_ending(holds, *_next_step(read, report))
+
+
+def _write_template(folder: Path, robot_type: str, references: bool) -> None:
+    """Write tables and robot.yaml to fill in, and say what to type next."""
+    from omnibench.data.importers.csv_tables.csv_template import write_template
+
+    files = write_template(folder, robot_type, references=references)
+    typer.echo(f"{plural(len(files), 'file')}: {folder}")
+    for file in files:
+        typer.echo(f"  {file.name}", err=True)
+    print_ending(
+        f"{folder} holds robot.yaml and {plural(len(files) - 1, 'table')} to fill in",
+        "put your robot and your samples into them, and import them",
+        *("omnibench", "import", "csv", folder, "-o", f"data/{folder.resolve().name}"),
+    )
 
 
 def _checked(read: "RecordingSource") -> "CheckReport":
     from omnibench.fit.check.checking import check_recording  # slow to import, and left out by --no-check
 
     return check_recording(read)
+
+
+def _next_step(read: "RecordingSource", report: "CheckReport | None") -> tuple[Any, ...]:
+    """The next step after an import in words, then the words to type."""
+    if report is None:
+        return "see what they tell", "omnibench", "inspect", read.folder
+    from omnibench.fit.check.checking import mending
+
+    if command := mending(read, report):
+        return "mend it", *shlex.split(command)
+    if report.verdict == "ready":
+        return "calibrate it", "omnibench", "calibrate", read.folder, "-o", "calibration.yaml"
+    return "see what is missing", "omnibench", "check", read.folder
 
 
 _NAMES = 12  # columns of the list's names, with the spaces around them
@@ -321,10 +332,10 @@ def check(
 _NEEDED = {True: "a calibration is needed", False: "a calibration is hardly needed", None: ""}
 
 
-def _print_check(console: "Console", checked: "CheckReport", then: str) -> None:
+def _print_check(console: "Console", checked: "CheckReport", next_step: str) -> None:
     """Print the report; what can be typed is not wrapped, so that it can be copied.
 
-    then: the command line for a recording that is ready.
+    next_step: the command line for a recording that is ready.
     """
     console.print(f"{checked.verdict.upper()}: {checked.sentence}.", soft_wrap=True)
     for finding in checked.findings:
@@ -344,7 +355,7 @@ def _print_check(console: "Console", checked: "CheckReport", then: str) -> None:
     elif checked.verdict == "record more":
         print_ending("nothing of this can be typed", "record what is missing, and check again")
     else:
-        words = shlex.split(then)
+        words = shlex.split(next_step)
         print_ending("nothing stands in the way", f"{words[1]} it", *words)
 
 

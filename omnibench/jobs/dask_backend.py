@@ -56,6 +56,8 @@ from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.registry import loaded_plugin_files, plugin_text
 from omnibench.words import plural
 
+T = TypeVar("T")
+
 _CLIENT_CLOSED, _CLUSTER_CLOSED = 1.0, 5.0  # s in which they must have closed; chosen
 _ANSWER = 10.0  # s in which a scheduler must answer; chosen
 # s in which a worker must have joined, or be there again, and a scheduler at work must answer: workers of a batch
@@ -255,8 +257,6 @@ def checked_requirements(client: Any, preload: Sequence[str]) -> bytes:
             raise UnfitWorkerError(f"worker {worker} cannot run omnibench's jobs ({reason}); install the same there")
     return requirements
 
-
-T = TypeVar("T")
 
 _AHEAD = 2  # jobs a slot that are with the cluster: one at work, one that waits for it (chosen)
 _FULL = (ENOSPC, EDQUOT)

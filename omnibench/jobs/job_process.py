@@ -33,6 +33,8 @@ from omnibench.processes import (
 from omnibench.progress import Progress, Reporter
 from omnibench.registry import import_copies
 
+T = TypeVar("T")
+
 _MEGABYTE = 1_000_000  # bytes
 # s after its start in which a process takes further jobs: to start one costs 20 ms (tests/studies/job_overhead.py),
 # 2 % of that; what jobs leave behind in it (memory, caches) is that of a second. What unpacking jobs takes and changes
@@ -370,8 +372,6 @@ def raised(job: Job[Any], error: BaseException) -> Failure:
 def _in_words(error: BaseException) -> str:
     return one_line(f"{type(error).__name__}: {error}")
 
-
-T = TypeVar("T")
 
 _LONGEST = 3600.0  # s of one wait: the system takes no infinite time
 

@@ -398,8 +398,7 @@ class LiveNode(Closing):
     """Runs from its construction until ``close``; does all that its config says, ``record`` and ``foxglove`` included.
 
     remember: use the config's ``state``, if it has one; a replay starts afresh. stop: ends the waiting for a router.
-    ConfigError or DataError: it cannot
-    start; what was started before the error is closed again.
+    ConfigError or DataError: it cannot start; what was started before the error is closed again.
     """
 
     def __init__(self, config: LiveConfig, *, remember: bool = True, stop: Stop | None = None) -> None:
@@ -419,18 +418,7 @@ class LiveNode(Closing):
             }
             self.session = open_session(config.zenoh, f"node {config.name}", stop)
             started.callback(close_session, self.session)
-            # Refuse a robot that another node runs, and warn of tf frames that another node may publish too.
-            claim = Claim(self.session, self.trackers.keys(), _PRESENCE_TIMEOUT)
-            started.callback(claim.close)
-            # All robots share the topic tf: two on frames of the same names overwrite each other's transforms.
-            robots = config.on_common_frames()
-            if robots and claim.others:
-                name = robots[0]
-                LOG.warning(
-                    "robot %s publishes tf between map, odom and base_link, and so may %s on the same network; "
-                    "`frames: prefixed` makes them %s/odom and %s/base_link",
-                    *(name, ", ".join(claim.others), name, name),
-                )
+            self._claim_robots(started)
             intake = Intake()
             started.callback(intake.close)
             listeners = started.enter_context(ExitStack())  # closed after the services, to have their last messages
@@ -441,19 +429,8 @@ class LiveNode(Closing):
                 started.callback(service.close)
             self._services = services
             # after the services: a replay begins with the first subscriber, and the samples are for these
-            if config.foxglove is not False:
-                server = listeners.enter_context(
-                    FoxgloveServer(port=PORT if config.foxglove is True else config.foxglove)
-                )
-                server.forward(self.session, self.keys, list(self.trackers))
-                listeners.callback(lambda: _tell_missed("Foxglove", server.missed))
-                LOG.warning("Foxglove: open %s", server.address)
-            if config.record is not None:  # in a new file where the config's is there already
-                path = free_path(config.record)
-                recorder = Recorder(self.session, self.keys, list(self.trackers), path, on_failure=LOG.error)
-                listeners.enter_context(recorder)
-                listeners.callback(lambda: _tell_missed(f"the recording {path}", recorder.missed.total()))
-                LOG.warning("recording to %s", path)
+            self._serve_foxglove(listeners)
+            self._record(listeners)
             queries = QueryServer(self.session, self.trackers, partial(robot_info, config, self.keys), memories)
             started.callback(queries.close)
             started.callback(DiagnosticsTimer(services).close)
@@ -467,6 +444,40 @@ class LiveNode(Closing):
     def health(self, robot: str) -> Health:
         """A robot's health now."""
         return self.trackers[robot].health(time.monotonic())
+
+    def _claim_robots(self, started: ExitStack) -> None:
+        """Refuse a robot that another node runs, and warn of tf frames that another node may publish too."""
+        claim = Claim(self.session, self.trackers.keys(), _PRESENCE_TIMEOUT)
+        started.callback(claim.close)
+        # All robots share the topic tf: two on frames of the same names overwrite each other's transforms.
+        robots = self.config.on_common_frames()
+        if robots and claim.others:
+            name = robots[0]
+            LOG.warning(
+                "robot %s publishes tf between map, odom and base_link, and so may %s on the same network; "
+                "`frames: prefixed` makes them %s/odom and %s/base_link",
+                *(name, ", ".join(claim.others), name, name),
+            )
+
+    def _serve_foxglove(self, listeners: ExitStack) -> None:
+        """Serve the robots' topics to Foxglove, if the config asks for it."""
+        if self.config.foxglove is False:
+            return
+        port = PORT if self.config.foxglove is True else self.config.foxglove
+        server = listeners.enter_context(FoxgloveServer(port=port))
+        server.forward(self.session, self.keys, list(self.trackers))
+        listeners.callback(lambda: _tell_missed("Foxglove", server.missed))
+        LOG.warning("Foxglove: open %s", server.address)
+
+    def _record(self, listeners: ExitStack) -> None:
+        """Record the robots' topics, if the config asks for it; in a new file where the config's is there already."""
+        if self.config.record is None:
+            return
+        path = free_path(self.config.record)
+        recorder = Recorder(self.session, self.keys, list(self.trackers), path, on_failure=LOG.error)
+        listeners.enter_context(recorder)
+        listeners.callback(lambda: _tell_missed(f"the recording {path}", recorder.missed.total()))
+        LOG.warning("recording to %s", path)
 
 
 def load_effects(config: LiveConfig) -> None:

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
-from plotly.subplots import make_subplots
 
 from omnibench.report.blocks import Figure, FigureGrid, LegendItem
 from omnibench.report.numbers import fixed, plain
@@ -244,6 +243,8 @@ def drawn(grid: FigureGrid) -> go.Figure:
         alone = go.Figure(figure.plot)
         alone.update_layout(title_text=text(figure.title), title_x=0.02)
         return _with_legend(alone, grid, figure.height)
+    from plotly.subplots import make_subplots  # only a notebook needs it
+
     titles = [text(figure.title) for figure in grid.figures]
     columns = min(grid.columns, len(grid.figures))
     rows = -(-len(grid.figures) // columns)

@@ -346,25 +346,34 @@ class DrivableCommands:
 
     def __iter__(self) -> Iterator[TimedCommand]:
         """Lines, arcs to both sides and turns on the spot, each as fast as the limits and the pace allow."""
+        rolls = straight_and_pivot(self.robot)
+        pivot = (0.0, 0.0) if rolls is None else rolls[1]
         for pace in self.shapes.paces:
-            rolls = straight_and_pivot(self.robot)
-            pivot = (0.0, 0.0) if rolls is None else rolls[1]
             for direction in map(math.radians, default_directions(self.robot)):
-                if line := self._drivable(direction, 0.0, pivot, pace):
-                    longest = min(max(self.free), LONGEST * line.speed)
-                    for share in self.shapes.lines:
-                        yield TimedCommand(line, tidy(share * longest) / line.speed)
-                for radius in self._radii(direction, pivot):
-                    for side in (1.0, -1.0):
-                        if arc := self._drivable(direction, side / radius, pivot, pace):
-                            turns = self.shapes.turns
-                            yield from self._of_length(arc, [math.radians(turn) * radius / arc.speed for turn in turns])
+                yield from self._lines(direction, pivot, pace)
+                yield from self._arcs(direction, pivot, pace)
+            yield from self._spins(pivot, pace)
+
+    def _lines(self, direction: float, pivot: tuple[float, float], pace: float) -> Iterator[TimedCommand]:
+        if line := self._drivable(direction, 0.0, pivot, pace):
+            longest = min(max(self.free), LONGEST * line.speed)
+            for share in self.shapes.lines:
+                yield TimedCommand(line, tidy(share * longest) / line.speed)
+
+    def _arcs(self, direction: float, pivot: tuple[float, float], pace: float) -> Iterator[TimedCommand]:
+        for radius in self._radii(direction, pivot):
             for side in (1.0, -1.0):
-                turn_rate = side * pace * self._slower(Command(0.0, 0.0, side, pivot))
-                spin = Command(0.0, 0.0, turn_rate, pivot)
-                if is_within(self.robot, spin, self.steering_limit):
-                    spins = self.shapes.spins
-                    yield from self._of_length(spin, [math.radians(turn) / abs(spin.turn_rate) for turn in spins])
+                if arc := self._drivable(direction, side / radius, pivot, pace):
+                    durations = [math.radians(turn) * radius / arc.speed for turn in self.shapes.turns]
+                    yield from self._of_length(arc, durations)
+
+    def _spins(self, pivot: tuple[float, float], pace: float) -> Iterator[TimedCommand]:
+        """Turns on the spot."""
+        for side in (1.0, -1.0):
+            turn_rate = side * pace * self._slower(Command(0.0, 0.0, side, pivot))
+            spin = Command(0.0, 0.0, turn_rate, pivot)
+            if is_within(self.robot, spin, self.steering_limit):
+                yield from self._of_length(spin, [math.radians(turn) / abs(turn_rate) for turn in self.shapes.spins])
 
     def _radii(self, direction: float, pivot: tuple[float, float]) -> list[float]:
         """Radii of arcs, m: shares of the area, and a little more than the smallest that a robot steers."""

@@ -191,7 +191,7 @@ class Pid(NamedTuple):
 
 
 def motor_steps(motor: Motor) -> MotorSteps:
-    """Transition of a motor's state."""
+    """Transition of a motor's state. SI units, at the wheel."""
     resistance, inductance, inertia = motor.resistance, motor.inductance, motor.inertia
     torque = motor.wheel_torque_constant
     system = np.zeros((5, 5))  # state: current, rate, angle, voltage, friction; the last two are constant

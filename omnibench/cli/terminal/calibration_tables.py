@@ -186,18 +186,22 @@ def print_evaluation(console: Console, evaluation: Evaluation) -> None:
     kind = " (simulated data)" if evaluation.simulated else ""
     note = f"fitted with the loss {evaluation.loss}; cost and errors are without it" if evaluation.loss else ""
     print_table(console, Table(f"{evaluation.dataset}{kind}", columns, tuple(rows), note))
-    # Errors at references other than poses, by kind, of the calibration and of the design values.
-    at_references = []
+    _print_reference_errors(console, evaluation)
+
+
+def _print_reference_errors(console: Console, evaluation: Evaluation) -> None:
+    """Print the errors at references other than poses, by kind, of the calibration and of the design values."""
+    rows = []
     for split, errors in evaluation.splits.items():
         if not errors.references:
             continue
-        at_references.append(Row.of(split, role="group"))
+        rows.append(Row.of(split, role="group"))
         for fitted, before in zip(errors.references, evaluation.design[split].references, strict=True):
             sizes = (
                 _size(each, of_model.unit) for of_model in (fitted, before) for each in (of_model.mean, of_model.max)
             )
             ratios = (f"{fitted.in_sigmas:.1f}", f"{before.in_sigmas:.1f}")
-            at_references.append(Row.of(fitted.kind, str(fitted.references), *sizes, *ratios))
+            rows.append(Row.of(fitted.kind, str(fitted.references), *sizes, *ratios))
     headings = (
         Column("reference", numeric=False),
         Column("number"),
@@ -208,11 +212,11 @@ def print_evaluation(console: Console, evaluation: Evaluation) -> None:
         Column("in sigmas"),
         Column("design: in sigmas", priority=1),
     )
-    if at_references:
+    if rows:
         note = (
             "in sigmas: root mean square of errors in the references' own standard deviations, 1 if the model is right"
         )
-        print_table(console, Table("errors by kind of reference", headings, tuple(at_references), note))
+        print_table(console, Table("errors by kind of reference", headings, tuple(rows), note))
 
 
 def _size(value: float, unit: str) -> str:
@@ -242,12 +246,12 @@ def how_to_use(calibration: Calibration, file: Path) -> tuple[str, ...]:
     if left_out(calibration):
         return "name it in the config of a live node, which alone has its effects", "omnibench", "guide", "live"
     # The format to try first: parameters of a ROS 2 controller where one suits the robot.
-    form = "ros2_controllers"
+    export_format = "ros2_controllers"
     try:
-        export_calibration(calibration, form)
+        export_calibration(calibration, export_format)
     except ConfigError:
-        form = "c_header"
-    return "use it on the robot", "omnibench", "export", str(file), "--to", form
+        export_format = "c_header"
+    return "use it on the robot", "omnibench", "export", str(file), "--to", export_format
 
 
 def print_certificate_ending(certified: CertifiedCalibration, file: Path, datasets: Sequence[Path]) -> None:

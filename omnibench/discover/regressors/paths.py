@@ -70,10 +70,10 @@ class Paths:
             samples = slice(int(edges[first]), int(edges[last]))
             stamps = slice(self.parts[first].start, self.parts[last - 1].stop)
             # The samples of each session that are in the part, counted from its first
-            first_of, end = samples.start, samples.stop
+            start, stop = samples.start, samples.stop
             within = [
-                (name, slice(max(own.start, first_of) - first_of, max(min(own.stop, end), first_of) - first_of))
-                for name, own in self.sessions
+                (name, slice(max(session.start, start) - start, max(min(session.stop, stop), start) - start))
+                for name, session in self.sessions
             ]
             yield replace(
                 self,
@@ -84,7 +84,7 @@ class Paths:
                 middle=self.middle[samples],
                 poses=self.poses[stamps],
                 run=self.run[stamps] - first,
-                parts=tuple(slice(own.start - stamps.start, own.stop - stamps.start) for own in self.parts[first:last]),
+                parts=tuple(slice(run.start - stamps.start, run.stop - stamps.start) for run in self.parts[first:last]),
                 ends=self.ends[first:last],
                 first=self.first + first,
                 _turns=self._turns[samples],
@@ -236,8 +236,8 @@ def make_paths(
     samples = RunSamples.of([log.times for log in logs])
     sessions, starts = _sessions(logs, samples.edges), np.array([log.start for log in logs])
     if needs is None:
-        every = [effects.create(entry.name) for entry in effects.entries()]
-        needs = frozenset().union(*(effect.needs for effect in every if effect.applies(robot)))
+        known_effects = [effects.create(entry.name) for entry in effects.entries()]
+        needs = frozenset().union(*(effect.needs for effect in known_effects if effect.applies(robot)))
     needs = frozenset(needs) - {"poses"}  # poses are computed in any case
     of_sessions = [
         signals_of_runs(

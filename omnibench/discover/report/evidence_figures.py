@@ -422,7 +422,7 @@ def _headings_by_direction(commands: Sequence[CommandResidual], styles: Sequence
         return (grid,)
     parts = []
     for each in sorted(still, key=lambda each: motion_of(each.run)):
-        turns = " → ".join(f"{fixed(math.degrees(each.means[s.index][2]), 2, signed=True)}°" for s in styles)
+        turns = " → ".join(f"{fixed(math.degrees(each.means[style.index][2]), 2, signed=True)}°" for style in styles)
         noise = fixed(math.degrees(NORMAL_95 * each.error[2]), 2)
         parts.append(f"{command_in_words(each)}: {turns} (noise ±{noise}°)")
     return grid, Paragraph(f"Turns on the spot, mean heading residual: {'; '.join(parts)}.", "note")

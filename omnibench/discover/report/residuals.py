@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 import plotly.graph_objects as go
@@ -20,8 +21,9 @@ from omnibench.data.dataset import Trajectory
 from omnibench.discover.regressors.paths import Paths, make_paths
 from omnibench.discover.result import Discovery
 from omnibench.fit.noise import Whitener, grouped
-from omnibench.report.blocks import LegendItem
+from omnibench.report.blocks import Figure, FigureGrid, LegendItem
 from omnibench.report.figures import area, joined, marks
+from omnibench.report.numbers import listing
 from omnibench.report.style import QUIET, plot, text
 from omnibench.robot.kinematics import Array, relative, rotation
 
@@ -194,6 +196,13 @@ BEFORE, AFTER, FLOOR = "#d97706", "#0072b2", "#8a8f98"
 BAND = "rgba(102,114,127,0.20)"
 _NOISE = "#c3c9d0"
 _VAGUE = 3.0  # usual half-widths of the band: a value within a wider one says nothing; only the drawing hangs on it
+_HEIGHT = 270  # px
+_BY_CHANCE = 0.05  # share of the values that leave bands of 95 % by chance
+# Why a test may find what no value of a figure shows.
+_WITHIN = (
+    "The test in the table above, of all values together and against noise alone, may still find a dependence: the "
+    "band also holds what depends on other covariates, so that what is missing need not depend on this one."
+)
 # A line across the plot at y = 0, as part of the layout: adding it to a figure is much slower.
 ZERO = {"type": "line", "xref": "x domain", "x0": 0, "x1": 1, "y0": 0, "y1": 0, "line": {"color": QUIET, "width": 1}}
 
@@ -255,6 +264,67 @@ def drawn(panels: Sequence[Panel]) -> list[go.Figure]:
     limits = [_reach(panel) for panel in panels]
     reach = 1.1 * max(limits, default=1.0) or 1.0
     return [_plot(panel, reach) for panel in panels]
+
+
+def fitted_panels(
+    residuals: Residuals, styles: Sequence[ModelStyle], parts: Sequence[tuple[Array, float, Panel]]
+) -> list[Panel]:
+    """Panels with the curves of one fit.
+
+    parts: for each panel its columns (S, 3, B), as for ``Residuals.fit``, the factor from SI to its unit, and the panel
+    without curves.
+    """
+    if not parts:
+        return []
+    fitted = residuals.fit(np.concatenate([columns for columns, _, _ in parts], axis=2))
+    panels, first = [], 0
+    for columns, factor, panel in parts:
+        part = slice(first, first + columns.shape[2])
+        panels.append(replace(panel, curves=fitted_curves(fitted, styles, factor, part)))
+        first = part.stop
+    return panels
+
+
+def fitted_curves(
+    fitted: Fitted, styles: Sequence[ModelStyle], factor: float, part: slice = slice(None)
+) -> tuple[Curve, ...]:
+    """Curves of a part of the fitted values, with their 95 % bands. factor: from SI to the unit that is drawn."""
+    return tuple(
+        Curve(style, factor * fitted.values[part, style.index], NORMAL_95 * factor * fitted.errors[part, style.index])
+        for style in styles
+    )
+
+
+def grid(panels: Sequence[Panel], styles: Sequence[ModelStyle], caption: str = "") -> FigureGrid | None:
+    """Panels on which the data say something, side by side, those of the same unit on one scale; None without any."""
+    panels = [panel for panel in panels if not panel.empty]
+    figures: list[Figure | None] = [None] * len(panels)
+    for unit in dict.fromkeys(panel.unit for panel in panels):
+        members = [index for index, panel in enumerate(panels) if panel.unit == unit]
+        for index, figure in zip(members, drawn([panels[index] for index in members]), strict=True):
+            panel = panels[index]
+            words = f"{panel.title}: {panel.y_title} against {panel.x_title}"
+            figures[index] = Figure(panel.title, figure, words, _HEIGHT)
+    caption = f"{caption} {_within_bands(panels)}".strip()
+    found = tuple(figure for figure in figures if figure is not None)
+    columns: Literal[2, 3] = 2 if len(found) % 3 and len(found) % 2 == 0 else 3
+    return FigureGrid(found, legend(styles, all(panel.shared for panel in panels)), columns, caption) if found else None
+
+
+def _within_bands(panels: Sequence[Panel]) -> str:
+    """Words on each model of which no more values leave their bands than by chance; empty if there is none."""
+    counts: dict[str, tuple[int, int]] = {}
+    for curve in (curve for panel in panels for curve in panel.curves):
+        outside, known = counts.get(curve.style.label, (0, 0))
+        seen = np.isfinite(curve.values) & np.isfinite(curve.half_width)
+        left = int((np.abs(curve.values) > curve.half_width)[seen].sum())
+        counts[curve.style.label] = (outside + left, known + int(seen.sum()))
+    within = [
+        f"of the {label} {outside} of {known} values leave their band"
+        for label, (outside, known) in counts.items()
+        if known and outside <= _BY_CHANCE * known
+    ]
+    return f"No more than by chance, {listing(within)}. {_WITHIN}" if within else ""
 
 
 def _reach(panel: Panel) -> float:

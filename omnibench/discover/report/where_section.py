@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal
 
 import numpy as np
 import plotly.graph_objects as go
@@ -28,12 +27,12 @@ from omnibench.discover.report.residuals import (
     NORMAL_95,
     PLAIN,
     Curve,
-    Fitted,
     ModelStyle,
     Panel,
     Residuals,
-    drawn,
-    legend,
+    fitted_curves,
+    fitted_panels,
+    grid,
     shares,
 )
 from omnibench.discover.report.tables import dependence_table
@@ -48,17 +47,10 @@ from omnibench.robot.kinematics import Array, interpolated, rotated
 from omnibench.words import plural
 
 _BINS = 12  # bins along an axis; only the drawing hangs on it
-_HEIGHT = 270  # px
-_BY_CHANCE = 0.05  # share of the values that leave bands of 95 % by chance
 _LEAST = 0.002  # share of the samples; a bin with fewer, 2 % of its even part, is left out of the drawing
 _STILL = 1e-3  # rad/s, m/s; slower counts as standing
 # Harmonics per turn, as in the bases of covariate dependence: by halves, then whole ones up to 16.
 _HARMONICS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, *map(float, range(4, 17)))
-# Why a test may find what no value of a figure shows.
-_WITHIN = (
-    "The test in the table above, of all values together and against noise alone, may still find a dependence: the "
-    "band also holds what depends on other covariates, so that what is missing need not depend on this one."
-)
 # A figure over a covariate; None where the recordings do not show it.
 CovariateFigure = Callable[[Residuals, Sequence[ModelStyle]], FigureGrid | None]
 # Modes of the error of the motion: name, factor from SI, unit.
@@ -98,67 +90,6 @@ def motion_panels(
         panel = Panel(title, x, (), x_title, y_title, unit, words=words, ticks=ticks)
         parts.append((paths.of_twist(paths.tracked(direction), bins), factor, panel))
     return fitted_panels(residuals, styles, parts)
-
-
-def fitted_panels(
-    residuals: Residuals, styles: Sequence[ModelStyle], parts: Sequence[tuple[Array, float, Panel]]
-) -> list[Panel]:
-    """Panels with the curves of one fit.
-
-    parts: for each panel its columns (S, 3, B), as for ``Residuals.fit``, the factor from SI to its unit, and the panel
-    without curves.
-    """
-    if not parts:
-        return []
-    fitted = residuals.fit(np.concatenate([columns for columns, _, _ in parts], axis=2))
-    panels, first = [], 0
-    for columns, factor, panel in parts:
-        part = slice(first, first + columns.shape[2])
-        panels.append(replace(panel, curves=fitted_curves(fitted, styles, factor, part)))
-        first = part.stop
-    return panels
-
-
-def fitted_curves(
-    fitted: Fitted, styles: Sequence[ModelStyle], factor: float, part: slice = slice(None)
-) -> tuple[Curve, ...]:
-    """Curves of a part of the fitted values, with their 95 % bands. factor: from SI to the unit that is drawn."""
-    return tuple(
-        Curve(style, factor * fitted.values[part, style.index], NORMAL_95 * factor * fitted.errors[part, style.index])
-        for style in styles
-    )
-
-
-def grid(panels: Sequence[Panel], styles: Sequence[ModelStyle], caption: str = "") -> FigureGrid | None:
-    """Panels on which the data say something, side by side, those of the same unit on one scale; None without any."""
-    panels = [panel for panel in panels if not panel.empty]
-    figures: list[Figure | None] = [None] * len(panels)
-    for unit in dict.fromkeys(panel.unit for panel in panels):
-        own = [index for index, panel in enumerate(panels) if panel.unit == unit]
-        for index, figure in zip(own, drawn([panels[index] for index in own]), strict=True):
-            panel = panels[index]
-            words = f"{panel.title}: {panel.y_title} against {panel.x_title}"
-            figures[index] = Figure(panel.title, figure, words, _HEIGHT)
-    caption = f"{caption} {_within_bands(panels)}".strip()
-    found = tuple(figure for figure in figures if figure is not None)
-    columns: Literal[2, 3] = 2 if len(found) % 3 and len(found) % 2 == 0 else 3
-    return FigureGrid(found, legend(styles, all(panel.shared for panel in panels)), columns, caption) if found else None
-
-
-def _within_bands(panels: Sequence[Panel]) -> str:
-    """Words on each model of which no more values leave their bands than by chance; empty if there is none."""
-    counts: dict[str, tuple[int, int]] = {}
-    for curve in (curve for panel in panels for curve in panel.curves):
-        outside, known = counts.get(curve.style.label, (0, 0))
-        seen = np.isfinite(curve.values) & np.isfinite(curve.half_width)
-        left = int((np.abs(curve.values) > curve.half_width)[seen].sum())
-        counts[curve.style.label] = (outside + left, known + int(seen.sum()))
-    within = [
-        f"of the {label} {outside} of {known} values leave their band"
-        for label, (outside, known) in counts.items()
-        if known and outside <= _BY_CHANCE * known
-    ]
-    return f"No more than by chance, {listing(within)}. {_WITHIN}" if within else ""
 
 
 def heading_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGrid | None:
@@ -772,23 +703,23 @@ def where_section(discovery: Discovery) -> Section:
     styles = (ALONE,) if all(np.array_equal(*pair) for pair in pairs) else (PLAIN, EXTENDED)
     motors = motor_grid(discovery, residuals.runs)
     order = list(_NOT_DRAWN)  # new covariates come last
-    drawn: dict[str, tuple[Block, ...]] = {
-        covariate: tuple(grid for figure in _FIGURES[covariate] if (grid := figure(residuals, styles)) is not None)
+    figures: dict[str, tuple[Block, ...]] = {
+        covariate: tuple(shown for figure in _FIGURES[covariate] if (shown := figure(residuals, styles)) is not None)
         for covariate in sorted(_FIGURES, key=lambda name: order.index(name) if name in order else len(order))
     }
-    drawn["motors"] = () if motors is None else (motors,)
+    figures["motors"] = () if motors is None else (motors,)
     covariates = [
         "motors" if dependence.stage == "actuator" else dependence.covariate for dependence in discovery.where
     ]
-    named = [name for name in dict.fromkeys(covariates) if name in drawn]
+    named = [name for name in dict.fromkeys(covariates) if name in figures]
     sections = [Section("where-command", "Residuals by command", command_blocks(residuals, styles))]
     for number, name in enumerate(named, 1):
-        if drawn[name]:
-            sections.append(Section(f"where-{number}", _title(name), drawn[name]))
+        if figures[name]:
+            sections.append(Section(f"where-{number}", _title(name), figures[name]))
     others: list[Block] = [
-        Details(_title(name), blocks) for name, blocks in drawn.items() if name not in named and blocks
+        Details(_title(name), blocks) for name, blocks in figures.items() if name not in named and blocks
     ]
-    not_drawn = [f"{name} ({_NOT_DRAWN.get(name, 'not recorded')})" for name, blocks in drawn.items() if not blocks]
+    not_drawn = [f"{name} ({_NOT_DRAWN.get(name, 'not recorded')})" for name, blocks in figures.items() if not blocks]
     if not_drawn:
         others.append(Paragraph(f"Not drawn: {'; '.join(not_drawn)}.", "note"))
     if others:

@@ -5,7 +5,8 @@ Extrapolation monitor: how long a robot has driven outside the training domain o
 
 Saved state, which outlives the node: pose, wheel angles, and a calibration that was swapped in. The pose goes to the
 two slots of one file in turn, so that a node that is killed while it writes leaves the other slot. A state is one line
-that fills a block, or of many wheels some: its CRC-32, by which a slot that was written in part is known, and JSON.
+of JSON after its CRC-32, by which a slot that was written in part is known. The line is padded to whole blocks of the
+disk: one block for most robots, several for a robot with many wheels.
 """
 
 from __future__ import annotations

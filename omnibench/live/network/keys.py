@@ -102,13 +102,7 @@ def make_keys(
         contents[folder / f"{name}.pem"] = certificate.public_bytes(Encoding.PEM)
         contents[folder / f"{name}.key"] = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
     if users:
-        # A password for each name, and the router's file with all, beside those that it holds already.
-        path = folder / "users.txt"
-        passwords = {name: secrets.token_urlsafe(18) for name in names}
-        lines = read_text(path).splitlines() if not overwrite and path.exists() else []
-        lines += [f"{name}:{password}" for name, password in passwords.items()]
-        contents |= {folder / f"{name}.password": f"{password}\n".encode() for name, password in passwords.items()}
-        contents[path] = "".join(f"{line}\n" for line in lines).encode()
+        contents |= _passwords(folder, names, keep=not overwrite)
     existing = [path for path in contents if path.exists() and path.name != "users.txt"]
     if existing and not overwrite:
         raise ConfigError(f"{existing[0]}: is there already; choose other names, or --force to replace all in {folder}")
@@ -120,6 +114,16 @@ def make_keys(
             with os.fdopen(descriptor, "wb") as file:
                 file.write(content)
     return list(contents)
+
+
+def _passwords(folder: Path, names: Sequence[str], *, keep: bool) -> dict[Path, bytes]:
+    """Files with a password for each name, and the router's file with all; ``keep`` the passwords it holds already."""
+    path = folder / "users.txt"
+    passwords = {name: secrets.token_urlsafe(18) for name in names}
+    lines = read_text(path).splitlines() if keep and path.exists() else []
+    lines += [f"{name}:{password}" for name, password in passwords.items()]
+    files = {folder / f"{name}.password": f"{password}\n".encode() for name, password in passwords.items()}
+    return files | {path: "".join(f"{line}\n" for line in lines).encode()}
 
 
 def _member(name: str, served: Sequence[x509.GeneralName], until: datetime, authority: _Pair) -> _Pair:

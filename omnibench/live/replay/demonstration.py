@@ -182,41 +182,52 @@ def demonstrate(
         finally:
             if not guarded:
                 close_session(session)
-        # The node's output against the batch odometry, and all odometry against the truth or the reference.
-        calibration = tracker.calibration
-        drive = replace(drive, robot=calibration.robot)  # whose drive signals the node took
-        times = drive.wheel_times
-        batch = calibration.model.poses([drive.log(session=calibration.session)])[0]
-        design = OdometryModel.of_design(calibration.robot, calibration.integration).poses([drive.log()])[0]
-        origin = odometry.stamps[0] if odometry.stamps else 0
-        rows = _rows(odometry.stamps, origin, times)
-        # odom begins at the origin, the drive at its start pose; the drive's poses are of the tracked point
-        published = _tracked(calibration, odometry.poses)
-        if odometry.stamps:
-            published = moved_to(drive.start_poses[0], published)
-        if recording.truth is not None:
-            against, reference = "the simulated truth", concatenated_truth(drive, recording)
-            chosen = rows
-        else:
-            against, reference = (
-                "the reference poses of the recording",
-                interpolated(times, drive.slam_times, drive.slam_poses),
-            )
-            chosen = rows[(times[rows] >= drive.slam_times[0]) & (times[rows] <= drive.slam_times[-1])]
-        return Demonstration(
-            robot=health.robot,
-            calibration=calibration.name,
-            simulated=recording.dataset.simulated,
-            report=report,
-            against=against,
-            theoretical=_deviation(design[chosen], reference[chosen]),
-            calibrated=_deviation(batch[chosen], reference[chosen]),
-            fused=None
-            if fused is None
-            else _fused_deviation(fused.stamps, _tracked(calibration, fused.poses), origin, drive, reference, chosen),
-            batch_difference=float(np.abs(published - batch[rows]).max()) if len(rows) else math.nan,
-            health=health,
+        return _evaluate(drive, recording, tracker.calibration, report, odometry, fused, health)
+
+
+def _evaluate(
+    drive: ConcatenatedDrive,
+    recording: Recording,
+    calibration: Calibration,
+    report: PlayReport,
+    odometry: _Collector,
+    fused: _Collector | None,
+    health: Health,
+) -> Demonstration:
+    """Compare the node's output with the batch odometry, and all odometry with the truth or the reference."""
+    drive = replace(drive, robot=calibration.robot)  # whose drive signals the node took
+    times = drive.wheel_times
+    batch = calibration.model.poses([drive.log(session=calibration.session)])[0]
+    design = OdometryModel.of_design(calibration.robot, calibration.integration).poses([drive.log()])[0]
+    origin = odometry.stamps[0] if odometry.stamps else 0
+    rows = _rows(odometry.stamps, origin, times)
+    # odom begins at the origin, the drive at its start pose; the drive's poses are of the tracked point
+    published = _tracked(calibration, odometry.poses)
+    if odometry.stamps:
+        published = moved_to(drive.start_poses[0], published)
+    if recording.truth is not None:
+        against, reference = "the simulated truth", concatenated_truth(drive, recording)
+        chosen = rows
+    else:
+        against, reference = (
+            "the reference poses of the recording",
+            interpolated(times, drive.slam_times, drive.slam_poses),
         )
+        chosen = rows[(times[rows] >= drive.slam_times[0]) & (times[rows] <= drive.slam_times[-1])]
+    return Demonstration(
+        robot=health.robot,
+        calibration=calibration.name,
+        simulated=recording.dataset.simulated,
+        report=report,
+        against=against,
+        theoretical=_deviation(design[chosen], reference[chosen]),
+        calibrated=_deviation(batch[chosen], reference[chosen]),
+        fused=None
+        if fused is None
+        else _fused_deviation(fused.stamps, _tracked(calibration, fused.poses), origin, drive, reference, chosen),
+        batch_difference=float(np.abs(published - batch[rows]).max()) if len(rows) else math.nan,
+        health=health,
+    )
 
 
 def _rows(stamps: list[int], origin: int, times: Array) -> Array:
