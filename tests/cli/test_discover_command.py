@@ -16,6 +16,7 @@ import pytest
 from commands import Command, Printed, assert_refused, run_here, succeeded
 from discovery_samples import EXPERIMENT, incomplete, named, nameless, nothing, simulated
 from nodes import Command as CommandProcess
+from report_page import Page
 from rich.console import Console
 from sessions import until
 
@@ -134,7 +135,9 @@ def test_an_earlier_discovery_is_replaced_with_all_its_files(written: Path, tmp_
     assert (folder / "experiment-2.yaml").read_text(encoding="utf-8") == EXPERIMENT.config
     write_discovery(replace(nothing(), experiments=(EXPERIMENT,)), OPTIONS, folder)
     assert {path.name for path in folder.iterdir()} == {*FILES, "experiment-1.yaml"} - {"model.yaml"}
-    assert json.loads((folder / "discovery.json").read_text(encoding="utf-8"))["verdict"] == "none"
+    document = json.loads((folder / "discovery.json").read_text(encoding="utf-8"))
+    assert (document["verdict"], document["model"]) == ("none", None)
+    assert "model.yaml" not in Page((folder / "report.html").read_text(encoding="utf-8")).text
 
 
 def test_a_disk_that_refuses_one_file_leaves_all_as_they_were(written: Path, tmp_path: Path) -> None:

@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 from config_robots import NAMES as NAMES_OF_ROBOTS
 from config_robots import settings as settings_of
-from discovery_samples import DELAY, ECCENTRICITY, lagging, nothing, simulated
+from discovery_samples import DELAY, ECCENTRICITY, lagging, nothing, plain_fit, simulated
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from recording_samples import in_room
 from scipy.stats import binomtest, chi2
 from screening_samples import FIRST, SECOND, THIRD, screening
 
 from omnibench.config import validate
 from omnibench.discover.discover import discover_effects
-from omnibench.discover.fitting import Fit, fit_matrix, paths_of
+from omnibench.discover.fitting import Fit, paths_of
 from omnibench.discover.regressors.paths import slopes_by
 from omnibench.discover.regressors.significance import Family, Group, Significance, significance_of, together
 from omnibench.discover.report.residuals import EXTENDED, NORMAL_95, PLAIN, Residuals, shares
@@ -90,33 +91,15 @@ def test_residuals_are_as_seen_from_the_start_wherever_that_is() -> None:
     found = nothing()
     rng = np.random.default_rng(4)
     moves = {name: rng.uniform(-3, 3, 3) for name in found.trajectories}
-    dataset = replace(
-        found.dataset,
-        trajectories=tuple(
-            replace(run, poses=moved(run.poses, moves[run.id])) for run in found.dataset.trajectories if run.id in moves
-        ),
-    )
-    before = tuple(
-        moved(own, np.array([0.0, 0.0, moves[name][2]]), turn=False)
-        for name, own in zip(found.trajectories, found.before, strict=True)
-    )
+    runs = [run for run in found.dataset.trajectories if run.id in moves]
+    moved = tuple(replace(run, poses=in_room(moves[run.id], run.poses)) for run in runs)
+    dataset = replace(found.dataset, trajectories=moved)
+    turns = [np.array([0.0, 0.0, moves[name][2]]) for name in found.trajectories]
+    before = tuple(in_room(turn, own) - turn for turn, own in zip(turns, found.before, strict=True))
     here, there = Residuals(found).commands, Residuals(replace(found, dataset=dataset, before=before)).commands
     for one, other in zip(here, there, strict=True):
         np.testing.assert_allclose(other.end, one.end, atol=1e-9)
         np.testing.assert_allclose(other.means[0], one.means[0], atol=1e-9)
-
-
-def moved(poses: np.ndarray, move: np.ndarray, turn: bool = True) -> np.ndarray:
-    """Poses (K, 3) turned about the origin and then shifted; turn: their headings, too."""
-    x, y, angle = move
-    cosine, sine = np.cos(angle), np.sin(angle)
-    return np.column_stack(
-        [
-            x + cosine * poses[:, 0] - sine * poses[:, 1],
-            y + sine * poses[:, 0] + cosine * poses[:, 1],
-            poses[:, 2] + (angle if turn else 0.0),
-        ]
-    )
 
 
 def test_a_change_that_the_data_do_not_tell_has_no_value() -> None:
@@ -206,8 +189,7 @@ def on_robot(robot: str) -> Fit:
             "train": {"seed": 1, "distance": 1.0},
         }
         dataset = simulate_dataset(validate(FlowerConfig, given | changes, robot)).dataset
-    runs = usable_runs(dataset.split("train"))[:8]
-    return fit_matrix(runs, dataset.robot, dataset.sample_period, dataset.robot.inverse_kinematic_matrix)
+    return plain_fit(dataset, usable_runs(dataset.split("train"))[:8])
 
 
 @pytest.fixture(scope="module")

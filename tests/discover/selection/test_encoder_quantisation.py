@@ -8,6 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from extended_samples import FORWARD, MATRIX, extended_of, run_of
+from hypothesis import given
+from hypothesis import strategies as st
 
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.selection.screening import EncoderQuantisation, quantisation_steps
@@ -39,6 +41,13 @@ def test_ticks_are_found_in_wheel_rates_that_are_written_with_six_digits(tick: f
     angles = tick * np.diff(counts, axis=0, prepend=0.0)
     steps = quantisation_steps([turning(np.round(angles / 0.02, 6) * 0.02)])
     assert steps == pytest.approx(tick, rel=1e-3)
+
+
+@given(tick=st.floats(1e-5, 0.05), seed=st.integers(0, 2**32 - 1), most=st.integers(1, 200))
+def test_the_size_of_a_tick_is_found(tick: float, seed: int, most: int) -> None:
+    counts = np.random.default_rng(seed).integers(-most, most + 1, size=(400, 3))
+    counts[:2] = [[most] * 3, [most - 1] * 3]
+    np.testing.assert_allclose(quantisation_steps([turning(tick * counts)]), tick, rtol=1e-9)
 
 
 def bound(commands: Sequence[str], columns: Sequence[np.ndarray], beyond: Sequence[int] = ()) -> float:

@@ -7,18 +7,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from discovery_samples import shorn, simulated
+from discovery_samples import plain_fit, shorn, simulated
 from screening_samples import FIRST, FOURTH, MATRIX, POSITIVE, SECOND, THIRD, screening
 
 from omnibench.discover.covariate_dependence import Dependences, covariate_dependences, weights_of_covariates
-from omnibench.discover.fitting import Extended, Fit, extend, fit_matrix
+from omnibench.discover.fitting import Extended, Fit, extend
 from omnibench.discover.regressors.covariate_bases import Basis
 from omnibench.discover.regressors.significance import Family, Group, Significance, together
 from omnibench.discover.selection.detectability import Detectability, detectability_of
 from omnibench.discover.selection.evidence import Missing
 from omnibench.discover.selection.model_selection import Selection, select_effects
 from omnibench.discover.selection.screening import Screening, screen_again, screen_extended, screen_plain
-from omnibench.fit.trajectory_fit import usable_runs
 
 DRIFT, BIAS, SLIP = "heading_drift", "body_velocity_bias", "rotation_translation_coupling"
 FLOOR, LATENCY = "floor_drift", "heading_latency"
@@ -134,9 +133,7 @@ LEFT_OUT = ("heading_drift",)
 
 @pytest.fixture(scope="module")
 def plain() -> Fit:
-    dataset = shorn(simulated(validation=None), session="first")
-    runs = usable_runs(dataset.split("train"))
-    return fit_matrix(runs, dataset.robot, dataset.sample_period, dataset.robot.inverse_kinematic_matrix)
+    return plain_fit(shorn(simulated(validation=None), session="first"))
 
 
 @pytest.fixture(scope="module")
