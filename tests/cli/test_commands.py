@@ -12,6 +12,7 @@ import numpy as np
 import polars as pl
 import pytest
 import yaml
+from browser import chromium
 from commands import (
     COMMAND,
     CONFIGS,
@@ -29,8 +30,6 @@ from recording_samples import sample
 from timing import PATIENCE
 
 from omnibench.data.storage import load_dataset, save_dataset
-from omnibench.errors import DataError
-from omnibench.report.figure_files import browser
 from omnibench.robot.calibration import EffectTerm, read_calibration, write_calibration
 from omnibench.robot.kinematics import published_matrix
 from omnibench.testing.synthetic import synthetic_robot
@@ -344,10 +343,7 @@ LONG = (
     "typed", [QUICK, *(pytest.param(typed, marks=pytest.mark.slow) for typed in LONG)], ids=lambda typed: typed[0]
 )
 def test_every_figure_is_written_as_svg_and_png(command: Command, prepared: Prepared, typed: tuple[str, ...]) -> None:
-    try:
-        browser()
-    except DataError:
-        pytest.skip("no Chromium on this machine to draw figures with")
+    chromium()
     if "scans" in typed:
         save_dataset(sample(repetitions=1, rays=360).dataset, Path("scans"))
     Path("out").mkdir()

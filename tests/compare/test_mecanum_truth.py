@@ -50,12 +50,3 @@ def test_inspection_names_the_direction_that_was_not_driven(command: Command, me
     assert found["driven_directions"] == 3
     shown = command("inspect", mecanum / "data").stdout
     assert "no run drives the wheels along fl - fr - rl + rr, as for any robot on four wheels" in shown
-
-
-def test_the_truth_is_nowhere_in_the_data(mecanum: Path) -> None:
-    truth = yaml.safe_load((mecanum / "truth" / "truth.yaml").read_text())["matrix"]
-    assert {file.suffix for file in (mecanum / "data").iterdir()} == {".parquet", ".yaml"}
-    header = (mecanum / "data" / "dataset.yaml").read_text()
-    for value in np.ravel(truth):
-        assert f"{value:.6g}"[:8] not in header
-    assert "tolerances" not in header

@@ -17,6 +17,7 @@ from commands import (
     Prepared,
     assert_refused,
     flower,
+    refused,
     registries_restored,
     run_here,
     small,
@@ -54,13 +55,6 @@ def planned(folder: Path, **changes: Any) -> list[PlannedRun]:
     load_calibrators(config.plugins, [entry.name for entry in config.calibrators])
     config = effective_config(config)
     return make_plan(config, load_datasets(config))
-
-
-def complaint(folder: Path, **changes: Any) -> str:
-    with pytest.raises(OmnibenchError) as failure:
-        planned(folder, **changes)
-    assert "\n" not in str(failure.value)
-    return str(failure.value)
 
 
 @pytest.mark.parametrize(
@@ -105,18 +99,15 @@ def complaint(folder: Path, **changes: Any) -> str:
     ids=lambda value: json.dumps(value)[:60] if isinstance(value, dict) else "",
 )
 def test_a_mistake_in_a_config_is_one_line_that_names_it(changes: dict[str, Any], parts: str, tmp_path: Path) -> None:
-    found = complaint(tmp_path, **changes)
-    for part in parts.split():
-        assert part in found
+    with refused(OmnibenchError, *parts.split()):
+        planned(tmp_path, **changes)
 
 
 @pytest.mark.parametrize("text", ["[" * 3000, "name: 2023-99-99\n", "name: 0b_\n", "name: [\n", "", "- a\n"])
 def test_a_file_that_is_no_config_is_one_line(text: str, tmp_path: Path) -> None:
     (tmp_path / "broken.yaml").write_text(text)
-    with pytest.raises(OmnibenchError) as failure:
+    with refused(OmnibenchError, start=f"{tmp_path / 'broken.yaml'}: "):
         read_compare_config(tmp_path / "broken.yaml")
-    assert str(failure.value).startswith(f"{tmp_path / 'broken.yaml'}: ")
-    assert "\n" not in str(failure.value)
 
 
 @pytest.fixture(scope="module")
@@ -175,8 +166,8 @@ def test_an_empty_training_split_is_refused(tmp_path: Path) -> None:
     run_here("simulate", write_config(tmp_path), "-o", tmp_path / "data", "--format", "csv", cwd=tmp_path)
     table = tmp_path / "data" / "trajectories.csv"
     table.write_text(table.read_text().replace(",train,train", ",validation,train"))
-    found = complaint(tmp_path, datasets={"flower": {"path": "data"}})
-    assert found.startswith("data set flower: the training split is empty")
+    with refused(OmnibenchError, start="data set flower: the training split is empty"):
+        planned(tmp_path, datasets={"flower": {"path": "data"}})
 
 
 def test_only_what_is_random_is_run_with_every_seed(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from browser import first_picture
+from browser import assert_picture_comes_first
 from discovery_samples import (
     COUPLING,
     EXPERIMENT,
@@ -149,9 +149,7 @@ def test_recorded_data_wear_no_badge_and_hostile_names_stay_words() -> None:
 @pytest.mark.parametrize("make", [named, nothing, nameless])
 def test_the_paths_stand_in_the_first_900_pixels(make: Callable[[], Discovery], tmp_path: Path) -> None:
     (tmp_path / "report.html").write_text(render(discovery_report(make(), "seed: 0\n")), encoding="utf-8")
-    bottom, width = first_picture(tmp_path / "report.html")
-    assert bottom <= 900
-    assert width <= 1280
+    assert_picture_comes_first(tmp_path / "report.html")
 
 
 def test_a_discovery_is_written_with_names_and_paths_in_the_place_of_data_and_models(
