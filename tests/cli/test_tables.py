@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import COMMAND, ENVIRONMENT, Command, compared_here, search, succeeded, write_config
-from report_page import Page
+from report_page import Page, on_terminal
 from rich.console import Console
 from syrupy.assertion import SnapshotAssertion
 from timing import PATIENCE
@@ -56,9 +56,7 @@ TABLE = Table(
 
 
 def printed(table: Table, width: int) -> str:
-    stream = StringIO()
-    print_table(Console(file=stream, width=width, markup=False, emoji=False, highlight=False), table)
-    return stream.getvalue()
+    return on_terminal(print_table, table, width=width)
 
 
 @pytest.mark.parametrize("width", [48, 60, 80, 160])
@@ -115,10 +113,8 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> ComparisonResult:
     return compared_here(tmp_path_factory.mktemp("tables") / "out", calibrators=[*entries, refused])
 
 
-def compared_text(result: ComparisonResult, width: int = 160) -> str:
-    stream = StringIO()
-    print_result(Console(file=stream, width=width, markup=False, emoji=False, highlight=False), result)
-    return stream.getvalue()
+def compared_text(result: ComparisonResult, width: int) -> str:
+    return on_terminal(print_result, result, width=width)
 
 
 def test_all_entries_are_in_every_table_in_usual_units(result: ComparisonResult, snapshot: SnapshotAssertion) -> None:
@@ -197,10 +193,8 @@ def test_a_terminal_shows_a_bar_for_all_runs_and_one_for_each_that_is_under_way(
 
 def calibration_lines(dataset: Dataset, *arguments: Any, **options: Any) -> list[str]:
     """What is printed of a data set and its calibration."""
-    console = Console(file=StringIO(), width=160)
-    print_calibration(console, calibrate(dataset, *arguments, **options))
-    print_inspection(console, inspect_dataset(dataset))
-    return console.file.getvalue().splitlines()
+    calibrated = on_terminal(print_calibration, calibrate(dataset, *arguments, **options), width=160)
+    return (calibrated + on_terminal(print_inspection, inspect_dataset(dataset), width=160)).splitlines()
 
 
 def test_a_matrix_has_a_column_for_each_drive_signal() -> None:

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import Prepared, compared_here, compared_once, summary, without_seconds
+from report_page import on_terminal
 
 from omnibench.cli.terminal.comparison_tables import print_result
-from omnibench.cli.terminal.console import make_console
 from omnibench.data.storage import load_dataset
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.certify import certify_optimum
@@ -60,23 +60,21 @@ class TestFits:
         assert {(each.lower_bound, each.boxes) for each in others} == {(one.lower_bound, one.boxes)}
 
 
-def test_machines_that_differ_are_compared_by_the_ratio_to_their_reference(capsys: pytest.CaptureFixture[str]) -> None:
+def test_machines_that_differ_are_compared_by_the_ratio_to_their_reference() -> None:
     result = compared_once()
     for run in summary(result.output)["runs"]:
         assert 0 < run["reference_seconds"] < 1
         assert run["machine"]
     first, *rest = result.runs
     other = replace(first, record=first.record.model_copy(update={"machine": "another"}))
-    print_result(make_console(), replace(result, runs=(other, *rest)))
-    printed = " ".join(capsys.readouterr().out.split())
+    printed = " ".join(on_terminal(print_result, replace(result, runs=(other, *rest)), width=200).split())
     assert "of the start)" in printed
     assert "since the machines differ" in printed
 
 
-def test_runs_that_are_not_timed_show_no_seconds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_runs_that_are_not_timed_show_no_seconds(tmp_path: Path) -> None:
     result = compared_here(tmp_path, timing=False, calibrators=["theoretical"])
     assert {run["reference_seconds"] for run in summary(tmp_path)["runs"]} == {None}
-    print_result(make_console(), result)
-    printed = " ".join(capsys.readouterr().out.split())
+    printed = " ".join(on_terminal(print_result, result, width=200).split())
     assert "The runs were not timed." in printed
     assert " ms)" not in printed

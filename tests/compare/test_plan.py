@@ -15,7 +15,6 @@ from commands import (
     ROOT,
     Command,
     Prepared,
-    assert_refused,
     flower,
     refused,
     registries_restored,
@@ -243,35 +242,8 @@ def test_folders_of_a_data_set_are_compared_as_one(
     for day in ("day1", "day2"):
         shutil.copytree(prepared.data, day)
     by_glob = command("compare", "day*", "-o", "by_glob")
-    one_by_one = command("compare", "day1", "day2", "-o", "one_by_one")
+    one_by_one = command("compare", "day1", "day2", "--plugins", "none", "-o", "one_by_one")
     assert (by_glob.returncode, one_by_one.returncode) == (0, 0), by_glob.stderr + one_by_one.stderr
     (named,) = yaml.safe_load(Path("by_glob/config.yaml").read_text())["datasets"].values()
     assert [Path(path).name for path in named["path"]] == ["day1", "day2"]
     assert summary(Path("by_glob"))["runs"][0]["train_cost"] == summary(Path("one_by_one"))["runs"][0]["train_cost"]
-
-
-def test_one_config_is_compared_at_a_time(command: Command, prepared: Prepared) -> None:
-    printed = command("compare", prepared.config, prepared.data)
-    assert_refused(printed, f"unexpected extra argument {prepared.data}; compare takes one config, or the folders of")
-
-
-def test_a_folder_that_is_not_there_is_named_beside_one_that_is(command: Command, prepared: Prepared) -> None:
-    assert_refused(command("compare", prepared.data, "nope"), "nope: no such folder; compare takes one config")
-
-
-def test_no_plugins_may_be_asked_for_as_of_other_commands(
-    command: Command, prepared: Prepared, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("omnibench.compare.recording_config.suitable_calibrators", lambda _: ["theoretical"])
-    printed = command("compare", prepared.data, "--plugins", "none", "-o", "out")
-    assert printed.returncode == 0, printed.stderr
-
-
-def test_data_is_for_a_config(command: Command, prepared: Prepared) -> None:
-    printed = command("compare", prepared.data, "--data", prepared.data)
-    assert_refused(printed, "--data is for a config", "leave it out")
-
-
-def test_a_folder_that_is_no_data_set_is_named(command: Command, tmp_path: Path) -> None:
-    (tmp_path / "empty").mkdir()
-    assert_refused(command("compare", tmp_path / "empty"), "is a folder without dataset.yaml")

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import json
 import re
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import pytest
 from browser import assert_picture_comes_first
-from report_page import NUMBER, Page
+from report_page import NUMBER, Page, on_terminal
 from report_samples import flower
-from rich.console import Console
 from sample_robots import APR02, LEVER_MECANUM
 from syrupy.assertion import SnapshotAssertion
 
@@ -53,10 +51,7 @@ def page(design: Design, folder: Path) -> Page:
 
 
 def printed(design: Design, width: int = 100) -> str:
-    console = Console(file=StringIO(), width=width, markup=False, emoji=False, highlight=False)
-    print_design(console, design)
-    assert isinstance(console.file, StringIO)
-    return console.file.getvalue()
+    return on_terminal(print_design, design, width=width)
 
 
 def plots(told: Page) -> list[dict[str, Any]]:

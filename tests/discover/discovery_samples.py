@@ -28,6 +28,7 @@ Effects = tuple[dict[str, Any], ...]
 COUPLING: Effects = ({"name": "rotation_translation_coupling", "parameters": {"kx": 0.3, "ky": -0.2}},)
 ECCENTRICITY: Effects = ({"name": "wheel_eccentricity", "parameters": {"a_a": 0.02, "b_a": 0.0}},)
 DEAD_ZONE: Effects = ({"name": "wheel_dead_zone", "parameters": {"c": 0.03}},)
+SMALL = {"directions_deg": [0, 120, 240], "turn_rates": [-0.35, 0.35], "ramp": 0.3}  # commands, of which few runs come
 DELAY: Effects = ({"name": "reference_time_offset", "parameters": {"tau": 0.06}},)
 
 

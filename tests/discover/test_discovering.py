@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from discovery_samples import COUPLING, DELAY, lagging, named, nothing, plain_fit, repeated, shorn, simulated
+from discovery_samples import COUPLING, DELAY, SMALL, lagging, named, nothing, plain_fit, repeated, shorn, simulated
 from page_figures import assert_printed, discovery_figures, plan_lines, printed_plan
 from recording_samples import in_room
 
@@ -141,9 +141,6 @@ def test_the_runs_that_are_proposed_tell_the_class_apart_together_with_the_recor
     assert found.effects[0].weight >= 0.95
 
 
-SMALL: dict[str, Any] = {"commands": {"directions_deg": [0, 120, 240], "turn_rates": [-0.35, 0.35], "ramp": 0.3}}
-
-
 def test_steps_come_in_order_confirming_only_with_an_effect_and_what_concludes_fits_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -161,8 +158,8 @@ def test_steps_come_in_order_confirming_only_with_an_effect_and_what_concludes_f
     monkeypatch.setattr(discover, "conclude", conclude_without_fits)
     with_effect: list[Progress] = []
     without_effect: list[Progress] = []
-    assert discover.discover_effects(simulated(**SMALL), watch=with_effect.append).verdict == "named"
-    discover.discover_effects(simulated((), **SMALL), watch=without_effect.append)
+    assert discover.discover_effects(simulated(commands=SMALL), watch=with_effect.append).verdict == "named"
+    discover.discover_effects(simulated((), commands=SMALL), watch=without_effect.append)
     confirming = "looking again, now that the noise is known better"
     stages = [
         "fitting the plain matrix",
@@ -195,7 +192,7 @@ def test_an_effect_that_was_given_up_is_kept_if_fitted_in_full_it_explains_most_
         return given_up[0]
 
     monkeypatch.setattr(discover, "select_effects", giving_up_at_first)
-    assert [effect.name for effect in discover.discover_effects(simulated(**SMALL)).effects] == names
+    assert [effect.name for effect in discover.discover_effects(simulated(commands=SMALL)).effects] == names
 
 
 def with_runs(dataset: Dataset, change) -> Dataset:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from io import StringIO
 from pathlib import Path
 
 import pytest
 from discovery_samples import held_out, shorn
 from hidden.session_sets import session_set
-from report_page import Page
-from rich.console import Console
+from report_page import Page, on_terminal
 from shared_results import made_once
 
 from omnibench.cli.terminal.discovery_summary import print_discovery
@@ -33,9 +31,7 @@ def page(found: Discovery) -> Page:
 
 
 def printed(found: Discovery) -> str:
-    output = StringIO()
-    print_discovery(Console(width=80, file=output), found, Path("found"))
-    return output.getvalue()
+    return on_terminal(print_discovery, found, Path("found"))
 
 
 def test_nothing_is_not_said_to_be_missing_where_the_held_out_session_has_other_wheels() -> None:

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from multiprocessing import forkserver
 from pathlib import Path
@@ -261,23 +261,23 @@ def slowly(seconds: float, _: Reporter) -> Answer:
     return Answer(0, os.getpid())
 
 
+LEFT: dict[str, Callable[[], object]] = {
+    "variable": lambda: os.environ.update(LEFT="behind"),
+    "handler": lambda: signal.signal(signal.SIGUSR1, signal.SIG_IGN),
+    "thread": lambda: threading.Thread(target=time.sleep, args=(60,), daemon=True).start(),
+    "child": lambda: subprocess.Popen(["sleep", "60"]),
+    "folder": lambda: os.chdir("/"),
+    "error": lambda: wrong(0, print),
+    "nothing": lambda: None,
+}
+
+
 def leaves_behind(what: str, _: Reporter) -> Answer:
-    if what == "variable":
-        os.environ["LEFT"] = "behind"
-    elif what == "handler":
-        signal.signal(signal.SIGUSR1, signal.SIG_IGN)
-    elif what == "thread":
-        threading.Thread(target=time.sleep, args=(60,), daemon=True).start()
-    elif what == "child":
-        subprocess.Popen(["sleep", "60"])
-    elif what == "folder":
-        os.chdir("/")
-    elif what == "error":
-        raise DataError("wrong")
+    LEFT[what]()
     return Answer(0, os.getpid())
 
 
-@pytest.mark.parametrize("what", ["variable", "handler", "thread", "child", "folder", "error", "nothing"])
+@pytest.mark.parametrize("what", LEFT)
 def test_what_a_job_leaves_ends_its_process(what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(job_process, "_YOUNG", PATIENCE)
     first = Job("first", leaves_behind, what)

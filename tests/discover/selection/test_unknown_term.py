@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,11 +12,13 @@ from discovery_samples import nothing, plain_fit, simulated
 from hidden.experiment import ROBOT
 from hidden.sets import Truth, make_set
 
+from omnibench.data.dataset import Dataset
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.fitting import Extended, extend
 from omnibench.discover.held_out import group_counts, step_name
 from omnibench.discover.regressors.covariate_bases import Basis
 from omnibench.discover.regressors.significance import Group
+from omnibench.discover.result import Discovery
 from omnibench.discover.selection.competing_models import CompetingModels
 from omnibench.discover.selection.model_selection import Selection, select_effects
 from omnibench.discover.selection.screening import Screening, screen_plain
@@ -23,13 +26,6 @@ from omnibench.discover.selection.unknown_term import add_smooth_terms, chosen_f
 from omnibench.fit.noise import Whitener
 from omnibench.registry import effects
 from omnibench.robot.calibration import Calibration, read_calibration, write_calibration
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from omnibench.data.dataset import Dataset
-    from omnibench.discover.result import Discovery
 
 FOLDS = np.tile(np.arange(5), 12)  # of the 60 runs of a small set
 
