@@ -107,11 +107,12 @@ def test_a_calibration_comes_close_to_the_truth_and_says_where_it_is_from(prepar
 
 
 def test_settings_reach_the_calibrator_and_infinity_is_null_in_json(command: Command, prepared: Prepared) -> None:
-    options = ("--set", "population=20", "--set", "generations=2", "--set", "tolerance=.inf", "--seed", "5")
-    found = document(command("calibrate", prepared.data, "--json", "--calibrator", "genetic", *options))
+    options = ("--set", "population=20", "--set", "generations=2", "--set", "tolerance=.inf")
+    choices = ("--calibrator", "genetic", "--seed", "5", "--unidentified", "fit")
+    found = document(command("calibrate", prepared.data, "--json", *choices, *options))
     recorded = found["provenance"]["options"]
     assert (recorded["population"], recorded["generations"], recorded["tolerance"]) == (20, 2, None)
-    assert found["provenance"]["seed"] == 5
+    assert (found["provenance"]["seed"], found["provenance"]["unidentified"]) == (5, "fit")
 
 
 @pytest.mark.parametrize("name", ["raises", "says_nan"])
@@ -306,28 +307,6 @@ def test_design_prints_one_document_and_writes_its_report(command: Command, tmp_
     assert json.loads((tmp_path / "out" / "design.json").read_text(encoding="utf-8")) == found
     assert found["sets"][0]["step"]["efficiency"] > 0.99
     assert (tmp_path / "out" / "report.html").stat().st_size > 10_000
-
-
-@pytest.mark.slow
-def test_a_motion_hardly_driven_keeps_the_design_unless_it_is_to_be_fitted(command: Command, tmp_path: Path) -> None:
-    recordings = RECORDINGS / "robotino"
-    if not recordings.is_dir():
-        pytest.skip(f"{recordings} is not there")
-    data = tmp_path / "data"
-    plugins = CONFIGS.parent / "plugins"
-    assert command("import", "robotino", recordings, "-o", data, "--plugins", plugins).returncode == 0
-    told = command("inspect", data).stdout
-    assert "turning on the spot" in told
-    assert "cannot be identified" in told
-    turned = {}
-    for choice in ("keep", "fit"):
-        file = tmp_path / f"{choice}.yaml"
-        printed = command("calibrate", data, "-o", file, "--unidentified", choice)
-        assert "do not identify" in printed.stderr
-        calibration = read_calibration(file)
-        turned[choice] = (calibration.matrix_array - calibration.robot.inverse_kinematic_matrix).sum(axis=1)
-    assert np.abs(turned["keep"]).max() < 1e-9
-    assert np.abs(turned["fit"]).max() > 1e-4
 
 
 @pytest.fixture(scope="module")

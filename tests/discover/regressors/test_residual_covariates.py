@@ -26,6 +26,7 @@ from omnibench.fit.trajectory_fit import Whitened, usable_runs
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import ActuatorEffect, make_term
 from omnibench.robot.model import OdometryModel
+from omnibench.robot.odometry import WheelLog
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.simulate import simulate_dataset
 
@@ -55,18 +56,12 @@ def test_an_eccentric_wheel_shows_its_amplitude_before_and_nothing_after(eccentr
 
 def test_a_late_reference_shows_its_delay_in_every_run(eccentric: Residuals) -> None:
     paths = eccentric.paths
-    velocity = np.concatenate(
-        [
-            np.column_stack(
-                [
-                    (np.interp(log.stamps + 0.05, [0, *log.times], path[:, axis])
-                     - np.interp(log.stamps - 0.05, [0, *log.times], path[:, axis])) / 0.1
-                    for axis in range(3)
-                ]
-            )
-            for log, path in zip(paths.logs, paths.ends, strict=True)
-        ]
-    )  # fmt: skip
+
+    def seen(log: WheelLog, path: np.ndarray, later: float) -> np.ndarray:
+        return np.column_stack([np.interp(log.stamps + later, [0, *log.times], axis) for axis in path.T])
+
+    ways = zip(paths.logs, paths.ends, strict=True)
+    velocity = np.concatenate([(seen(log, path, 0.05) - seen(log, path, -0.05)) / 0.1 for log, path in ways])
     fitted = eccentric.fit_runs(-velocity[:, :, None])
     assert (fitted.values[:, PLAIN.index] > 0).mean() > 0.9
     assert np.median(fitted.values[:, PLAIN.index]) > 0.01  # of 0.06: the matrix takes up much
