@@ -62,6 +62,13 @@ def python(program: str, *arguments: object, **others: Any) -> subprocess.Comple
     return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False, **others)
 
 
+def alive(session: int) -> list[str]:
+    """Commands of the processes of a session that have not ended."""
+    listing = ["ps", "-o", "stat=,args=", "-s", str(session)]
+    listed = subprocess.run(listing, capture_output=True, text=True, check=False).stdout.splitlines()
+    return [line for line in listed if not line.startswith("Z")]
+
+
 def compared(config: Path, output: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
     """Run a comparison that must succeed."""
     run = omnibench("compare", config, "--output", output, *arguments)

@@ -1,9 +1,14 @@
-"""A report as its reader sees it, for the tests."""
+"""A report and a table on a terminal as their readers see them, for the tests."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from html.parser import HTMLParser
+from io import StringIO
+from typing import Any
+
+from rich.console import Console
 
 NUMBER = re.compile(r"\b[0-9a-f]{16,}\b|[-+−]?\d+([.,]\d+)*(e[-+]?\d+)?")
 
@@ -66,3 +71,10 @@ class Page(HTMLParser):
         text = self.text.rsplit("How to reproduce", 1)[0]
         lines = (" ".join(line.split()) for line in text.splitlines())
         return "\n".join(NUMBER.sub("#", line) for line in lines if line)
+
+
+def on_terminal(write: Callable[..., object], *shown: Any, width: int = 80) -> str:
+    """What a function prints of something on a terminal of so many columns."""
+    console = Console(file=StringIO(), width=width, markup=False, emoji=False, highlight=False)
+    write(console, *shown)
+    return console.file.getvalue()

@@ -1,4 +1,4 @@
-"""Processor time of a call, which other processes do not lengthen as they do wall time, how long to wait, and load."""
+"""Processor time of a call, which other processes do not lengthen as they do wall time, waiting, and load."""
 
 from __future__ import annotations
 
@@ -31,3 +31,11 @@ def load(loops: int) -> Iterator[None]:
         for each in running:
             each.kill()
             each.wait()
+
+
+def until(condition: Callable[[], object], what: str) -> None:
+    """Wait until ``condition`` holds; the test fails, saying ``what`` was waited for, when it does not in time."""
+    deadline = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < deadline, f"waited {PATIENCE} s in vain for {what}"
+        time.sleep(0.005)

@@ -12,6 +12,7 @@ import numpy as np
 import polars as pl
 import pytest
 import yaml
+from browser import chromium
 from commands import (
     COMMAND,
     CONFIGS,
@@ -21,6 +22,7 @@ from commands import (
     Prepared,
     Printed,
     assert_refused,
+    run_here,
     succeeded,
     write_config,
     write_plugin,
@@ -29,8 +31,7 @@ from recording_samples import sample
 from timing import PATIENCE
 
 from omnibench.data.storage import load_dataset, save_dataset
-from omnibench.errors import DataError
-from omnibench.report.figure_files import browser
+from omnibench.fit.span import driven_span
 from omnibench.robot.calibration import EffectTerm, read_calibration, write_calibration
 from omnibench.robot.kinematics import published_matrix
 from omnibench.testing.synthetic import synthetic_robot
@@ -106,11 +107,12 @@ def test_a_calibration_comes_close_to_the_truth_and_says_where_it_is_from(prepar
 
 
 def test_settings_reach_the_calibrator_and_infinity_is_null_in_json(command: Command, prepared: Prepared) -> None:
-    options = ("--set", "population=20", "--set", "generations=2", "--set", "tolerance=.inf", "--seed", "5")
-    found = document(command("calibrate", prepared.data, "--json", "--calibrator", "genetic", *options))
+    options = ("--set", "population=20", "--set", "generations=2", "--set", "tolerance=.inf")
+    choices = ("--calibrator", "genetic", "--seed", "5", "--unidentified", "fit")
+    found = document(command("calibrate", prepared.data, "--json", *choices, *options))
     recorded = found["provenance"]["options"]
     assert (recorded["population"], recorded["generations"], recorded["tolerance"]) == (20, 2, None)
-    assert found["provenance"]["seed"] == 5
+    assert (found["provenance"]["seed"], found["provenance"]["unidentified"]) == (5, "fit")
 
 
 @pytest.mark.parametrize("name", ["raises", "says_nan"])
@@ -307,26 +309,40 @@ def test_design_prints_one_document_and_writes_its_report(command: Command, tmp_
     assert (tmp_path / "out" / "report.html").stat().st_size > 10_000
 
 
-@pytest.mark.slow
-def test_a_motion_hardly_driven_keeps_the_design_unless_it_is_to_be_fitted(command: Command, tmp_path: Path) -> None:
-    recordings = RECORDINGS / "robotino"
-    if not recordings.is_dir():
-        pytest.skip(f"{recordings} is not there")
-    data = tmp_path / "data"
-    plugins = CONFIGS.parent / "plugins"
-    assert command("import", "robotino", recordings, "-o", data, "--plugins", plugins).returncode == 0
-    told = command("inspect", data).stdout
-    assert "turning on the spot" in told
-    assert "cannot be identified" in told
-    turned = {}
-    for choice in ("keep", "fit"):
-        file = tmp_path / f"{choice}.yaml"
-        printed = command("calibrate", data, "-o", file, "--unidentified", choice)
-        assert "do not identify" in printed.stderr
-        calibration = read_calibration(file)
-        turned[choice] = (calibration.matrix_array - calibration.robot.inverse_kinematic_matrix).sum(axis=1)
-    assert np.abs(turned["keep"]).max() < 1e-9
-    assert np.abs(turned["fit"]).max() > 1e-4
+@pytest.fixture(scope="module")
+def mecanum(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with simulated data of four mecanum wheels, the hidden truth and a calibration."""
+    folder = tmp_path_factory.mktemp("mecanum")
+    for arguments in (
+        ("simulate", CONFIGS / "mecanum.yaml", "-o", folder / "data", "--truth", folder / "truth"),
+        ("calibrate", folder / "data", "-o", folder / "calibration.yaml"),
+    ):
+        succeeded(run_here(*arguments, cwd=folder))
+    return folder
+
+
+def test_four_wheels_are_calibrated_to_the_hidden_matrix_where_they_were_driven(mecanum: Path) -> None:
+    truth = np.array(yaml.safe_load((mecanum / "truth" / "truth.yaml").read_text())["matrix"])
+    calibration = read_calibration(mecanum / "calibration.yaml")
+    dataset = load_dataset(mecanum / "data")
+    span = driven_span(dataset.split("train"))
+    design = dataset.robot.inverse_kinematic_matrix
+    assert truth.shape == calibration.matrix_array.shape == (3, 4)
+    on_span, size = span.driven.T @ span.driven, np.abs(truth).max(axis=1)
+    missed = np.abs((calibration.matrix_array - truth) @ on_span).max(axis=1) / size
+    to_be_found = np.abs((design - truth) @ on_span).max(axis=1) / size
+    assert missed.max() < 0.003
+    assert to_be_found.min() > 0.015
+    assert np.abs((calibration.matrix_array - design) @ span.null.T).max() < 1e-12
+    assert np.abs((truth - design) @ span.null.T).max() > 1e-4  # which the data cannot tell
+
+
+def test_inspection_names_the_direction_that_was_not_driven(command: Command, mecanum: Path) -> None:
+    found = document(command("inspect", mecanum / "data", "--json"))
+    assert found["undriven"] == ["fl - fr - rl + rr"]
+    assert found["driven_directions"] == 3
+    shown = command("inspect", mecanum / "data").stdout
+    assert "no run drives the wheels along fl - fr - rl + rr, as for any robot on four wheels" in shown
 
 
 QUICK = ("inspect", "{data}", "--report", "out/report.html")
@@ -344,10 +360,7 @@ LONG = (
     "typed", [QUICK, *(pytest.param(typed, marks=pytest.mark.slow) for typed in LONG)], ids=lambda typed: typed[0]
 )
 def test_every_figure_is_written_as_svg_and_png(command: Command, prepared: Prepared, typed: tuple[str, ...]) -> None:
-    try:
-        browser()
-    except DataError:
-        pytest.skip("no Chromium on this machine to draw figures with")
+    chromium()
     if "scans" in typed:
         save_dataset(sample(repetitions=1, rays=360).dataset, Path("scans"))
     Path("out").mkdir()

@@ -7,21 +7,19 @@ import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
-from io import StringIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import polars as pl
 import pytest
 from commands import Command, Printed, assert_refused, run_here, succeeded
-from discovery_samples import EXPERIMENT, incomplete, named, nameless, nothing, simulated
+from discovery_samples import EXPERIMENT, SMALL, incomplete, named, nameless, nothing, simulated
 from nodes import Command as CommandProcess
-from rich.console import Console
+from report_page import Page, on_terminal
 from sessions import until
 
 from omnibench.cli.terminal.discovery_summary import print_discovery
 from omnibench.config import parse_yaml
-from omnibench.data.dataset import Dataset
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.discover.output import DiscoverOptions, write_discovery
 from omnibench.discover.result import Discovery
@@ -41,7 +39,7 @@ FILES = {
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small data set with a strong hidden effect, as a folder."""
     folder = tmp_path_factory.mktemp("discover") / "data"
-    save_dataset(small(), folder)
+    save_dataset(simulated(commands=SMALL), folder)
     return folder
 
 
@@ -54,11 +52,6 @@ class Told(NamedTuple):
     @property
     def document(self) -> dict[str, Any]:
         return json.loads(self.run.stdout)
-
-
-def small() -> Dataset:
-    commands = {"directions_deg": [0, 120, 240], "turn_rates": [-0.35, 0.35], "ramp": 0.3}
-    return simulated(commands=commands, repetitions=2)
 
 
 @pytest.fixture(scope="module")
@@ -134,7 +127,9 @@ def test_an_earlier_discovery_is_replaced_with_all_its_files(written: Path, tmp_
     assert (folder / "experiment-2.yaml").read_text(encoding="utf-8") == EXPERIMENT.config
     write_discovery(replace(nothing(), experiments=(EXPERIMENT,)), OPTIONS, folder)
     assert {path.name for path in folder.iterdir()} == {*FILES, "experiment-1.yaml"} - {"model.yaml"}
-    assert json.loads((folder / "discovery.json").read_text(encoding="utf-8"))["verdict"] == "none"
+    document = json.loads((folder / "discovery.json").read_text(encoding="utf-8"))
+    assert (document["verdict"], document["model"]) == ("none", None)
+    assert "model.yaml" not in Page((folder / "report.html").read_text(encoding="utf-8")).text
 
 
 def test_a_disk_that_refuses_one_file_leaves_all_as_they_were(written: Path, tmp_path: Path) -> None:
@@ -198,9 +193,7 @@ SHOWN: dict[Callable[[], Discovery], tuple[str, ...]] = {
 
 @pytest.mark.parametrize("make", SHOWN)
 def test_what_is_found_is_told_on_a_screen_of_eighty_columns(make: Callable[[], Discovery]) -> None:
-    console = Console(file=StringIO(), width=80, markup=False, emoji=False, highlight=False)
-    print_discovery(console, make(), Path("results/flower/now"))
-    lines = console.file.getvalue().splitlines()
+    lines = on_terminal(print_discovery, make(), Path("results/flower/now")).splitlines()
     assert max(len(line.rstrip()) for line in lines) <= 80
     text = " ".join(" ".join(lines).split())
     assert "…" not in text

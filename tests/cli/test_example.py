@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ import pytest
 import yaml
 from commands import CONFIGS, Command, assert_refused, succeeded
 from real_recordings import OPTIODOM
-from rich.console import Console
+from report_page import on_terminal
 from typed_pages import parse
 
 import omnibench
@@ -140,8 +139,6 @@ def test_the_sample_holds_every_second_row_of_its_source(command: str) -> None:
 def test_a_row_that_is_zero_by_design_is_called_so_and_warned_of_nowhere() -> None:
     options = {"wheel_unit": "ticks/sample", "ticks_per_turn": 2796.8}
     run = omnibench.calibrate(omnibench.import_dataset("csv", ROBOT / "log", options))
-    console = Console(file=io.StringIO(), width=100)
-    print_calibration(console, run)
-    assert console.file.getvalue().count("by design") == 2
+    assert on_terminal(print_calibration, run, width=100).count("by design") == 2
     assert run.result.held == ("m21", "m22")
     assert run.untouched == ()

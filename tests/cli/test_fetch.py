@@ -6,7 +6,6 @@ import os
 import shutil
 import signal
 import subprocess
-import time
 from pathlib import Path
 
 import polars as pl
@@ -15,7 +14,7 @@ from commands import COMMAND, ENVIRONMENT, RECORDINGS, ROOT, Command, Prepared, 
 from corelli import CORELLI
 from newcomer import PAGES, lines_of
 from real_recordings import OMNI3, ROBOTINO
-from timing import PATIENCE
+from timing import PATIENCE, until
 
 from omnibench.cli import fetch
 from omnibench.cli.examples import EXAMPLES
@@ -298,10 +297,7 @@ class TestMistakes:
             [*COMMAND, "fetch", "diff"], cwd=tmp_path, env=ENVIRONMENT | {"PATH": path, "PYTHONPATH": str(ROOT)},
             stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
-        deadline = time.monotonic() + PATIENCE
-        while not (tmp_path / "pid").exists() or not (tmp_path / "pid").read_text():
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
+        until(lambda: (tmp_path / "pid").exists() and (tmp_path / "pid").read_text(), "git to begin")
         assert list((tmp_path / "clones" / "sousarbarb").iterdir())
         process.send_signal(signal.SIGINT)
         _, said = process.communicate(timeout=PATIENCE)

@@ -13,6 +13,7 @@ import pytest
 import yaml
 from commands import Command, assert_refused, succeeded
 from newcomer_log import Machine, write_logs
+from sample_robots import fixed, mecanum
 
 from omnibench.data.dataset import Dataset
 from omnibench.data.importers.csv_tables.csv_template import write_template
@@ -146,12 +147,9 @@ def test_a_data_set_keeps_what_was_typed_and_import_ends_with_what_came_out(comm
 # By 40 seeds 2 to 12 % of the elements lie beyond 2.1 standard deviations; these two seeds were chosen, 1 is as good.
 _SEEDS = {"diff": 2, "mecanum": 6}
 _WHEELS = {
-    "diff": [
-        {"name": name, "type": "fixed", "radius": 0.075, "x": 0, "y": y}
-        for name, y in (("left", 0.16), ("right", -0.16))
-    ],
+    "diff": [fixed(name, 0, y, radius=0.075) for name, y in (("left", 0.16), ("right", -0.16))],
     "mecanum": [
-        {"name": name, "type": "mecanum", "radius": 0.06, "x": 0.21 * x, "y": 0.17 * y, "roller_angle_deg": 45 * x * y}
+        mecanum(name, 0.21 * x, 0.17 * y, 45 * x * y) | {"radius": 0.06}
         for name, x, y in (("fl", 1, 1), ("fr", 1, -1), ("rl", -1, 1), ("rr", -1, -1))
     ],
 }

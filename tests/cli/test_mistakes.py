@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import functools
 import os
-import resource
 import shutil
 import subprocess
 from pathlib import Path
@@ -29,7 +27,10 @@ from omnibench.data.storage import load_dataset, save_dataset
         (["compare", "CONFIG", "--data", "CONFIG"], ["is a file", "dataset.yaml"]),
         (["compare", "CONFIG", "--plugins", "nowhere"], ["plug-in folder", "nowhere"]),
         (["compare", "CONFIG", "--output", "x" * 300], ["File name too long"]),
-        (["compare", "."], ["dataset.yaml"]),
+        (["compare", "."], ["is a folder without dataset.yaml"]),
+        (["compare", "CONFIG", "DATA"], ["unexpected extra argument", "compare takes one config, or the folders of"]),
+        (["compare", "DATA", "nope"], ["nope: no such folder; compare takes one config"]),
+        (["compare", "DATA", "--data", "DATA"], ["--data is for a config", "leave it out"]),
         (["compare", "DATA/dataset.yaml"], ["unknown key 'format'"]),
         (["calibrate", "DATA", "-o", "x", "--calibrator", "crss"], ["--calibrator", "'crss'", "'crs'"]),
         (["calibrate", "DATA", "-o", "x", "--box", "papr"], ["--box", "'papr'", "'paper', 'row'"]),
@@ -124,18 +125,10 @@ def test_a_full_disk_behind_standard_output_is_one_line() -> None:
 FULL = "cannot be written: File too large"
 
 
-@pytest.mark.slow
-def test_a_full_disk_is_one_line_and_leaves_no_half_file(prepared: Prepared, tmp_path: Path) -> None:
-    limited = functools.partial(resource.setrlimit, resource.RLIMIT_FSIZE, (100, 100))
-    run = omnibench("simulate", prepared.config, "-o", tmp_path / "new", preexec_fn=limited)
-    assert_refused(run, str(tmp_path / "new"), FULL)
-    assert [file for file in (tmp_path / "new").rglob("*") if file.is_file()] == []
-
-
-@pytest.mark.parametrize("arguments", [["calibrate", "DATA", "-o", "new/c.yaml"], ["plugin", "new", "mine"]])
-def test_a_file_too_large_for_the_disk_is_not_there(arguments: list[str], command: Command, prepared: Prepared) -> None:
+@pytest.mark.parametrize("arguments", ["calibrate {data} -o new/c.yaml", "plugin new mine", "simulate {config} -o new"])
+def test_a_file_too_large_for_the_disk_is_not_there(arguments: str, command: Command, prepared: Prepared) -> None:
     with disk_that_takes(600):  # the line on standard error
-        run = command(*(str(prepared.data) if argument == "DATA" else argument for argument in arguments))
+        run = command(*arguments.format_map(prepared._asdict()).split())
     assert_refused(run, FULL)
     assert [file for file in Path().rglob("*") if file.is_file()] == []
 

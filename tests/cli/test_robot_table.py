@@ -39,10 +39,10 @@ def apr02(loopback: Loopback) -> AnnouncedRobot:
     return AnnouncedRobot(loopback.router, "apr02")
 
 
-def listened(loopback: Loopback, robot: str | None, *, terminal: bool = False, width: int = 100, **options: Any) -> str:
+def listened(loopback: Loopback, robot: str | None, **options: Any) -> str:
     """The output of ``listen`` after one reading."""
     text = StringIO()
-    console = Console(file=text, width=width, force_terminal=terminal, color_system=None)
+    console = Console(file=text, width=100)
     listen(robot, loopback.client(), KEYS, console, Event(), **{"seconds": 0.05, "patience": PATIENCE, **options})
     return text.getvalue()
 

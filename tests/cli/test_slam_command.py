@@ -17,6 +17,7 @@ import yaml
 from commands import ENVIRONMENT, Command, Printed, assert_refused, python, run_here, succeeded
 from drives import calibration
 from nodes import Command as CommandProcess
+from recording_samples import in_room
 
 from omnibench.data.dataset import make_dataset
 from omnibench.data.scans import ScansInMemory, TrajectoryScans
@@ -24,7 +25,6 @@ from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.data.true_poses import TruePath, write_true_poses
 from omnibench.registry import effects, load_plugins
 from omnibench.robot.calibration import write_calibration
-from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.simulate.floor_plan import RoomPlan, make_plan
 from omnibench.simulate.lidar import Lidar, measure_scans, scan_stamps
@@ -53,7 +53,7 @@ def driven(tmp_path_factory: pytest.TempPathFactory) -> Driven:
         times = np.arange(0.0, run.times[-1] + 1e-9, 0.002)
         (path,) = model.poses([run.log(times)])
         stamps = scan_stamps(LIDAR, float(run.times[-1]), rng)
-        scans[run.id] = measure_scans(plan, LIDAR, TruePath(times, _in_room(plan.start, path)), stamps, rng)
+        scans[run.id] = measure_scans(plan, LIDAR, TruePath(times, in_room(plan.start, path)), stamps, rng)
         truth[run.id] = TruePath(times, path)
         wrong = run.poses + np.where(run.pose_times[:, None] > 0, [0.03, 0.04, math.radians(1.0)], 0.0)
         runs.append(replace(run, poses=wrong))
@@ -61,11 +61,6 @@ def driven(tmp_path_factory: pytest.TempPathFactory) -> Driven:
     save_dataset(data, folder / "data")
     write_true_poses(folder / "truth", truth)
     return Driven(folder / "data", folder / "truth")
-
-
-def _in_room(start: Array, path: Array) -> Array:
-    place = (path[:, 0] + 1j * path[:, 1]) * np.exp(1j * start[2])
-    return np.column_stack([start[0] + place.real, start[1] + place.imag, start[2] + path[:, 2]])
 
 
 class Found(NamedTuple):

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import COMMAND, ENVIRONMENT, Command, compared_here, search, succeeded, write_config
-from export_samples import TRICYCLE
-from report_page import Page
+from report_page import Page, on_terminal
 from rich.console import Console
 from syrupy.assertion import SnapshotAssertion
 from timing import PATIENCE
+from wheeled_samples import TRICYCLE, driven
 
 from omnibench.cli.terminal.calibration_tables import print_calibration
 from omnibench.cli.terminal.comparison_tables import print_result
@@ -26,7 +26,7 @@ from omnibench.cli.terminal.inspection_summary import print_inspection
 from omnibench.cli.terminal.progress_display import ProgressDisplay
 from omnibench.cli.terminal.tables import in_brief, print_table
 from omnibench.compare.result import ComparisonResult
-from omnibench.data.dataset import Dataset, Trajectory, make_dataset
+from omnibench.data.dataset import Dataset, make_dataset
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.inspect import inspect_dataset
 from omnibench.fit.problem import Budget
@@ -34,8 +34,6 @@ from omnibench.progress import Progress, Stages
 from omnibench.report.blocks import Cell, Column, Document, Row, Section, Table
 from omnibench.report.render import render
 from omnibench.robot.kinematics import Robot, Wheel
-from omnibench.robot.model import OdometryModel
-from omnibench.robot.odometry import WheelLog
 from omnibench.testing.synthetic import PERIOD, synthetic_trajectories
 
 TABLE = Table(
@@ -58,9 +56,7 @@ TABLE = Table(
 
 
 def printed(table: Table, width: int) -> str:
-    stream = StringIO()
-    print_table(Console(file=stream, width=width, markup=False, emoji=False, highlight=False), table)
-    return stream.getvalue()
+    return on_terminal(print_table, table, width=width)
 
 
 @pytest.mark.parametrize("width", [48, 60, 80, 160])
@@ -117,10 +113,8 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> ComparisonResult:
     return compared_here(tmp_path_factory.mktemp("tables") / "out", calibrators=[*entries, refused])
 
 
-def compared_text(result: ComparisonResult, width: int = 160) -> str:
-    stream = StringIO()
-    print_result(Console(file=stream, width=width, markup=False, emoji=False, highlight=False), result)
-    return stream.getvalue()
+def compared_text(result: ComparisonResult, width: int) -> str:
+    return on_terminal(print_result, result, width=width)
 
 
 def test_all_entries_are_in_every_table_in_usual_units(result: ComparisonResult, snapshot: SnapshotAssertion) -> None:
@@ -166,7 +160,7 @@ def test_a_pipe_gets_one_plain_line_for_each_run_and_the_tables(command: Command
     assert re.search(r"closed_form.* 0\.13873 ", run.stdout)
 
 
-def on_a_terminal(*arguments: object, **others: Any) -> tuple[int, str]:
+def on_a_terminal(*arguments: object) -> tuple[int, str]:
     """Exit code and everything shown by a command on a terminal of 80 columns."""
     ours, theirs = pty.openpty()
     process = subprocess.Popen(
@@ -175,7 +169,6 @@ def on_a_terminal(*arguments: object, **others: Any) -> tuple[int, str]:
         stdin=theirs,
         stdout=theirs,
         stderr=theirs,
-        **others,
     )
     os.close(theirs)
     shown = b""
@@ -187,8 +180,8 @@ def on_a_terminal(*arguments: object, **others: Any) -> tuple[int, str]:
 
 
 def test_a_terminal_shows_a_bar_for_all_runs_and_one_for_each_that_is_under_way(tmp_path: Path) -> None:
-    entries = ["theoretical", *(search(label, 10_000, batch=10) for label in ("[/b] one", "two"))]
-    config = write_config(tmp_path, calibrators=entries, budget={"evaluations": 10_000})
+    twins = [search(label, 10_000, batch=10) for label in ("[/b] one", "two")]  # the same work under two names
+    config = write_config(tmp_path, calibrators=["theoretical", *twins], budget={"evaluations": 10_000})
     code, shown = on_a_terminal("compare", config, "--output", tmp_path / "out")
     assert code == 0, shown
     plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown)
@@ -198,44 +191,21 @@ def test_a_terminal_shows_a_bar_for_all_runs_and_one_for_each_that_is_under_way(
     assert "Traceback" not in plain
 
 
-@pytest.mark.slow
-def test_twins_under_way_at_the_same_time_have_a_bar_each(tmp_path: Path) -> None:
-    twins = [search(label, 8_000, batch=10) for label in ("one", "two")]  # the same work under two names
-    config = write_config(tmp_path, calibrators=twins, budget={"evaluations": 8_000})
-    code, shown = on_a_terminal("compare", config, "--output", tmp_path / "out")
-    assert code == 0, shown
-    assert "Traceback" not in shown
-
-
-def a_dataset() -> Dataset:
-    """Curves of a tricycle to both sides, a hundredth off its design."""
-    times, stamps = 0.1 * np.arange(1, 51), 0.5 * np.arange(11)
-    model = OdometryModel(TRICYCLE, 1.01 * TRICYCLE.inverse_kinematic_matrix, "arc")
-    runs = []
-    for number, angle in enumerate((-0.6, -0.3, 0.0, 0.3, 0.6)):
-        rates, steering = 3 + np.sin(times + number)[:, None], angle + 0.2 * np.sin(times)[:, None]
-        (poses,) = model.poses([WheelLog(times, rates, np.zeros(3), stamps, steering=steering, drive=TRICYCLE.drive)])
-        runs.append(Trajectory(f"run-{number}", "train", times, rates, stamps, poses, steering=steering))
-    return make_dataset("curves", TRICYCLE, 0.1, runs)
-
-
 def calibration_lines(dataset: Dataset, *arguments: Any, **options: Any) -> list[str]:
     """What is printed of a data set and its calibration."""
-    console = Console(file=StringIO(), width=160)
-    print_calibration(console, calibrate(dataset, *arguments, **options))
-    print_inspection(console, inspect_dataset(dataset))
-    return console.file.getvalue().splitlines()
+    calibrated = on_terminal(print_calibration, calibrate(dataset, *arguments, **options), width=160)
+    return (calibrated + on_terminal(print_inspection, inspect_dataset(dataset), width=160)).splitlines()
 
 
 def test_a_matrix_has_a_column_for_each_drive_signal() -> None:
-    lines = calibration_lines(a_dataset())
+    lines = calibration_lines(driven(TRICYCLE))
     assert any(line.split() == ["front_cos", "front_sin"] for line in lines)
     assert any(line.startswith("directions of drive signals driven: 2 of 2") for line in lines)
     assert not any("wheel front" in line for line in lines)
 
 
 def test_the_geometry_of_a_tricycle_is_shown_with_the_place_of_its_tracked_point() -> None:
-    lines = calibration_lines(a_dataset(), "crs", parameterisation="geometry", budget=Budget(evaluations=200))
+    lines = calibration_lines(driven(TRICYCLE), "crs", parameterisation="geometry", budget=Budget(evaluations=200))
     assert any(line.startswith("mount_x") for line in lines)
 
 

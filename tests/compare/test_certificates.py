@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 from commands import compared_here, search, small
+from report_page import on_terminal
 from report_samples import page, run, usual
 
 from omnibench.cli.terminal.comparison_tables import print_result
-from omnibench.cli.terminal.console import make_console
 from omnibench.compare.config import CertificateChoice, CompareConfig
 from omnibench.compare.result import ComparisonResult
 
@@ -44,11 +44,8 @@ def test_the_exact_optimum_has_little_to_gain_and_a_poor_search_much(result: Com
     assert gaps["search"] > gaps["closed_form"]
 
 
-def test_terminal_and_report_say_what_is_proven(
-    result: ComparisonResult, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    print_result(make_console(), result)
-    assert "Proven: what share of the cost" in " ".join(capsys.readouterr().out.split())
+def test_terminal_and_report_say_what_is_proven(result: ComparisonResult, tmp_path: Path) -> None:
+    assert "Proven: what share of the cost" in on_terminal(print_result, result, width=200)
     text = page(result, tmp_path).text
     assert "What no optimiser can beat" in text
     assert "proven: ≤" in text

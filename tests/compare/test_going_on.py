@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import time
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from commands import (
     COMMAND,
     ENVIRONMENT,
     Command,
+    alive,
     assert_refused,
     compared_here,
     files_of,
@@ -26,7 +26,7 @@ from commands import (
     write_config,
     write_plugin,
 )
-from timing import PATIENCE
+from timing import PATIENCE, until
 
 from omnibench.data.storage import save_dataset
 from omnibench.files import results_locked
@@ -81,19 +81,6 @@ def started(folder: Path, ended: int = 1, **changes: Any) -> subprocess.Popen[st
     return process
 
 
-def left_behind(group: int) -> list[str]:
-    """Commands of a session's processes that do not end."""
-    listing = ["ps", "-o", "stat=,args=", "-s", str(group)]
-    deadline = time.monotonic() + PATIENCE
-    while time.monotonic() < deadline:
-        listed = subprocess.run(listing, capture_output=True, text=True, check=False).stdout.splitlines()
-        alive = [line for line in listed if not line.startswith("Z")]
-        if not alive:
-            return []
-        time.sleep(0.05)
-    return alive
-
-
 def test_ctrl_c_keeps_what_had_ended_and_going_on_gives_what_an_uninterrupted_comparison_gives(tmp_path: Path) -> None:
     output = tmp_path / "out"
     process = started(tmp_path, workers=1)
@@ -102,7 +89,7 @@ def test_ctrl_c_keeps_what_had_ended_and_going_on_gives_what_an_uninterrupted_co
     assert process.returncode == 130
     line = f"interrupted; 1 of 4 runs are kept in {output}: run again with -o {output}"
     assert [text for text in stderr.splitlines() if text] == [line]
-    assert left_behind(process.pid) == []
+    until(lambda: not alive(process.pid), "its processes to end")
     files = files_of(output)
     assert {Path(name).suffix for name in files} == {".yaml", ".json"}
     kept = {name: content for name, content in files.items() if name.startswith("runs/")}
@@ -137,7 +124,7 @@ def test_ctrl_c_while_the_workers_start_is_one_line(tmp_path: Path) -> None:
         _, said = process.communicate(timeout=PATIENCE)
         assert next(line for line in said.splitlines() if not line.startswith("[")).startswith("interrupted; ")
         assert "Traceback" not in said
-        assert left_behind(process.pid) == []
+        until(lambda session=process.pid: not alive(session), "its processes to end")
 
 
 @pytest.mark.slow
@@ -164,7 +151,7 @@ def test_the_runs_end_with_a_comparison_that_is_killed_which_then_goes_on(
     if name == "SIGTERM":
         assert process.returncode == 128 + signal.SIGTERM
         assert stderr.splitlines()[-1].endswith(f"run again with -o {tmp_path / 'out'}")
-    assert left_behind(process.pid) == []
+    until(lambda: not alive(process.pid), "its processes to end")
     before = files_of(tmp_path / "out" / "runs", WHOLE)
     (tmp_path / "go").touch()
     run = command("compare", tmp_path / "small.yaml", "--output", tmp_path / "out")

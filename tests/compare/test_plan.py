@@ -15,8 +15,8 @@ from commands import (
     ROOT,
     Command,
     Prepared,
-    assert_refused,
     flower,
+    refused,
     registries_restored,
     run_here,
     small,
@@ -54,13 +54,6 @@ def planned(folder: Path, **changes: Any) -> list[PlannedRun]:
     load_calibrators(config.plugins, [entry.name for entry in config.calibrators])
     config = effective_config(config)
     return make_plan(config, load_datasets(config))
-
-
-def complaint(folder: Path, **changes: Any) -> str:
-    with pytest.raises(OmnibenchError) as failure:
-        planned(folder, **changes)
-    assert "\n" not in str(failure.value)
-    return str(failure.value)
 
 
 @pytest.mark.parametrize(
@@ -105,18 +98,15 @@ def complaint(folder: Path, **changes: Any) -> str:
     ids=lambda value: json.dumps(value)[:60] if isinstance(value, dict) else "",
 )
 def test_a_mistake_in_a_config_is_one_line_that_names_it(changes: dict[str, Any], parts: str, tmp_path: Path) -> None:
-    found = complaint(tmp_path, **changes)
-    for part in parts.split():
-        assert part in found
+    with refused(OmnibenchError, *parts.split()):
+        planned(tmp_path, **changes)
 
 
 @pytest.mark.parametrize("text", ["[" * 3000, "name: 2023-99-99\n", "name: 0b_\n", "name: [\n", "", "- a\n"])
 def test_a_file_that_is_no_config_is_one_line(text: str, tmp_path: Path) -> None:
     (tmp_path / "broken.yaml").write_text(text)
-    with pytest.raises(OmnibenchError) as failure:
+    with refused(OmnibenchError, start=f"{tmp_path / 'broken.yaml'}: "):
         read_compare_config(tmp_path / "broken.yaml")
-    assert str(failure.value).startswith(f"{tmp_path / 'broken.yaml'}: ")
-    assert "\n" not in str(failure.value)
 
 
 @pytest.fixture(scope="module")
@@ -175,8 +165,8 @@ def test_an_empty_training_split_is_refused(tmp_path: Path) -> None:
     run_here("simulate", write_config(tmp_path), "-o", tmp_path / "data", "--format", "csv", cwd=tmp_path)
     table = tmp_path / "data" / "trajectories.csv"
     table.write_text(table.read_text().replace(",train,train", ",validation,train"))
-    found = complaint(tmp_path, datasets={"flower": {"path": "data"}})
-    assert found.startswith("data set flower: the training split is empty")
+    with refused(OmnibenchError, start="data set flower: the training split is empty"):
+        planned(tmp_path, datasets={"flower": {"path": "data"}})
 
 
 def test_only_what_is_random_is_run_with_every_seed(tmp_path: Path) -> None:
@@ -252,35 +242,8 @@ def test_folders_of_a_data_set_are_compared_as_one(
     for day in ("day1", "day2"):
         shutil.copytree(prepared.data, day)
     by_glob = command("compare", "day*", "-o", "by_glob")
-    one_by_one = command("compare", "day1", "day2", "-o", "one_by_one")
+    one_by_one = command("compare", "day1", "day2", "--plugins", "none", "-o", "one_by_one")
     assert (by_glob.returncode, one_by_one.returncode) == (0, 0), by_glob.stderr + one_by_one.stderr
     (named,) = yaml.safe_load(Path("by_glob/config.yaml").read_text())["datasets"].values()
     assert [Path(path).name for path in named["path"]] == ["day1", "day2"]
     assert summary(Path("by_glob"))["runs"][0]["train_cost"] == summary(Path("one_by_one"))["runs"][0]["train_cost"]
-
-
-def test_one_config_is_compared_at_a_time(command: Command, prepared: Prepared) -> None:
-    printed = command("compare", prepared.config, prepared.data)
-    assert_refused(printed, f"unexpected extra argument {prepared.data}; compare takes one config, or the folders of")
-
-
-def test_a_folder_that_is_not_there_is_named_beside_one_that_is(command: Command, prepared: Prepared) -> None:
-    assert_refused(command("compare", prepared.data, "nope"), "nope: no such folder; compare takes one config")
-
-
-def test_no_plugins_may_be_asked_for_as_of_other_commands(
-    command: Command, prepared: Prepared, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("omnibench.compare.recording_config.suitable_calibrators", lambda _: ["theoretical"])
-    printed = command("compare", prepared.data, "--plugins", "none", "-o", "out")
-    assert printed.returncode == 0, printed.stderr
-
-
-def test_data_is_for_a_config(command: Command, prepared: Prepared) -> None:
-    printed = command("compare", prepared.data, "--data", prepared.data)
-    assert_refused(printed, "--data is for a config", "leave it out")
-
-
-def test_a_folder_that_is_no_data_set_is_named(command: Command, tmp_path: Path) -> None:
-    (tmp_path / "empty").mkdir()
-    assert_refused(command("compare", tmp_path / "empty"), "is a folder without dataset.yaml")

@@ -172,14 +172,6 @@ def test_results_go_to_a_folder_of_their_own_with_a_link_to_the_latest(
     assert (tmp_path / "results" / "small" / "latest").resolve() == folders[-1]
 
 
-@pytest.mark.parametrize("name", ["notes.txt", "config.yaml"])
-def test_a_folder_that_holds_something_else_is_left_alone(name: str, tmp_path: Path) -> None:
-    (tmp_path / name).write_text("mine: precious\n")
-    with pytest.raises(DataError, match="holds other files"):
-        prepare_output(CompareConfig.model_validate(small()), tmp_path)
-    assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [(name, "mine: precious\n")]
-
-
 @pytest.mark.parametrize(
     ("output", "parts"),
     [

@@ -1,7 +1,8 @@
-"""Only runs that are new, changed or damaged are run; all others are read from the results that are there."""
+"""Only runs that are new, changed or damaged are run, by their keys; all others are read from the results there."""
 
 from __future__ import annotations
 
+import ast
 import json
 import shutil
 import tempfile
@@ -24,8 +25,9 @@ from commands import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from omnibench.compare.config import CompareConfig, effective_config, read_compare_config
-from omnibench.compare.plan import load_datasets, make_plan
+import omnibench
+from omnibench.compare.config import CompareConfig, effective_config, load_calibrators, read_compare_config
+from omnibench.compare.plan import PlannedRun, load_datasets, make_plan, shared_code
 from omnibench.compare.run import run_comparison
 from omnibench.errors import DataError
 from omnibench.fit.calibrator import Outcome, RunResult
@@ -34,6 +36,12 @@ from omnibench.jobs.job import ResultStore
 from omnibench.progress import Progress
 
 ALL = {"theoretical 1", "closed_form 1", "search 1"}
+PACKAGE = Path(omnibench.__file__).parent
+# Imported by the code of runs, without a say in their results. What has one belongs to the key's files instead.
+NEUTRAL = {
+    "config", "errors", "registry", "files", "environment", "processes", "progress", "words", "views",
+    "data.scans", "data.splits", "data.domain_check", "jobs.job_process", "jobs.job",
+}  # fmt: skip
 
 
 def ran_and_kept(output: Path, config: CompareConfig | None = None, **changes: Any) -> tuple[set[str], set[str]]:
@@ -47,6 +55,14 @@ def ran_and_kept(output: Path, config: CompareConfig | None = None, **changes: A
 
     run_comparison(config or CompareConfig.model_validate(small(**changes)), output, watch)
     return ran, kept
+
+
+def planned(**changes: Any) -> list[PlannedRun]:
+    """The runs of a small comparison."""
+    config = CompareConfig.model_validate(small(**changes))
+    load_calibrators(config.plugins, [entry.name for entry in config.calibrators])
+    config = effective_config(config)
+    return make_plan(config, load_datasets(config))
 
 
 @pytest.fixture
@@ -86,16 +102,19 @@ def test_only_what_is_new_or_damaged_is_run(output: Path) -> None:
         ({"budget": {"evaluations": 2001, "seconds": 60}}, ALL),
         ({"cost": "final_position"}, ALL),
         ({"integration": "euler"}, ALL),
+        ({"unidentified": "fit"}, ALL),
+        ({"box": "paper"}, ALL),
+        ({"seeds": [9]}, {"theoretical 9", "closed_form 9", "search 9"}),
         ({"datasets": {"flower": {"simulate": flower(sample_period=0.1)}}}, ALL),
+        ({"datasets": {"flower": {"simulate": flower(train={"seed": 9, "distance": 1.2})}}}, ALL),
         ({"workers": 1, "bootstrap": {"resamples": 300}, "description": "other words"}, set()),
     ],
     ids=lambda value: ", ".join(sorted(value)) or "nothing",
 )
 def test_only_runs_that_a_change_touches_are_new(changes: dict[str, Any], new: set[str]) -> None:
-    config = CompareConfig.model_validate(small(**changes))
-    plan = make_plan(effective_config(config), load_datasets(config))
     stored = compared_once().output / "runs"
-    assert {f"{run.label} {run.settings.seed}" for run in plan if not (stored / f"{run.key}.json").exists()} == new
+    new_runs = [run for run in planned(**changes) if not (stored / f"{run.key}.json").exists()]
+    assert {f"{run.label} {run.settings.seed}" for run in new_runs} == new
 
 
 PLUGIN = """
@@ -191,3 +210,80 @@ def test_a_folder_that_cannot_be_made_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "runs").write_text("a file")
     with pytest.raises(DataError, match=r"runs/key\.json: cannot be written: .*runs is not a folder"):
         ResultStore(tmp_path / "runs", RunResult).put("key", RunResult(Outcome.TIME, "", None, None, None, 0, 0.0, ()))
+
+
+# What is in a key
+
+
+@pytest.fixture(scope="module")
+def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the package's tree, which the tests change."""
+    copy = tmp_path_factory.mktemp("package") / "omnibench"
+    return Path(shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__")))
+
+
+@pytest.mark.parametrize(
+    "file",
+    [
+        "fit/problem.py",
+        "fit/noise.py",
+        "fit/information.py",
+        "fit/evaluator.py",
+        "fit/certify.py",
+        "robot/odometry.py",
+        "robot/effects/effect.py",
+        "robot/export/formats.py",
+        "data/dataset.py",
+        "data/stored_rows.py",
+        "compare/plan.py",
+    ],
+)
+def test_a_change_of_code_that_all_runs_share_changes_every_key_in_subfolders_too(file: str, package: Path) -> None:
+    before = shared_code(package)
+    (package / file).write_text((package / file).read_text(encoding="utf-8") + "# changed\n", encoding="utf-8")
+    assert shared_code(package) != before
+
+
+def test_a_new_file_changes_every_key_and_another_calibrator_none(package: Path) -> None:
+    before = shared_code(package)
+    folder = package / "fit" / "calibrators"
+    (folder / "newcomer.py").write_text("# a calibrator\n")
+    (folder / "nlopt_searches.py").write_text("# changed\n")
+    assert shared_code(package) == before
+    (package / "fit" / "new" / "deep").mkdir(parents=True)
+    (package / "fit" / "new" / "deep" / "module.py").write_text("")
+    assert shared_code(package) != before
+
+
+def test_no_calibrator_of_the_package_imports_another() -> None:
+    for file in (PACKAGE / "fit" / "calibrators").glob("*.py"):
+        assert not [name for name in imported(file) if name.startswith("fit.calibrators")], file
+
+
+def test_everything_that_the_code_of_runs_imports_is_in_the_key_or_has_no_say_in_the_result() -> None:
+    hashed = ("robot", "fit", "data.dataset", "data.references", "data.stored")
+    for file in (file for room in ("robot", "fit") for file in (PACKAGE / room).rglob("*.py")):
+        if file.parent.name == "check":
+            continue  # judges recordings, and is not in the key
+        for name in imported(file):
+            assert name in NEUTRAL or name.startswith(hashed), f"{file} imports {name}"
+
+
+def imported(file: Path) -> set[str]:
+    """Modules of the package that a file imports, anywhere in it, without the package's name."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            names.add(node.module)
+        elif isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+    return {name.removeprefix("omnibench.") for name in names if name.startswith("omnibench.")}
+
+
+def test_the_key_of_a_run_changes_with_the_plugin_that_does_the_search(tmp_path: Path) -> None:
+    body = '@calibrators.register("inner")\nclass Inner(Calibrator):\n    def calibrate(self, problem): ...\n'
+    plugins = write_plugin(tmp_path / "plugins", "inner", body)
+    entry = {"name": "parametric", "options": {"search": "inner"}}
+    before = planned(plugins=[str(plugins)], calibrators=[entry])[0].key
+    write_plugin(plugins, "inner", body + "# changed\n")
+    assert planned(plugins=[str(plugins)], calibrators=[entry])[0].key != before

@@ -113,35 +113,6 @@ def test_a_comparison_runs_in_another_thread_than_the_main_one_and_leaves_the_pr
     assert state() == before
 
 
-TELLS = """
-import signal
-
-@calibrators.register("tells")
-class Tells(Calibrator):
-    "Tells what its process is like."
-
-    def calibrate(self, problem):
-        names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
-        threads = " ".join(os.environ.get(name, "unset") for name in names)
-        return Solution(problem.start, f"{threads}, {signal.getsignal(signal.SIGINT).name}")
-"""
-
-
-@pytest.mark.slow
-def test_every_run_has_one_thread_and_leaves_ctrl_c_to_the_comparison(tmp_path: Path) -> None:
-    plugins = write_plugin(tmp_path / "plugins", "tells", TELLS)
-    config = write_config(tmp_path, plugins=[str(plugins)], calibrators=["tells"])
-    environment = {name: value for name, value in ENVIRONMENT.items() if not name.endswith("NUM_THREADS")}
-    subprocess.run(
-        [*COMMAND, "compare", str(config), "--output", str(tmp_path / "out")],
-        env=environment,
-        capture_output=True,
-        timeout=PATIENCE,
-        check=True,
-    )
-    assert rows(tmp_path / "out")["tells"]["reason"] == "1 1 1 1, SIG_IGN"
-
-
 @pytest.mark.parametrize("workers", [1, 2])
 def test_no_more_runs_are_under_way_than_there_are_workers(workers: int, tmp_path: Path) -> None:
     class Count:

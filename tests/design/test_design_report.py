@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import json
 import re
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import pytest
-from browser import first_picture
-from report_page import NUMBER, Page
+from browser import assert_picture_comes_first
+from report_page import NUMBER, Page, on_terminal
 from report_samples import flower
-from rich.console import Console
 from sample_robots import APR02, LEVER_MECANUM
 from syrupy.assertion import SnapshotAssertion
 
@@ -53,10 +51,7 @@ def page(design: Design, folder: Path) -> Page:
 
 
 def printed(design: Design, width: int = 100) -> str:
-    console = Console(file=StringIO(), width=width, markup=False, emoji=False, highlight=False)
-    print_design(console, design)
-    assert isinstance(console.file, StringIO)
-    return console.file.getvalue()
+    return on_terminal(print_design, design, width=width)
 
 
 def plots(told: Page) -> list[dict[str, Any]]:
@@ -157,6 +152,4 @@ def test_limits_that_leave_no_equal_are_told(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_what_to_drive_stands_as_a_picture_in_the_first_900_pixels(design: Design, tmp_path: Path) -> None:
     page(design, tmp_path)
-    bottom, width = first_picture(tmp_path / "report.html")
-    assert bottom <= 900
-    assert width <= 1280
+    assert_picture_comes_first(tmp_path / "report.html")

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 from sample_robots import APR02
 from shared_results import made_once
 
-from omnibench.data.dataset import Dataset
+from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.discover.discover import discover_effects
+from omnibench.discover.fitting import Fit, fit_matrix
 from omnibench.discover.result import (
     CovariateDependence,
     Discovery,
@@ -18,6 +20,7 @@ from omnibench.discover.result import (
     Extrapolation,
     HeldOut,
 )
+from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.simulate import simulate_dataset
 
@@ -25,6 +28,7 @@ Effects = tuple[dict[str, Any], ...]
 COUPLING: Effects = ({"name": "rotation_translation_coupling", "parameters": {"kx": 0.3, "ky": -0.2}},)
 ECCENTRICITY: Effects = ({"name": "wheel_eccentricity", "parameters": {"a_a": 0.02, "b_a": 0.0}},)
 DEAD_ZONE: Effects = ({"name": "wheel_dead_zone", "parameters": {"c": 0.03}},)
+SMALL = {"directions_deg": [0, 120, 240], "turn_rates": [-0.35, 0.35], "ramp": 0.3}  # commands, of which few runs come
 DELAY: Effects = ({"name": "reference_time_offset", "parameters": {"tau": 0.06}},)
 
 
@@ -46,6 +50,12 @@ def flower(effects: Effects = COUPLING, **changes: Any) -> dict[str, Any]:
 def simulated(effects: Effects = COUPLING, **changes: Any) -> Dataset:
     """A simulated data set with hidden effects."""
     return simulate_dataset(FlowerConfig.model_validate(flower(effects, **changes))).dataset
+
+
+def plain_fit(dataset: Dataset, runs: Sequence[Trajectory] | None = None) -> Fit:
+    """The plain matrix fitted to runs of a data set, by default to those that train."""
+    fitted = usable_runs(dataset.split("train") if runs is None else runs)
+    return fit_matrix(fitted, dataset.robot, dataset.sample_period, dataset.robot.inverse_kinematic_matrix)
 
 
 def shorn(dataset: Dataset, **values: Any) -> Dataset:

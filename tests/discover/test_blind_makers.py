@@ -8,13 +8,11 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 from hidden.absorbed import ABSORBED
-from hidden.disturbances import PLAIN
 from hidden.experiment import DESIGNS, RAMP, ROBOT, SAMPLE, Command, Run, plan, true_matrix
 from hidden.form import Form, Make
 from hidden.forms import FORMS
 from hidden.motion import Correction, Grid
 from hidden.sets import LEVELS, make_set
-from hidden.signature import Sight
 
 from omnibench.robot.effects.effect import make_term
 from omnibench.robot.kinematics import Array
@@ -30,8 +28,8 @@ RUNS = plan(DESIGNS["sessions"], np.random.default_rng(2))[:180:6]
 BEHIND = {"acceleration_slip": 0.05 / RAMP, "load_transfer": 0.05 / RAMP}
 
 
-def values_of(form: Form, factor: float = 1.0) -> dict[str, float]:
-    return form.scaled(form.direction(np.random.default_rng(3)), factor)
+def values_of(form: Form) -> dict[str, float]:
+    return form.scaled(form.direction(np.random.default_rng(3)), 1.0)
 
 
 def poses_of(grid: Grid, make: Make, values: Mapping[str, float]) -> Array:
@@ -41,11 +39,6 @@ def poses_of(grid: Grid, make: Make, values: Mapping[str, float]) -> Array:
 @pytest.fixture(scope="module")
 def grid() -> Grid:
     return Grid(RUNS, MATRIX)
-
-
-@pytest.fixture(scope="module")
-def sight() -> Sight:
-    return Sight(RUNS, MATRIX, PLAIN.known(MATRIX))
 
 
 def log_of(grid: Grid, index: int, poses: Array) -> WheelLog:

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from io import StringIO
 from pathlib import Path
 
 import pytest
-from discovery_samples import held_out, named, nothing
+from discovery_samples import held_out, shorn
 from hidden.session_sets import session_set
-from report_page import Page
-from rich.console import Console
+from report_page import Page, on_terminal
 from shared_results import made_once
 
 from omnibench.cli.terminal.discovery_summary import print_discovery
 from omnibench.data.dataset import Dataset
 from omnibench.discover.discover import discover_effects
-from omnibench.discover.output import DiscoverOptions, write_discovery
 from omnibench.discover.report.discovery_report import discovery_report
 from omnibench.discover.report.tables import VERDICTS, verdict_in_words
 from omnibench.discover.result import Discovery, discovery_document
@@ -34,9 +31,7 @@ def page(found: Discovery) -> Page:
 
 
 def printed(found: Discovery) -> str:
-    output = StringIO()
-    print_discovery(Console(width=80, file=output), found, Path("found"))
-    return output.getvalue()
+    return on_terminal(print_discovery, found, Path("found"))
 
 
 def test_nothing_is_not_said_to_be_missing_where_the_held_out_session_has_other_wheels() -> None:
@@ -51,10 +46,7 @@ def test_nothing_is_not_said_to_be_missing_where_the_held_out_session_has_other_
 
 @pytest.mark.slow
 def test_nothing_is_not_said_to_be_missing_where_sessions_cannot_be_compared() -> None:
-    dataset = session_set("small", 3, change=0.02)
-    found = discover_effects(
-        replace(dataset, trajectories=tuple(replace(t, command=None) for t in dataset.trajectories))
-    )
+    found = discover_effects(shorn(session_set("small", 3, change=0.02), command=None))
     assert found.verdict == "none"
     assert "Whether the sessions differ cannot be said: no session repeats a command" in found.headline
     told, report = printed(found), page(found).text
@@ -76,9 +68,7 @@ def test_a_change_of_the_radii_closes_the_gap_to_the_held_out_session() -> None:
 
 
 def test_sessions_that_both_train_give_tyre_wear_its_name() -> None:
-    dataset = session_set("small", 3, change=0.02)
-    both = tuple(replace(run, split="train") for run in dataset.trajectories)
-    found = discover_effects(replace(dataset, trajectories=both))
+    found = discover_effects(shorn(session_set("small", 3, change=0.02), split="train"))
     assert [effect.name for effect in found.effects] == ["tyre_wear"]
     assert found.verdict == "named"
     assert found.sessions.differences == ()
@@ -107,18 +97,6 @@ def test_without_repetitions_in_a_session_the_runs_of_another_are_none() -> None
     assert found.noise.source == "within runs"
     assert "no session repeats a command" in found.noise.description
     assert all(held.eq6.floor is None for held in found.held_out)
-
-
-def test_where_nothing_was_added_programs_are_offered_no_extended_calibration(tmp_path: Path) -> None:
-    found = nothing()
-    assert discovery_document(found, tmp_path)["model"] is None
-    options = DiscoverOptions(dataset="data")
-    write_discovery(named(), options, tmp_path / "found")
-    assert (tmp_path / "found" / "model.yaml").exists()
-    write_discovery(found, options, tmp_path / "found")
-    assert not (tmp_path / "found" / "model.yaml").exists()
-    assert "model.yaml" not in page(found).text
-    assert (tmp_path / "found" / "plain.yaml").exists()
 
 
 def test_of_one_run_nothing_is_held_out_and_there_is_no_floor() -> None:

@@ -16,7 +16,8 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
-from job_samples import IMPORTING_THIS, wait_for
+from job_samples import IMPORTING_THIS
+from timing import until
 
 from omnibench.errors import OmnibenchError
 from omnibench.jobs.backend_choice import BackendChoice, open_backend
@@ -56,7 +57,7 @@ def scheduler(
     host = ("--host", "tls://127.0.0.1") if "--tls-ca-file" in arguments else ("--host", "127.0.0.1")
     started = program(log, "scheduler", *host, "--port", "0", "--no-dashboard", *arguments, environment=environment)
     with started as process:
-        wait_for(lambda: re.search(r"Scheduler at: +(\S+)", log.read_text()))
+        until(lambda: re.search(r"Scheduler at: +(\S+)", log.read_text()), "the scheduler")
         found = re.search(r"Scheduler at: +(\S+)", log.read_text())
         yield found[1], process
 
@@ -69,7 +70,7 @@ def worker(
     folder.mkdir(exist_ok=True)
     log, kind = folder / "worker.log", ("--nthreads", "1", "--no-dashboard", "--local-directory", str(folder))
     with program(log, "worker", address, *kind, *arguments, environment=environment) as process:
-        wait_for(lambda: "Registered to:" in log.read_text())
+        until(lambda: "Registered to:" in log.read_text(), "the worker to join")
         yield process
 
 

@@ -5,13 +5,10 @@ from __future__ import annotations
 import multiprocessing
 import os
 import sys
-import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-from timing import PATIENCE
 
 from omnibench.jobs.job import Backend, Failure, Job, JobWatch, ResultStore, run_jobs
 from omnibench.progress import Progress, Reporter
@@ -81,14 +78,6 @@ def tried(folder: Path, name: str) -> int:
 def squared(number: int, report: Reporter) -> Answer:
     report(Progress("squaring", number))
     return Answer(number * number, os.getpid(), os.environ.get("OPENBLAS_NUM_THREADS"))
-
-
-def wait_for(happened: Callable[[], object]) -> None:
-    """Wait for an event."""
-    deadline = time.monotonic() + PATIENCE
-    while not happened():
-        assert time.monotonic() < deadline, "it did not happen"
-        time.sleep(0.05)
 
 
 # For programs that import the modules here.

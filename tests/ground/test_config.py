@@ -63,11 +63,6 @@ def complaint(path: Path) -> str:
     return message.removeprefix(f"{path}: ")
 
 
-def test_a_document_is_read_into_its_model(written) -> None:
-    robot = read_model(Robot, written("title: APR-02\nwheels: [{radius: 0.148}]\n"))
-    assert (robot.title, robot.wheels[0].radius) == ("APR-02", 0.148)
-
-
 @pytest.mark.parametrize(
     ("text", "parts"),
     [

@@ -25,8 +25,8 @@ from commands import (
     write_plugin,
 )  # fmt: skip
 from dask_samples import certificates, program, refusal, scheduler, searched_first, worker
-from job_samples import IMPORTING_THIS, Answer, Notes, jobs_of, wait_for
-from timing import PATIENCE
+from job_samples import IMPORTING_THIS, Answer, Notes, jobs_of
+from timing import PATIENCE, until
 
 import omnibench as package
 from omnibench.jobs import dask_backend
@@ -199,10 +199,10 @@ def test_when_the_client_is_killed_its_jobs_end_and_it_goes_on_when_started_agai
     command = [sys.executable, "-c", CLIENT, address, str(tmp_path)]
     with worker(address, tmp_path / "worker"):
         client = subprocess.Popen(command, env=IMPORTING_THIS)
-        wait_for((tmp_path / "alive").exists)
+        until((tmp_path / "alive").exists, "the jobs to begin")
         client.kill()
         client.wait()
-        wait_for(lambda: time.time() - (tmp_path / "alive").stat().st_mtime > 1)
+        until(lambda: time.time() - (tmp_path / "alive").stat().st_mtime > 1, "the jobs to end")
         (tmp_path / "go_on").touch()
         subprocess.run(command, env=IMPORTING_THIS, check=True, timeout=PATIENCE)
     assert len(list((tmp_path / "store").glob("*.json"))) == 5
@@ -211,7 +211,7 @@ def test_when_the_client_is_killed_its_jobs_end_and_it_goes_on_when_started_agai
 def test_ctrl_c_in_a_terminal_is_left_to_the_client(tmp_path: Path) -> None:
     command = [sys.executable, "-c", CLIENT, "dask", str(tmp_path)]
     client = subprocess.Popen(command, env=IMPORTING_THIS, stderr=subprocess.PIPE, text=True, start_new_session=True)
-    wait_for((tmp_path / "alive").exists)
+    until((tmp_path / "alive").exists, "the jobs to begin")
     os.killpg(client.pid, signal.SIGINT)  # a terminal sends it to all of its processes
     assert client.communicate(timeout=PATIENCE)[1] == "interrupted\n"
 
@@ -220,7 +220,7 @@ def test_a_scheduler_that_is_killed_is_one_line(tmp_path: Path) -> None:
     with scheduler(tmp_path) as (place, process), worker(place, tmp_path / "worker"):
         command = [sys.executable, "-c", CLIENT, place, str(tmp_path)]
         client = subprocess.Popen(command, env=IMPORTING_THIS, stderr=subprocess.PIPE, text=True)
-        wait_for((tmp_path / "alive").exists)
+        until((tmp_path / "alive").exists, "the jobs to begin")
         process.kill()
         told = client.communicate(timeout=PATIENCE)[1]
     assert told == f"the Dask scheduler {place} is lost; start it again, then the same command\n"

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from multiprocessing import forkserver
 from pathlib import Path
@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
-from job_samples import IMPORTING_THIS, Answer, Notes, jobs_of, run, squared, tried, wait_for
-from timing import PATIENCE
+from commands import alive
+from job_samples import IMPORTING_THIS, Answer, Notes, jobs_of, run, squared, tried
+from timing import PATIENCE, until
 
 import omnibench.jobs.job_process as job_process
 from omnibench.errors import DataError
@@ -214,10 +215,7 @@ def test_what_a_job_started_ends_with_it(end: str, tmp_path: Path) -> None:
         run_jobs([job], ResultStore(tmp_path / "store", Answer), Processes(1), notes)
         assert isinstance(notes.endings[0], Answer) == (end == "answer")
     state = Path(f"/proc/{file.read_text()}/stat")
-    deadline = time.monotonic() + PATIENCE
-    while state.exists() and " Z " not in state.read_text():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    until(lambda: not state.exists() or " Z " in state.read_text(), "what the job started to end")
 
 
 def processes_of(notes: Notes) -> list[int]:
@@ -274,23 +272,23 @@ def slowly(seconds: float, _: Reporter) -> Answer:
     return Answer(0, os.getpid())
 
 
+LEFT: dict[str, Callable[[], object]] = {
+    "variable": lambda: os.environ.update(LEFT="behind"),
+    "handler": lambda: signal.signal(signal.SIGUSR1, signal.SIG_IGN),
+    "thread": lambda: threading.Thread(target=time.sleep, args=(60,), daemon=True).start(),
+    "child": lambda: subprocess.Popen(["sleep", "60"]),
+    "folder": lambda: os.chdir("/"),
+    "error": lambda: wrong(0, print),
+    "nothing": lambda: None,
+}
+
+
 def leaves_behind(what: str, _: Reporter) -> Answer:
-    if what == "variable":
-        os.environ["LEFT"] = "behind"
-    elif what == "handler":
-        signal.signal(signal.SIGUSR1, signal.SIG_IGN)
-    elif what == "thread":
-        threading.Thread(target=time.sleep, args=(60,), daemon=True).start()
-    elif what == "child":
-        subprocess.Popen(["sleep", "60"])
-    elif what == "folder":
-        os.chdir("/")
-    elif what == "error":
-        raise DataError("wrong")
+    LEFT[what]()
     return Answer(0, os.getpid())
 
 
-@pytest.mark.parametrize("what", ["variable", "handler", "thread", "child", "folder", "error", "nothing"])
+@pytest.mark.parametrize("what", LEFT)
 def test_what_a_job_leaves_ends_its_process(what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(job_process, "_YOUNG", PATIENCE)
     first = Job("first", leaves_behind, what)
@@ -406,10 +404,19 @@ def test_a_waiting_process_that_is_killed_costs_no_job_a_try(one_process: Backen
     data = np.ones(3)
     ((_, process, _),) = gathered(one_process, total, [(0, data)], shared=(data,))
     os.kill(process, signal.SIGKILL)
-    wait_for(lambda: not psutil.pid_exists(process) or psutil.Process(process).status() == psutil.STATUS_ZOMBIE)
+    until(lambda: not psutil.pid_exists(process) or psutil.Process(process).status() == psutil.STATUS_ZOMBIE, "its end")
     ((result, other, _),) = gathered(one_process, total, [(1, data)], shared=(data,))
     assert result == 4
     assert other != process
+
+
+def surroundings(_: object, __: Reporter) -> list[str]:
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
+    return [*map(os.environ.__getitem__, names), signal.getsignal(signal.SIGINT).name]
+
+
+def test_a_job_has_one_thread_and_leaves_ctrl_c_to_its_parent(one_process: Backend) -> None:
+    assert gathered(one_process, surroundings, [0]) == [["1", "1", "1", "1", "SIG_IGN"]]
 
 
 def wrong(number: int, _: Reporter) -> int:
@@ -535,7 +542,7 @@ def little_memory_group() -> Iterator[Path]:
     except OSError:
         pytest.skip("needs the right to make a control group (version 1)")
     yield group
-    wait_for(lambda: not (group / "cgroup.procs").read_text())
+    until(lambda: not (group / "cgroup.procs").read_text(), "the processes of the group to end")
     group.rmdir()
 
 
@@ -568,23 +575,15 @@ def until_told(folder: Path, _: Reporter) -> Answer:
     return Answer(count)
 
 
-def alive(session: int) -> list[str]:
-    """Commands of the processes of a session that have not ended."""
-    listed = subprocess.run(
-        ["ps", "-o", "stat=,args=", "-s", str(session)], capture_output=True, text=True, check=False
-    )
-    return [line for line in listed.stdout.splitlines() if not line.startswith("Z")]
-
-
 @pytest.mark.slow
 def test_when_the_parent_is_killed_no_worker_is_left_and_nothing_that_ended_is_run_again(tmp_path: Path) -> None:
     command = [sys.executable, "-c", PROGRAM, str(tmp_path)]
     parent = subprocess.Popen(command, env=IMPORTING_THIS, start_new_session=True)
     results = tmp_path / "results"
-    wait_for(lambda: len(list(results.glob("*.json"))) == 3 and (tmp_path / "waits").exists())
+    until(lambda: len(list(results.glob("*.json"))) == 3 and (tmp_path / "waits").exists(), "three jobs to end")
     parent.kill()
     parent.wait()
-    wait_for(lambda: not alive(parent.pid))
+    until(lambda: not alive(parent.pid), "the workers to end")
     before = {file.name: file.stat().st_mtime_ns for file in results.iterdir()}
     assert set(before) == {"first.json", "second.json", "third.json"}
     (tmp_path / "go_on").touch()

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import ROOT, python
+from commands import ROOT
 from start_up import NUMPY, PACKAGE, ratio
 
 import omnibench
@@ -115,11 +115,6 @@ def test_a_result_in_the_place_of_what_it_holds_is_told_where_that_lies() -> Non
 def test_one_folder_of_plug_ins_is_not_taken_for_a_list_of_letters() -> None:
     with pytest.raises(omnibench.OmnibenchError, match="plug-in folder nowhere does not exist"):
         omnibench.load_plugins("nowhere")
-
-
-def test_importing_the_package_loads_no_heavy_library() -> None:
-    program = "import sys, omnibench; print(sorted({'numpy', 'polars', 'plotly', 'cvxpy'} & set(sys.modules)))"
-    assert python(program).stdout == "[]\n"
 
 
 def test_importing_the_package_takes_at_most_twice_as_long_as_importing_numpy() -> None:

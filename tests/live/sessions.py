@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import socket
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import count
@@ -13,7 +12,7 @@ from zlib import crc32
 
 import zenoh
 from shared_results import shared_folder
-from timing import PATIENCE
+from timing import until as until
 
 
 def free_port() -> int:
@@ -70,11 +69,3 @@ def open_loopback() -> Loopback:
     """A router on a free port."""
     port = free_port()
     return Loopback(port, raw_session("router", listen=[f"tcp/127.0.0.1:{port}"]))
-
-
-def until(condition: Callable[[], object], what: str, seconds: float = PATIENCE) -> None:
-    """Wait until ``condition`` holds; the test fails, saying ``what`` was waited for, when it does not in time."""
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, f"waited {seconds} s in vain for {what}"
-        time.sleep(0.005)

@@ -4,25 +4,24 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import plotly.graph_objects as go
 import polars as pl
 import pytest
 from commands import CONFIGS, compared_here, prepare
 from pydantic import BaseModel
+from recording_samples import with_a_tape
 from shared_results import shared_folder
 from timing import PATIENCE
 from wheeled_samples import CAR, DIFF, SWERVE, TRICYCLE
 
 import omnibench
 from omnibench.cli.handbook_topics import HANDBOOK
-from omnibench.data.dataset import Dataset, Split, Trajectory, make_dataset
-from omnibench.data.references import Reference, References
+from omnibench.data.dataset import Dataset
 from omnibench.robot.calibration import read_calibration
 from omnibench.robot.kinematics import Robot
 from omnibench.views import Shown, brief
@@ -133,18 +132,8 @@ def test_long_values_are_shortened_and_many_fields_are_counted() -> None:
 
 
 def test_an_evaluation_of_runs_without_poses_shows_the_errors_that_there_are() -> None:
-    robot, rolled = DIFF, np.linspace(0.0, 10.0, 101)[1:]
-    signals = robot.signal_equations @ np.array([0.3, 0.0, 0.0])
-    runs = []
-    for index in range(4):
-        tape = Reference("distance", 3.0 + 0.01 * index, 0.01)
-        references = References.of([tape], rolled[-1])
-        rates = np.tile(signals, (100, 1))
-        split: Split = "train" if index < 3 else "validation"
-        runs.append(
-            Trajectory(f"run{index}", split, rolled, rates, np.zeros(1), np.zeros((1, 3)), references=references)
-        )
-    dataset = make_dataset("tape", robot, 0.1, runs)
+    recorded = result("dataset")
+    dataset = replace(recorded, trajectories=tuple(map(with_a_tape, recorded.trajectories)))
     evaluation = omnibench.evaluate(omnibench.calibrate(dataset).calibration, dataset)
     assert "mean position error" in repr(evaluation)
     assert "heading error" not in repr(evaluation)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import plotly.graph_objects as go
 import pytest
+from browser import chromium
 
 from omnibench.errors import DataError
 from omnibench.report.blocks import Choice, Details, Document, Figure, FigureGrid, LegendItem, Section
@@ -38,10 +39,7 @@ def test_figures_of_one_name_are_numbered() -> None:
 
 
 def test_every_figure_is_written_as_svg_and_png_with_titles_and_legend(tmp_path: Path) -> None:
-    try:
-        browser()
-    except DataError:
-        pytest.skip("no Chromium on this machine to draw figures with")
+    chromium()
     names = write_figures(document(), tmp_path / "figures")
     assert len(names) == 3
     assert sorted(file.name for file in (tmp_path / "figures").iterdir()) == sorted(
@@ -56,10 +54,7 @@ def test_every_figure_is_written_as_svg_and_png_with_titles_and_legend(tmp_path:
 
 @pytest.mark.slow
 def test_a_figure_of_a_megabyte_is_written(tmp_path: Path) -> None:
-    try:
-        browser()
-    except DataError:
-        pytest.skip("no Chromium on this machine to draw figures with")
+    chromium()
     dots = go.Scatter(x=list(range(6000)), y=[1] * 6000, mode="markers")
     grids = (FigureGrid((Figure("many dots", plot(dots), "many dots", 200),), (), 1, "", "dots"),)
     assert write_figures(Document("A report", "", (Section("a", "Answer", grids),)), tmp_path / "figures") == ["dots"]

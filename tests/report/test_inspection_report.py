@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import first_picture
+from browser import assert_picture_comes_first
 from recording_samples import sample
 from report_page import Page
 from syrupy.assertion import SnapshotAssertion
@@ -102,9 +102,7 @@ def test_every_parameter_has_its_precision(recorded: Dataset, report: Page) -> N
 
 @pytest.mark.slow
 def test_the_paths_stand_in_the_first_900_pixels(file: Path) -> None:
-    bottom, width = first_picture(file)
-    assert bottom <= 900
-    assert width <= 1280
+    assert_picture_comes_first(file)
 
 
 def test_runs_that_are_all_alike_leave_motions_open(recorded: Dataset, tmp_path: Path) -> None:

@@ -11,12 +11,11 @@ import numpy as np
 import yaml
 from commands import ROOT
 from sample_robots import APR_02, DIFFERENTIAL
+from wheeled_recordings import path
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.storage import save_dataset
 from omnibench.robot.kinematics import Array, Robot, wheel_equations
-from omnibench.study.config import StudyConfig
-from omnibench.study.study import read_study_config
 
 PERIOD, SAMPLES = 0.1, 40
 TWISTS = {
@@ -30,10 +29,10 @@ METHODS: tuple[dict[str, Any], ...] = (
 )
 
 
-def robot_dataset(robot: Robot, name: str, seed: int, spoil: float = 0.05) -> Dataset:
-    """Two kinds of path in three sessions each, two commands each, driven twice; every wheel is off by ``spoil``."""
+def robot_dataset(robot: Robot, name: str, seed: int) -> Dataset:
+    """Two kinds of path in three sessions each, two commands each, driven twice; every wheel is 5 % off."""
     rng = np.random.default_rng(seed)
-    shares = 1 + spoil * rng.choice([-1.0, 1.0], len(robot.wheels))
+    shares = 1 + 0.05 * rng.choice([-1.0, 1.0], len(robot.wheels))
     runs: list[Trajectory] = []
     for kind, twists in TWISTS.items():
         for session in range(3):
@@ -52,13 +51,7 @@ def _run(robot: Robot, shares: Array, twist: Array, rng: np.random.Generator, na
     times = PERIOD * np.arange(1, SAMPLES + 1)
     rates = np.tile(wheel_equations(robot.wheels) @ twist / shares, (SAMPLES, 1))
     stamps = np.append(0.0, times[9::10])
-    heading = twist[2] * stamps
-    turn = np.where(np.abs(heading) > 1e-9, heading, 1.0)
-    along = np.where(np.abs(heading) > 1e-9, np.sin(turn) / turn, 1.0)
-    aside = np.where(np.abs(heading) > 1e-9, (1 - np.cos(turn)) / turn, 0.0)
-    way = stamps[:, None] * np.column_stack(
-        [along * twist[0] - aside * twist[1], aside * twist[0] + along * twist[1], np.full(len(stamps), twist[2])]
-    )
+    way = path(np.tile(PERIOD * twist, (SAMPLES, 1)))[::10]
     poses = way + rng.normal(0.0, 0.003, way.shape) * (stamps > 0)[:, None]
     return Trajectory(name, "train", times, rates, stamps, poses)
 
@@ -85,8 +78,3 @@ def write_study(folder: Path, change: Callable[[dict[str, Any]], None] | None = 
     file = folder / "study.yaml"
     file.write_text(yaml.safe_dump(config))
     return file
-
-
-def study_config(folder: Path, change: Callable[[dict[str, Any]], None] | None = None) -> StudyConfig:
-    """The same as a config that was read."""
-    return read_study_config(write_study(folder, change))

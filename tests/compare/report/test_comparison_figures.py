@@ -57,31 +57,25 @@ def test_a_command_is_described_as_the_paper_writes_it() -> None:
     assert describe(trajectory) == f"(0.2 m/s, 30°, 0.35 rad/s), {trajectory.id}"
 
 
-@pytest.fixture(scope="module")
-def view():
-    (found,) = views(usual())
-    return found
+def test_the_design_values_are_no_search() -> None:
+    assert {course.run.record.label for course in courses(usual_view())} == {"closed_form", "random_search"}
 
 
-def test_the_design_values_are_no_search(view) -> None:
-    assert {course.run.record.label for course in courses(view)} == {"closed_form", "random_search"}
-
-
-def test_a_course_ends_with_the_answer(view) -> None:
-    for course in courses(view):
+def test_a_course_ends_with_the_answer() -> None:
+    for course in courses(usual_view()):
         assert course.costs[-1] == pytest.approx(course.run.record.train_cost, rel=1e-12)
         assert course.evaluations[-1] == course.run.record.evaluations
 
 
-def test_the_exact_optimum_reaches_every_target(view) -> None:
-    exact = [course for course in courses(view) if course.run.record.label == "closed_form"]
+def test_the_exact_optimum_reaches_every_target() -> None:
+    exact = [course for course in courses(usual_view()) if course.run.record.label == "closed_form"]
     times, share = targets_reached(exact, 1, "evaluations")
     assert share[-1] == 1.0
     assert (np.diff(times) >= 0).all()
 
 
-def test_targets_are_counted_by_hand_for_a_random_search(view) -> None:
-    course = next(course for course in courses(view) if course.run.record.label == "random_search")
+def test_targets_are_counted_by_hand_for_a_random_search() -> None:
+    course = next(course for course in courses(usual_view()) if course.run.record.label == "random_search")
     _, share = targets_reached([course], 1, "evaluations")
     lowest = course.costs.min() / course.best_known - 1
     assert len(share) == np.count_nonzero(lowest <= TARGETS)

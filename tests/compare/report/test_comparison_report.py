@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import first_picture, opened
-from recording_samples import sample
+from browser import assert_picture_comes_first, opened
+from recording_samples import sample, with_a_tape
 from report_page import NUMBER, Page
 from report_samples import config, flower, page, run, statistics, usual
 from sample_robots import APR02, LEVER_MECANUM
@@ -21,8 +21,7 @@ from syrupy.assertion import SnapshotAssertion
 from omnibench.compare.plan import load_datasets
 from omnibench.compare.report.comparison_report import comparison_document
 from omnibench.compare.result import ComparisonResult
-from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.data.references import Reference, References
+from omnibench.data.dataset import Dataset, make_dataset
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.fit.problem import Improvement
 from omnibench.fit.ratio_intervals import Interval
@@ -221,13 +220,6 @@ def test_of_runs_whose_lengths_alone_are_known_no_heading_error_is_stated(told: 
     assert report.row("Error of the final pose, held-out runs", "closed_form")[3:] == ["–", "–"]
 
 
-def with_a_tape(run_: Trajectory) -> Trajectory:
-    """A run of which only the length of its way is known."""
-    length = float(np.hypot(*np.diff(run_.poses[:, :2], axis=0).T).sum())
-    references = References.of([Reference("distance", length, 0.003)], float(run_.times[-1]))
-    return replace(run_, pose_times=np.zeros(1), poses=np.zeros((1, 3)), references=references)
-
-
 def test_the_design_values_lead_the_tables_even_if_no_entry_asks_for_them(report: Page, told: Render) -> None:
     unasked = told(calibrators=["closed_form"])
     for caption in (TRAINING, HELD_OUT):
@@ -325,6 +317,4 @@ def test_a_browser_draws_every_plot_and_finds_no_fault(result: ComparisonResult,
 @pytest.mark.slow
 def test_the_paths_before_and_after_stand_in_the_first_900_pixels(result: ComparisonResult, tmp_path: Path) -> None:
     write_document(comparison_document(result), tmp_path / "report.html")
-    bottom, width = first_picture(tmp_path / "report.html")
-    assert bottom <= 900
-    assert width <= 1280
+    assert_picture_comes_first(tmp_path / "report.html")

@@ -8,15 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from discovery_samples import DEAD_ZONE, Effects, look_alike, simulated
+from discovery_samples import DEAD_ZONE, Effects, look_alike, plain_fit, simulated
 from wheeled_samples import DIFF, SWERVE, TRICYCLE, driven
 
 from omnibench.data.splits import joined
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.experiments import Choice, Members, Separation, candidate_runs, choose_runs, description_of
-from omnibench.discover.fitting import Fit, fit_matrix
+from omnibench.discover.fitting import Fit
 from omnibench.discover.selection.evidence import DISCREPANCY, log_evidence
-from omnibench.fit.trajectory_fit import Whitened, usable_runs
+from omnibench.fit.trajectory_fit import Whitened
 from omnibench.registry import effects
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.simulate.config import FlowerConfig
@@ -24,12 +24,6 @@ from omnibench.simulate.simulate import simulate_dataset
 from omnibench.simulate.source import read_simulation
 
 CREEP: Effects = ({"name": "coulomb_creep", "parameters": {"c": 0.022}},)
-
-
-def fit_of(robot: Robot) -> Fit:
-    """The plain matrix fitted to runs of a robot."""
-    runs = usable_runs(driven(robot).split("train"))
-    return fit_matrix(runs, robot, 0.1, robot.inverse_kinematic_matrix)
 
 
 def proposed(folder: Path) -> FlowerConfig:
@@ -68,7 +62,7 @@ def test_whichever_of_the_look_alikes_is_right_is_named_after_the_proposed_runs(
 
 @pytest.mark.parametrize("robot", [DIFF, TRICYCLE, SWERVE], ids=lambda robot: robot.name)
 def test_candidates_are_no_faster_and_steer_no_farther_than_what_was_recorded(robot: Robot) -> None:
-    fit = steered_half(fit_of(robot))
+    fit = steered_half(plain_fit(driven(robot)))
     candidates = candidate_runs(fit, [effects.create("heading_drift")])
     assert len({candidate.timed.command.speed for candidate in candidates}) > 2
     assert any(candidate.timed.command.turn_rate for candidate in candidates)
@@ -87,7 +81,7 @@ def steered_half(fit: Fit) -> Fit:
 
 
 def test_headings_matter_only_to_effects_that_depend_on_them() -> None:
-    fit = fit_of(DIFF)
+    fit = plain_fit(driven(DIFF))
     headings = {
         name: {candidate.run.start[2] for candidate in candidate_runs(fit, [effects.create(name)])}
         for name in ("heading_drift", "floor_drift")
@@ -97,7 +91,7 @@ def test_headings_matter_only_to_effects_that_depend_on_them() -> None:
 
 
 def test_steering_is_turned_within_a_run_where_its_play_is_in_doubt() -> None:
-    fit = fit_of(TRICYCLE)
+    fit = plain_fit(driven(TRICYCLE))
     steady, weaving = (
         candidate_runs(fit, [effects.create(name)])[0].run.steering for name in ("heading_drift", "steering_play")
     )

@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import pytest
-from discovery_samples import APR02, shorn, simulated
+from discovery_samples import APR02, plain_fit, shorn, simulated
 from hidden.sets import make_set
 
-from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.discover.fitting import Fit, fit_matrix, paths_of
+from omnibench.discover.fitting import Fit, paths_of
 from omnibench.discover.regressors.fine_structure import fine_structure
 from omnibench.discover.regressors.significance import Significance
-from omnibench.fit.trajectory_fit import usable_runs
 
 CHANCE = 0.002
-
-
-def fit_of(runs: Sequence[Trajectory], dataset: Dataset) -> Fit:
-    return fit_matrix(usable_runs(runs), dataset.robot, dataset.sample_period, dataset.robot.inverse_kinematic_matrix)
 
 
 def found_in(fit: Fit) -> Significance:
@@ -31,7 +23,7 @@ def found_in(fit: Fit) -> Significance:
 def found_beside(kind: str, seed: int) -> Significance:
     """Fine structure that the plain matrix leaves in 180 runs with something of a non-centrality of 300."""
     dataset, _ = make_set("outside", kind, 300.0, seed)
-    return found_in(fit_of(dataset.split("train"), dataset))
+    return found_in(plain_fit(dataset))
 
 
 @pytest.mark.parametrize(
@@ -74,7 +66,7 @@ def test_a_belt_is_seen_at_the_number_of_times_that_it_turns_with_its_wheel() ->
 
 def test_without_absolute_angles_of_the_wheels_none_of_their_waves_are_looked_for() -> None:
     dataset = shorn(simulated(), angles=None)
-    groups = found_in(fit_of(dataset.split("train"), dataset)).groups
+    groups = found_in(plain_fit(dataset)).groups
     assert not any(group.name == "wheel angle" for group in groups)
 
 
@@ -84,18 +76,18 @@ def test_without_absolute_angles_of_the_wheels_none_of_their_waves_are_looked_fo
 def test_where_nothing_is_missing_no_fine_structure_is_surer_than_chance_however_few_runs(commands: int) -> None:
     dataset, _ = make_set("null", "", 0.0, 1003, design="small")
     kept = sorted({run.command or "" for run in dataset.trajectories})[:commands]
-    found = found_in(fit_of([run for run in dataset.split("train") if run.command in kept], dataset))
+    found = found_in(plain_fit(dataset, [run for run in dataset.split("train") if run.command in kept]))
     assert found.p_value(found.best) > CHANCE
 
 
 def test_few_runs_have_no_fine_structure() -> None:
     dataset = simulated()
-    assert fine_structure(fit_of(dataset.split("train")[:14], dataset), np.random.default_rng(0)) is None
+    assert fine_structure(plain_fit(dataset, dataset.split("train")[:14]), np.random.default_rng(0)) is None
 
 
 def test_a_wave_scores_as_its_slopes_do_where_the_tracked_point_is_off_the_robots_centre() -> None:
     dataset = simulated(robot=APR02 | {"mount": {"x": 0.2, "y": -0.1, "yaw": 0.3}})
-    fit = fit_of(dataset.split("train"), dataset)
+    fit = plain_fit(dataset)
     found, paths = found_in(fit), paths_of(fit, 0.0)
     number = next(row for row, group in enumerate(found.groups) if group.name == "heading")  # once a turn
     heading = paths.middle[:, 2]

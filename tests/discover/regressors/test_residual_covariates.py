@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 from config_robots import NAMES as NAMES_OF_ROBOTS
 from config_robots import settings as settings_of
-from discovery_samples import DELAY, ECCENTRICITY, lagging, nothing, simulated
+from discovery_samples import DELAY, ECCENTRICITY, lagging, nothing, plain_fit, simulated
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from recording_samples import in_room
 from scipy.stats import binomtest, chi2
 from screening_samples import FIRST, SECOND, THIRD, screening
 
 from omnibench.config import validate
 from omnibench.discover.discover import discover_effects
-from omnibench.discover.fitting import Fit, fit_matrix, paths_of
+from omnibench.discover.fitting import Fit, paths_of
 from omnibench.discover.regressors.paths import slopes_by
 from omnibench.discover.regressors.significance import Family, Group, Significance, significance_of, together
 from omnibench.discover.report.residuals import EXTENDED, NORMAL_95, PLAIN, Residuals, shares
@@ -25,6 +26,7 @@ from omnibench.fit.trajectory_fit import Whitened, usable_runs
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import ActuatorEffect, make_term
 from omnibench.robot.model import OdometryModel
+from omnibench.robot.odometry import WheelLog
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.simulate import simulate_dataset
 
@@ -54,18 +56,12 @@ def test_an_eccentric_wheel_shows_its_amplitude_before_and_nothing_after(eccentr
 
 def test_a_late_reference_shows_its_delay_in_every_run(eccentric: Residuals) -> None:
     paths = eccentric.paths
-    velocity = np.concatenate(
-        [
-            np.column_stack(
-                [
-                    (np.interp(log.stamps + 0.05, [0, *log.times], path[:, axis])
-                     - np.interp(log.stamps - 0.05, [0, *log.times], path[:, axis])) / 0.1
-                    for axis in range(3)
-                ]
-            )
-            for log, path in zip(paths.logs, paths.ends, strict=True)
-        ]
-    )  # fmt: skip
+
+    def seen(log: WheelLog, path: np.ndarray, later: float) -> np.ndarray:
+        return np.column_stack([np.interp(log.stamps + later, [0, *log.times], axis) for axis in path.T])
+
+    ways = zip(paths.logs, paths.ends, strict=True)
+    velocity = np.concatenate([(seen(log, path, 0.05) - seen(log, path, -0.05)) / 0.1 for log, path in ways])
     fitted = eccentric.fit_runs(-velocity[:, :, None])
     assert (fitted.values[:, PLAIN.index] > 0).mean() > 0.9
     assert np.median(fitted.values[:, PLAIN.index]) > 0.01  # of 0.06: the matrix takes up much
@@ -90,33 +86,15 @@ def test_residuals_are_as_seen_from_the_start_wherever_that_is() -> None:
     found = nothing()
     rng = np.random.default_rng(4)
     moves = {name: rng.uniform(-3, 3, 3) for name in found.trajectories}
-    dataset = replace(
-        found.dataset,
-        trajectories=tuple(
-            replace(run, poses=moved(run.poses, moves[run.id])) for run in found.dataset.trajectories if run.id in moves
-        ),
-    )
-    before = tuple(
-        moved(own, np.array([0.0, 0.0, moves[name][2]]), turn=False)
-        for name, own in zip(found.trajectories, found.before, strict=True)
-    )
+    runs = [run for run in found.dataset.trajectories if run.id in moves]
+    moved = tuple(replace(run, poses=in_room(moves[run.id], run.poses)) for run in runs)
+    dataset = replace(found.dataset, trajectories=moved)
+    turns = [np.array([0.0, 0.0, moves[name][2]]) for name in found.trajectories]
+    before = tuple(in_room(turn, own) - turn for turn, own in zip(turns, found.before, strict=True))
     here, there = Residuals(found).commands, Residuals(replace(found, dataset=dataset, before=before)).commands
     for one, other in zip(here, there, strict=True):
         np.testing.assert_allclose(other.end, one.end, atol=1e-9)
         np.testing.assert_allclose(other.means[0], one.means[0], atol=1e-9)
-
-
-def moved(poses: np.ndarray, move: np.ndarray, turn: bool = True) -> np.ndarray:
-    """Poses (K, 3) turned about the origin and then shifted; turn: their headings, too."""
-    x, y, angle = move
-    cosine, sine = np.cos(angle), np.sin(angle)
-    return np.column_stack(
-        [
-            x + cosine * poses[:, 0] - sine * poses[:, 1],
-            y + sine * poses[:, 0] + cosine * poses[:, 1],
-            poses[:, 2] + (angle if turn else 0.0),
-        ]
-    )
 
 
 def test_a_change_that_the_data_do_not_tell_has_no_value() -> None:
@@ -206,8 +184,7 @@ def on_robot(robot: str) -> Fit:
             "train": {"seed": 1, "distance": 1.0},
         }
         dataset = simulate_dataset(validate(FlowerConfig, given | changes, robot)).dataset
-    runs = usable_runs(dataset.split("train"))[:8]
-    return fit_matrix(runs, dataset.robot, dataset.sample_period, dataset.robot.inverse_kinematic_matrix)
+    return plain_fit(dataset, usable_runs(dataset.split("train"))[:8])
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""What the report of a discovery says."""
+"""What the report of a discovery and its ``discovery.json`` say."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from browser import first_picture
+from browser import assert_picture_comes_first
 from discovery_samples import (
     COUPLING,
     EXPERIMENT,
@@ -24,13 +24,14 @@ from discovery_samples import (
     shorn,
     simulated,
 )
-from report_page import Page
+from pydantic_core import to_json
+from report_page import NUMBER, Page
 from sample_robots import LEVER_MECANUM
 from syrupy.assertion import SnapshotAssertion
 
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.report.discovery_report import discovery_report, sure_blocks, what_blocks
-from omnibench.discover.result import Absorbed, Discovery, EstimatedParameter
+from omnibench.discover.result import Absorbed, Discovery, EstimatedParameter, NotLookedFor, discovery_document
 from omnibench.report.blocks import Document, Section
 from omnibench.report.render import render
 
@@ -148,6 +149,23 @@ def test_recorded_data_wear_no_badge_and_hostile_names_stay_words() -> None:
 @pytest.mark.parametrize("make", [named, nothing, nameless])
 def test_the_paths_stand_in_the_first_900_pixels(make: Callable[[], Discovery], tmp_path: Path) -> None:
     (tmp_path / "report.html").write_text(render(discovery_report(make(), "seed: 0\n")), encoding="utf-8")
-    bottom, width = first_picture(tmp_path / "report.html")
-    assert bottom <= 900
-    assert width <= 1280
+    assert_picture_comes_first(tmp_path / "report.html")
+
+
+def test_a_discovery_is_written_with_names_and_paths_in_the_place_of_data_and_models(
+    snapshot: SnapshotAssertion,
+) -> None:
+    effect = incomplete().effects[0]
+    shape = EstimatedParameter("length", 0.05, "m", 0.05, 0.05, shape=True)  # has no interval
+    found = replace(
+        incomplete(),
+        dataset_hash="of the whole recording",  # not of the runs without outliers
+        effects=(replace(effect, parameters=(*effect.parameters, shape)),),
+        not_looked_for=(NotLookedFor("tyre_wear", "all runs are of one session"),),
+    )
+    written = json.loads(to_json(discovery_document(found, Path("/results"))))
+    assert written["runs"] == len(found.trajectories)
+    assert written["noise"]["components"] == found.noise.noise.model_dump()
+    session, held_out = written["held_out"]["session"], found.held_out[-1]
+    assert session["position_m"] == dict(zip(("before", "after"), held_out.position_m, strict=True))
+    assert NUMBER.sub("#", json.dumps(written, indent=1)) == snapshot

@@ -6,14 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from discovery_samples import COUPLING, simulated
+from discovery_samples import COUPLING, plain_fit, simulated
 
-from omnibench.discover.fitting import Extended, Fit, extend, fit_matrix
+from omnibench.discover.fitting import Extended, Fit, extend
 from omnibench.discover.regressors.significance import Group
 from omnibench.discover.selection.competing_models import CompetingModels, averaged, competing_models
 from omnibench.discover.selection.model_selection import Selection, select_effects
 from omnibench.discover.selection.screening import screen_plain
-from omnibench.fit.trajectory_fit import usable_runs
 
 Fitted = tuple[Fit, Selection, dict[str, Group]]
 RIGHT, WRONG = "rotation_translation_coupling", "acceleration_slip"
@@ -22,9 +21,7 @@ RIGHT, WRONG = "rotation_translation_coupling", "acceleration_slip"
 @pytest.fixture(scope="module")
 def fitted() -> Fitted:
     """The plain fit, the selection of the one effect that is there, and all effects."""
-    dataset = simulated(COUPLING, validation=None)
-    runs = usable_runs(dataset.split("train"))
-    plain = fit_matrix(runs, dataset.robot, dataset.sample_period, dataset.robot.inverse_kinematic_matrix)
+    plain = plain_fit(simulated(COUPLING, validation=None))
     screening = screen_plain(plain, ())
     return plain, select_effects(screening, np.random.default_rng(0)), {g.name: g for g in screening.groups.effects}
 

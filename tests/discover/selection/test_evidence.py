@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 from scipy.stats import ncx2
@@ -77,9 +79,17 @@ def test_the_bayes_factor_is_near_that_of_non_central_chi_squares(left: float) -
 
 
 def credibility(
-    gains: list[float], left: float, beyond: float, count: int = 1, parameter: Parameter = PARAMETER
+    gains: Sequence[float],
+    left: float = 0.0,
+    beyond: float = 0.0,
+    count: int = 1,
+    *,
+    second: np.ndarray = SECOND,
+    function: np.ndarray = THIRD,
+    parameter: Parameter = PARAMETER,
 ) -> Credibility:
-    given = screening({DRIFT: FIRST, BIAS: SECOND}, BASES, gains, parameter=parameter)
+    """Credibility of the first ``count`` of two effects beside a basis of one function."""
+    given = screening({DRIFT: FIRST, BIAS: second}, {"place": function}, gains, parameter=parameter)
     start, chosen = given.beyond_matrix(), given.groups.effects[:count]
     return credibility_of(effect_sets(start, chosen, count), start, chosen, significance(left), significance(beyond))
 
@@ -97,17 +107,6 @@ def test_a_name_is_the_less_credible_the_more_it_leaves() -> None:
     assert found == sorted(found, reverse=True)
 
 
-def test_of_look_alikes_one_is_right_more_likely_than_a_single_name_that_explains_as_much() -> None:
-    given = screening({DRIFT: FIRST, BIAS: FIRST}, BASES, [0, 20, 0, 0, 0])
-    start, chosen = given.beyond_matrix(), given.groups.effects[:1]
-    single, alike = (
-        credibility_of(effect_sets(start, chosen, 1), start, chosen, significance(40.0), significance(10.0), number)
-        for number in (1.0, 2.0)
-    )
-    odds = [each.probability / (1 - each.probability) for each in (single, alike)]
-    assert odds[1] == pytest.approx(2 * odds[0])
-
-
 def test_what_bases_do_not_find_beside_a_name_raises_the_odds_only_so_far() -> None:
     unexplained, little, nothing = (
         credibility([0, 20, 0, 0, 0], 40.0, beyond).probability for beyond in (40.0, 2.0, 0.0)
@@ -117,32 +116,27 @@ def test_what_bases_do_not_find_beside_a_name_raises_the_odds_only_so_far() -> N
 
 def test_two_names_have_a_fifth_of_the_odds_of_one() -> None:
     one = credibility([0, 20, 0, 0, 0], 20.0, 20.0)
-    two = credibility(
-        [0, np.sqrt(201), np.sqrt(200), 0, 0], 20.0, 20.0, count=2
-    )  # as large together: 401 - 2 = 400 - 1
+    two = credibility([0, np.sqrt(201), np.sqrt(200), 0, 0], 20.0, 20.0, 2)  # as large together: 401 - 2 = 400 - 1
     odds = [each.probability / (1 - each.probability) for each in (one, two)]
     assert odds[1] == pytest.approx(odds[0] / 5)
 
 
 def test_an_effect_of_an_impossible_sign_has_even_odds_at_most() -> None:
-    assert credibility([0, -20, 0, 0, 0], 0.0, 0.0, parameter=POSITIVE).probability == 0.5
-    assert (
-        credibility([0, -2, 0, 0, 0], 0.0, 0.0, parameter=POSITIVE).probability > 0.5
-    )  # within 3 standard errors of 0
-    assert credibility([0, 20, 0, 0, 0], 0.0, 0.0, parameter=POSITIVE).probability > 0.99
+    assert credibility([0, -20, 0, 0, 0], parameter=POSITIVE).probability == 0.5
+    assert credibility([0, -2, 0, 0, 0], parameter=POSITIVE).probability > 0.5  # within 3 standard errors of 0
+    assert credibility([0, 20, 0, 0, 0], parameter=POSITIVE).probability > 0.99
 
 
 def test_effects_that_cancel_each_other_have_even_odds_at_most() -> None:
     # Columns 25 degrees apart, and residuals along their difference: together 1 of what they make alone is left.
     close = np.cos(np.radians(25)) * FIRST + np.sin(np.radians(25)) * SECOND
     given = screening({DRIFT: FIRST, BIAS: close}, BASES, [0, 0, 20, 0, 0])
-    start, chosen = given.beyond_matrix(), given.groups.effects
+    start = given.beyond_matrix()
     values, _ = start.estimate([1, 2])
     joint = start.chi_square([1, 2]) / float(np.square(values).sum())
     assert joint == pytest.approx(1 / (1 / np.tan(np.radians(25)) ** 2 + 1 / np.sin(np.radians(25)) ** 2))
     assert joint < 0.45
-    found = credibility_of(effect_sets(start, chosen, 2), start, chosen, significance(0.0), significance(0.0))
-    assert found.probability == 0.5
+    assert credibility([0, 0, 20, 0, 0], count=2, second=close).probability == 0.5
 
 
 @pytest.mark.parametrize(
@@ -159,27 +153,17 @@ def test_a_name_has_even_odds_at_most_where_one_function_that_is_not_its_own_exp
     function, residual = (
         np.cos(np.radians(turn)) * FIRST + np.sin(np.radians(turn)) * THIRD for turn in (apart, along)
     )
-    given = screening({DRIFT: FIRST, BIAS: SECOND}, {"place": function}, (20 * residual).tolist())
-    start, chosen = given.beyond_matrix(), given.groups.effects[:1]
-    found = credibility_of(effect_sets(start, chosen, 1), start, chosen, significance(0.0), significance(0.0))
-    assert (found.probability > 0.95) is credible
-    assert credible or found.probability == 0.5
+    probability = credibility(20 * residual, function=function).probability
+    assert (probability > 0.95) is credible
+    assert credible or probability == 0.5
 
 
 def test_two_names_have_even_odds_at_most_where_one_function_explains_nearly_as_much() -> None:
     both = (FIRST + SECOND) / np.sqrt(2)
     function = np.cos(np.radians(7)) * both + np.sin(np.radians(7)) * THIRD  # 98.5 % of what both explain, each 50 %
-    assert joint_credibility(function, 20 * both) == 0.5
+    assert credibility(20 * both, count=2, function=function).probability == 0.5
 
 
 def test_two_names_stay_sure_where_one_function_explains_no_more_than_the_first_of_them() -> None:
     function = np.cos(np.radians(7)) * FIRST + np.sin(np.radians(7)) * THIRD
-    assert joint_credibility(function, 300 * FIRST + 30 * SECOND) > 0.95
-
-
-def joint_credibility(function: np.ndarray, residual: np.ndarray) -> float:
-    """Probability that two names are right, beside a basis of one function."""
-    given = screening({DRIFT: FIRST, BIAS: SECOND}, {"place": function}, residual.tolist())
-    start, both = given.beyond_matrix(), given.groups.effects
-    sets = effect_sets(start, both, 2)
-    return credibility_of(sets, start, both, significance(0.0), significance(0.0)).probability
+    assert credibility(300 * FIRST + 30 * SECOND, count=2, function=function).probability > 0.95

@@ -2,35 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
-from discovery_samples import nothing, simulated
+from discovery_samples import nothing, plain_fit, simulated
 from hidden.experiment import ROBOT
 from hidden.sets import Truth, make_set
 
+from omnibench.data.dataset import Dataset
 from omnibench.discover.discover import discover_effects
-from omnibench.discover.fitting import Extended, extend, fit_matrix
+from omnibench.discover.fitting import Extended, extend
 from omnibench.discover.held_out import group_counts, step_name
 from omnibench.discover.regressors.covariate_bases import Basis
 from omnibench.discover.regressors.significance import Group
+from omnibench.discover.result import Discovery
 from omnibench.discover.selection.competing_models import CompetingModels
 from omnibench.discover.selection.model_selection import Selection, select_effects
 from omnibench.discover.selection.screening import Screening, screen_plain
 from omnibench.discover.selection.unknown_term import add_smooth_terms, chosen_functions
 from omnibench.fit.noise import Whitener
-from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.registry import effects
 from omnibench.robot.calibration import Calibration, read_calibration, write_calibration
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from omnibench.data.dataset import Dataset
-    from omnibench.discover.result import Discovery
 
 FOLDS = np.tile(np.arange(5), 12)  # of the 60 runs of a small set
 
@@ -53,7 +48,7 @@ def grooved() -> tuple[Dataset, Truth, Discovery]:
 @pytest.fixture(scope="module")
 def bare(grooved: tuple[Dataset, Truth, Discovery]) -> Extended:
     """Their plain fit."""
-    return plain(grooved[0])
+    return extend(plain_fit(grooved[0]), ())
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +102,7 @@ def test_no_term_is_tried_where_it_is_not_wanted_or_nothing_is_missing(make: Cal
 
 
 def test_of_two_waves_the_one_that_is_there_is_chosen() -> None:
-    base = plain(recorded("oval_wheel")[0])
+    base = extend(plain_fit(recorded("oval_wheel")[0]), ())
     found = chosen_functions(base, [group("smooth_wheel_angle", harmonic=3.5), group("smooth_wheel_angle", harmonic=2)])
     largest = max(found, key=lambda each: len(each.parameters))
     assert largest.shapes["harmonic"] == 2
@@ -165,12 +160,6 @@ def test_named_effects_come_one_by_one_and_what_has_no_name_at_once() -> None:
     assert group_counts([named]) == [1]
     assert group_counts([]) == []
     assert step_name(nameless) == "unnamed, over place"
-
-
-def plain(dataset: Dataset) -> Extended:
-    runs = usable_runs(dataset.split("train"))
-    start = dataset.robot.inverse_kinematic_matrix
-    return extend(fit_matrix(runs, dataset.robot, dataset.sample_period, start), ())
 
 
 def with_names(bare: Extended, selection: Selection, *groups: Group) -> CompetingModels:

@@ -906,7 +906,7 @@ class TestRecordings:
         found = inspect_dataset(robotino)
         turning = found.findings[0]
         assert turning.startswith("these recordings hardly turn the robot: they drive the wheels along 1 + 2 + 3")
-        assert "row 3 (heading)" in turning
+        assert "what row 3 (heading) says of it cannot be identified" in turning
         assert states(found.identifiability)["turning on the spot"] == "weak"
         assert untold(found.identifiability) == ("distance_1", "distance_2", "distance_3")
         assert warnings_of_calibration(omni3.robot, driven_span(omni3.split("train")), "matrix", "keep") == ()

@@ -1,4 +1,4 @@
-"""Outliers: jumps are left out, what recurs is not, and poses come back once the model holds what moved them."""
+"""Fitted runs: long drives in windows, jumps left out, poses that come back once the model holds what moved them."""
 
 from __future__ import annotations
 
@@ -6,18 +6,54 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from discovery_samples import simulated
+from discovery_samples import plain_fit, simulated
 from extended_samples import FORWARD, run_of
+from hypothesis import given
+from hypothesis import strategies as st
 from outlier_study import EFFECT, TRUTH
 from outlier_study import simulated as with_directions
 
-from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.discover.fitting import Extended, Fit, InlierWhitener, extend, fit_matrix, inliers_of, with_noise
+from omnibench.data.dataset import Trajectory
+from omnibench.discover.fitting import Extended, Fit, InlierWhitener, extend, in_windows, inliers_of, with_noise
 from omnibench.discover.regressors.significance import Group
 from omnibench.fit.noise import Whitener
-from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.registry import effects
 from omnibench.robot.calibration import Noise
+from omnibench.robot.model import OdometryModel
+
+# Windows
+
+ROBOT_MODEL = simulated(()).robot
+
+
+def drive(seed: int, seconds: float = 60.0) -> Trajectory:
+    """A drive whose poses are those of its own odometry."""
+    rng, times = np.random.default_rng(seed), np.arange(1, int(seconds / 0.04) + 1) * 0.04
+    rates = np.cumsum(rng.normal(0, 0.05, (len(times), 3)), axis=0)
+    stamps = np.append(0.0, times[4::5])
+    run = Trajectory("drive", "train", times, rates, stamps, np.zeros((len(stamps), 3)), started_at=7.0)
+    (poses,) = OdometryModel.of_design(ROBOT_MODEL, "arc").poses([run.log(stamps[1:])])
+    return replace(run, poses=np.vstack([run.start, poses]))
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_the_odometry_of_every_window_ends_where_the_drive_does(seed: int) -> None:
+    windows = in_windows([drive(seed)])
+    assert len(windows) == 15  # of 4 s
+    model = OdometryModel.of_design(ROBOT_MODEL, "arc")
+    for window, poses in zip(windows, model.poses([window.reference_log for window in windows]), strict=True):
+        np.testing.assert_allclose(poses, window.poses[1:], atol=1e-9)
+    assert windows[3].started_at == pytest.approx(7.0 + 12.0, abs=0.2)
+
+
+def test_repetitions_and_many_runs_are_not_cut() -> None:
+    repeated = [replace(drive(seed), id=str(seed), command="c") for seed in (1, 2)]
+    assert in_windows(repeated) == tuple(repeated)
+    many = [replace(drive(1, 9.0), id=str(number)) for number in range(30)]
+    assert in_windows(many) == tuple(many)
+
+
+# Outliers
 
 UNIT = Noise(pose_position=1.0, pose_heading=1.0)
 POSES = 20
@@ -101,12 +137,6 @@ def test_outliers_are_whitened_as_if_they_had_not_been_seen() -> None:
     np.testing.assert_allclose(whiten.weighted(white).ravel(), precision @ residuals.ravel(), atol=1e-12)
 
 
-def plain_of(dataset: Dataset) -> Fit:
-    robot = dataset.robot
-    runs = usable_runs(dataset.split("train"))
-    return fit_matrix(runs, robot, dataset.sample_period, robot.inverse_kinematic_matrix)
-
-
 def extended_by(name: str, plain: Fit) -> Extended:
     effect = effects.create(name)
     linear = tuple(each for each in effect.parameters(plain.model.robot) if not each.choices)
@@ -114,7 +144,7 @@ def extended_by(name: str, plain: Fit) -> Extended:
 
 
 def test_an_effect_that_looks_like_outliers_is_estimated_without_bias() -> None:
-    model = extended_by(EFFECT, plain_of(with_directions(1)))
+    model = extended_by(EFFECT, plain_fit(with_directions(1)))
     assert model.fit.jumps == 0
     assert (np.abs(model.values - TRUTH) < 2 * model.covariance.reach[-3:]).all()
 
@@ -127,7 +157,7 @@ def test_poses_come_back_and_jumps_stay_out_once_the_model_holds_the_effect() ->
     for run in runs:
         if run.id in thrown:
             run.poses[1 + thrown[run.id], :2] += 0.2
-    model = extended_by(EFFECT, plain_of(replace(dataset, trajectories=tuple(runs))))
+    model = extended_by(EFFECT, plain_fit(replace(dataset, trajectories=tuple(runs))))
     strict = replace(model.fit, inliers=tuple(np.arange(len(mask)) % 3 > 0 for mask in model.fit.masks))
     again = with_noise(strict)
     assert {run.id: np.flatnonzero(~mask).tolist() for run, mask in zip(again.runs, again.masks, strict=True)} == {
@@ -143,7 +173,7 @@ def test_a_heading_that_is_thrown_at_the_end_of_runs_loses_no_final_pose() -> No
     for run in runs:
         place = commands.index(str(run.command))
         run.poses[-1, 2] += 0.08 * (-1) ** place * (place % 5 > 1)  # three commands of five, either way
-    plain = plain_of(replace(dataset, trajectories=tuple(runs)))
+    plain = plain_fit(replace(dataset, trajectories=tuple(runs)))
     assert all(mask[-1] for mask in plain.masks)
 
 
@@ -154,6 +184,6 @@ def test_the_fit_ends_where_neither_outliers_nor_noise_change() -> None:
     for run in runs:
         if rng.random() < 0.3:
             run.poses[int(rng.integers(1, len(run.poses))), :2] += rng.choice([-0.08, 0.08], 2)
-    plain = plain_of(replace(dataset, trajectories=tuple(runs)))
+    plain = plain_fit(replace(dataset, trajectories=tuple(runs)))
     assert plain.jumps > 10
     np.testing.assert_array_equal(np.concatenate(with_noise(plain).masks), np.concatenate(plain.masks))
