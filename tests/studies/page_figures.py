@@ -240,7 +240,8 @@ def assert_printed(part: str, figures: Figures, skipped: Sequence[str] = ()) -> 
 
 def compared_with(name: str, folder: Path, **changes: Any) -> Path:
     """The results of a config of ours after some changes."""
-    content = yaml.safe_load((CONFIGS / f"{name}.yaml").read_text(encoding="utf-8")) | changes
+    content = yaml.safe_load((CONFIGS / f"{name}.yaml").read_text(encoding="utf-8"))
+    content |= {"plugins": [str(ROOT / "plugins")]} | changes
     config = folder / f"{name}.yaml"
     config.write_text(yaml.safe_dump(content), encoding="utf-8")
     compared(config, folder / name, "--data", RECORDINGS / "optiodom" / "omni3") if name == "omni3" else compared(
@@ -271,9 +272,8 @@ def main() -> None:
             discoveries.append(discover_effects(omni3_dataset()))
             return discovery_figures(discoveries[0])
 
-        plugins = {"plugins": [str(ROOT / "plugins")]}
         measured: Mapping[str, Callable[[], Figures]] = {
-            "paper": lambda: paper_figures(compared_with("apr02", folder, **plugins)),
+            "paper": lambda: paper_figures(compared_with("apr02", folder)),
             "chain": lambda: chain_figures(chain_results(folder)),
             "omni3": lambda: omni3_figures(
                 compared_with("omni3", folder, calibrators=["theoretical", "closed_form"]), omni3_dataset()
