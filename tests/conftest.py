@@ -49,6 +49,11 @@ def pytest_configure(config: pytest.Config) -> None:
         config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the studies first: their files take longest, and at the end the other workers would wait for them."""
+    items.sort(key=lambda item: "study" not in item.path.parts)
+
+
 @pytest.fixture(autouse=True)
 def registries_as_before() -> Iterator[None]:
     """What a test registers or loads is gone after it."""
