@@ -304,7 +304,7 @@ class TestMistakes:
         assert process.returncode == 130
         assert said.splitlines()[-1] == "interrupted; the same command begins anew"
         assert not (tmp_path / "clones").exists()
-        assert not Path("/proc", (tmp_path / "pid").read_text().strip()).exists()
+        until(lambda: not Path("/proc", (tmp_path / "pid").read_text().strip()).exists(), "git to end")
 
 
 def pretend_git(folder: Path, cloning: str) -> None:
