@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+import weakref
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -91,6 +92,22 @@ def test_scans_that_are_many_row_groups_long_come_back(tmp_path: Path) -> None:
     save_dataset(replace(everything_known(), scans=ScansInMemory(SCANNER, long)), tmp_path / "data")
     for trajectory, expected in long.items():
         assert_same(scans_of(tmp_path / "data").of(trajectory), expected)
+
+
+def test_one_trajectory_is_in_memory_at_a_time_while_scans_are_saved(tmp_path: Path) -> None:
+    given: list[weakref.ref[TrajectoryScans]] = []
+    alive: list[int] = []
+
+    class Counted(ScansInMemory):
+        def of(self, trajectory: str) -> TrajectoryScans:
+            alive.append(sum(earlier() is not None for earlier in given))
+            found = replace(super().of(trajectory))
+            given.append(weakref.ref(found))
+            return found
+
+    scans = Counted(SCANNER, {"run-1": some_scans(4, 1), "run-2": some_scans(3, 2)})
+    save_dataset(replace(everything_known(), scans=scans), tmp_path / "data")
+    assert alive == [0, 0]
 
 
 def test_a_part_is_saved_with_its_own_scans_and_without_scans_without_a_scanner(folder: Path, tmp_path: Path) -> None:
@@ -219,13 +236,14 @@ def test_lists_and_arrays_of_any_numbers_are_read(tmp_path: Path, dtype: pl.Data
     np.testing.assert_array_equal(scans_of(tmp_path).of("run-2").ranges, np.tile(np.arange(1.0, 8.0), (3, 1)))
 
 
-def test_names_that_are_numbers_stay_names(tmp_path: Path) -> None:
+def test_names_that_are_numbers_or_formulas_stay_names(tmp_path: Path) -> None:
     data = everything_known()
-    runs = [replace(run, id=name) for run, name in zip(data.trajectories, ("007", "7"), strict=True)]
-    scans = ScansInMemory(SCANNER, {"007": some_scans(2, 1), "7": some_scans(3, 2)})
+    runs = [replace(run, id=name) for run, name in zip(data.trajectories, ("007", "=7"), strict=True)]
+    scans = ScansInMemory(SCANNER, {"007": some_scans(2, 1), "=7": some_scans(3, 2)})
     for table_format in FORMATS:
         save_dataset(replace(data, trajectories=tuple(runs), scans=scans), tmp_path, table_format)
-        assert {name: len(found.times) for name, found in scans_of(tmp_path)} == {"007": 2, "7": 3}
+        assert {name: len(found.times) for name, found in scans_of(tmp_path)} == {"007": 2, "=7": 3}
+    assert "\n=" not in (tmp_path / "scans.csv").read_text()
 
 
 @pytest.mark.parametrize(

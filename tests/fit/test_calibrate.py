@@ -20,7 +20,7 @@ from omnibench.data.dataset import Dataset, make_dataset
 from omnibench.environment import package_versions
 from omnibench.errors import ConfigError, DataError, UnknownNameError
 from omnibench.fit.calibrate import CalibrationRun, calibrate
-from omnibench.fit.calibrator import Outcome
+from omnibench.fit.calibrator import Outcome, calibration_of_fit
 from omnibench.fit.evaluate import evaluate
 from omnibench.fit.geometry import GeometryLimits
 from omnibench.fit.problem import Budget
@@ -75,6 +75,12 @@ def test_the_calibration_has_the_robot_the_matrix_and_the_integration(dataset: D
     assert (run.calibration.robot, run.calibration.sample_period) == (ROBOT, 0.2)
     assert run.calibration.integration == "euler"
     np.testing.assert_array_equal(run.calibration.matrix_array, run.result.matrix)
+
+
+def test_values_that_no_robot_has_lead_back_to_the_recordings(dataset: Dataset) -> None:
+    choices = {"calibrator": "crs", "seed": 1, "cost": "final_pose", "box": "row", "outcome": "converged"}
+    with pytest.raises(DataError, match=r"^calibration 'far': matrix.*; check the recordings for poses and rates far"):
+        calibration_of_fit("far", dataset, np.full((3, 3), 1e9), choices, integration="arc")
 
 
 def test_only_training_runs_matter(dataset: Dataset) -> None:

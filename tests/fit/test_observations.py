@@ -160,13 +160,13 @@ def test_what_is_left_open_keeps_the_design_and_has_no_interval() -> None:
     run = calibrate(dataset)
     assert np.isnan(run.uncertainty.intervals.low[2]).all()
     np.testing.assert_array_equal(run.calibration.matrix_array[2], dataset.robot.inverse_kinematic_matrix[2])
-    assert any("no reference tells of turning" in warning for warning in run.warnings)
+    assert any("of turning: row 3 (heading) of the matrix keeps the design" in warning for warning in run.warnings)
 
 
 def test_the_direction_of_the_x_axis_is_open_only_where_the_tracked_point_is_fitted() -> None:
     dataset = reduced("diff", 2, "distance")
     known, fitted = (" ".join(calibrate(dataset, mount=mount).warnings) for mount in ("known", "fit"))
-    assert "no reference tells of turning" in known
+    assert "of turning: row 3 (heading) of the matrix rests on the design and its tolerance" in known
     assert "x axis points" not in known
     assert "x axis points" in fitted
 

@@ -274,6 +274,7 @@ def slowly(seconds: float, _: Reporter) -> Answer:
 
 LEFT: dict[str, Callable[[], object]] = {
     "variable": lambda: os.environ.update(LEFT="behind"),
+    "path": lambda: sys.path.append("/"),
     "handler": lambda: signal.signal(signal.SIGUSR1, signal.SIG_IGN),
     "thread": lambda: threading.Thread(target=time.sleep, args=(60,), daemon=True).start(),
     "child": lambda: subprocess.Popen(["sleep", "60"]),

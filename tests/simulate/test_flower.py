@@ -18,6 +18,7 @@ from omnibench.data.dataset import Dataset, Split
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import ConfigError
 from omnibench.fit.evaluate import ModelErrors
+from omnibench.progress import Progress
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import MotionEffect, Parameter, Values
 from omnibench.robot.kinematics import Array, published_matrix
@@ -113,6 +114,13 @@ def test_the_data_set_says_that_it_is_simulated_and_has_no_warnings() -> None:
     assert benchmark().dataset.simulated
     assert benchmark().dataset.source == "simulated by omnibench"
     assert benchmark().dataset.warnings == ()
+
+
+def test_every_run_is_told_of_while_it_is_simulated() -> None:
+    told: list[Progress] = []
+    count = len(simulate_dataset(small(), watch=told.append).dataset.trajectories)
+    assert [(event.done, event.total) for event in told[:-1]] == [(done, count) for done in range(1, count + 1)]
+    assert told[-1].over
 
 
 def test_the_same_config_gives_the_same_bits_on_disk_too(tmp_path: Path) -> None:

@@ -108,6 +108,13 @@ def test_what_recurs_at_a_stamp_of_a_command_is_signal(commands: str) -> None:
     assert not any(outliers(runs_of(*commands), residuals))
 
 
+def test_a_jump_far_beyond_what_recurs_is_left_out() -> None:
+    residuals = np.random.default_rng(1).standard_normal((8, POSES, 3)) / 3
+    residuals[:4, 6] += 6.0
+    residuals[1, 6] += 60.0
+    assert outliers(runs_of(*"aaaabbbb"), residuals) == [[], [6], [], [], [], [], [], []]
+
+
 def test_what_recurs_at_the_end_of_runs_is_signal_though_no_command_is_repeated_and_they_differ_in_length() -> None:
     runs = [run for count in range(12, 30) for run in runs_of(f"c{count}", poses=count)]
     rng = np.random.default_rng(1)

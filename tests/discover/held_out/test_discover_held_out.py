@@ -49,6 +49,7 @@ def constants(*values: float) -> Whitened:
 def test_repetitions_of_a_command_go_to_different_folds() -> None:
     folds = folds_of_repetitions(runs_of(*5 * ("forward",), *5 * ("turn",)))
     assert folds.tolist() == [0, 1, 2, 3, 4, 0, 1, 2, 3, 4]
+    assert folds_of_repetitions(runs_of(*"aabbcc")).tolist() == [0, 1, 1, 2, 2, 3]  # few begin one after the other
 
 
 def test_at_random_repetitions_still_go_to_different_folds_and_differ_by_the_generator() -> None:
@@ -165,6 +166,7 @@ def test_the_floor_is_the_scatter_between_repetitions_as_one_prediction_errs_by_
     floor = floor_of(extended_of(RUNS, left(1, 3, 2, 2)).fit)
     assert floor is not None
     assert sorted(floor.eq6.tolist()) == pytest.approx([0.0, np.sqrt(2)])  # 2 apart, over the root of 2
+    assert floor_of(extended_of(RUNS[::2], left(1, 2)).fit) is None  # no command is repeated
 
 
 def test_held_out_errors_are_means_of_both_models_over_the_runs() -> None:

@@ -46,6 +46,7 @@ def test_the_covariance_of_the_matrix_spreads_as_the_batch_derivatives_say(integ
     expected = slopes @ np.array(path.calibration.covariance) @ slopes.T
     quiet = path.calibration.model_copy(update={"noise": Noise(walk_position=1e-9, walk_heading=1e-9)})
     live = driven(LiveOdometry(quiet), path.angles, np.full(400, 0.01))
+    np.testing.assert_allclose(live.pose, path.poses[-1], rtol=0, atol=1e-12)
     np.testing.assert_allclose(live.covariance, expected, rtol=2e-3, atol=1e-3 * np.abs(expected).max())
 
 
@@ -299,12 +300,12 @@ def test_a_swap_while_driving_is_not_taken_for_a_start_from_rest() -> None:
 
 
 @pytest.mark.parametrize("effect", ["wheel_eccentricity", "thermal_radius_drift"])
-def test_counted_angles_and_the_sessions_time_go_on_over_a_swap(effect: str) -> None:
+def test_counted_angles_and_the_sessions_time_go_on_over_swaps(effect: str) -> None:
     using = with_effects(term(effect, **EFFECTS[effect]))
     path = drive(6.0, using=using)
     live = LiveOdometry(using)
     for number, turned in enumerate(np.diff(path.angles, axis=0)):
-        if number == 500:
+        if number in (200, 500):
             live = live.continued(using)
         live.step(WheelStep(0, PERIOD, turned, turned / PERIOD))
     from_zero = replace(path, angles=path.angles - path.angles[0])
