@@ -17,8 +17,10 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import entry_points
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Generic, TypeVar
 
 from pydantic import BaseModel, ConfigDict
@@ -31,6 +33,19 @@ _MOST_BYTES = 1 << 24  # bytes: a larger plug-in file is refused; chosen
 _IMPORT_SECONDS = 60.0  # in which a plug-in file must be imported, whatever command loads it; chosen: JAX takes 10 s
 
 _FILE_MODULE = "omnibench_plugin_"  # begins the names of modules that are plug-in files
+
+# Modules that hold today what plug-ins import from those beside them, which have gone.
+_MOVED = {
+    "omnibench.data.clock_matching": ("data.alignment",),
+    "omnibench.fit.differential": ("fit.differential.axle", "fit.differential.driven_squares"),
+    "omnibench.fit.motion_windows": ("fit.observations.motion_windows",),
+    "omnibench.fit.shrinkage": ("fit.shrinkage.shrunk_matrix",),
+    "omnibench.fit.uncertainty": ("fit.uncertainty.uncertainty",),
+    "omnibench.robot.corrections": ("robot.domain.fade", "robot.domain.training_domain"),
+    "omnibench.robot.effects.effect": ("robot.effects.weights",),
+    "omnibench.robot.effects.learned": ("robot.effects.learned.network",),
+    "omnibench.robot.kinematics": ("robot.planar", "robot.robot_class"),
+}
 
 T = TypeVar("T")
 C = TypeVar("C", bound=type[Any])
@@ -224,6 +239,11 @@ def _files_in(folder: Path) -> list[Path]:
 def _attempt(origin: str, load: Callable[[], object]) -> PluginFailure | None:
     for registry in REGISTRIES:  # first, so that no plug-in takes a built-in name unnoticed
         registry._load_builtin()
+    for today, gone in _MOVED.items():
+        for name in gone:
+            module = ModuleType(f"omnibench.{name}")
+            module.__getattr__ = partial(_found_today, today)  # type: ignore[method-assign]
+            sys.modules.setdefault(module.__name__, module)
     before = [dict(registry._entries) for registry in REGISTRIES]
     try:
         load()
@@ -232,6 +252,12 @@ def _attempt(origin: str, load: Callable[[], object]) -> PluginFailure | None:
             registry._entries = entries
         return PluginFailure(origin, " ".join(f"{type(error).__name__}: {error}".split()))
     return None
+
+
+def _found_today(module: str, name: str) -> Any:
+    if name.startswith("__"):  # what tools ask of every module
+        raise AttributeError(name)
+    return getattr(importlib.import_module(module), name)
 
 
 def _import_file(path: Path) -> None:

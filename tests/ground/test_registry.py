@@ -175,3 +175,13 @@ def test_a_plugin_file_keeps_its_failure_when_it_is_asked_for_again(tmp_path: Pa
     assert load_plugin_file(tmp_path / "faulty.py") == first
     with pytest.raises(PluginError, match="nowhere does not exist"):
         load_plugins([tmp_path / "nowhere"], installed=False)
+
+
+def test_a_plugin_finds_names_where_they_were_before_modules_were_joined(folder: Path) -> None:
+    before = (
+        "from omnibench.robot.robot_class import class_of\nfrom omnibench.fit.differential.axle import TWO_WHEELS\n"
+    )
+    (folder / "old.py").write_text(before + PLUGIN.format(name="old"))
+    assert load_plugin_file(folder / "old.py") is None
+    (folder / "wrong.py").write_text("from omnibench.robot.robot_class import nothing_of_the_kind\n")
+    assert "nothing_of_the_kind" in str(load_plugin_file(folder / "wrong.py"))
