@@ -252,8 +252,8 @@ class Windows:
 
     def _left(self, fitted: Sequence[Array], columns: Array) -> Array:
         """Residuals (2, W), rad and m, of the reference less what changes (W, C) of the wheels' counts explain."""
-        told = [columns[:, channel] @ each for channel, each in zip(self.channels(), fitted, strict=True)]
-        return self.shown - np.array(told)
+        explained = [columns[:, channel] @ each for channel, each in zip(self.channels(), fitted, strict=True)]
+        return self.shown - np.array(explained)
 
     def _deviations(self, left: Array, clock: Clock) -> Array:
         """Robust standard deviations (2,) of what is left (2, W)."""
@@ -325,16 +325,16 @@ class Windows:
 def _coefficients(windows: Sequence[Windows], clocks: Sequence[Clock]) -> list[Array]:
     """The coefficients h and s of Eq. (2) and (3) that fit all runs best by their clocks."""
     fitted = []
-    told = [
+    by_run = [
         (each, each.within(clock), each.columns(clock, np.zeros(1))[0])
         for each, clock in zip(windows, clocks, strict=True)
     ]
     for row in range(2):
-        columns, wanted = [], []
-        for each, within, changes in told:
+        columns, shown = [], []
+        for each, within, changes in by_run:
             columns.append(changes[within, each.channels()[row]])
-            wanted.append(each.shown[row][within])
-        rows = np.concatenate(wanted)
+            shown.append(each.shown[row][within])
+        rows = np.concatenate(shown)
         fitted.append(_solved(np.concatenate(columns), rows, np.ones(len(rows), dtype=bool)))
     return fitted
 

@@ -399,8 +399,8 @@ class StoredWheels:
         named = wheel_columns(robot)
         check_columns(self.file, list(types), ("trajectory", *named["times"], *named["rates"]))
         check_steering(self.file, list(types), robot)
-        wanted = {name: each for name, each in named.items() if _all_there(self.file, each, types)}
-        columns = [column for each in wanted.values() for column in each]
+        present = {name: each for name, each in named.items() if _all_there(self.file, each, types)}
+        columns = [column for each in present.values() for column in each]
         if not all(types[column].is_numeric() for column in columns):
             raise WholeTableError
         rows = self._rows_of_runs(runs, columns)
@@ -411,8 +411,8 @@ class StoredWheels:
             if after is None or after - edges[-1] > BLOCK_ROWS:
                 edges.append(end)
         blocks = BlockFile(file, tuple(edges), state)
-        together = [column for name in ("times", "rates", "steering") for column in wanted.get(name, ())]
-        return [WheelArrays(**_arrays(blocks, wanted, together, of_run)) for of_run in rows]
+        together = [column for name in ("times", "rates", "steering") for column in present.get(name, ())]
+        return [WheelArrays(**_arrays(blocks, present, together, of_run)) for of_run in rows]
 
     def _rows_of_runs(self, runs: Table, columns: Sequence[str]) -> list[RunRows]:
         """The rows of each run, whose values are checked. DataError, WholeTableError: see of_runs."""

@@ -381,8 +381,8 @@ def _moves_at_once(robot: Robot, run: Trajectory, ways: Array) -> bool:
     return True
 
 
-# s that a clock must be off, and in standard errors, to be told (chosen: simulated runs, whose clocks are right, are
-# below); from _SPOILS, s, on it spoils a fit.
+# A clock is reported that is off by at least so many s and so many standard errors (chosen: simulated runs, whose
+# clocks are right, are below); from _SPOILS, s, on it spoils a fit.
 _LEAST_OFF, _ERRORS, _SPOILS = 0.05, 4.0, 0.15
 # Runs up to which so many errors hold; ten times as many runs need as many errors again, as one of them is farther off
 # by chance (chosen: the farthest of 333, 1,665 and 6,660 simulated runs, whose clocks are right, are 4.2, 6.0 and 7.4
@@ -459,8 +459,8 @@ def clock_findings(runs: Sequence[Trajectory], clocks: Sequence[ClockMatch | Non
 
 def _off(values: Array) -> str:
     """Offsets in words: the largest one, or the largest to either side."""
-    told = [f"{size:.2f} s too {side}" for side, size in (("late", -values.min()), ("early", values.max())) if size > 0]
-    return " to ".join(told) if len(told) > 1 else f"up to {told[0]}"
+    ways = [f"{size:.2f} s too {way}" for way, size in (("late", -values.min()), ("early", values.max())) if size > 0]
+    return " to ".join(ways) if len(ways) > 1 else f"up to {ways[0]}"
 
 
 def _count(found: Sequence[object], runs: Sequence[Trajectory]) -> str:

@@ -213,9 +213,9 @@ def _by_headers(
         except NoRowsError:
             warnings.append(f"{file}: left out, as it has no rows")
             continue
-        name, wanted = file.relative_to(source).with_suffix("").as_posix(), pose_columns(options, shared=True)
-        posed = references.of(name) is None or not _all_missing(wanted, table)
-        missing = [*wheel_columns(options).missing(table), *(wanted.missing(table) if posed else ())]
+        name, poses = file.relative_to(source).with_suffix("").as_posix(), pose_columns(options, shared=True)
+        posed = references.of(name) is None or not _all_missing(poses, table)
+        missing = [*wheel_columns(options).missing(table), *(poses.missing(table) if posed else ())]
         if missing:
             lacking[file] = table, list(dict.fromkeys(missing))
         else:
@@ -333,7 +333,8 @@ def read_measured(table: CellTable, options: CsvOptions, *, shared: bool) -> Ref
     return references
 
 
-_MOST_REPEATED = 0.5  # of a table's rows; more mean that its times are too coarse
+# Share of a table's rows that may have the time of the row before; with more its times are too coarse.
+_MOST_REPEATED = 0.5
 
 
 def read_wheels(
