@@ -23,8 +23,10 @@ from omnibench.words import plural
 
 _GRACE = 10.0  # s after the budget's time: a run that has not stopped by then is killed (chosen)
 _REFERENCES = 5  # evaluations that a machine is measured by: the best is one that nothing disturbed (chosen)
-# Modules that the processes share, so that they need not be imported for every run.
-PRELOAD = ("omnibench.compare.execute", "omnibench.fit.sum_of_norms", "nlopt")
+# Modules that the processes share, so that they need not be imported for every run. Importers are among them, since a
+# plug-in is loaded after all that is built in.
+_IMPORTERS = ("omnibench.data.importers.csv_tables", "omnibench.data.importers.rosbag", "omnibench.data.importers.tum")
+PRELOAD = ("omnibench.compare.execute", "omnibench.fit.sum_of_norms", "nlopt", *_IMPORTERS)
 
 
 def execute(

@@ -8,11 +8,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from omnibench.data.dataset import Dataset
+from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.discover.covariate_dependence import Dependences
 from omnibench.discover.fitting import Extended, Fit
-from omnibench.discover.held_out import ValidationRuns, training_gap
-from omnibench.discover.output import Request, calibration_of
+from omnibench.discover.held_out import ValidationRuns, training_domain, training_gap
 from omnibench.discover.report.tables import weight_in_words
 from omnibench.discover.result import (
     CovariateDependence,
@@ -31,7 +30,12 @@ from omnibench.discover.selection.competing_models import candidates_of
 from omnibench.discover.selection.detectability import Detectability
 from omnibench.discover.selection.model_selection import CHANCE, SURE, Selection
 from omnibench.discover.selection.screening import Screening
+from omnibench.environment import package_versions
+from omnibench.errors import DataError
+from omnibench.fit.calibrator import calibration_of_fit
 from omnibench.fit.sessions import SessionComparison
+from omnibench.registry import costs
+from omnibench.robot.calibration import Calibration, EffectTerm, covariance_rows, matrix_rows
 from omnibench.robot.kinematics import Array
 
 _Dependences = Sequence[CovariateDependence]
@@ -203,6 +207,15 @@ class Findings:
     eq6_of_sessions: float | None
 
 
+@dataclass(frozen=True)
+class Request:
+    """The options of a discovery, as discover_effects was called with them."""
+
+    without: tuple[str, ...]
+    unknown_term: bool
+    seed: int
+
+
 def conclude(dataset: Dataset, request: Request, findings: Findings, seconds: float) -> Discovery:
     """The result of a discovery that took so many seconds."""
     baseline, extended, held_out = findings.baseline, findings.extended, findings.held_out
@@ -241,8 +254,8 @@ def conclude(dataset: Dataset, request: Request, findings: Findings, seconds: fl
         noise=fit.noise,
         outliers=fit.jumps,
         poses=sum(len(run.pose_times) - 1 for run in inliers),
-        plain=calibration_of(dataset, baseline, "plain", request, headline),
-        extended=calibration_of(dataset, extended, "extended", request, headline, baseline),
+        plain=_calibration_of(dataset, baseline, "plain", request, headline),
+        extended=_calibration_of(dataset, extended, "extended", request, headline, baseline),
         trajectories=tuple(run.id for run in fit.runs),
         before=_of_inliers(fit, baseline.fit.residuals),
         after=_of_inliers(fit, fit.residuals),
@@ -317,3 +330,53 @@ def _notes(findings: Findings) -> Iterator[str]:
             yield f"{words[0].upper()}{words[1:]}; estimated for each run."
     for name, others in findings.detectability.sums:
         yield f"{name} could be imitated by {' and '.join(others)} together."
+
+
+def _calibration_of(
+    dataset: Dataset,
+    extended: Extended,
+    name: str,
+    request: Request,
+    reason: str,
+    plain: Extended | None = None,
+) -> Calibration:
+    """The calibration of a fit with its noise, covariance and provenance.
+
+    reason: why the fit ended, in words. plain: the fit of the plain matrix, to which the effects of a model fade.
+    """
+    terms = tuple(EffectTerm.of(term) for term in extended.fit.model.terms)
+    provenance = {
+        "calibrator": "discover",
+        "options": {"without": list(request.without), "unknown_term": request.unknown_term},
+        "seed": request.seed,
+        "cost": "final_pose",
+        "box": "none",
+        "versions": package_versions(),
+        "training_cost": _cost(extended, dataset.split("train")),
+        "validation_cost": _cost(extended, dataset.split("validation")),
+        "outcome": "converged",
+        "reason": reason,
+    }
+    return calibration_of_fit(
+        f"{dataset.name} {name}",
+        dataset,
+        extended.fit.model.matrix,
+        provenance,
+        integration=extended.fit.model.integration,
+        effects=terms,
+        noise=extended.fit.noise.noise,
+        covariance=covariance_rows(extended.covariance_of_terms),
+        session=extended.fit.runs[0].session,
+        driven=tuple(tuple(float(value) for value in motion) for motion in training_domain(extended)),
+        plain=matrix_rows(plain.fit.model.matrix) if plain is not None and terms else None,
+    )
+
+
+def _cost(extended: Extended, runs: Sequence[Trajectory]) -> float | None:
+    """Eq. (6), m and rad, of runs as recorded; None without runs, or where they lack what an effect needs."""
+    if not runs:
+        return None
+    try:
+        return costs.create("final_pose").of_model(extended.fit.model, runs)
+    except DataError:
+        return None

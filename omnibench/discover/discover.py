@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from omnibench.data.dataset import Dataset
-from omnibench.discover.conclude import Findings, conclude, lacks_a_name, verdict_of
+from omnibench.discover.conclude import Findings, Request, conclude, lacks_a_name, verdict_of
 from omnibench.discover.covariate_dependence import covariate_dependences, without_smooth_term
 from omnibench.discover.experiments import experiments_for
 from omnibench.discover.fitting import Extended, Fit, extend, fit_matrix, in_windows, without_effects
@@ -29,7 +29,6 @@ from omnibench.discover.held_out import (
     validation_runs,
     waterfall_steps,
 )
-from omnibench.discover.output import Request
 from omnibench.discover.regressors.fine_structure import fine_structure
 from omnibench.discover.regressors.significance import Significance, together
 from omnibench.discover.result import Discovery

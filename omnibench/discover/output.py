@@ -3,21 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 
 from omnibench.config import Model, to_json, to_yaml
-from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.discover.fitting import Extended
-from omnibench.discover.held_out import training_domain
 from omnibench.discover.report.discovery_report import discovery_report
 from omnibench.discover.result import CALIBRATION_FILES, Discovery, discovery_document, experiment_file
-from omnibench.environment import package_versions
-from omnibench.errors import DataError
 from omnibench.files import (
     RESULTS,
     check_results_folder,
@@ -28,71 +21,8 @@ from omnibench.files import (
     results_locked,
     write_files,
 )
-from omnibench.fit.calibrator import calibration_of_fit
-from omnibench.registry import costs
 from omnibench.report.render import render
-from omnibench.robot.calibration import Calibration, EffectTerm, covariance_rows, matrix_rows
 from omnibench.robot.kinematics import Array
-
-
-@dataclass(frozen=True)
-class Request:
-    """The options of a discovery, as discover_effects was called with them."""
-
-    without: tuple[str, ...]
-    unknown_term: bool
-    seed: int
-
-
-def calibration_of(
-    dataset: Dataset,
-    extended: Extended,
-    name: str,
-    request: Request,
-    reason: str,
-    plain: Extended | None = None,
-) -> Calibration:
-    """The calibration of a fit with its noise, covariance and provenance.
-
-    reason: why the fit ended, in words. plain: the fit of the plain matrix, to which the effects of a model fade.
-    """
-    terms = tuple(EffectTerm.of(term) for term in extended.fit.model.terms)
-    provenance = {
-        "calibrator": "discover",
-        "options": {"without": list(request.without), "unknown_term": request.unknown_term},
-        "seed": request.seed,
-        "cost": "final_pose",
-        "box": "none",
-        "versions": package_versions(),
-        "training_cost": _cost(extended, dataset.split("train")),
-        "validation_cost": _cost(extended, dataset.split("validation")),
-        "outcome": "converged",
-        "reason": reason,
-    }
-    return calibration_of_fit(
-        f"{dataset.name} {name}",
-        dataset,
-        extended.fit.model.matrix,
-        provenance,
-        integration=extended.fit.model.integration,
-        effects=terms,
-        noise=extended.fit.noise.noise,
-        covariance=covariance_rows(extended.covariance_of_terms),
-        session=extended.fit.runs[0].session,
-        driven=tuple(tuple(float(value) for value in motion) for motion in training_domain(extended)),
-        plain=matrix_rows(plain.fit.model.matrix) if plain is not None and terms else None,
-    )
-
-
-def _cost(extended: Extended, runs: Sequence[Trajectory]) -> float | None:
-    """Eq. (6), m and rad, of runs as recorded; None without runs, or where they lack what an effect needs."""
-    if not runs:
-        return None
-    try:
-        return costs.create("final_pose").of_model(extended.fit.model, runs)
-    except DataError:
-        return None
-
 
 # First line of config.yaml: it tells a folder of results from one that happens to hold a file of that name.
 _MARK = "# The effective options of a discovery; the results beside it were made with them."
