@@ -27,6 +27,7 @@ from commands import (
     write_config,
     write_plugin,
 )
+from lanes import slow
 from recording_samples import sample
 from timing import PATIENCE
 
@@ -75,6 +76,11 @@ def test_calibrate_prints_what_it_would_write(command: Command, prepared: Prepar
     assert found == json.loads(read_calibration(tmp_path / "c.yaml").model_dump_json())
     assert found["format"] == "omnibench-calibration/1"
     assert np.shape(found["matrix"]) == (3, 3)
+
+
+def test_calibrate_warns_of_what_a_box_holds(command: Command, prepared: Prepared) -> None:
+    printed = succeeded(command("calibrate", prepared.data, "--box", "paper"))
+    assert "not fitted, kept at the start value by the box 'paper' or the cost: m12" in printed.stderr
 
 
 def test_calibrate_and_evaluate_end_with_what_held_out_runs_say(command: Command, prepared: Prepared) -> None:
@@ -356,9 +362,7 @@ LONG = (
 )
 
 
-@pytest.mark.parametrize(
-    "typed", [QUICK, *(pytest.param(typed, marks=pytest.mark.slow) for typed in LONG)], ids=lambda typed: typed[0]
-)
+@pytest.mark.parametrize("typed", [QUICK, *slow(*LONG)], ids=lambda typed: typed[0])
 def test_every_figure_is_written_as_svg_and_png(command: Command, prepared: Prepared, typed: tuple[str, ...]) -> None:
     chromium()
     if "scans" in typed:

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import typer
 from commands import Command, Prepared, flower, run_here, succeeded, write_config
+from lanes import slow
 from shared_results import made_once, shared_folder
 from typed_pages import parse
 
@@ -85,9 +86,7 @@ def test_a_command_ends_with_a_sentence(command: Command, prepared: Prepared, ty
     assert "; next, " not in printed.stdout
 
 
-@pytest.mark.parametrize(
-    "typed", [*_QUICK, *(pytest.param(typed, marks=pytest.mark.slow) for typed in _LONG)], ids=" ".join
-)
+@pytest.mark.parametrize("typed", [*_QUICK, *slow(*_LONG)], ids=" ".join)
 def test_a_command_with_tables_ends_with_a_sentence_and_cuts_no_word_on_a_narrow_terminal(
     command: Command, prepared: Prepared, monkeypatch: pytest.MonkeyPatch, typed: tuple[str, ...]
 ) -> None:

@@ -13,6 +13,7 @@ import polars as pl
 import pytest
 import yaml
 from commands import flower, refused
+from lanes import slow
 from storage_samples import a_trajectory
 from wheeled_samples import DIFF, TRICYCLE, driven
 
@@ -280,7 +281,7 @@ def test_standstill_between_runs_is_bounded(dataset: Dataset) -> None:
         concatenate_runs(replace(dataset, trajectories=tuple(runs)), pause=3600.0)
 
 
-@pytest.mark.parametrize("shift", [10.0, *(pytest.param(far, marks=pytest.mark.slow) for far in (1e3, 1e4))])
+@pytest.mark.parametrize("shift", [10.0, *slow(1e3, 1e4)])
 @pytest.mark.parametrize("calibrator", ["closed_form", "trajectory_ml"])
 def test_a_pose_that_is_just_believed_gives_an_answer_or_one_line(folder: Path, shift: float, calibrator: str) -> None:
     dataset = load_dataset(folder)

@@ -12,6 +12,7 @@ import pytest
 import yaml
 from commands import CONFIGS, RECORDINGS, Command, refused
 from config_robots import NAMES, robot, settings
+from lanes import slow
 from report_samples import APR02, flower
 
 from omnibench.config import validate
@@ -368,9 +369,7 @@ def test_candidates_stay_within_speed_wheels_steering_and_the_area(name: str) ->
         assert ((sides[0] <= AREA[0] - 2 * half + 0.01) & (sides[1] <= AREA[1] - 2 * half + 0.01)).any()
 
 
-@pytest.mark.parametrize(
-    "name", ["diff", *(pytest.param(name, marks=pytest.mark.slow) for name in ("tricycle", "car"))]
-)
+@pytest.mark.parametrize("name", ["diff", *slow("tricycle", "car")])
 def test_a_few_runs_are_chosen_and_told_as_a_person_drives_them(name: str) -> None:
     design = design_experiment(pool_of(name))
     (chosen,) = design.sets

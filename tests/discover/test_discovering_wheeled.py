@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from config_robots import NAMES, settings
+from lanes import slow
 from real_recordings import diff, tricyc
 
 from omnibench.config import validate
@@ -67,7 +68,7 @@ def recordings(
 FIRST, *OTHERS = HIDDEN
 
 
-@pytest.mark.parametrize("case", [FIRST, *(pytest.param(case, marks=pytest.mark.slow) for case in OTHERS)])
+@pytest.mark.parametrize("case", [FIRST, *slow(*OTHERS)])
 def test_an_effect_of_a_robots_class_is_named_with_its_size(case: str) -> None:
     robot, name, parameters, commands, share = HIDDEN[case]
     found = discover_effects(recordings(robot, [{"name": name, "parameters": parameters}], commands))

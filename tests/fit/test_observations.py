@@ -116,6 +116,18 @@ def test_intervals_hold_the_truth(kind: str) -> None:
     assert (np.abs(errors) < 1).mean() > 0.75  # the study of 300 sets is tests/studies/reference_coverage.py
 
 
+@pytest.mark.parametrize("loss", ["squares", "huber"])
+def test_intervals_of_final_errors_hold_the_truth(loss: str) -> None:
+    away = []
+    for seed in range(3):
+        exact, truth = study.simulated("diff", seed)
+        run = calibrate(
+            study.reduced(exact, "distance and turn", np.random.default_rng(seed)), "closed_form", loss=loss
+        )
+        away.append((run.calibration.matrix_array - truth)[[0, 2]] / run.uncertainty.standard_deviations[[0, 2]])
+    assert np.sqrt(np.mean(np.square(away))) < 2
+
+
 @pytest.mark.slow
 def test_turns_that_share_the_offset_of_a_gyro_have_errors_within_their_intervals() -> None:
     offset_sigma = 0.01  # rad/s: ten times what the noise leaves of a turn of a second

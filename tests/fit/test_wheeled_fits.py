@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from corelli import corelli_dataset, half
+from lanes import slow
 from numpy.typing import NDArray
 from real_recordings import mean_errors
 from sample_robots import CAR, DIFFERENTIAL, TRICYCLE, WHEELED
@@ -57,11 +58,7 @@ def test_a_differential_drive_does_not_slide_unless_its_tracked_point_may_be_els
     np.testing.assert_allclose(fitted.calibration.matrix_array[1], moved[1], rtol=0, atol=2e-4)
 
 
-@pytest.mark.parametrize(
-    "robot",
-    [DIFFERENTIAL, *(pytest.param(robot, marks=pytest.mark.slow) for robot in (TRICYCLE, CAR))],
-    ids=lambda robot: robot.name,
-)
+@pytest.mark.parametrize("robot", [DIFFERENTIAL, *slow(TRICYCLE, CAR)], ids=lambda robot: robot.name)
 def test_the_geometry_is_found_by_a_search(robot: Robot) -> None:
     geometry = WheelGeometry(robot)
     hidden = geometry.start + geometry.scale * 0.02 * np.random.default_rng(7).standard_normal(len(geometry.start))

@@ -21,6 +21,7 @@ import psutil
 import pytest
 from commands import alive
 from job_samples import IMPORTING_THIS, Answer, Notes, jobs_of, run, squared, tried
+from lanes import slow
 from timing import PATIENCE, until
 
 import omnibench.jobs.job_process as job_process
@@ -205,7 +206,7 @@ def leaving(order: tuple[Path, str], _: Reporter) -> Answer:
     return Answer(1)
 
 
-@pytest.mark.parametrize("end", ["answer", *(pytest.param(end, marks=pytest.mark.slow) for end in ("crash", "hang"))])
+@pytest.mark.parametrize("end", ["answer", *slow("crash", "hang")])
 def test_what_a_job_started_ends_with_it(end: str, tmp_path: Path) -> None:
     file, seconds = tmp_path / "pid", 1.0
     while not file.exists() or not file.read_text():  # a busy machine may end the job before it started anything
@@ -298,9 +299,7 @@ def test_what_a_job_leaves_ends_its_process(what: str, tmp_path: Path, monkeypat
 
 
 class TestWorkersThatDie:
-    @pytest.mark.parametrize(
-        "by", [signal.SIGKILL, *(pytest.param(by, marks=pytest.mark.slow) for by in (signal.SIGTERM, signal.SIGHUP))]
-    )
+    @pytest.mark.parametrize("by", [signal.SIGKILL, *slow(signal.SIGTERM, signal.SIGHUP)])
     def test_a_job_that_is_killed_is_tried_three_times(self, by: signal.Signals, tmp_path: Path) -> None:
         jobs = [*jobs_of(killed, [(tmp_path, by)]), Job("other", squared, 3)]
         notes = run(tmp_path / "results", jobs, Processes(2))

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from lanes import slow
 from slam_study import ROBOT, Run, drive, flower_command
 
 from omnibench.config import validate
@@ -493,7 +494,7 @@ class TestRise:
 
 class TestDisagreementWithTheOdometry:
     @pytest.mark.parametrize("options", [SlamOptions(), LAST_POSE], ids=["odometry", "last_pose"])
-    @pytest.mark.parametrize("number", [1, *(pytest.param(each, marks=pytest.mark.slow) for each in (0, 3))])
+    @pytest.mark.parametrize("number", [1, *slow(0, 3)])
     def test_a_mirrored_or_turned_scanner_and_standing_wheels_are_said(self, number: int, options: SlamOptions) -> None:
         run, scanner = driven_in(room("furnished_room"), number), LIDAR.scanner
         turned = scanner.model_copy(update={"mount": scanner.mount.model_copy(update={"yaw": np.pi})})

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 from commands import refused
+from lanes import slow
 from pydantic import Field
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
@@ -344,7 +345,7 @@ def only_for(kind: RobotClass) -> type[Honest]:
     return OnlyForOne
 
 
-@pytest.mark.parametrize("kind", ["tricycle", *(pytest.param(kind, marks=pytest.mark.slow) for kind in OTHER_CLASSES)])
+@pytest.mark.parametrize("kind", ["tricycle", *slow(*OTHER_CLASSES)])
 def test_a_calibrator_for_one_class_of_robots_is_tested_on_it(kind: RobotClass) -> None:
     tested = suite(CalibratorConformance, only_for(kind))
     assert class_of(tested.problem().robot) == kind

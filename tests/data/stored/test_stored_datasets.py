@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from lanes import slow
 from sample_robots import APR_02, MECANUM
 from wheeled_samples import CAR, DIFF, SWERVE, driven
 
@@ -74,11 +75,7 @@ def test_what_stays_in_its_file_is_the_data_set_that_was_saved(robot: Robot, tmp
 
 
 @pytest.mark.usefixtures("nothing_held")
-@pytest.mark.parametrize(
-    "robot",
-    [SWERVE, *(pytest.param(robot, marks=pytest.mark.slow) for robot in (APR_02, MECANUM, DIFF, CAR))],
-    ids=lambda robot: robot.name,
-)
+@pytest.mark.parametrize("robot", [SWERVE, *slow(APR_02, MECANUM, DIFF, CAR)], ids=lambda robot: robot.name)
 def test_fits_errors_and_checks_are_as_in_memory(robot: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     save_dataset(recorded(robot), tmp_path / "saved")
     stored = load_dataset(tmp_path / "saved", most_in_memory=0)
@@ -101,13 +98,7 @@ def test_fits_errors_and_checks_are_as_in_memory(robot: Robot, tmp_path: Path, m
 
 
 @pytest.mark.usefixtures("nothing_held")
-@pytest.mark.parametrize(
-    "cost",
-    [
-        "final_pose",
-        *(pytest.param(cost, marks=pytest.mark.slow) for cost in ("final_position", "final_heading", "trajectory")),
-    ],
-)
+@pytest.mark.parametrize("cost", ["final_pose", *slow("final_position", "final_heading", "trajectory")])
 def test_bounds_of_all_costs_are_proven_as_in_memory(folder: Path, cost: str, monkeypatch: pytest.MonkeyPatch) -> None:
     stored = load_dataset(folder, most_in_memory=0)
     found = calibrate(stored, cost=cost).calibration

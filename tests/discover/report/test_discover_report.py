@@ -94,6 +94,13 @@ def test_four_wheels_and_one_run_of_each_command_have_a_report() -> None:
     assert not any(is_empty(trace) for each in drawn for trace in each["data"])
 
 
+def test_turns_on_the_spot_are_told_beside_the_figures_of_directions() -> None:
+    dataset = named().dataset
+    runs = [replace(run, v=0.0) if run.alpha == 0 else run for run in dataset.trajectories]
+    told = whole(lambda: replace(named(), dataset=replace(dataset, trajectories=tuple(runs))))
+    assert re.search(r"Turns on the spot, mean heading residual: .*° → .*° \(noise ±", told.text)
+
+
 def test_parameters_have_intervals_and_units(report: Page) -> None:
     rows = report.tables["Parameters of the effects that were added"]
     assert re.search(r"rotation_translation_coupling \(body\), weight 9[5-9]\.\d %; as in the textbook", rows[1][0])

@@ -13,6 +13,7 @@ import pytest
 from commands import RECORDINGS, ROOT
 from contamination import with_jumps
 from fit_samples import make_problem
+from lanes import slow
 from wheeled_recordings import recorded
 from wheeled_samples import DIFF, TRICYCLE
 
@@ -105,10 +106,7 @@ def test_headings_that_jump_cost_five_percent_at_most(loss: LossName) -> None:
     assert error(run, judged) <= 1.05 * on_clean(TRICYCLE, "least_squares", "trajectory")
 
 
-@pytest.mark.parametrize(
-    "calibrator",
-    ["closed_form", *(pytest.param(name, marks=pytest.mark.slow) for name in ("least_squares", "trajectory_ml"))],
-)
+@pytest.mark.parametrize("calibrator", ["closed_form", *slow("least_squares", "trajectory_ml")])
 def test_real_recordings_with_jumps_are_calibrated_as_without(calibrator: str) -> None:
     if not RECORDINGS.exists():
         pytest.skip(f"no real recordings: {RECORDINGS} is not there")
