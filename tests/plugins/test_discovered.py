@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -16,6 +17,7 @@ from omnibench.fit.calibrate import CalibrationRun, calibrate
 from omnibench.fit.calibrator import Outcome
 from omnibench.fit.evaluate import evaluate
 from omnibench.fit.problem import Budget
+from omnibench.progress import Progress
 from omnibench.robot.calibration import read_calibration, write_calibration
 
 PLUGINS = ("discovered",)
@@ -61,8 +63,12 @@ def test_where_nothing_is_found_the_answer_is_that_of_closed_form() -> None:
 
 
 def test_spent_seconds_leave_the_matrix_alone() -> None:
+    def at_a_step(event: Progress) -> None:
+        if event.unit == "step":
+            time.sleep(2.0)
+
     calibrate(simulated())  # so that compiling and reading are not part of the seconds
-    run = calibrate(simulated(), calibrator="discovered", budget=Budget(seconds=1.0))
+    run = calibrate(simulated(), calibrator="discovered", budget=Budget(seconds=2.0), watch=at_a_step)
     assert run.result.outcome is Outcome.TIME
     assert "s spent while" in run.result.reason
     assert not run.calibration.effects
