@@ -190,10 +190,11 @@ def write_scans(scans: Scans, table_format: TableFormat, trajectories: Iterable[
 
     table = register_io_source(frames, schema=_SCHEMA | ({"ranges": pl.String()} if as_text else {}))
     try:
-        if as_text:
-            table.sink_csv(file, maintain_order=True)
-        else:
-            table.sink_parquet(file, row_group_size=_ROW_GROUP, maintain_order=True)
+        with file.open("wb") as opened:  # polars would open it at any time, even after a break has removed it
+            if as_text:
+                table.sink_csv(opened, maintain_order=True)
+            else:
+                table.sink_parquet(opened, row_group_size=_ROW_GROUP, maintain_order=True)
     except pl.exceptions.PolarsError as error:
         raise OSError(errno.EIO, str(error)) from None
 
