@@ -270,7 +270,7 @@ def test_final_poses_of_full_turns_are_said_to_leave_the_matrix_undetermined(tmp
         {"speed": 0, **turn},
     ]
     path = written(tmp_path, sets={"star": turns})
-    with pytest.raises(ConfigError, match="the final poses of star leave row 1 of the matrix undetermined along"):
+    with pytest.raises(ConfigError, match=r"the final poses of star leave row [12] of the matrix undetermined along"):
         design_experiment(path, use="final")
     design = design_experiment(path, use="trajectory")
     assert equal_in_words(design, set_of(design, "star"), "final").startswith("none: they leave part")
