@@ -19,7 +19,7 @@ _PUBLIC = {
     "Trajectory": "data.dataset",
     "Wheel": "robot.kinematics",
     "calibrate": "fit.calibrate",
-    "check": "fit.check.checking",
+    "check": "check.check",
     "certify_optimum": "fit.certify",
     "design_experiment": "design.design",
     "discover_effects": "discover.discover",
@@ -29,7 +29,7 @@ _PUBLIC = {
     "inspect_dataset": "fit.inspect",
     "load_dataset": "data.storage",
     "load_plugins": "registry",
-    "make_dataset": "data.tables",
+    "make_dataset": "data.dataset",
     "odometry": "robot.dead_reckoning",
     "read_calibration": "robot.calibration",
     "read_compare_config": "compare.config",
@@ -50,23 +50,23 @@ __version__: str  # of the installed package, "unknown" in a folder of source fi
 if TYPE_CHECKING:  # imports for type checkers; tests/ground/test_package.py holds them equal to the list
     from typing import Any
 
+    from omnibench.check.check import check as check
     from omnibench.compare.config import read_compare_config as read_compare_config
     from omnibench.compare.run import run_comparison as run_comparison
     from omnibench.data.dataset import Dataset as Dataset
     from omnibench.data.dataset import Trajectory as Trajectory
+    from omnibench.data.dataset import make_dataset as make_dataset
     from omnibench.data.importers.tum import read_tum as read_tum
     from omnibench.data.importers.tum import write_tum as write_tum
     from omnibench.data.references import Reference as Reference
     from omnibench.data.references import References as References
     from omnibench.data.storage import load_dataset as load_dataset
     from omnibench.data.storage import save_dataset as save_dataset
-    from omnibench.data.tables import make_dataset as make_dataset
     from omnibench.design.design import design_experiment as design_experiment
     from omnibench.discover.discover import discover_effects as discover_effects
     from omnibench.errors import OmnibenchError as OmnibenchError
     from omnibench.fit.calibrate import calibrate as calibrate
     from omnibench.fit.certify import certify_optimum as certify_optimum
-    from omnibench.fit.check.checking import check as check
     from omnibench.fit.evaluate import evaluate as evaluate
     from omnibench.fit.inspect import inspect_dataset as inspect_dataset
     from omnibench.fit.settings import Budget as Budget

@@ -37,6 +37,8 @@ _FILE_MODULE = "omnibench_plugin_"  # begins the names of modules that are plug-
 # Modules that hold today what plug-ins import from those beside them, which have gone.
 _MOVED = {
     "omnibench.data.clock_matching": ("data.alignment",),
+    "omnibench.data.importers.tum": ("data.importers.orientation",),
+    "omnibench.data.recording": ("data.importers.recording_options", "data.importers.robot_option"),
     "omnibench.fit.differential": ("fit.differential.axle", "fit.differential.driven_squares"),
     "omnibench.fit.motion_windows": ("fit.observations.motion_windows",),
     "omnibench.fit.shrinkage": ("fit.shrinkage.shrunk_matrix",),

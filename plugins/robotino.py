@@ -87,7 +87,7 @@ class Robotino(Importer):
 
 def _read_run(file: Path) -> Trajectory:
     table = read_numbers(file, ("t", *_COMMAND, *_SET_SPEEDS, *_TICKS, *_CAMERA), separator=";", header_lines=3)
-    if len(table.values) < 2:
+    if len(table) < 2:
         raise DataError(f"{file}: a run needs two rows or more")
     times = (table.increasing("t") - table.column("t")[0]) * 1e-3
     angles = table.columns(_TICKS) * (2 * math.pi / (TICKS_PER_MOTOR_TURN * GEAR))

@@ -145,7 +145,7 @@ def _asked_comparison(given: Sequence[Path], data: list[str] | None, plugins: Se
     """The config that is given, or one for the data set that is: its folders, or a glob."""
     from omnibench.compare.config import read_compare_config
     from omnibench.compare.recording_config import config_in_words, recording_config
-    from omnibench.data.tables import is_glob
+    from omnibench.data.storage import is_glob
 
     first = given[0]
     of_recordings = all(place.is_dir() or is_glob(place) for place in given)
@@ -237,6 +237,9 @@ def calibrate(
     assert calibration.provenance is not None  # a fit has one, with its verdict
     assert calibration.provenance.held_out is not None
     print_verdict(calibration.provenance.held_out)
+    if result.at_bounds and result.shrinkage is None and output is not None:
+        what = f"{output} lies on a bound of what was searched: robot.yaml may be wrong, do not use it"
+        return print_ending(what, "see what is", "omnibench", "check", *dataset)
     if output is None:
         again = ("omnibench", *sys.argv[1:], "-o", "calibration.yaml")
         return print_ending("the calibration above is written nowhere", "write it to a file", *again)
@@ -399,7 +402,7 @@ def discover(
     from omnibench.cli.terminal.discovery_summary import print_discovery
     from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.config import to_yaml
-    from omnibench.data.storage import load_whole
+    from omnibench.data.storage import load_dataset as load_whole
     from omnibench.discover.discover import discover_effects
     from omnibench.discover.output import DiscoverOptions, check_output, write_discovery
     from omnibench.discover.report.discovery_report import discovery_report

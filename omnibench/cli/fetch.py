@@ -18,14 +18,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from omnibench.check.misreadings import search
+from omnibench.check.source import recognised, recorded
 from omnibench.cli.examples import bundled_folder
 from omnibench.config import Model, read_model
-from omnibench.data.checks.finding import FindingWarning
 from omnibench.data.dataset import Dataset
+from omnibench.data.finding import UNITS
 from omnibench.data.storage import check_dataset_folder, save_dataset
 from omnibench.errors import ConfigError, DataError, PluginError, nearest
 from omnibench.files import check_place, refuse_existing, write_files
-from omnibench.fit.check.fixes import recognised
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.registry import importers, load_plugin_file
 from omnibench.slam.import_dataset import import_dataset
@@ -372,7 +373,7 @@ def fetch_recording(
         try:
             fetched = replace(fetched, importer=recognised(clone.folder))
             dataset = _imported(fetched, fetched.importer, clone.folder, folder, {})
-            wrong = [each for each in dataset.warnings if isinstance(each, FindingWarning) and each.unit]
+            wrong = [mistake.what for mistake in search(recorded(dataset)).mistakes if mistake.kind in UNITS]
             if wrong:
                 raise DataError("; ".join(wrong))
         except (ConfigError, DataError) as refused:

@@ -69,7 +69,7 @@ Plugins = Annotated[
 
 
 # Modules that jobs which read a data set share.
-_READING = ("omnibench.data.checks.stream_faults", "omnibench.robot.compiled_beforehand")
+_READING = ("omnibench.check.streams", "omnibench.check.clocks", "omnibench.robot.compiled_beforehand")
 BackendName = Annotated[
     str | None,
     typer.Option(

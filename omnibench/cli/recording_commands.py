@@ -38,8 +38,8 @@ from omnibench.words import plural
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from omnibench.fit.check.checking import CheckReport
-    from omnibench.fit.check.fixes import RecordingSource
+    from omnibench.check.check import CheckReport
+    from omnibench.check.source import RecordingSource
 
 
 recording_app = typer.Typer()
@@ -103,13 +103,13 @@ def import_(
     robot), rosbag, dataset (a data set again, with other options), table1, optiodom and plug-ins. Recordings with laser
     scans but without reference poses get these by SLAM.
     """
+    from omnibench.check.source import RecordingSource
     from omnibench.config import parse_settings
-    from omnibench.data.checks.finding import UNITS, FindingWarning
     from omnibench.data.dataset import Imported
+    from omnibench.data.finding import UNITS
     from omnibench.data.splits import division_in_words
     from omnibench.data.storage import check_dataset_folder, save_dataset
     from omnibench.files import refuse_existing, resolved
-    from omnibench.fit.check.fixes import RecordingSource
     from omnibench.registry import importers
     from omnibench.slam.import_dataset import import_dataset
 
@@ -139,21 +139,15 @@ def import_(
     dataset = import_dataset(importer, source, options)
     read = RecordingSource(dataset, importer, source, given, output)
     report = None if no_check else _checked(read)
-    findings = [warning for warning in dataset.warnings if isinstance(warning, FindingWarning)]
-    if not accept_units:
+    if not accept_units and report is not None:
         # Units that cannot be right are refused, with what to type.
-        wrong: list[str] = [warning for warning in findings if warning.unit]
-        if not wrong and report is not None:
-            errors = [finding for finding in report.findings if finding.severity == "error"]
-            wrong = [error.what for error in errors if error.kind in UNITS]
+        wrong = [finding.what for finding in report.findings if finding.severity == "error" and finding.kind in UNITS]
         if wrong:
-            mended = (report or _checked(read)).command
-            way = f"type {mended}, or " if mended else ""
+            way = f"type {report.command}, or " if report.command else ""
             raise DataError(f"{'; '.join(wrong)}; {output} is not written: {way}--accept-units to write it as it is")
     dataset = replace(dataset, imported=Imported.of(importer, source, given))
     save_dataset(dataset, output, table_format, overwrite=force)
-    summarised = [warning for warning in findings if report is not None and warning.finding.what in report.sentence]
-    warn(warning for warning in dataset.warnings if warning not in summarised)
+    warn(dataset.warnings)
     typer.echo(f"{plural(len(dataset.trajectories), 'trajectory')}: {output}")
     way = " (other: --set validation=PATTERN)" if "validation" in entry.cls.Options.model_fields else ""
     divided = f"{division_in_words(dataset.trajectories, options)}{way}"
@@ -166,7 +160,7 @@ def import_(
 
 def _write_template(folder: Path, robot_type: str, references: bool) -> None:
     """Write tables and robot.yaml to fill in, and say what to type next."""
-    from omnibench.data.importers.csv_tables.csv_template import write_template
+    from omnibench.data.importers.csv_template import write_template
 
     files = write_template(folder, robot_type, references=references)
     typer.echo(f"{plural(len(files), 'file')}: {folder}")
@@ -180,7 +174,7 @@ def _write_template(folder: Path, robot_type: str, references: bool) -> None:
 
 
 def _checked(read: "RecordingSource") -> "CheckReport":
-    from omnibench.fit.check.checking import check_recording  # slow to import, and left out by --no-check
+    from omnibench.check.check import check_recording  # slow to import, and left out by --no-check
 
     return check_recording(read)
 
@@ -189,7 +183,7 @@ def _next_step(read: "RecordingSource", report: "CheckReport | None") -> tuple[A
     """The next step after an import in words, then the words to type."""
     if report is None:
         return "see what they tell", "omnibench", "inspect", read.folder
-    from omnibench.fit.check.checking import mending
+    from omnibench.check.check import mending
 
     if command := mending(read, report):
         return "mend it", *shlex.split(command)
@@ -296,12 +290,12 @@ def check(
 
     Nothing is changed. Exit 0 whatever the verdict; 2 where the source cannot be read.
     """
+    from omnibench.check.check import check_recording
+    from omnibench.check.source import next_command, read_source
     from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.config import parse_settings
     from omnibench.errors import PluginError
     from omnibench.files import refuse_existing
-    from omnibench.fit.check.checking import check_recording
-    from omnibench.fit.check.fixes import next_command, read_source
     from omnibench.registry import load_plugin_file, load_plugins
 
     refuse_existing(report, force=force)
@@ -324,11 +318,14 @@ def check(
             typer.echo(f"report: {report}", err=True)
         write_asked_figures(document, figures)
     if as_json:
-        print_json(checked.model_dump(mode="json", include={"verdict", "needed", "findings"}))
-        return
-    _print_check(make_console(), checked, next_command(read))
+        print_json(checked.model_dump(mode="json", include={"verdict", "needed", "findings", "command"}))
+    else:
+        _print_check(make_console(), checked, next_command(read))
+    if checked.verdict != "ready":
+        raise typer.Exit(1)
 
 
+_COLOURS = {"error": "red", "warning": "yellow", "note": "cyan"}
 _NEEDED = {True: "a calibration is needed", False: "a calibration is hardly needed", None: ""}
 
 
@@ -337,12 +334,16 @@ def _print_check(console: "Console", checked: "CheckReport", next_step: str) -> 
 
     next_step: the command line for a recording that is ready.
     """
-    console.print(f"{checked.verdict.upper()}: {checked.sentence}.", soft_wrap=True)
+    from rich.text import Text
+
+    colour = {"ready": "bold green", "fix": "bold red", "record more": "bold yellow"}[checked.verdict]
+    console.print(Text.assemble((checked.verdict.upper(), colour), f": {checked.sentence}."), soft_wrap=True)
     for finding in checked.findings:
         console.print()
-        console.print(f"{finding.severity}: {finding.what} [{finding.where}]", soft_wrap=True)
-        if finding.fix.startswith("omnibench "):
-            console.out(f"  {finding.fix}", highlight=False)
+        said = Text.assemble((finding.severity, _COLOURS[finding.severity]), f": {finding.what} [{finding.where}]")
+        console.print(said, soft_wrap=True)
+        if finding.changes and finding.fix:
+            console.out(f"  --set {finding.fix}", highlight=False)
         elif finding.fix:
             console.print(f"  {finding.fix}", soft_wrap=True)
     if checked.gain:
@@ -354,6 +355,8 @@ def _print_check(console: "Console", checked: "CheckReport", next_step: str) -> 
         print_ending("what can be mended is mended by one import", "type", *shlex.split(checked.command))
     elif checked.verdict == "record more":
         print_ending("nothing of this can be typed", "record what is missing, and check again")
+    elif checked.verdict == "fix":
+        print_ending("no option mends this", "correct what is named above, and check again")
     else:
         words = shlex.split(next_step)
         print_ending("nothing stands in the way", f"{words[1]} it", *words)

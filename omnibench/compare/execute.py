@@ -25,7 +25,7 @@ _GRACE = 10.0  # s after the budget's time: a run that has not stopped by then i
 _REFERENCES = 5  # evaluations that a machine is measured by: the best is one that nothing disturbed (chosen)
 # Modules that the processes share, so that they need not be imported for every run. Importers are among them, since a
 # plug-in is loaded after all that is built in.
-_IMPORTERS = ("omnibench.data.importers.csv_tables", "omnibench.data.importers.rosbag", "omnibench.data.importers.tum")
+_IMPORTERS = ("omnibench.data.importers.csv", "omnibench.data.importers.rosbag", "omnibench.data.importers.tum")
 PRELOAD = ("omnibench.compare.execute", "omnibench.fit.sum_of_norms", "nlopt", *_IMPORTERS)
 
 

@@ -31,12 +31,12 @@ _SHARED = (
     "fit/**/*.py",
     "data/dataset.py",
     "data/references.py",
-    "data/stored_rows.py",
-    "data/tables.py",
+    "data/parquet.py",
+    "data/stored.py",
     "compare/plan.py",
 )
 _CALIBRATORS = "fit/calibrators/*.py"
-_NO_PART = "fit/check/*.py"  # judges recordings before they are fitted
+_NO_PART = "check/*.py"  # judges recordings before they are fitted
 
 
 def run_key(settings: CompleteSettings, dataset: Dataset) -> str:

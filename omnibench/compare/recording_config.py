@@ -12,8 +12,7 @@ from omnibench.compare.result import THEORETICAL_NAME
 from omnibench.config import validate
 from omnibench.data.dataset import Dataset
 from omnibench.data.splits import training_split
-from omnibench.data.storage import load_dataset
-from omnibench.data.tables import dataset_folders, in_few_words
+from omnibench.data.storage import dataset_folders, in_few_words, load_dataset
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import Calibrator
 from omnibench.fit.prior import default_cost, default_unidentified

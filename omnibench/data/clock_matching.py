@@ -52,6 +52,7 @@ _CHORDS = 2e-4
 # Robust cost that an offset _AWAY, s, from the best one must add, as a share. Chosen: every run of four robots under
 # motion capture (OptiOdom) adds 0.43 or more, and the 72 of a Robotino that drives evenly throughout add 0.07 or less.
 _AWAY, _TOLD = 0.5, 0.2
+_FINE = 60  # ticks in a sample at most, of counters that are coarse; chosen
 _RANK = 1e-3  # of the strongest direction of the signals: what is weaker is noise; chosen
 
 
@@ -137,7 +138,8 @@ class Windows:
 
     edges (F + 1,), counted (F + 1, C): times, s, and integrals of the signals, then of the design's speed and of the
     signals' magnitudes. stamps (K,): s. starts (B,): first stamp of each bin. shown (2, W): change of heading, rad, and
-    way, m. heading: number of the columns that tell the heading.
+    way, m. heading: number of the columns that tell the heading. tick: usual time of one, s; 0 of fine counters.
+    steers: the way alone tells the clock, since wheels may follow their steering angles late.
     """
 
     edges: Array
@@ -148,6 +150,8 @@ class Windows:
     first: NDArray[np.intp]
     last: NDArray[np.intp]
     shown: Array
+    tick: float = 0.0
+    steers: bool = False
 
     @classmethod
     def of(cls, robot: Robot, run: Streams) -> Windows | None:
@@ -172,7 +176,9 @@ class Windows:
         speeds = np.column_stack([np.hypot(twists[:, 0], twists[:, 1]), np.abs(driven)])
         counted = np.hstack([run.driven, np.vstack([np.zeros(speeds.shape[1]), np.cumsum(speeds, axis=0)])])
         shown = np.array([moved[:, 2], np.hypot(moved[:, 0], moved[:, 1])])
-        return cls(run.edges, counted, driven.shape[1], run.pose_times, starts, first, last, shown)
+        tick = _tick_time(driven, np.diff(run.edges))
+        steers = bool(robot.drive.steered)
+        return cls(run.edges, counted, driven.shape[1], run.pose_times, starts, first, last, shown, tick, steers)
 
     @property
     def middle(self) -> float:
@@ -233,12 +239,14 @@ class Windows:
             left = np.where(within, shown - (told @ solved[..., None])[..., 0], 0.0)
             whole = (wanted**2).sum(axis=1)
             share = np.maximum((left**2).sum(axis=1) / np.maximum(whole, 1e-300), 1e-9)
-            shares *= np.where(whole > 0, share, 1.0)
+            shares *= np.where((whole > 0) & (number == 1 or not self.steers), share, 1.0)
         shares[within.sum(axis=1) < max(_FEWEST, within.shape[1] / 2)] = np.inf
         return shares
 
-    def residuals(self, fitted: Sequence[Array], clock: Clock) -> tuple[Array, Array, Array]:
-        """Residuals (2, W), in their standard deviations, their slopes by the middle's offset, and Huber's weights."""
+    def residuals(self, fitted: Sequence[Array], clock: Clock) -> tuple[Array, Array, Array, Array]:
+        """Residuals (2, W), in their standard deviations, their slopes by the middle's offset, Huber's weights, and the
+        changes (2, W) that the wheels explain.
+        """
         before, now, after = self.columns(clock, np.array([-_DELTA, 0.0, _DELTA]))
         rates = (after - before) / (2 * _DELTA)
         left = self._left(fitted, now)
@@ -248,7 +256,8 @@ class Windows:
         weights: Array = np.where(
             self.within(clock), np.minimum(1.0, _HUBER / np.maximum(np.abs(residuals), 1e-12)), 0.0
         )
-        return residuals, slopes / deviations, weights
+        weights[: int(self.steers)] = 0.0
+        return residuals, slopes / deviations, weights, (self.shown - left) / deviations
 
     def _left(self, fitted: Sequence[Array], columns: Array) -> Array:
         """Residuals (2, W), rad and m, of the reference less what changes (W, C) of the wheels' counts explain."""
@@ -264,10 +273,10 @@ class Windows:
     def improved(self, fitted: Sequence[Array], clock: Clock, steps: int = _STEPS) -> Clock:
         """The clock after some steps of Gauss-Newton."""
         for _ in range(steps):
-            residuals, slopes, weights = self.residuals(fitted, clock)
-            design = self._design(slopes)
+            residuals, slopes, weights, explained = self.residuals(fitted, clock)
+            design = self._design(slopes, explained)
             normal, wanted = (design * weights.ravel()) @ design.T, design @ (weights * residuals).ravel()
-            step = np.linalg.lstsq(normal, wanted)[0]
+            step = np.linalg.lstsq(normal, wanted)[0][2:]
             clock = (
                 clock[0] + float(np.clip(step[0], -0.2, 0.2)),
                 float(np.clip(clock[1] + (step[1] if len(step) > 1 else 0.0), -_LARGEST_DRIFT, _LARGEST_DRIFT)),
@@ -287,15 +296,20 @@ class Windows:
             if both.sum() < _FEWEST:
                 return False
             left = self._left(fitted, columns) / deviations
-            cost, least = (float(_huber(each[:, both]).sum()) for each in (left, best))
+            cost, least = (float(_huber(each[int(self.steers) :, both]).sum()) for each in (left, best))
             if cost - least <= _TOLD * least:  # both are 0 where the reference stands still
                 return False
         return True
 
-    def _design(self, slopes: Array) -> Array:
-        """Derivatives (P, 2 W) of the shown changes by the offset and, of a run that is long enough, by the drift."""
+    def _design(self, slopes: Array, explained: Array) -> Array:
+        """Derivatives (P, 2 W) of the shown changes by the offset and, of a run that is long enough, by the drift.
+
+        Before them stand those by the gains of both channels in this run: slip makes every window longer, and a drift
+        does, too; what tells a drift are the moments at which the motion changes.
+        """
+        none = np.zeros_like(explained[0])
         moments = (self.stamps[self.starts][self.first] + self.stamps[self.starts][self.last]) / 2 - self.middle
-        rows = [slopes.ravel()]
+        rows = [np.append(explained[0], none), np.append(none, explained[1]), slopes.ravel()]
         if self.length >= _LEAST_DRIFTING:
             rows.append((slopes * moments).ravel())
         return np.array(rows)
@@ -307,19 +321,35 @@ class Windows:
         """
         if abs(clock[0]) > search + _WINDOW or not self._told(fitted, clock):
             return None
-        residuals, slopes, weights = self.residuals(fitted, clock)
-        design = self._design(slopes)
+        residuals, slopes, weights, explained = self.residuals(fitted, clock)
+        design = self._design(slopes, explained)
         normal = (design * weights.ravel()) @ design.T
         scores = (design * (weights * residuals).ravel()).reshape(len(design), *residuals.shape)
         blocks = np.floor((self.stamps[self.starts][self.first] - self.stamps[0]) / _BLOCK)
         sums = np.add.reduceat(scores, np.flatnonzero(np.diff(blocks, prepend=-1.0)), axis=2)
         sums = sums.reshape(len(design), -1)
-        inverse = np.linalg.inv(normal)
-        chords = np.array([_CHORDS, _CHORDS * np.sqrt(12.0) / self.length])[: len(design)]
-        errors = np.sqrt(np.diag(inverse @ (sums @ sums.T) @ inverse) + chords**2)
+        inverse = np.linalg.pinv(normal)
+        # Chords, and the ticks of coarse counters, which scatter less than they are long, but in a pattern.
+        least = np.array([_CHORDS, _CHORDS * np.sqrt(12.0) / self.length]) + self.tick * np.array(
+            [0.25, 1 / self.length]
+        )
+        errors = np.sqrt(np.diag(inverse @ (sums @ sums.T) @ inverse)[2:] + least[: len(design) - 2] ** 2)
         told = len(errors) > 1 and abs(clock[1]) < _LARGEST_DRIFT
         drift_error = float(errors[1]) if told else np.inf
         return ClockMatch(clock[0], float(errors[0]), clock[1], drift_error, self.length)
+
+
+def _tick_time(driven: Array, durations: Array) -> float:
+    """The usual time, s, of a tick of counters with steps (F, M), which are whole numbers of it; 0 if they are not."""
+    steps = np.abs(driven)
+    moved = steps[steps > 1e-9 * max(float(steps.max(initial=0.0)), 1e-12)]
+    if not len(moved):
+        return 0.0
+    ticks = moved / moved.min()
+    if np.abs(ticks - np.round(ticks)).max() > 0.05 or ticks.max() > _FINE:
+        return 0.0
+    rates = (steps / durations[:, None]).max(axis=1)
+    return float(moved.min() / np.median(rates[rates > 0]))
 
 
 def _coefficients(windows: Sequence[Windows], clocks: Sequence[Clock]) -> list[Array]:
@@ -443,11 +473,23 @@ def align(begin: float, wheel_times: Array, pose_times: Array, poses: Array) -> 
     )
 
 
-def median_period(times: Sequence[Array]) -> float:
-    """The median time between samples of several recordings, to the microsecond, s."""
+_BUNCHED, _TOGETHER = 1.2, 10  # factor of the mean period from the median, and samples that it is taken over; chosen
+
+
+def usual_period(times: Sequence[Array]) -> float:
+    """The usual time between samples of recordings, to the microsecond, s: the median, or the mean where stamps bunch.
+
+    Messages that are stamped on arrival come in bunches: 47 ms, 3 ms, 47 ms ... at a period of 25 ms.
+    """
     steps = [np.diff(recording) for recording in times if len(recording) > 1]
     typical = float(np.median(np.concatenate(steps))) if steps else float(times[0][0])
+    spans = [(each[_TOGETHER:] - each[:-_TOGETHER]) / _TOGETHER for each in times if len(each) > 2 * _TOGETHER]
+    if spans and not 1 / _BUNCHED < (mean := float(np.median(np.concatenate(spans)))) / typical < _BUNCHED:
+        typical = mean
     return round(typical, 6) or typical
+
+
+median_period = usual_period  # as plug-ins know it
 
 
 def _pose_at(time: float, times: Array, poses: Array) -> Array:

@@ -1,133 +1,86 @@
-"""Trajectory and Dataset: a robot's recordings in memory, SI units throughout; and the header of their folder."""
+"""Trajectory and Dataset: a robot's recordings, SI units throughout; made from arrays or tables, which are checked."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections import Counter
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from numbers import Real
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+import polars as pl
+from pydantic import Field
 from pydantic_core import to_jsonable_python
 
-from omnibench.config import Model, Name, Positive, read_yaml, to_yaml, validate
-from omnibench.data.checks.finding import findings_of
-from omnibench.data.checks.implausible import implausible
-from omnibench.data.references import References, odd_references, reference_flaw, with_whole_turns
-from omnibench.data.run_checks import check_sample_period, pose_times_flaw, reach_flaw, values_flaw, wheel_times_flaw
-from omnibench.data.scans import Scanner, Scans
-from omnibench.data.stored_rows import in_file, median_period, noted, period_of
-from omnibench.errors import ConfigError, DataError, nearest, require_type, shown
-from omnibench.robot.kinematics import Array, Drive, Robot, in_the_middle, interpolated
+from omnibench.config import Model
+from omnibench.data.references import NUMBERS, References, reference_flaw, references_of, with_whole_turns
+from omnibench.data.scans import Scans
+from omnibench.data.stored import (
+    Flaw,
+    Table,
+    arrays_of_runs,
+    median_period,
+    pose_times_flaw,
+    present_groups,
+    required_columns,
+    samples_in_memory,
+    times_flaw,
+    values_flaw,
+    wheel_times_flaw,
+)
+from omnibench.errors import DataError, nearest, require_type
+from omnibench.robot.calibration import SAMPLE_PERIODS
+from omnibench.robot.kinematics import Array, Drive, Robot, interpolated
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.odometry import WheelLog, kept_with_samples
+from omnibench.robot.odometry import WheelLog
+from omnibench.robot.samples import Samples, digest_of, with_samples
 from omnibench.views import Shown
-from omnibench.words import plural
+from omnibench.words import plural, some
 
 TURN = 2 * np.pi  # rad
-
-
-def unwrap(robot: Robot, logs: Sequence[WheelLog], headings: Sequence[Array]) -> tuple[list[Array], list[int]]:
-    """Continuous headings (rad) and the indices of trajectories in which they are ambiguous.
-
-    Every increment gets the whole turns that bring it closest to the design model's odometry. Where the reference is
-    dense this is the nearest turn; where it is sparse, the odometry tells how often the robot turned in between. A
-    trajectory is ambiguous if the two still differ by more than a quarter turn between two reference poses.
-    """
-    model = OdometryModel.of_design(robot, "arc")
-    unwrapped: list[Array] = []
-    ambiguous: list[int] = []
-    for index, (odometry, heading) in enumerate(zip(model.poses(logs), headings, strict=True)):
-        steps, expected = np.diff(heading), np.diff(odometry[:, 2])
-        turns = np.round((expected - steps) / TURN)
-        # Added to the headings as recorded, so that continuous ones stay as they are to the bit.
-        unwrapped.append(heading + TURN * np.concatenate([[0.0], np.cumsum(turns)]))
-        if len(steps) and np.abs(steps + TURN * turns - expected).max() > TURN / 4:
-            ambiguous.append(index)
-    return unwrapped, ambiguous
-
-
-FORMAT: Final = "omnibench-dataset/1"
-
-
-class Imported(Model):
-    """The importer, the source and the options as they were given: what was typed."""
-
-    importer: str = Field(description="name of the importer")
-    source: str = Field(description="file or folder, as it was given")
-    options: dict[str, Any] = Field({}, description="options as they were given")
-
-    @classmethod
-    def of(cls, importer: str, source: Path, options: Mapping[str, Any]) -> Imported:
-        """The import of a source; options are kept as JSON can hold them."""
-        return cls(importer=importer, source=str(source), options=to_jsonable_python(dict(options), fallback=str))
-
-
-class Header(Model):
-    """The content of dataset.yaml."""
-
-    format: Literal["omnibench-dataset/1"] = FORMAT
-    name: Name = Field(min_length=1)
-    description: str = ""
-    source: str = ""
-    licence: str = ""
-    simulated: bool = Field(False, description="true for simulated data")
-    robot: Robot
-    sample_period: Positive = Field(description="s")
-    wheels: tuple[str, ...] = Field(description="the wheels with a measured rate; column names: omega_<wheel>")
-    scanner: Scanner | None = Field(None, description="the scanner, if there are scans")
-    imported: Imported | None = Field(None, description="how it was imported; no part of the hash")
-
-    @model_validator(mode="after")
-    def _wheels_are_the_robots(self) -> Header:
-        if self.wheels != self.robot.wheel_names:
-            raise ValueError(
-                f"wheels are {', '.join(self.wheels)}, but the robot's wheels with a measured rate are "
-                f"{', '.join(self.robot.wheel_names)}; name the same wheels in the same order"
-            )
-        return self
-
-    @property
-    def text(self) -> str:
-        """The header as it is written: how it was imported only where that is known."""
-        return to_yaml(self.model_dump(mode="json", by_alias=True, exclude=None if self.imported else {"imported"}))
-
-
-def read_header(folder: Path) -> Header:
-    """The dataset.yaml of a data set's folder. DataError: it is none, or it is wrong."""
-    if not folder.is_dir():
-        what = "is a file" if folder.exists() else "no such folder"
-        raise DataError(f"{folder}: {what}; a data set is a folder with dataset.yaml in it")
-    file = folder / "dataset.yaml"
-    if not file.exists():
-        several = any(folder.glob("*/dataset.yaml"))
-        way = f"its folders are some: give '{folder}/*'" if several else "`omnibench import` makes one of a log"
-        raise DataError(f"{file}: no such file, and so {folder} is no data set; {way}")
-    try:
-        content = read_yaml(file)
-        given = content.get("format") if isinstance(content, dict) else None
-        if given != FORMAT:
-            raise DataError(f"{file}: format is {shown(given)}, expected {FORMAT!r}")
-        return validate(Header, content, str(file))
-    except ConfigError as error:
-        raise DataError(str(error)) from None
-
-
 Split = Literal["train", "validation"]
 SPLITS: tuple[Split, ...] = ("train", "validation")
-# Digits of a fingerprint that tell the wheel samples: a run is taken for one of 1000 others in 1 of 4 million cases.
-WHEEL_DIGITS = 8
+
+# Columns of the arrays of a run's reference, and of its motion commands.
+POSES = {"poses": ["x", "y", "theta"]}
+COVARIANCES = {"pose_covariances": [f"cov_{name}" for name in ("xx", "xy", "xtheta", "yy", "ytheta", "thetatheta")]}
+SENT = {"sent": ["t", "v", "alpha", "omega", "t_r"]}
+RUN_COLUMNS = ("trajectory", "split")  # those that every table of runs has
+POSE_COLUMNS = ("trajectory", "t", *POSES["poses"])  # of poses
+REFERENCE_COLUMNS = ("trajectory", "kind")  # of references
+RUN_NUMBERS = ("started_at", "v", "alpha", "omega", "duration", "distance")
+_ARRAYS = (
+    *("times", "rates", "pose_times", "poses", "angles", "targets", "pose_covariances", "steering"),
+    *("odometry", "sent"),  # recorded, but no fit depends on them
+)
+_HASHED = (
+    *("id", "split", "times", "rates", "pose_times", "poses", "command", "repetition", "session", "started_at"),
+    *("v", "alpha", "omega", "duration", "distance", "angles", "targets", "pose_covariances", "steering", "references"),
+)
+
 # A reference that moves by more, m and rad, is no noise of one that stands; a robot whose wheels drive less than the
 # share of that has a dead encoder. Chosen: motion capture scatters by mm, and no wheel slips a hundredfold.
 _MOVED, _TURNED, _HARDLY = 0.05, 0.1, 0.01
 _EVERY = 1.0  # s between the moments at which wheel angles are compared where there are no poses; chosen
-_UNUSED = ("odometry", "sent")  # recorded, but no fit depends on them
-_ARRAYS = ("times", "rates", "pose_times", "poses", "angles", "targets", "pose_covariances", "steering", *_UNUSED)
+# The farthest pose from a run's start as a multiple of the wheels' travel and a metre; chosen: poses in mm, which the
+# check tells of, are a thousand times too far.
+_FARTHEST = 1e4
+# A sample period is refused when it is this many times longer or shorter than the median of the stamps; chosen: one in
+# ms in the place of s is just within, and warned of.
+_MOST_PERIODS = 1001.0
+# Share of the runs whose headings are neither wrapped nor those of the wheels, from which on none is unwrapped (chosen:
+# in degrees most are such, in radians none); turns within which wrapped headings lie, with what rounding adds.
+_CONTRADICTED, _WITHIN = 0.25, 1.001
+_SHOWN = 5  # ids in a warning, at most
+_ONLY_RUN = "run"  # id of the run of tables without a column "trajectory"
+_PERIOD_DECIMALS = 9  # of a sample period in s that is taken from stamps: ns
 
 
+@with_samples("times", "rates", "angles", "targets", "steering", "odometry")
 @dataclass(frozen=True, eq=False, repr=False)
 class Trajectory(Shown):
     """One recorded run.
@@ -161,27 +114,12 @@ class Trajectory(Shown):
     references: References | None = None  # distances, turns and the like that were measured in the place of poses
     odometry: Array | None = None  # x, y (m), heading (rad) at ``times`` (F, 3) that the robot computed; not used
     sent: Array | None = None  # motion commands (C, 5) sent in the run: t (s), v, alpha, omega, validity t_r (s)
+    samples: Samples = field(default=Samples({}), kw_only=True)  # the arrays (F, ...) above, which this handle gives
 
-    def with_arrays(self) -> Trajectory:
-        """The run with its numbers as arrays, whatever sequences they were given as. DataError: they are no numbers."""
-        if self.references is not None:
-            require_type(self.references, References, "References.of([...], end=...)")
-        arrays: dict[str, Any] = {}
-        for name in _ARRAYS:
-            if (value := getattr(self, name)) is not None and not in_file(value):
-                try:
-                    arrays[name] = np.asarray(value, dtype=float)
-                except (TypeError, ValueError):
-                    raise DataError(f"trajectory {self.id}: {name}: expected numbers, in rows of one length") from None
-        return replace(self, **arrays)
-
-    @kept_with_samples
+    @property
     def signals(self) -> Array:
         """Drive signals (F, M) of the wheel samples, rad/s: the rates, where the robot does not steer."""
-        if self.drive is None:
-            return self.rates
-        assert self.steering is not None  # the drive steers
-        return self.drive.signals(self.rates, in_the_middle(self.steering))
+        return self.samples.signals(self.drive)
 
     @cached_property
     def angles_at_poses(self) -> Array:
@@ -199,7 +137,7 @@ class Trajectory(Shown):
     @property
     def end(self) -> float:
         """Time of the last reference pose, of a run without any that of its last wheel sample, s."""
-        return float(self.pose_times[-1] if self.has_poses else self.times[-1])
+        return float(self.pose_times[-1]) if self.has_poses else self.samples.end
 
     @property
     def start_known(self) -> bool:
@@ -222,31 +160,13 @@ class Trajectory(Shown):
 
         The first 8 begin the SHA-256 of the wheel samples, the others that of the reference poses.
         """
-        reference = _digest(self.pose_times, self.poses)
-        if self.references is not None:
-            reference.update(repr(self.references.content).encode())
-        return self.wheel_digits + reference.hexdigest()[:8]
-
-    @property
-    def wheel_digits(self) -> str:
-        """The first half of the fingerprint."""
-        sampled = (self.times, self.rates) if self.steering is None else (self.times, self.rates, self.steering)
-        return noted(self.times, "wheel_digits", lambda: _digest(*sampled).hexdigest()[:WHEEL_DIGITS])
+        references = [] if self.references is None else [repr(self.references.content).encode()]
+        return self.samples.digest + digest_of(self.pose_times, self.poses, *references)[:8]
 
     def log(self, stamps: Sequence[float] | Array) -> WheelLog:
         """The wheel rates from the start pose, with poses wanted at ``stamps`` (s)."""
-        wanted = np.asarray(stamps, dtype=float)
-        return WheelLog(
-            self.times,
-            self.rates,
-            self.start,
-            wanted,
-            self.angles,
-            self.started_at,
-            self.session,
-            self.steering,
-            self.drive,
-        )
+        known: dict[str, Any] = {"samples": self.samples, "started_at": self.started_at, "session": self.session}
+        return WheelLog(start=self.start, stamps=np.asarray(stamps, dtype=float), drive=self.drive, **known)
 
     @property
     def final_log(self) -> WheelLog:
@@ -259,9 +179,22 @@ class Trajectory(Shown):
         return self.log(self.pose_times[1:])
 
 
+class Imported(Model):
+    """The importer, the source and the options as they were given: what was typed."""
+
+    importer: str = Field(description="name of the importer")
+    source: str = Field(description="file or folder, as it was given")
+    options: dict[str, Any] = Field({}, description="options as they were given")
+
+    @classmethod
+    def of(cls, importer: str, source: Path, options: Mapping[str, Any]) -> Imported:
+        """The import of a source; options are kept as JSON can hold them."""
+        return cls(importer=importer, source=str(source), options=to_jsonable_python(dict(options), fallback=str))
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Dataset(Shown):
-    """Recordings of one robot. Make it with :func:`make_dataset`, which unwraps headings and looks for wrong units.
+    """Recordings of one robot. Make it with :func:`make_dataset`, which checks them and unwraps headings.
 
     scans: scans of its laser scanner, if it has one and they were recorded. referenced: the poses are reference poses;
     False: they are placeholders until ``slam_dataset`` makes poses from the scans, and the data set cannot be saved.
@@ -301,12 +234,12 @@ class Dataset(Shown):
         """SHA-256 of everything a fit could depend on; independent of names and file formats."""
         digest = hashlib.sha256(self.robot.model_dump_json().encode())
         digest.update(repr(self.sample_period).encode())
-        for trajectory in self.trajectories:
-            for item in fields(trajectory):
-                value = getattr(trajectory, item.name)
-                if item.name in ("drive", *_UNUSED) or (item.name in ("steering", "references") and value is None):
-                    continue  # the robot has it; runs without steering or references keep the hash of earlier versions
-                if item.name in _ARRAYS and value is not None:
+        for run in self.trajectories:
+            for name in _HASHED:
+                value = getattr(run, name)
+                if value is None and name in ("steering", "references"):
+                    continue  # runs without them keep the hash of earlier versions
+                if value is not None and name in _ARRAYS:
                     digest.update(np.ascontiguousarray(value, dtype=float).tobytes())
                 elif isinstance(value, References):
                     digest.update(repr(value.content).encode())
@@ -318,147 +251,369 @@ class Dataset(Shown):
 def make_dataset(
     name: str,
     robot: Robot,
-    sample_period: float,
-    trajectories: Iterable[Trajectory],
+    sample_period: float | None = None,
+    trajectories: Iterable[Trajectory] | Any = None,
     *,
+    wheels: Any = None,
+    poses: Any = None,
+    references: Any = None,
     description: str = "",
     source: str = "",
     licence: str = "",
     simulated: bool = False,
     scans: Scans | None = None,
 ) -> Dataset:
-    """A data set with unwrapped headings and with warnings about values that cannot be right.
+    """A data set from arrays or data frames, checked as files are checked, with unwrapped headings.
 
-    DataError: there is no trajectory, two have the same id, an array has another shape, other times or other values
-    than a data set on disk may have, or the sample period is far from that of the stamps.
+    sample_period: s, that of the wheel samples; default: the median of their stamps. Either
+
+    - ``trajectories``: :class:`Trajectory` objects, one a run, with arrays; or
+    - tables: Polars or pandas data frames, or dicts of columns, with the columns of a data set's files.
+      wheels: trajectory, t (s), omega_<wheel> (rad/s) of every wheel, steer_<wheel> (rad) of steered ones; poses:
+      trajectory, t, x, y (m), theta (rad), the first of a run at t = 0; references: in their place or beside them.
+      trajectories: trajectory, split (train or validation), command ...; default: every run of ``wheels``. Without
+      ``split`` every second run of a command validates. Tables of one run need no column ``trajectory``.
+
+    DataError names the table, its row (1 is the first) and column, and what is wrong: a missing column or value, times
+    that do not increase, a run without a pose at t = 0, two runs of the same name, values that no robot reaches. Units
+    and signs are judged by :func:`omnibench.check`.
+
+    >>> import numpy as np
+    >>> robot = Robot(name="cart", wheels=[
+    ...     Wheel(name="left", type="fixed", radius=0.05, x=0, y=0.15),
+    ...     Wheel(name="right", type="fixed", radius=0.05, x=0, y=-0.15)])
+    >>> t = np.arange(1, 51) * 0.02
+    >>> wheels = {"t": t, "omega_left": np.full(50, 4.0), "omega_right": np.full(50, 4.0)}
+    >>> poses = {"t": [0.0, 1.0], "x": [0.0, 0.2], "y": [0.0, 0.0], "theta": [0.0, 0.0]}
+    >>> make_dataset("day1", robot, wheels=wheels, poses=poses)
+    Dataset 'day1': 1 run (1 train, 0 validation) of robot cart (wheels left, right)
+      recorded, 50 wheel samples every 20 ms, 2 reference poses
     """
-    raw = tuple(_with_drive(trajectory, robot) for trajectory in trajectories)
-    if not raw:
-        raise DataError(f"data set {name}: it has no trajectory")
-    matrix, standing = robot.inverse_kinematic_matrix, list[str]()
-    seen: set[str] = set()
-    for trajectory in raw:
-        if trajectory.id in seen:
-            raise DataError(f"data set {name}: trajectory {trajectory.id} is there twice; give each its own id")
-        seen.add(trajectory.id)
-        _check_run(f"data set {name}", robot, trajectory)
-        if _moves_unseen(matrix, trajectory):
-            standing.append(trajectory.id)
-        if in_file(trajectory.times):  # its samples are at hand now, and would be read again
-            _ = trajectory.wheel_digits, period_of(trajectory)
-    median = median_period(raw)
-    check_sample_period(f"data set {name}", sample_period, median)
-    logs = [trajectory.log(trajectory.pose_times) for trajectory in raw]
-    warnings = implausible(robot, logs, [trajectory.poses for trajectory in raw])
-    headings, ambiguous = [trajectory.poses[:, 2] for trajectory in raw], list[int]()
-    wrong = {finding.kind for finding in findings_of(warnings)}
-    if "heading_unit" not in wrong:  # whole turns of 2 pi would spoil them
-        headings, ambiguous = unwrap(robot, logs, headings)
-    if ambiguous and not warnings:
-        shown = ", ".join(raw[index].id for index in ambiguous[:5])
-        warnings = [
+    require_type(robot, Robot, "Robot(name=..., wheels=[...])")
+    if wheels is None and (trajectories is None or poses is not None or references is not None):
+        raise DataError(f"data set {name}: wheels is missing: a table with the columns t and omega_<wheel>")
+    if wheels is not None and poses is None and references is None:
+        raise DataError(
+            f"data set {name}: poses is missing: a table with the columns t, x, y and theta; or references, with "
+            "distances, turns and the like"
+        )
+    if not isinstance(sample_period, Real | None):
+        raise DataError(f"data set {name}: sample_period is {sample_period!r}, expected a number of seconds")
+    if wheels is None:
+        runs = [_checked(f"data set {name}", robot, run) for run in trajectories]
+    else:
+        runs = _runs_of_frames(robot, trajectories, wheels, poses, references)
+    period: Any = sample_period
+    if period is None:  # the median; that there is no run is said next
+        period = round(median_period(runs), _PERIOD_DECIMALS) if runs else 1.0
+    texts: dict[str, Any] = {"description": description, "source": source, "licence": licence}
+    return dataset_of_runs(name, robot, period, runs, simulated=simulated, scans=scans, **texts)
+
+
+def _checked(place: str, robot: Robot, run: Any) -> Trajectory:
+    """A run with its numbers as arrays, whatever sequences they were given as.
+
+    DataError in one line that begins with ``place``: it is no run, or its split, a shape, a time or a value is wrong.
+    """
+    if not isinstance(run, Trajectory):
+        kind = type(run).__name__
+        raise DataError(f"{place}: a trajectory is of type {kind}; of tables give wheels= and poses=, too")
+    where = f"{place}: trajectory {run.id}"
+    if run.split not in SPLITS:
+        hint = nearest(str(run.split), SPLITS)
+        raise DataError(f"{where}: split is {run.split!r}; {hint}it must be train or validation")
+    if run.references is not None:
+        require_type(run.references, References, "References.of([...], end=...)")
+    arrays, changed = dict[str, Array](), dict[str, Any]()
+    for name in _ARRAYS:
+        if (value := getattr(run, name)) is not None:
+            try:
+                arrays[name] = np.asarray(value, dtype=float)
+            except (TypeError, ValueError):
+                raise DataError(f"{where}: {name}: expected numbers, in rows of one length") from None
+            if arrays[name] is not value:
+                changed[name] = arrays[name]
+    samples, poses = arrays["times"].shape, arrays["pose_times"].shape
+    if run.steering is None and robot.drive.steered:
+        raise DataError(f"{where}: it has no steering angles; wheels {', '.join(robot.drive.steered)} steer")
+    rates, sent = (*samples, len(robot.wheel_names)), (len(arrays.get("sent", ())), 5)
+    expected = {"rates": rates, "poses": (*poses, 3), "angles": rates, "targets": rates, "sent": sent}
+    expected |= {"steering": (*samples, len(robot.drive.steered)), "odometry": (*samples, 3)}
+    for name, shape in {**expected, "pose_covariances": (*poses, 3, 3)}.items():
+        found = arrays[name].shape if name in arrays else shape
+        if len(samples) != 1 or len(poses) != 1 or found != shape:
+            raise DataError(f"{where}: {name} has shape {found}, expected {shape}")
+    if not samples[0] or not poses[0]:
+        raise DataError(f"{where}: it has no {'reference poses' if samples[0] else 'wheel samples'}")
+    flaws = [(name, values_flaw(array)) for name, array in arrays.items()]
+    flaws += [("times", wheel_times_flaw(arrays["times"], run.id))]
+    flaws += [("pose_times", pose_times_flaw(arrays["pose_times"], run.id))]
+    if run.references is not None:
+        flaws += [("references", reference_flaw(run.references, arrays["times"]))]
+    for name, flaw in flaws:
+        if flaw is not None:
+            raise DataError(f"{where}: {name}, row {flaw[0] + 1}: {flaw[1]}")
+    return replace(run, **changed) if changed else run
+
+
+def _runs_of_frames(robot: Robot, trajectories: Any, wheels: Any, poses: Any, references: Any) -> list[Trajectory]:
+    """The runs of the tables that a user gave."""
+    required = {"wheels": required_columns(robot), "poses": POSE_COLUMNS, "references": REFERENCE_COLUMNS}
+    given = {"wheels": wheels, "poses": poses, "references": references}
+    frames = {name: _frame(name, content) for name, content in given.items() if content is not None}
+    if all("trajectory" not in frame.columns for frame in frames.values()):
+        frames = {name: frame.with_columns(pl.lit(_ONLY_RUN).alias("trajectory")) for name, frame in frames.items()}
+    tables = {name: Table(Path(name), frame, required[name]) for name, frame in frames.items()}
+    named = tables["wheels"].frame["trajectory"].unique(maintain_order=True)
+    runs = pl.DataFrame({"trajectory": named}) if trajectories is None else _frame("trajectories", trajectories)
+    if "split" not in runs.columns:
+        commands = runs["command"].to_list() if "command" in runs.columns else [None] * len(runs)
+        runs = runs.with_columns(pl.Series("split", every_second(commands), dtype=pl.String))
+    of_runs = check_runs(Table(Path("trajectories"), runs, RUN_COLUMNS))
+    samples = samples_in_memory(tables["wheels"], of_runs, robot)
+    return runs_of_tables(of_runs, samples, tables.get("poses"), tables.get("references"))
+
+
+def _frame(name: str, content: Any) -> pl.DataFrame:
+    """A data frame or a dict of columns as a Polars frame. DataError names the table and the column that is unfit."""
+    if isinstance(content, pl.DataFrame):
+        return content
+    names = content if isinstance(content, Mapping) else getattr(content, "columns", None)  # as pandas has them
+    if names is None:
+        raise DataError(f"{name}: expected a data frame or a dict of arrays, found {type(content).__name__}")
+    arrays = {str(column): np.atleast_1d(np.asarray(content[column])) for column in names}
+    first, rows = next(((column, len(array)) for column, array in arrays.items()), ("", 0))
+    for column, array in arrays.items():
+        if array.ndim != 1:
+            raise DataError(f"{name}: column {column!r} has shape {array.shape}; give a column for each wheel or axis")
+        if len(array) != rows:
+            raise DataError(f"{name}: column {column!r} has {len(array)} rows, {first!r} has {rows}")
+    return pl.DataFrame(
+        {column: array.tolist() if array.dtype == object else array for column, array in arrays.items()}, strict=False
+    )
+
+
+def check_runs(runs: Table) -> Table:
+    """The table of runs with its numbers as such. DataError names the row and what is wrong."""
+    for column in runs.frame.columns:
+        if column in (*RUN_NUMBERS, "repetition"):
+            values = runs.floats(column)
+            infinite = ~values.is_finite() & values.is_not_null()
+            runs.refuse(infinite, f"{column} is {{}}; leave it empty if it is not known", values)
+            fraction = (values % 1 != 0) if column == "repetition" else infinite
+            runs.refuse(fraction, f"{column} is {{}}, not a whole number", values)
+            runs.frame = runs.frame.with_columns(values.alias(column))
+    ids, splits = runs.frame["trajectory"], runs.frame["split"]
+    runs.refuse(~ids.is_first_distinct(), "trajectory {} is there twice; give each its own id", ids)
+    for row, split in enumerate(splits):
+        if split not in SPLITS:
+            raise runs.fail(row, f"split is {split!r}; {nearest(str(split), SPLITS)}it must be train or validation")
+    return runs
+
+
+def runs_of_tables(
+    runs: Table,
+    samples: Sequence[Samples],
+    poses: Table | None,
+    references: Table | None,
+    commands: Table | None = None,
+) -> list[Trajectory]:
+    """The runs of a data set's tables. DataError names the table, the row and what is wrong.
+
+    runs: see ``check_runs``. samples: of each run. poses: None where all runs have references. commands: the motion
+    commands that were sent in runs, if they were recorded.
+    """
+    started = set() if poses is None else set(poses.ids)
+    measured = {} if references is None else _references(references, runs, [of_run.end for of_run in samples], started)
+
+    def flaw(times: Array, run: str) -> Flaw | None:
+        return pose_times_flaw(times, run, fewest=1 if run in measured else 2)
+
+    groups = POSES if poses is None else POSES | present_groups(poses.file, COVARIANCES, poses.frame.columns)
+    posed = arrays_of_runs(poses, runs, groups, flaw, measured)
+    sent = arrays_of_runs(commands, runs, SENT, lambda times, _: times_flaw(times), runs.ids)
+    trajectories = []
+    for index, row in enumerate(runs.frame.iter_rows(named=True)):
+        known = {name: row[name] for name in RUN_NUMBERS if row.get(name) is not None}
+        known |= {name: str(row[name]) for name in ("command", "session") if row.get(name) is not None}
+        if row.get("repetition") is not None:
+            known["repetition"] = round(row["repetition"])
+        if (upper := posed[index].get("pose_covariances")) is not None:
+            known["pose_covariances"] = upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+        known["pose_times"] = posed[index].get("times", np.zeros(1))
+        known["poses"] = posed[index].get("poses", np.zeros((1, 3)))
+        known |= {"references": measured.get(row["trajectory"]), "sent": sent[index].get("sent")}
+        trajectories.append(Trajectory(row["trajectory"], row["split"], samples=samples[index], **known))
+    return trajectories
+
+
+def _references(table: Table, runs: Table, ends: Sequence[float], started: set[str]) -> dict[str, References]:
+    """The references of each run that has some.
+
+    The table has a row for each measurement of a run's motion. Columns: trajectory, kind, value and sigma of kinds of
+    one number, value_x, value_y, sigma_x and sigma_y of those of two (sigma stands for both where these are empty), t0
+    and t1, which may be missing or empty: the run's start and end; sigma_rate (rad/s) of a gyro's offset, which the
+    turns of a session share.
+
+    ends: of the wheel samples of each run, s. started: ids of the runs whose start pose is known.
+    """
+    numbers = {name: np.full(len(table.frame), np.nan) for name in NUMBERS}
+    for name in numbers.keys() & {*table.frame.columns}:
+        numbers[name] = table.floats(name).fill_null(np.nan).to_numpy()
+        if name in ("t0", "t1"):
+            table.refuse(np.isinf(numbers[name]), f"{name} is {{}}; remove or repair the row", numbers[name].tolist())
+    kinds = np.array(["" if kind is None else str(kind).strip() for kind in table.frame["kind"]], dtype=str)
+    measured: dict[str, References] = {}
+    for index, rows in table.rows_by_run(runs.ids, runs.file.name):
+        run, of_run = runs.ids[index], {name: values[rows] for name, values in numbers.items()}
+        references = references_of(kinds[rows], of_run, start_known=run in started).of_run(0.0, ends[index])
+        if (flaw := reference_flaw(references, np.array([ends[index]]))) is not None:
+            raise table.fail(int(rows[flaw[0]]), flaw[1])
+        measured[run] = references.by_time()
+    return measured
+
+
+def dataset_of_runs(
+    name: str,
+    robot: Robot,
+    sample_period: float,
+    trajectories: Iterable[Trajectory],
+    *,
+    scans: Scans | None = None,
+    **described: Any,
+) -> Dataset:
+    """A data set of runs whose arrays are checked, with unwrapped headings, and with warnings about the runs.
+
+    described: further fields of the data set. DataError: there is no run, two have the same id, a pose is farther away
+    than wheels roll, or the sample period is far from that of the stamps.
+    """
+    place, drive = f"data set {name}", None if robot.drive.direct else robot.drive
+    runs = [run if run.drive == drive else replace(run, drive=drive) for run in trajectories]
+    if not runs:
+        raise DataError(f"{place}: it has no trajectory")
+    for identity, count in Counter(run.id for run in runs).items():
+        if count > 1:
+            raise DataError(f"{place}: trajectory {identity} is there twice; give each its own id")
+    moving, standing = 0, list[str]()
+    for each in runs:
+        _refuse_far_poses(f"{place}: trajectory {each.id}", robot, each)
+        moved = np.abs(each.poses - each.poses[0]).max(axis=0)
+        if (far := moved > (_MOVED, _MOVED, _TURNED)).any():
+            # The reference moves: do the wheels, by the design matrix, travel more than hardly any of it?
+            driven = np.abs(each.signals @ robot.inverse_kinematic_matrix.T) * np.diff(each.times, prepend=0.0)[:, None]
+            moving += 1
+            standing += [each.id] if driven.sum(axis=0).max() < _HARDLY * moved[far].max() else []
+        each.samples.summarise()  # while they are at hand
+    period = median_period(runs)
+    _refuse_sample_period(place, sample_period, period)
+
+    warnings = []
+    recorded = [run.poses[:, 2] for run in runs]
+    headings, ambiguous = unwrap(robot, [run.log(run.pose_times) for run in runs], recorded)
+    # Wrapped headings lie within a turn, and continuous ones need no turns: others are in degrees, say.
+    contradicted = [
+        run.id
+        for run, before, after in zip(runs, recorded, headings, strict=True)
+        if np.ptp(before) > _WITHIN * TURN and not np.array_equal(before, after)
+    ]
+    if len(contradicted) > _CONTRADICTED * sum(run.has_poses for run in runs):
+        headings = recorded
+        warnings.append(
+            f"headings of {plural(len(contradicted), 'trajectory')} turn otherwise than the wheels, so that all stay "
+            f"as they were recorded: {some(contradicted, _SHOWN)}"
+        )
+    elif ambiguous:
+        warnings.append(
             f"headings of {plural(len(ambiguous), 'trajectory')} may be unwrapped wrongly (reference too sparse): "
-            f"{shown}"
-        ]
-    # Where all stand, another warning says so; in other units all runs seem to move too far.
-    if 0 < len(standing) < len(raw) and not warnings:
+            f"{some([runs[index].id for index in ambiguous], _SHOWN)}"
+        )
+    if 0 < len(standing) < moving and headings is not recorded:  # in other units runs seem to move too far
         warnings.append(
             f"the reference moves in {plural(len(standing), 'trajectory')} though no wheel turns, which spoils every "
-            f"fit; leave {'it' if len(standing) == 1 else 'them'} out: {', '.join(standing[:5])}"
+            f"fit; leave {'it' if len(standing) == 1 else 'them'} out: {some(standing, _SHOWN)}"
         )
-    warnings += _late_references(raw)
-    if not 0.5 < median / sample_period < 2:
+    late = [run.id for run in runs if run.pose_times[-1] > run.samples.end * (1 + 1.5 / run.samples.count)]
+    if late:
+        have = "has reference poses after its" if len(late) == 1 else "have reference poses after their"
+        warnings.append(f"{plural(len(late), 'trajectory')} {have} last wheel sample, e.g. {some(late, _SHOWN)}")
+    if not 0.5 < period / sample_period < 2:
         warnings.append(
-            f"sample_period is {sample_period:g} s, but the wheel samples come every {median:g} s (the median)"
+            f"sample_period is {sample_period:g} s, but the wheel samples come every {period:g} s (the median)"
         )
-    unwrapped = [
-        replace(trajectory, poses=np.column_stack([trajectory.poses[:, :2], heading]))
-        for trajectory, heading in zip(raw, headings, strict=True)
-    ]
-    unwrapped = [
-        run
-        if run.references is None
-        else replace(run, references=with_whole_turns(robot, run.log([0.0]), run.references))
-        for run in unwrapped
-    ]
-    warnings += odd_references(
-        robot, [(run.log([0.0]), run.references) for run in unwrapped if run.references is not None]
-    )
-    dataset = Dataset(name, robot, sample_period, tuple(unwrapped), description, source, licence, simulated, (), scans)
+    for index, (run, heading) in enumerate(zip(runs, headings, strict=True)):
+        references = run.references
+        if references is not None:
+            references = with_whole_turns(robot, run.log([0.0]), references)
+        runs[index] = replace(run, poses=np.column_stack([run.poses[:, :2], heading]), references=references)
+    return with_warnings(Dataset(name, robot, sample_period, tuple(runs), scans=scans, **described), warnings)
+
+
+def with_warnings(dataset: Dataset, warnings: Iterable[str]) -> Dataset:
+    """The data set with more warnings, each once, and with one about copies in its validation split."""
+    warnings = list(dict.fromkeys([*dataset.warnings, *warnings]))
     if copies := dataset.copies:
         are = "is a copy of a training run and is" if len(copies) == 1 else "are copies of training runs and are"
-        warnings.append(f"{plural(len(copies), 'trajectory')} {are} left out of validation: {', '.join(copies[:5])}")
+        warnings.append(f"{plural(len(copies), 'trajectory')} {are} left out of validation: {some(copies, _SHOWN)}")
     return replace(dataset, warnings=tuple(warnings))
 
 
-def _with_drive(trajectory: Trajectory, robot: Robot) -> Trajectory:
-    """A run with the drive signals of a robot that steers."""
-    drive = None if robot.drive.direct else robot.drive
-    return trajectory if trajectory.drive == drive else replace(trajectory, drive=drive)
+def _refuse_far_poses(where: str, robot: Robot, run: Trajectory) -> None:
+    """DataError: a pose is farther from the start than the wheels can have rolled, by orders of magnitude."""
+    travel = float((np.abs(run.rates) * robot.radii).max(axis=1) @ np.diff(run.times, prepend=0.0))  # m, the fastest's
+    distances = np.linalg.norm(run.poses[:, :2] - run.poses[0, :2], axis=1)
+    for row in np.flatnonzero(distances > _FARTHEST * (travel + 1.0))[:1]:
+        x, y = run.poses[row, :2]
+        raise DataError(
+            f"{where}: the pose at {run.pose_times[row]:g} s, x {x:g} and y {y:g}, is {distances[row]:.3g} m from the "
+            f"run's start, whose wheels rolled {travel:.3g} m; remove or repair it"
+        )
 
 
-def _check_run(place: str, robot: Robot, trajectory: Trajectory) -> None:
-    """DataError in one line that begins with ``place``: a shape, a time, a value or the split of a run is wrong."""
-    where = f"{place}: trajectory {trajectory.id}"
-    if trajectory.split not in SPLITS:
-        hint = nearest(str(trajectory.split), SPLITS)
-        raise DataError(f"{where}: split is {trajectory.split!r}; {hint}it must be train or validation")
-    samples, poses = trajectory.times.shape, trajectory.pose_times.shape
-    expected: dict[str, tuple[int, ...]] = {"rates": (*samples, len(robot.wheel_names)), "poses": (*poses, 3)}
-    expected |= {"angles": expected["rates"], "targets": expected["rates"], "pose_covariances": (*poses, 3, 3)}
-    expected |= {"steering": (*samples, len(robot.drive.steered)), "odometry": (*samples, 3)}
-    expected |= {} if trajectory.sent is None else {"sent": (len(trajectory.sent), 5)}
-    if trajectory.steering is None and robot.drive.steered:
-        raise DataError(f"{where}: it has no steering angles; wheels {', '.join(robot.drive.steered)} steer")
-    for item, shape in expected.items():
-        array = getattr(trajectory, item)
-        if len(samples) != 1 or len(poses) != 1 or (array is not None and array.shape != shape):
-            given = None if array is None else array.shape
-            raise DataError(f"{where}: {item} has shape {given}, expected {shape}")
-    if not samples[0] or not poses[0]:
-        raise DataError(f"{where}: it has no {'reference poses' if samples[0] else 'wheel samples'}")
-    arrays = {name: array for name in _ARRAYS if (array := getattr(trajectory, name)) is not None}
-    for name, flaw in (
-        *((name, values_flaw(array)) for name, array in arrays.items() if not in_file(array)),
-        ("times", None if in_file(trajectory.times) else wheel_times_flaw(trajectory.times, trajectory.id)),
-        ("pose_times", pose_times_flaw(trajectory.pose_times, trajectory.id)),
-    ):
-        if flaw is not None:
-            raise DataError(f"{where}: {name}, row {flaw[0] + 1}: {flaw[1]}")
-    references, times = trajectory.references, trajectory.times
-    if references is not None and (flaw := reference_flaw(references, times)) is not None:
-        raise DataError(f"{where}: references, row {flaw[0] + 1}: {flaw[1]}")
-    if (flaw := reach_flaw(robot, times, trajectory.rates, trajectory.pose_times, trajectory.poses)) is not None:
-        raise DataError(f"{where}: {flaw[1]}")
+def _refuse_sample_period(place: str, sample_period: float, median: float) -> None:
+    """DataError: a nominal sample period, s, cannot be meant, as the wheel samples come every ``median`` s."""
+    if not median / _MOST_PERIODS < sample_period < median * _MOST_PERIODS:
+        raise DataError(
+            f"{place}: sample_period is {sample_period:g} s, but the wheel samples come every {median:g} s (the "
+            f"median); set it to {median:.3g}"
+        )
+    shortest, longest = SAMPLE_PERIODS
+    if not shortest <= sample_period <= longest:
+        raise DataError(
+            f"{place}: sample_period is {sample_period:g} s, expected {shortest:g} to {longest:g} s; "
+            "check the units of the times"
+        )
 
 
-def _moves_unseen(matrix: Array, run: Trajectory) -> bool:
-    """True if the reference moves in a run while the wheels, by the design matrix (3, N), travel hardly any of it."""
-    moved = np.abs(run.poses - run.poses[0]).max(axis=0)
-    far = moved > (_MOVED, _MOVED, _TURNED)
-    if not far.any():
-        return False
-    driven = np.abs(run.signals @ matrix.T) * np.diff(run.times, prepend=0.0)[:, None]
-    return bool(driven.sum(axis=0).max() < _HARDLY * moved[far].max())
+def unwrap(robot: Robot, logs: Sequence[WheelLog], headings: Sequence[Array]) -> tuple[list[Array], list[int]]:
+    """Continuous headings (rad) and the indices of trajectories in which they are ambiguous.
+
+    Every increment gets the whole turns that bring it closest to the design model's odometry. Where the reference is
+    dense this is the nearest turn; where it is sparse, the odometry tells how often the robot turned in between. A
+    trajectory is ambiguous if the two still differ by more than a quarter turn between two reference poses.
+    """
+    model = OdometryModel.of_design(robot, "arc")
+    unwrapped: list[Array] = []
+    ambiguous: list[int] = []
+    for index, (odometry, heading) in enumerate(zip(model.poses(logs), headings, strict=True)):
+        steps, expected = np.diff(heading), np.diff(odometry[:, 2])
+        turns = np.round((expected - steps) / TURN)
+        # Added to the headings as recorded, so that continuous ones stay as they are to the bit.
+        unwrapped.append(heading + TURN * np.concatenate([[0.0], np.cumsum(turns)]))
+        if np.abs(steps + TURN * turns - expected).max(initial=0.0) > TURN / 4:
+            ambiguous.append(index)
+    return unwrapped, ambiguous
 
 
-def _digest(*arrays: Array) -> hashlib._Hash:
-    """SHA-256 of arrays one after another."""
-    digest = hashlib.sha256()
-    for array in arrays:
-        digest.update(np.ascontiguousarray(array, dtype=float).tobytes())
-    return digest
+def every_second(groups: Sequence[Hashable]) -> list[Split]:
+    """Splits by turns within each group, in the order given; the first member trains."""
+    return ["train" if number % 2 else "validation" for number in repetitions(groups)]
 
 
-def _late_references(trajectories: Sequence[Trajectory]) -> list[str]:
-    late = []
-    for trajectory in trajectories:
-        last = trajectory.times[-1]
-        period = last / len(trajectory.times)
-        if trajectory.pose_times[-1] > last + 1.5 * period:
-            late.append(trajectory.id)
-    if not late:
-        return []
-    shown = ", ".join(late[:5])
-    have = "has reference poses after its" if len(late) == 1 else "have reference poses after their"
-    return [f"{plural(len(late), 'trajectory')} {have} last wheel sample, e.g. {shown}"]
+def repetitions(commands: Sequence[Hashable]) -> list[int]:
+    """Number of each run among the runs of its command, from 1, in the order given."""
+    seen: Counter[Hashable] = Counter()
+    numbers = []
+    for command in commands:
+        seen[command] += 1
+        numbers.append(seen[command])
+    return numbers

@@ -1,4 +1,4 @@
-"""Reading of tables of numbers, from delimited text or Parquet; every flaw is reported with its file and row."""
+"""Tables of numbers from delimited text, read by polars, or from Parquet; a flaw is told with its file and row."""
 
 from __future__ import annotations
 
@@ -6,23 +6,36 @@ import csv
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+import polars as pl
 from numpy.typing import NDArray
 
 from omnibench.errors import DataError, nearest
-from omnibench.files import read_text
+from omnibench.files import check_file, read_text
 from omnibench.robot.kinematics import Array
 
-if TYPE_CHECKING:
-    import polars as pl
-
 AUTO = "auto"  # as a separator: the one that the header holds
-BLANK = frozenset({"", "nan", "na", "n/a", "null", "none", "-"})  # cells without a value, in any case
+BLANK = ("", "nan", "na", "n/a", "null", "none", "-")  # cells without a value, in any case
 DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+")
 _COMMAS = " (decimal commas? --set decimal=comma with --set separator)"
+_HEAD = 1 << 16  # characters in which the header and the first rows stand; chosen
+_MOST_BYTES = 1 << 34  # of a table; chosen
+_UNIT = re.compile(r"[\[(<].*[\])>]|-|[a-zµ°%][a-zµ°%/^0-9·*. -]*", re.IGNORECASE)
+# Of times that are dates, ISO 8601 and its usual variants.
+_DATES = (
+    "%Y-%m-%dT%H:%M:%S%.f%#z",
+    "%Y-%m-%d %H:%M:%S%.f%#z",
+    "%Y-%m-%dT%H:%M:%S%.f",
+    "%Y-%m-%d %H:%M:%S%.f",
+    "%Y/%m/%d %H:%M:%S%.f",
+)
+
+
+Lines = Sequence[int] | NDArray[np.intp]
+"""Numbers of lines of a file, from 1."""
 
 
 class ColumnError(DataError):
@@ -34,26 +47,70 @@ class NoRowsError(DataError):
 
 
 @dataclass(frozen=True, eq=False)
-class NumberTable:
-    """Named columns of finite numbers. values (rows, n). lines (rows,): the line of the file that a row came from."""
+class Table:
+    """A table as it stands in its file: columns of texts, of a Parquet file also of numbers.
+
+    names: of the columns, numbers from 1 where there is no header. frame: the columns in their order. lines (rows,): of
+    the file that a row came from. units: those of a row below the header. headed: the names come from a header.
+    """
 
     file: Path
     names: tuple[str, ...]
-    values: Array
-    lines: NDArray[np.intp]
+    frame: pl.DataFrame
+    lines: Lines
+    units: tuple[str, ...] = ()
+    headed: bool = True
+
+    def __len__(self) -> int:
+        return len(self.frame)
 
     def __contains__(self, name: str) -> bool:
-        return name in self.names
+        """True if a column has the name, or that number, from 1."""
+        return name in self.names or _is_number(name, self.names)
 
-    def column(self, name: str) -> Array:
-        """One column (rows,)."""
-        column: Array = self.values[:, self.names.index(name)]
-        return column
+    def in_lower_case(self) -> Table:
+        """The table with the names of its columns in lower case, for tables whose names are given."""
+        return replace(self, names=tuple(name.lower() for name in self.names))
+
+    def only(self, rows: NDArray[np.intp]) -> Table:
+        """The table of some of the rows, by their indices."""
+        return replace(self, frame=self.frame[rows], lines=np.asarray(self.lines)[rows])
+
+    def unit_of(self, name: str) -> str:
+        """The unit that stands below a column's name; empty without one."""
+        return self.units[_place(self.file, name, self.names)] if self.units else ""
+
+    def fail(self, row: int, what: str) -> DataError:
+        """The error of one row (0 is the first)."""
+        return row_error(self.file, row, int(self.lines[row]), what)
+
+    def texts(self, name: str) -> list[str]:
+        """One column as texts; whole numbers without a decimal point."""
+        column = self._column(name)
+        if column.dtype != pl.String:
+            return [f"{value:.15g}" if value is not None and np.isfinite(value) else "" for value in column.to_list()]
+        return column.fill_null("").str.strip_chars().to_list()
+
+    def numbers(self, names: Sequence[str]) -> Array:
+        """Columns as numbers (rows, n), NaN where a cell is blank. DataError: a cell holds something else."""
+        numbers = np.empty((len(self), len(names)))
+        for place, name in enumerate(names):
+            column = self._column(name)
+            numbers[:, place] = self._parsed(name, column) if column.dtype == pl.String else _floats(column)
+        return numbers
 
     def columns(self, names: Sequence[str]) -> Array:
-        """Several columns (rows, n), in the order asked for."""
-        columns: Array = self.values[:, [self.names.index(name) for name in names]]
-        return columns
+        """Columns of finite numbers (rows, n). DataError names the first cell that is not one."""
+        numbers = self.numbers(names)
+        for row, place in np.argwhere(~np.isfinite(numbers))[:1].tolist():
+            cell = self._column(names[place])[row]
+            flaw = f"is {str(cell).strip()}; remove or repair the row" if cell not in (None, "") else "is missing"
+            raise self.fail(row, f"{names[place]} {flaw}")
+        return numbers
+
+    def column(self, name: str) -> Array:
+        """One column of finite numbers (rows,)."""
+        return self.columns([name])[:, 0]
 
     def increasing(self, name: str) -> Array:
         """One column (rows,), which must increase; DataError names the first row that does not."""
@@ -63,97 +120,26 @@ class NumberTable:
             raise self.fail(flaw[0], f"{name} {flaw[1]}")
         return values
 
-    def only(self, kept: NDArray[np.bool_]) -> NumberTable:
-        """The table of some of the rows."""
-        return NumberTable(self.file, self.names, self.values[kept], self.lines[kept])
+    def _parsed(self, name: str, column: pl.Series) -> Array:
+        """Texts as numbers; dates become seconds since 1970."""
+        cells = column.fill_null("").str.strip_chars()
+        numbers = cells.cast(pl.Float64, strict=False)
+        wrong = numbers.is_null() & ~cells.str.to_lowercase().is_in(BLANK)
+        if not wrong.any():
+            return _floats(numbers)
+        for form in _DATES if wrong.sum() * 2 > len(wrong) else ():
+            zone = "UTC" if "z" in form else None
+            with_zone = cells.str.replace("Z$", "+00:00")
+            dates = with_zone.str.to_datetime(form, time_unit="ns", time_zone=zone, strict=False)
+            if not (dates.is_null() & wrong).any():
+                return _floats(_seconds(dates))
+        row = int(wrong.arg_true()[0])
+        text = cells[row]
+        hint = "; of decimal commas say --set decimal=comma" if DECIMAL_COMMA.fullmatch(text) else ""
+        raise self.fail(row, f"{name} is {text!r}, expected a number{hint}")
 
-    def fail(self, row: int, what: str) -> DataError:
-        """The error of one row (0 is the first)."""
-        return row_error(self.file, row, int(self.lines[row]), what)
-
-
-@dataclass(frozen=True, eq=False)
-class CellTable:
-    """A table as it stands in its file: columns of texts, or of numbers where the file is Parquet.
-
-    names: of the columns, numbers from 1 where there is no header. columns: cells (rows,) of each. lines (rows,): the
-    line of the file that a row came from. headed: the names come from a header.
-    """
-
-    file: Path
-    names: tuple[str, ...]
-    columns: tuple[Sequence[str] | Array, ...]
-    lines: NDArray[np.intp]
-    headed: bool = True
-
-    def __len__(self) -> int:
-        return len(self.lines)
-
-    def named(self, names: Sequence[str]) -> CellTable:
-        """The table with other names of its columns."""
-        return replace(self, names=tuple(names))
-
-    def in_lower_case(self) -> CellTable:
-        """The table with the names of its columns in lower case, for tables whose names are given."""
-        return self.named([name.lower() for name in self.names])
-
-    def only(self, rows: NDArray[np.intp]) -> CellTable:
-        """The table of some of the rows, by their indices."""
-        columns = tuple(
-            column[rows] if isinstance(column, np.ndarray) else [column[row] for row in rows.tolist()]
-            for column in self.columns
-        )
-        return replace(self, columns=columns, lines=self.lines[rows])
-
-    def missing(self, names: Iterable[str]) -> list[str]:
-        """The names that no column has, by name or by its number, from 1."""
-        return [name for name in names if name not in self.names and not _is_number(name, self.names)]
-
-    def fail(self, row: int, what: str) -> DataError:
-        """The error of one row (0 is the first)."""
-        return row_error(self.file, row, int(self.lines[row]), what)
-
-    def texts(self, name: str) -> list[str]:
-        """One column as texts; whole numbers without a decimal point."""
-        column = self.columns[self._index(name)]
-        if not isinstance(column, np.ndarray):
-            return [cell.strip() for cell in column]
-        return [f"{value:.15g}" if np.isfinite(value) else "" for value in column.tolist()]
-
-    def numbers(self, names: Sequence[str]) -> Array:
-        """Columns as numbers (rows, n), NaN where a cell is blank. DataError: a cell holds something else."""
-        chosen = [self._index(name) for name in names]
-        numbers = np.empty((len(self), len(names)))
-        for place, index in enumerate(chosen):
-            column = self.columns[index]
-            try:
-                numbers[:, place] = column
-            except ValueError:
-                numbers[:, place] = [self._number(names[place], row, cell) for row, cell in enumerate(column)]
-        return numbers
-
-    def finite(self, names: Sequence[str]) -> NumberTable:
-        """Columns of finite numbers. DataError names the first cell that is not one."""
-        table = NumberTable(self.file, tuple(names), self.numbers(names), self.lines)
-        for row, place in np.argwhere(~np.isfinite(table.values))[:1].tolist():
-            cell = str(self.columns[self._index(names[place])][row]).strip()
-            flaw = f"is {cell}; remove or repair the row" if cell else "is missing"
-            raise table.fail(row, f"{names[place]} {flaw}")
-        return table
-
-    def _number(self, name: str, row: int, cell: str) -> float:
-        text = str(cell).strip()
-        if text.lower() in BLANK:
-            return np.nan
-        try:
-            return float(text)
-        except ValueError:
-            hint = "; of decimal commas say --set decimal=comma" if DECIMAL_COMMA.fullmatch(text) else ""
-            what = f"{name} is {text!r}, expected a number{hint}"
-            raise self.fail(row, what) from None
-
-    def _index(self, name: str) -> int:
-        return _place(self.file, name, self.names)
+    def _column(self, name: str) -> pl.Series:
+        return self.frame.to_series(_place(self.file, name, self.names))
 
 
 def read_cells(
@@ -163,63 +149,122 @@ def read_cells(
     separator: str | None = ",",
     header_lines: int = 1,
     decimal_comma: bool = False,
-) -> CellTable:
-    """The cells of a delimited text file, or of a Parquet file.
+) -> Table:
+    """The table of a delimited text file, or of a Parquet file, in which dates become seconds since 1970.
 
-    The last of the header lines names the columns; without header lines they are numbered. separator: None for white
-    space, with comments from ``#`` on; ``auto``: a semicolon, a tab or a comma, whichever the header holds. Blank lines
-    are skipped. DataError: the file cannot be read, a column that is required is missing or named twice (ColumnError),
-    it has no rows (NoRowsError), a row has more or fewer fields than columns.
+    The last of the header lines names the columns, and a row of units may follow; without header lines columns are
+    numbered. separator: None for white space, with comments from ``#`` on; ``auto``: a semicolon, a tab or a comma,
+    whichever the header holds. Blank lines are skipped. DataError: the file cannot be read, a column that is required
+    is missing or named twice (ColumnError), it has no rows (NoRowsError), a row has more fields than columns.
     """
     if file.suffix == ".parquet":
-        # Dates become seconds since 1970, durations seconds.
-        import polars as pl
-
-        from omnibench.data.stored_rows import read_parquet
+        from omnibench.data.parquet import read_parquet
 
         frame = read_parquet(file)
         if frame.is_empty():
             raise NoRowsError(f"{file}: it has no rows")
-        cells = [
-            column.fill_null("").to_list()
-            if column.dtype == pl.String
-            else _seconds(column).cast(pl.Float64, strict=False).fill_null(np.nan).to_numpy()
-            for column in frame.iter_columns()
-        ]
-        return CellTable(file, tuple(frame.columns), tuple(cells), np.arange(1, len(frame) + 1))
-    text = read_text(file)
-    lines = _split_lines(file, text, _separator(text, header_lines) if separator == AUTO else separator)
-    rows = lines[header_lines:]
+        frame = frame.select(_seconds(column) for column in frame.iter_columns())
+        return Table(file, tuple(frame.columns), frame, range(1, len(frame) + 1))
+    str(file).encode()  # polars takes no other names: UnicodeEncodeError, which is told in one line
+    source, head, lines = _source_of(file, separator)
+    # Blank lines within the header, which are left out, count as its lines.
+    header_lines = sum(int(number < lines[0] + header_lines) for number in lines[:header_lines])
+    if separator == AUTO:
+        separator = next((sign for sign in ";\t," if head and sign in head[: max(header_lines, 1)][-1]), ",")
+    separator = separator or "\t"
+    rows = list(csv.reader(head, delimiter=separator, skipinitialspace=True))
     if header_lines:
-        if len(lines) < header_lines:
+        if len(rows) < header_lines:
             raise DataError(f"{file}: it has no header with the names of its columns; repair it, or take it out")
-        names = [name.strip() for name in lines[header_lines - 1][1]]
+        names = [name.strip() for name in rows[header_lines - 1]]
         names[0] = names[0].lstrip("# ")  # as numpy.savetxt writes it
     else:
-        names = [str(number) for number in range(1, len(rows[0][1]) + 1)] if rows else []
+        names = [str(number) for number in range(1, len(rows[0]) + 1)] if rows else []
     for name in required:
         _place(file, name, names)
-    if not rows:
+    body = rows[header_lines:]
+    units = tuple(cell.strip() for cell in body[0]) if header_lines and len(body) > 1 and _are_units(*body[:2]) else ()
+    skipped = header_lines + bool(units)
+    if len(rows) <= skipped:
         raise NoRowsError(f"{file}: it has no rows")
-    for row, (line, fields) in enumerate(rows):
-        if len(fields) != len(names):
-            what = f"it has {len(fields)} fields, expected {len(names)}; repair the row"
-            raise row_error(file, row, line, what + (_COMMAS if len(fields) > len(names) else ""))
-    columns: list[Sequence[str]] = [list(column) for column in zip(*(fields for _, fields in rows), strict=True)]
+    if len(rows[skipped]) != len(names):
+        begun = next((row for row, cells in enumerate(rows) if 2 * sum(map(_is_float, cells)) >= len(cells) > 1), 0)
+        above = int(lines[begun]) - 1
+        way = f"; are there {above} lines above the rows? --set header_lines={above} (or pose_header_lines)"
+        error = _ragged(file, rows[skipped], names, 0, int(lines[skipped]))
+        raise DataError(f"{error}{way if begun > skipped else ''}")
+    frame = _frame(file, source, separator, skipped, names, lines)
     if decimal_comma:
-        columns = [[cell.replace(",", ".") for cell in column] for column in columns]
-    return CellTable(file, tuple(names), tuple(columns), np.array([line for line, _ in rows]), bool(header_lines))
+        frame = frame.with_columns(pl.all().str.replace(",", ".", literal=True))
+    return Table(file, tuple(names), frame, lines[skipped : skipped + len(frame)], units, bool(header_lines))
 
 
-def read_numbers(
-    file: Path,
-    required: Sequence[str],
-    *,
-    optional: Sequence[str] = (),
-    separator: str | None = ",",
-    header_lines: int = 1,
-) -> NumberTable:
-    """The columns ``required``, and those of ``optional`` that are there, of a delimited text file of finite numbers.
+def _source_of(file: Path, separator: str | None) -> tuple[Path | bytes, list[str], Lines]:
+    """What polars reads of a file, its first lines, and the numbers of its lines, of which some may be left out."""
+    check_file(file, _MOST_BYTES, text=True)
+    try:
+        with file.open(encoding="utf-8-sig", newline="") as opened:
+            head = opened.read(_HEAD)
+    except UnicodeDecodeError:
+        head = read_text(file)[:_HEAD]  # which says that it is no text
+    blank = re.search(r"(?:^|\n)[ \t,;]*\r?\n", head) is not None
+    if separator is not None and not blank and ', "' not in head and "\r" not in head.replace("\r\n", ""):
+        shown = head.splitlines()
+        return file, shown if len(head) < _HEAD else shown[:-1], range(1, _MOST_BYTES)
+    kept: list[tuple[int, str]] = []
+    for number, line in enumerate(read_text(file).replace(', "', ',"').splitlines(), 1):
+        fields = "\t".join(line.split("#", 1)[0].split()) if separator is None else line
+        if fields.strip(" \t,;"):
+            kept.append((number, fields))
+    text = [line for _, line in kept]
+    return "\n".join(text).encode(), text[:1000], np.array([number for number, _ in kept])
+
+
+def _frame(
+    file: Path, source: Path | bytes, separator: str, skipped: int, names: Sequence[str], lines: Lines
+) -> pl.DataFrame:
+    """The rows of a text below the header, as texts. DataError: it cannot be read, or a row has too many fields."""
+    reason: Exception | None = None
+    try:
+        read = BytesIO(source) if isinstance(source, bytes) else source
+        frame = pl.read_csv(
+            read, has_header=False, separator=separator, skip_lines=skipped, infer_schema_length=0, glob=False
+        )
+    except (pl.exceptions.PolarsError, OSError) as error:
+        reason = error
+    if reason or frame.width > len(names):
+        text = source.decode() if isinstance(source, bytes) else read_text(file)
+        for row, fields in enumerate(csv.reader(text.splitlines()[skipped:], delimiter=separator)):
+            if fields and len(fields) != len(names):
+                raise _ragged(file, fields, names, row, int(lines[skipped + row]))
+        raise DataError(f"{file}: cannot be read: {reason}")
+    # Columns whose fields are missing in all rows are blank.
+    blank = [pl.lit(None, pl.String).alias(f"blank {place}") for place in range(frame.width, len(names))]
+    return frame.with_columns(blank)
+
+
+def _ragged(file: Path, fields: Sequence[str], names: Sequence[str], row: int, line: int) -> DataError:
+    what = f"it has {len(fields)} fields, expected {len(names)}; repair the row"
+    return row_error(file, row, line, what + (_COMMAS if len(fields) > len(names) else ""))
+
+
+def _are_units(cells: Sequence[str], following: Sequence[str]) -> bool:
+    """True for a row that holds units, or nothing, in every cell (``[rad]``, ``m/s``, ``-``) above a row of numbers."""
+    shown = [cell.strip() for cell in cells]
+    numbers = sum(_is_float(after) and not _is_float(cell) for cell, after in zip(shown, following, strict=False))
+    return 2 * numbers >= len(shown) and all(not cell or _UNIT.fullmatch(cell) for cell in shown)
+
+
+def _is_float(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def read_numbers(file: Path, required: Sequence[str], *, separator: str | None = ",", header_lines: int = 1) -> Table:
+    """The table of a delimited text file whose columns ``required`` hold finite numbers.
 
     A column that the header does not name may be given by its number, from 1; without header lines all are, or the file
     has exactly the required columns. DataError: as for ``read_cells``; a column is missing or named twice
@@ -232,9 +277,10 @@ def read_numbers(
     if not header_lines and not any(name.isdecimal() for name in required):
         if len(table.names) != len(required):
             what = f"it has {len(table.names)} fields, expected {len(required)}: {' '.join(required)}"
-            raise ColumnError(str(row_error(file, 0, int(table.lines[0]), what)))
-        table = table.named(required)
-    return table.finite([*required, *(name for name in optional if name in table.names)])
+            raise ColumnError(str(table.fail(0, what)))
+        table = replace(table, names=tuple(required))
+    table.columns(required)
+    return table
 
 
 def not_increasing(values: Array) -> tuple[int, str] | None:
@@ -264,8 +310,6 @@ def row_error(file: Path, row: int, line: int, what: str) -> DataError:
 
 def _seconds(column: pl.Series) -> pl.Series:
     """A column of dates or durations in seconds; another as it is."""
-    import polars as pl
-
     if column.dtype == pl.Date:
         column = column.cast(pl.Datetime("ns"))
     if column.dtype == pl.Datetime:
@@ -273,21 +317,10 @@ def _seconds(column: pl.Series) -> pl.Series:
     return column.dt.total_nanoseconds() / 1e9 if column.dtype == pl.Duration else column
 
 
-def _separator(text: str, header_lines: int) -> str:
-    """The separator that the last header line, or the first row, holds."""
-    lines = [line for line in text.splitlines() if line.strip()][: max(header_lines, 1)]
-    return next((each for each in ";\t," if lines and each in lines[-1]), ",")
-
-
-def _split_lines(file: Path, text: str, separator: str | None) -> list[tuple[int, list[str]]]:
-    if separator is None:
-        rows = (line.split("#", 1)[0].split() for line in text.splitlines())
-        return [(line, fields) for line, fields in enumerate(rows, 1) if fields]
-    reader = csv.reader(text.splitlines(), delimiter=separator)
-    try:
-        return [(reader.line_num, fields) for fields in reader if any(field.strip() for field in fields)]
-    except csv.Error as error:
-        raise DataError(f"{file}, line {reader.line_num}: {error}") from None
+def _floats(column: pl.Series) -> Array:
+    """A column of numbers (rows,), NaN where it has none."""
+    floats: Array = column.cast(pl.Float64).fill_null(np.nan).to_numpy()
+    return floats
 
 
 def _place(file: Path, name: str, names: Sequence[str]) -> int:

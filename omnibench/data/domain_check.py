@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.corrections import TrainingDomain, extrapolation_consequence, motions_of
 from omnibench.robot.kinematics import Array
+from omnibench.words import some
 
 _NAMED = 3  # commands that the warning names; the others are counted
 
@@ -19,12 +23,9 @@ def extrapolation_warning(calibration: Calibration, runs: Sequence[Trajectory]) 
     """
     if not calibration.effects or not calibration.driven:
         return None
-    domain = TrainingDomain(calibration.robot, calibration.driven)
-    count = 0
+    domain, count = TrainingDomain(calibration.robot, calibration.driven), 0
     worst = dict[str, tuple[float, Array]]()  # by command: share of the worst run that is outside, and these motions
-    for run in runs:
-        motions = motions_of(calibration.matrix_array, run.times, run.signals)
-        outside = domain.outside_in_run(motions)
+    for run, motions, outside in _motions(calibration, domain, runs):
         if outside.any():
             count += 1
             command, share = run.command or run.id, float(outside.mean())
@@ -33,13 +34,11 @@ def extrapolation_warning(calibration: Calibration, runs: Sequence[Trajectory]) 
     if not count:
         return None
     commands = sorted(worst, key=lambda command: -worst[command][0])
-    words = domain.in_words(worst[commands[0]][1])
-    consequence = extrapolation_consequence(
-        [term.name for term in calibration.effects], fading=calibration.plain is not None
-    )
+    words, effects = domain.in_words(worst[commands[0]][1]), [term.name for term in calibration.effects]
+    consequence = extrapolation_consequence(effects, fading=calibration.plain is not None)
     return (
         f"{count} of {len(runs)} runs drive motions that calibration {calibration.name!r} was not fitted to "
-        f"({_first(commands)}), such as {words}: {consequence}"
+        f"({some(commands, _NAMED)}), such as {words}: {consequence}"
     )
 
 
@@ -48,12 +47,14 @@ def share_outside(calibration: Calibration, runs: Sequence[Trajectory]) -> float
     if not calibration.driven or not runs:
         return None
     domain = TrainingDomain(calibration.robot, calibration.driven)
-    times = [float(run.times[-1]) for run in runs]
-    motions = (motions_of(calibration.matrix_array, run.times, run.signals) for run in runs)
-    outside = [domain.outside_in_run(of_run).mean() * time for of_run, time in zip(motions, times, strict=True)]
-    return float(sum(outside) / sum(times))
+    outside = [outside.mean() * run.samples.end for run, _, outside in _motions(calibration, domain, runs)]
+    return float(sum(outside) / sum(run.samples.end for run in runs))
 
 
-def _first(commands: Sequence[str]) -> str:
-    others = len(commands) - _NAMED
-    return ", ".join(commands[:_NAMED]) + (f" and {others} more" if others > 0 else "")
+def _motions(
+    calibration: Calibration, domain: TrainingDomain, runs: Sequence[Trajectory]
+) -> Iterator[tuple[Trajectory, Array, NDArray[np.bool_]]]:
+    """Each run with its motions, and which of these are outside the training domain."""
+    for run in runs:
+        motions = motions_of(calibration.matrix_array, run.times, run.signals)
+        yield run, motions, domain.outside_in_run(motions)

@@ -1,4 +1,4 @@
-"""A planar laser scanner and its scans, one trajectory at a time.
+"""A planar laser scanner and its scans, one trajectory at a time, in memory and on disk.
 
 The ray at angle a of a scanner that is tilted by p (nose down) has, with x ahead of the scanner, y to its left and z
 up, the direction
@@ -11,20 +11,32 @@ lies along the floor, and from the height h it meets the floor after h/(cos a si
 
 from __future__ import annotations
 
+import errno
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import polars as pl
 from numpy.typing import NDArray
+from polars.io.plugins import register_io_source
 from pydantic import Field, FiniteFloat, model_validator
 
 from omnibench.config import Model, NonNegative, Positive
+from omnibench.data.parquet import check_unchanged, file_state, parquet_shape, readable
+from omnibench.data.stored import Rows, Table, check_columns, times_flaw
 from omnibench.errors import DataError
+from omnibench.files import TableFormat, check_file, quoted_formulas, unquoted_formulas
 from omnibench.robot.kinematics import Array
 
 Ranges = NDArray[np.float32]
+_COLUMNS = ("trajectory", "t", "ranges")
+_ROW_GROUP = 256  # rows of a Parquet row group; about 1 MB
+_MOST_ROWS = 4096  # rows of a Parquet file that are read at a time; about 20 MB
+_ROWS_OF_CSV = 65536  # rows of a CSV file read at a time: more, since every reading begins at its first line
 _FLOOR_MARGIN = 5.0  # standard deviations of a range: one floor range in 3.5 million is shorter (normal noise)
 
 
@@ -168,3 +180,129 @@ class ScansInMemory(Scans):
         if trajectory not in self._scans:
             raise DataError(f"trajectory {trajectory} has no scans")
         return self._scans[trajectory]
+
+
+class ScansOnDisk(Scans):
+    """A table of scans. Stamps and names are checked at once, ranges when a trajectory's scans are read.
+
+    DataError in one line names the file, the row (1 is the first) and what is wrong.
+    """
+
+    def __init__(self, file: Path, scanner: Scanner, trajectories: Iterable[str]) -> None:
+        self.file, self.scanner, self._state = file, scanner, file_state(file)
+        self._in_parquet = file.suffix == ".parquet"
+        if self._in_parquet:
+            parquet_shape(file)
+        else:
+            check_file(file, text=True)
+        with readable(file):
+            check_columns(file, list(self._lazy().collect_schema()), _COLUMNS)
+            frame = self._lazy().select("trajectory", "t").collect()
+        table = Table(file, frame if self._in_parquet else unquoted_formulas(frame))
+        times = table.numbers("t")
+        self._index: dict[str, tuple[Rows, Array]] = {}  # rows and stamps of every trajectory, in its order
+        ids = list(trajectories)
+        for index, rows in table.rows_by_run(ids, "the table of trajectories"):
+            if (flaw := times_flaw(times[rows], times[rows] < 0, "it must not be negative")) is not None:
+                raise table.fail(int(rows[flaw[0]]), flaw[1])
+            self._index[ids[index]] = rows, times[rows]
+
+    @property
+    def trajectories(self) -> tuple[str, ...]:
+        return tuple(self._index)
+
+    def times(self, trajectory: str) -> Array:
+        return self._indexed(trajectory)[1]
+
+    def of(self, trajectory: str) -> TrajectoryScans:
+        rows, times = self._indexed(trajectory)
+        check_unchanged(self.file, self._state)
+        ranges, begin = np.empty((len(rows), self.scanner.rays), np.float32), 0
+        while begin < len(rows):  # some rows of the file at a time
+            end = int(np.searchsorted(rows, rows[begin] + (_MOST_ROWS if self._in_parquet else _ROWS_OF_CSV)))
+            part = slice(begin, end)
+            ranges[part] = self._read(rows[part], f"trajectory {trajectory}", times[part])
+            begin = end
+        return TrajectoryScans(times, ranges)
+
+    def _indexed(self, trajectory: str) -> tuple[Rows, Array]:
+        if trajectory not in self._index:
+            raise DataError(f"{self.file}: trajectory {trajectory} has no scans")
+        return self._index[trajectory]
+
+    def _lazy(self) -> pl.LazyFrame:
+        if self._in_parquet:
+            return pl.scan_parquet(self.file, glob=False)
+        # Cells are read as text, so that one that is no number is reported with its row.
+        return pl.scan_csv(self.file, infer_schema=False, glob=False)
+
+    def _read(self, rows: Rows, whose: str, times: Array) -> Ranges:
+        """The checked ranges (n, R) of some rows."""
+
+        def refuse(faulty: Any, words: str) -> None:
+            for index in np.flatnonzero(faulty)[:1].tolist():
+                what = words.format(length=lengths[index], time=times[index])
+                raise DataError(f"{self.file}, row {rows[index] + 1}: {what}")
+
+        first, last, scanner = int(rows[0]), int(rows[-1]), self.scanner
+        with readable(self.file):
+            column = self._lazy().select("ranges").slice(first, last - first + 1).collect()["ranges"]
+        column = column[rows - first] if len(rows) < len(column) else column
+        lengths = np.zeros(len(rows), dtype=int)
+        if isinstance(column.dtype, pl.Array):
+            column = column.arr.to_list()
+        if column.dtype == pl.String:  # in CSV a cell is text with blanks between the numbers
+            texts = column.str.strip_chars().str.split(" ")
+            column = texts.list.eval(pl.element().cast(pl.Float32, strict=False))
+            broken = texts.list.len() != column.list.drop_nulls().list.len()
+            refuse(broken.fill_null(value=False), "ranges must be numbers, in CSV with a blank between them")
+        if not isinstance(column.dtype, pl.List) or not column.dtype.inner.is_numeric():
+            raise DataError(f"{self.file}: column 'ranges' holds {column.dtype}, expected lists of numbers")
+        lengths = column.list.len().fill_null(0).to_numpy()
+        refuse(lengths != scanner.rays, f"the scan has {{length}} ranges, but scanner.rays is {scanner.rays}")
+        ranges: Ranges = column.explode().cast(pl.Float32).fill_null(np.nan).to_numpy().reshape(len(rows), -1)
+        refuse(np.isnan(ranges).any(axis=1), "a range is missing or NaN; write inf where nothing was seen")
+        empty = ~scanner.valid(ranges).any(axis=1)
+        if empty.any():
+            seen = ranges[empty][0][np.isfinite(ranges[empty][0])]
+            in_millimetres = len(seen) > 0 and scanner.valid(seen / 1000).mean() > 0.5
+            way = "they look like mm, give m" if in_millimetres else "remove the row"
+            limits = f"from {scanner.range_min:g} to {scanner.range_max:g} m"
+            refuse(empty, f"the scan of {whose} at {{time:g}} s is empty: no range {limits}; {way}")
+        return ranges
+
+
+def write_scans(scans: Scans, table_format: TableFormat, trajectories: Iterable[str], file: Path) -> None:
+    """Write the scans of ``trajectories``, of those that have some; one trajectory's are in memory at a time.
+
+    Ranges are written in single precision. DataError: scans cannot be read. OSError: the disk refuses.
+    """
+    recorded = set(scans.trajectories)
+    chosen = [trajectory for trajectory in trajectories if trajectory in recorded]
+    as_text = table_format == "csv"
+
+    def frames(*_: Any) -> Iterator[pl.DataFrame]:
+        for trajectory in chosen:
+            yield from _frames(trajectory, scans.of(trajectory), as_text)
+
+    ranges = pl.String() if as_text else pl.List(pl.Float32)
+    table = register_io_source(frames, schema={"trajectory": pl.String(), "t": pl.Float64(), "ranges": ranges})
+    try:
+        with file.open("wb") as opened:  # polars would open it at any time, even after a break has removed it
+            if as_text:
+                table.sink_csv(opened, maintain_order=True)
+            else:
+                table.sink_parquet(opened, row_group_size=_ROW_GROUP, maintain_order=True)
+    except pl.exceptions.PolarsError as error:
+        raise OSError(errno.EIO, str(error)) from None
+
+
+def _frames(trajectory: str, scans: TrajectoryScans, as_text: bool) -> Iterator[pl.DataFrame]:
+    for first in range(0, len(scans.times), _ROW_GROUP):
+        part = slice(first, first + _ROW_GROUP)
+        times, ranges = scans.times[part], np.asarray(scans.ranges[part], dtype=np.float32)
+        columns = {"trajectory": [trajectory] * len(times), "t": times, "ranges": ranges}
+        frame = pl.DataFrame(columns).with_columns(pl.col("ranges").arr.to_list(), pl.col("t").cast(pl.Float64))
+        if as_text:
+            frame = quoted_formulas(frame.with_columns(pl.col("ranges").cast(pl.List(pl.String)).list.join(" ")))
+        yield frame

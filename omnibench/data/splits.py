@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import replace
 from fnmatch import fnmatchcase
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any
 
 from pydantic import BeforeValidator
 
-from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory, make_dataset
+from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory, with_warnings
+from omnibench.data.dataset import every_second as every_second
+from omnibench.data.dataset import repetitions as repetitions
 from omnibench.errors import ConfigError, DataError, nearest
-from omnibench.robot.kinematics import Robot
 from omnibench.words import plural
 
 _OPTIONAL = ("angles", "targets", "pose_covariances")  # fields of a run that all runs of a data set have, or none
@@ -67,21 +67,23 @@ def remaining(names: Sequence[str], patterns: Sequence[str], kind: str) -> set[s
 
     ConfigError: a pattern matches nothing, or all names match.
     """
-    matched: set[str] = set()
-    for pattern in patterns:
-        matching = {name for name in names if fnmatchcase(name, pattern) or fnmatchcase(name, f"{pattern}#*")}
-        if not matching:
-            raise _unmatched("leave_out", pattern, names, kind)
-        matched |= matching
-    if matched >= set(names):
+    others = set(names) - _matching("leave_out", names, patterns, kind, "#*")
+    if not others:
         raise ConfigError(f"leave_out: every {kind} matches {', '.join(patterns)}; keep one at least")
-    return set(names) - matched
+    return others
 
 
-def _unmatched(option: str, pattern: str, names: Sequence[str], kind: str) -> ConfigError:
-    known = sorted(set(names))
-    shown = ", ".join(known[:12]) + (", ..." if len(known) > 12 else "")
-    return ConfigError(f"{option}: no {kind} matches {pattern!r}; {nearest(pattern, known)}found: {shown}")
+def _matching(option: str, names: Sequence[str], patterns: Sequence[str], kind: str, parts: str = "") -> set[str]:
+    """The names that match one of the patterns, by themselves or followed by ``parts``."""
+    matched = set[str]()
+    for pattern in patterns:
+        matching = {name for name in names if fnmatchcase(name, pattern) or fnmatchcase(name, pattern + parts)}
+        if not matching:
+            known = sorted(set(names))
+            shown = ", ".join(known[:12]) + (", ..." if len(known) > 12 else "")
+            raise ConfigError(f"{option}: no {kind} matches {pattern!r}; {nearest(pattern, known)}found: {shown}")
+        matched |= matching
+    return matched
 
 
 def split_by_name(
@@ -92,47 +94,21 @@ def split_by_name(
     When only one side has patterns, everything else goes to the other; with both, names that match neither get None.
     ConfigError: a pattern matches nothing, or a name matches both sides. ``kind`` is what the names are, for messages.
     """
-    sides = {"train": train, "validation": validation}
-    for side, patterns in sides.items():
-        for pattern in patterns:
-            if not any(fnmatchcase(name, pattern) for name in names):
-                raise _unmatched(side, pattern, names, kind)
+    trains, validates = (
+        _matching(side, names, patterns, kind) for side, patterns in zip(SPLITS, (train, validation), strict=True)
+    )
+    for name in names:
+        if name in trains & validates:
+            raise ConfigError(f"{kind} {name!r} is in both train and validation; name it once")
     rest: Split | None = "validation" if not validation else "train" if not train else None
-    return [_split_of(name, train, validation, rest, kind) for name in names]
-
-
-def _split_of(
-    name: str, train: Sequence[str], validation: Sequence[str], rest: Split | None, kind: str
-) -> Split | None:
-    trains, validates = (any(fnmatchcase(name, pattern) for pattern in side) for side in (train, validation))
-    if trains and validates:
-        raise ConfigError(f"{kind} {name!r} is in both train and validation; name it once")
-    return "train" if trains else "validation" if validates else rest
+    return ["train" if name in trains else "validation" if name in validates else rest for name in names]
 
 
 def training_split(dataset: Dataset) -> tuple[Trajectory, ...]:
     """The training trajectories of a data set; DataError when there are none."""
-    trajectories = dataset.split("train")
-    if not trajectories:
-        raise DataError(
-            f"data set {dataset.name}: the training split is empty; set split to train for some trajectories"
-        )
-    return trajectories
-
-
-def every_second(groups: Sequence[Hashable]) -> list[Split]:
-    """Splits by turns within each group, in the order given; the first member trains."""
-    return ["train" if number % 2 else "validation" for number in repetitions(groups)]
-
-
-def repetitions(commands: Sequence[Hashable]) -> list[int]:
-    """Number of each run among the runs of its command, from 1, in the order given."""
-    seen: Counter[Hashable] = Counter()
-    numbers = []
-    for command in commands:
-        seen[command] += 1
-        numbers.append(seen[command])
-    return numbers
+    if trajectories := dataset.split("train"):
+        return trajectories
+    raise DataError(f"data set {dataset.name}: the training split is empty; set split to train for some trajectories")
 
 
 def division_in_words(runs: Sequence[Trajectory], options: Mapping[str, Any]) -> str:
@@ -156,7 +132,6 @@ def division_in_words(runs: Sequence[Trajectory], options: Mapping[str, Any]) ->
     return f"{', '.join(parts)}, {rule}"
 
 
-SCANS_LEFT_OUT = "scans are left out of joined data sets"
 _SAME_PERIOD = 0.1  # share by which sample periods may differ: as between drives of one robot (chosen)
 
 
@@ -170,82 +145,59 @@ def joined(first: Dataset, others: Sequence[Dataset]) -> Dataset:
     if not others:
         return first
     datasets = (first, *others)
-    for dataset in others:
-        check_fits(first, dataset)
-    made = make_dataset(
-        first.name,
-        first.robot,
-        first.sample_period,
-        complete(distinct_runs([(dataset.name, dataset.trajectories) for dataset in datasets])),
-        description=first.description,
-        source="; ".join(dict.fromkeys(dataset.source for dataset in datasets if dataset.source)),
-        licence="; ".join(dict.fromkeys(dataset.licence for dataset in datasets if dataset.licence)),
-        simulated=any(dataset.simulated for dataset in datasets),
-    )
     warnings = [warning for dataset in datasets for warning in dataset.warnings]
-    if any(dataset.scans is not None for dataset in datasets):
-        warnings.append(SCANS_LEFT_OUT)
-    return replace(made, warnings=tuple(dict.fromkeys([*warnings, *made.warnings])))
+    return with_warnings(Dataset(**joined_fields(datasets, datasets)), warnings)
 
 
-class _Described(Protocol):
-    """A data set, or its header: name, robot and sample period."""
+def joined_fields(
+    parts: Sequence[Any], described: Sequence[Any], places: Sequence[str] | None = None
+) -> dict[str, Any]:
+    """The fields of the data set that joins others, see ``joined``.
 
-    @property
-    def name(self) -> str: ...
-    @property
-    def robot(self) -> Robot: ...
-    @property
-    def sample_period(self) -> float: ...
-
-
-def check_fits(first: _Described, other: _Described, names: tuple[str, str] | None = None) -> None:
-    """DataError: another robot or sample period than the first's. names: of both in messages, as their folders."""
-    one, another = names or (first.name, other.name)
-    robots = [dataset.robot.model_dump(exclude={"name"}) for dataset in (first, other)]
-    if different := _first_difference(robots[0], robots[1]):
-        raise DataError(
-            f"data set {another}: its robot is not that of {one} ({different}); give both the same robot.yaml "
-            "(omnibench import dataset FOLDER --set robot=FILE)"
-        )
-    if abs(other.sample_period / first.sample_period - 1) > _SAME_PERIOD:
-        raise DataError(
-            f"data set {another}: its wheels were sampled every {other.sample_period:g} s, those of {one} every "
-            f"{first.sample_period:g} s; take each by itself"
-        )
-
-
-def _first_difference(one: Any, other: Any, place: str = "") -> str:
-    """The first difference of two documents in words, such as ``wheels.0.radius: 0.06 and 0.05``; empty if none."""
-    pairs: list[tuple[str, Any, Any]]
-    if isinstance(one, Mapping) and isinstance(other, Mapping):
-        pairs = [(name, one.get(name), other.get(name)) for name in dict.fromkeys([*one, *other])]
-    elif isinstance(one, list | tuple) and isinstance(other, list | tuple) and len(one) == len(other):
-        pairs = [(str(index), mine, theirs) for index, (mine, theirs) in enumerate(zip(one, other, strict=True))]
-    else:
-        return "" if one == other else f"{place}: {other} and {one}"
-    found = (_first_difference(mine, theirs, f"{place}.{name}".lstrip(".")) for name, mine, theirs in pairs)
-    return next(filter(None, found), "")
+    parts: have ``trajectories`` and ``scans``. described: their names, robots and the like. places: what messages call
+    them, default: their names. DataError: another robot or sample period than the first's.
+    """
+    first, places = described[0], places or [part.name for part in described]
+    robot = _flat(first.robot.model_dump(exclude={"name"}))
+    for place, other in zip(places, described, strict=True):
+        another = _flat(other.robot.model_dump(exclude={"name"}))
+        for key in robot | another:
+            if robot.get(key) != another.get(key):
+                raise DataError(
+                    f"data set {place}: its robot is not that of {places[0]} ({key}: {another.get(key)} and "
+                    f"{robot.get(key)}); give both the same robot.yaml (omnibench import dataset FOLDER --set "
+                    "robot=FILE)"
+                )
+        if abs(other.sample_period / first.sample_period - 1) > _SAME_PERIOD:
+            raise DataError(
+                f"data set {place}: its wheels were sampled every {other.sample_period:g} s, those of {places[0]} "
+                f"every {first.sample_period:g} s; take each by itself"
+            )
+    fields: dict[str, Any] = {name: getattr(first, name) for name in ("name", "robot", "sample_period")}
+    for name in ("description", "source", "licence"):
+        fields[name] = "; ".join(dict.fromkeys(text for part in described if (text := getattr(part, name))))
+    if any(part.scans is not None for part in parts):
+        fields["warnings"] = ("scans are left out of joined data sets",)
+    runs = _distinct_runs([(of.name, part.trajectories) for of, part in zip(described, parts, strict=True)])
+    return fields | {"simulated": any(part.simulated for part in described), "trajectories": tuple(complete(runs))}
 
 
-def distinct_runs(recordings: Sequence[tuple[str, Sequence[Trajectory]]]) -> list[Trajectory]:
+def _flat(document: Any, place: str = "") -> dict[str, Any]:
+    """The values of a document by their places in it, such as ``wheels.0.radius``."""
+    if not isinstance(document, Mapping | list | tuple):
+        return {place: document}
+    items = document.items() if isinstance(document, Mapping) else enumerate(document)
+    return {key: value for name, part in items for key, value in _flat(part, f"{place}.{name}".lstrip(".")).items()}
+
+
+def _distinct_runs(recordings: Sequence[tuple[str, Sequence[Trajectory]]]) -> list[Trajectory]:
     """The runs of recordings, which are given with their names, under ids and sessions that no two recordings share."""
-    runs = []
-    ids, sessions = set[str](), set[str]()
-    for name, (_, trajectories) in zip(_distinct([name for name, _ in recordings]), recordings, strict=True):
-        of_sessions = {run.session: run.session or name for run in trajectories}
-        of_sessions = {
-            given: f"{name}/{session}" if session in sessions else session for given, session in of_sessions.items()
-        }
-        taken = set(ids)
+    runs, names = list[Trajectory](), list[str]()
+    for name, trajectories in recordings:
+        names.append(name if name not in names else f"{name}-{len(names) + 1}")
+        prefix, ids, sessions = f"{names[-1]}/", {run.id for run in runs}, {run.session for run in runs}
         for run in trajectories:
-            new = f"{name}/{run.id}" if run.id in taken else run.id
-            runs.append(replace(run, id=new, session=of_sessions[run.session]))
-            ids.add(new)
-        sessions |= set(of_sessions.values())
+            session = run.session or names[-1]
+            session = prefix + session if session in sessions else session
+            runs.append(replace(run, id=prefix + run.id if run.id in ids else run.id, session=session))
     return runs
-
-
-def _distinct(names: Sequence[str]) -> list[str]:
-    """The names, of which those that occur before have a number behind them."""
-    return [name if name not in names[:index] else f"{name}-{index + 1}" for index, name in enumerate(names)]

@@ -10,13 +10,14 @@ import numpy as np
 import polars as pl
 
 from omnibench.config import read_yaml, validate
-from omnibench.data.tables import read_table
+from omnibench.data.stored import read_table
 from omnibench.errors import DataError
 from omnibench.files import write_table
 from omnibench.robot.kinematics import Array, Robot, interpolated
 
 TRUTH_FILE = "truth.yaml"
 POSES_FILE = "poses.parquet"
+_COLUMNS = ("t", "x", "y", "theta")
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,13 +34,10 @@ class TruePath:
 
 def write_true_poses(folder: Path, paths: Mapping[str, TruePath]) -> None:
     """Write ``poses.parquet`` into the truth folder. DataError when the disk refuses."""
-    frames = [
-        pl.DataFrame(
-            {"trajectory": [name] * len(path.times), "t": path.times}
-            | {column: path.poses[:, index] for index, column in enumerate(("x", "y", "theta"))}
-        )
-        for name, path in paths.items()
-    ]
+    frames = []
+    for name, path in paths.items():
+        columns = dict(zip(_COLUMNS, np.column_stack([path.times, path.poses]).T, strict=True))
+        frames.append(pl.DataFrame({"trajectory": [name] * len(path.times)} | columns))
     write_table(folder / POSES_FILE, pl.concat(frames))
 
 
@@ -48,14 +46,10 @@ def read_true_poses(folder: Path | str) -> dict[str, TruePath]:
     folder = Path(folder)
     if not (folder / POSES_FILE).is_file():
         raise DataError(f"{folder}: no {POSES_FILE}; name the truth of a simulated robot with scans")
-    table = read_table(folder, Path(POSES_FILE).stem, ("trajectory", "t", "x", "y", "theta"))
-    columns = np.column_stack([table.numbers(name) for name in ("t", "x", "y", "theta")])
-    names = table.frame["trajectory"].to_numpy()
-    return {
-        str(name): TruePath(columns[rows, 0], columns[rows, 1:])
-        for name in table.frame["trajectory"].unique(maintain_order=True)
-        for rows in [np.flatnonzero(names == name)]
-    }
+    table = read_table(folder, "poses", ("trajectory", *_COLUMNS))
+    ids, values = list(dict.fromkeys(table.ids)), table.stack(_COLUMNS)
+    paths = table.rows_by_run(ids, POSES_FILE)
+    return {ids[index]: TruePath(values[rows, 0], values[rows, 1:]) for index, rows in paths}
 
 
 def robot_of_truth(folder: Path | str) -> Robot | None:

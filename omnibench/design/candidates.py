@@ -13,9 +13,9 @@ from pydantic import Field, model_validator
 
 from omnibench.config import Model, Positive, read_yaml, validate
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.data.importers.recording_options import RobotOption
+from omnibench.data.recording import RobotOption
 from omnibench.data.splits import training_split
-from omnibench.data.storage import load_whole
+from omnibench.data.storage import load_dataset
 from omnibench.design.config import DesignConfig
 from omnibench.design.d_optimality import Counts
 from omnibench.errors import ConfigError, DataError, OmnibenchError, UnknownNameError
@@ -280,7 +280,7 @@ def read_candidates(
     path = Path(source)
     if path.is_dir():
         refuse_choice(dataset, path)
-        return candidates_of_dataset(load_whole(path), integration or "arc", str(path))
+        return candidates_of_dataset(load_dataset(path), integration or "arc", str(path))
     content = read_yaml(path)
     if isinstance(content, Mapping) and "datasets" in content:
         compared = validate(ComparedData, content, str(path), path.resolve().parent)

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 
 from omnibench.config import Model, Positive
-from omnibench.data.importers.recording_options import RobotOption
+from omnibench.data.recording import RobotOption
 from omnibench.errors import UnknownNameError
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Robot

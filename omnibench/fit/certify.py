@@ -15,8 +15,8 @@ from __future__ import annotations
 import heapq
 import math
 import time
-from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 from operator import itemgetter
 from typing import NamedTuple, get_args
@@ -31,7 +31,7 @@ from omnibench.data.splits import training_split
 from omnibench.errors import ConfigError, DataError, require_choice, require_range, require_type
 from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.cost import SumOfNorms
-from omnibench.fit.evaluator import ElementBox, Path, cut, impulses, make_path, quadrature
+from omnibench.fit.evaluator import ElementBox, cut, impulses, make_path, quadrature
 from omnibench.fit.parameterisation import Box, BoxName, ExplicitBox, MatrixElements
 from omnibench.fit.problem import CalibrationProblem, make_problem
 from omnibench.fit.settings import CompleteSettings, CostChoice
@@ -42,7 +42,7 @@ from omnibench.registry import calibrators
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Complex, Integration, OdometryBatch, WheelLog
-from omnibench.robot.stored_odometry import are_many
+from omnibench.robot.stored_odometry import EachLog
 from omnibench.views import Brief
 
 # m: error of the quadrature of arcs, which bounds subtract: a millionth of the millimetre that poses are known to.
@@ -102,15 +102,21 @@ class StampSums:
     def __init__(self, problem: CalibrationProblem, fitted: Array, elements: ElementBox) -> None:
         logs = problem.objective.logs(problem.trajectories)
         integration = problem.integration
-        paths = _Paths(logs, integration) if are_many(logs) else [make_path(log, integration) for log in logs]
+        paths = EachLog(partial(make_path, integration=integration), logs)
         row, speed = elements.largest[2], elements.speed
         nodes = quadrature(paths, row, speed, QUADRATURE, integration)
         if nodes is None:
             raise ConfigError("samples turn too far for a lower bound with arcs; use integration euler")
         self._quadrature = QUADRATURE if integration == "arc" else 0.0
-        headings = [float(log.start[2]) for log in logs]
-        runs = _Runs(paths, headings, problem.start.reshape(3, -1), fitted, row, integration, nodes)
-        self._runs: Iterable[_RunColumns] = runs if isinstance(paths, _Paths) else list(runs)
+        columns = partial(
+            _columns_of,
+            design=problem.start.reshape(3, -1),
+            fitted=fitted,
+            row=row,
+            integration=integration,
+            nodes=nodes,
+        )
+        self._runs = EachLog(columns, logs)
         self.curvature = np.concatenate([run.curvature for run in self._runs])
         reaches = [
             ((np.abs(path.angles) @ speed).sum(), (np.abs(path.before) @ row).max(initial=0.0)) for path in paths
@@ -138,49 +144,6 @@ class StampSums:
         """
         turned = float(self._farthest @ reach)
         return self._quadrature + self._rounding * (1 + turned) ** 2 * (1 + size)
-
-
-@dataclass(frozen=True, eq=False)
-class _Paths:
-    """The paths of logs, made anew whenever they are gone through, as their samples are read then."""
-
-    logs: Sequence[WheelLog]
-    integration: Integration
-
-    def __iter__(self) -> Iterator[Path]:
-        return (make_path(log, self.integration) for log in self.logs)
-
-
-@dataclass(frozen=True, eq=False)
-class _Runs:
-    """Terms of the sums of each run, computed whenever it is gone through.
-
-    headings: of the runs' starts, rad. row: the largest magnitudes of row 3. Else as in StampSums.
-    """
-
-    paths: Iterable[Path]
-    headings: Sequence[float]
-    design: Array
-    fitted: Array
-    row: Array
-    integration: Integration
-    nodes: int
-
-    def __iter__(self) -> Iterator[_RunColumns]:
-        design, fitted = self.design, self.fitted
-        nothing = np.zeros((1, design.shape[1]))
-        for path, heading in zip(self.paths, self.headings, strict=True):
-            (whole,) = cut(path, self.row, np.inf)
-            # One row of zeros more: the sum up to a stamp at the end, or at t = 0, then begins at a row that exists.
-            angles, before = (
-                np.vstack([np.reshape(part, (-1, design.shape[1])), nothing])
-                for part in impulses(path, whole, self.integration, self.nodes)
-            )
-            moved, along, turns = angles @ (design[0] + 1j * design[1]), angles @ fitted.T, before @ fitted.T
-            sources = np.column_stack([moved.real, moved.imag, along])
-            columns = np.concatenate([sources, *(sources * turn[:, None] for turn in turns.T)], axis=1)
-            sizes = np.column_stack([np.abs(moved), np.abs(along)])
-            yield _RunColumns(columns, before @ design[2] + heading, turns, path.ends * self.nodes, sizes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,6 +179,25 @@ class _RunColumns:
         )
         between[firsts == ends] = 0.0  # reduceat returns the first row for an empty part
         return np.cumsum(between, axis=0)
+
+
+def _columns_of(
+    log: WheelLog, design: Array, fitted: Array, row: Array, integration: Integration, nodes: int
+) -> _RunColumns:
+    """The impulses of a run. row: the largest magnitudes of row 3. Else as in StampSums."""
+    path = make_path(log, integration)
+    nothing = np.zeros((1, design.shape[1]))
+    (whole,) = cut(path, row, np.inf)
+    # One row of zeros more: the sum up to a stamp at the end, or at t = 0, then begins at a row that exists.
+    angles, before = (
+        np.vstack([np.reshape(part, (-1, design.shape[1])), nothing])
+        for part in impulses(path, whole, integration, nodes)
+    )
+    moved, along, turns = angles @ (design[0] + 1j * design[1]), angles @ fitted.T, before @ fitted.T
+    sources = np.column_stack([moved.real, moved.imag, along])
+    columns = np.concatenate([sources, *(sources * turn[:, None] for turn in turns.T)], axis=1)
+    sizes = np.column_stack([np.abs(moved), np.abs(along)])
+    return _RunColumns(columns, before @ design[2] + float(log.start[2]), turns, path.ends * nodes, sizes)
 
 
 class Minimum(NamedTuple):

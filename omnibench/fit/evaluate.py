@@ -11,12 +11,11 @@ import numpy as np
 from pydantic import Field
 
 from omnibench.config import Model
-from omnibench.data.dataset import SPLITS, WHEEL_DIGITS, Dataset, Trajectory
+from omnibench.data.dataset import SPLITS, Dataset, Trajectory
 from omnibench.data.domain_check import extrapolation_warning, share_outside
 from omnibench.data.references import UNITS, ReferenceKind
-from omnibench.data.stored_rows import drawn_runs, in_memory
+from omnibench.data.stored import drawn_runs
 from omnibench.errors import computable, require_type
-from omnibench.fit.check.missing_motions import command_names
 from omnibench.fit.cost import NO_ERROR
 from omnibench.fit.linear_fit import quick_fit
 from omnibench.fit.ratio_intervals import BOOTSTRAPPED, FEWEST, Bootstrap, Interval, RatioIntervals, Units, units_of
@@ -26,6 +25,7 @@ from omnibench.registry import costs
 from omnibench.robot.calibration import Calibration, HeldOutVerdict
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
+from omnibench.robot.samples import DIGITS
 from omnibench.views import Shown
 from omnibench.words import noun_for, plural
 
@@ -35,6 +35,7 @@ _FEWEST_CROSSED = 4  # runs, below which nothing can be left out
 _MOST = 120  # runs that quick fits look at; chosen: a second
 # Share of what a quick fit gains on all runs: a model that gains less is not judged by quick fits. Chosen.
 _AS_GOOD = 0.9
+_ALIKE = 0.1  # by which the angles that wheels turn may differ in repetitions of a command; chosen
 _MEANINGS = {"better": "better than the design", "worse": "worse than the design: do not use"}
 _BASES = {"held_out": "held out", "cross_validation": "cross-validated"}
 _HOLD_OUT = (
@@ -253,8 +254,8 @@ def _held_out(calibration: Calibration, dataset: Dataset) -> tuple[Sequence[Traj
         # A run with the wheel samples of a fitted run is that run with a reference made anew, unless fitted runs share
         # theirs (commanded rates, or simulated ones without noise).
         fitted = set(provenance.fitted)
-        wheels = {fingerprint[:WHEEL_DIGITS] for fingerprint in fitted}
-        digits = None if len(wheels) < len(fitted) else WHEEL_DIGITS
+        wheels = {fingerprint[:DIGITS] for fingerprint in fitted}
+        digits = None if len(wheels) < len(fitted) else DIGITS
         seen = fitted if digits is None else wheels
         runs = tuple(run for run in dataset.trajectories if run.fingerprint[:digits] not in seen)
         samples = "the wheel samples of a run that the calibration was fitted to"
@@ -263,6 +264,24 @@ def _held_out(calibration: Calibration, dataset: Dataset) -> tuple[Sequence[Traj
         changed = f"the data set {dataset.name} or its split was changed after the fit"
         return None, f"{changed}, so that which runs were fitted is not known"
     return runs or dataset.trajectories, ""
+
+
+def command_names(runs: Sequence[Trajectory]) -> list[str]:
+    """The command of every run; of runs without one, runs whose wheels turn alike share a name."""
+    names = [run.command or "" for run in runs]
+    nameless = [index for index, run in enumerate(runs) if run.command is None]
+    angles = []  # that the drive signals of each run count, with their signs and without (2 M,), rad
+    for run in (runs[index] for index in nameless):
+        seconds = np.diff(run.times, prepend=0.0)
+        angles.append(np.concatenate([run.signals.T @ seconds, np.abs(run.signals).T @ seconds]))
+    driven = np.array(angles)
+    firsts: list[int] = []  # index of the first run of each group that drives alike
+    for row, index in enumerate(nameless):
+        alike = np.abs(driven[firsts] - driven[row]).max(axis=1) <= _ALIKE * np.abs(driven[row]).max()
+        first = firsts[int(alike.argmax())] if alike.any() else row
+        firsts += [row] if first == row else []
+        names[index] = f"like {runs[nameless[first]].id}"
+    return names
 
 
 def verdict_on(model: OdometryModel, training: Sequence[Trajectory], held_out: Sequence[Trajectory]) -> HeldOutVerdict:
@@ -316,7 +335,7 @@ def _gains_as_quick_fits(model: OdometryModel, runs: Sequence[Trajectory]) -> bo
 def looked_at(runs: Sequence[Trajectory]) -> list[Trajectory]:
     """The runs that quick fits look at: of very many some that chance has drawn, in memory."""
     drawn = np.sort(np.random.default_rng(0).permutation(len(runs))[:_MOST]).tolist()
-    return [in_memory(run) for run in drawn_runs([runs[index] for index in drawn])]
+    return drawn_runs([runs[index] for index in drawn])
 
 
 def final_errors(model: OdometryModel, trajectories: Sequence[Trajectory]) -> Array:

@@ -31,7 +31,7 @@ from omnibench.fit.parameterisation import MatrixElements, Parameterisation, Par
 from omnibench.processes import one_thread
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Complex, Integration, OdometryBatch, WheelLog
-from omnibench.robot.stored_odometry import together
+from omnibench.robot.stored_odometry import parts_of
 
 # Share by which the box of a curved parameterisation is widened beyond its linear reach. Candidates outside are
 # integrated directly, so that it decides on speed alone: half of it and twice change costs by 4e-14 m and the memory by
@@ -454,18 +454,18 @@ class PartedEvaluator:
         return np.concatenate([part.poses(matrices) for part in self.parts], axis=1)
 
 
-def make_parted_evaluator(
+def evaluator_of_runs(
     logs: Sequence[WheelLog], integration: Integration, box: ElementBox, frame: DrivenFrame | None
-) -> PartedEvaluator | None:
-    """The evaluator of logs for matrices in a box; None where that of a part is None. frame: of the matrices."""
+) -> PoseEvaluator | PartedEvaluator | None:
+    """The evaluator of logs for matrices in a box; None where direct integration is faster. frame: of the matrices."""
     parts = []
-    for part in together(logs):
+    for part in parts_of(logs):
         seen = part if frame is None else frame.logs(part)
         evaluator = make_evaluator(OdometryBatch(seen, integration), seen, integration, box)
         if evaluator is None:
             return None
         parts.append(evaluator)
-    return PartedEvaluator(parts)
+    return parts[0] if len(parts) == 1 else PartedEvaluator(parts)
 
 
 def moments_of(plan: ExpansionPlan) -> Array:

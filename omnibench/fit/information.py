@@ -14,12 +14,10 @@ from omnibench.data.dataset import Trajectory
 from omnibench.fit.loss import LossName, make_loss
 from omnibench.fit.noise import NoiseEstimate, Whitener, differences_between_repetitions, estimate_noise
 from omnibench.fit.trajectory_fit import with_poses
-from omnibench.jobs.job import gathered
-from omnibench.progress import Reporter, no_progress
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog, split_by
-from omnibench.robot.stored_odometry import StoredOdometry, are_many, together, workers
+from omnibench.robot.stored_odometry import of_runs, poses_of_runs
 
 INTERVAL = 0.95  # probability of the intervals, by convention; every table of the program says 95 %
 # Degrees of freedom that stand for infinity: the quantile of Student's t differs from the normal one by 2e-9 there.
@@ -72,11 +70,7 @@ def noise_of_matrix(
     has any.
     """
     runs = [run for run in runs if run.has_poses]
-    logs = [run.reference_log for run in runs]
-    if are_many(logs):
-        odometry = split_by(StoredOdometry(logs, integration).poses(matrix[None])[0], [log.stamps for log in logs])
-    else:
-        odometry = [OdometryBatch([log], integration).poses(matrix[None])[0] for log in logs]
+    odometry = poses_of_runs([run.reference_log for run in runs], matrix, integration)
     residuals: list[Array] = [poses - run.poses[1:] for poses, run in zip(odometry, runs, strict=True)]
     near, residuals = without_jumps(runs, residuals, loss)
     return estimate_noise(differences_between_repetitions(near, residuals))
@@ -106,18 +100,14 @@ def information_of_runs(
     """Fisher information (Z, 3N, 3N) of each run; their sum is that of all runs together."""
     name = "final_log" if stamps == "final" else "reference_log"
     logs: list[WheelLog] = [run if isinstance(run, WheelLog) else getattr(run, name) for run in runs]
-    if are_many(logs):
-        tasks = [(StoredOdometry, part, matrix, integration, noise) for part in together(logs)]
-        return np.concatenate(gathered(workers(), informations, tasks))
-    one_by_one = [informations((OdometryBatch, [log], matrix, integration, noise), no_progress) for log in logs]
-    return np.reshape(one_by_one, (len(logs), matrix.size, matrix.size))
+    by_parts = of_runs(_informations, logs, integration, matrix, noise)
+    return np.concatenate([np.zeros((0, matrix.size, matrix.size)), *by_parts])
 
 
-def informations(task: tuple[type[OdometryBatch], Sequence[WheelLog], Array, Integration, Noise], _: Reporter) -> Array:
-    """Fisher information (Z, 3N, 3N) of logs. The task: class of the odometry, logs, matrix, integration and noise."""
-    odometry, logs, matrix, integration, noise = task
+def _informations(odometry: OdometryBatch, logs: Sequence[WheelLog], matrix: Array, noise: Noise) -> Array:
+    """Fisher information (Z, 3N, 3N) of logs."""
     information = np.empty((len(logs), matrix.size, matrix.size))
-    jacobians = split_by(odometry(logs, integration).jacobian(matrix), [log.stamps for log in logs])
+    jacobians = split_by(odometry.jacobian(matrix), [log.stamps for log in logs])
     for of_run, log, jacobian in zip(information, logs, jacobians, strict=True):
         whitened = Whitener(noise, log.stamps)(jacobian.reshape(len(jacobian), 3, -1))
         columns = whitened.reshape(-1, whitened.shape[-1])

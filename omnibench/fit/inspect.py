@@ -112,7 +112,7 @@ def inspect_dataset(dataset: Dataset) -> Inspection:
         sample_period_s=dataset.sample_period,
         sample_period_range_s=(float(periods.min()), float(periods.max())),
         pose_period_s=float(np.median(pose_periods)) if len(pose_periods) else None,
-        wheel_samples=sum(len(t.times) for t in trajectories),
+        wheel_samples=sum(t.samples.count for t in trajectories),
         reference_poses=len(pose_periods) + sum(run.start_known for run in trajectories),
         references={kind: kinds.count(kind) for kind in KINDS if kind in kinds},
         has_angles=all(t.angles is not None for t in trajectories),
@@ -140,7 +140,7 @@ def _content(dataset: Dataset, split: Split) -> SplitContent:
         repetitions_min=min(counts),
         repetitions_max=max(counts),
         sessions=len({t.session for t in group if t.session is not None}),
-        duration_s=float(sum(t.times[-1] for t in group)),
+        duration_s=float(sum(t.samples.end for t in group)),
         distance_m=float(sum(np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).sum() for path in paths)),
         turned_rad=float(sum(np.abs(path[-1, 2] - path[0, 2]) for path in paths)),
     )

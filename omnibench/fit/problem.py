@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
-from omnibench.data.stored_rows import median_period
+from omnibench.data.stored import median_period
 from omnibench.errors import DataError
 from omnibench.fit.cost import Cost
 from omnibench.fit.evaluator import (
@@ -20,8 +20,7 @@ from omnibench.fit.evaluator import (
     ElementBox,
     PartedEvaluator,
     PoseEvaluator,
-    make_evaluator,
-    make_parted_evaluator,
+    evaluator_of_runs,
 )
 from omnibench.fit.geometry import GeometryLimits, WheelGeometry
 from omnibench.fit.loss import RobustCost, moved_ends_in_words, norms_of, with_ends_from_others, with_loss
@@ -347,17 +346,11 @@ class CalibrationProblem(SearchBox):
         a search asks for many candidates. The costs of both ways are equal to 1e-11.
         """
         if not self._evaluator_tried and isinstance(self.odometry, OdometryBatch):
-            logs, odometry, searched = self.objective.logs(self.trajectories), self.odometry, self.parameterisation
+            logs, searched = self.objective.logs(self.trajectories), self.parameterisation
             if isinstance(searched, MatrixElements) and len(searched.null):
                 self._frame = DrivenFrame.of(searched)
             box = ElementBox.of(self._frame or searched, self.lower, self.upper)
-            if isinstance(odometry, StoredOdometry):
-                self._evaluator = make_parted_evaluator(logs, self.integration, box, self._frame)
-            else:
-                if self._frame is not None:
-                    logs = self._frame.logs(logs)
-                    odometry = OdometryBatch(logs, self.integration)
-                self._evaluator = make_evaluator(odometry, logs, self.integration, box)
+            self._evaluator = evaluator_of_runs(logs, self.integration, box, self._frame)
         self._evaluator_tried = True
         return self._evaluator
 

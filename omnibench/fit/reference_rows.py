@@ -20,7 +20,7 @@ from omnibench.data.references import KINDS, UNITS, ReferenceKind, References
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.odometry import Integration, WheelLog, kept_with_samples, locate
+from omnibench.robot.odometry import Integration, WheelLog, locate
 from omnibench.robot.stored_odometry import odometry_of
 
 _GRID = 16  # headings among which Newton's steps begin: Eq. (2) has two waves a turn
@@ -480,10 +480,10 @@ class _Ways:
     """The way along the path of one run, up to its stamps, which depends on rows 1 and 2 alone."""
 
     def __init__(self, log: WheelLog) -> None:
-        self._log, self.rates = log, log.rates
+        self._log = log
         self._sample, self._share = locate(log.times, log.stamps)
 
-    @kept_with_samples
+    @property
     def _angles(self) -> Array:
         """Integrals (F, M) of the signals over each sample, rad."""
         angles: Array = self._log.signals * np.diff(self._log.times, prepend=0.0)[:, None]

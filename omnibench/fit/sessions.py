@@ -65,7 +65,7 @@ from numpy.typing import NDArray
 from scipy.special import fdtrc, stdtrit
 
 from omnibench.data.dataset import Trajectory
-from omnibench.data.stored_rows import drawn_runs
+from omnibench.data.stored import drawn_runs
 from omnibench.errors import DataError
 from omnibench.fit.information import INTERVAL
 from omnibench.fit.noise import common_poses, grouped, roots_of, whiteners

@@ -47,7 +47,7 @@ from scipy.optimize import minimize, minimize_scalar
 from scipy.special import chdtri
 
 from omnibench.data.dataset import Trajectory
-from omnibench.data.stored_rows import median_period
+from omnibench.data.stored import median_period
 from omnibench.errors import DataError
 from omnibench.fit.noise import (
     LEAST_WHITE,

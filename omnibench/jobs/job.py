@@ -45,6 +45,8 @@ def content_key(facts: Mapping[str, Any]) -> str:
 def _plain(value: Any) -> Any:
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json")
+    if callable(contents := getattr(value, "contents", None)):  # a handle, of a run's samples
+        return contents()
     if is_dataclass(value):
         return {field.name: getattr(value, field.name) for field in fields(value)}
     return [value.dtype.str, value.shape, hashlib.sha256(value.tobytes()).hexdigest()]  # an array

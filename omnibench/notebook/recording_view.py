@@ -11,7 +11,7 @@ import plotly.graph_objects as go
 import polars as pl
 
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.data.tables import reference_frame, tables_of
+from omnibench.data.storage import reference_frame, tables_of
 from omnibench.errors import DataError
 from omnibench.report.blocks import Figure, FigureGrid
 from omnibench.report.figures import START, drawn, is_drawn, marks, motion_system, path
@@ -67,7 +67,7 @@ class DatasetView(View):
         splits = ", ".join(f"{sum(run.split == split for run in runs)} {split}" for split in ("train", "validation"))
         robot = f"robot {dataset.robot.name} (wheels {', '.join(dataset.robot.wheel_names)})"
         yield f"Dataset {dataset.name!r}: {plural(len(runs), 'run')} ({splits}) of {robot}"
-        samples, poses = sum(len(run.times) for run in runs), sum(len(run.pose_times) for run in runs)
+        samples, poses = sum(run.samples.count for run in runs), sum(len(run.pose_times) for run in runs)
         yield (
             f"  {'simulated' if dataset.simulated else 'recorded'}, {plural(samples, 'wheel sample')} every "
             f"{1000 * dataset.sample_period:g} ms, {plural(poses, 'reference pose')}"

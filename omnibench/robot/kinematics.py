@@ -488,7 +488,8 @@ class Robot(Shown, Model):
         if self.skid and not fixed:
             raise ValueError("skid: true is for fixed wheels; this robot has none")
         driven = self.signal_equations @ allowed
-        strengths = np.linalg.svd(driven / np.linalg.norm(driven, axis=0), compute_uv=False)
+        lengths = np.linalg.norm(driven, axis=0)
+        strengths = np.linalg.svd(driven / np.maximum(lengths, _RANK * lengths.max()), compute_uv=False)
         if len(strengths) < allowed.shape[1] or strengths[-1] < _RANK * strengths[0]:
             if not fixed and drive.direct:
                 raise ValueError(

@@ -15,9 +15,9 @@ import numpy as np
 from omnibench.robot.corrections import Fade, check_needs, faded_twists, needs_of
 from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect, Term
 from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.odometry import Integration, OdometryStream, PathBatch, RunSamples, WheelLog, advance, split_by
+from omnibench.robot.odometry import Integration, OdometryStream, PathBatch, RunSamples, WheelLog, advance
 from omnibench.robot.signals import SignalStream, signals_of_runs
-from omnibench.robot.stored_odometry import StoredOdometry, are_many
+from omnibench.robot.stored_odometry import are_many, parts_of, poses_of_runs
 
 # Chord by length of an arc. Below it the arc ends where it began, and no motion in the robot's frame displaces its end.
 _NO_STRETCH = 1e-6
@@ -140,8 +140,7 @@ class OdometryModel:
         After the last sample the pose is constant. DataError in one line: a log lacks data that an effect needs.
         """
         if not self._corrects and are_many(logs) and all((np.diff(log.stamps) >= 0).all() for log in logs):
-            of_all = StoredOdometry(logs, self.integration).poses(self.matrix[None])[0]
-            return split_by(of_all, [log.stamps for log in logs])
+            return poses_of_runs(logs, self.matrix, self.integration)
         return self._of_paths(logs, PathBatch.poses)
 
     def reported(self, logs: Sequence[WheelLog]) -> list[Array]:
@@ -208,11 +207,11 @@ def _blocks(logs: Sequence[WheelLog]) -> Iterator[list[int]]:
     for members in sessions.values():
         block, count = list[int](), 0
         for index in members:
-            if block and count + len(logs[index].times) > _BLOCK:
+            if block and count + logs[index].samples.count > _BLOCK:
                 yield block
                 block, count = [], 0
             block.append(index)
-            count += len(logs[index].times)
+            count += logs[index].samples.count
         yield block
 
 
@@ -223,20 +222,21 @@ def reported_poses(
 
     poses_of: the poses of the logs' paths at the logs' stamps, in any order of these.
     """
-    measured = []
-    for log in logs:
-        of_position = of_heading = log.stamps
-        for term in terms:
-            assert isinstance(term.effect, ReferenceEffect)
-            before = term.effect.delays(log.stamps, term.values)
-            of_position, of_heading = of_position - before[0], of_heading - before[1]
-        when = np.concatenate([of_position, of_heading])
-        measured.append(replace(log.continued(when.max(initial=0.0)), stamps=when))
     reported = []
-    for log, both in zip(logs, poses_of(measured), strict=True):
-        poses = np.column_stack([both[: len(log.stamps), :2], both[len(log.stamps) :, 2]])
-        for term in terms:
-            assert isinstance(term.effect, ReferenceEffect)
-            poses = term.effect.reported(poses, log.start, term.values)
-        reported.append(poses)
+    for part in parts_of(logs):
+        measured = []
+        for log in part:
+            of_position = of_heading = log.stamps
+            for term in terms:
+                assert isinstance(term.effect, ReferenceEffect)
+                before = term.effect.delays(log.stamps, term.values)
+                of_position, of_heading = of_position - before[0], of_heading - before[1]
+            when = np.concatenate([of_position, of_heading])
+            measured.append(replace(log.continued(when.max(initial=0.0)), stamps=when))
+        for log, both in zip(part, poses_of(measured), strict=True):
+            poses = np.column_stack([both[: len(log.stamps), :2], both[len(log.stamps) :, 2]])
+            for term in terms:
+                assert isinstance(term.effect, ReferenceEffect)
+                poses = term.effect.reported(poses, log.start, term.values)
+            reported.append(poses)
     return reported

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import accumulate, pairwise
 from typing import Any, Literal, TypeVar
@@ -22,27 +22,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.robot.kinematics import Array, Drive, in_the_middle
+from omnibench.robot.samples import Samples, with_samples
 
 Integration = Literal["euler", "arc"]
 Complex = NDArray[np.complex128]
-Value = TypeVar("Value")
 Numbers = TypeVar("Numbers", Array, Complex, NDArray[np.intp])
 
 _LAST = 5  # samples whose mean rate continues a log after its last sample; chosen
 _BLOCK = 120_000  # samples at a time (candidates x samples), so that temporaries stay in the processor's cache
 
 
-class kept_with_samples(cached_property[Value]):  # noqa: N801 (a decorator)
-    """A property that is computed once where ``rates`` are in memory, and each time where they are read when used."""
-
-    def __get__(self, instance: Any, owner: type[Any] | None = None) -> Any:
-        value = super().__get__(instance, owner)
-        if instance is not None and not isinstance(instance.rates, np.ndarray):
-            vars(instance).pop(self.attrname, None)
-        return value
-
-
-@dataclass(frozen=True)
+@with_samples("times", "rates", "steering", wheel_angles="angles")
+@dataclass(frozen=True, eq=False)
 class WheelLog:
     """Input of odometry for one trajectory.
 
@@ -63,42 +54,32 @@ class WheelLog:
     session: str | None = None
     steering: Array | None = None
     drive: Drive | None = None
+    samples: Samples = field(default=Samples({}), kw_only=True, repr=False)
 
-    @kept_with_samples
+    @property
     def middle_steering(self) -> Array | None:
         """Steering angles (F, W) in the middle of each sample, rad; None where none are measured."""
         return None if self.steering is None else in_the_middle(self.steering)
 
-    @kept_with_samples
+    @property
     def signals(self) -> Array:
         """Drive signals (F, M): the rates, or what they and the steering angles make."""
-        return self.rates if self.drive is None else self.drive.signals(self.rates, self.middle_steering)
+        return self.samples.signals(self.drive)
 
     def continued(self, until: float) -> WheelLog:
         """The log with one more sample of the last mean rate up to ``until`` (s), where its samples end before.
 
         The robot drives on after the last sample: a path that stopped there would have a kink.
         """
-        end = self.times[-1]
-        if until <= end:
+        if until <= self.samples.end:
             return self
-        rates = self.rates[-_LAST:].mean(axis=0)
-        angles, steering = self.wheel_angles, self.steering
-        return replace(
-            self,
-            times=_followed(self.times, np.array(until)),
-            rates=_followed(self.rates, rates),
-            wheel_angles=None if angles is None else _followed(angles, angles[-1] + rates * (until - end)),
-            steering=None if steering is None else _followed(steering, steering[-1]),
-        )
-
-
-def _followed(rows: Array, row: Array) -> Array:
-    """Rows (F, ...) and one more (...); of an array that is read where it is used, another one of that kind."""
-    if (followed := getattr(rows, "followed_by", None)) is not None:
-        longer: Array = followed(row)
-        return longer
-    return np.concatenate([rows, row[None]])
+        rate = self.rates[-_LAST:].mean(axis=0)
+        row: dict[str, Any] = {"times": until, "rates": rate}
+        if self.wheel_angles is not None:
+            row["angles"] = self.wheel_angles[-1] + rate * (until - self.samples.end)
+        if self.steering is not None:
+            row["steering"] = self.steering[-1]
+        return replace(self, samples=self.samples.followed(row))
 
 
 @dataclass(frozen=True, eq=False)

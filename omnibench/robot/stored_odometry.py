@@ -1,15 +1,18 @@
-"""Odometry of runs whose samples are read where they are used: as OdometryBatch, without holding them."""
+"""Odometry of any number of runs: of few their samples are held, of very many they are read whenever they are needed.
+
+``odometry_of``, ``poses_of_runs``, ``of_runs`` and ``EachLog`` decide which by themselves; their callers need not know.
+"""
 
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
-from typing import Any, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -17,9 +20,11 @@ from omnibench.jobs.job import Backend, gathered
 from omnibench.progress import Reporter
 from omnibench.robot.compiled import path_sums
 from omnibench.robot.kinematics import Array
-from omnibench.robot.odometry import Complex, Integration, OdometryBatch, RunSamples, WheelLog
+from omnibench.robot.odometry import Complex, Integration, OdometryBatch, RunSamples, WheelLog, split_by
 
 Sampled = TypeVar("Sampled", bound=Any)  # a log, or a run
+Value = TypeVar("Value")
+Result = TypeVar("Result", covariant=True)
 
 # Samples up to which an OdometryBatch holds them, in 0.1 kB each of three wheels (chosen: beyond, reading them anew and
 # summing in compiled code takes a tenth of the time, too).
@@ -32,13 +37,59 @@ _WORKERS: ContextVar[Backend | None] = ContextVar("workers", default=None)
 
 
 def odometry_of(logs: Sequence[WheelLog], integration: Integration) -> OdometryBatch:
-    """The odometry of logs, which holds their samples where these are few."""
+    """The odometry of logs, by samples that are held where these are few, and else read anew for every matrix."""
     return (StoredOdometry if are_many(logs) else OdometryBatch)(logs, integration)
+
+
+def poses_of_runs(logs: Sequence[WheelLog], matrix: Array, integration: Integration) -> list[Array]:
+    """Poses (S, 3) in m, m, rad of each log at its stamps by one matrix (3, M)."""
+    if not are_many(logs):
+        return [OdometryBatch([log], integration).poses(matrix[None])[0] for log in logs]
+    return split_by(StoredOdometry(logs, integration).poses(matrix[None])[0], [log.stamps for log in logs])
+
+
+class FunctionOfRuns(Protocol[Result]):
+    """What ``of_runs`` computes of the odometry of some logs."""
+
+    def __call__(self, odometry: OdometryBatch, logs: Sequence[WheelLog], *arguments: Any) -> Result: ...
+
+
+def of_runs(
+    function: FunctionOfRuns[Value], logs: Sequence[WheelLog], integration: Integration, *arguments: Any
+) -> list[Value]:
+    """Results of a function, from the top of a module, for each log, or for parts of very many, in the logs' order."""
+    if not are_many(logs):
+        return [function(OdometryBatch([log], integration), [log], *arguments) for log in logs]
+    tasks = [(function, part, integration, arguments) for part in together(logs)]
+    return gathered(workers(), _of_part, tasks)
+
+
+def _of_part(
+    task: tuple[FunctionOfRuns[Value], Sequence[WheelLog], Integration, tuple[Any, ...]], _: Reporter
+) -> Value:
+    function, logs, integration, arguments = task
+    return function(StoredOdometry(logs, integration), logs, *arguments)
+
+
+class EachLog(Generic[Value]):
+    """What a function makes of each log: held, or for very many samples made again in every iteration."""
+
+    def __init__(self, make: Callable[[WheelLog], Value], logs: Sequence[WheelLog]) -> None:
+        self._make, self._logs = make, logs
+        self._made = None if are_many(logs) else [make(log) for log in logs]
+
+    def __iter__(self) -> Iterator[Value]:
+        return map(self._make, self._logs) if self._made is None else iter(self._made)
+
+
+def parts_of(logs: Sequence[WheelLog]) -> list[list[WheelLog]]:
+    """All logs in one part, or very many in parts that are read at a time."""
+    return list(together(logs)) if are_many(logs) else [list(logs)]
 
 
 def are_many(logs: Sequence[WheelLog]) -> bool:
     """True if logs have so many samples that odometry should not hold them."""
-    return sum(len(log.times) for log in logs) > _HELD
+    return sum(log.samples.count for log in logs) > _HELD
 
 
 def together(logs: Iterable[Sampled], samples: int | None = None) -> Iterator[list[Sampled]]:
@@ -48,10 +99,10 @@ def together(logs: Iterable[Sampled], samples: int | None = None) -> Iterator[li
     """
     part, longest = list[Sampled](), 0
     for log in logs:
-        longest = max(longest, len(log.times))
+        longest = max(longest, log.samples.count)
         if part and (len(part) + 1) * longest > (samples or _TOGETHER):
             yield part
-            part, longest = [], len(log.times)
+            part, longest = [], log.samples.count
         part.append(log)
     if part:
         yield part
@@ -158,8 +209,8 @@ def sums_of_logs(task: tuple[Sequence[WheelLog], Sequence[Array], Integration, b
     logs, matrices, integration, slopes = task
     parts = []
     for part in together(logs):
-        samples = RunSamples.of([np.asarray(log.times) for log in part])
-        signals = np.ascontiguousarray(np.concatenate([np.asarray(log.signals) for log in part]))
+        samples = RunSamples.of([log.times for log in part])
+        signals = np.ascontiguousarray(np.concatenate([log.signals for log in part]))
         stamps = [log.stamps for log in part]
         parts.append([_sums(samples, signals, stamps, matrix, integration, slopes) for matrix in matrices])
     return _joined(parts)

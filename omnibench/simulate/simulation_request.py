@@ -15,7 +15,7 @@ import numpy as np
 from omnibench.config import to_json, to_yaml
 from omnibench.data.dataset import Dataset, make_dataset
 from omnibench.data.domain_check import extrapolation_warning
-from omnibench.data.storage import check_dataset_folder, load_whole, save_dataset
+from omnibench.data.storage import check_dataset_folder, load_dataset, save_dataset
 from omnibench.data.true_poses import POSES_FILE, TRUTH_FILE, write_true_poses
 from omnibench.errors import ConfigError, DataError
 from omnibench.files import TableFormat, refuse_existing, remove, resolved, write_text
@@ -158,7 +158,7 @@ class SimulationRequest:
             assert self.like is not None
             assert self.model is not None
             calibration = read_calibration(self.model)
-            dataset = simulate_like(load_whole(self.like), calibration, (self.seed or 0) if self.noise else None)
+            dataset = simulate_like(load_dataset(self.like), calibration, (self.seed or 0) if self.noise else None)
             save_dataset(dataset, self.output, table_format, overwrite=self.force)
             return WrittenSimulation(dataset)
         check_effect_options(self.effects)

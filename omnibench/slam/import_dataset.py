@@ -9,25 +9,23 @@ from typing import Any
 
 from omnibench.config import validate
 from omnibench.data.dataset import Dataset, Imported
-from omnibench.data.importer import Importer
+from omnibench.data.importing import importer_of, read_dataset
 from omnibench.files import check_source
-from omnibench.registry import importers
 from omnibench.slam.slam_options import SlamOptions
 
 
 def import_dataset(name: str, source: Path | str, options: Mapping[str, Any] | None = None) -> Dataset:
     """Read ``source`` with the importer called ``name``; recordings without reference poses get them by SLAM.
 
-    options: the importer's, with those of SLAM under ``slam`` where the importer reads scans. UnknownNameError,
-    ConfigError or DataError in one line.
+    options: the importer's, with those of SLAM under ``slam`` where the importer reads scans; or those of ``import
+    dataset`` that the importer does not have, as if its data set was imported again. UnknownNameError, ConfigError or
+    DataError in one line.
     """
-    given, source = dict(options or {}), Path(source)
-    entry = importers.entry(name)
+    source = Path(source)
     check_source(source)
-    given = entry.cls.completed(given, source)
-    importer: Importer = importers.create(name, given)
+    importer, again = importer_of(name, source, options or {})
     slam = validate(SlamOptions, getattr(importer.options, "slam", {}), f"importer {name!r}: slam")
-    recorded = importer.read(source)
+    recorded = read_dataset(importer, source, again)
     dataset = recorded if recorded.referenced else _with_reference_poses(recorded, slam, source)
     return replace(dataset, imported=Imported.of(name, source, options or {}))
 

@@ -13,7 +13,7 @@ from pydantic import Field
 
 from omnibench.config import Model
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.data.storage import check_dataset_folder, load_whole, save_dataset
+from omnibench.data.storage import check_dataset_folder, load_dataset, save_dataset
 from omnibench.data.true_poses import TruePath, read_true_poses, robot_of_truth
 from omnibench.errors import ConfigError, DataError, Interrupted
 from omnibench.files import TableFormat, refuse_existing, resolved
@@ -293,7 +293,7 @@ class SlamRequest:
         Until the data set is written, the paths found so far are kept in a folder beside it, with which the command
         goes on when it is run again. Interrupted: Ctrl-C; the message names that folder, as a note of any error does.
         """
-        recorded = load_whole(self.dataset)
+        recorded = load_dataset(self.dataset)
         truth = self._truth_of(recorded)
         model = self._model_of(recorded)
         if self.output is not None:

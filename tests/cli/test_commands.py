@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import polars as pl
 import pytest
 import yaml
 from browser import chromium
@@ -163,13 +162,6 @@ def test_a_terminal_without_a_letter_shows_another(prepared: Prepared, tmp_path:
     assert run.returncode == 0
     assert "Traceback" not in run.stderr
     assert run.stdout.startswith("Gr??e: simulated data")
-
-
-def test_inspect_warns_of_units_that_cannot_be_right(command: Command, prepared: Prepared, tmp_path: Path) -> None:
-    file = shutil.copytree(prepared.data, tmp_path / "data") / "poses.parquet"
-    pl.read_parquet(file).with_columns(pl.col("x", "y") * 1000).write_parquet(file)
-    printed = succeeded(command("inspect", tmp_path / "data"))
-    assert "warning: positions look like mm" in printed.stderr
 
 
 def test_list_names_everything_that_a_config_can_name(command: Command) -> None:

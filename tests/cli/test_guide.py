@@ -19,7 +19,7 @@ from typed_pages import commands_in, parse
 import omnibench
 from omnibench.cli.handbook_topics import HANDBOOK, topics
 from omnibench.compare.config import CompareConfig
-from omnibench.data.importers.recording_options import RobotOption
+from omnibench.data.recording import RobotOption
 from omnibench.study.config import StudyConfig
 
 PAGES = [ROOT / "README.md", *sorted(HANDBOOK.rglob("*.md"))]
@@ -150,6 +150,7 @@ ROBOTS = {robot["name"]: robot for robot in SHOWN}
     ("two_wheels", [1, 1], [-1, 1]),
     ("omni", [-1, 0, 1], [1, 1, 1]),
     ("mecanum", [1, 1, 1, 1], [-1, 1, -1, 1]),
+    ("tracking_wheels", [1, 1, 0], [-1, 1, -1]),
 ])  # fmt: skip
 def test_wheels_count_as_the_page_of_robots_says(name: str, pushed: list[int], turned: list[int]) -> None:
     robot = TypeAdapter(RobotOption).validate_python(ROBOTS[name])

@@ -17,7 +17,7 @@ from newcomer_log import Machine, write_logs
 from sample_robots import fixed, mecanum
 
 from omnibench.data.dataset import Dataset
-from omnibench.data.importers.csv_tables.csv_template import write_template
+from omnibench.data.importers.csv_template import write_template
 from omnibench.data.storage import load_dataset
 from omnibench.registry import importers
 from omnibench.report.path_pictures import DESIGN_ITEM, paths_before_after

@@ -234,7 +234,7 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "robot/effects/effect.py",
         "robot/export/formats.py",
         "data/dataset.py",
-        "data/stored_rows.py",
+        "data/stored.py",
         "compare/plan.py",
     ],
 )

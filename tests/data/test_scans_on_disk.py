@@ -18,8 +18,8 @@ from commands import refused
 from storage_samples import FORMATS, Format, everything_known, read_frame, table_file, write_frame
 
 from omnibench.data.dataset import Dataset
-from omnibench.data.scans import Mount, Scanner, ScansInMemory, TrajectoryScans
-from omnibench.data.storage import ScansOnDisk, load_dataset, save_dataset
+from omnibench.data.scans import Mount, Scanner, ScansInMemory, ScansOnDisk, TrajectoryScans
+from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import DataError, OmnibenchError
 
 SCANNER = Scanner(

@@ -6,6 +6,7 @@ import math
 import os
 import shutil
 from dataclasses import fields, replace
+from inspect import signature
 from operator import methodcaller
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,7 @@ from storage_samples import (
 )
 from wheeled_samples import CAR, DIFF, TRICYCLE, driven
 
+from omnibench.check.check import check
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.references import Reference, References
 from omnibench.data.storage import load_dataset, save_dataset
@@ -41,6 +43,8 @@ from omnibench.errors import DataError
 from omnibench.robot.kinematics import wheel_equations
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
+
+RECORDED = signature(Trajectory).parameters.keys() - {"samples"}  # what is given to a run, or found there
 
 
 @pytest.fixture(params=FORMATS)
@@ -56,8 +60,8 @@ def test_a_data_set_comes_back_as_it_was(good: dict[Format, Path], fmt: Format) 
         if item.name != "trajectories":
             assert getattr(found, item.name) == getattr(written, item.name), item.name
     for before, after in zip(written.trajectories, found.trajectories, strict=True):
-        for item in fields(Trajectory):
-            np.testing.assert_array_equal(getattr(after, item.name), getattr(before, item.name), item.name)
+        for name in RECORDED:
+            np.testing.assert_array_equal(getattr(after, name), getattr(before, name), name)
 
 
 def test_parquet_and_csv_have_the_hash_of_what_was_written(good: dict[Format, Path]) -> None:
@@ -119,7 +123,7 @@ def test_only_trajectory_and_split_are_needed(folder: Path) -> None:
     ):
         with_frame(name, methodcaller("select", kept))(folder)
     run = load_dataset(folder).trajectories[0]
-    unknown = {item.name for item in fields(run) if getattr(run, item.name) is None}
+    unknown = {name for name in RECORDED if getattr(run, name) is None}
     assert unknown == {
         *("command", "repetition", "session", "started_at", "v", "alpha", "omega", "duration", "distance"),
         *("angles", "targets", "pose_covariances", "steering", "drive", "references", "odometry", "sent"),
@@ -445,9 +449,9 @@ def test_wrapped_headings_of_a_compass_become_continuous() -> None:
         (Reference("turn", 11.5, 0.1), "degrees"),
     ],
 )
-def test_references_in_other_units_are_warned_of(reference: Reference, unit: str) -> None:
-    (warning,) = a_set(measured("run-1", reference)).warnings
-    assert f"as if they were in {unit}" in warning
+def test_references_in_other_units_are_found(reference: Reference, unit: str) -> None:
+    (finding, *_) = check(a_set(measured("run-1", reference))).findings
+    assert f"as if they were in {unit}" in finding.what
 
 
 def test_references_of_a_data_set_and_of_a_run_are_tables() -> None:

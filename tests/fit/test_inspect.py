@@ -15,7 +15,6 @@ from sample_robots import WHEELED
 from syrupy.assertion import SnapshotAssertion
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.data.tables import make_dataset as dataset_of_tables
 from omnibench.errors import DataError
 from omnibench.fit.inspect import Inspection, inspect_dataset
 from omnibench.fit.span import (
@@ -34,7 +33,7 @@ from omnibench.testing.synthetic import synthetic_robot
 def test_wheels_that_never_turn_tell_nothing_of_any_robot(robot: Robot) -> None:
     t, poses = np.arange(1, 21) * 0.1, {"t": [0.0, 1.0, 2.0]} | dict.fromkeys(("x", "y", "theta"), np.zeros(3))
     names = [f"omega_{wheel}" for wheel in robot.wheel_names] + [f"steer_{wheel}" for wheel in robot.drive.steered]
-    still = dataset_of_tables("still", robot, wheels={"t": t} | dict.fromkeys(names, np.zeros(20)), poses=poses)
+    still = make_dataset("still", robot, wheels={"t": t} | dict.fromkeys(names, np.zeros(20)), poses=poses)
     inspection = inspect_dataset(still)
     assert inspection.driven_directions == 0
     assert not any(parameter.told for parameter in inspection.identifiability.parameters)
@@ -124,13 +123,10 @@ def test_a_split_that_is_empty_is_told_and_all_runs_are_judged(split: str, missi
     assert len(inspection.identifiability.directions) == 3
 
 
-def test_missing_commands_and_warnings_of_the_data_set_are_told() -> None:
-    millimetres = [replace(run, poses=run.poses * [1000, 1000, 1], command=None) for run in commanded()]
-    inspection = inspect_dataset(dataset(millimetres))
+def test_missing_commands_are_told() -> None:
+    inspection = inspect_dataset(dataset([replace(run, command=None) for run in commanded()]))
     assert any("no commands" in finding for finding in inspection.findings)
     assert inspection.splits["train"].commands == 0
-    (warning,) = inspection.warnings
-    assert "mm" in warning
 
 
 def test_a_real_recording_of_hours_is_inspected(omni3: Dataset) -> None:

@@ -111,3 +111,26 @@ def test_a_malformed_row_and_a_folder_without_runs_are_named(tmp_path: Path) -> 
     file.write_text(file.read_text().replace("400.02;0.1", "400.02;full"))
     with pytest.raises(DataError, match=r"exp00\.csv, row 3 \(line 6\): xsetspeed is 'full'"):
         import_dataset("robotino", tmp_path)
+
+
+class TestCommonOptions:
+    """Options of ``import dataset`` hold for an importer that knows none of them."""
+
+    def test_signs_order_and_cuts_are_applied_to_what_it_reads(self, tmp_path: Path) -> None:
+        write_run(tmp_path)
+        (plain,) = import_dataset("robotino", tmp_path).trajectories
+        data = import_dataset("robotino", tmp_path, {"wheel_signs": [-1, 1, 1], "wheel_columns": ["2", "1", "3"]})
+        (run,) = data.trajectories
+        np.testing.assert_allclose(run.rates, plain.rates[:, [1, 0, 2]] * [-1, 1, 1])
+        assert (run.id, run.split, run.command, run.session) == (plain.id, plain.split, plain.command, plain.session)
+        assert data.imported is not None
+        assert data.imported.options == {"wheel_signs": [-1, 1, 1], "wheel_columns": ["2", "1", "3"]}
+        cut = import_dataset("robotino", tmp_path, {"window": 0.5, "name": "halves"})
+        assert (cut.name, len(cut.trajectories)) == ("halves", 2)
+
+    def test_wrong_and_unknown_ones_are_refused(self, tmp_path: Path) -> None:
+        write_run(tmp_path)
+        with pytest.raises(ConfigError, match="importer 'robotino': wheel_signs has 2 values, expected 3"):
+            import_dataset("robotino", tmp_path, {"wheel_signs": [1, 1]})
+        with pytest.raises(ConfigError, match="importer 'robotino': unknown key 'wheel_sgns'"):
+            import_dataset("robotino", tmp_path, {"wheel_sgns": [1, 1, 1]})

@@ -315,9 +315,12 @@ FOUR = [fixed("a", 0.2, 0.2), fixed("b", 0.2, -0.2), fixed("c", -0.2, 0.2), fixe
 
 
 LEFT, RIGHT = fixed("a", 0, 0.1), fixed("b", 0, -0.1)
+# Omni wheels by name, x, y and axle, all of which roll through the centre.
+NO_TURN = [("a", 0, 0.1, 0), ("b", 0, -0.1, 0), ("c", -0.1, 0, math.pi / 2)]
 CANNOT_BE: list[tuple[list[dict[str, Any]], str]] = [
     (omni(0, 0, math.pi), "every direction"),
     ([rolling(side, name) for side, name in zip((1, -1, 1, -1), "abcd", strict=True)], "every direction"),
+    ([fixed(name, x, y, type="omni", angle=d) for name, x, y, d in NO_TURN], "every direction"),
     (omni(0, math.pi / 2), "wheels"),
     (omni(60, 180, 300), "60 cannot be an angle in rad; is it in degrees?"),
     (omni(0, 2, 4, roller_angle=45), "wheels.0.roller_angle"),

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from constant_study import Answer, Part, Value, carry_out, estimates, stated, words, work
 from interval_coverage import simulated, wheel_equations
-
 from omnibench.data.checks.implausible import implausible
+
 from omnibench.data.dataset import Dataset
 from omnibench.design.candidates import candidates_of_dataset
 from omnibench.design.design import design_experiment

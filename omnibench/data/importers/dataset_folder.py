@@ -2,54 +2,56 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
 from pydantic import Field, model_validator
 
-from omnibench.data.dataset import Dataset
+from omnibench.config import validate
+from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.importer import Importer
-from omnibench.data.importers.copied_reference import follows_the_wheels
-from omnibench.data.importers.recording_options import RADIANS, SECONDS, HeadingUnit, TimeUnit
-from omnibench.data.importers.runs.recording_runs import Columns, in_seconds, reread_runs, scans_of
-from omnibench.data.importers.wheel_samples import EncoderOptions, Signs
-from omnibench.data.splits import Names, complete, joined
-from omnibench.data.storage import load_whole, read_recorded
-from omnibench.errors import DataError
+from omnibench.data.recording import (
+    SECONDS,
+    PoseReadings,
+    Recording,
+    ReferenceOptions,
+    RunAttributes,
+    ScanReadings,
+    WheelReadings,
+)
+from omnibench.data.runs import dataset_of
+from omnibench.data.scans import Ranges, Scans
+from omnibench.data.splits import Names, joined
+from omnibench.data.storage import Header, load_dataset, read_recorded
+from omnibench.errors import ConfigError, DataError, nearest
 from omnibench.registry import importers
+from omnibench.robot.kinematics import Robot
 
 _POSE = ("x", "y", "theta")
 
 
-class DatasetOptions(EncoderOptions):
+class DatasetOptions(ReferenceOptions):
     """How the columns of a data set are to be read."""
 
     group: ClassVar[str] = "Columns of the data set"
 
     name: str = Field("dataset", min_length=1, description="name of the data set")
     wheel_columns: Names = Field((), description="its wheels in the robot's order, as [b,a]; default by name")
-    wheel_signs: Signs = Field((), description="-1 for wheels that count the other way round, as [-1,1]")
-    wheel_time_unit: TimeUnit = Field("s", description="unit of the times of its wheels, whose rates stay")
-    pose_time_unit: TimeUnit = Field("s", description="unit of the times of its poses")
     steering_columns: Names = Field((), description="its steered wheels in the robot's order; default by name")
     pose_columns: Names = Field(_POSE, description="columns of x, y and heading, as [y,x,theta]")
-    heading_unit: HeadingUnit = Field("rad", description="unit of the headings as the data set has them")
     join: Names = Field((), description="folders of further data sets of this robot, whose runs are added as they are")
 
     @model_validator(mode="after")
-    def _fits_together(self) -> DatasetOptions:
-        self.require_one_each("wheel_columns", "wheel_signs", "steering_columns")
+    def _columns_fit_together(self) -> DatasetOptions:
+        self.require_one_each("wheel_columns", "steering_columns")
         if sorted(self.pose_columns) != sorted(_POSE):
             raise ValueError(f"pose_columns is {', '.join(self.pose_columns)}; give x, y and theta in another order")
         if self.quantity != "rates":
             raise ValueError(f"wheel_unit {self.wheel_unit}: a data set holds rates; give rpm, deg/s, rev/s or ticks/s")
         return self
-
-    @property
-    def signs(self) -> Signs:
-        return self.wheel_signs
 
 
 @importers.register("dataset")
@@ -75,36 +77,113 @@ class DatasetFolder(Importer):
         return {"robot": file, **options}
 
     def read(self, source: Path) -> Dataset:
-        """The data set as the options say. DataError as for ``load_whole``."""
-        options, warnings = self.options, list[str]()
+        """The data set as the options say. DataError as for ``load_dataset``."""
         recorded = read_recorded(source)
-        header = recorded.header
-        columns = Columns.of(header.robot, options, options.wheel_columns, options.steering_columns)
-        poses = [_POSE.index(column) for column in options.pose_columns]
-        wheel_second, pose_second = SECONDS[options.wheel_time_unit], SECONDS[options.pose_time_unit]
-        parts = reread_runs(
-            [in_seconds(columns.read(run, options), wheel_second, pose_second) for run in recorded.trajectories],
-            options,
-            poses,
-            RADIANS[options.heading_unit],
-            warnings,
-        )
-        if not parts:
-            raise DataError(f"{source}: no run is left; {warnings[-1] if warnings else 'check the options'}")
-        runs = complete([part.run for part in parts])
-        numbers = {run.id: run.repetition for run in runs}
-        runs = [
-            replace(run, repetition=numbers[run.id])
-            for run in options.divided(runs, otherwise=[run.split for run in runs])
-        ]
-        scans = None if recorded.scans is None else scans_of(recorded.scans, parts)
+        header, options = recorded.header, self.options
         said = {key: getattr(options, key) or getattr(header, key) for key in ("description", "source", "licence")}
-        said["sample_period"] = options.sample_period or header.sample_period * wheel_second
-        dataset = replace(options.model_copy(update=said).dataset(runs, scans), simulated=header.simulated)
-        if not header.simulated and (residual := follows_the_wheels(dataset.trajectories)) is not None:
-            warnings.append(
-                "the reference is the robot's odometry: some matrix makes its headings of the wheels to "
-                f"{residual:.1g} rad a second; record an independent one"
-            )
-        dataset = replace(dataset, warnings=(*warnings, *dataset.warnings))
-        return joined(dataset, [load_whole(folder) for folder in options.join])
+        return _reread(recorded.trajectories, header, recorded.scans, options.model_copy(update=said), [])
+
+    def recordings(self, source: Path, notes: list[str]) -> list[Recording]:  # noqa: ARG002 (as of other importers)
+        """The runs of the data set as recordings, as they stand in its tables."""
+        recorded = read_recorded(source)
+        return recordings_of(recorded.trajectories, recorded.header.robot, recorded.scans, self.options)
+
+
+def read_again(dataset: Dataset, settings: Mapping[str, Any], place: str) -> Dataset:
+    """The data set of an importer with options of ``import dataset``, relative to what it holds. ConfigError.
+
+    place: the importer, for messages. Warnings of what cannot be right are made anew, other notes stay.
+    """
+    known = {key: getattr(dataset, key) for key in ("robot", "name", "description", "source", "licence")}
+
+    def by(settings: Mapping[str, Any], notes: list[str]) -> Dataset:
+        options = validate(DatasetOptions, {**known, **settings}, place)
+        return _reread(dataset.trajectories, dataset, dataset.scans, options, notes)
+
+    before = by({}, []).warnings
+    notes = [warning for warning in dataset.warnings if warning not in before]
+    again = by(settings, notes)
+    return again if dataset.referenced else replace(again, referenced=False, warnings=tuple(notes))
+
+
+def _reread(
+    runs: Sequence[Trajectory], header: Header | Dataset, scans: Scans | None, options: DatasetOptions, notes: list[str]
+) -> Dataset:
+    """The data set of runs by the options; its sample period stays unless these say another, or another unit of times.
+
+    header: says the robot by which the runs were recorded, their sample period, and whether they were simulated.
+    """
+    recordings = recordings_of(runs, header.robot, scans, options)
+    dataset = dataset_of(recordings, options, notes, simulated=header.simulated)
+    if not options.sample_period and options.wheel_time_unit == "s":
+        dataset = replace(dataset, sample_period=header.sample_period)
+    return joined(dataset, [load_dataset(folder) for folder in options.join])
+
+
+def recordings_of(
+    runs: Sequence[Trajectory], robot: Robot, scans: Scans | None, options: DatasetOptions
+) -> list[Recording]:
+    """The runs of a robot's data set as recordings. ConfigError: it has no wheel of a name that the options give."""
+    wheels = _indices(options.wheel_columns or options.robot.wheel_names, robot.wheel_names, "omega_", "wheel_columns")
+    axles = options.steering_columns or options.robot.drive.steered
+    steering = _indices(axles, robot.drive.steered, "steer_", "steering_columns")
+    names = tuple(robot.wheel_names[index] for index in wheels), tuple(robot.drive.steered[index] for index in steering)
+    poses = [_POSE.index(column) for column in options.pose_columns]
+    factors, second = options.wheel_factors(options.wheel_unit), SECONDS[options.wheel_time_unit]
+    scanned = set() if scans is None else set(scans.trajectories)
+    recordings = []
+    for run in runs:
+        covariances = run.pose_covariances
+        if covariances is not None and poses != [0, 1, 2]:
+            covariances = covariances[:, poses][:, :, poses]
+        others = {
+            "angles": None if run.angles is None else run.angles[:, wheels] * factors,
+            "targets": None if run.targets is None else run.targets[:, wheels] * (options.wheel_signs or 1),
+            "odometry": run.odometry,
+        }
+        numbers = {key: getattr(run, key) for key in ("v", "alpha", "omega", "duration", "distance")}
+        angles = None if run.steering is None or not steering else run.steering[:, steering]
+        attributes = RunAttributes(
+            run.command,
+            run.repetition,
+            run.split,
+            run.session,
+            run.started_at,
+            {key: value for key, value in numbers.items() if value is not None},
+            None if run.sent is None else run.sent * (second, 1, 1, 1, second),
+        )
+        readings = WheelReadings(
+            run.times,
+            run.rates[:, wheels],
+            options.wheel_unit,
+            angles,
+            *names,
+            begin=0.0,
+            others={key: value for key, value in others.items() if value is not None},
+        )
+        seen = PoseReadings(run.pose_times, run.poses[:, poses], covariances) if run.start_known else None
+        measured = None if run.references is None else run.references.open_ended(float(run.times[-1]))
+        seeing = None
+        if scans is not None and run.id in scanned:
+            ranges = partial(_ranges, scans, run.id)
+            seeing = ScanReadings(scans.scanner, run.id, scans.times(run.id), ranges)
+        place = f"trajectory {run.id}"
+        recordings.append(
+            Recording(run.id, place, readings, seen, measured, attributes=attributes, scans=seeing, a_run=True)
+        )
+    return recordings
+
+
+def _ranges(scans: Scans, run: str, rows: Any) -> Ranges:
+    return scans.of(run).ranges[rows]
+
+
+def _indices(names: Sequence[str], known: Sequence[str], prefix: str, option: str) -> list[int]:
+    bare = [name.removeprefix(prefix) for name in names]
+    for name in bare:
+        if name not in known:
+            shown = ", ".join(known) or "none"
+            raise ConfigError(f"the data set has no wheel {name!r}; {nearest(name, known)}found: {shown}; set {option}")
+    if len(set(bare)) < len(bare):
+        raise ConfigError(f"{option} names one wheel twice: {', '.join(names)}; name each once")
+    return [known.index(name) for name in bare]

@@ -11,18 +11,19 @@ import csv
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import cycle
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from omnibench.data.clock_matching import median_period
+from omnibench.data.clock_matching import usual_period
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.data.delimited import NumberTable, read_numbers
+from omnibench.data.delimited import read_numbers
 from omnibench.data.importer import Importer
 from omnibench.data.splits import Names, complete, divided
 from omnibench.errors import DataError, nearest
@@ -33,6 +34,53 @@ from omnibench.words import plural
 
 
 @dataclass(frozen=True)
+class Kind:
+    """A robot, and the columns of its files, counted from 0.
+
+    lengths: how many the metadata state, L, or L1 and L2. wheels: name, type, and x and y in these lengths, or of omni
+    wheels the angle of the axle, deg. columns: of its run files after t, x, y, theta; ticks first. signs: of these, to
+    the wheels' sense in omnibench. log_fields: of a row of its log, whose first is the time. log_ticks, log_signs: as
+    in the run files. log_commands: v, vn (if any) and omega; in ticks and rad a cycle, not in m/s and rad/s, where
+    there is no vn. Empty: they are not logged.
+    """
+
+    title: str
+    lengths: int
+    wheels: tuple[tuple[str, str, float, float], ...]
+    columns: tuple[str, ...]
+    signs: tuple[int, ...]
+    log_fields: int
+    log_ticks: tuple[int, ...]
+    log_signs: tuple[int, ...]
+    log_commands: tuple[int, ...] = ()
+
+
+KINDS = {
+    "diff": Kind(
+        "differential drive, encoders at 20 Hz", 1, (("right", "fixed", 0, -0.5), ("left", "fixed", 0, 0.5)),
+        ("ticks_right", "ticks_left"), (1, 1), 8, (2, 1), (1, 1), (6, 7),
+    ),
+    "omni3": Kind(
+        "three-wheeled omnidirectional robot, encoders at 25 Hz", 1,
+        (("0", "omni", 300, 0), ("1", "omni", 60, 0), ("2", "omni", 180, 0)),
+        ("ticks_0", "ticks_1", "ticks_2"), (-1, -1, -1), 10, (1, 2, 3), (1, 1, 1), (7, 8, 9),
+    ),
+    "omni4": Kind(
+        "mecanum base, encoders at 100 Hz", 2,
+        (("front_left", "mecanum", 0.5, 0.5), ("front_right", "mecanum", 0.5, -0.5),
+         ("rear_left", "mecanum", -0.5, 0.5), ("rear_right", "mecanum", -0.5, -0.5)),
+        ("turns_0", "turns_1", "turns_2", "turns_3"), (1, -1, 1, -1), 11, (1, 2, 3, 4), (-1, 1, -1, 1), (8, 9, 10),
+    ),
+    "tricyc": Kind(
+        "tricycle with a driven and steered front wheel, encoders at 20 Hz", 1,
+        (("front", "steered", 1, 0), ("rear_left", "fixed", 0, 0.5), ("rear_right", "fixed", 0, -0.5)),
+        ("ticks", "steering"), (1,), 3, (1,), (1,),
+    ),
+}  # fmt: skip
+"""The robots by their type in the metadata."""
+
+
+@dataclass(frozen=True)
 class Geometry:
     """Design values by a session's metadata, m. lengths: L, or L1 and L2. diameters: of the wheels."""
 
@@ -40,146 +88,36 @@ class Geometry:
     diameters: tuple[float, ...]
 
     def __str__(self) -> str:
-        return f"L {_listed(self.lengths)} m, D {_listed(self.diameters)} m"
+        shown = [
+            f"{values[0]:g}" if len(set(values)) == 1 else ", ".join(f"{value:g}" for value in values)
+            for values in (self.lengths, self.diameters)
+        ]
+        return f"L {shown[0]} m, D {shown[1]} m"
 
-
-@dataclass(frozen=True)
-class LogFormat:
-    """Columns of a robot's own log, counted from 0, the time.
-
-    ticks: of each wheel; signs: to its sense in omnibench. commands: v, vn (if any) and omega; none: they are not
-    logged. in_ticks: they are in ticks and rad a cycle, not in m/s and rad/s.
-    """
-
-    fields: int
-    ticks: tuple[int, ...]
-    signs: tuple[int, ...]
-    commands: tuple[int, ...] = ()
-    in_ticks: bool = False
-
-
-@dataclass(frozen=True)
-class Kind:
-    """A robot. columns: of its run files after the pose, ticks first; signs: to the wheels' sense in omnibench."""
-
-    title: str
-    columns: tuple[str, ...]
-    signs: tuple[int, ...]
-    lengths: int
-    diameters: int
-    log: LogFormat
-    wheels: Callable[[Geometry], tuple[Wheel, ...]]
-
-    @property
-    def ticks(self) -> tuple[str, ...]:
-        """The columns with ticks, one for each wheel with a measured rate."""
-        return self.columns[: len(self.signs)]
-
-
-def _listed(values: tuple[float, ...]) -> str:
-    return f"{values[0]:g}" if len(set(values)) == 1 else ", ".join(f"{value:g}" for value in values)
-
-
-def _diff(geometry: Geometry) -> tuple[Wheel, ...]:
-    half = geometry.lengths[0] / 2
-    right, left = (diameter / 2 for diameter in geometry.diameters)
-    return (
-        Wheel(name="right", type="fixed", radius=right, x=0.0, y=-half),
-        Wheel(name="left", type="fixed", radius=left, x=0.0, y=half),
-    )
-
-
-def _tricyc(geometry: Geometry) -> tuple[Wheel, ...]:
-    (length,), (diameter,) = geometry.lengths, geometry.diameters
-    rear = (("rear_left", 1), ("rear_right", -1))  # their radius and distance apart are not known and do not count
-    return (
-        Wheel(name="front", type="steered", radius=diameter / 2, x=length, y=0.0),
-        *(
-            Wheel(name=name, type="fixed", radius=diameter / 2, x=0.0, y=side * length / 2, measured=False)
-            for name, side in rear
-        ),
-    )
-
-
-def _omni3(geometry: Geometry) -> tuple[Wheel, ...]:
-    return tuple(
-        Wheel(
-            name=str(index),
-            radius=diameter / 2,
-            distance=geometry.lengths[0],
-            angle=math.radians(axle),
-            roller_angle=0.0,
-        )
-        for index, (diameter, axle) in enumerate(zip(geometry.diameters, (300, 60, 180), strict=True))
-    )
-
-
-def _omni4(geometry: Geometry) -> tuple[Wheel, ...]:
-    x, y = (length / 2 for length in geometry.lengths)
-    corners = (("front_left", 1, 1), ("front_right", 1, -1), ("rear_left", -1, 1), ("rear_right", -1, -1))
-    return tuple(
-        Wheel(
-            name=name,
-            type="mecanum",
-            radius=diameter / 2,
-            x=ahead * x,
-            y=side * y,
-            roller_angle=ahead * side * math.pi / 4,
-        )
-        for (name, ahead, side), diameter in zip(corners, geometry.diameters, strict=True)
-    )
-
-
-KINDS = {
-    "diff": Kind(
-        "differential drive, encoders at 20 Hz",
-        ("ticks_right", "ticks_left"),
-        (1, 1),
-        1,
-        2,
-        LogFormat(8, (2, 1), (1, 1), (6, 7), in_ticks=True),
-        _diff,
-    ),
-    "omni3": Kind(
-        "three-wheeled omnidirectional robot, encoders at 25 Hz",
-        ("ticks_0", "ticks_1", "ticks_2"),
-        (-1, -1, -1),
-        1,
-        3,
-        LogFormat(10, (1, 2, 3), (1, 1, 1), (7, 8, 9)),
-        _omni3,
-    ),
-    "omni4": Kind(
-        "mecanum base, encoders at 100 Hz",
-        ("turns_0", "turns_1", "turns_2", "turns_3"),
-        (1, -1, 1, -1),
-        2,
-        4,
-        LogFormat(11, (1, 2, 3, 4), (-1, 1, -1, 1), (8, 9, 10)),
-        _omni4,
-    ),
-    "tricyc": Kind(
-        "tricycle with a driven and steered front wheel, encoders at 20 Hz",
-        ("ticks", "steering"),
-        (1,),
-        1,
-        1,
-        LogFormat(3, (1,), (1,)),
-        _tricyc,
-    ),
-}
-"""The robots by their type in the metadata."""
+    def robot(self, kind: str, name: str) -> Robot:
+        """The robot of some type. The radius of a tricycle's rear wheels, and their distance apart, do not count."""
+        wheels = []
+        for (wheel, sort, x, y), diameter in zip(KINDS[kind].wheels, cycle(self.diameters), strict=False):
+            place: dict[str, Any] = {"type": sort, "x": x * self.lengths[0], "y": y * self.lengths[-1]}
+            if sort == "omni":
+                place = {"distance": self.lengths[0], "angle": math.radians(x), "roller_angle": 0.0}
+            elif sort == "mecanum":
+                place["roller_angle"] = math.copysign(math.pi / 4, x * y)
+            elif kind == "tricyc" and sort == "fixed":
+                place["measured"] = False
+            wheels.append(Wheel(name=wheel, radius=diameter / 2, **place))
+        return Robot(name=name, wheels=tuple(wheels))
 
 
 _RUN = re.compile(r"_run-(\d+)\.csv$")
 
 
 @dataclass(frozen=True)
-class SessionMetadata:
-    """Content of ``<session>_metadata.csv``, and the run files beside it.
+class Session:
+    """Content of ``<session>_metadata.csv``, and the run files beside it by their numbers.
 
-    robot: its type. gear and resolution (ticks per turn of the motor); starts: when each run's file begins in the
-    session's log, s after the run's begin there.
+    robot: its type. angle_per_tick: of a wheel, rad. starts: when each run's file begins in the session's log, s after
+    the run's begin there.
     """
 
     file: Path
@@ -187,102 +125,71 @@ class SessionMetadata:
     name: str
     robot: str
     geometry: Geometry
-    gear: float
-    resolution: float
+    angle_per_tick: float
     starts: tuple[float, ...]
-    runs: tuple[Path, ...]
-
-    @property
-    def kind(self) -> Kind:
-        """What its files hold."""
-        return KINDS[self.robot]
-
-    @property
-    def angle_per_tick(self) -> float:
-        """Wheel angle of one tick, rad."""
-        return 2 * math.pi / (self.gear * self.resolution)
+    runs: dict[int, Path]
 
 
-def read_metadata(file: Path) -> SessionMetadata:
+def read_metadata(file: Path) -> Session:
     """Read a session's metadata and find its runs. DataError names the file and the key that is wrong."""
     values = {fields[0].strip(): fields[1:] for fields in csv.reader(read_text(file).splitlines()) if fields}
     robot = "".join(values.get("type", [])[:1]).strip()
     if robot not in KINDS:
         raise DataError(f"{file}: type is {robot!r}; {nearest(robot, KINDS)}it must be one of {', '.join(KINDS)}")
-    kind = KINDS[robot]
-    diameters = _numbers(file, values, "Di", kind.diameters)
-    lengths = _numbers(file, values, "Li", kind.lengths)
-    (gear,) = _numbers(file, values, "ngear", 1)
-    (resolution,) = _numbers(file, values, "encRes", 1)
-    for key, number in (("Di", min(diameters)), ("Li", min(lengths)), ("ngear", gear), ("encRes", resolution)):
-        if number <= 0:
-            raise DataError(f"{file}: {key} is {number:g}, it must be above 0")
+    numbers: dict[str, tuple[float, ...]] = {"odo_ti": ()}
+    counts = {"Di": len(KINDS[robot].signs), "Li": KINDS[robot].lengths, "ngear": 1, "encRes": 1}
+    for key, count in (counts | ({"odo_ti": 0} if "odo_ti" in values else {})).items():
+        if key not in values:
+            raise DataError(f"{file}: key {key!r} is missing; {nearest(key, values)}found: {', '.join(values)}")
+        texts = [text.strip() for text in values[key] if text.strip()]
+        numbers[key] = _numbers(texts)
+        if len(numbers[key]) != (count or len(texts)):
+            raise DataError(f"{file}: {key} is {', '.join(texts)!r}, expected {count or 'finite'} numbers")
+        if count and min(numbers[key]) <= 0:
+            raise DataError(f"{file}: {key} is {min(numbers[key]):g}, it must be above 0")
     name = file.name.removesuffix("_metadata.csv")
-    runs = sorted(path for path in file.parent.glob(f"{name}_run-*.csv") if _RUN.search(path.name))
+    files = sorted(file.parent.glob(f"{name}_run-*.csv"))
+    runs = {int(match[1]): path for path in files if (match := _RUN.search(path.name))}
     if not runs:
         raise DataError(f"{file.parent}: no {name}_run-NN.csv beside {file.name}")
-    starts = _numbers(file, values, "odo_ti", None) if "odo_ti" in values else ()
-    return SessionMetadata(
-        file, file.parent.parent.name, name, robot, Geometry(lengths, diameters), gear, resolution, starts, tuple(runs)
-    )
+    geometry = Geometry(numbers["Li"], numbers["Di"])
+    tick = 2 * math.pi / (numbers["ngear"][0] * numbers["encRes"][0])
+    return Session(file, file.parent.parent.name, name, robot, geometry, tick, numbers["odo_ti"], runs)
 
 
-def _numbers(file: Path, values: dict[str, list[str]], key: str, count: int | None) -> tuple[float, ...]:
-    if key not in values:
-        raise DataError(f"{file}: key {key!r} is missing; {nearest(key, values)}found: {', '.join(values)}")
-    texts = [text.strip() for text in values[key] if text.strip()]
+def _numbers(texts: Sequence[str]) -> tuple[float, ...]:
+    """Texts as numbers; empty if one is not a finite number."""
     try:
         numbers = tuple(float(text) for text in texts)
     except ValueError:
-        raise DataError(f"{file}: {key} is {', '.join(texts)!r}, expected numbers") from None
-    if (count is not None and len(numbers) != count) or not all(map(math.isfinite, numbers)):
-        raise DataError(f"{file}: {key} is {', '.join(texts)!r}, expected {count or 'finite'} numbers")
-    return numbers
+        return ()
+    return numbers if all(map(math.isfinite, numbers)) else ()
 
 
 @dataclass(frozen=True, eq=False)
-class LogStretch:
-    """Rows of a log: times (F,) s; ticks (F, N) and angles (F, N), rad, in the sense of the wheels of omnibench;
-    commanded twists (F, 3) m/s, m/s, rad/s, or None."""
+class SessionLog:
+    """The robot's own log of a session. path: its size, in a name's words. runs (F,): number of the run of each row.
 
+    times (F,): s. ticks, angles (F, N): of the wheels, and rad, in omnibench's sense. commands (F, 3): twists, m/s,
+    m/s, rad/s, or None.
+    """
+
+    file: Path
+    path: str
+    runs: NDArray[np.intp]
     times: Array
     ticks: Array
     angles: Array
     commands: Array | None
 
 
-@dataclass(frozen=True, eq=False)
-class SessionLog:
-    """The robot's own log of a session. runs (F,): number of the run of each row. path: its size, in a name's words."""
-
-    file: Path
-    path: str
-    runs: NDArray[np.intp]
-    rows: LogStretch
-
-    @property
-    def begin(self) -> float:
-        """Time of the first row, s."""
-        return float(self.rows.times[0])
-
-    def stretch(self, run: int, first: int, count: int) -> LogStretch | None:
-        """``count`` rows of one run from its row ``first`` on; None when the log does not hold them."""
-        rows = np.flatnonzero(self.runs == run)[first : first + count]
-        if len(rows) < count:
-            return None
-        whole = self.rows
-        commands = None if whole.commands is None else whole.commands[rows]
-        return LogStretch(whole.times[rows], whole.ticks[rows], whole.angles[rows], commands)
-
-
-def read_log(session: SessionMetadata) -> SessionLog | None:
+def read_log(session: Session) -> SessionLog | None:
     """The session's log, if it is there. DataError names the file and the line that is wrong."""
-    file = session.file.with_name(f"{session.name}.csv")
+    file, kind = session.file.with_name(f"{session.name}.csv"), KINDS[session.robot]
     if not file.is_file():
         return None
-    form = session.kind.log
     header: list[list[str]] = []
-    run, runs, rows = None, [], []
+    run, rows = None, []
     for line, text in enumerate(read_text(file).splitlines(), 1):
         fields = text.split(",")
         if fields[0] == "Run:":
@@ -292,38 +199,24 @@ def read_log(session: SessionMetadata) -> SessionLog | None:
         elif fields[0] in ("RUNFINISHED", "METHODFINISHED") or fields[0].startswith("+++"):
             run = None
         elif run is not None:
-            runs.append(run)
-            if len(fields) < form.fields:
-                raise DataError(f"{file}, line {line}: it has {len(fields)} fields, expected {form.fields}")
-            try:
-                numbers = [float(field) for field in fields[: form.fields]]
-            except ValueError as error:
-                raise DataError(f"{file}, line {line}: {error}") from None
-            if not all(map(math.isfinite, numbers)):
-                raise DataError(f"{file}, line {line}: a value is not finite; remove or repair the row")
-            rows.append(numbers)
+            numbers = _numbers(fields[: kind.log_fields])
+            if len(numbers) < kind.log_fields:
+                raise DataError(f"{file}, line {line}: expected {kind.log_fields} finite numbers; repair the row")
+            rows.append((run, *numbers))
         elif not rows:
             header.append(fields)
     if not rows:
         raise DataError(f"{file}: it holds no run")
-    table = np.array(rows)
-    ticks = table[:, form.ticks] * form.signs
+    runs, table = np.array(rows)[:, 0].astype(int), np.array(rows)[:, 1:]
+    times, ticks, commands = table[:, 0], table[:, kind.log_ticks] * kind.log_signs, None
+    if len(kind.log_commands) == 3:
+        commands = table[:, kind.log_commands]
+    elif kind.log_commands:
+        metres = session.angle_per_tick * float(np.mean(session.geometry.diameters)) / 2
+        speed, turn = table[:, kind.log_commands].T
+        commands = np.column_stack([speed * metres, np.zeros(len(table)), turn]) / float(np.median(np.diff(times)))
     angles = np.cumsum(ticks, axis=0) * session.angle_per_tick
-    stretch = LogStretch(table[:, 0], ticks, angles, _commands(session, table))
-    return SessionLog(file, _path(header), np.array(runs), stretch)
-
-
-def _commands(session: SessionMetadata, table: Array) -> Array | None:
-    """Commanded twists (F, 3), m/s, m/s, rad/s; None where the log has none."""
-    form = session.kind.log
-    if not form.commands:
-        return None
-    if not form.in_ticks:
-        return table[:, form.commands]
-    cycle = float(np.median(np.diff(table[:, 0])))
-    speed, turn = table[:, form.commands].T
-    metres = session.angle_per_tick * float(np.mean(session.geometry.diameters)) / 2
-    return np.column_stack([speed * metres, np.zeros(len(table)), turn]) / cycle
+    return SessionLog(file, _path(header), runs, times, ticks, angles, commands)
 
 
 def _path(header: Sequence[Sequence[str]]) -> str:
@@ -333,8 +226,7 @@ def _path(header: Sequence[Sequence[str]]) -> str:
     """
     said = {key: value for line in header for key, value in zip(line[::2], line[1::2], strict=False)}
     shrinkage = next((value for key, value in said.items() if key.startswith("Rrate(")), "")  # its end is garbled
-    length = said.get("L(LmxLm):") or said.get("L(Lm):")
-    radius = said.get("R(m):")
+    length, radius = said.get("L(LmxLm):") or said.get("L(Lm):"), said.get("R(m):")
     if [len(line) for line in header] == [1, 4, 4]:  # the tricycle's: path; L, D, offset, ticks; N, size, %, turns
         (kind,), _, (_, size, shrinkage, _) = header
         radius, length = (size, None) if kind == "circular" else (None, size)
@@ -404,20 +296,20 @@ class Optiodom(Importer):
 
     def read(self, source: Path) -> Dataset:
         """All sessions under ``source``; DataError names the file and the row of what is wrong."""
-        # The sessions of the one robot to import.
+        options = self.options
         sessions = [read_metadata(file) for file in sorted(source.resolve().rglob("*_metadata.csv"))]
         if not sessions:
             raise DataError(f"{source}: no *_metadata.csv below it; name a folder with OptiOdom sessions (data/omni3)")
-        found = sorted({session.robot for session in sessions})
-        wanted = self.options.robot
-        if wanted is None and len(found) > 1:
+        kinds = sorted({session.robot for session in sessions})
+        if options.robot is None and len(kinds) > 1:
             raise DataError(
-                f"{source}: it holds recordings of {plural(len(found), 'robot')}, {', '.join(found)}; import one at a "
-                f"time: name its folder, or --set robot={found[0]}"
+                f"{source}: it holds recordings of {plural(len(kinds), 'robot')}, {', '.join(kinds)}; import one at a "
+                f"time: name its folder, or --set robot={kinds[0]}"
             )
-        if wanted is not None and wanted not in found:
-            raise DataError(f"{source}: it holds no recordings of robot {wanted}; found: {', '.join(found)}")
-        sessions = [session for session in sessions if wanted in (None, session.robot)]
+        if options.robot not in (None, *kinds):
+            raise DataError(f"{source}: it holds no recordings of robot {options.robot}; found: {', '.join(kinds)}")
+        kind = options.robot or kinds[0]
+        sessions = [session for session in sessions if session.robot == kind]
         # The commonest geometry, of equally common ones the first session's; and a note if there are others.
         (geometry, most), *others = Counter(session.geometry for session in sessions).most_common()
         notes = []
@@ -427,40 +319,36 @@ class Optiodom(Importer):
                 f"sessions state different dimensions of the robot: those of {most} of {len(sessions)} are taken, "
                 f"{geometry} (others: {rest})"
             )
-        wheels = sessions[0].kind.wheels(geometry)
-        robot = Robot(name=self.options.robot_name or f"inesc_tec_{sessions[0].robot}", wheels=wheels)
-        logs = [read_log(session) if self.options.log else None for session in sessions]
+        logs = [read_log(session) if options.log else None for session in sessions]
         unlogged = [session.name for session, log in zip(sessions, logs, strict=True) if log is None]
-        if self.options.log and unlogged:
+        if options.log and unlogged:
             notes.append(
                 f"{len(unlogged)} of {plural(len(sessions), 'session')} have no log ({', '.join(unlogged)}): commands "
                 "are named after the motion by the wheels there, and absolute wheel angles are left out of all runs"
             )
         runs = [
-            _read_run(session, index, log, self.options.log)
+            _read_run(session, number, log, options.log)
             for session, log in zip(sessions, logs, strict=True)
-            for index in range(len(session.runs))
+            for number in session.runs
         ]
         groups = [session.group for session in sessions for _ in session.runs]
-        train, validation = self.options.train, self.options.validation
-        if not train and not validation and len(set(groups)) > 1:
+        train = options.train
+        if not train and not options.validation and len(set(groups)) > 1:
             train = (min(groups),)
+        said = (f"{note[:1].upper()}{note[1:]}." for note in notes)
         dataset = make_dataset(
-            self.options.name,
-            robot,
-            median_period([run.pose_times for run in runs]),
-            divided(complete(runs), train, validation, "group", names=groups),
-            description=" ".join(
-                [_DESCRIPTION.format(sessions[0].kind.title), *(f"{note[:1].upper()}{note[1:]}." for note in notes)]
-            ),
-            source=self.options.source,
+            options.name,
+            geometry.robot(kind, options.robot_name or f"inesc_tec_{kind}"),
+            usual_period([run.pose_times for run in runs]),
+            divided(complete(runs), train, options.validation, "group", names=groups),
+            description=" ".join([_DESCRIPTION.format(KINDS[kind].title), *said]),
+            source=options.source,
             licence="MIT",
         )
         return replace(dataset, warnings=(*notes, *dataset.warnings))
 
 
-@dataclass(frozen=True)
-class _Motion:
+class _Motion(NamedTuple):
     """A run's motion: medians of speed, m/s, direction, rad, and rate of turn, rad/s, while it moves; the greatest
     speed, m/s; length, m, and turn, rad, in all."""
 
@@ -471,30 +359,32 @@ class _Motion:
     distance: float
     turned: float
 
-    @classmethod
-    def of(cls, twists: Array, durations: Array) -> _Motion:
-        """The motion of twists (rows, 3) in m/s, m/s, rad/s for durations (rows,), s."""
-        speeds = np.hypot(twists[:, 0], twists[:, 1])
-        moving = (speeds > _SAME_SPEED) | (np.abs(twists[:, 2]) > _SAME_SPEED)
-        vx, vy, omega = np.median(twists[moving], axis=0) if moving.any() else np.zeros(3)
-        v, alpha = float(np.hypot(vx, vy)), math.atan2(vy, vx)
-        turned = float(twists[:, 2] @ durations)
-        return cls(v, alpha, float(omega), float(speeds.max()), float(speeds @ durations), turned)
+
+def _motion(twists: Array, durations: Array) -> _Motion:
+    """The motion of twists (rows, 3) in m/s, m/s, rad/s for durations (rows,), s."""
+    speeds = np.hypot(twists[:, 0], twists[:, 1])
+    moving = (speeds > _SAME_SPEED) | (np.abs(twists[:, 2]) > _SAME_SPEED)
+    vx, vy, omega = np.median(twists[moving], axis=0) if moving.any() else np.zeros(3)
+    v, alpha, turned = float(np.hypot(vx, vy)), math.atan2(vy, vx), float(twists[:, 2] @ durations)
+    return _Motion(v, alpha, float(omega), float(speeds.max()), float(speeds @ durations), turned)
 
 
-def _read_run(session: SessionMetadata, index: int, log: SessionLog | None, with_log: bool) -> Trajectory:
-    columns = (*_POSE, *session.kind.columns)
-    table = read_numbers(session.runs[index], columns, header_lines=0)
-    if len(table.values) < 2:
+def _read_run(session: Session, number: int, log: SessionLog | None, with_log: bool) -> Trajectory:
+    """A run; unless logs are left out, with the name of its command: what was sent to the robot, as far as the log has
+    it, and what the robot made of that by the odometry by which it drove."""
+    kind = KINDS[session.robot]
+    table = read_numbers(session.runs[number], (*_POSE, *kind.columns), header_lines=0)
+    if len(table) < 2:
         raise DataError(f"{table.file}: a run needs two rows or more")
-    times = table.increasing("t") - table.values[0, 0]
-    ticks = table.columns(session.kind.ticks) * session.kind.signs
-    driven = ticks * session.angle_per_tick
+    times = table.increasing("t")
+    times = times - times[0]
+    ticks = table.columns(kind.columns[: len(kind.signs)]) * kind.signs
+    rates = ticks[1:] * session.angle_per_tick / np.diff(times)[:, None]
     run = Trajectory(
-        id=f"{session.group}_{session.runs[index].stem}",
+        id=f"{session.group}_{table.file.stem}",
         split="train",
         times=times[1:],
-        rates=driven[1:] / np.diff(times)[:, None],
+        rates=rates,
         pose_times=times,
         poses=table.columns(_POSE[1:]),
         session=session.name,
@@ -503,40 +393,23 @@ def _read_run(session: SessionMetadata, index: int, log: SessionLog | None, with
     )
     if not with_log:
         return run
-    return _with_command(run, session) if log is None else _with_log(run, session, log, table, ticks)
-
-
-def _with_log(
-    run: Trajectory, session: SessionMetadata, log: SessionLog, table: NumberTable, ticks: Array
-) -> Trajectory:
-    match = _RUN.search(table.file.name)
-    assert match is not None  # only such files are collected
-    number = int(match.group(1))
-    start = session.starts[number - 1] if number <= len(session.starts) else 0.0
-    part = log.stretch(number, round(start / float(np.median(np.diff(run.pose_times)))), len(table.values))
-    if part is None or not np.allclose(part.ticks, ticks, rtol=0, atol=_SAME_TICKS):
-        raise DataError(
-            f"{log.file}: does not hold the ticks of {table.file.name}; import with log: false to do without"
-        )
-    run = replace(run, angles=part.angles[1:], started_at=float(part.times[0] - log.begin))
-    if part.commands is None:
-        return _with_command(run, session, log)
-    told = _Motion.of(part.commands, np.diff(part.times, prepend=part.times[0]))
-    run = replace(run, v=told.v, alpha=told.alpha, omega=told.omega, distance=told.distance)
-    return _with_command(run, session, log, told)
-
-
-def _with_command(
-    run: Trajectory, session: SessionMetadata, log: SessionLog | None = None, told: _Motion | None = None
-) -> Trajectory:
-    """The run with the name of its command: what was told, as far as the log has it, and what the robot made of that by
-    the odometry by which it drove."""
-    robot = Robot(name=session.robot, wheels=session.kind.wheels(session.geometry))
+    robot = session.geometry.robot(session.robot, session.robot)
     middle = None if run.steering is None else in_the_middle(run.steering)
-    twists = robot.drive.signals(run.rates, middle) @ robot.inverse_kinematic_matrix.T
-    driven = _Motion.of(twists, np.diff(run.times, prepend=0.0))
-    direction = round(math.degrees((told or driven).alpha) / 5) * 5
-    turn = round(math.degrees(driven.turned) / 90) * 90
-    speed = f"_v{told.fastest:.2g}" if told else ""
-    path = log.path if log else f"_{driven.distance:.1f}m"
+    driven = _motion(robot.drive.signals(rates, middle) @ robot.inverse_kinematic_matrix.T, np.diff(times))
+    alpha, speed, path = driven.alpha, "", f"_{driven.distance:.1f}m"
+    if log is not None:
+        path, start = log.path, session.starts[number - 1] if number <= len(session.starts) else 0.0
+        first = round(start / float(np.median(np.diff(times))))
+        rows = np.flatnonzero(log.runs == number)[first : first + len(ticks)]
+        if len(rows) < len(ticks) or not np.allclose(log.ticks[rows], ticks, rtol=0, atol=_SAME_TICKS):
+            raise DataError(
+                f"{log.file}: does not hold the ticks of {table.file.name}; import with log: false to do without"
+            )
+        logged = log.times[rows]
+        run = replace(run, angles=log.angles[rows[1:]], started_at=float(logged[0] - log.times[0]))
+        if log.commands is not None:
+            sent = _motion(log.commands[rows], np.diff(logged, prepend=logged[0]))
+            run = replace(run, v=sent.v, alpha=sent.alpha, omega=sent.omega, distance=sent.distance)
+            alpha, speed = sent.alpha, f"_v{sent.fastest:.2g}"
+    direction, turn = round(math.degrees(alpha) / 5) * 5, round(math.degrees(driven.turned) / 90) * 90
     return replace(run, command=f"{session.group}_a{direction}_turn{turn:+d}{speed}{path}")

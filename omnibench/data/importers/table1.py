@@ -6,28 +6,38 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar
 
 import numpy as np
 from pydantic import Field
 
-from omnibench.data.clock_matching import align
-from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory
-from omnibench.data.delimited import NumberTable, read_numbers
+from omnibench.data.dataset import SPLITS, Dataset, Split
+from omnibench.data.delimited import read_numbers
 from omnibench.data.importer import Importer
-from omnibench.data.importers.recording_options import RecordingOptions, RobotOption
-from omnibench.data.scans import Scanner, ScansInMemory, TrajectoryScans
-from omnibench.data.splits import complete
+from omnibench.data.recording import (
+    METRES,
+    RADIANS,
+    HeadingUnit,
+    PoseReadings,
+    Recording,
+    ReferenceOptions,
+    RobotOption,
+    RunAttributes,
+    ScanReadings,
+    WheelReadings,
+    WheelUnit,
+)
+from omnibench.data.runs import dataset_of
+from omnibench.data.scans import Scanner
+from omnibench.data.splits import every_second, repetitions
 from omnibench.errors import DataError
 from omnibench.registry import importers
 from omnibench.robot.kinematics import Array, Robot, Wheel
 from omnibench.words import plural
 
-RPM = 2 * math.pi / 60  # rad/s
-_METRES = {"m": 1.0, "mm": 1e-3}
 _COMMAND = ("v", "alpha", "omega", "d")
-_POSE = ("t", "x", "y", "theta")
-_SENT = ("t", "v", "alpha", "omega", "t_r")
+_POSE = ("x", "y", "theta")
+_SENT = ("v", "alpha", "omega", "t_r")
 _WAY_OUT = "set scanner={rays: 1080, angle_min: -2.356, ..., mount: {x: 0.1, y: 0, yaw: 0}} (m, rad)"
 
 APR_02 = Robot(
@@ -51,13 +61,16 @@ UTM_30LX = Scanner(
 """The paper's LIDAR by its data sheet (270 degrees, 25 ms a turn), with 1080 of its 1081 ranges, as in Table 1."""
 
 
-class Table1Options(RecordingOptions):
-    """Unit of positions, the robot, and which trajectories train and validate."""
+class Table1Options(ReferenceOptions):
+    """The robot, the scanner, and the units of Table 1."""
 
-    position_unit: Literal["m", "mm"] = Field("m", description="of x and y; Table 1 has m")
+    group: ClassVar[str] = "Table 1"
+
     robot: RobotOption = Field(APR_02, description="mapping as in dataset.yaml, or path of a YAML file; default APR-02")
     scanner: Scanner = Field(UTM_30LX, description="of lidar.csv: mapping as in dataset.yaml; default Hokuyo UTM-30LX")
     name: str = Field("table1", min_length=1, description="name of the data set")
+    wheel_unit: WheelUnit = Field("rpm", description="of wheels.csv and of omega_Ma, ...; Table 1 has rpm")
+    heading_unit: HeadingUnit = Field("deg", description="of theta; Table 1 has deg")
 
 
 @importers.register("table1")
@@ -88,117 +101,94 @@ class Table1(Importer):
 
     def read(self, source: Path) -> Dataset:
         """All trajectories under ``source``; DataError names the file and the row of what is wrong."""
+        notes: list[str] = []
+        return dataset_of(self.recordings(source, notes), self.options, notes)
+
+    def recordings(self, source: Path, notes: list[str]) -> list[Recording]:
+        """The trajectories under ``source`` as they stand in their tables."""
         folders = [file.parent for file in sorted(source.rglob("command.csv"))]
         if not folders:
-            raise DataError(
-                f"{source}: no command.csv below it; Table 1 wants one folder a trajectory with command.csv"
-            )
-        scans: dict[str, TrajectoryScans] = {}
-        runs = [self._trajectory(folder, _name(folder, source), scans) for folder in folders]
-        train, validation = self.options.train, self.options.validation
-        by_folder = None if train or validation else _splits_by_folder([run.id for run in runs])
-        alike = [(run.session, run.command) for run in runs]
-        runs = self.options.divided(complete(runs), otherwise=by_folder, alike=alike, kind="trajectory")
-        if not scans:
-            return self.options.dataset(runs)
-        dataset = self.options.dataset(runs, ScansInMemory(self.options.scanner, scans))
-        if self.options.scanner != UTM_30LX:
-            return dataset
-        unknown = (
-            f"{source}: lidar.csv does not say where the LIDAR is mounted; the robot's middle is taken; {_WAY_OUT}"
-        )
-        return replace(dataset, warnings=(*dataset.warnings, unknown))
-
-    def _trajectory(self, folder: Path, name: str, scans: dict[str, TrajectoryScans]) -> Trajectory:
-        """The trajectory of a folder; its scans, if it has some, are added to ``scans``."""
-        wheels = self.options.robot.wheel_names
-        samples = read_numbers(folder / "wheels.csv", ("t", *(f"omega_{wheel}" for wheel in wheels)))
-        slam = read_numbers(folder / "slam.csv", _POSE)
-        target_names = [f"omega_M{wheel}" for wheel in wheels]
-        table = read_numbers(folder / "command.csv", _COMMAND, optional=target_names)
-        if len(table.values) != 1:
-            raise DataError(
-                f"{table.file}: it has {plural(len(table.values), 'row')}, expected one: the command of this trajectory"
-            )
-        v, degrees, omega, distance = (float(value) for value in table.columns(_COMMAND)[0])
-        alpha, has_targets = math.radians(degrees), all(name in table for name in target_names)
-        times, pose_times = _times(samples), _times(slam)
-        metres = _METRES[self.options.position_unit]
-        units = (metres, metres, math.radians(1))
-        poses = slam.columns(_POSE[1:]) * units
-        aligned = align(0.0, times, pose_times, poses)
-        if aligned is None:
-            raise DataError(
-                f"{slam.file}: no two poses while the wheels were recorded (wheels end at t = {times[-1]:g})"
-            )
-        if (folder / "lidar.csv").exists():
-            scans[name] = _read_scans(folder / "lidar.csv", self.options.scanner, aligned.zero, float(times[-1]))
-        odometry = sent = None
-        if (file := folder / "odometry.csv").exists():
-            computed = read_numbers(file, _POSE)
-            if not np.array_equal(computed.column("t"), times):
-                raise DataError(f"{file}: its times t are not those of {samples.file.name}; give a row for each")
-            odometry = (computed.columns(_POSE[1:]) * units)[aligned.after_start]
-        if (file := folder / "commands.csv").exists():
-            commands = read_numbers(file, _SENT)
-            _times(commands)
-            sent = commands.columns(_SENT) * (1, 1, math.radians(1), 1, 1) - (aligned.zero, 0, 0, 0, 0)
-        times = times[aligned.after_start] - aligned.zero
-        return Trajectory(
-            id=name,
-            split="train",
-            times=times,
-            rates=samples.values[aligned.after_start, 1:] * RPM,
-            pose_times=aligned.pose_times,
-            poses=aligned.poses,
-            command=f"v{v:g}_a{math.degrees(alpha):g}_w{omega:g}_d{distance:g}",
-            session=name.rsplit("/", 1)[0] if "/" in name else None,
-            v=v,
-            alpha=alpha,
-            omega=omega,
-            distance=distance,
-            duration=float(times[-1]),
-            odometry=odometry,
-            sent=sent,
-            targets=np.tile(table.columns(target_names)[0] * RPM, (len(times), 1)) if has_targets else None,
-        )
+            what = "no command.csv below it; Table 1 wants one folder a trajectory with command.csv"
+            raise DataError(f"{source}: {what}")
+        recordings = [_recording(folder, source, self.options) for folder in folders]
+        if self.options.scanner == UTM_30LX and any(recording.scans for recording in recordings):
+            unknown = "lidar.csv does not say where the LIDAR is mounted; the robot's middle is taken"
+            notes.append(f"{source}: {unknown}; {_WAY_OUT}")
+        # Splits by folders called train and validation, else every second repetition validates.
+        attributes = [recording.attributes for recording in recordings]
+        alike = [(said.session, said.command) for said in attributes]
+        splits: list[Split | None] = [said.split for said in attributes]
+        if not any(splits) or self.options.train or self.options.validation:
+            splits = list(every_second(alike))
+        if None in splits:
+            stray = recordings[splits.index(None)].name
+            raise DataError(f"trajectory {stray!r} is in no folder train or validation; move it or give train=PATTERN")
+        rows = zip(recordings, attributes, splits, repetitions(alike), strict=True)
+        return [replace(each, attributes=replace(said, split=side, repetition=at)) for each, said, side, at in rows]
 
 
-def _read_scans(file: Path, scanner: Scanner, zero: float, end: float) -> TrajectoryScans:
-    """The scans from ``zero`` to ``end``, s of the file's clock; stamps count from ``zero``, ranges in m."""
+def _recording(folder: Path, source: Path, options: Table1Options) -> Recording:
+    """The trajectory of a folder, which is called by it as seen from the source."""
+    name = folder.relative_to(source).as_posix()
+    name = folder.resolve().name if name == "." else name
+    wheels, targets = ([f"omega_{prefix}{wheel}" for wheel in options.robot.wheel_names] for prefix in ("", "M"))
+    table = read_numbers(folder / "command.csv", _COMMAND)
+    if len(table) != 1:
+        rows = plural(len(table), "row")
+        raise DataError(f"{table.file}: it has {rows}, expected one: the command of this trajectory")
+    v, alpha, omega, distance = table.columns(_COMMAND)[0].tolist()
+    times, rates = _timed(folder / "wheels.csv", wheels)
+    pose_times, poses = _timed(folder / "slam.csv", _POSE)
+    others: dict[str, Array] = {}
+    if all(target in table for target in targets):
+        factors = options.wheel_factors(options.wheel_unit)
+        others["targets"] = np.tile(table.columns(targets)[0] * factors, (len(times), 1))
+    if (file := folder / "odometry.csv").exists():
+        stamps, odometry = _timed(file, _POSE)
+        if not np.array_equal(stamps, times):
+            raise DataError(f"{file}: its times t are not those of wheels.csv; give a row for each")
+        metre = METRES[options.position_unit]
+        others["odometry"] = odometry * (metre, metre, RADIANS[options.heading_unit])
+    sent = scans = None
+    if (file := folder / "commands.csv").exists():
+        sent = np.column_stack(_timed(file, _SENT)) * (1, 1, math.radians(1), 1, 1)
+    if (file := folder / "lidar.csv").exists():
+        scans = _scans(file, options.scanner, float(pose_times[0]), float(times[-1]))
+    split = next((split for split in SPLITS if split in name.split("/")), None)
+    numbers = {"v": v, "alpha": math.radians(alpha), "omega": omega, "distance": distance}
+    command, session = f"v{v:g}_a{alpha:g}_w{omega:g}_d{distance:g}", name.rpartition("/")[0] or None
+    return Recording(
+        name,
+        str(folder / "slam.csv"),
+        WheelReadings(times, rates, options.wheel_unit, begin=0.0, others=others),
+        PoseReadings(pose_times, poses),
+        attributes=RunAttributes(command, split=split, session=session, numbers=numbers, sent=sent),
+        scans=scans,
+    )
+
+
+def _timed(file: Path, columns: Sequence[str]) -> tuple[Array, Array]:
+    """Times (F,), s, and columns (F, n) of a file."""
+    table = read_numbers(file, ("t", *columns))
+    times = table.increasing("t")
+    if times[0] < 0:
+        raise table.fail(0, f"t is {times[0]:g}; times count from the start of the command and must not be negative")
+    return times, table.columns(columns)
+
+
+def _scans(file: Path, scanner: Scanner, begin: float, end: float) -> ScanReadings:
+    """The scans of a file. DataError: it does not fit the scanner, or none is from ``begin`` to ``end``, s."""
     columns = [f"d{ray}" for ray in range(1, scanner.rays + 1)]
-    table = read_numbers(file, ("t", *columns), optional=[f"d{scanner.rays + 1}"])
-    if len(table.names) > scanner.rays + 1:
+    table = read_numbers(file, ("t", *columns))
+    if f"d{scanner.rays + 1}" in table:
         raise DataError(f"{file}: it has more than the {scanner.rays} ranges of the scanner; {_WAY_OUT}")
-    times = _times(table)
-    ranges = (table.columns(columns) * _METRES["mm"]).astype(np.float32)
+    times = table.increasing("t")
+    ranges = (table.columns(columns) * METRES["mm"]).astype(np.float32)
     seen = scanner.valid(ranges)
     for row in np.flatnonzero(~seen.any(axis=1))[:1]:
         limits = f"{1e3 * scanner.range_min:g} to {1e3 * scanner.range_max:g} mm"
         raise table.fail(int(row), f"no range is from {limits}; give mm, and remove scans that saw nothing")
-    shown = (times >= zero) & (times <= end)
-    if not shown.any():
-        raise DataError(f"{file}: no scan while poses and wheels were recorded, {zero:g} to {end:g} s")
-    return TrajectoryScans(times[shown] - zero, np.where(seen, ranges, np.float32(np.inf))[shown])
-
-
-def _times(table: NumberTable) -> Array:
-    times = table.increasing("t")
-    if times[0] < 0:
-        raise table.fail(0, f"t is {times[0]:g}; times count from the start of the command and must not be negative")
-    return times
-
-
-def _name(folder: Path, source: Path) -> str:
-    name = folder.relative_to(source).as_posix()
-    return folder.resolve().name if name == "." else name
-
-
-def _splits_by_folder(names: Sequence[str]) -> list[Split] | None:
-    """The splits by folders called train and validation; None without such folders."""
-    found = [next((split for split in SPLITS if split in name.split("/")), None) for name in names]
-    splits = [split for split in found if split]
-    if splits and len(splits) < len(names):
-        stray = names[found.index(None)]
-        raise DataError(f"trajectory {stray!r} is in no folder train or validation; move it or give train=PATTERN")
-    return splits or None
+    if not ((times >= begin) & (times <= end)).any():
+        raise DataError(f"{file}: no scan while poses and wheels were recorded, {begin:g} to {end:g} s")
+    ranges = np.where(seen, ranges, np.float32(np.inf))
+    return ScanReadings(scanner, str(file), times, lambda rows: ranges[rows])

@@ -21,7 +21,7 @@ from pydantic import BeforeValidator, Field
 
 from omnibench.config import Model, NonNegative, Positive
 from omnibench.data.dataset import Dataset, Split, Trajectory
-from omnibench.data.storage import load_whole
+from omnibench.data.storage import load_dataset
 from omnibench.data.true_poses import TruePath
 from omnibench.errors import ConfigError, DataError
 from omnibench.progress import Reporter, no_progress
@@ -60,7 +60,7 @@ def load_recording(path: Path, dataset: str | None = None, watch: Reporter = no_
         return Recording(simulation.dataset, simulation.truth, simulation.paths)
     if dataset is not None:
         raise ConfigError(f"--dataset {dataset}: {path} is a folder with one data set; leave --dataset out")
-    return Recording(load_whole(path))
+    return Recording(load_dataset(path))
 
 
 FULL_TURN = 2 * np.pi

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from omnibench.data.checks.finding import Finding
+from omnibench.check.check import CheckReport
+from omnibench.check.motions import SHARE, motion_kinds, turning
 from omnibench.data.clock_matching import ClockMatch
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.fit.check.checking import CheckReport
-from omnibench.fit.check.missing_motions import SHARE, motion_kinds, turning
+from omnibench.data.finding import Finding
 from omnibench.fit.identifiability import ROWS, UNTOLD
 from omnibench.fit.inspect import Inspection
 from omnibench.report.blocks import (

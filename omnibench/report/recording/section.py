@@ -15,7 +15,7 @@ import numpy as np
 import plotly.graph_objects as go
 
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.data.stored_rows import MOST_IN_MEMORY
+from omnibench.data.stored import drawn_runs
 from omnibench.data.true_poses import TruePath
 from omnibench.errors import DataError
 from omnibench.report.blocks import (
@@ -285,9 +285,7 @@ def _nees(summary: ErrorSummary) -> str:
 def contents_table(dataset: Dataset) -> Table:
     """A table of the quantities from motion command to SLAM pose: recorded or not, how many, at what interval."""
     runs = dataset.trajectories
-    samples = [run.times for run in runs]
-    number, steers = sum(map(len, samples)), runs[0].steering is not None
-    step = rate_step(runs[0])
+    steers, step = runs[0].steering is not None, rate_step(runs[0])
     rows = [
         _commands(runs),
         _sent(runs),
@@ -295,9 +293,9 @@ def contents_table(dataset: Dataset) -> Table:
         _row(
             "Measured wheel rates",
             _rates("ω", dataset),
-            number,
+            sum(run.samples.count for run in runs),
             "samples",
-            _every(samples, first=0.0),
+            _every_sample(runs),
             "by encoders" if step is None else f"by encoders, in steps of {significant(step, 3)} rad/s",
         ),
         _wheels("Wheel angles", "φ", runs, "angles", "absolute, continuous within a session"),
@@ -351,10 +349,9 @@ def _wheels(name: str, symbol: str, runs: Sequence[Trajectory], field: str, rema
     recorded = [run for run in runs if getattr(run, field) is not None]
     if not recorded:
         return _missing(name, symbol)
-    times = [run.times for run in recorded]
     if len(recorded) < len(runs):
         remark += f"; in {count(len(recorded))} of {count(len(runs))} runs"
-    return _row(name, symbol, sum(map(len, times)), "samples", _every(times, first=0.0), remark)
+    return _row(name, symbol, sum(run.samples.count for run in recorded), "samples", _every_sample(recorded), remark)
 
 
 def _scans(dataset: Dataset) -> Row:
@@ -381,14 +378,14 @@ def _reference(dataset: Dataset) -> Row:
     return _row("Reference poses", symbol, sum(map(len, times)), "poses", _every(times), remark)
 
 
-def _every(times: Sequence[Array], first: float | None = None) -> str:
-    """The interval between stamps in words, of very many by some of the runs from first to last.
+def _every_sample(runs: Sequence[Trajectory]) -> str:
+    """The interval between wheel samples in words."""
+    return _every([np.append(0.0, run.times) for run in drawn_runs(runs)])
 
-    first: the time from which the first interval of a run counts, s.
-    """
-    some = times[:: -(-sum(map(len, times)) // MOST_IN_MEMORY) or 1]
-    stamps = some if first is None else [np.append(first, run) for run in some]
-    gaps = 1e3 * np.concatenate([np.diff(run) for run in stamps])
+
+def _every(times: Sequence[Array]) -> str:
+    """The interval between stamps in words."""
+    gaps = 1e3 * np.concatenate([np.diff(run) for run in times])
     if not len(gaps):
         return NOTHING
     low, middle, high = np.quantile(gaps, [0.01, 0.5, 0.99])

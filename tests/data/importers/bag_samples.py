@@ -83,6 +83,11 @@ def header(stamp: int, frame: str = "map") -> dict[str, Any]:
     return {"stamp": {"sec": int(stamp) // 10**9, "nanosec": int(stamp) % 10**9}, "frame_id": frame}
 
 
+def stamp_of(sent: Sent) -> int:
+    stamp = sent.content["header"]["stamp"]
+    return int(stamp["sec"]) * 10**9 + int(stamp["nanosec"])
+
+
 def joint_state(
     stamp: int,
     positions: Sequence[float] = (),

@@ -20,15 +20,14 @@ from drive_samples import DIFF, MODEL, PERIOD, ROBOT, drive, odometry_error
 from tricycle_samples import PERIOD as LOG_PERIOD
 from tricycle_samples import TRICYCLE, tricycle_drive
 
+from omnibench.check.check import check
 from omnibench.config import parse_settings
-from omnibench.data.checks.finding import findings_of
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.data.importers.csv_tables.csv import Csv
-from omnibench.data.importers.csv_tables.csv_options import CsvOptions
-from omnibench.data.importers.csv_tables.csv_template import write_template
-from omnibench.data.importers.dataset_folder import DatasetFolder, DatasetOptions
-from omnibench.data.importers.runs.recording_runs import in_seconds
+from omnibench.data.finding import findings_of
+from omnibench.data.importers.csv_template import write_template
+from omnibench.data.importers.dataset_folder import DatasetOptions, recordings_of
 from omnibench.data.importers.tum import write_tum
+from omnibench.data.runs import dataset_of
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import ConfigError, DataError
 from omnibench.robot.kinematics import Array
@@ -346,7 +345,7 @@ def test_clocks_of_other_epochs_are_matched(tmp_path: Path) -> None:
         assert odometry_error(read(tmp_path, **options)) < FITS
     for seed in (1, 2):
         poses(seed).with_columns(t=(pl.col("t") + 1.7e9) * 1e3).write_csv(tmp_path / f"r{seed}_poses.csv")
-    assert "look like ms: --set pose_time_unit=ms" in refusal(tmp_path)
+    assert "--set pose_time_unit=ms" in refusal(tmp_path)
 
 
 @pytest.mark.parametrize("names", [{}, {"columns": {"omega_left": "l", "phi_right": "r"}}])
@@ -359,14 +358,13 @@ def test_columns_named_for_another_unit_are_taken_where_the_unit_is_said(tmp_pat
     assert odometry_error(read(tmp_path, wheel_unit="rpm", **names)) < FITS
 
 
-def test_names_that_look_like_repetitions_are_told_with_the_pattern_to_type(tmp_path: Path) -> None:
-    for seed, name in enumerate(("left_1", "left_2", "right_1", "right_2")):
+def test_the_words_of_runs_names_are_their_commands(tmp_path: Path) -> None:
+    for seed, name in enumerate(("left_1", "left_2", "run03_right", "run04_right")):
         both(seed).write_csv(tmp_path / f"{name}.csv")
-    (told,) = read(tmp_path).warnings
-    assert "look like repetitions of 2 commands" in told
-    pattern = told.partition("command_pattern=")[2].partition("'")[0]
-    runs = read(tmp_path, command_pattern=pattern).trajectories
-    assert [run.command for run in runs] == ["left", "left", "right", "right"]
+    data = read(tmp_path)
+    assert [run.command for run in data.trajectories] == ["left", "left", "right", "right"]
+    assert [run.split for run in data.trajectories] == ["train", "validation"] * 2
+    assert data.warnings[0].startswith("commands by the names of the runs: left, right")
 
 
 def test_dates_in_parquet_files_are_seconds(tmp_path: Path) -> None:
@@ -544,7 +542,7 @@ def test_rows_that_repeat_a_time_or_the_wheels_while_they_turned_are_left_out_an
     before = np.arange(401)
     before[[60, 150]] -= 1
     data = read_log(log(tmp_path, angle=DRIVE["angle"][before], phi=DRIVE["phi"][before]))
-    assert "log.csv: 2 rows that repeat the ones before" in data.warnings[0]
+    assert "log.csv: 2 readings that repeat the ones before" in data.warnings[0]
     assert len(data.trajectories[0].times) == 398
     assert log_error(data) < 0.01
 
@@ -569,14 +567,13 @@ def test_steering_angles_in_any_unit_are_the_same(tmp_path: Path, shown: Array, 
 
 
 @pytest.mark.parametrize("step", [1, 5])
-def test_a_steering_column_in_degrees_is_named_however_coarse_the_samples_are(tmp_path: Path, step: int) -> None:
+def test_a_steering_column_in_degrees_is_found_however_coarse_the_samples_are(tmp_path: Path, step: int) -> None:
     data = read_log(log(tmp_path, slice(None, None, step), phi=np.degrees(DRIVE["phi"])))
-    assert any(warning.startswith("steering angles look like degrees; ") for warning in data.warnings)
+    assert "steering_unit=deg" in {finding.fix for finding in check(data).findings}
 
 
-def test_a_recording_is_cut_into_equal_runs_and_the_robot_s_own_odometry_is_warned_of(tmp_path: Path) -> None:
+def test_a_recording_is_cut_into_equal_runs(tmp_path: Path) -> None:
     data = read_log(log(tmp_path))
-    assert "the robot's odometry, or simulated without noise" in data.warnings[-1]
     save_dataset(data, tmp_path / "data")
     assert load_dataset(tmp_path / "data").hash == data.hash
     data = read_log(log(tmp_path), window=9)
@@ -619,19 +616,18 @@ def test_the_design_of_another_laboratory_s_tricycle_is_its_own_model() -> None:
 
 
 def test_the_steering_scale_of_another_laboratory_s_tricycle_is_told_relative_to_that_of_the_import() -> None:
-    if not CORELLI.is_file():
-        pytest.skip(f"the recording is not at {CORELLI}")
-    *_, warning = import_dataset("csv", CORELLI, CORELLI_OPTIONS).warnings
-    assert warning.startswith("steering angles look about 5 times too small")
-    assert "--set steering_scale=4.96, times the present ones" in warning
-    *_, last = import_dataset("csv", CORELLI, CORELLI_OPTIONS | {"steering_scale": 0.5}).warnings
-    assert "steering" not in last
+    fixes = {finding.kind: finding.fix for finding in check(corelli_dataset()).findings}
+    assert fixes["steering_unit"] == "steering_scale=0.491"
+    found = check(corelli_dataset(steering_scale=0.5)).findings
+    assert not [finding for finding in found if "steering" in finding.kind]
 
 
 def test_the_first_guesses_of_another_laboratory_s_tricycle_are_far_off() -> None:
     data = corelli_dataset()
     for warning, part in zip(
-        data.warnings, ("4294967296 ticks", "4 steps of wheel positions ran back", "51 rows that repeat"), strict=False
+        data.warnings,
+        ("4294967296 ticks", "4 steps of wheel positions ran back", "51 readings that repeat"),
+        strict=False,
     ):
         assert part in warning
     restarts = [finding.what for finding in findings_of(data.warnings) if finding.kind == "counter_restart"]
@@ -666,12 +662,8 @@ def write(folder: Path, **tables: str) -> Path:
     return folder
 
 
-def read_tables(source: Path, **options: Any) -> Dataset:
-    return Csv(CsvOptions(robot=DIFF, **options)).read(source)
-
-
 def the_run(source: Path, **options: Any) -> Trajectory:
-    (run,) = read_tables(source, **options).trajectories
+    (run,) = read(source, **options).trajectories
     return run
 
 
@@ -688,13 +680,13 @@ def test_a_run_with_references_needs_no_poses_and_one_table_holds_those_of_all_r
     assert measured(run) == [("distance", 0.0, 5.0, 1.01)]
     table = "run,kind,value,sigma\nb,turn,3.1,0.01\na,distance,1.0,0.003\nb,turn,3.2,0.01\n"
     source = write(tmp_path / "all", a_wheels=wheel_table(), b_wheels=wheel_table(0.0, (-2, 2)), references=table)
-    runs = read_tables(source).trajectories
+    runs = read(source).trajectories
     assert [[kind for kind, *_ in measured(run)] for run in runs] == [["distance"], ["turn", "turn"]]
 
 
 def test_references_may_stand_beside_one_table_of_the_wheels_of_all_runs(tmp_path: Path) -> None:
     told = "run,kind,value,sigma\na,distance,1.0,0.003\nb,distance,1.1,0.003\n"
-    runs = read_tables(write(tmp_path, log=of_two_runs("run"), references=told)).trajectories
+    runs = read(write(tmp_path, log=of_two_runs("run"), references=told)).trajectories
     assert [(run.id, measured(run)[0][3]) for run in runs] == [("a", 1.0), ("b", 1.1)]
 
 
@@ -702,18 +694,18 @@ def test_references_that_do_not_name_their_run_are_not_taken_for_those_of_every_
     told = "Name,Kind,Value,Sigma\na,distance,1.0,0.003\nb,distance,1.1,0.003\n"
     source = write(tmp_path, log=of_two_runs("Lauf"), references=told)
     with pytest.raises(DataError, match=r"references\.csv: column 'Lauf' is missing; .* --set run_column=NAME"):
-        read_tables(source, run_column="Lauf")
+        read(source, run_column="Lauf")
     write(tmp_path, log=of_two_runs("run"))
     with pytest.raises(DataError, match=r"references\.csv: column 'run' is missing, .*; --set run_column=NAME"):
-        read_tables(source)
-    runs = read_tables(write(tmp_path, references=told.replace("Name", "Run"))).trajectories
+        read(source)
+    runs = read(write(tmp_path, references=told.replace("Name", "Run"))).trajectories
     assert [measured(run)[0][3] for run in runs] == [1.0, 1.1]
 
 
 def test_some_runs_have_poses_and_others_references(tmp_path: Path) -> None:
     poses = "t,x,y,theta\n0,0,0,0\n2.5,0.5,0.001,0\n5,1.001,0,0.001\n"
     source = write(tmp_path, a_wheels=wheel_table(), a_poses=poses, b_wheels=wheel_table(), b_references=TAPE)
-    posed, taped = read_tables(source).trajectories
+    posed, taped = read(source).trajectories
     assert (posed.has_poses, posed.references) == (True, None)
     assert (taped.has_poses, len(measured(taped))) == (False, 1)
 
@@ -763,14 +755,14 @@ def test_a_pose_at_the_start_alone_makes_the_frame_of_positions_known(tmp_path: 
 
 def test_references_outside_of_the_wheels_are_left_out_and_said(tmp_path: Path) -> None:
     table = "kind,t1,value_x,value_y,sigma\nposition,2,0.4,0,0.01\nposition,9,1,0,0.01\n"
-    dataset = read_tables(write(tmp_path, a_wheels=wheel_table(), a_references=table))
+    dataset = read(write(tmp_path, a_wheels=wheel_table(), a_references=table))
     assert len(measured(dataset.trajectories[0])) == 1
     assert any("1 of 2 references left out" in warning for warning in dataset.warnings)
 
 
 def test_a_recording_cut_into_windows_keeps_the_references_within_each(tmp_path: Path) -> None:
     table = "kind,t0,t1,value,sigma\ndistance,0.5,2,0.3,0.003\ndistance,3,4.5,0.3,0.003\ndistance,,,1,0.003\n"
-    runs = read_tables(write(tmp_path, a_wheels=wheel_table(), a_references=table), window=2.5).trajectories
+    runs = read(write(tmp_path, a_wheels=wheel_table(), a_references=table), window=2.5).trajectories
     assert [measured(run) for run in runs] == [
         [("distance", 0.5, 2.0, 0.3)],
         [("distance", pytest.approx(0.5), pytest.approx(2.0), 0.3)],
@@ -794,13 +786,13 @@ def test_a_recording_cut_into_windows_keeps_the_references_within_each(tmp_path:
 def test_what_is_wrong_with_references_is_said_in_one_line(tmp_path: Path, tables: dict[str, str], words: str) -> None:
     source = write(tmp_path, a_wheels=wheel_table(), **tables)
     with refused(DataError, match=words):
-        read_tables(source)
+        read(source)
 
 
 @pytest.mark.parametrize("robot_type", ["diff", "omni3", "swerve"])
 def test_the_template_with_references_imports_as_it_is_written(tmp_path: Path, robot_type: str) -> None:
     write_template(tmp_path / "log", robot_type, references=True)
-    dataset = Csv(CsvOptions.model_validate(Csv.completed({}, tmp_path / "log"))).read(tmp_path / "log")
+    dataset = import_dataset("csv", tmp_path / "log")
     assert dataset.warnings == ()
     kinds = {kind for run in dataset.trajectories for kind, *_ in measured(run)}
     assert {"distance", "turn"} <= kinds
@@ -809,12 +801,12 @@ def test_the_template_with_references_imports_as_it_is_written(tmp_path: Path, r
 
 def reread(folder: Path, **options: Any) -> Dataset:
     """A data set on disk by the importer ``dataset``."""
-    return DatasetFolder(DatasetOptions.model_validate(DatasetFolder.completed(options, folder))).read(folder)
+    return import_dataset("dataset", folder, options)
 
 
 def test_the_importer_of_data_sets_keeps_references_to_the_bit(tmp_path: Path) -> None:
     write_template(tmp_path / "log", "omni3", references=True)
-    dataset = Csv(CsvOptions.model_validate(Csv.completed({}, tmp_path / "log"))).read(tmp_path / "log")
+    dataset = import_dataset("csv", tmp_path / "log")
     save_dataset(dataset, tmp_path / "old")
     assert reread(tmp_path / "old").hash == dataset.hash
     cut = reread(tmp_path / "old", jumps="cut", start_at_rest=True, clocks="match", pose_time_offset=0.1)
@@ -823,8 +815,8 @@ def test_the_importer_of_data_sets_keeps_references_to_the_bit(tmp_path: Path) -
 
 def test_a_data_set_read_in_other_units_has_its_references_in_them_too(tmp_path: Path) -> None:
     source = write(tmp_path / "log", a_wheels=wheel_table(), a_references="kind,value,sigma\ndistance,1010,3\n")
-    assert any("--set position_unit=mm" in warning for warning in read_tables(source).warnings)
-    save_dataset(read_tables(source), tmp_path / "old")
+    assert [finding.fix for finding in check(read(source)).findings][:1] == ["position_unit=mm"]
+    save_dataset(read(source), tmp_path / "old")
     (run,) = reread(tmp_path / "old", position_unit="mm").trajectories
     assert measured(run) == [("distance", 0.0, 5.0, pytest.approx(1.01))]
 
@@ -834,7 +826,7 @@ def test_a_run_of_a_data_set_that_is_cut_keeps_the_references_of_each_part(tmp_p
         "\n".join(line for line in wheel_table().splitlines() if not line.startswith(("2.1", "2.2", "2.3"))) + "\n"
     )
     table = "kind,t0,t1,value,sigma\ndistance,0.5,2,0.3,0.003\ndistance,3,4.5,0.3,0.003\ndistance,,,1,0.003\n"
-    save_dataset(read_tables(write(tmp_path / "log", a_wheels=with_gap, a_references=table)), tmp_path / "old")
+    save_dataset(read(write(tmp_path / "log", a_wheels=with_gap, a_references=table)), tmp_path / "old")
     runs = reread(tmp_path / "old", longest_gap=0.2).trajectories
     assert [(run.id, len(measured(run))) for run in runs] == [("a#1", 1), ("a#2", 1)]
 
@@ -845,5 +837,7 @@ def test_a_data_set_with_times_in_ms_has_its_references_in_seconds_too(tmp_path:
     source = write(tmp_path / "log", a_wheels="\n".join(["t,omega_left,omega_right", *rows]), a_references=table)
     run = the_run(source, pose_time_unit="ms")
     slow = replace(run, references=replace(run.references, t0=run.references.t0 * 1e3, t1=run.references.t1 * 1e3))
-    mended = in_seconds(replace(slow, times=run.times * 1e3), 1e-3, 1e-3)
+    options = DatasetOptions(robot=ROBOT, wheel_time_unit="ms", pose_time_unit="ms")
+    recordings = recordings_of([replace(slow, times=run.times * 1e3)], options.robot, None, options)
+    (mended,) = dataset_of(recordings, options, []).trajectories
     assert measured(mended) == [(kind, pytest.approx(t0), pytest.approx(t1), v) for kind, t0, t1, v in measured(run)]

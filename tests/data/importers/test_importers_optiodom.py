@@ -149,13 +149,13 @@ def test_without_a_log_angles_are_left_out_and_a_command_is_named_after_the_moti
         ("_run-01", "0.08,", "0.02,", r"row 3: t goes backwards: 0\.02 after 0\.04"),
         ("_run-01", "-100,100,0\n0.12", "-100,oops,0\n0.12", r"row 3: ticks_1 is 'oops'"),
         ("_run-01", "-100,100,0\n0.12", "-100,nan,0\n0.12", r"row 3: ticks_1 is nan"),
-        ("_run-01", "-100,100,0\n0.12", "-100,100\n0.12", r"row 3: it has 6 fields, expected 7"),
+        ("_run-01", "-100,100,0\n0.12", "-100,100\n0.12", r"row 3: ticks_2 is missing"),
         ("_metadata", "type,omni3", "type,omni2", r"type is 'omni2'; did you mean 'omni4'\?"),
         ("_metadata", "Di,0.102,0.102,0.102", "Di,0.102,0.102", "Di is '0.102, 0.102', expected 3 numbers"),
         ("_metadata", "Li,0.195", "Lo,0.195", r"key 'Li' is missing; did you mean 'Lo'\?"),
         ("_metadata", "ngear,12", "ngear,0", r"ngear is 0"),
         ("_metadata", "encRes,1024", "encRes,many", r"encRes is 'many'"),
-        ("", "10.08,100,", "10.08,x,", "line 7: could not convert"),
+        ("", "10.08,100,", "10.08,x,", "line 7: expected 10 finite numbers"),
         ("", "10.08,100,", "10.08,99,", r"does not hold the ticks of s1_run-01\.csv; .* log: false"),
     ],
 )
@@ -192,6 +192,21 @@ def test_a_source_of_several_robots_is_refused_with_the_way_out(tmp_path: Path) 
     (tmp_path / "empty").mkdir()
     with pytest.raises(DataError, match=r"no \*_metadata\.csv below it"):
         import_dataset("optiodom", tmp_path / "empty")
+
+
+def test_options_of_import_dataset_hold_too(tmp_path: Path) -> None:
+    write_session(tmp_path, name="s1")
+    write_session(tmp_path, name="s2", log=False)
+    plain = import_dataset("optiodom", tmp_path)
+    turned = import_dataset("optiodom", tmp_path, {"wheel_signs": [-1, -1, 1]})
+    for run, other in zip(plain.trajectories, turned.trajectories, strict=True):
+        np.testing.assert_array_equal(other.rates, run.rates * [-1, -1, 1])
+        assert (other.split, other.command, other.session) == (run.split, run.command, run.session)
+    assert turned.warnings[0] == plain.warnings[0]  # that sessions have no log
+    assert turned.sample_period == plain.sample_period
+    left = import_dataset("optiodom", tmp_path, {"leave_out": "*s2*", "position_unit": "cm"})
+    assert [run.session for run in left.trajectories] == ["s1", "s1"]
+    np.testing.assert_allclose(left.trajectories[0].poses[:, 0], plain.trajectories[0].poses[:, 0] / 100)
 
 
 @pytest.fixture

@@ -47,8 +47,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from timing import PATIENCE
 
-from omnibench.data.importers.rosbag.rosbag import between_rests
-from omnibench.data.importers.runs.recording_runs import find_rests
+from omnibench.data.runs import between_rests, find_rests
 from omnibench.data.storage import load_dataset
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrate import calibrate
@@ -163,7 +162,7 @@ def test_the_command_imports_a_bag(command: Command, tmp_path: Path) -> None:
     (tmp_path / "robot.yaml").write_text(yaml.safe_dump(ROBOT.model_dump(mode="json")))
     run = command("import", "rosbag", source, "-o", "data", "--set", "robot=robot.yaml", "--set", "name=lab")
     assert run.returncode == 0
-    assert run.stderr.startswith("training 1 run, validation 1 run, ")
+    assert run.stderr.startswith("training 2 runs, validation 0 runs, ")  # they move in different ways
     assert "\ndata holds 2 runs of " in run.stderr
     assert "2 trajectories: data" in run.stdout
     data = load_dataset(tmp_path / "data")
@@ -242,7 +241,10 @@ def test_joints_can_be_named(tmp_path: Path) -> None:
     [
         ({"wheel_topic": "/robot/joint_state"}, r"wheel_topic: .* did you mean '/robot/joint_states'\?"),
         ({"pose_topic": "/slam"}, r"pose_topic: unknown topic '/slam'; .*/robot/slam_pose"),
-        ({"wheel_topic": SLAM}, r"wheel_topic: /robot/slam_pose is geometry_msgs/\S+, expected sensor_msgs/msg/Joint"),
+        (
+            {"wheel_topic": SLAM},
+            r"wheel_topic: /robot/slam_pose is geometry_msgs/\S+, expected sensor_msgs/msg/Joint.*joints=",
+        ),
         ({"pose_topic": WHEELS}, r"pose_topic: /robot/joint_states is sensor_msgs/\S+, expected geometry_msgs"),
         ({"cut": "topic", "cut_topic": "/go"}, r"cut_topic: unknown topic '/go'"),
         ({"cut": "topic"}, "cut=topic and cut_topic"),
@@ -250,8 +252,10 @@ def test_joints_can_be_named(tmp_path: Path) -> None:
         ({"window": 3}, "cut=windows and window"),
         ({"joints": ["a", "b"]}, "joints has 2 values, expected 3"),
         ({"joints": ["a", "b", "b"]}, "joints names one joint twice"),
-        ({"joint_signs": [1, -1]}, "joint_signs has 2 values, expected 3"),
-        ({"joint_signs": [1, 0, 1]}, "joint_signs"),
+        ({"joint_signs": [1, -1]}, "wheel_signs has 2 values, expected 3"),
+        ({"joint_signs": [1, 0, 1]}, "wheel_signs"),
+        ({"joint_signs": [1, 1, 1], "wheel_signs": [1, 1, 1]}, "joint_signs is another name of wheel_signs"),
+        ({"wheel_time_unit": "ms"}, "stamps of bags are in s"),
         ({"wraps_at": 6, "use": "velocities"}, "wraps_at is for positions"),
         ({"wheel_unit": "rpm", "use": "positions"}, "wheel_unit rpm"),
         ({"pose_frames": "map"}, r"pose_frames has 1 value, expected 2: \[world, robot\]"),
@@ -280,7 +284,7 @@ def test_short_drives_are_left_out_and_counted(tmp_path: Path) -> None:
     bumped = part(REST + RUN + REST + 0.3)
     data = read(write_mcap(tmp_path / "bumped", bumped))
     assert len(data.trajectories) == 1
-    assert "1 of 2 drives left out: 1 shorter than 1 s (least_run)" in data.warnings[0]
+    assert "1 of 2 runs left out: 1 shorter than 1 s (least_run)" in data.warnings[0]
 
 
 def test_the_messages_of_a_topic_begin_runs_and_name_their_commands(tmp_path: Path) -> None:
@@ -381,15 +385,15 @@ def test_pieces_between_rests_hold_drives(lengths: list[tuple[float, float]], fi
     rests = find_rests(times, angles, 0.5, 0.025)
     assert len(rests) == len(lengths) + 1
     stamps = np.arange(first, times[-1], period)
-    pieces = between_rests((times[0], times[-1]), rests, stamps)
+    pieces = between_rests(slice(0), (times[0], times[-1]), rests, stamps)
     assert len(pieces) == len(lengths)
     for piece, before, after in zip(pieces, rests[:-1], rests[1:], strict=True):
-        assert before[0] <= piece.begin <= before[1]
-        assert after[0] <= piece.end <= after[1]
-        for (begin, end), instant in ((before, piece.begin), (after, piece.end)):
+        assert before[0] <= piece.span[0] <= before[1]
+        assert after[0] <= piece.span[1] <= after[1]
+        for (begin, end), instant in zip((before, after), piece.span, strict=True):
             inside = stamps[(stamps >= begin) & (stamps <= end)]
             assert not len(inside) or instant in inside
-    assert all(one.end <= other.begin for one, other in pairwise(pieces))
+    assert all(one.span[1] <= other.span[0] for one, other in pairwise(pieces))
 
 
 def moving(lengths: Sequence[tuple[float, float]]) -> tuple[Array, Array]:

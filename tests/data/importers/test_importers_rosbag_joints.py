@@ -1,4 +1,4 @@
-"""Joints of bags as any driver publishes them, recordings that are not as they should be, odometry as the reference."""
+"""Wheels and poses of bags by joints and fields of any message; recordings that are not as they should be; odometry."""
 
 from __future__ import annotations
 
@@ -17,6 +17,9 @@ from bag_samples import (
     EPOCH,
     FORMATS,
     ROBOT,
+    ROS1,
+    ROS2,
+    RUN,
     SLAM,
     TRUTH,
     WHEELS,
@@ -32,6 +35,8 @@ from bag_samples import (
     pose,
     read,
     slam_pose,
+    stamp_of,
+    text,
     transform,
     write_mcap,
     write_rosbag1,
@@ -39,8 +44,10 @@ from bag_samples import (
 )
 from commands import refused
 from mcap.writer import IndexType
+from rosbags.typesys import get_types_from_msg
 from tricycle_samples import TRICYCLE, tricycle_drive
 
+from omnibench.check.check import check
 from omnibench.data.dataset import Dataset
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import ConfigError, DataError, OmnibenchError
@@ -49,8 +56,13 @@ from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, WheelLog
 
 TRACKER = [each for each in messages(DRIVE) if each.topic == SLAM]
+WHEELS_ONLY = [each for each in messages(DRIVE) if each.topic == WHEELS]
 TURN = 2 * math.pi
-TICKS = {"wheel_unit": "ticks", "ticks_per_turn": 4096}
+TICKS: dict[str, Any] = {"wheel_unit": "ticks", "ticks_per_turn": 4096}
+
+
+def noisy(poses: Array) -> Array:
+    return poses + np.random.default_rng(0).normal(0, (1e-3, 1e-3, 2e-3), poses.shape)
 
 
 def numbers(topic: str, kind: str, rows: Sequence[Any], late: int = 0) -> list[Sent]:
@@ -89,7 +101,7 @@ def test_joints_have_any_unit_and_gear(tmp_path: Path, per_radian: Any, options:
 def test_all_wheels_may_come_as_plain_numbers(tmp_path: Path) -> None:
     rows = np.column_stack([np.zeros(len(DRIVE.stamps), dtype=int), ticks(DRIVE.angles[:, [2, 0, 1]])])
     source = write_rosbag1(tmp_path / "drive", [*TRACKER, *numbers("/enc", "Int32MultiArray", rows)])
-    with pytest.raises(ConfigError, match=r"--set wheel_topic=NAME .*: /enc \(std_msgs"):
+    with pytest.raises(DataError, match=r"topics found: /enc \(std_msgs.*are the wheels in --set wheel_topic=/enc\?"):
         read(source)
     with pytest.raises(ConfigError, match=r"--set joints=.*joints found: 0, 1, 2, 3"):
         read(source, wheel_topic="/enc", **TICKS)
@@ -221,8 +233,9 @@ def test_missing_joints_are_refused(tmp_path: Path, sent: list[Sent], options: d
         read_steered(tmp_path, sent, **options)
 
 
-def test_a_steering_joint_that_a_driver_fills_in_is_warned_of(tmp_path: Path) -> None:
-    assert "wheel front never changes" in read_steered(tmp_path, steering(lambda _: 0.0)).warnings[-1]
+def test_a_steering_joint_that_a_driver_fills_in_is_found(tmp_path: Path) -> None:
+    findings = check(read_steered(tmp_path, steering(lambda _: 0.0))).findings
+    assert "steering_frozen" in {finding.kind for finding in findings}
 
 
 def unstamped(sent: list[Sent], topic: str) -> list[Sent]:
@@ -254,7 +267,8 @@ def test_topics_without_header_stamps_or_of_two_clocks_may_have_the_times_of_rec
 
 
 def test_a_steering_joint_in_degrees_or_ticks_is_named_with_its_unit(tmp_path: Path) -> None:
-    assert "steering_unit=deg" in read_steered(tmp_path, steering(math.degrees)).warnings[-1]
+    findings = check(read_steered(tmp_path, steering(math.degrees))).findings
+    assert "steering_unit=deg" in {finding.fix for finding in findings}
     sent = steering(lambda angle: round(angle * 8192 / TURN) % 8192)
     with pytest.raises(DataError, match=r"read in rad, .*--set steering_unit=ticks --set steering_t"):
         read_steered(tmp_path, sent)
@@ -282,7 +296,7 @@ def test_messages_recorded_out_of_order_are_sorted_and_counted(tmp_path: Path) -
     late = edited(part(12.4), WHEELS, lambda each: replace(each, logged=each.logged + 50_000_000), every=9)
     data = read(write_mcap(tmp_path / "drive", late))
     count = sum(each.topic == WHEELS for each in part(12.4)) // 9
-    assert f"topic {WHEELS}: {count} messages were recorded late and sorted" in data.warnings[0]
+    assert f"topic {WHEELS}: {count} messages recorded late, and sorted" in data.warnings[0]
     assert odometry_error(data) < 1e-9
 
 
@@ -331,13 +345,13 @@ def in_degrees(each: Sent) -> Sent:
         ),
         (
             edited(part(12.4), SLAM, lambda each: changed(each, header=header(each.logged - EPOCH))),
-            "no two poses while the wheels were recorded",
+            "no two messages of /robot/slam_pose while the wheels were recorded",
         ),
         (edited(part(5), WHEELS, in_degrees), r"wheels, read in rad, turn at up to \d+ rad/s; --set wheel_unit"),
         (part(1.4), "the wheels rest all the time"),
         (
             [each for each in part(7) if each.topic == WHEELS or each.logged < EPOCH + 0.9e9],
-            "1 with fewer than two reference poses",
+            "1 with fewer than two poses",
         ),
     ],
     ids=["no stamps", "clock set back", "two clocks", "degrees", "no motion", "no poses"],
@@ -350,13 +364,13 @@ def test_a_recording_without_one_sound_run_is_refused(tmp_path: Path, sent: list
 @pytest.mark.parametrize("missing", [WHEELS, SLAM])
 def test_a_missing_topic_is_named_with_those_that_are_there(tmp_path: Path, missing: str) -> None:
     (other,) = {WHEELS, SLAM} - {missing}
-    with pytest.raises(DataError, match=rf"no topic of type \S.*; topics found: {other} \("):
+    with pytest.raises(DataError, match=rf"no messages of type \S.*; topics found: {other} \("):
         read(write_mcap(tmp_path / "drive", [each for each in part(7) if each.topic == other]))
 
 
 def test_an_empty_topic_is_named(tmp_path: Path) -> None:
     source = write_rosbag2(tmp_path / "drive", [each for each in part(7) if each.topic == WHEELS], empty=[SLAM])
-    with pytest.raises(DataError, match=r"/robot/slam_pose \(.*, 0 messages\): nothing was recorded on it"):
+    with pytest.raises(DataError, match=r"no messages of type .*found: .*/robot/slam_pose \(\S+, 0 messages\)"):
         read(source)
     with pytest.raises(DataError, match=r"pose_topic: topic /robot/slam_pose has no messages"):
         read(source, pose_topic=SLAM)
@@ -411,7 +425,6 @@ def test_a_profile_other_than_ros2_is_refused(tmp_path: Path) -> None:
         read(write_mcap(tmp_path / "drive", part(2), profile=""))
 
 
-WHEELS_ONLY = [each for each in messages(DRIVE) if each.topic == WHEELS]
 OWN = "is the robot's own odometry: .* --set pose_topic=NAME"
 
 
@@ -425,10 +438,6 @@ def transforms(parent: str, child: str, stamps: Array, poses: Array, topic: str 
         )
         for stamp, place in zip(stamps, poses, strict=True)
     ]
-
-
-def noisy(poses: Array) -> Array:
-    return poses + np.random.default_rng(0).normal(0, (1e-3, 1e-3, 2e-3), poses.shape)
 
 
 def test_odometry_is_no_reference_unless_named(tmp_path: Path) -> None:
@@ -487,3 +496,244 @@ def test_transforms_that_the_robot_made_of_its_wheels_are_refused(tmp_path: Path
     source = write_mcap(tmp_path / "drive", [*WHEELS_ONLY, *transforms("odom", "base", DRIVE.pose_stamps, DRIVE.poses)])
     with pytest.raises(DataError, match=f"/tf {OWN}"):
         read(source, pose_topic="/tf", pose_frames=["odom", "base"])
+
+
+DEFINITIONS = {
+    "base_msgs/msg/Motor": "int32 ticks\nfloat64 angle\n",
+    "base_msgs/msg/Status": "std_msgs/Header header\nfloat32 battery\nbase_msgs/Motor[] motors\nfloat64[3] wheel\n",
+    "base_msgs/msg/Tick": "std_msgs/Header header\nint32 data\nuint16 resolution\n",
+    "base_msgs/msg/Located": "std_msgs/Header header\ngeometry_msgs/Pose place\nfloat64 x\nfloat64 y\nfloat64 yaw\n",
+}
+for _store in (ROS1, ROS2):
+    for _name, _definition in DEFINITIONS.items():
+        _store.register(get_types_from_msg(_definition, _name))
+BY_PATH = ["motors.2.angle", "motors.0.angle", "motors.1.angle"]
+
+
+def status() -> list[Sent]:
+    """The wheels c, a, b as parts of a message of the base."""
+    order = [1, 2, 0]
+    return [
+        Sent(
+            "/status",
+            "base_msgs/msg/Status",
+            {
+                "header": header(stamp, ""),
+                "battery": 24.0,
+                "motors": [{"ticks": 0, "angle": float(angles[wheel])} for wheel in order],
+                "wheel": np.degrees(angles).tolist(),
+            },
+            int(stamp),
+        )
+        for stamp, angles in zip(DRIVE.stamps, DRIVE.angles, strict=True)
+    ]
+
+
+def tick_messages(late: int = 3_000_000, bits: int = 31) -> list[Sent]:
+    """A message a wheel, of 4096 ticks a turn, whose counters begin again."""
+    counted = np.floor(DRIVE.angles * 4096 / (2 * math.pi)).astype(int)
+    shown = (counted + 2 ** (bits - 1)) % 2**bits - 2 ** (bits - 1)
+    return [
+        Sent(
+            f"/motor_{wheel}/tick",
+            "base_msgs/msg/Tick",
+            {"header": header(stamp + late * index), "data": int(count), "resolution": 4096},
+            int(stamp) + late * index,
+        )
+        for index, wheel in enumerate("abc")
+        for stamp, count in zip(DRIVE.stamps, shown[:, index], strict=True)
+    ]
+
+
+def located() -> list[Sent]:
+    """The reference as a pose within a message, and as three numbers, m and deg."""
+    return [
+        Sent(
+            "/camera",
+            "base_msgs/msg/Located",
+            {
+                "header": header(stamp),
+                "place": pose(place),
+                "x": place[0],
+                "y": place[1],
+                "yaw": math.degrees(place[2]),
+            },
+            int(stamp),
+        )
+        for stamp, place in zip(DRIVE.pose_stamps, noisy(DRIVE.poses).tolist(), strict=True)
+    ]
+
+
+@pytest.mark.parametrize("write", [write_mcap, write_rosbag1])
+def test_wheels_are_read_from_fields_of_any_message(tmp_path: Path, write: Callable[..., Path]) -> None:
+    source = write(tmp_path / "drive", [*TRACKER, *status()])
+    data = read(source, wheel_topic="/status", joints=BY_PATH)
+    assert len(data.trajectories) == len(DRIVE.begins)
+    assert data.warnings == ()
+    assert odometry_error(data) < 1e-9
+    others = read(source, wheel_topic="/status", joints=["wheel.0", "wheel.1", "wheel.2"], wheel_unit="deg")
+    assert odometry_error(others) < 1e-9
+
+
+def test_poses_are_read_from_fields_of_any_message(tmp_path: Path) -> None:
+    source = write_mcap(tmp_path / "drive", [*WHEELS_ONLY, *located()])
+    for options in (
+        {"pose_columns": ["place"]},
+        {"pose_columns": ["x", "y", "yaw"], "heading_unit": "deg"},
+    ):
+        assert odometry_error(read(source, pose_topic="/camera", **options)) < 0.05
+    with pytest.raises(DataError, match=r"poses in other messages: --set pose_topic=NAME --set pose_columns"):
+        read(source)
+    with refused(ConfigError, match=r"pose_topic: /camera is .*or --set pose_columns=.*place,.*x, y, yaw"):
+        read(source, pose_topic="/camera")
+    with refused(ConfigError, match=r"pose_columns: .* has no field 'plac'; did you mean 'place'\?"):
+        read(source, pose_topic="/camera", pose_columns="plac")
+    with refused(ConfigError, match="pose_columns: yaw of /camera .* is no geometry pose"):
+        read(source, pose_topic="/camera", pose_columns="yaw")
+    with refused(ConfigError, match="pose_columns needs pose_topic"):
+        read(source, pose_columns=["x", "y", "yaw"])
+
+
+def test_each_wheel_may_have_a_topic_whose_counter_begins_again(tmp_path: Path) -> None:
+    """Counts between two messages of a wheel are interpolated only after they were counted on."""
+    topics = [f"/motor_{wheel}/tick" for wheel in "abc"]
+    source = write_mcap(tmp_path / "drive", [*TRACKER, *tick_messages(bits=12)])
+    data = read(source, wheel_topic=topics, joints=["data", "data", "data"], **TICKS)
+    assert any("begin again after 4096 ticks" in warning for warning in data.warnings)
+    assert len(data.trajectories) == len(DRIVE.begins)
+    assert odometry_error(data) < 5e-3  # of ticks
+    with refused(ConfigError, match="joints names one joint twice"):
+        read(source, wheel_topic=topics[0], joints=["data", "data", "data"], **TICKS)
+
+
+@pytest.mark.parametrize(
+    ("sent", "typed"),
+    [
+        (
+            tick_messages(),
+            r"--set wheel_topic=\[/motor_a/tick,/motor_b/tick,/motor_c/tick\] --set \"joints=\[data,data,data\]\"",
+        ),
+        (
+            status(),
+            r"--set wheel_topic=/status --set \"joints=\[motors\.0\.ticks,motors\.0\.angle,wheel\.0\]\".*battery",
+        ),
+    ],
+    ids=["a topic each", "one topic"],
+)
+def test_without_a_joint_state_the_error_says_what_to_type(tmp_path: Path, sent: list[Sent], typed: str) -> None:
+    source = write_mcap(tmp_path / "drive", [*TRACKER, *sent])
+    with refused(DataError, match=rf"topics found: .*{sent[0].kind}.*; are the wheels in {typed}"):
+        read(source)
+    with refused(ConfigError, match=r"wheel_topic: \S+ is base_msgs.*--set \"joints="):
+        read(source, wheel_topic=sent[0].topic)
+
+
+def test_a_field_that_is_not_there_is_named(tmp_path: Path) -> None:
+    source = write_mcap(tmp_path / "drive", [*TRACKER, *status()])
+    with refused(
+        ConfigError, match=r"joints: /status .* has no field 'motors\.0\.angel'; did you mean 'motors\.0\.angle'"
+    ):
+        read(source, wheel_topic="/status", joints=["motors.0.angel", *BY_PATH[1:]])
+    with refused(DataError, match="messages left out: .* that cannot be decoded"):
+        read(source, wheel_topic="/status", joints=["motors.7.angle", *BY_PATH[1:]])
+
+
+@pytest.mark.parametrize("inside", ["msg", ""])
+def test_definitions_may_be_given_of_types_that_a_bag_does_not_define(tmp_path: Path, inside: str) -> None:
+    source = without_definitions(write_rosbag2(tmp_path / "drive", [*TRACKER, *status()]))
+    options: dict[str, Any] = {"wheel_topic": "/status", "joints": BY_PATH}
+    with refused(ConfigError, match=r"the bag does not define its messages; .*--set message_definitions=FOLDER"):
+        read(source, **options)
+    folder = tmp_path / "share" / "base_msgs" / inside
+    folder.mkdir(parents=True)
+    for name in ("Motor", "Status"):
+        (folder / f"{name}.msg").write_text(DEFINITIONS[f"base_msgs/msg/{name}"])
+    assert odometry_error(read(source, message_definitions=[str(tmp_path / "share")], **options)) < 1e-9
+    files = [str(file) for file in folder.iterdir()]
+    assert odometry_error(read(source, message_definitions=files, **options)) < 1e-9
+    (folder / "Motor.msg").write_text("int32 !\n")
+    with refused(DataError, match=r"Motor\.msg: cannot be read as the definition of a message"):
+        read(source, message_definitions=[str(tmp_path / "share")], **options)
+
+
+def without_definitions(bag: Path) -> Path:
+    """A rosbag2 folder as recorders before ROS 2 Iron write it."""
+    import sqlite3
+
+    (database,) = bag.glob("*.db3")
+    with sqlite3.connect(database) as connection:
+        connection.execute("DELETE FROM message_definitions")
+    return bag
+
+
+def twists(
+    sent: Sequence[tuple[float, float, float]], topic: str = "/robot/cmd_vel", stamped: bool = False
+) -> list[Sent]:
+    """A twist sent every 0.1 s of each run, x, y and turn; 0 at the end."""
+    result = []
+    for begin, (x, y, turn) in zip(DRIVE.begins, sent, strict=False):
+        for step in range(round(RUN / 0.1) + 1):
+            share = step * 0.1 < RUN
+            content: dict[str, Any] = {
+                "linear": {"x": x * share, "y": y * share, "z": 0.0},
+                "angular": {"x": 0.0, "y": 0.0, "z": turn * share},
+            }
+            stamp = EPOCH + int((begin + 0.1 * step) * 1e9)
+            if stamped:
+                content = {"header": header(stamp), "twist": content}
+            result.append(Sent(topic, f"geometry_msgs/msg/Twist{'Stamped' if stamped else ''}", content, stamp))
+    return result
+
+
+SENT = [(0.3, 0.0, 0.6), (0.3, 0.0, 0.0), (0.3, 0.2, 0.0)] * 4
+
+
+@pytest.mark.parametrize("stamped", [False, True])
+def test_commands_are_the_twists_that_were_sent(tmp_path: Path, stamped: bool) -> None:
+    data = read(write_mcap(tmp_path / "drive", [*messages(DRIVE), *twists(SENT, stamped=stamped)]))
+    assert [run.command for run in data.trajectories] == ["v0.3_w0.6", "v0.3_w0", "v0.3_y0.2_w0"] * 4
+    assert [run.id for run in data.trajectories][:2] == ["001", "002"]
+    assert [run.repetition for run in data.trajectories] == [1] * 3 + [2] * 3 + [3] * 3 + [4] * 3
+    assert [run.split for run in data.trajectories] == (["train"] * 3 + ["validation"] * 3) * 2
+    assert data.warnings[0] == "commands by the twists that were sent (cmd_vel): v0.3_w0, v0.3_w0.6, v0.3_y0.2_w0"
+    first = data.trajectories[0]
+    assert first.sent is not None
+    assert (first.sent[:, 1:4] == [0.3, 0.0, 0.6]).all(axis=1).any()
+    begin = DRIVE.begins[0] - first.started_at
+    driven = first.sent[first.sent[:, 1] > 0]
+    np.testing.assert_allclose(driven[0, [0, 4]], [begin, RUN], atol=0.11)
+
+
+def test_twists_that_change_all_the_time_are_no_command_and_others_are_not_read(tmp_path: Path) -> None:
+    def varied(each: Sent) -> Sent:
+        turn = each.content["linear"]["x"] * ((each.logged // 10**8) % 17) / 17
+        return changed(each, angular={"z": turn})
+
+    sent = edited(twists(SENT), "/robot/cmd_vel", varied)
+    assert {run.command for run in read(write_mcap(tmp_path / "varied", [*messages(DRIVE), *sent])).trajectories} == {
+        None
+    }
+    joystick = twists(SENT, "/joy_vel")
+    assert read(write_mcap(tmp_path / "joy", [*messages(DRIVE), *joystick])).trajectories[0].sent is None
+    named = [text("go", EPOCH + int((begin - 0.1) * 1e9)) for begin in DRIVE.begins]
+    source = write_mcap(tmp_path / "named", [*messages(DRIVE), *twists(SENT), *named])
+    assert {run.command for run in read(source, cut="topic", cut_topic="/robot/command").trajectories} == {"go"}
+
+
+def test_commands_that_were_driven_once_leave_runs_to_validate(tmp_path: Path) -> None:
+    for day in range(2):  # on which the robot moves alike
+        once = [(0.1 + 0.02 * number + 0.01 * day, 0.0, 0.0) for number in range(12)]
+        write_mcap(tmp_path / f"day{day}", [*messages(DRIVE), *twists(once)])
+    data = read(tmp_path)
+    assert len({run.command for run in data.trajectories}) == 24
+    assert [run.split for run in data.trajectories] == ["train"] * 12 + ["validation"] * 12
+
+
+def test_poses_of_another_epoch_are_matched_or_moved(tmp_path: Path) -> None:
+    other = edited(messages(DRIVE), SLAM, lambda each: changed(each, header=header(stamp_of(each) - EPOCH + 10**9)))
+    source = write_mcap(tmp_path / "drive", other)
+    with pytest.raises(DataError, match="no two messages of /robot/slam_pose while the wheels were recorded"):
+        read(source)
+    matched = read(source, clocks="match")
+    assert odometry_error(matched) < 0.05
+    assert odometry_error(read(source, pose_time_offset=EPOCH / 1e9 - 1)) < 1e-6

@@ -103,8 +103,6 @@ def test_millimetres_are_an_option(tmp_path: Path) -> None:
     in_m = only(tmp_path / "m")
     np.testing.assert_allclose(in_mm.poses, in_m.poses, atol=1e-12)
     assert (in_m.odometry, in_m.sent) == (None, None)
-    (warning,) = import_dataset("table1", tmp_path / "mm").warnings
-    assert "positions look like mm" in warning
 
 
 def test_the_command_is_read_in_the_units_of_table_1(tmp_path: Path) -> None:
@@ -227,7 +225,7 @@ def test_a_malformed_scan_file_is_named(tmp_path: Path, changes: dict[str, Any],
     [
         ("wheels.csv", "0.05,", "0.03,", r"wheels\.csv, row 5 \(line 6\): t goes backwards: 0\.03 after 0\.04"),
         ("wheels.csv", "omega_b", "omegab", r"wheels\.csv: column 'omega_b' is missing; did you mean 'omegab'\?"),
-        ("slam.csv", "0.50,", "0.50;", r"slam\.csv, row 3 \(line 4\): it has 3 fields, expected 4"),
+        ("slam.csv", "0.50,", "0.50;", r"slam\.csv, row 3 \(line 4\): t is '0\.50;\S+', expected a number"),
         ("slam.csv", "0.00,", "-0.10,", r"slam\.csv, row 1 \(line 2\): t is -0\.1"),
         ("slam.csv", None, "t,x,y,theta\n2,0,0,0\n3,0,0,0\n", r"slam\.csv: no two poses while the wheels"),
         ("command.csv", "0.2,30", "fast,30", r"command\.csv, row 1 \(line 2\): v is 'fast'"),
@@ -247,7 +245,7 @@ def test_a_missing_file_no_trajectory_and_an_unknown_unit_are_named(tmp_path: Pa
     with pytest.raises(DataError, match=r"no command\.csv below it"):
         import_dataset("table1", tmp_path)
     with pytest.raises(ConfigError, match="importer 'table1': position_unit"):
-        import_dataset("table1", tmp_path, {"position_unit": "inch"})
+        import_dataset("table1", tmp_path, {"position_unit": "mile"})
     (write_trajectory(tmp_path / "t01") / "slam.csv").unlink()
     with pytest.raises(DataError, match=r"t01.slam\.csv: no such file"):
         import_dataset("table1", tmp_path)

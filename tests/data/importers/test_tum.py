@@ -12,11 +12,18 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from sample_robots import APR_02, WHEELED
 
+from omnibench.data.counters import (
+    POWERS_OF_TWO,
+    about_zero,
+    counted_on,
+    counter_range,
+    lost_register,
+    repeated_readings,
+    turns_restored,
+)
 from omnibench.data.dataset import Trajectory, make_dataset
-from omnibench.data.importers import wheel_samples
 from omnibench.data.importers.copied_reference import follows_the_wheels
-from omnibench.data.importers.rosbag.message_streams import planar_headings
-from omnibench.data.importers.tum import read_tum, write_tum
+from omnibench.data.importers.tum import planar_headings, read_tum, write_tum
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array, CarDrive, Robot
 
@@ -53,9 +60,9 @@ def test_small_roll_and_pitch_hardly_change_the_heading(
 @pytest.mark.parametrize(
     ("row", "message"),
     [
-        ("1 0 0 0 0 0 1", r"row 2 \(line 3\): it has 7 fields, expected 8"),
+        ("1 0 0 0 0 0 1", r"row 2 \(line 3\): qw is missing"),
         ("1 0 0 x 0 0 0 1", r"row 2 \(line 3\): tz is 'x', expected a number"),
-        ("1 0 nan 0 0 0 0 1", r"row 2 \(line 3\): ty is nan"),
+        ("1 0 nan 0 0 0 0 1", r"row 2 \(line 3\): ty is nan; remove"),
         ("0.5 0 0 0 0 0 0 1", r"row 2 \(line 3\): timestamp is repeated: 0\.5 after 0\.5"),
         ("0.4 0 0 0 0 0 0 1", r"row 2 \(line 3\): timestamp goes backwards: 0\.4 after 0\.5"),
         ("1 0 0 0 0 0 0 2", r"row 2 \(line 3\): quaternion has length 2, expected 1"),
@@ -123,14 +130,19 @@ def drive(seed: int, longest: float) -> Array:
     return np.cumsum(np.round(longest * speeds / np.abs(speeds).max()))
 
 
+def recognised(counts: Array) -> float | None:
+    """The range of a counter of ticks whose wheel's turn is far longer."""
+    return counter_range([counts], 1e300, True)
+
+
 @given(st.integers(0, 10**6), st.integers(8, 48), st.floats(0.01, 0.24), st.booleans(), st.floats(0, 1))
 def test_a_counter_of_any_bits_is_counted_on(seed: int, bits: int, longest: float, signed: bool, start: float) -> None:
     wrap = 2.0**bits
     counts = drive(seed, longest * wrap) + np.round(start * wrap)
     shown = counts % wrap - (wrap / 2 if signed else 0)
     wrapped = bool((np.abs(np.diff(shown)) > wrap / 2).any())
-    assert wheel_samples.recognised_wrap(shown, wheel_samples.POWERS_OF_TWO) == (wrap if wrapped else None)
-    np.testing.assert_array_equal(np.diff(wheel_samples.counted_on(shown, wrap)), np.diff(counts))
+    assert recognised(shown) == (wrap if wrapped else None)
+    np.testing.assert_array_equal(np.diff(counted_on(shown, wrap)), np.diff(counts))
 
 
 def late_drive(seed: int, late: int) -> tuple[Array, Array, Array]:
@@ -152,20 +164,20 @@ def late_drive(seed: int, late: int) -> tuple[Array, Array, Array]:
 def test_turns_that_a_register_lost_are_restored(seed: int, late: int) -> None:
     times, counts, shown = late_drive(seed, late)
     lost = not np.array_equal(counts, shown)
-    assert wheel_samples.recognised_register(shown, times, wheel_samples.POWERS_OF_TWO) == (2**16 if lost else None)
-    np.testing.assert_array_equal(wheel_samples.turns_restored(shown, times, 2**16), counts)
+    assert lost_register(shown, times, POWERS_OF_TWO) == (2**16 if lost else None)
+    np.testing.assert_array_equal(turns_restored(shown, times, 2**16), counts)
 
 
 @given(st.integers(0, 10**6), st.integers(8, 20), st.floats(0.01, 0.24))
 def test_a_wheel_that_turns_back_has_lost_no_turns(seed: int, bits: int, longest: float) -> None:
     counts = drive(seed, longest * 2.0**bits)
-    assert wheel_samples.recognised_register(counts, 0.05 * np.arange(len(counts)), wheel_samples.POWERS_OF_TWO) is None
+    assert lost_register(counts, 0.05 * np.arange(len(counts)), POWERS_OF_TWO) is None
 
 
 @given(st.integers(0, 10**6), st.integers(300, 10**6))
 def test_a_counter_that_is_set_to_zero_does_not_begin_again(seed: int, before: int) -> None:
     counts = np.abs(drive(seed, 3.0))
-    assert wheel_samples.recognised_wrap(np.concatenate([before + counts, counts]), wheel_samples.POWERS_OF_TWO) in (
+    assert recognised(np.concatenate([before + counts, counts])) in (
         None,
         power_near(before),
     )
@@ -180,44 +192,44 @@ def power_near(number: int) -> float | None:
 @pytest.mark.parametrize("before", [8_000, 8_100])
 def test_a_counter_that_is_set_to_zero_while_its_wheel_turns_has_lost_no_turn(before: int) -> None:
     counts = np.append(np.arange(0, before, 290), np.arange(0, 30_000, 290)).astype(float)
-    assert wheel_samples.recognised_register(counts, 0.03 * np.arange(len(counts)), wheel_samples.POWERS_OF_TWO) is None
+    assert lost_register(counts, 0.03 * np.arange(len(counts)), POWERS_OF_TWO) is None
 
 
 def test_steps_of_a_third_of_the_range_are_not_unambiguous() -> None:
-    assert wheel_samples.recognised_wrap(np.arange(0, 40000.0, 85) % 256, wheel_samples.POWERS_OF_TWO) is None
+    assert recognised(np.arange(0, 40000.0, 85) % 256) is None
 
 
 @pytest.mark.parametrize("start", [0.0, 100.0, 8191.0])
 def test_an_absolute_encoder_that_counts_from_zero_is_read_about_zero(start: float) -> None:
     angle = 2000 * np.sin(np.linspace(0, 20, 300) + start)
-    np.testing.assert_allclose(wheel_samples.about_zero(angle % 8192, 8192), angle, atol=1e-9)
+    np.testing.assert_allclose(about_zero(angle % 8192, 8192), angle, atol=1e-9)
 
 
 def test_an_absolute_encoder_that_counts_both_ways_stays_as_it_is() -> None:
     angle = np.linspace(-3, 3.1, 50)
-    np.testing.assert_array_equal(wheel_samples.about_zero(angle, 2 * np.pi), angle)
+    np.testing.assert_array_equal(about_zero(angle, 2 * np.pi), angle)
 
 
 def test_a_potentiometer_that_passes_half_a_turn_makes_no_jump() -> None:
     shown = 512 + 400 * np.sin(np.linspace(0, 6, 100))
-    np.testing.assert_array_equal(wheel_samples.about_zero(shown, 1229), shown)
+    np.testing.assert_array_equal(about_zero(shown, 1229), shown)
 
 
 def test_only_readings_logged_again_in_the_middle_of_a_drive_are_repeated() -> None:
     steps = np.array([0, 0, 100, 120, 0, 110, 100, 0, 0, 100, 100, 0, 0])
     angles = np.append(0, np.cumsum(steps)).astype(float)[:, None]
     times = np.arange(len(angles), dtype=float)
-    assert np.flatnonzero(wheel_samples.repeated_readings(times, angles, None)).tolist() == [5]
+    assert np.flatnonzero(repeated_readings(times, angles, None)).tolist() == [5]
     steers = np.zeros_like(angles)
     steers[5:] = 0.1  # the steering encoder was read anew
-    assert not wheel_samples.repeated_readings(times, angles, steers).any()
+    assert not repeated_readings(times, angles, steers).any()
     rest = times + 3 * (times >= 5)
-    assert not wheel_samples.repeated_readings(rest, angles, None).any()
+    assert not repeated_readings(rest, angles, None).any()
 
 
 def test_a_wheel_that_creeps_from_tick_to_tick_repeats_nothing() -> None:
     angles = np.floor(np.arange(100) * 0.7)[:, None]
-    assert not wheel_samples.repeated_readings(np.arange(100.0), angles, None).any()
+    assert not repeated_readings(np.arange(100.0), angles, None).any()
 
 
 PERIOD, SAMPLES = 0.02, 3000  # s: a minute of driving

@@ -17,22 +17,22 @@ from lanes import slow
 from sample_robots import APR_02, MECANUM
 from wheeled_samples import CAR, DIFF, SWERVE, driven
 
-import omnibench.data.stored_rows as periods
-import omnibench.data.tables as stored_wheels
+import omnibench.data.stored as stored_samples
 import omnibench.robot.stored_odometry as odometry_of_stored
+from omnibench.check.check import check
 from omnibench.data.dataset import Dataset
-from omnibench.data.storage import load_dataset, save_dataset
-from omnibench.data.stored_rows import StoredRows, drawn_runs, in_memory, median_period
-from omnibench.data.tables import in_few_words
+from omnibench.data.storage import in_few_words, load_dataset, save_dataset
+from omnibench.data.stored import drawn_runs, median_period, read_block
 from omnibench.errors import DataError
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.certify import LowerBounds, certify_optimum
-from omnibench.fit.check.checking import check
 from omnibench.fit.evaluate import evaluate
 from omnibench.fit.inspect import inspect_dataset
 from omnibench.fit.problem import Budget, BudgetSpent, CalibrationProblem, make_parameterisation
 from omnibench.registry import costs
 from omnibench.robot.kinematics import Robot
+from omnibench.robot.odometry import WheelLog
+from omnibench.robot.samples import Samples
 
 
 def recorded(robot: Robot = APR_02, runs: int = 12) -> Dataset:
@@ -69,9 +69,26 @@ def nothing_held(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_what_stays_in_its_file_is_the_data_set_that_was_saved(robot: Robot, tmp_path: Path) -> None:
     save_dataset(recorded(robot), tmp_path / "saved")
     held, stored = load_dataset(tmp_path / "saved"), load_dataset(tmp_path / "saved", most_in_memory=0)
-    assert all(isinstance(run.times, StoredRows) for run in stored.trajectories)
+    assert not any(run.samples.held for run in stored.trajectories)
     assert (stored.hash, stored.warnings) == (held.hash, held.warnings)
     assert stored.fingerprints("train") == held.fingerprints("train")
+
+
+def test_a_run_gives_arrays_and_is_replaced_without_reading_them(folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder, tmp_path / "fleet")
+    held, stored = load_dataset(folder).trajectories[3], load_dataset(tmp_path / "fleet", most_in_memory=0)
+    run = stored.trajectories[3]
+    for name in ("times", "rates", "signals"):
+        assert type(getattr(run, name)) is type(getattr(run.final_log, name)) is np.ndarray
+        np.testing.assert_array_equal(getattr(run, name), getattr(held, name))
+    (tmp_path / "fleet" / "wheels.parquet").unlink()
+    read_block.cache_clear()
+    other = replace(run, id="other", angles=None).log([0.5])
+    assert (other.samples.count, other.samples.end) == (len(held.times), held.times[-1])
+    half = replace(run, rates=held.rates / 2)
+    np.testing.assert_array_equal(half.rates, held.rates / 2)
+    with pytest.raises(DataError, match="cannot be read"):
+        _ = half.times
 
 
 @pytest.mark.usefixtures("nothing_held")
@@ -170,9 +187,10 @@ def test_costs_of_poses_that_are_held_in_parts_are_the_same(folder: Path, monkey
 
 def test_a_long_run_among_short_ones_is_put_with_few(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(odometry_of_stored, "_TOGETHER", 1000)
-    runs = [Sampled(np.ones(count)) for count in (100, 100, 900, *[10] * 200)]
-    parts = [[len(run.times) for run in part] for part in odometry_of_stored.together(runs)]
-    assert [count for part in parts for count in part] == [len(run.times) for run in runs]
+    counts = [100, 100, 900, *[10] * 200]
+    logs = [WheelLog(np.ones(count), np.ones((count, 3)), np.zeros(3), np.ones(1)) for count in counts]
+    parts = [[len(log.times) for log in part] for part in odometry_of_stored.together(logs)]
+    assert [count for part in parts for count in part] == counts
     assert max(len(part) * max(part) for part in parts) <= 1000
     assert [len(part) for part in parts] == [2, 1, 100, 100]
 
@@ -239,12 +257,12 @@ def test_rows_that_interleave_are_read_whole(tmp_path: Path) -> None:
     file = tmp_path / "saved" / "wheels.parquet"
     pl.read_parquet(file).sort("t", maintain_order=True).write_parquet(file)
     mixed = load_dataset(tmp_path / "saved", most_in_memory=0)
-    assert isinstance(mixed.trajectories[0].times, np.ndarray)
+    assert mixed.trajectories[0].samples.held
     assert mixed.hash == before
 
 
 def test_a_faulty_row_far_into_the_file_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stored_wheels, "_ROWS", 50)
+    monkeypatch.setattr(stored_samples, "_ROWS", 50)
     save_dataset(recorded(), tmp_path / "saved")
     file = tmp_path / "saved" / "wheels.parquet"
     table = pl.read_parquet(file)
@@ -259,21 +277,25 @@ def test_a_file_that_changes_under_the_data_set_is_not_read_on(tmp_path: Path) -
     stored = load_dataset(tmp_path / "saved", most_in_memory=0)
     file = tmp_path / "saved" / "wheels.parquet"
     os.utime(file, (1, 1))
-    pickled = pickle.loads(pickle.dumps(stored.trajectories[5]))  # another process has no block in memory
+    read_block.cache_clear()  # another process has no block in memory
+    pickled = pickle.loads(pickle.dumps(stored.trajectories[5]))
     with pytest.raises(DataError, match="the file has changed"):
-        pickled.rates.file.read(pickled.rates.columns, 0)
+        _ = pickled.rates
 
 
 @dataclass
 class Sampled:
     """A run of which only the times matter."""
 
-    times: np.ndarray
+    samples: Samples
+
+    def __init__(self, times: np.ndarray) -> None:
+        self.samples = Samples({"times": times})
 
 
 def test_the_usual_period_of_many_samples_is_that_of_the_run_in_their_middle(monkeypatch: pytest.MonkeyPatch) -> None:
     runs = [Sampled(np.arange(1, 1 + count) * period) for count, period in ((400, 0.1), (900, 0.01), (600, 0.02))]
-    monkeypatch.setattr(periods, "MOST_IN_MEMORY", 0)
+    monkeypatch.setattr(stored_samples, "MOST_IN_MEMORY", 0)
     assert median_period(runs) == pytest.approx(0.02)
     assert median_period([*runs, Sampled(np.array([5.0, 99.0]))]) == pytest.approx(0.02)
 
@@ -283,8 +305,8 @@ def test_some_runs_are_drawn_always_the_same_and_into_memory(folder: Path) -> No
     some = drawn_runs(runs, most=1840)
     assert len(some) == 23
     assert [run.id for run in some] == [run.id for run in drawn_runs(runs, most=1840)]
-    assert all(isinstance(run.rates, np.ndarray) and run.rates.base is None for run in some)
-    assert list(runs) == drawn_runs(runs, most=10**6)
+    assert all(run.samples.held for run in some)
+    assert [run.id for run in runs] == [run.id for run in drawn_runs(runs, most=10**6)]
     rare = [replace(run, command="rare" if number in (9, 31) else "usual") for number, run in enumerate(runs)]
     assert {"run-9", "run-31"} <= {run.id for run in drawn_runs(rare, most=1)}
-    assert in_memory(runs[0]).fingerprint == runs[0].fingerprint
+    assert some[0].fingerprint == next(run for run in runs if run.id == some[0].id).fingerprint

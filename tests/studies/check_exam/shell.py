@@ -72,8 +72,8 @@ def _served(words: list[str], folder: Path, files: list[Path]) -> int:
 
 def serve() -> None:
     """Run each command line of standard input in a child of its own, and print the status with which it ended."""
+    import omnibench.check.check
     import omnibench.cli.app
-    import omnibench.fit.check.checking
     from omnibench.__main__ import main
 
     assert omnibench.cli.app

@@ -23,6 +23,7 @@ from check_exam.writing import Source, read_dataset, write
 _WORDS = re.compile(
     r"\b(drive|record|repeat|turn|log|track|measure|check|leave|look|name|connect|another)", re.IGNORECASE
 )
+_OPTION = re.compile(r"[a-z_]+=")
 _FEWEST, _MOST = 8, 14  # runs of a case
 UNTOUCHED = "untouched"
 
@@ -41,6 +42,7 @@ class Result:
     fixed: bool | None = None
     reason: str = ""
     fix: str = ""
+    line: str = ""
     verdict: str = ""
     findings: list[dict[str, str]] = field(default_factory=list)
     beside: list[str] = field(default_factory=list)
@@ -117,7 +119,7 @@ def _checked(result: Result, source: str, options: tuple[str, ...], folder: Path
     result.command = result.command or command
     answer = typed(command, folder)
     content: Any = None
-    if answer.status == 0:
+    if answer.status in (0, 1):  # ready; fix, or record more
         try:
             content = json.loads(answer.output)
         except json.JSONDecodeError:
@@ -127,6 +129,7 @@ def _checked(result: Result, source: str, options: tuple[str, ...], folder: Path
         result.reason = f"{command} ended with {answer.status}: {answer.errors.strip()[-400:]}"
         return None
     findings = [Finding.of(each) for each in content["findings"]]
+    result.line = str(content["command"])
     if not result.findings and not result.verdict:
         result.verdict = str(content["verdict"])
         result.findings = [asdict(finding) for finding in findings]
@@ -154,8 +157,8 @@ def _judge(result: Result, damage: Damage, source: Source) -> None:
     result.fix = finding.fix
     if way == "none":
         result.fixed = _imports(result, damage, source)
-    elif finding.fix.startswith("omnibench "):
-        result.fixed = _works(result, damage, source, finding.fix, right)
+    elif _OPTION.match(finding.fix):
+        result.fixed = _works(result, damage, source, _typed(result.line, finding.fix, source), right)
     elif way == "typed":
         result.fixed, result.reason = False, f"the fix cannot be typed: {finding.fix!r}"
     else:
@@ -171,6 +174,19 @@ def _imports(result: Result, damage: Damage, source: Source) -> bool:
     options = ["--set" if word == "--robot" else word for word in options]
     command = shlex.join(["omnibench", "import", "csv", source.name, "-o", "mended", *options])
     return _sound_import(result, damage, source, command) is not None
+
+
+def _typed(line: str, fix: str, source: Source) -> str:
+    """The line to type for a fix: the one of all fixes, or the import with this one, which is no error's."""
+    if fix.partition(" --set ")[0].partition("=")[0] in line:
+        return line
+    if source.name == "csv" or not line:
+        words = ["--set" if word == "--robot" else word for word in source.options]
+        words = [f"robot={word}" if word == "robot.yaml" else word for word in words]
+        options = [option for each in fix.split(" --set ") for option in ("--set", each)]
+        form = "dataset" if (source.folder / source.name / "dataset.yaml").is_file() else "csv"
+        return shlex.join(["omnibench", "import", form, source.name, "-o", "mended", *words, *options])
+    return f"{line} --set {shlex.quote(fix)}"
 
 
 def _works(result: Result, damage: Damage, source: Source, fix: str, right: set[str]) -> bool:

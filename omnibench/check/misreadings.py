@@ -1,0 +1,362 @@
+"""Search for the mistakes, in the log or in the robot's file, that bring the motion nearest to the robot's design.
+
+Where reference poses are dense, every hypothesis has the score
+
+    d^2 + costs of its mistakes + n log(residual) + n log(contradiction),                           (1)
+
+d^2 being the distance of the fitted matrix from the design (motion_fit.py); the residual of the fit tells readings by
+which the windows contradict each other, and the share of the signals that no motion gives those by which the wheels do.
+Where poses are sparse, the design's odometry is compared with them at a few moments of each run.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnibench.check.hypotheses import (
+    Hypothesis,
+    design_hypotheses,
+    headings_in_degrees,
+    position_units,
+    reference_hypotheses,
+    steering_readings,
+    steering_scales,
+    steering_transforms,
+    turned_reference,
+    wheel_hypotheses,
+)
+from omnibench.check.motion_fit import DesignDistance, FreeFit, Windows, continuous, transformed
+from omnibench.data.finding import Finding
+from omnibench.robot.kinematics import Array, Robot, wrapped
+from omnibench.robot.odometry import OdometryBatch, WheelLog
+
+# d^2 from which on a recording is suspicious, share of it that may remain, and score by which an explanation must be
+# better (chosen: untouched recordings have 3.6 at most, a wheel counted 1.5 times too much adds 16 or more).
+_SUSPICIOUS, _REMAINS, _BETTER = 7.0, 0.6, 4.0
+# Contradiction from which on a recording is suspicious, and what slip and designs make of it: chosen, OptiOdom's
+# mecanum base has 0.03.
+_CONTRADICTING, _USUAL = 0.1, 0.04
+_BADLY = 0.25  # share of the motion that no matrix explains, from which on a recording is suspicious; usual: 0.08
+_MOST_WEIGHED, _CORRELATED = 60.0, 4.0  # n of Eq. (1) at most, and windows that tell as much as one; chosen
+# Share of the way and of the turns that is left where wheels and reference have nothing in common; chosen.
+UNRELATED = 0.5
+_SIMPLE = 4.5  # cost of wheels' mistakes that are looked for beside one of the reference
+_IN_DEGREES = 8.0  # cost of headings in degrees; less where a run begins beyond a whole turn
+_TURN = 2 * math.pi
+_ALIKE, _SAME = 3.0, 0.5  # scores nearer than this are told as a class; and without their costs; chosen
+_MOST_SAMPLES = 60_000  # of the runs that are looked at; chosen: half a second
+# Of sparse poses: misfits of the odometry from which on a recording is suspicious, and steering is; share of it
+# that may remain; runs and stamps of each that are compared at most (chosen: errors of calibration, slip and noise stay
+# below).
+_LEAST_FACTOR, _AS_GOOD = 1.8, 1.1  # least factor of rates; and misfits that are as good as the best; chosen
+_MISFIT, _LEAST_MISFIT, _EXPLAINED, _MOST_RUNS, _MOST_STAMPS = 0.15, 0.05, 0.35, 24, 300
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """Runs of a robot: logs, and reference poses (K, 3) at their stamps; and these poses as they were read."""
+
+    robot: Robot
+    logs: Sequence[WheelLog]
+    poses: Sequence[Array]
+    as_read: Sequence[Array] = ()
+
+    def some(self) -> Recorded:
+        """Runs from first to last that are looked at, all if they are few or short; with continuous headings."""
+        samples = sum(len(log.times) for log in self.logs)
+        every = max(1, math.ceil(samples / _MOST_SAMPLES)) if len(self.logs) > 3 else 1
+        logs, as_read = self.logs[::every], self.poses[::every]
+        poses = [continuous(log.stamps, of_run) for log, of_run in zip(logs, as_read, strict=True)]
+        return Recorded(self.robot, logs, poses, as_read)
+
+    def fit(self) -> FreeFit | None:
+        """The matrix that fits freely; None where poses are too sparse."""
+        windows = Windows.of(self.logs, self.poses)
+        return None if windows is None else windows.fit(self.robot.reach)
+
+    def with_headings(self, factor: float) -> Recorded:
+        """With headings times a factor."""
+        return replace(self, poses=[poses * (1.0, 1.0, factor) for poses in self.poses])
+
+    def in_degrees(self) -> Recorded:
+        """With headings that were recorded in degrees."""
+        headings = [np.radians(np.unwrap(poses[:, 2], period=360.0)) for poses in self.as_read or self.poses]
+        return replace(
+            self,
+            poses=[
+                np.column_stack([of_run[:, :2], turned]) for of_run, turned in zip(self.poses, headings, strict=True)
+            ],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Explained:
+    """The best hypothesis: its mistakes, those that fit about as well, and d^2 as recorded.
+
+    searched: False where the wheels stand. unexplained: share of the way or of the turns, whichever is less, that no
+    matrix explains if it is read so. far: the recording is far from the design, and no hypothesis explains it.
+    """
+
+    mistakes: tuple[Finding, ...] = ()
+    alike: tuple[tuple[Finding, ...], ...] = ()
+    distance: float = 0.0
+    searched: bool = True
+    unexplained: float = 0.0
+    far: bool = False
+    fit: FreeFit | None = field(default=None, repr=False)
+
+
+@dataclass(frozen=True, eq=False)
+class _Base:
+    """A fit, the mistakes under which it was made, and their cost. flipped: with headings of the other sign."""
+
+    fit: FreeFit
+    mistakes: tuple[Finding, ...] = ()
+    cost: float = 0.0
+    flipped: bool = False
+    plain: bool = False  # no other hypotheses are tried with it
+
+
+@dataclass(frozen=True, eq=False)
+class _Scored:
+    score: float
+    cost: float
+    distance: float
+    contradiction: float
+    left: float
+    mistakes: tuple[Finding, ...]
+
+
+def search(recording: Recorded) -> Explained:
+    """The mistakes that explain a recording best; none if its matrix is near enough to the design."""
+    some = recording.some()
+    fit = some.fit()
+    if fit is None:
+        return _search_sparse(recording)
+    if not fit.gram.any():  # the wheels stand
+        return Explained(searched=False)
+    far = DesignDistance(recording.robot)
+    distance = far.of(fit)
+    contradiction = float(far.contradictions(fit.gram, np.eye(len(fit.gram))[None])[0])
+    if distance < _SUSPICIOUS and contradiction < _CONTRADICTING and fit.share < _BADLY:
+        return Explained(distance=distance, fit=fit)
+    scored = sorted(_scores(some, fit), key=lambda each: each.score)
+    best, present = scored[0], next(each for each in scored if not each.mistakes)
+    # Hardly anything remains of what made the recording suspicious.
+    likely = (
+        best.score <= present.score - _BETTER
+        and best.left < UNRELATED
+        and best.distance <= max(_REMAINS * present.distance, _SUSPICIOUS)
+        and best.contradiction <= max(_REMAINS * present.contradiction, _CONTRADICTING)
+    )
+    if not best.mistakes or not likely:
+        unexplained = distance >= _SUSPICIOUS or contradiction >= _CONTRADICTING
+        return Explained(distance=distance, unexplained=present.left, far=unexplained, fit=fit)
+    kinds = {mistake.kind for mistake in best.mistakes}
+    alike: dict[frozenset[str], tuple[Finding, ...]] = {}
+    for other in scored[1:]:
+        others = frozenset(mistake.kind for mistake in other.mistakes)
+        near = other.score < best.score + _ALIKE or other.score - other.cost < best.score - best.cost + _SAME
+        if near and others != kinds and len(other.mistakes) <= len(best.mistakes):
+            alike.setdefault(others, other.mistakes)
+    return Explained(best.mistakes, tuple(alike.values()), distance, unexplained=best.left, fit=fit)
+
+
+def _scores(recording: Recorded, fit: FreeFit) -> Iterator[_Scored]:
+    weight = min(fit.windows / _CORRELATED, _MOST_WEIGHED)
+    wheels = [*wheel_hypotheses(recording.robot), *steering_transforms(recording.robot)]
+    present = DesignDistance(recording.robot)
+    for base in _bases(recording, fit):
+        cost, left = base.cost + weight * math.log(max(base.fit.share, 1e-9)), float(base.fit.left.min())
+        for robot, hypotheses in _combined(recording.robot, base, wheels):
+            far = present if robot is None else DesignDistance(robot)
+            rows, columns = (np.array([getattr(each, name) for each in hypotheses]) for name in ("rows", "columns"))
+            squared = far.squared(*transformed(base.fit, rows, columns))
+            against = far.contradictions(base.fit.gram, columns)
+            scores = cost + squared + weight * np.log(np.hypot(against, _USUAL))
+            numbers = zip(hypotheses, scores.tolist(), squared.tolist(), against.tolist(), strict=True)
+            for hypothesis, score, distance, share in numbers:
+                mistakes = (*base.mistakes, *hypothesis.mistakes)
+                every = base.cost + hypothesis.cost
+                yield _Scored(score + hypothesis.cost, every, distance, share, left, mistakes)
+
+
+def _combined(
+    robot: Robot, base: _Base, wheels: Sequence[Hypothesis]
+) -> Iterator[tuple[Robot | None, list[Hypothesis]]]:
+    """Mistakes of the wheels, and of the reference or the robot's file with those, by the design that is meant.
+
+    Never more than three are made at once.
+    """
+    simple = [wheel for wheel in wheels if wheel.cost <= _SIMPLE]
+    if not base.flipped:
+        yield None, list(wheels)
+        if base.plain:
+            return
+        for unit in position_units():
+            yield None, [wheel.with_reference(unit) for wheel in simple]
+        turned = [
+            wheel.with_reference(reference)
+            for wheel in simple
+            if not wheel.mistakes or wheel.mistakes[0].kind != "wheels_swapped"
+            if (reference := turned_reference(robot, base.fit, wheel.columns)) is not None
+        ]
+        if turned:
+            yield None, turned
+        for hypothesis in () if base.mistakes else design_hypotheses(robot, base.fit):
+            yield hypothesis.robot, [hypothesis]
+    for mirrored in reference_hypotheses(base.flipped):
+        yield None, [wheel.with_reference(mirrored) for wheel in simple]
+
+
+def _bases(recording: Recorded, fit: FreeFit) -> Iterator[_Base]:
+    yield _Base(fit)
+    flipped = recording.with_headings(-1.0).fit()
+    if flipped is not None:
+        yield _Base(flipped, flipped=True)
+    # Headings in rad hardly begin beyond a whole turn.
+    beyond = any(abs(float(poses[0, 2])) > 1.01 * _TURN for poses in recording.poses)
+    degrees, cost = recording.in_degrees(), 0.0 if beyond else _IN_DEGREES
+    read_as: list[tuple[Recorded, tuple[Finding, ...], float]] = [(recording, (), 0.0)]
+    for factor in (1.0, -1.0):
+        base = degrees.with_headings(factor).fit()
+        if base is not None:
+            yield _Base(base, (headings_in_degrees(),), cost, flipped=factor < 0)
+            if factor > 0 and (beyond or base.left[1] < fit.left[1] / 2):
+                read_as.append((degrees, (headings_in_degrees(),), cost))
+    for read, mistakes, more in read_as:
+        for hypothesis in steering_readings(read.robot, read.logs, read.poses):
+            assert hypothesis.reading is not None  # each has one
+            base = replace(read, logs=[hypothesis.reading.of(log) for log in read.logs]).fit()
+            if base is not None:
+                yield _Base(base, (*mistakes, *hypothesis.mistakes), more + hypothesis.cost, plain=True)
+
+
+def _search_sparse(recording: Recorded) -> Explained:
+    """The mistakes that explain sparse poses best, by the misfit of the design's odometry to them."""
+    if not any(log.rates.any() for log in recording.logs):
+        return Explained(searched=False)
+    moments, hypotheses = _Moments.of(recording), list(_sparse_hypotheses(recording.robot))
+    scored = []
+    for radian, headings in ((1.0, ()), (math.pi / 180, (headings_in_degrees(),))):
+        for hypothesis, misfit in zip(hypotheses, moments.misfits(hypotheses, radian).tolist(), strict=True):
+            scored.append((misfit, hypothesis.cost, (*headings, *hypothesis.mistakes)))
+    present = scored[0][0]
+    if not present > _LEAST_MISFIT:  # nan: it hardly moved
+        return Explained(_contradicting(recording))
+    for hypothesis in steering_scales(recording.robot):
+        assert hypothesis.reading is not None  # each has one
+        read = _Moments.of(replace(recording, logs=[hypothesis.reading.of(log) for log in recording.logs]))
+        scored.append((float(read.misfits([hypotheses[0]])[0]), hypothesis.cost, hypothesis.mistakes))
+    # The simplest of those that fit about as well as the best one.
+    if present <= _MISFIT:  # as far as another design goes, but for steering
+        scored = [each for each in scored if all(mistake.kind.startswith("steering") for mistake in each[2])]
+    least = np.nanmin([misfit for misfit, _, _ in scored])
+    near = [each for each in scored if each[0] <= _AS_GOOD * least + _MISFIT / 4]
+    misfit, _, mistakes = min(near, key=lambda each: (len(each[2]), each[1], each[0]))
+    explained = bool(mistakes) and misfit < _EXPLAINED * present
+    return Explained(mistakes if explained else (), far=not explained and present > _MISFIT)
+
+
+def _contradicting(recording: Recorded) -> tuple[Finding, ...]:
+    """The mistake of one steered wheel without which the wheels agree about the motion; empty if there is none."""
+    hypotheses = list(steering_transforms(recording.robot))
+    if max(recording.robot.drive.pairs, default=-1) < 1 or not hypotheses:
+        return ()
+    signals = np.concatenate([log.signals for log in recording.logs])
+    lengths = np.concatenate([np.diff(log.times, prepend=0.0) for log in recording.logs])
+    gram = (signals.T * lengths) @ signals
+    far, columns = DesignDistance(recording.robot), np.array([each.columns for each in hypotheses])
+    present, shares = far.contradictions(gram, np.eye(len(gram))[None])[0], far.contradictions(gram, columns)
+    best = int(shares.argmin())
+    told = present > _CONTRADICTING / 3 and shares[best] < _EXPLAINED * present
+    return hypotheses[best].mistakes if told else ()
+
+
+def _sparse_hypotheses(robot: Robot) -> Iterator[Hypothesis]:
+    """Mistakes of the wheels, one of them or none, each with every unit of the positions."""
+    wheels = [each for each in (*wheel_hypotheses(robot), *steering_transforms(robot)) if not _near_one(each)]
+    plain = wheels[0]
+    yield from wheels
+    for unit in position_units():
+        yield from (wheel.with_reference(unit) for wheel in wheels if wheel is plain or _is_unit(wheel))
+
+
+def _near_one(hypothesis: Hypothesis) -> bool:
+    """True for a factor of rates that is what a calibration is for: sparse poses do not tell it from another design."""
+    factors = [factor for mistake in hypothesis.mistakes for factor in mistake.changes.get("rate_factors", ())]
+    return bool(factors) and all(1 / _LEAST_FACTOR < factor < _LEAST_FACTOR for factor in factors)
+
+
+def _is_unit(hypothesis: Hypothesis) -> bool:
+    return hypothesis.mistakes[0].kind == "wheel_unit"
+
+
+@dataclass(frozen=True, eq=False)
+class _Moments:
+    """Some runs, at moments between which the robot turns by a radian: path since the start, turn since the last one.
+
+    odometry: of the logs at these moments. path (S,): complex, m. turns (S,): rad. first (S,): True for the first
+    moment of a run.
+    """
+
+    robot: Robot
+    odometry: OdometryBatch
+    poses: Array
+    starts: Array
+    first: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, recording: Recorded) -> _Moments:
+        """The moments of some runs from first to last."""
+        chosen = np.unique(
+            np.linspace(0, len(recording.logs) - 1, min(len(recording.logs), _MOST_RUNS)).round().astype(int)
+        )
+        logs, poses = [], []
+        row_3 = recording.robot.inverse_kinematic_matrix[2]
+        for index in chosen.tolist():
+            log, of_run = recording.logs[index], recording.poses[index]
+            turned = np.cumsum((log.signals @ row_3) * np.diff(log.times, prepend=0.0))
+            headings = np.interp(log.stamps, np.append(0.0, log.times), np.append(0.0, turned))
+            numbers = np.floor(np.abs(headings - headings[0])).astype(int)
+            seen = np.unique([*np.flatnonzero(np.diff(numbers, prepend=0))[:_MOST_STAMPS], len(headings) - 1])
+            logs.append(replace(log, start=np.zeros(3), stamps=log.stamps[seen]))
+            poses.append(np.vstack([of_run[:1], of_run[seen]]))
+        odometry = OdometryBatch(logs, "arc")
+        starts = np.array([of_run[0] for of_run in poses])[odometry.trajectory]
+        first = np.diff(odometry.trajectory, prepend=-1) > 0
+        return cls(recording.robot, odometry, np.concatenate([of_run[1:] for of_run in poses]), starts, first)
+
+    def misfits(self, hypotheses: Sequence[Hypothesis], radian: float = 1.0) -> Array:
+        """Misfits (P,) of the design to the poses under hypotheses, from 0 (exact) to 1 (unrelated).
+
+        radian: unit of the recorded headings. NaN where the robot hardly moved: at rest it fits any matrix.
+        """
+        design, columns = self.robot.inverse_kinematic_matrix, np.array([each.columns for each in hypotheses])
+        odometry = self.odometry.poses(design @ np.linalg.inv(columns))
+        metres = np.array([each.rows[0, 0] for each in hypotheses])[:, None]
+        moved = self.poses - self.starts
+        path = metres * (moved[:, 0] + 1j * moved[:, 1]) * np.exp(-1j * radian * self.starts[:, 2])
+        driven = odometry[..., 0] + 1j * odometry[..., 1]
+        turned = self._turns(odometry[..., 2])
+        # Whole turns between two moments do not show in the headings, and are no reason for a larger error.
+        missed = wrapped(turned - self._turns(radian * moved[:, 2]))
+        lengths = (np.abs(driven) + np.abs(path)).sum(axis=1)
+        told = np.minimum(np.abs(turned), _TURN)
+        angles = (told + np.minimum(np.abs(turned - missed), _TURN)).sum(axis=1)
+        # Noise and slip may amount to a radian and the robot's size at every moment, and to more while it turns.
+        count, rims, size = len(moved), told.sum(axis=1), self.robot.reach
+        position = np.abs(driven - path).sum(axis=1) / (lengths + size * (rims + count))
+        heading = np.abs(missed).sum(axis=1) / (angles + count)
+        runs = int(self.first.sum())
+        return np.where((lengths < runs * size) & (angles < runs), np.nan, np.maximum(position, heading))
+
+    def _turns(self, headings: Array) -> Array:
+        """Turns (..., S) since the moment before from headings since the start."""
+        turns: Array = headings - np.where(self.first, 0.0, np.roll(headings, 1, axis=-1))
+        return turns

@@ -1,0 +1,286 @@
+"""The matrix that fits a recording best, whatever the design says, and its distance from a design.
+
+The matrix is fitted freely, by linear least squares. Between reference poses at t_i and t_j about a second apart, with
+C (M) the integrals of the drive signals, p = x + iy and theta the reference's position and heading,
+
+    theta_j - theta_i = k3 . (C_j - C_i),                                                           (1)
+    exp(-i theta_i) (p_j - p_i) = (k1 + i k2) . sum over samples of exp(i (theta - theta_i)) dC.    (2)
+
+Both are linear in the matrix with rows k1, k2, k3. Headings between two poses lie on straight lines.
+
+Its distance from a design is counted in what designs, tyres and floors may be off. With k the elements of a fitted
+matrix K (3, M) and k0 the design's, the distance is
+
+    d^2 = (k - k0)^T (V + S)^-1 (k - k0),                                                           (3)
+
+V being the covariance of the fit and S that of real robots about their designs: a radius and a gain of every row, the
+yaw and place of the tracked point, and small errors of all elements. Directions that are not driven have a huge V and
+add nothing, so that no mistake is claimed of what the recording does not show. Over OptiOdom's four robots, a Robotino
+and simulated ones d^2 is at most 3.9, in whole sets and single sessions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnibench.robot.kinematics import Array, Robot, interpolated
+from omnibench.robot.odometry import Complex, WheelLog
+
+_WINDOW = 1.0  # s between two poses: long beside their noise, short beside the drift of headings; chosen
+_LONGEST = 3.0  # s: a longer window turns too far for straight lines between its poses; chosen
+_DENSE = 0.6  # s between poses, in which no robot of this kind turns by half a turn; chosen
+_STEP = 0.1  # s: samples are taken together up to here, which windows of a second hardly show; chosen
+_HUBER = 1.5  # standard deviations from which on a residual counts less
+_REWEIGHTED = 5  # rounds of reweighted least squares; outliers are found in three
+# Slip of the strongest motion that may pass for motion along a weakly driven direction, as a share; of mecanum and
+# skid-steered robots it is the largest; chosen.
+_SLIP = 0.03
+# Share of the largest singular value of the wheel angles: a direction with less is noise, and its part of the matrix
+# stays 0; a wheel that slips nowhere leaves 0.003 along the direction in which it would have to slip.
+_NULL = 5e-3
+_CORRELATED_WINDOWS = 4.0  # windows that tell as much as one, since slip lasts; chosen
+_FEWEST = 8  # windows for each column of the matrix, below which it is not told; chosen
+
+
+@dataclass(frozen=True, eq=False)
+class FreeFit:
+    """The matrix that fits a recording best.
+
+    matrix (3, M): m, m and rad per rad. covariance (3, M, M): of each row. left (2,): share of position and heading
+    that the wheels do not explain, robust; share: of both together, a turn counting at the robot's size. windows: their
+    number. gram (M, M): sum of products of the driven signals,
+    rad^2.
+    """
+
+    matrix: Array
+    covariance: Array
+    left: Array
+    share: float
+    windows: int
+    gram: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """Windows of all runs together: driven (W, M), bent (W, M) as in Eq. (2), turned (W,), rad, moved (W,), m.
+
+    run (W,): index of the run. times (W, 2): stamps of both poses, s.
+    """
+
+    driven: Array
+    bent: Complex
+    turned: Array
+    moved: Complex
+    run: NDArray[np.intp]
+    times: Array
+
+    @classmethod
+    def of(cls, logs: Sequence[WheelLog], poses: Sequence[Array], length: float = _WINDOW) -> Windows | None:
+        """The windows of logs with the reference's poses (K, 3) at their stamps; None if its poses are too sparse.
+
+        length: s between two poses, at least.
+        """
+        pairs = enumerate(zip(logs, poses, strict=True))
+        parts = [part for run, pair in pairs if (part := _of_run(run, *pair, length))]
+        if not parts:
+            return None
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
+
+    def fit(self, reach: float) -> FreeFit | None:
+        """The free fit; None if there are too few windows. reach: size of the robot, m."""
+        count, columns = self.driven.shape
+        if count < _FEWEST * columns:
+            return None
+        heading, heading_weights = _robust(self.driven.astype(complex), self.turned.astype(complex))
+        position, position_weights = _robust(self.bent, self.moved)
+        left = np.array(
+            [
+                _unexplained(self.moved, self.bent @ position, position_weights),
+                _unexplained(self.turned, self.driven @ heading.real, heading_weights),
+            ]
+        )
+        # Slip of the wheels as a covariance (M, M) of the matrix, as a share of a row's scale squared.
+        _, strengths, directions = np.linalg.svd(self.driven, full_matrices=False)
+        shares = np.maximum(strengths / max(float(strengths[0]), 1e-300), 1e-4)
+        slip: Array = (directions.T * (_SLIP / shares) ** 2) @ directions
+        rows = [
+            _covariance(self.bent, self.moved - self.bent @ position, position_weights) / 2,
+            _covariance(self.bent, self.moved - self.bent @ position, position_weights) / 2,
+            _covariance(self.driven.astype(complex), self.turned - self.driven @ heading, heading_weights),
+        ]
+        matrix = np.array([position.real, position.imag, heading.real])
+        scales = np.maximum(np.abs(matrix).max(axis=1), 1e-12)
+        scales[:2] = scales[:2].max()
+        covariance = np.array([row + (scale**2) * slip for row, scale in zip(rows, scales, strict=True)])
+        wholes = [float(position_weights @ np.abs(self.moved) ** 2), reach**2 * float(heading_weights @ self.turned**2)]
+        share = float(np.sqrt((left**2) @ wholes / max(sum(wholes), 1e-300)))
+        return FreeFit(matrix, covariance, left, share, count, self.driven.T @ self.driven)
+
+
+def continuous(stamps: Array, poses: Array) -> Array:
+    """Poses (K, 3) at stamps (K,) with steps of the heading of less than half a turn, where poses are near each other.
+
+    A data set has the steps that its wheels tell, which are whole turns off where these are misread.
+    """
+    if len(stamps) < 2 or float(np.median(np.diff(stamps))) > _DENSE:
+        return poses
+    return np.column_stack([poses[:, :2], np.unwrap(poses[:, 2])])
+
+
+def _of_run(run: int, log: WheelLog, poses: Array, length: float) -> Windows | None:
+    stamps = log.stamps
+    if len(stamps) < 3:
+        return None
+    period = float(np.median(np.diff(stamps)))
+    apart = max(length, period)
+    if apart > _LONGEST:
+        return None
+    # Stamps that are ``apart``, s, or a little more.
+    numbers = np.floor((stamps - stamps[0]) / apart + 1e-9)
+    chosen = np.flatnonzero(np.diff(numbers, prepend=-1.0))
+    first, last = chosen[:-1], chosen[1:]
+    near = stamps[last] - stamps[first] < 1.5 * apart + period
+    first, last = first[near], last[near]
+    if not len(first):
+        return None
+    edges = np.append(0.0, log.times)
+    counted = np.vstack([np.zeros(log.signals.shape[1]), np.cumsum(log.signals * np.diff(edges)[:, None], axis=0)])
+    begins, ends = stamps[first], stamps[last]
+    # Bounds of the steps of all windows: a grid of _STEP within each, so that every run is a few array operations.
+    steps = max(1, int(np.ceil(apart / _STEP)))
+    grid = begins[:, None] + (ends - begins)[:, None] * np.linspace(0, 1, steps + 1)
+    at = interpolated(grid.ravel(), edges, counted).reshape(*grid.shape, -1)
+    pieces = np.diff(at, axis=1)  # (W, steps, M)
+    middles = (grid[:, 1:] + grid[:, :-1]) / 2
+    headings = np.interp(middles, stamps, poses[:, 2]) - poses[first, 2][:, None]
+    bent: Complex = np.einsum("ws,wsm->wm", np.exp(1j * headings), pieces)
+    path = poses[:, 0] + 1j * poses[:, 1]
+    moved: Complex = (path[last] - path[first]) * np.exp(-1j * poses[first, 2])
+    return Windows(
+        at[:, -1] - at[:, 0],
+        bent,
+        poses[last, 2] - poses[first, 2],
+        moved,
+        np.full(len(first), run),
+        np.column_stack([begins, ends]),
+    )
+
+
+def _robust(columns: Complex, wanted: Complex) -> tuple[Complex, Array]:
+    """Least squares (M,) with Huber's weights (W,)."""
+    weights = np.ones(len(wanted))
+    for _ in range(_REWEIGHTED):
+        roots = np.sqrt(weights)
+        solution = np.linalg.lstsq(columns * roots[:, None], wanted * roots, rcond=_NULL)[0]
+        sizes = np.abs(wanted - columns @ solution)
+        deviation = 1.4826 * float(np.median(sizes))
+        if not deviation:
+            break
+        weights = np.minimum(1.0, _HUBER * deviation / np.maximum(sizes, 1e-300)) ** 2  # outliers hardly count
+    return solution.astype(np.complex128), weights
+
+
+def _unexplained(wanted: Array | Complex, fitted: Array | Complex, weights: Array) -> float:
+    """Share of what is wanted that a fit leaves."""
+    whole = float(weights @ np.abs(wanted) ** 2)
+    return float(np.sqrt(weights @ np.abs(wanted - fitted) ** 2 / whole)) if whole else 0.0
+
+
+def _covariance(columns: Complex, left: Array | Complex, weights: Array) -> Array:
+    """Covariance (M, M) of a fit's solution, huge along directions that are not driven."""
+    normal = ((columns.conj() * weights[:, None]).T @ columns).real
+    values, vectors = np.linalg.eigh(normal)
+    values = np.maximum(values, 1e-8 * max(float(values[-1]), 1e-300))
+    variance = _CORRELATED_WINDOWS * float(weights @ np.abs(left) ** 2) / max(float(weights.sum()), 1.0)
+    covariance: Array = (vectors / values) @ vectors.T * variance
+    return covariance
+
+
+# Standard deviations by which robots differ from their designs, as shares (chosen; OptiOdom's tricycle is 7 % off in
+# row 3, omni3's rows 1 and 2 by 10 %): radius of each wheel, gains of rows x, y and heading, each element.
+_RADIUS, _GAINS, _ELEMENT = 0.06, (0.05, 0.05, 0.12), 0.02
+_LATERAL = 0.2  # the gain of row y of mecanum wheels, which slip sideways; chosen
+_SKID = 0.5  # the gain of row 3 of a skid-steered robot, which turns 20 to 50 % less than its design
+_YAW = 0.035  # rad of the tracked point's heading; chosen, 2 degrees
+_PLACE = 0.1  # of the robot's size: standard deviation of the tracked point's x and y from the design; chosen
+
+
+class DesignDistance:
+    """Distances of fits from the design of one robot, Eq. (3)."""
+
+    def __init__(self, robot: Robot) -> None:
+        self.design = robot.inverse_kinematic_matrix
+        scales = robot.row_scales
+        self._outside = beyond_twists(robot)
+        self._units = np.repeat(1 / scales, self.design.shape[1])
+        self._allowed = _allowed(robot, scales) * np.outer(self._units, self._units)
+
+    def squared(self, matrices: Array, covariances: Array) -> Array:
+        """d^2 (P,) of matrices (P, 3, M) whose rows have covariances (P, 3, M, M)."""
+        count, _, columns = matrices.shape
+        whole = np.zeros((count, 3 * columns, 3 * columns))
+        for row in range(3):
+            block = slice(row * columns, (row + 1) * columns)
+            whole[:, block, block] = covariances[:, row]
+        off = (matrices - self.design).reshape(count, -1) * self._units
+        whole = whole * np.outer(self._units, self._units) + self._allowed
+        squared: Array = np.einsum("pi,pi->p", off, np.linalg.solve(whole, off[..., None])[..., 0])
+        return squared
+
+    def of(self, fit: FreeFit) -> float:
+        """d^2 of one fit."""
+        return float(self.squared(fit.matrix[None], fit.covariance[None])[0])
+
+    def contradictions(self, gram: Array, columns: Array) -> Array:
+        """Shares (P,) of the signals that no motion of the robot gives, by which its wheels contradict each other.
+
+        gram (M, M): sum of products of the signals as recorded. columns (P, M, M): from those meant to those recorded.
+        """
+        meant = np.linalg.inv(columns)
+        grams = meant @ gram @ np.swapaxes(meant, 1, 2)
+        whole = np.maximum(np.trace(grams, axis1=1, axis2=2), 1e-300)
+        outside = np.einsum("ij,pjk,ik->p", self._outside, grams, self._outside)
+        shares: Array = np.sqrt(np.maximum(outside, 0.0) / whole)
+        return shares
+
+
+def beyond_twists(robot: Robot) -> Array:
+    """The projection (M, M) that takes from drive signals those that a twist of the robot gives."""
+    equations = robot.signal_equations @ robot.allowed_basis
+    within, strengths, _ = np.linalg.svd(equations, full_matrices=False)
+    within = within[:, strengths > 1e-9 * strengths[0]]
+    outside: Array = np.eye(len(equations)) - within @ within.T
+    return np.where(np.abs(outside) < 1e-12, 0.0, outside)
+
+
+def _allowed(robot: Robot, scales: Array) -> Array:
+    """S (3M, 3M)."""
+    design = robot.inverse_kinematic_matrix
+    lateral = _LATERAL if any(wheel.kind == "mecanum" for wheel in robot.wheels) else _GAINS[1]
+    gains = (_GAINS[0], lateral, _SKID if robot.skid else _GAINS[2])
+    columns = range(design.shape[1])
+    changes = [_RADIUS * design * (np.arange(design.shape[1]) == column) for column in columns]
+    changes += [gain * design * (np.arange(3) == row)[:, None] for row, gain in enumerate(gains)]
+    changes.append(_YAW * np.array([-design[1], design[0], 0 * design[2]]))
+    zero = np.zeros_like(design[0])
+    changes += [_PLACE * robot.reach * np.array(rows) for rows in ([design[2], zero, zero], [zero, design[2], zero])]
+    flat = np.array(changes).reshape(len(changes), -1)
+    elements = np.repeat((_ELEMENT * scales) ** 2, design.shape[1])
+    allowed: Array = flat.T @ flat + np.diag(elements)
+    return allowed
+
+
+def transformed(fit: FreeFit, rows: Array, columns: Array) -> tuple[Array, Array]:
+    """Matrices (P, 3, M) and covariances (P, 3, M, M) of a fit for other readings of what was recorded.
+
+    rows (P, 3, 3): from a twist as recorded to the one meant. columns (P, M, M): from the signals that are meant to
+    those recorded.
+    """
+    matrices = rows @ fit.matrix @ columns
+    turned = np.einsum("pij,jkl->pikl", rows**2, fit.covariance)
+    covariances: Array = np.swapaxes(columns, 1, 2)[:, None] @ turned @ columns[:, None]
+    return matrices, covariances

@@ -1,0 +1,138 @@
+"""Motions that a recording lacks, and runs and repetitions that are too few, in words.
+
+A kind of motion is told by its twist; reports show those that were driven.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnibench.check.motion_fit import Windows
+from omnibench.data.dataset import Trajectory
+from omnibench.data.finding import Finding
+from omnibench.fit.evaluate import command_names
+from omnibench.fit.span import driven_span
+from omnibench.robot.kinematics import Array, Robot
+from omnibench.words import plural
+
+# Least share of the time in motion that counts as driven on purpose; chosen: about a second in a minute.
+SHARE = 0.02
+TURNING, _STRAIGHT = 0.06, 0.04  # rad/s from which on a robot turns, and up to which it goes straight; chosen
+MOVING = 0.02  # m/s from which on it moves; chosen
+_ON_THE_SPOT = 0.1  # way ahead, as a share of the wheels' way by turning, below which it turns on the spot; chosen
+_SECTOR = 30.0  # deg about an axis that count as along it; chosen
+_SLIDING = 0.35  # rad between two directions of motion that count as different; chosen
+_FEW_RUNS, _SOME_RUNS = 3, 7  # runs up to which no interval can be had, and few
+_LEAST_REPEATED = 2
+_SIDES = ("left", "right")
+
+Kinds = Mapping[str, NDArray[np.bool_]]
+"""Twists (n,) of each kind, True, by its name."""
+
+
+def motion_kinds(twists: Array, robot: Robot) -> Kinds:
+    """The kinds that a robot can drive, with those of twists (n, 3), m/s, m/s and rad/s, that are of each.
+
+    A twist is straight or turns, and goes forward, backward or sideways. A steered robot turns in curves alone.
+    """
+    speed, turn = np.hypot(twists[:, 0], twists[:, 1]), twists[:, 2]
+    moving, turns = speed > MOVING, np.abs(turn) > TURNING
+    spot = turns & (speed < _ON_THE_SPOT * robot.reach * np.abs(turn) + MOVING) & robot.drive.direct
+    angle = np.degrees(np.arctan2(twists[:, 1], twists[:, 0]))
+    sides = dict(zip(_SIDES, (turn > 0, turn < 0), strict=True))
+    kinds = {"straight": moving & (np.abs(turn) < _STRAIGHT)}
+    kinds |= {f"curves to the {side}": turns & ~spot & to_side for side, to_side in sides.items()}
+    if robot.drive.direct:
+        kinds |= {f"on the spot to the {side}": spot & to_side for side, to_side in sides.items()}
+    ahead = moving & ~spot
+    kinds |= {"forward": ahead & (np.abs(angle) <= _SECTOR), "backward": ahead & (np.abs(angle) >= 180 - _SECTOR)}
+    if len(robot.motions) == 3:
+        kinds |= {
+            "sideways to the left": ahead & (np.abs(angle - 90) <= _SECTOR),
+            "sideways to the right": ahead & (np.abs(angle + 90) <= _SECTOR),
+        }
+    return kinds
+
+
+def turning(kinds: Kinds, side: str) -> NDArray[np.bool_]:
+    """True (n,) for twists that turn to a side, left or right, in curves or on the spot."""
+    curves = kinds[f"curves to the {side}"]
+    return curves | kinds.get(f"on the spot to the {side}", np.zeros_like(curves))
+
+
+def missing_motions(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Finding]:
+    """Motions that a robot of this kind needs and that were not driven; none where the reference does not move."""
+    if not any(run.rates.any() for run in runs):
+        yield _missing("the robot never moved", "drive it, and see that the columns of the wheels are those that count")
+        return
+    windows = Windows.of([run.log(run.pose_times) for run in runs], [run.poses for run in runs])
+    if windows is None:
+        return
+    seconds = windows.times[:, 1] - windows.times[:, 0]
+    velocity, rates = windows.moved / seconds, windows.turned / seconds
+    kinds = motion_kinds(np.column_stack([velocity.real, velocity.imag, rates]), robot)
+    active = (np.abs(rates) > TURNING) | (np.abs(velocity) > MOVING)
+    if not active.any():
+        return
+    whole = float(seconds[active].sum())
+
+    def share(chosen: NDArray[np.bool_]) -> float:
+        return float(seconds[active & chosen].sum()) / whole
+
+    left, right = share(turning(kinds, "left")), share(turning(kinds, "right"))
+    if left < SHARE and right < SHARE:
+        yield _missing("the robot never turned", f"drive {_turns(robot)}, to either side")
+    elif min(left, right) < SHARE:
+        side = "left" if left < SHARE else "right"
+        yield _missing(f"the robot never turned {side}", f"drive {_turns(robot)}, to the {side}")
+    if share(kinds["straight"]) < SHARE:
+        yield _missing("the robot never went straight", "drive three straight lines of 2 m and more")
+    moved = windows.moved[np.abs(velocity) > MOVING]
+    if robot.slides and not robot.skid and len(moved):
+        # 1 if the robot moved along one line in its frame, 0 all round.
+        spread = abs(complex(np.sum(moved**2))) / float(np.sum(np.abs(moved) ** 2))
+        if spread >= math.cos(2 * _SLIDING):
+            yield _missing(
+                "the robot went in one direction only", "drive forward, and sideways to either side, 2 m each"
+            )
+    if robot.drive.direct and left >= SHARE and right >= SHARE and robot.slides:
+        spot = share(kinds["on the spot to the left"] | kinds["on the spot to the right"])
+        shares = driven_span(runs).shares
+        if spot < SHARE and shares[-1] < SHARE / 2 and len(shares) == 3:
+            yield _missing("the robot never turned on the spot", "drive three turns at 0.5 rad/s, to either side")
+
+
+def _missing(what: str, fix: str) -> Finding:
+    return Finding(kind="motion_missing", what=what, where="the recording", severity="warning", fix=fix)
+
+
+def _turns(robot: Robot) -> str:
+    return "three circles" if robot.drive.steered else "three turns on the spot at 0.5 rad/s"
+
+
+def too_few(runs: Sequence[Trajectory]) -> Iterator[Finding]:
+    """Runs or repetitions by which neither noise nor intervals can be had."""
+    count = len(runs)
+    if count <= _FEW_RUNS:
+        yield Finding(
+            kind="few_runs",
+            what=f"there {'is' if count == 1 else 'are'} only {plural(count, 'run')}: nothing is left to judge a "
+            "calibration by",
+            where="the recording",
+            severity="warning",
+            fix=f"record {_SOME_RUNS + 1} runs or more, of several commands",
+        )
+    repeated = max(Counter(command_names(runs)).values())
+    if repeated < _LEAST_REPEATED:
+        yield Finding(
+            kind="few_repetitions",
+            what="no command was driven twice: noise and errors of the model cannot be told apart",
+            where="the recording",
+            severity="warning",
+            fix="drive every command three times",
+        )

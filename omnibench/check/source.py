@@ -1,0 +1,401 @@
+"""A recording and the options by which it was read: read otherwise, and the one command that reads it so."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from glob import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from omnibench.check.hypotheses import mistake
+from omnibench.check.misreadings import Recorded
+from omnibench.config import as_yaml, validate
+from omnibench.data.dataset import Dataset
+from omnibench.data.finding import Finding
+from omnibench.data.importers.dataset_folder import DatasetOptions, recordings_of
+from omnibench.data.importing import importer_of, read_dataset
+from omnibench.data.recording import Recording, ReferenceOptions, quantity_of
+from omnibench.data.runs import dataset_of
+from omnibench.data.storage import dataset_folders, in_few_words, load_dataset
+from omnibench.data.stored import median_period
+from omnibench.errors import ConfigError, DataError
+from omnibench.files import check_source
+from omnibench.registry import importers
+
+_BAGS = (".mcap", ".bag", ".db3")
+_ANY_RATE = 1e9  # rad/s: the option ``fastest`` with which rates in any unit are read
+# Periods, s, of wheels and of poses that are more likely in another unit; chosen: no encoder is read less often.
+_SLOWEST, _SLOWEST_POSES, _FASTEST = 1.5, 5.0, 3e-4
+_TIME_UNITS = ("ms", "us", "ns")
+_EXPLAINED = 0.35  # share of the way that the wheels may leave unexplained with the right unit of time; chosen
+_RATES = {"rpm": 2 * np.pi / 60, "deg/s": np.pi / 180, "rev/s": 2 * np.pi}
+_COLUMNS = {"wheel_order": ("joints", "wheel_columns"), "steering_order": ("steering_joints", "steering_columns")}
+
+
+@dataclass(frozen=True, eq=False)
+class RecordingSource:
+    """A data set and how it was read.
+
+    importer, options: by which ``source`` is read again. folder: of the data set, where it is one. findings: those of
+    reading it. in_memory: ``source`` is only where the data set would be saved, whatever stands there. places: the
+    folders of a data set that are several.
+    """
+
+    dataset: Dataset
+    importer: str
+    source: Path
+    options: Mapping[str, Any]
+    folder: Path | None = None
+    findings: tuple[Finding, ...] = field(default=())
+    in_memory: bool = False
+    places: tuple[Path, ...] = ()
+
+    @property
+    def readable(self) -> bool:
+        """True if the source can be read again."""
+        return not self.in_memory and self.source.exists()
+
+    @cached_property
+    def reading(self) -> tuple[list[Recording], ReferenceOptions] | None:
+        """The recordings as their reader gives them, and the options; None if the source cannot be read again."""
+        if self.places:
+            return None
+        try:
+            return (
+                _recordings(self.importer, self.source, self.options) if self.readable else _of_runs(self.dataset, {})
+            )
+        except (DataError, ConfigError):
+            return None
+
+    def read_by(self, options: Mapping[str, Any]) -> Dataset | None:
+        """The data set by other options; None if it cannot be read by them."""
+        if self.reading is None:
+            return None
+        recordings, present = self.reading
+        changed = {key: value for key, value in options.items() if self.options.get(key) != value}
+        try:
+            read = validate(type(present), {**present.model_dump(exclude_unset=True), **changed}, "options")
+            return dataset_of([_as_said(recording, read, changed) for recording in recordings], read, [])
+        except (DataError, ConfigError):
+            return None
+
+    def columns(self, key: str) -> list[str]:
+        """Names in the source of the wheels' columns, or of the steering angles', in the robot's order."""
+        if self.reading is None:
+            return []
+        wheels = self.reading[0][0].wheels
+        return list(wheels.columns if key == "wheel_order" else wheels.steering_columns)
+
+
+def _recordings(name: str, source: Path, given: Mapping[str, Any]) -> tuple[list[Recording], ReferenceOptions]:
+    """The recordings of a source, and the options. DataError, ConfigError: it cannot be read."""
+    importer, again = importer_of(name, source, given)
+    if not again and isinstance(importer.options, ReferenceOptions) and hasattr(importer, "recordings"):
+        return importer.recordings(source, []), importer.options
+    return _of_runs(importer.read(source), again)
+
+
+def _of_runs(dataset: Dataset, given: Mapping[str, Any]) -> tuple[list[Recording], ReferenceOptions]:
+    """The runs of a data set as recordings."""
+    options = DatasetOptions(robot=dataset.robot, **given)
+    return recordings_of(dataset.trajectories, dataset.robot, None, options), options
+
+
+def _as_said(recording: Recording, options: ReferenceOptions, changed: Mapping[str, Any]) -> Recording:
+    """A recording whose wheels are read in another unit, where that is changed."""
+    if "wheel_unit" not in changed:
+        return recording
+    return replace(recording, wheels=replace(recording.wheels, unit=options.wheel_unit))
+
+
+def read_source(
+    source: Path | Sequence[Path],
+    form: str | None = None,
+    options: Mapping[str, Any] | None = None,
+    robot: Path | None = None,
+) -> RecordingSource:
+    """Read a data set folder, or several, or recordings with an importer, which is recognised unless it is given.
+
+    DataError or ConfigError in one line where it cannot be read.
+    """
+    settings = dict(options or {}) | ({"robot": str(robot)} if robot else {})
+    places = dataset_folders(source)
+    if len(places) > 1:
+        if form or settings:
+            raise ConfigError(
+                f"{places[0]} and {len(places) - 1} more: an importer reads one source; import each by itself"
+            )
+        return replace(of_dataset(load_dataset(places)), places=tuple(places))
+    (source,) = places
+    check_source(source)
+    name = form or recognised(source)
+    is_dataset = name == "dataset" and not settings
+    # Other units of time are tried where the source cannot be read, or makes no sense, in those given.
+    try:
+        dataset = load_dataset(source) if is_dataset else _read(name, source, settings)
+    except DataError:
+        if (mended := _by_other_times(name, source, settings)) is None:
+            raise
+    else:
+        mended = _by_other_times(name, source, settings) if odd_times(dataset) else None
+    if mended is not None:
+        return replace(mended, folder=source) if is_dataset else mended
+    return of_dataset(dataset, source) if is_dataset else RecordingSource(dataset, name, source, settings)
+
+
+def of_dataset(dataset: Dataset, folder: Path | None = None) -> RecordingSource:
+    """A data set with the source and options that it was imported with, where it knows them."""
+    place = folder or Path(dataset.name)
+    imported = dataset.imported
+    if imported is None or not Path(imported.source).exists():
+        return RecordingSource(dataset, "dataset", place, {}, place, in_memory=folder is None)
+    return RecordingSource(dataset, imported.importer, Path(imported.source), imported.options, place)
+
+
+def recognised(source: Path) -> str:
+    """The importer of a source, by its files. ConfigError: it is none that is known."""
+    if (source / "dataset.yaml").is_file():
+        return "dataset"
+    if source.is_file():
+        return "rosbag" if source.suffix in _BAGS else "csv"
+    if (source / "metadata.yaml").is_file() or any(source.glob("*.mcap")) or any(source.glob("*.bag")):
+        return "rosbag"
+    for pattern, name in (
+        ("command.csv", "table1"),
+        ("*_metadata.csv", "optiodom"),
+        ("*.csv", "csv"),
+        ("*.txt", "csv"),
+    ):
+        if next(source.rglob(pattern), None) is not None:
+            return name
+    raise ConfigError(f"{source}: no recording is recognised there; name the importer with --format (omnibench list)")
+
+
+def _by_other_times(name: str, source: Path, given: Mapping[str, Any]) -> RecordingSource | None:
+    """The source by the other units of time that make sense; None if none does."""
+    for finding in other_times(given):
+        try:
+            dataset = _read(name, source, {**given, **finding.changes})
+        except (DataError, ConfigError):
+            continue
+        if sensible(dataset):
+            return RecordingSource(dataset, name, source, given, findings=(finding,))
+    return None
+
+
+def _read(name: str, source: Path, given: Mapping[str, Any]) -> Dataset:
+    """The data set of a source, also if its rates are too fast for any wheel, which is what a check tells then."""
+    options = dict(given)
+    if "name" in importers.entry(name, "--format").options.model_fields:
+        options.setdefault("name", source.resolve().stem)
+    try:
+        dataset = _read_by(name, source, options)
+    except DataError as refusal:
+        if "fastest" in given:
+            raise
+        try:
+            dataset = _read_by(name, source, {**options, "fastest": _ANY_RATE})
+        except (DataError, ConfigError):
+            raise refusal from None
+    if not dataset.referenced:
+        raise DataError(
+            f"{source}: it has no reference poses; import it, which makes them from its scans, and check that"
+        )
+    return dataset
+
+
+def _read_by(name: str, source: Path, options: Mapping[str, Any]) -> Dataset:
+    importer, again = importer_of(name, source, options)
+    return read_dataset(importer, source, again)
+
+
+def sensible(dataset: Dataset) -> bool:
+    """True if the times of a data set are usual, and its wheels explain its motion."""
+    if odd_times(dataset):
+        return False
+    fit = recorded(dataset).fit()
+    return fit is not None and bool(fit.left[0] < _EXPLAINED)
+
+
+def recorded(dataset: Dataset) -> Recorded:
+    """The runs of a data set that have poses."""
+    runs = [run for run in dataset.trajectories if run.has_poses]
+    return Recorded(dataset.robot, [run.log(run.pose_times) for run in runs], [run.poses for run in runs])
+
+
+def odd_times(dataset: Dataset) -> bool:
+    """True if samples or poses follow each other so slowly, or so fast, that their times are likely in another unit."""
+    posed = [run for run in dataset.trajectories if run.has_poses]
+    wheels = median_period(dataset.trajectories)
+    poses = float(np.median(np.concatenate([np.diff(run.pose_times) for run in posed]))) if posed else 1.0
+    return wheels > _SLOWEST or wheels < _FASTEST or poses > _SLOWEST_POSES or poses < _FASTEST
+
+
+def other_times(given: Mapping[str, Any]) -> Iterator[Finding]:
+    """Findings that another unit of time would mend: of all times, of the poses' and of the wheels'."""
+    wheels, poses = "wheel_time_unit", "pose_time_unit"
+    for unit in _TIME_UNITS:
+        for changes, which, where in (
+            ({wheels: unit, poses: unit}, "all times", "the recording"),
+            ({poses: unit}, "the times of the poses", "the reference"),
+            ({wheels: unit, poses: given.get(poses) or "s"}, "the times of the wheels", "all wheels"),
+        ):
+            yield mistake("time_unit", f"{which} look like {unit}; they are read in s", where, changes)
+
+
+def with_fixes(read: RecordingSource, findings: Sequence[Finding]) -> list[Finding]:
+    """The findings, each with the options that mend it where they are not set already."""
+    fixed = []
+    for finding in findings:
+        if finding.changes and (settings := settings_of(read, [finding])):
+            finding = finding.model_copy(update={"fix": " --set ".join(settings)})
+        fixed.append(finding)
+    return fixed
+
+
+def settings_of(read: RecordingSource, findings: Sequence[Finding]) -> list[str]:
+    """The options, KEY=VALUE, by which findings are mended, beside those by which the recording was read."""
+    mended = mended_options(read, findings)
+    return [f"{key}={as_yaml(value)}" for key, value in mended.items() if read.options.get(key) != value]
+
+
+def command(read: RecordingSource, findings: Sequence[Finding]) -> str:
+    """The command line that reads a recording again, mended; of a data set in memory it says that it is to be saved."""
+    if not any(finding.changes for finding in findings) or not settings_of(read, findings):
+        return ""
+    if read.places:
+        return f'for each in {in_few_words(read.places)}; do omnibench check "$each"; done'
+    saved = "" if read.readable else f"  # after save_dataset(dataset, {str(read.source)!r})"
+    return import_command(read, mended_options(read, findings)) + saved
+
+
+def next_command(read: RecordingSource) -> str:
+    """The command line that goes on where nothing is to be mended: a data set is calibrated, a log imported first."""
+    places = read.places or ([read.folder] if read.folder and (read.folder / "dataset.yaml").is_file() else [])
+    if places:
+        return f"omnibench calibrate {in_few_words(places)} -o calibration.yaml"
+    return import_command(read, read.options)
+
+
+def import_command(read: RecordingSource, options: Mapping[str, Any]) -> str:
+    """The command line that imports a source by some options."""
+    if read.folder is None:
+        target = Path("data") / (read.source.stem or "recording")
+    else:
+        target = read.folder.with_name(f"{read.folder.name}_mended") if read.importer == "dataset" else read.folder
+    words = ["omnibench", "import", read.importer, str(read.source), "-o", str(target), "--force"]
+    for key, value in options.items():
+        words += ["--set", f"{key}={as_yaml(value)}"]
+    return shlex.join(words)
+
+
+def mended_options(read: RecordingSource, findings: Sequence[Finding]) -> dict[str, Any]:
+    """The options with the changes of findings, which are relative to those by which the recording was read."""
+    options = dict(read.options)
+    for finding in findings:
+        for key, value in finding.changes.items():
+            options |= _changed(read, options, key, value)
+            if key in _COLUMNS and options.get("columns"):  # names that now stand in the lists
+                names = {
+                    str(name) for other in _COLUMNS.values() for option in other for name in options.get(option) or ()
+                }
+                options["columns"] = {k: name for k, name in options["columns"].items() if str(name) not in names}
+                options = {k: v for k, v in options.items() if k != "columns" or v}
+    return options
+
+
+def _changed(read: RecordingSource, options: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]:
+    """The options that one change sets, relative to the present ones."""
+    fields = importers.entry(read.importer).options.model_fields
+    present = options.get(key)
+    if key in _COLUMNS:
+        option = next((name for name in _COLUMNS[key] if name in fields), _COLUMNS[key][1])
+        names = list(options.get(option) or read.columns(key))
+        changed: dict[str, Any] = {option: [names[column] for column in value]} if names else {}
+        for other in ("wheel_signs", "ticks_per_turn", "gear_ratio") if key == "wheel_order" else ():
+            if isinstance(options.get(other), list | tuple) and len(options[other]) == len(value):
+                changed[other] = [options[other][column] for column in value]
+        return changed
+    if key == "pose_order":  # x and y exchanged are mirrored, and turned by a right angle
+        signs = _product(options.get("pose_signs"), [1, -1, 1])
+        return {"pose_signs": signs, "heading_offset_deg": round(float(options.get("heading_offset_deg", 0.0)) - 90, 3)}
+    if key in ("wheel_signs", "pose_signs", "steering_signs"):
+        changed = {key: _product(present, value)}
+        if key == "steering_signs" and (offsets := options.get("steering_offsets_deg")):
+            changed["steering_offsets_deg"] = _product(offsets, value)
+        return changed
+    if key == "rate_factors":
+        return _geared(options, value)
+    if key == "wheel_quantity":
+        return {"wheel_unit": value}
+    if key == "wheel_unit":
+        return _wheel_unit(read, options, value)
+    if key == "steering_factors":
+        return {"steering_scale": _one_or_all(_product(options.get("steering_scale"), value))}
+    if key == "steering_offsets_deg":
+        offsets = zip(_listed(present, len(value), 0.0), value, strict=True)
+        return {key: _one_or_all([round(before + offset, 3) for before, offset in offsets])}
+    if key in ("heading_offset_deg", "steering_lag"):
+        return {key: round(float(present or 0.0) + value, 3)}
+    if key == "leave_out":
+        before = [present] if isinstance(present, str) else list(present or ())
+        return {key: [*before, *(name for name in map(escape, value) if name not in before)]}
+    if key == "wheels":
+        return {key: {**(present or {}), **value}}
+    return {key: value}
+
+
+def _wheel_unit(read: RecordingSource, options: Mapping[str, Any], unit: str) -> dict[str, Any]:
+    present = str(options.get("wheel_unit") or (read.reading[0][0].wheels.unit if read.reading else "rad/s"))
+    if present == "rad/s":
+        return {"wheel_unit": unit}
+    base = unit.partition("/")[0]
+    if present.startswith("rad") and unit != "rpm":
+        return {"wheel_unit": f"{base}{present.removeprefix('rad')}"}
+    return _geared(options, [float(f"{1 / _RATES[unit]:.6g}")] * len(read.dataset.robot.wheel_names))
+
+
+def _geared(options: Mapping[str, Any], factors: Sequence[float]) -> dict[str, Any]:
+    """The option of the ticks, or of the gears, by which the wheels' rates become those divided by factors."""
+    option = "ticks_per_turn" if options.get("ticks_per_turn") else "gear_ratio"
+    return {option: _one_or_all(_product(options.get(option), factors))}
+
+
+def other_quantities(read: RecordingSource) -> Iterator[Finding]:
+    """Findings that the wheels are positions, increments or rates, whichever they are not read as."""
+    if read.reading is None or not (quantities := {each.wheels.unit for each in read.reading[0]}):
+        return
+    present = sorted(quantities)[0]
+    unit = present.partition("/")[0]
+    names = {"": "positions", "/sample": "increments since the row before", "/s": "rates"}
+    for ending, quantity in names.items():
+        if unit != "rpm" and f"{unit}{ending}" != present:
+            yield mistake(
+                "wheel_unit",
+                f"the wheels look like {quantity} ({unit}{ending}); read as {quantity_of(present)} ({present})",
+                "all wheels",
+                {"wheel_quantity": f"{unit}{ending}"},
+            )
+
+
+def _listed(present: Any, count: int, default: float) -> list[float]:
+    values = present if isinstance(present, list | tuple) else [] if present is None else [present]
+    return list(values) * count if len(values) == 1 else list(values) or [default] * count
+
+
+def _product(present: Any, factors: Sequence[float]) -> list[float]:
+    count = max(len(factors), len(present) if isinstance(present, list | tuple) else 1)
+    both = zip(_listed(present, count, 1), _listed(list(factors), count, 1), strict=True)
+    return [
+        value if isinstance(value, int) else float(f"{value:.6g}") for value in (one * other for one, other in both)
+    ]
+
+
+def _one_or_all(values: Sequence[float]) -> Any:
+    """One value where all are the same."""
+    return values[0] if len(set(values)) == 1 else list(values)

@@ -1,0 +1,340 @@
+"""Messages of bags (MCAP, rosbag2 and ROS 1), read with rosbags, and the values in them by field path.
+
+Every fault of a file is one line. Messages that cannot be used are left out and counted, late ones are sorted.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import reduce
+from operator import attrgetter, itemgetter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnibench.config import read_yaml
+from omnibench.errors import ConfigError, DataError, UnknownNameError, nearest
+from omnibench.files import check_file, read_text
+from omnibench.robot.kinematics import Array
+from omnibench.words import plural
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+
+Stamps = NDArray[np.int64]
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+FIX, IMU, SCAN = (f"sensor_msgs/msg/{name}" for name in ("NavSatFix", "Imu", "LaserScan"))
+SECOND = 1_000_000_000  # ns
+LARGEST = 1e9  # m, rad or rad/s; a larger value is garbage
+_MOST_SET_BACK = 20  # messages that may come over a second late; more mean a clock that was set back (chosen)
+_NO_STAMP = "without a header stamp (it is 0)"
+_SUFFIXES, _METADATA = (".mcap", ".db3", ".bag"), "metadata.yaml"
+_REPAIR = {".mcap": "`mcap recover` saves what is there", ".bag": "`rosbag reindex` saves what is there"}
+_NO_VALUES = ("std_msgs/msg/Header", "builtin_interfaces/msg/Time", "string", "wstring")
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic of a bag. type: as ``sensor_msgs/msg/JointState``, also where the bag writes it shorter.
+
+    recorded: the times of recording count, not the stamps of the headers.
+    """
+
+    name: str
+    type: str
+    messages: int
+    recorded: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.name} ({self.type}, {plural(self.messages, 'message')})"
+
+    @property
+    def namespace(self) -> str:
+        """The part of the name before the last slash."""
+        return self.name.strip("/").rpartition("/")[0]
+
+
+@dataclass(frozen=True)
+class Record:
+    """A recorded message. number: in its topic, from 1. logged: time of recording, ns. message: None if undecodable."""
+
+    number: int
+    logged: int
+    message: Any
+
+
+class Bag:
+    """An open bag; see :func:`open_bag`. recorded: names of topics of which the times of recording count."""
+
+    def __init__(self, path: Path, reader: AnyReader, recorded: Sequence[str], definitions: Sequence[Path]) -> None:
+        self.path, self.definitions = path, definitions
+        self._reader = reader
+        self._connections: dict[tuple[str, str], list[Any]] = defaultdict(list)
+        for connection in reader.connections:
+            package, _, rest = connection.msgtype.partition("/")
+            kind = f"{package}/msg/{rest}" if rest and "/" not in rest else connection.msgtype
+            self._connections[connection.topic, kind].append(connection)
+        self.topics = [
+            Topic(*key, sum(each.msgcount for each in self._connections[key])) for key in sorted(self._connections)
+        ]
+        unstamped = {self.topic(name, "recorded_stamps").name for name in recorded}
+        self.topics = [replace(topic, recorded=topic.name in unstamped) for topic in self.topics]
+
+    def of_type(self, *types: str) -> list[Topic]:
+        """The topics of some types on which something was recorded."""
+        return [topic for topic in self.topics if topic.type in types and topic.messages]
+
+    def topic(self, name: str, key: str) -> Topic:
+        """The topic that the option ``key`` names, with or without its leading slash. UnknownNameError, DataError."""
+        named = [topic for topic in self.topics if topic.name.strip("/") == name.strip("/")]
+        if not named:
+            raise UnknownNameError("topic", name, {topic.name for topic in self.topics}, f"{self.path}: {key}")
+        chosen = max(named, key=lambda topic: topic.messages)
+        if chosen.messages == 0:
+            raise DataError(f"{self.path}: {key}: topic {chosen.name} has no messages; record it, or name another one")
+        return chosen
+
+    def records(self, topic: Topic, first: int | None = None, last: int | None = None) -> Iterator[Record]:
+        """The messages of a topic in the order in which they were recorded. DataError: the bag is damaged.
+
+        first, last: times of recording, ns, between which messages are read; numbers count from the first of these.
+        """
+        number, stop = 0, None if last is None else last + 1
+        with _damage_as_error(self.path):
+            messages = self._reader.messages(self._connections[topic.name, topic.type], first, stop)
+            for number, (_, logged, data) in enumerate(messages, 1):
+                try:
+                    message = self._reader.deserialize(data, topic.type)
+                except Exception:  # garbage fails in many ways
+                    message = None
+                yield Record(number, logged, message)
+        if first is None and number < topic.messages:  # an MCAP without its message indexes
+            raise DataError(
+                f"{self.path}: only {number} of {plural(topic.messages, 'message')} on {topic.name} can be found; "
+                f"its index is damaged; {_repair(self.path)}"
+            )
+
+    def fields(self, kind: str, before: str = "") -> dict[str, str]:
+        """Types of the numbers and messages within a type by their paths; of arrays the first element's."""
+        types: dict[str, str] = {}
+        definitions: Any = self._reader.typestore.fielddefs
+        for name, (sort, detail) in definitions.get(kind, ((), ()))[1]:
+            path = before + name
+            if sort.name in ("ARRAY", "SEQUENCE"):
+                path, (sort, detail) = f"{path}.0", detail[0]
+            inner = detail if sort.name == "NAME" else detail[0]
+            if inner not in _NO_VALUES:
+                types |= {path: inner, **self.fields(inner, f"{path}.")}
+        return types
+
+    def numbers(self, topic: Topic) -> list[str]:
+        """Paths of the numbers in a topic's messages."""
+        return [path for path, kind in self.fields(topic.type).items() if "/" not in kind and kind != "bool"]
+
+    def require_fields(self, topic: Topic, paths: Sequence[str], key: str) -> None:
+        """ConfigError: the messages of a topic do not have the fields that the option ``key`` names."""
+        fields, place = self.fields(topic.type), f"{self.path}: {key}: {topic.name} ({topic.type})"
+        if not fields:
+            way = "say what is in them by .msg files, or the folder of their package: --set message_definitions=FOLDER"
+            raise ConfigError(f"{place}: the bag does not define its messages; {way}")
+        for path in paths:
+            if re.sub(r"\.\d+", ".0", path) not in fields:
+                numbers = ", ".join(self.numbers(topic)) or "none"
+                raise ConfigError(f"{place} has no field {path!r}; {nearest(path, fields)}its numbers: {numbers}")
+
+
+@contextmanager
+def open_bag(path: Path, recorded: Sequence[str] = (), definitions: Sequence[Path] = ()) -> Iterator[Bag]:
+    """Open a bag for reading. DataError in one line: it is no bag, it is cut off, or it is damaged.
+
+    recorded: as for ``Bag``. definitions: files or folders of .msg files, of types that the bag does not define.
+    """
+    # Imported here, since they load slowly and `omnibench list` does without.
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    for file in files:
+        if file.name == _METADATA:
+            try:
+                read_yaml(file)  # within limits, which rosbags has not
+            except ConfigError as error:
+                raise DataError(str(error)) from None
+        elif not file.is_dir():
+            check_file(file)
+    # Bags before ROS 2 Iron do not hold the definitions of their types; those of ROS itself hardly ever changed.
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    types = store.fielddefs | _defined_types(definitions)
+    with _damage_as_error(path):
+        if definitions:
+            store = get_typestore(Stores.EMPTY)
+            store.register(types)
+        reader = AnyReader([path], default_typestore=store)
+        reader.open()
+        if definitions:
+            types = {name: fields for name, fields in types.items() if name not in reader.typestore.fielddefs}
+            reader.typestore.register(types)
+    try:
+        yield Bag(path, reader, recorded, definitions)
+    finally:
+        reader.close()
+
+
+def _defined_types(places: Sequence[Path]) -> dict[str, Any]:
+    """The types that .msg files define: PACKAGE/msg/NAME.msg or PACKAGE/NAME.msg. DataError names a file."""
+    from rosbags.typesys import get_types_from_msg
+
+    types: dict[str, Any] = {}
+    for place in places:
+        for file in sorted(place.rglob("*.msg")) if place.is_dir() else [place]:
+            folder, text = file.resolve().parent, read_text(file)
+            package = folder.parent.name if folder.name == "msg" else folder.name
+            try:
+                types |= get_types_from_msg(text, f"{package}/msg/{file.stem}")
+            except Exception as error:  # of rosbags' parser
+                raise DataError(f"{file}: cannot be read as the definition of a message: {error}") from None
+    return types
+
+
+def find_bags(source: Path) -> dict[str, Path]:
+    """Bags by name: the file or rosbag2 folder ``source``, or all bags below the folder ``source``. DataError."""
+    if source.is_file() or (source / _METADATA).is_file():
+        return {source.resolve().stem if source.is_file() else source.resolve().name: source}
+    folders = [file.parent for file in source.rglob(_METADATA)]
+    files = [file for file in source.rglob("*") if file.suffix in _SUFFIXES and file.is_file()]
+    bags = [*folders, *(file for file in files if not any(file.is_relative_to(folder) for folder in folders))]
+    if not bags:
+        raise DataError(f"{source}: no bag below it; name an .mcap or .bag file, or the folder of a rosbag2 recording")
+    names = {bag: bag if bag.is_dir() else bag.with_suffix("") for bag in sorted(bags)}
+    return {name.relative_to(source).as_posix(): bag for bag, name in names.items()}
+
+
+def _repair(path: Path) -> str:
+    return f"if the recording broke off, {_REPAIR.get(path.suffix, '`ros2 bag reindex` may repair it')}"
+
+
+@contextmanager
+def _damage_as_error(path: Path) -> Iterator[None]:
+    """Turn any error of rosbags on a file that is no bag, or a damaged one, into a DataError."""
+    try:
+        yield
+    except PermissionError:
+        raise DataError(f"{path}: cannot be read: permission denied") from None
+    except Exception as error:  # struct.error, TypeError, KeyError, ...: rosbags trusts what it reads
+        reason = str(error) if type(error).__module__.startswith("rosbags.") else f"{type(error).__name__}: {error}"
+        raise DataError(f"{path}: cannot be read as a bag: {reason.rstrip('.')}; {_repair(path)}") from None
+
+
+def reader_of(paths: Sequence[str]) -> Callable[[Any], list[float]]:
+    """A function that gives the numbers at dotted paths in a message, such as ``status.wheels.0.angle``."""
+    parts = [re.split(r"\.(?=\d)|(?<=\d)\.", path) for path in paths]
+    steps = [[itemgetter(int(part)) if part.isdecimal() else attrgetter(part) for part in path] for path in parts]
+    return lambda message: [float(reduce(lambda value, step: step(value), path, message)) for path in steps]
+
+
+def header_stamp(message: Any) -> int | None:
+    """The stamp of a message's header, ns; None without a header."""
+    header = getattr(message, "header", None)
+    return None if header is None else int(header.stamp.sec) * SECOND + int(header.stamp.nanosec)
+
+
+def stamp_of(topic: Topic, record: Record, part: Any) -> int:
+    """The stamp, ns, of (a part of) a message: that of its header, or the time of recording where this counts."""
+    stamp = None if topic.recorded else header_stamp(part)
+    return record.logged if stamp is None else stamp
+
+
+class TopicMessages:
+    """The messages of a topic. Useless ones are left out and counted by reason, the others sorted by their stamps.
+
+    contents: what ``read`` gives of each, or of a ``part`` of it; where either gives None, it is of something else.
+    numbers, stamps, logged (K,): from 1, and ns. rows: indices of the messages that remain. Messages without a header,
+    and those of topics for which it is asked, have the times of recording as stamps.
+    """
+
+    def __init__(
+        self, bag: Bag, topic: Topic, read: Callable[[Any], Any], part: Callable[[Any], Any] = lambda message: message
+    ) -> None:
+        self.place = f"{bag.path}: topic {topic.name}"
+        self.contents: list[Any] = []
+        self._bag, self._topic, self._headless = bag, topic, False
+        self._left_out: list[tuple[int, str]] = []  # numbers of messages, and why
+        stamped = []
+        for record in bag.records(topic):
+            try:
+                message = part(record.message)
+                if message is None and record.message is not None:
+                    continue
+                content, stamp = read(message), stamp_of(topic, record, message)
+            except (AttributeError, IndexError, TypeError, ValueError):  # garbage, or a type that is defined otherwise
+                self._left_out.append((record.number, "that cannot be decoded"))
+                continue
+            if content is not None and stamp > 0:
+                self.contents.append(content)
+                stamped.append((record.number, stamp, record.logged))
+                self._headless |= not hasattr(message, "header")
+            elif content is not None:
+                self._left_out.append((record.number, _NO_STAMP))
+        self.numbers, self.stamps, self.logged = np.array(stamped, dtype=np.int64).reshape(-1, 3).T
+        self.rows = np.arange(len(stamped))
+
+    def table(self, columns: int) -> Array:
+        """The contents as numbers (K, columns)."""
+        return np.array(self.contents, dtype=float).reshape(-1, columns)
+
+    def keep(self, good: NDArray[np.bool_], reason: str) -> None:
+        """Drop the messages that are not good (K,) for ``reason``."""
+        self._left_out += [(number, reason) for number in self.numbers[self.rows[~good[self.rows]]].tolist()]
+        self.rows = self.rows[good[self.rows]]
+
+    def in_order(self, notes: list[str], way_out: str = "") -> NDArray[np.intp]:
+        """Indices of the messages that remain, sorted by stamp, without repeated stamps.
+
+        ``notes`` tell what is left out. DataError: the clock was set back, more messages were dropped than remain, or
+        fewer than two remain. way_out: what to do where these have stamps.
+        """
+        stamps = self.stamps[self.rows]
+        behind = np.maximum.accumulate(stamps) - stamps
+        if (behind > SECOND).sum() > _MOST_SET_BACK:
+            first = int(np.argmax(behind > SECOND))
+            raise DataError(
+                f"{self.place}, message {self.numbers[self.rows[first]]}: the stamps go back by "
+                f"{behind[first] / SECOND:.3g} s and stay behind: the clock was set back, or two recordings share the "
+                "bag; split it there"
+            )
+        self.rows = self.rows[np.argsort(stamps, kind="stable")]
+        fresh = np.zeros(len(self.contents), dtype=bool)
+        fresh[self.rows] = np.diff(self.stamps[self.rows], prepend=-1) > 0
+        self.keep(fresh, "with a repeated stamp")
+        firsts, total = {reason: number for number, reason in self._left_out[::-1]}, self._topic.messages
+        counts = Counter(reason for _, reason in self._left_out)
+        reasons = [f"{count} {reason} (first: message {firsts[reason]})" for reason, count in counts.items()]
+        left_out = f"{counts.total()} of {plural(total, 'message')} left out: {', '.join(reasons)}"
+        if len(self.rows) < max(2, counts.total()):
+            if _NO_STAMP in counts:
+                topics = [topic.name for topic in self._bag.topics if topic.recorded or topic == self._topic]
+                way_out = (
+                    f"set recorded_stamps=[{','.join(topics)}] to take the times of recording, or record it anew: the "
+                    "publisher must fill header.stamp"
+                )
+            problem = left_out if counts else f"it has {plural(total, 'message')}, too few"
+            raise DataError(f"{self.place}: {problem}{'; ' if way_out else ''}{way_out}")
+        words = [left_out] if counts else []
+        if self._headless:
+            words.append("its messages have no stamps; they have the times of recording")
+        if late := int(np.count_nonzero(behind)):
+            words.append(f"{plural(late, 'message')} recorded late, and sorted by stamp")
+        notes += [note for note in (f"{self.place}: {word}" for word in words) if note not in notes]
+        return self.rows
+
+
+def possible(values: Array, largest: float = LARGEST) -> NDArray[np.bool_]:
+    """True for rows of values (F, n) that are finite, and smaller than anything real."""
+    small: NDArray[np.bool_] = np.abs(values) < largest
+    return np.asarray(small.all(axis=1))

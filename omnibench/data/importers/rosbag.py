@@ -1,0 +1,629 @@
+"""Importer of ROS recordings (MCAP files, rosbag2 folders and ROS 1 bags): its options, and which topics it reads."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from omnibench.config import Positive
+from omnibench.data.dataset import Dataset
+from omnibench.data.importer import Importer
+from omnibench.data.importers.bag_messages import (
+    FIX,
+    IMU,
+    SCAN,
+    SECOND,
+    TRANSFORMS,
+    Bag,
+    Record,
+    Stamps,
+    Topic,
+    TopicMessages,
+    find_bags,
+    header_stamp,
+    open_bag,
+    possible,
+    reader_of,
+)
+from omnibench.data.importers.bag_sensors import BagSensors, SensorOptions, frames_between, read_scans, read_sensor
+from omnibench.data.importers.copied_reference import follows_the_wheels
+from omnibench.data.importers.tum import planar_headings
+from omnibench.data.recording import (
+    Event,
+    PoseReadings,
+    Recording,
+    RunAttributes,
+    Signs,
+    WheelReadings,
+    WheelUnit,
+    words_of,
+)
+from omnibench.data.runs import dataset_of
+from omnibench.data.scans import Mount
+from omnibench.data.splits import Names
+from omnibench.errors import ConfigError, DataError, one_line
+from omnibench.registry import importers
+from omnibench.robot.joint_choice import JointChoice
+from omnibench.robot.kinematics import Array, compose, interpolated, pose_covariance, usable_covariances
+from omnibench.words import plural, some
+
+JOINT_STATE, ODOMETRY = "sensor_msgs/msg/JointState", "nav_msgs/msg/Odometry"
+POSE_TYPES = tuple(f"geometry_msgs/msg/{name}Stamped" for name in ("PoseWithCovariance", "Pose", "Transform"))
+_TWISTS = ("geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped")
+_NUMBERS = re.compile(r"std_msgs/msg/(U?Int(8|16|32|64)|Float(32|64))(MultiArray)?")  # types
+_REFERENCES = "poses, sensor_msgs/LaserScan, NavSatFix or Imu"
+_OWN_POSES = re.compile(r"(?<![a-z])odom(etry)?(?![a-z])")  # in the name of a topic
+_NO_WHEELS = {"geometry_msgs", "nav_msgs", "sensor_msgs", "tf2_msgs", "rcl_interfaces", "rosgraph_msgs"}  # packages
+_COUNTED = {"data", "tick", "encoder", "count", "position", "angle", "wheel"}  # words of what wheels count
+# A longer gap while the robot drives ends a stretch, since a constant twist does not describe it (chosen):
+_LONGEST_GAP = 0.5  # s, and
+_LONGEST_GAP_PERIODS = 10  # sample periods
+_LARGEST_COUNT = 2.0**64  # of a joint, in any unit; a larger value is garbage
+# Types of poses in messages, and their fields with x and y, and with the quaternion.
+_POSES = {
+    "geometry_msgs/msg/Pose": ("position", "orientation"),
+    "geometry_msgs/msg/Transform": ("translation", "rotation"),
+}
+_COVARIANCE = [f"covariance.{6 * row + column}" for row in (0, 1, 5) for column in (0, 1, 5)]  # of x, y and yaw
+
+
+class RosbagOptions(SensorOptions):
+    """The robot, topics and joints, and how the recording is cut into runs."""
+
+    group: ClassVar[str] = "Topics, joints and cuts"
+
+    name: str = Field("rosbag", min_length=1, description="name of the data set")
+    wheel_unit: WheelUnit = Field("rad", description="of positions and, per s, velocities; or rpm; or rad/sample, ...")
+    wheel_topic: Names = Field((), description="of all wheels, or a list of one each; default: a JointState")
+    steering_topic: Names = Field((), description="of all steering angles, or a list of one each; default: the wheels'")
+    joints: Names = Field(
+        (), description="in the robot's order: joints; numbers of elements, from 0; or fields; default: by the names"
+    )
+    steering_joints: Names = Field((), description="in the order of the wheels that steer; default: by the names")
+    joint_signs: Signs = Field((), description="another name of wheel_signs")
+    use: Literal["auto", "positions", "velocities"] = Field("auto", description="auto: positions, if they are there")
+    pose_topic: str | None = Field(
+        None,
+        min_length=1,
+        description="default: the only poses, or slam_pose; Odometry and tf only where they are named",
+    )
+    pose_columns: Names = Field((), description="fields of pose_topic: of x, y and heading, or of a geometry pose")
+    pose_frames: Names = Field((), description="with a tf pose_topic: frame of the reference, and the tracked one")
+    pose_sigma: tuple[Positive, Positive] | None = Field(
+        None, description="m and deg, for poses of unknown covariance; default: if one is unknown, none counts"
+    )
+    scan_topic: str | None = Field(None, min_length=1, description="LaserScan; default: the only one, or /scan")
+    scans: bool = Field(True, description="false: leave the scans out")
+    scanner_mount: Mount | None = Field(None, description="of the scanner, m, rad; default: by /tf_static, else 0")
+    slam: dict[str, Any] = Field({}, description="options of omnibench slam, for bags with scans and without poses")
+    recorded_stamps: Names = Field((), description="topics of which the times of recording count, not the headers'")
+    message_definitions: tuple[Path, ...] = Field((), description=".msg files, or folders, of types that bags lack")
+    cut: Literal["rests", "topic", "windows", "none"] = Field("rests", description="where runs end and begin")
+    cut_topic: str | None = Field(None, min_length=1, description="its messages begin runs; a String names the command")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _signs_have_one_name(cls, content: Any) -> Any:
+        if not isinstance(content, Mapping) or not content.get("joint_signs"):
+            return content
+        if content.get("wheel_signs"):
+            raise ValueError("joint_signs is another name of wheel_signs; leave one out")
+        return {**content, "wheel_signs": content["joint_signs"]}
+
+    @model_validator(mode="after")
+    def _topics_fit_together(self) -> RosbagOptions:
+        self.require_one_each("joints", "steering_joints")
+        self.require_one_each("wheel_topic", "steering_topic", or_one=True)
+        if not self.scans and (self.scan_topic is not None or self.scanner_mount is not None):
+            raise ValueError("scans=false leaves the scans out; leave scan_topic and scanner_mount out, too")
+        if len(self.wheel_topic) < 2 and len(set(self.joints)) < len(self.joints):
+            raise ValueError("joints names one joint twice; name another one for each wheel")
+        if isinstance(self.wraps_at, float) and self.use == "velocities":
+            raise ValueError("wraps_at is for positions; leave it out with use=velocities")
+        if self.quantity == {"positions": "rates", "velocities": "increments"}.get(self.use):
+            raise ValueError(f"wheel_unit {self.wheel_unit} is not one of {self.use}; leave use out")
+        if len(self.pose_frames) not in (0, 2):
+            raise ValueError(f"pose_frames has {plural(len(self.pose_frames), 'value')}, expected 2: [world, robot]")
+        if len(self.pose_columns) not in (0, 1, 3) or (self.pose_columns and not self.pose_topic):
+            raise ValueError("pose_columns needs pose_topic, and is [X,Y,HEADING] or [POSE], paths in its messages")
+        for key, cut in (("cut_topic", "topic"), ("window", "windows")):
+            if (getattr(self, key) is not None) != (self.cut == cut):
+                raise ValueError(f"cut={cut} and {key} belong together; give both or none")
+        if self.wheel_time_unit != "s" or self.pose_time_unit not in (None, "s"):
+            raise ValueError("stamps of bags are in s; leave wheel_time_unit and pose_time_unit out")
+        return self
+
+
+def wheel_topics(bag: Bag, options: RosbagOptions) -> list[Topic]:
+    """The topics of the wheels: those named, else the only JointState, or the only one that ends in joint_states.
+
+    DataError: the wheels are in messages of another type, and what to type then.
+    """
+    if options.wheel_topic:
+        return [bag.topic(name, "wheel_topic") for name in options.wheel_topic]
+    if topics := _chosen(bag, "wheel_topic", (), (JOINT_STATE,), "joint_states"):
+        return topics
+    others = [topic for topic in bag.topics if topic.messages and topic.type.split("/")[0] not in _NO_WHEELS]
+    way = wheels_typed(bag, options.robot.wheel_names, others)
+    raise DataError(f"{bag.path}: no messages of type {JOINT_STATE}; topics found: {_listed(bag.topics)}{way}")
+
+
+def wheels_typed(bag: Bag, wheels: Sequence[str], topics: Sequence[Topic]) -> str:
+    """What to type for wheels that are numbers on one of the topics, by the words in the names of topics and fields."""
+    numbers = {topic: fields for topic in topics if (fields := bag.numbers(topic))}
+    if not numbers:
+        return ""
+
+    def words(name: str) -> set[str]:
+        return {word.rstrip("s") for word in words_of(name)}
+
+    def of_wheels(names: Sequence[str]) -> list[str]:
+        """The one of the names that says each wheel; empty unless every wheel has one."""
+        alike = [[name for name in names if words(wheel) <= words(name)] for wheel in wheels]
+        return [names[0] for names in alike] if all(len(names) == 1 for names in alike) else []
+
+    best = max(numbers, key=lambda topic: sum(len(words(name) & _COUNTED) for name in (topic.name, *numbers[topic])))
+    fields = sorted(numbers[best], key=lambda path: not words(path) & _COUNTED)  # the likely ones first
+    joints, topic = of_wheels(fields), best.name
+    if not joints and (places := of_wheels([topic.name for topic in numbers if topic.type == best.type])):
+        joints, topic = fields[:1] * len(wheels), f"[{','.join(places)}]"
+    typed = f"--set wheel_topic={topic}"
+    if not _NUMBERS.fullmatch(best.type):
+        typed += f' --set "joints=[{",".join(joints or fields[: len(wheels)])}]"'
+    return f"; are the wheels in {typed}? {best.type} holds {some(numbers[best], 24)}"
+
+
+def pose_topics(bag: Bag, options: RosbagOptions, wheels: Topic, *, others: bool) -> list[Topic]:
+    """The topic of the reference poses: the one named, the only one, or the only one that ends in slam_pose.
+
+    Odometry and transforms are never taken unasked: a calibration against the robot's own odometry would find nothing
+    wrong. Empty: there is none, but there are ``others``, scans or sensors.
+    """
+    types = (*POSE_TYPES, ODOMETRY, TRANSFORMS)
+    if options.pose_topic is not None and options.pose_columns:
+        topic = bag.topic(options.pose_topic, "pose_topic")
+        bag.require_fields(topic, options.pose_columns, "pose_columns")
+        return [topic]
+    if options.pose_topic is not None:
+        return _chosen(bag, "pose_topic", options.pose_topic, types)
+    odometry = [topic for topic in bag.of_type(*POSE_TYPES) if _OWN_POSES.search(topic.name.lower())]
+    topics = _chosen(bag, "pose_topic", (), POSE_TYPES, "slam_pose", wheels, odometry)
+    if topics or others:
+        return topics
+    if doubtful := [topic for topic in bag.of_type(*types) if not topic.name.endswith("tf_static")]:
+        raise ConfigError(
+            f"{bag.path}: the only poses are {_listed(doubtful)}, by name or type the robot's own odometry and not a "
+            "reference for it; if one is independent of the wheels, set pose_topic to it, or record a reference: "
+            f"{_REFERENCES}"
+        )
+    raise DataError(
+        f"{bag.path}: no messages of type {' or '.join(POSE_TYPES)}, nor another reference ({_REFERENCES}); topics "
+        f"found: {_listed(bag.topics)}; poses in other messages: --set pose_topic=NAME --set pose_columns=[X,Y,HEADING]"
+    )
+
+
+def _chosen(
+    bag: Bag,
+    key: str,
+    names: str | Sequence[str] | None,
+    types: Sequence[str],
+    ending: str = "",
+    wheels: Topic | None = None,
+    without: Sequence[Topic] = (),
+) -> list[Topic]:
+    """The topics that an option names, or the only one of some types, or the only one of these with an ending.
+
+    Among several that end so the one in the wheels' namespace. Empty: there is none of these types with messages.
+    ConfigError: one that is named is of another type, or there are several.
+    """
+    named = [bag.topic(name, key) for name in ([names] if isinstance(names, str) else names or ())]
+    for topic in named:
+        if topic.type not in types:
+            fields = ", ".join(bag.fields(topic.type)) or "what .msg files define (message_definitions)"
+            way = f", or --set pose_columns=[X,Y,HEADING] or [POSE] of {fields}" if key == "pose_topic" else ""
+            raise ConfigError(
+                f"{bag.path}: {key}: {topic.name} is {topic.type}, expected {' or '.join(types)}{way}; found: "
+                f"{_listed(bag.of_type(*types))}"
+            )
+    candidates = [topic for topic in bag.of_type(*types) if topic not in without]
+    if named or not candidates:
+        return named
+    ended = [topic for topic in candidates if topic.name.endswith(ending)]
+    beside = [topic for topic in ended if wheels is not None and topic.namespace == wheels.namespace]
+    for choice in (beside, candidates, ended):
+        if len(choice) == 1:
+            return choice
+    raise ConfigError(f"{bag.path}: several topics could be the {key}; --set {key}=NAME, one of: {_listed(candidates)}")
+
+
+def _listed(topics: Sequence[Topic]) -> str:
+    return ", ".join(map(str, topics)) or "none"
+
+
+@dataclass(frozen=True, eq=False)
+class _Joints:
+    """Messages of some joints. stamps, logged (F,): ns. values (F, n), in ``unit``. names: of the joints."""
+
+    stamps: Stamps
+    logged: Stamps
+    values: Array
+    unit: str
+    names: tuple[str, ...]
+
+    @property
+    def longest_gap(self) -> float:
+        """The longest time, s, between messages of a robot that drives."""
+        return max(_LONGEST_GAP, _LONGEST_GAP_PERIODS * float(np.median(np.diff(self.stamps))) / SECOND)
+
+    def covers(self, stamps: Stamps) -> NDArray[np.bool_]:
+        """True for stamps (F,) at which there is a message, or one before and one after without a gap."""
+        after = np.searchsorted(self.stamps, stamps)
+        inside = np.clip(after, 1, len(self.stamps) - 1)
+        apart = self.stamps[inside] - self.stamps[inside - 1] > self.longest_gap * SECOND
+        within = (stamps >= self.stamps[0]) & (stamps <= self.stamps[-1])
+        return within & (~apart | np.isin(stamps, self.stamps))
+
+
+@dataclass(frozen=True, eq=False)
+class _WheelClock:
+    """The clock of the wheels' messages: stamps (F,) and times of recording (F,), ns; the first stamp is t = 0."""
+
+    path: Path
+    topic: Topic
+    stamps: Stamps
+    logged: Stamps
+
+    def seconds(self, stamps: Stamps) -> Array:
+        """Times, s since the first message; exact to the nanosecond, which a double of unix time is not."""
+        return np.asarray((stamps - self.stamps[0]) / SECOND)
+
+    def seconds_of(self, topic: Topic, stamps: Stamps) -> Array:
+        """Times of a topic's messages, s. DataError: no two of them are within the wheels' recording."""
+        if ((stamps >= self.stamps[0]) & (stamps <= self.stamps[-1])).sum() < 2:
+            spans = [f"{span[0] / SECOND:.3f} to {span[-1] / SECOND:.3f} s" for span in (stamps, self.stamps)]
+            raise DataError(
+                f"{self.path}: no two messages of {topic.name} while the wheels were recorded, by the stamps of their "
+                f"headers ({topic.name} {spans[0]}, {self.topic.name} {spans[1]}); both must be stamped by one clock, "
+                f"or set recorded_stamps=[{self.topic.name},{topic.name}] to take the times of recording"
+            )
+        return self.seconds(stamps)
+
+    def of_record(self, topic: Topic, record: Record) -> float:
+        """The time of a message, s: by its header, or by when it was recorded, as the wheels' messages have both."""
+        stamp = None if topic.recorded else header_stamp(record.message)
+        if stamp:
+            return float(self.seconds(np.array(stamp)))
+        order = np.argsort(self.logged, kind="stable")
+        logged, stamps = self.logged[order], np.maximum.accumulate(self.stamps[order])
+        return float(np.interp(record.logged - logged[0], logged - logged[0], self.seconds(stamps)))
+
+
+def read_bag(path: Path, name: str, options: RosbagOptions, notes: list[str]) -> Recording:
+    """The recording of a bag; what is left out is added to ``notes``. DataError, ConfigError."""
+    with open_bag(path, options.recorded_stamps, options.message_definitions) as bag:
+        topics = wheel_topics(bag, options)
+        if options.robot.drive.steered and not options.steering_topic and len(topics) > 1:
+            raise ConfigError(f"{path}: every wheel has its own topic; --set steering_topic=[...], too")
+        steering = [bag.topic(name, "steering_topic") for name in options.steering_topic] or topics
+        scans = _chosen(bag, "scan_topic", options.scan_topic, (SCAN,), "/scan", topics[0]) if options.scans else []
+        others = bool(scans or options.references or bag.of_type(FIX, IMU))
+        references = pose_topics(bag, options, topics[0], others=others)
+        # Sensors count where they are named, or where nothing else tells how the robot moved.
+        sensors = _chosen(bag, "references", options.references, (FIX, IMU)) if options.references else []
+        if not (references or scans or sensors):
+            sensors = [topic for kind in (FIX, IMU) for topic in _chosen(bag, "references", (), (kind,))]
+        twists = [topic for topic in bag.of_type(*_TWISTS) if topic.name.endswith("cmd_vel")]
+        beside = [topic for topic in twists if topic.namespace == topics[0].namespace]
+        sent = next((each[0] for each in (twists, beside) if len(each) == 1), None)
+        wheels, clock = read_wheels(bag, topics, steering if options.robot.drive.steered else [], options, notes)
+        readings = [read_sensor(bag, topic, options, clock.seconds_of, notes) for topic in sensors]
+        return Recording(
+            name,
+            f"{path}: topic {topics[0].name}",
+            wheels,
+            read_poses(bag, references[0], options, clock, notes) if references else None,
+            events=_events(bag, options.cut_topic, clock) if options.cut_topic else (),
+            attributes=RunAttributes(sent=_sent_twists(bag, sent, clock) if sent else None),
+            scans=read_scans(bag, scans[0], options.scanner_mount, clock.seconds_of, notes) if scans else None,
+            sensors=BagSensors(readings, options) if readings else None,
+            numbered=True,
+        )
+
+
+def read_wheels(
+    bag: Bag, wheels: Sequence[Topic], steering: Sequence[Topic], options: RosbagOptions, notes: list[str]
+) -> tuple[WheelReadings, _WheelClock]:
+    """Wheels and steering angles in the robot's order, and the clock of their messages.
+
+    Where they come by several topics, the messages of the others that are nearest to those of the first count, with the
+    times that they have; where the others have gaps, messages of the first are left out. DataError, ConfigError.
+    """
+    robot, apart = options.robot, set(wheels).isdisjoint(steering)
+    streams: list[_Joints] = []
+    for steers, topics, names, asked in (
+        (False, wheels, robot.wheel_names, options.joints),
+        (True, steering, robot.drive.steered, options.steering_joints),
+    ):
+        choices = [JointChoice((wheel,), asked[row : row + 1], steers, True) for row, wheel in enumerate(names)]
+        if len(topics) == 1:
+            choices = [JointChoice(names, asked, steers, apart)]
+        streams += [read_joints(bag, *pair, options, notes) for pair in zip(topics, choices, strict=False)]
+    first, count, several = streams[0], len(wheels), len(streams) > 1
+    if len({stream.unit for stream in streams[:count]}) > 1:
+        raise DataError(f"{bag.path}: some wheel topics hold positions and some velocities; --set use=velocities")
+    covered = np.logical_and.reduce([stream.covers(first.stamps) for stream in streams])
+    if covered.sum() < 2:
+        shown = ", ".join(topic.name for topic in dict.fromkeys((*wheels, *steering)))
+        raise DataError(
+            f"{bag.path}: topics {shown} hold no messages of one time; all must be stamped by one clock, or be named "
+            "in recorded_stamps"
+        )
+    clock = _WheelClock(bag.path, wheels[0], first.stamps[covered], first.logged[covered])
+    times, values, read_at = clock.seconds(clock.stamps), [], []
+    for stream in streams:
+        stamps, numbers = clock.seconds(stream.stamps), stream.values
+        if several and stream.unit.endswith("/sample"):  # there may be several between two messages of the first
+            numbers = np.cumsum(numbers, axis=0)
+        nearest = np.searchsorted((stamps[1:] + stamps[:-1]) / 2, times)
+        values.append(numbers[nearest])
+        read_at.append(np.tile(stamps[nearest][:, None], len(stream.names)))
+    return WheelReadings(
+        times,
+        np.hstack(values[:count]),
+        first.unit.removesuffix("/sample") if several else first.unit,
+        np.hstack(values[count:]) if steering else None,
+        tuple(chain.from_iterable(stream.names for stream in streams[:count])),
+        tuple(chain.from_iterable(stream.names for stream in streams[count:])),
+        longest_gap=first.longest_gap,
+        read_at=np.hstack(read_at) if several else None,
+    ), clock
+
+
+def read_joints(bag: Bag, topic: Topic, choice: JointChoice, options: RosbagOptions, notes: list[str]) -> _Joints:
+    """The joints of some wheels that come by one topic. DataError, ConfigError."""
+    role, unit = ("steering", options.steering_unit) if choice.steering else ("wheel", str(options.wheel_unit))
+    key, whose = ("steering_joints", "joint that steers") if choice.steering else ("joints", "wheel")
+    quantity, use = ("positions", "positions") if choice.steering else (options.quantity, options.use)
+    paths, fields = choice.asked, None
+    numbers = _NUMBERS.fullmatch(topic.type) and all(path.isdecimal() for path in paths)
+    if topic.type != JOINT_STATE and not numbers:
+        if not paths:
+            way = wheels_typed(bag, choice.wheels, [topic])
+            raise ConfigError(f"{bag.path}: {role}_topic: {topic.name} is {topic.type}, expected {JOINT_STATE}{way}")
+        bag.require_fields(topic, paths, key)
+        fields, choice = reader_of(paths), replace(choice, asked=())
+    places: dict[tuple[str, ...], tuple[int, ...] | None] = {}
+
+    def read(message: Any) -> Array | None:
+        """Positions and velocities (2, n) of the joints, NaN where there are none; None of a message of others."""
+        if topic.type == JOINT_STATE:
+            names, values = tuple(message.name), [message.position, message.velocity]
+        else:
+            shown = np.ravel(np.asarray(fields(message) if fields else message.data, dtype=float))
+            names, values = tuple(map(str, range(len(shown)))), [[], shown] if quantity == "rates" else [shown, []]
+        if names not in places:
+            places[names] = choice.places(names)
+        if (chosen := places[names]) is None:
+            return None
+        missing = [np.nan] * len(names)
+        return np.array([row if len(row) == len(names) else missing for row in values], dtype=float)[:, list(chosen)]
+
+    messages, joints = TopicMessages(bag, topic, read), list(dict.fromkeys(chain(*places)))
+    if places and not any(places.values()):
+        raise choice.not_found(messages.place, joints)
+    count = len(choice.wheels)
+    positions, velocities = messages.table(2 * count).reshape(-1, 2, count).swapaxes(0, 1)
+    if quantity == "positions" and use == "auto":
+        use = "positions" if _counts(positions, velocities) else "velocities"
+    counted = quantity == "increments" or (quantity == "positions" and use == "positions")
+    values, kind = (positions, "position") if counted else (velocities, "velocity")
+    messages.keep(possible(values, _LARGEST_COUNT), f"without a finite {kind} of every {whose}")
+    way = f"set {key} or {role}_topic to those that are measured (joints found: {', '.join(joints)})"
+    rows = messages.in_order(notes, way if options.use == "auto" else f"leave use={options.use} out, or {way}")
+    names = paths or next(tuple(names[place] for place in chosen) for names, chosen in places.items() if chosen)
+    unit = f"{unit}/s" if quantity == "positions" and not counted else unit
+    return _Joints(messages.stamps[rows], messages.logged[rows], values[rows], unit, names)
+
+
+def _counts(positions: Array, velocities: Array) -> bool:
+    """True if positions (F, n) tell what velocities (F, n) do, and are not zeros that a driver fills in."""
+    counted, measured = possible(positions, _LARGEST_COUNT), possible(velocities, _LARGEST_COUNT)
+    if measured.sum() > 2 * counted.sum():
+        return False
+    stands = bool((positions[counted] == positions[counted][:1]).all())
+    return not (stands and measured.any() and bool(velocities[measured].any()))
+
+
+def read_poses(bag: Bag, topic: Topic, options: RosbagOptions, clock: _WheelClock, notes: list[str]) -> PoseReadings:
+    """The poses of a topic; what is left out is added to ``notes``. DataError, ConfigError."""
+    covariances, columns = None, options.pose_columns
+    if topic.type == TRANSFORMS and not columns:
+        stamps, poses = _by_transforms(bag, topic, options.pose_frames, notes)
+    else:
+        paths = list(columns) if len(columns) == 3 else _pose_paths(bag, topic, columns)
+        messages = TopicMessages(bag, topic, reader_of(paths))
+        table = messages.table(len(paths))
+        rows, poses = _planar(messages, table[:, :6], notes)
+        stamps = messages.stamps[rows]
+        # Covariances (K, 3, 3): unless ``pose_sigma`` says one, a pose's that is unknown lets none count.
+        stated = len(paths) > 6
+        covariances = table[rows, 6:].reshape(-1, 3, 3) if stated else np.zeros((len(rows), 3, 3))
+        usable = usable_covariances(covariances)
+        unknown = f"{messages.place}: {(~usable).sum():,} of {plural(len(rows), 'pose')} have no usable covariance"
+        if not usable.all() and options.pose_sigma is not None:
+            metres, degrees = options.pose_sigma
+            notes.append(f"{unknown}: {metres:g} m and {degrees:g} deg count for them (pose_sigma)")
+            covariances[~usable] = pose_covariance(metres, degrees)
+        elif not usable.all():
+            covariances = None
+            notes += [f"{unknown}, so that none counts; set pose_sigma=[m,deg] to have them"] if stated else []
+    apart = options.clocks == "match" or options.pose_time_offset
+    times = clock.seconds(stamps) if apart else clock.seconds_of(topic, stamps)
+    return PoseReadings(times, poses, covariances, len(columns) < 3, "" if topic.type in POSE_TYPES else topic.name)
+
+
+def _pose_paths(bag: Bag, topic: Topic, columns: Sequence[str]) -> list[str]:
+    """Paths of x, y and the quaternion of the pose in a message, or at a path in it, and of its covariance if any."""
+    fields, within = bag.fields(topic.type), "".join(f"{column}." for column in columns)
+    pose = next((path for path, kind in fields.items() if kind in _POSES and f"{path}.".startswith(within)), None)
+    if pose is None:
+        raise ConfigError(f"{bag.path}: pose_columns: {within[:-1]} of {topic.name} ({topic.type}) is no geometry pose")
+    holder = pose.rpartition(".")[0]
+    covariance = _COVARIANCE if f"{holder}.covariance.0" in fields else []
+    return [*_pose_parts(fields[pose], pose), *(f"{holder}.{part}" for part in covariance)]
+
+
+def _pose_parts(kind: str, path: str) -> list[str]:
+    """Paths of x, y and the quaternion of a pose of some type at a path."""
+    place, turn = _POSES[kind]
+    return [f"{path}.{place}.{axis}" for axis in "xy"] + [f"{path}.{turn}.{axis}" for axis in "xyzw"]
+
+
+def _planar(messages: TopicMessages, table: Array, notes: list[str]) -> tuple[NDArray[np.intp], Array]:
+    """Rows of x, y and heading (K, 3), or of x, y and a quaternion (K, 6), on the floor, and their poses (n, 3)."""
+    messages.keep(possible(table[:, :2]), "without a finite position")
+    headings = table[:, 2]
+    if table.shape[1] > 3:
+        orientations = planar_headings(table[:, 2:])
+        headings, flawed = orientations.headings, messages.rows[orientations.flawed[messages.rows]]
+        flaw = f", as {orientations.flaw(int(flawed[0]))}" if len(flawed) else ""
+        messages.keep(~orientations.flawed, f"with a wrong orientation{flaw}")
+    messages.keep(possible(headings[:, None]), "without a finite heading")
+    rows = messages.in_order(notes)
+    return rows, np.column_stack([table[:, :2], headings])[rows]
+
+
+def _by_transforms(bag: Bag, topic: Topic, frames: Sequence[str], notes: list[str]) -> tuple[Stamps, Array]:
+    """Stamps and poses (K, 3) of the second of two frames in the first, when the rarest transform between them comes.
+
+    Transforms between are composed in the plane.
+    """
+    links, fixed = frames_between(bag, topic, frames)
+    read, streams = reader_of(_pose_parts("geometry_msgs/msg/Transform", "transform")), {}
+    for link in [link for link in links if link not in fixed]:
+
+        def placed(message: Any, link: str = link) -> Any:
+            return next((part for part in message.transforms if part.child_frame_id.strip("/") == link), None)
+
+        messages = TopicMessages(bag, topic, read, placed)
+        rows, poses = _planar(messages, messages.table(6), notes)
+        streams[link] = messages.stamps[rows], np.column_stack([poses[:, :2], np.unwrap(poses[:, 2])])
+    stamps = min((stamps for stamps, _ in streams.values()), key=len)
+    begin, end = max(stamps[0] for stamps, _ in streams.values()), min(stamps[-1] for stamps, _ in streams.values())
+    stamps = stamps[(stamps >= begin) & (stamps <= end)]
+    whole: Array = np.zeros((len(stamps), 3))
+    for link in reversed(links):
+        if link in streams:
+            times, poses = streams[link]
+            step = interpolated((stamps - times[0]) / SECOND, (times - times[0]) / SECOND, poses)
+        else:
+            matrix = fixed[link][1]
+            step = np.broadcast_to([*matrix[:2, 3], np.arctan2(matrix[1, 0], matrix[0, 0])], whole.shape)
+        whole = compose(whole, step)
+    return stamps, whole
+
+
+def _events(bag: Bag, name: str, clock: _WheelClock) -> tuple[Event, ...]:
+    """The messages of a topic as events, with the text of a String as the command."""
+    topic, events = bag.topic(name, "cut_topic"), []
+    for record in bag.records(topic):
+        text = record.message.data if topic.type == "std_msgs/msg/String" and record.message else ""
+        events.append(Event(clock.of_record(topic, record), one_line(str(text)) or None))
+    return tuple(sorted(events, key=lambda event: event.time))
+
+
+def _sent_twists(bag: Bag, topic: Topic, clock: _WheelClock) -> Array | None:
+    """The twists that were sent (C, 5), each valid until another one came; None without any."""
+    read = reader_of(("linear.x", "linear.y", "angular.z"))
+    messages = ((clock.of_record(topic, record), record.message) for record in bag.records(topic) if record.message)
+    rows = sorted((time, *read(getattr(message, "twist", message))) for time, message in messages)
+    times, x, y, turn = np.array([row for row in rows if np.isfinite(row).all()]).reshape(-1, 4).T
+    twists = np.column_stack([times, np.hypot(x, y), np.arctan2(y, x), turn])
+    twists = twists[np.diff(twists[:, 1:], axis=0, prepend=np.inf).any(axis=1)]  # of equal ones the first
+    if not len(twists):
+        return None
+    end = max(float(clock.seconds(clock.stamps[-1:])[0]), twists[-1, 0])
+    return np.column_stack([twists, np.diff(twists[:, 0], append=end)])
+
+
+@importers.register("rosbag")
+class Rosbag(Importer):
+    """ROS recordings: MCAP, rosbag2 (sqlite3 and mcap) and ROS 1, with wheels and reference poses or laser scans.
+
+    The source is a bag, or a folder of bags; ``robot`` (a YAML file or a mapping) is the only option that must be
+    given. Wheels are a sensor_msgs/JointState, poses a geometry_msgs/PoseWithCovarianceStamped, PoseStamped or
+    TransformStamped. A bag with several of them lists them, and ``wheel_topic`` and ``pose_topic`` choose. Joints are
+    those called like the wheels (``a``, ``wheel_a``, ``a_wheel_joint``), or ``joints`` names them in the robot's order;
+    those that steer have "steer" in their names, too, or ``steering_joints`` names them. ``wheel_signs: [-1, 1, 1]``
+    turns a wheel round; the sense of a positive rate is in ``omnibench guide conventions``.
+
+    Other messages: a named topic may hold std_msgs numbers, of all wheels in an array, or any other type, of which
+    ``joints: [left_encoder, right_encoder]`` are fields, or paths such as ``status.wheels.0.angle``. Each wheel may
+    have its own topic, ``wheel_topic: [/left, /right]`` (``joints: [data, data]``); these are interpolated at the
+    stamps of the first, as steering angles of another topic are. Poses are at paths, too: ``pose_columns: [pose.x,
+    pose.y, pose.theta]``, or ``[state.pose]`` of any geometry pose. Bags before ROS 2 Iron do not say what is in such
+    messages; ``message_definitions`` names their .msg files. A nav_msgs/Odometry or a tf (``pose_frames: [world,
+    robot]``) is a reference only when named, and refused where it is made of the wheels.
+
+    references: a sensor_msgs/NavSatFix gives positions, east and north of its first fix, an Imu headings (orientation)
+    or turned angles (its rates about z, without their mean at rest), one each ``reference_period``. They are taken
+    where a bag has neither poses nor scans, or where ``references`` names them.
+
+    scans: those of a sensor_msgs/LaserScan (``scan_topic``; ``scans: false`` leaves them out) go into the data set.
+    Where the scanner is mounted comes from /tf_static or from ``scanner_mount: {x, y, yaw}`` (m, rad). A bag with scans
+    and without reference poses (odometry does not count as one) gets them from its scans by SLAM, with the options in
+    ``slam``; each run then begins at (0, 0, 0).
+
+    times: the stamps of the headers, of all topics by one clock; when a message was recorded matters for the topics in
+    ``recorded_stamps`` only. Messages recorded late are sorted; those without a stamp, with a stamp that was there or
+    with values that are not finite are left out, and warnings say how many. Messages without a header have the times of
+    recording. Positions are preferred: their differences are exact however many samples were lost. Velocities count as
+    the mean since the message before. Covariances of poses that mean "unknown" (0, negative, NaN, huge) are left out.
+
+    cut: at ``rests`` (each run keeps a little of the rest at both ends, and begins and ends at a reference pose there);
+    by a ``topic`` (a message of ``cut_topic`` begins a run, and a String says which command is driven); in ``windows``
+    of ``window`` s; or ``none``. Where samples are missing while the wheels turn, or the positions begin anew, a run
+    ends in any case, and another session begins. Poses are as recorded; t = 0 is a run's first pose. The command of a
+    run between rests is the twist that was sent most of the time on a topic that ends in cmd_vel (``v0.3_w0.6``).
+
+    Splits: ``train`` and ``validation`` are patterns of run names (``00*``, ``*-forward``); with one of them all other
+    runs go to the other side, with both the runs in neither are left out, with none every second run of a command
+    validates. A run is called by its number, before it the bag (``day1/003``) if there are several, and after it the
+    command of ``cut_topic`` (``003-forward``) if there is one.
+    """
+
+    Options = RosbagOptions
+    options: RosbagOptions
+
+    def read(self, source: Path) -> Dataset:
+        """All bags at or below ``source``; DataError names the bag, the topic and the message of what is wrong."""
+        notes: list[str] = []
+        recordings = self.recordings(source, notes)
+        dataset = dataset_of(recordings, self.options, notes)
+        doubtful = sorted({each.poses.doubtful for each in recordings if each.poses and each.poses.doubtful})
+        if doubtful and (residual := follows_the_wheels(dataset.trajectories)) is not None:
+            raise DataError(
+                f"{source}: {', '.join(doubtful)} is the robot's own odometry: some matrix makes its headings of the "
+                f"wheels to {residual:.1g} rad a second, and no error can show; --set pose_topic=NAME of an "
+                "independent reference (motion capture, SLAM), or record one"
+            )
+        return dataset
+
+    def recordings(self, source: Path, notes: list[str]) -> list[Recording]:
+        """The bags at or below ``source`` as they were recorded."""
+        recordings = [read_bag(path, name, self.options, notes) for name, path in find_bags(source).items()]
+        bare = [recording.place for recording in recordings if not recording.referenced]
+        if 0 < len(bare) < len(recordings):
+            raise DataError(
+                f"{bare[0]}: no topic holds reference poses, as it does in other bags; import the bags without "
+                "reference poses apart"
+            )
+        return recordings

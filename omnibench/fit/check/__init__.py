@@ -1,1 +1,0 @@
-"""The check of a recording: is it fit for calibration, what is wrong with it, and what to type."""

@@ -1,0 +1,146 @@
+"""Wheels, units and references that are misread are named with what mends them; sound recordings give nothing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from config_robots import NAMES, experiment
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from omnibench.check.misreadings import Explained, Recorded, search
+from omnibench.data.dataset import Dataset, Trajectory, make_dataset
+from omnibench.robot.kinematics import Array
+from omnibench.simulate.simulate import simulate_dataset
+
+Change = Callable[[Trajectory], Trajectory]
+
+
+@cache
+def recorded(robot: str) -> Dataset:
+    """One run of every command of a config's robot, without noise."""
+    return simulate_dataset(experiment(robot)).dataset
+
+
+def explained(dataset: Dataset, change: Change = lambda run: run) -> Explained:
+    """What the search says of a data set whose runs are changed."""
+    runs = [change(run) for run in dataset.trajectories]
+    changed = make_dataset("changed", dataset.robot, dataset.sample_period, runs).trajectories
+    return search(Recorded(dataset.robot, [run.log(run.pose_times) for run in changed], [run.poses for run in changed]))
+
+
+def rates(change: Callable[[Array], Array]) -> Change:
+    return lambda run: replace(run, rates=change(run.rates))
+
+
+def poses(change: Callable[[Array], Array]) -> Change:
+    return lambda run: replace(run, poses=change(run.poses))
+
+
+def steering(change: Callable[[Array], Array]) -> Change:
+    return lambda run: run if run.steering is None else replace(run, steering=change(run.steering))
+
+
+def turned(degrees: float) -> Change:
+    """Headings that are constantly off."""
+    return poses(lambda values: np.column_stack([values[:, :2], values[:, 2] + math.radians(degrees)]))
+
+
+def one(run: Trajectory, factor: float) -> Trajectory:
+    factors = np.ones(run.rates.shape[1])
+    factors[0] = factor
+    return replace(run, rates=run.rates * factors)
+
+
+CHANGES: dict[str, tuple[Change, str]] = {
+    "all negated": (rates(np.negative), "wheels_negated"),
+    "all times 4": (rates(lambda values: 4 * values), "wheel_scale"),
+    "rpm": (rates(lambda values: values * 60 / (2 * math.pi)), "wheel_unit"),
+    "degrees a second": (rates(np.degrees), "wheel_unit"),
+    "mm": (poses(lambda values: values * (1e3, 1e3, 1)), "position_unit"),
+    "degrees": (poses(lambda values: values * (1, 1, 180 / math.pi)), "heading_unit"),
+    "heading mirrored": (poses(lambda values: values * (1, 1, -1)), "reference_mirrored"),
+    "y mirrored": (poses(lambda values: values * (1, -1, 1)), "reference_mirrored"),
+    "x and y exchanged": (poses(lambda values: values[:, [1, 0, 2]]), "reference_mirrored"),
+    "turned": (turned(40.0), "reference_turned"),
+}
+EVERY_WHEEL = ("diff", "skid", "mecanum")
+
+
+@pytest.mark.parametrize("robot", NAMES)
+def test_a_sound_recording_is_misread_in_nothing(robot: str) -> None:
+    assert explained(recorded(robot)).mistakes == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "robot"), [(change, NAMES[index % len(NAMES)]) for index, change in enumerate(CHANGES)]
+)
+def test_a_mistake_is_named(change: str, robot: str) -> None:
+    made, kind = CHANGES[change]
+    found = explained(recorded(robot), made)
+    named = [found.mistakes, *found.alike]
+    assert kind in {mistake.kind for mistakes in named for mistake in mistakes}
+
+
+@pytest.mark.parametrize("robot", EVERY_WHEEL)
+@pytest.mark.parametrize(("factor", "kind"), [(-1.0, "wheel_negated"), (2.0, "wheel_scale"), (0.25, "wheel_scale")])
+def test_one_wheel_that_is_misread_is_named(factor: float, kind: str, robot: str) -> None:
+    (mistake,) = explained(recorded(robot), lambda run: one(run, factor)).mistakes
+    assert mistake.kind == kind
+    assert mistake.where == f"wheel {recorded(robot).robot.wheel_names[0]}"
+
+
+@pytest.mark.parametrize("robot", EVERY_WHEEL)
+def test_exchanged_wheels_come_with_the_way_back(robot: str) -> None:
+    order = [1, 0, *range(2, len(recorded(robot).robot.wheel_names))]
+    found = explained(recorded(robot), rates(lambda values: values[:, order]))
+    changes = [mistake.changes for mistakes in (found.mistakes, *found.alike) for mistake in mistakes]
+    assert {"wheel_order": order} in changes
+
+
+@pytest.mark.parametrize(
+    ("change", "kind", "robot"),
+    [
+        pytest.param(change, kind, robot, id=f"{kind}-{robot}", marks=[pytest.mark.slow] * (robot != quick))
+        for quick, kind, change in (
+            ("tricycle", "steering_sign", steering(np.negative)),
+            ("car", "steering_unit", steering(np.degrees)),
+            ("tricycle", "steering_zero", steering(lambda angles: angles + math.radians(14))),
+        )
+        for robot in ("tricycle", "car", "swerve")
+    ],
+)
+def test_misread_steering_angles_are_named(change: Change, kind: str, robot: str) -> None:
+    found = explained(recorded(robot), change)
+    assert kind in {mistake.kind for mistakes in (found.mistakes, *found.alike) for mistake in mistakes}
+
+
+@settings(max_examples=8, deadline=None)
+@given(st.floats(-180, 180))
+def test_the_angle_of_a_turned_reference_is_told(degrees: float) -> None:
+    found = explained(recorded("diff"), turned(degrees))
+    if abs(degrees) < 5:
+        assert found.mistakes == ()
+    elif abs(degrees) > 15:
+        changes = {key: value for mistake in found.mistakes for key, value in mistake.changes.items()}
+        off = changes.get("heading_offset_deg", 0.0) + degrees
+        assert abs(math.remainder(off, 360)) < 2.0
+
+
+@pytest.mark.parametrize("name", ["omni3", "diff", "tricyc", "omni4", "robotino"])
+def test_real_recordings_are_misread_in_nothing(name: str, request: pytest.FixtureRequest) -> None:
+    dataset = request.getfixturevalue(name)
+    for part in (slice(0, None, 4), slice(0, len(dataset.trajectories) // 8), slice(-6, None)):
+        assert explained(replace(dataset, trajectories=dataset.trajectories[part])).mistakes == ()
+
+
+@pytest.mark.parametrize("change", ["all negated", "rpm", "mm", "degrees", "y mirrored", "turned"])
+def test_mistakes_of_a_real_robot_are_named(change: str, omni3: Dataset) -> None:
+    made, kind = CHANGES[change]
+    found = explained(replace(omni3, trajectories=omni3.trajectories[::8]), made)
+    assert [mistake.kind for mistake in found.mistakes] == [kind]
