@@ -38,7 +38,7 @@ _PUBLIC = {
     "read_tum": "data.importers.tum",
     "run_comparison": "compare.run",
     "save_dataset": "data.storage",
-    "simulate_dataset": "simulate.simulate",
+    "simulate_dataset": "simulate.source",
     "subscribe": "live.wire.subscriber",
     "write_calibration": "robot.calibration",
     "write_tum": "data.importers.tum",
@@ -82,8 +82,8 @@ if TYPE_CHECKING:  # imports for type checkers; tests/ground/test_package.py hol
     from omnibench.robot.export.formats import export_calibration as export_calibration
     from omnibench.robot.kinematics import Robot as Robot
     from omnibench.robot.kinematics import Wheel as Wheel
-    from omnibench.simulate.simulate import simulate_dataset as simulate_dataset
     from omnibench.simulate.source import read_simulation as read_simulation
+    from omnibench.simulate.source import simulate_dataset as simulate_dataset
     from omnibench.slam.import_dataset import import_dataset as import_dataset
 
 

@@ -40,6 +40,23 @@ from omnibench.registry import Options, calibrators
 """
 
 
+PLUGIN_EFFECT = """
+import numpy as np
+from omnibench.registry import effects
+from omnibench.robot.effects.effect import MotionEffect, Parameter
+
+@effects.register("{name}")
+class Mine(MotionEffect):
+    "An effect of the tests."
+
+    stage, physics, source, shows_in = "{stage}", "Tyres grow.", "first principles", "command"
+    fixed_parameters = (Parameter({parameter}),)
+
+    def correction(self, signals, values):
+        return {correction}
+"""
+
+
 def omnibench(
     *arguments: object, cwd: Path | None = None, timeout: float = 300, **others: Any
 ) -> subprocess.CompletedProcess[str]:
@@ -158,6 +175,13 @@ def write_plugin(folder: Path, name: str, body: str) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{name}.py").write_text(PLUGIN_IMPORTS + body, encoding="utf-8")
     return folder
+
+
+def write_effect(file: Path, stage: str, parameter: str, correction: str) -> None:
+    """Write a plug-in file whose effect of motion has the file's name."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    text = PLUGIN_EFFECT.format(name=file.stem, stage=stage, parameter=parameter, correction=correction)
+    file.write_text(text, encoding="utf-8")
 
 
 @contextmanager

@@ -19,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.check.hypotheses import (
+    IN_DEGREES,
     Hypothesis,
+    Reading,
     design_hypotheses,
-    headings_in_degrees,
     position_units,
     reference_hypotheses,
     steering_readings,
@@ -79,19 +80,21 @@ class Recorded:
         windows = Windows.of(self.logs, self.poses)
         return None if windows is None else windows.fit(self.robot.reach)
 
+    def meant(self, hypothesis: Hypothesis) -> Recorded:
+        """With the logs that were meant, by a reading of steering angles and rates."""
+        reading = hypothesis.reading or Reading()
+        return replace(self, logs=[reading.of(log) for log in self.logs])
+
     def with_headings(self, factor: float) -> Recorded:
         """With headings times a factor."""
         return replace(self, poses=[poses * (1.0, 1.0, factor) for poses in self.poses])
 
     def in_degrees(self) -> Recorded:
         """With headings that were recorded in degrees."""
-        headings = [np.radians(np.unwrap(poses[:, 2], period=360.0)) for poses in self.as_read or self.poses]
-        return replace(
-            self,
-            poses=[
-                np.column_stack([of_run[:, :2], turned]) for of_run, turned in zip(self.poses, headings, strict=True)
-            ],
-        )
+        as_read = self.as_read or self.poses
+        headings = [np.radians(np.unwrap(poses[:, 2], period=360.0)) for poses in as_read]
+        pairs = zip(self.poses, headings, strict=True)
+        return replace(self, poses=[np.column_stack([poses[:, :2], turned]) for poses, turned in pairs])
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,36 +173,32 @@ def search(recording: Recorded) -> Explained:
 def _scores(recording: Recorded, fit: FreeFit) -> Iterator[_Scored]:
     weight = min(fit.windows / _CORRELATED, _MOST_WEIGHED)
     wheels = [*wheel_hypotheses(recording.robot), *steering_transforms(recording.robot)]
-    present = DesignDistance(recording.robot)
     for base in _bases(recording, fit):
-        cost, left = base.cost + weight * math.log(max(base.fit.share, 1e-9)), float(base.fit.left.min())
+        residual, left = weight * math.log(max(base.fit.share, 1e-9)), float(base.fit.left.min())
         for robot, hypotheses in _combined(recording.robot, base, wheels):
-            far = present if robot is None else DesignDistance(robot)
+            far = DesignDistance(robot)
             rows, columns = (np.array([getattr(each, name) for each in hypotheses]) for name in ("rows", "columns"))
             squared = far.squared(*transformed(base.fit, rows, columns))
             against = far.contradictions(base.fit.gram, columns)
-            scores = cost + squared + weight * np.log(np.hypot(against, _USUAL))
+            scores = base.cost + residual + squared + weight * np.log(np.hypot(against, _USUAL))
             numbers = zip(hypotheses, scores.tolist(), squared.tolist(), against.tolist(), strict=True)
             for hypothesis, score, distance, share in numbers:
-                mistakes = (*base.mistakes, *hypothesis.mistakes)
-                every = base.cost + hypothesis.cost
-                yield _Scored(score + hypothesis.cost, every, distance, share, left, mistakes)
+                mistakes, cost = (*base.mistakes, *hypothesis.mistakes), base.cost + hypothesis.cost
+                yield _Scored(score + hypothesis.cost, cost, distance, share, left, mistakes)
 
 
-def _combined(
-    robot: Robot, base: _Base, wheels: Sequence[Hypothesis]
-) -> Iterator[tuple[Robot | None, list[Hypothesis]]]:
+def _combined(robot: Robot, base: _Base, wheels: Sequence[Hypothesis]) -> Iterator[tuple[Robot, Sequence[Hypothesis]]]:
     """Mistakes of the wheels, and of the reference or the robot's file with those, by the design that is meant.
 
     Never more than three are made at once.
     """
     simple = [wheel for wheel in wheels if wheel.cost <= _SIMPLE]
     if not base.flipped:
-        yield None, list(wheels)
+        yield robot, wheels
         if base.plain:
             return
         for unit in position_units():
-            yield None, [wheel.with_reference(unit) for wheel in simple]
+            yield robot, [wheel.with_reference(unit) for wheel in simple]
         turned = [
             wheel.with_reference(reference)
             for wheel in simple
@@ -207,33 +206,29 @@ def _combined(
             if (reference := turned_reference(robot, base.fit, wheel.columns)) is not None
         ]
         if turned:
-            yield None, turned
+            yield robot, turned
         for hypothesis in () if base.mistakes else design_hypotheses(robot, base.fit):
-            yield hypothesis.robot, [hypothesis]
+            yield hypothesis.robot or robot, [hypothesis]
     for mirrored in reference_hypotheses(base.flipped):
-        yield None, [wheel.with_reference(mirrored) for wheel in simple]
+        yield robot, [wheel.with_reference(mirrored) for wheel in simple]
 
 
 def _bases(recording: Recorded, fit: FreeFit) -> Iterator[_Base]:
     yield _Base(fit)
-    flipped = recording.with_headings(-1.0).fit()
-    if flipped is not None:
+    if (flipped := recording.with_headings(-1.0).fit()) is not None:
         yield _Base(flipped, flipped=True)
     # Headings in rad hardly begin beyond a whole turn.
     beyond = any(abs(float(poses[0, 2])) > 1.01 * _TURN for poses in recording.poses)
     degrees, cost = recording.in_degrees(), 0.0 if beyond else _IN_DEGREES
     read_as: list[tuple[Recorded, tuple[Finding, ...], float]] = [(recording, (), 0.0)]
     for factor in (1.0, -1.0):
-        base = degrees.with_headings(factor).fit()
-        if base is not None:
-            yield _Base(base, (headings_in_degrees(),), cost, flipped=factor < 0)
+        if (base := degrees.with_headings(factor).fit()) is not None:
+            yield _Base(base, (IN_DEGREES,), cost, flipped=factor < 0)
             if factor > 0 and (beyond or base.left[1] < fit.left[1] / 2):
-                read_as.append((degrees, (headings_in_degrees(),), cost))
+                read_as.append((degrees, (IN_DEGREES,), cost))
     for read, mistakes, more in read_as:
         for hypothesis in steering_readings(read.robot, read.logs, read.poses):
-            assert hypothesis.reading is not None  # each has one
-            base = replace(read, logs=[hypothesis.reading.of(log) for log in read.logs]).fit()
-            if base is not None:
+            if (base := read.meant(hypothesis).fit()) is not None:
                 yield _Base(base, (*mistakes, *hypothesis.mistakes), more + hypothesis.cost, plain=True)
 
 
@@ -243,16 +238,15 @@ def _search_sparse(recording: Recorded) -> Explained:
         return Explained(searched=False)
     moments, hypotheses = _Moments.of(recording), list(_sparse_hypotheses(recording.robot))
     scored = []
-    for radian, headings in ((1.0, ()), (math.pi / 180, (headings_in_degrees(),))):
+    for radian, headings in ((1.0, ()), (math.pi / 180, (IN_DEGREES,))):
         for hypothesis, misfit in zip(hypotheses, moments.misfits(hypotheses, radian).tolist(), strict=True):
             scored.append((misfit, hypothesis.cost, (*headings, *hypothesis.mistakes)))
     present = scored[0][0]
     if not present > _LEAST_MISFIT:  # nan: it hardly moved
         return Explained(_contradicting(recording))
     for hypothesis in steering_scales(recording.robot):
-        assert hypothesis.reading is not None  # each has one
-        read = _Moments.of(replace(recording, logs=[hypothesis.reading.of(log) for log in recording.logs]))
-        scored.append((float(read.misfits([hypotheses[0]])[0]), hypothesis.cost, hypothesis.mistakes))
+        misfits = _Moments.of(recording.meant(hypothesis)).misfits(hypotheses[:1])
+        scored.append((float(misfits[0]), hypothesis.cost, hypothesis.mistakes))
     # The simplest of those that fit about as well as the best one.
     if present <= _MISFIT:  # as far as another design goes, but for steering
         scored = [each for each in scored if all(mistake.kind.startswith("steering") for mistake in each[2])]
@@ -279,22 +273,20 @@ def _contradicting(recording: Recorded) -> tuple[Finding, ...]:
 
 
 def _sparse_hypotheses(robot: Robot) -> Iterator[Hypothesis]:
-    """Mistakes of the wheels, one of them or none, each with every unit of the positions."""
-    wheels = [each for each in (*wheel_hypotheses(robot), *steering_transforms(robot)) if not _near_one(each)]
-    plain = wheels[0]
+    """Mistakes of the wheels, one of them or none, each with every unit of the positions.
+
+    Factors of rates that a calibration is for are left out: sparse poses do not tell them from another design.
+    """
+    wheels = []
+    for each in (*wheel_hypotheses(robot), *steering_transforms(robot)):
+        factors = [factor for mistake in each.mistakes for factor in mistake.changes.get("rate_factors", ())]
+        if not factors or not all(1 / _LEAST_FACTOR < factor < _LEAST_FACTOR for factor in factors):
+            wheels.append(each)
     yield from wheels
     for unit in position_units():
-        yield from (wheel.with_reference(unit) for wheel in wheels if wheel is plain or _is_unit(wheel))
-
-
-def _near_one(hypothesis: Hypothesis) -> bool:
-    """True for a factor of rates that is what a calibration is for: sparse poses do not tell it from another design."""
-    factors = [factor for mistake in hypothesis.mistakes for factor in mistake.changes.get("rate_factors", ())]
-    return bool(factors) and all(1 / _LEAST_FACTOR < factor < _LEAST_FACTOR for factor in factors)
-
-
-def _is_unit(hypothesis: Hypothesis) -> bool:
-    return hypothesis.mistakes[0].kind == "wheel_unit"
+        for wheel in wheels:
+            if not wheel.mistakes or wheel.mistakes[0].kind == "wheel_unit":
+                yield wheel.with_reference(unit)
 
 
 @dataclass(frozen=True, eq=False)
@@ -314,12 +306,10 @@ class _Moments:
     @classmethod
     def of(cls, recording: Recorded) -> _Moments:
         """The moments of some runs from first to last."""
-        chosen = np.unique(
-            np.linspace(0, len(recording.logs) - 1, min(len(recording.logs), _MOST_RUNS)).round().astype(int)
-        )
+        few = np.linspace(0, len(recording.logs) - 1, min(len(recording.logs), _MOST_RUNS))
         logs, poses = [], []
         row_3 = recording.robot.inverse_kinematic_matrix[2]
-        for index in chosen.tolist():
+        for index in np.unique(few.round().astype(int)).tolist():
             log, of_run = recording.logs[index], recording.poses[index]
             turned = np.cumsum((log.signals @ row_3) * np.diff(log.times, prepend=0.0))
             headings = np.interp(log.stamps, np.append(0.0, log.times), np.append(0.0, turned))

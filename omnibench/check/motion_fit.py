@@ -97,28 +97,22 @@ class Windows:
             return None
         heading, heading_weights = _robust(self.driven.astype(complex), self.turned.astype(complex))
         position, position_weights = _robust(self.bent, self.moved)
-        left = np.array(
-            [
-                _unexplained(self.moved, self.bent @ position, position_weights),
-                _unexplained(self.turned, self.driven @ heading.real, heading_weights),
-            ]
-        )
+        off = self.moved - self.bent @ position
+        missed = self.turned - self.driven @ heading.real
+        left = [_share(off, self.moved, position_weights), _share(missed, self.turned, heading_weights)]
         # Slip of the wheels as a covariance (M, M) of the matrix, as a share of a row's scale squared.
         _, strengths, directions = np.linalg.svd(self.driven, full_matrices=False)
         shares = np.maximum(strengths / max(float(strengths[0]), 1e-300), 1e-4)
         slip: Array = (directions.T * (_SLIP / shares) ** 2) @ directions
-        rows = [
-            _covariance(self.bent, self.moved - self.bent @ position, position_weights) / 2,
-            _covariance(self.bent, self.moved - self.bent @ position, position_weights) / 2,
-            _covariance(self.driven.astype(complex), self.turned - self.driven @ heading, heading_weights),
-        ]
+        of_place = _covariance(self.bent, off, position_weights) / 2
+        of_heading = _covariance(self.driven.astype(complex), self.turned - self.driven @ heading, heading_weights)
         matrix = np.array([position.real, position.imag, heading.real])
         scales = np.maximum(np.abs(matrix).max(axis=1), 1e-12)
         scales[:2] = scales[:2].max()
-        covariance = np.array([row + (scale**2) * slip for row, scale in zip(rows, scales, strict=True)])
+        covariance = np.array([of_place, of_place, of_heading]) + scales[:, None, None] ** 2 * slip
         wholes = [float(position_weights @ np.abs(self.moved) ** 2), reach**2 * float(heading_weights @ self.turned**2)]
-        share = float(np.sqrt((left**2) @ wholes / max(sum(wholes), 1e-300)))
-        return FreeFit(matrix, covariance, left, share, count, self.driven.T @ self.driven)
+        share = float(np.sqrt(np.square(left) @ wholes / max(sum(wholes), 1e-300)))
+        return FreeFit(matrix, covariance, np.array(left), share, count, self.driven.T @ self.driven)
 
 
 def continuous(stamps: Array, poses: Array) -> Array:
@@ -184,10 +178,10 @@ def _robust(columns: Complex, wanted: Complex) -> tuple[Complex, Array]:
     return solution.astype(np.complex128), weights
 
 
-def _unexplained(wanted: Array | Complex, fitted: Array | Complex, weights: Array) -> float:
+def _share(left: Array | Complex, wanted: Array | Complex, weights: Array) -> float:
     """Share of what is wanted that a fit leaves."""
     whole = float(weights @ np.abs(wanted) ** 2)
-    return float(np.sqrt(weights @ np.abs(wanted - fitted) ** 2 / whole)) if whole else 0.0
+    return float(np.sqrt(weights @ np.abs(left) ** 2 / whole)) if whole else 0.0
 
 
 def _covariance(columns: Complex, left: Array | Complex, weights: Array) -> Array:
@@ -214,10 +208,22 @@ class DesignDistance:
 
     def __init__(self, robot: Robot) -> None:
         self.design = robot.inverse_kinematic_matrix
-        scales = robot.row_scales
-        self._outside = beyond_twists(robot)
-        self._units = np.repeat(1 / scales, self.design.shape[1])
-        self._allowed = _allowed(robot, scales) * np.outer(self._units, self._units)
+        scales, columns = robot.row_scales, self.design.shape[1]
+        self._outside = _beyond_twists(robot)
+        self._units = np.repeat(1 / scales, columns)
+        # S (3M, 3M) in units of the rows: what radii, gains, and yaw and place of the tracked point may change.
+        lateral = _LATERAL if any(wheel.kind == "mecanum" for wheel in robot.wheels) else _GAINS[1]
+        gains = (_GAINS[0], lateral, _SKID if robot.skid else _GAINS[2])
+        changes = [_RADIUS * self.design * (np.arange(columns) == column) for column in range(columns)]
+        changes += [gain * self.design * (np.arange(3) == row)[:, None] for row, gain in enumerate(gains)]
+        x, y, turn = self.design
+        changes.append(_YAW * np.array([-y, x, 0 * turn]))
+        changes += [
+            _PLACE * robot.reach * np.array(rows) for rows in ([turn, 0 * turn, 0 * turn], [0 * turn, turn, 0 * turn])
+        ]
+        flat = np.array(changes).reshape(len(changes), -1)
+        allowed = flat.T @ flat + np.diag(np.repeat((_ELEMENT * scales) ** 2, columns))
+        self._allowed = allowed * np.outer(self._units, self._units)
 
     def squared(self, matrices: Array, covariances: Array) -> Array:
         """d^2 (P,) of matrices (P, 3, M) whose rows have covariances (P, 3, M, M)."""
@@ -248,30 +254,13 @@ class DesignDistance:
         return shares
 
 
-def beyond_twists(robot: Robot) -> Array:
+def _beyond_twists(robot: Robot) -> Array:
     """The projection (M, M) that takes from drive signals those that a twist of the robot gives."""
     equations = robot.signal_equations @ robot.allowed_basis
     within, strengths, _ = np.linalg.svd(equations, full_matrices=False)
     within = within[:, strengths > 1e-9 * strengths[0]]
     outside: Array = np.eye(len(equations)) - within @ within.T
     return np.where(np.abs(outside) < 1e-12, 0.0, outside)
-
-
-def _allowed(robot: Robot, scales: Array) -> Array:
-    """S (3M, 3M)."""
-    design = robot.inverse_kinematic_matrix
-    lateral = _LATERAL if any(wheel.kind == "mecanum" for wheel in robot.wheels) else _GAINS[1]
-    gains = (_GAINS[0], lateral, _SKID if robot.skid else _GAINS[2])
-    columns = range(design.shape[1])
-    changes = [_RADIUS * design * (np.arange(design.shape[1]) == column) for column in columns]
-    changes += [gain * design * (np.arange(3) == row)[:, None] for row, gain in enumerate(gains)]
-    changes.append(_YAW * np.array([-design[1], design[0], 0 * design[2]]))
-    zero = np.zeros_like(design[0])
-    changes += [_PLACE * robot.reach * np.array(rows) for rows in ([design[2], zero, zero], [zero, design[2], zero])]
-    flat = np.array(changes).reshape(len(changes), -1)
-    elements = np.repeat((_ELEMENT * scales) ** 2, design.shape[1])
-    allowed: Array = flat.T @ flat + np.diag(elements)
-    return allowed
 
 
 def transformed(fit: FreeFit, rows: Array, columns: Array) -> tuple[Array, Array]:

@@ -7,14 +7,16 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
+from omnibench.check.evidence import Evidence
 from omnibench.check.motion_fit import Windows
-from omnibench.data.dataset import Trajectory
-from omnibench.data.finding import Finding
+from omnibench.check.references import left_open
+from omnibench.data.finding import Finding, Kind
+from omnibench.data.stored import drawn_runs
 from omnibench.fit.evaluate import command_names
 from omnibench.fit.span import driven_span
 from omnibench.robot.kinematics import Array, Robot
@@ -65,10 +67,32 @@ def turning(kinds: Kinds, side: str) -> NDArray[np.bool_]:
     return curves | kinds.get(f"on the spot to the {side}", np.zeros_like(curves))
 
 
-def missing_motions(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Finding]:
+def lacking(evidence: Evidence) -> Iterator[Finding]:
+    """Motions, runs and repetitions that are missing: noise and intervals cannot be had without them."""
+    runs = evidence.dataset.trajectories
+    if any(run.references is not None for run in runs):
+        yield from left_open(evidence)
+    else:
+        for what, fix in _missing_motions(evidence):
+            yield _warning("motion_missing", what, fix)
+    if len(runs) <= _FEW_RUNS:
+        what = f"there {'is' if len(runs) == 1 else 'are'} only {plural(len(runs), 'run')}: nothing is left to judge a "
+        fix = f"record {_SOME_RUNS + 1} runs or more, of several commands"
+        yield _warning("few_runs", f"{what}calibration by", fix)
+    if max(Counter(command_names(runs)).values()) < _LEAST_REPEATED:
+        what = "no command was driven twice: noise and errors of the model cannot be told apart"
+        yield _warning("few_repetitions", what, "drive every command three times")
+
+
+def _warning(kind: Kind, what: str, fix: str) -> Finding:
+    return Finding(kind=kind, what=what, where="the recording", severity="warning", fix=fix)
+
+
+def _missing_motions(evidence: Evidence) -> Iterator[tuple[str, str]]:
     """Motions that a robot of this kind needs and that were not driven; none where the reference does not move."""
+    robot, runs = evidence.dataset.robot, drawn_runs(evidence.aligned)
     if not any(run.rates.any() for run in runs):
-        yield _missing("the robot never moved", "drive it, and see that the columns of the wheels are those that count")
+        yield "the robot never moved", "drive it, and see that the columns of the wheels are those that count"
         return
     windows = Windows.of([run.log(run.pose_times) for run in runs], [run.poses for run in runs])
     if windows is None:
@@ -84,55 +108,22 @@ def missing_motions(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Findin
     def share(chosen: NDArray[np.bool_]) -> float:
         return float(seconds[active & chosen].sum()) / whole
 
-    left, right = share(turning(kinds, "left")), share(turning(kinds, "right"))
-    if left < SHARE and right < SHARE:
-        yield _missing("the robot never turned", f"drive {_turns(robot)}, to either side")
-    elif min(left, right) < SHARE:
-        side = "left" if left < SHARE else "right"
-        yield _missing(f"the robot never turned {side}", f"drive {_turns(robot)}, to the {side}")
+    sides = [side for side in _SIDES if share(turning(kinds, side)) < SHARE]
+    turns = "three circles" if robot.drive.steered else "three turns on the spot at 0.5 rad/s"
+    if len(sides) == 2:
+        yield "the robot never turned", f"drive {turns}, to either side"
+    elif sides:
+        yield f"the robot never turned {sides[0]}", f"drive {turns}, to the {sides[0]}"
     if share(kinds["straight"]) < SHARE:
-        yield _missing("the robot never went straight", "drive three straight lines of 2 m and more")
+        yield "the robot never went straight", "drive three straight lines of 2 m and more"
     moved = windows.moved[np.abs(velocity) > MOVING]
     if robot.slides and not robot.skid and len(moved):
         # 1 if the robot moved along one line in its frame, 0 all round.
         spread = abs(complex(np.sum(moved**2))) / float(np.sum(np.abs(moved) ** 2))
         if spread >= math.cos(2 * _SLIDING):
-            yield _missing(
-                "the robot went in one direction only", "drive forward, and sideways to either side, 2 m each"
-            )
-    if robot.drive.direct and left >= SHARE and right >= SHARE and robot.slides:
+            yield "the robot went in one direction only", "drive forward, and sideways to either side, 2 m each"
+    if robot.drive.direct and not sides and robot.slides:
         spot = share(kinds["on the spot to the left"] | kinds["on the spot to the right"])
         shares = driven_span(runs).shares
         if spot < SHARE and shares[-1] < SHARE / 2 and len(shares) == 3:
-            yield _missing("the robot never turned on the spot", "drive three turns at 0.5 rad/s, to either side")
-
-
-def _missing(what: str, fix: str) -> Finding:
-    return Finding(kind="motion_missing", what=what, where="the recording", severity="warning", fix=fix)
-
-
-def _turns(robot: Robot) -> str:
-    return "three circles" if robot.drive.steered else "three turns on the spot at 0.5 rad/s"
-
-
-def too_few(runs: Sequence[Trajectory]) -> Iterator[Finding]:
-    """Runs or repetitions by which neither noise nor intervals can be had."""
-    count = len(runs)
-    if count <= _FEW_RUNS:
-        yield Finding(
-            kind="few_runs",
-            what=f"there {'is' if count == 1 else 'are'} only {plural(count, 'run')}: nothing is left to judge a "
-            "calibration by",
-            where="the recording",
-            severity="warning",
-            fix=f"record {_SOME_RUNS + 1} runs or more, of several commands",
-        )
-    repeated = max(Counter(command_names(runs)).values())
-    if repeated < _LEAST_REPEATED:
-        yield Finding(
-            kind="few_repetitions",
-            what="no command was driven twice: noise and errors of the model cannot be told apart",
-            where="the recording",
-            severity="warning",
-            fix="drive every command three times",
-        )
+            yield "the robot never turned on the spot", "drive three turns at 0.5 rad/s, to either side"

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator
 
 import numpy as np
 
-from omnibench.check.hypotheses import POSITION_UNITS, mistake
-from omnibench.check.misreadings import Recorded
+from omnibench.check.evidence import Evidence
+from omnibench.check.hypotheses import POSITION_UNITS
 from omnibench.check.motion_fit import Windows
-from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.data.finding import Finding
+from omnibench.data.dataset import Trajectory
+from omnibench.data.finding import Finding, Kind, error
 from omnibench.data.references import KINDS, UNITS, ReferenceKind, References
 from omnibench.fit.open_combinations import open_sentences
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.odometry import WheelLog
 from omnibench.words import plural
 
 _REACHED = 0.05  # share of a run's time after which its last pose comes at least; chosen
@@ -25,113 +23,95 @@ _REACHED = 0.05  # share of a run's time after which its last pose comes at leas
 _LEFT = 0.25
 _TURNED = 0.5  # rad, root mean square of the runs' turns: less of it tells nothing; chosen
 _FEWEST = 3  # runs whose turns a matrix of a few numbers cannot all follow; chosen
-# How many times too large references in another unit are, and that unit.
+# How many times too large references in another unit are, and that unit; and the option that says so.
 _FACTORS = {"m": POSITION_UNITS, "rad": ((float(np.degrees(1)), "deg"),)}
+_OPTIONS: dict[str, Kind] = {"m": "position_unit", "rad": "heading_unit"}
 _NEAR = 1.5  # a ratio to the odometry within this factor of a unit's is that unit; chosen: designs are off by less
 _LEAST = {"m": 0.02, "rad": 0.05}  # m, rad: motions that are smaller tell nothing of a unit; chosen
 
 
-def odd_references(dataset: Dataset) -> Iterator[Finding]:
+def odd_references(evidence: Evidence) -> Iterator[Finding]:
     """Kinds of references whose values are as large as in another unit; beside poses no option mends them alone."""
     ratios: dict[ReferenceKind, list[float]] = {kind: [] for kind in KINDS}
-    model = OdometryModel.of_design(dataset.robot, "arc")
-    for run in dataset.trajectories:
+    model = OdometryModel.of_design(evidence.dataset.robot, "arc")
+    for run in evidence.dataset.trajectories:
         if run.references is None or not len(run.references):
             continue
-        sizes, driven = _sizes(model, run.log([0.0]), run.references)
+        sizes, driven = _sizes(model, run, run.references)
         for kind, size, expected in zip(run.references.kinds.tolist(), sizes, driven, strict=True):
             if expected > _LEAST[UNITS[kind]] and np.isfinite(size):
                 ratios[kind].append(size / expected)
-    beside = any(run.has_poses for run in dataset.trajectories)
     for kind, values in ratios.items():
-        ratio = float(np.median(values)) if values else 0.0
-        for factor, unit in _FACTORS[UNITS[kind]]:
+        ratio, must = float(np.median(values)) if values else 0.0, UNITS[kind]
+        for factor, unit in _FACTORS[must]:
             if factor / _NEAR < ratio < factor * _NEAR:
                 what = f"references of kind {kind} are {ratio:.3g} times what the wheels say, as if they were in "
-                what += f"{'degrees' if unit == 'deg' else unit}: they must be in {UNITS[kind]}"
-                option = "heading_unit" if UNITS[kind] == "rad" else "position_unit"
-                finding = mistake(option, what, f"references of kind {kind}", {} if beside else {option: unit})  # type: ignore[arg-type]
+                what += f"{'degrees' if unit == 'deg' else unit}: they must be in {must}"
+                where, option = f"references of kind {kind}", _OPTIONS[must]
                 fix = "write these references in m and rad, as the poses are, and import again"
-                yield finding.model_copy(update={"fix": fix}) if beside else finding
+                yield (
+                    error(option, what, where, fix=fix) if evidence.runs else error(option, what, where, {option: unit})
+                )
 
 
-def _sizes(model: OdometryModel, log: WheelLog, references: References) -> tuple[Array, Array]:
+def _sizes(model: OdometryModel, run: Trajectory, references: References) -> tuple[Array, Array]:
     """Magnitudes (R,) of what was measured and of the same by a model; positions and compass headings since the first.
 
     NaN for the first of those.
     """
-    first, last = (_at(model, log, stamps) for stamps in (references.t0, references.t1))
+    stamps, places = np.unique([references.t0, references.t1], return_inverse=True)
+    log = run.log(stamps)
+    first, last = model.poses([log])[0][places.reshape(2, -1)]  # (R, 3), poses at the begin and at the end of each
+    begin, end = model.lengths([log])[0][places.reshape(2, -1)]
     values = references.values.copy()
     for kind in ("position", "heading"):
         chosen = references.fixed_frame & (references.kinds == kind)
         if chosen.any():
             values[chosen] -= values[chosen][0]
             values[np.flatnonzero(chosen)[0]] = np.nan
-            first[0][chosen], first[1][chosen] = last[0][chosen][0], last[1][chosen][0]
+            first[chosen] = last[chosen][0]
     size = np.where(references.planar, np.hypot(values[:, 0], values[:, 1]), np.abs(values[:, 0]))
-    moved = last[0] - first[0]
-    expected = np.select(
-        [references.kinds == "distance", references.planar],
-        [last[1] - first[1], np.hypot(moved[:, 0], moved[:, 1])],
-        np.abs(moved[:, 2]),
-    )
+    moved = last - first
+    kinds = [references.kinds == "distance", references.planar]
+    expected = np.select(kinds, [end - begin, np.hypot(moved[:, 0], moved[:, 1])], np.abs(moved[:, 2]))
     return size, expected
 
 
-def _at(model: OdometryModel, log: WheelLog, stamps: Array) -> tuple[Array, Array]:
-    """Poses (S, 3) and distances driven (S,) at stamps (S,), in any order."""
-    order = np.argsort(stamps)
-    wanted = replace(log, stamps=stamps[order])
-    poses, lengths = np.empty((len(stamps), 3)), np.empty(len(stamps))
-    poses[order], lengths[order] = model.poses([wanted])[0], model.lengths([wanted])[0]
-    return poses, lengths
-
-
-def early_references(runs: Sequence[Trajectory]) -> Iterator[Finding]:
+def early_references(evidence: Evidence) -> Iterator[Finding]:
     """The finding that the poses of most runs end long before their wheels."""
+    runs = evidence.aligned
     early = [run for run in runs if run.references is None and run.pose_times[-1] < _REACHED * run.times[-1]]
     if 2 * len(early) > len(runs):
-        seen, driven = early[0].pose_times[-1], early[0].times[-1]
-        yield Finding(
-            kind="reference_foreign",
-            what=f"the poses of {plural(len(early), 'run')} end long before the wheels, as after {seen:.2g} s of "
-            f"{driven:.3g} s",
-            where="the reference",
-            severity="error",
-            fix="say the unit of the poses' times (pose_time_unit), or record poses to the end of each run",
-        )
+        what = f"the poses of {plural(len(early), 'run')} end long before the wheels, as after "
+        what += f"{early[0].pose_times[-1]:.2g} s of {early[0].times[-1]:.3g} s"
+        fix = "say the unit of the poses' times (pose_time_unit), or record poses to the end of each run"
+        yield error("reference_foreign", what, "the reference", fix=fix)
 
 
-def unrelated_references(recording: Recorded) -> Iterator[Finding]:
-    """The finding that no matrix explains how the reference turns, as where poses are of other drives."""
-    if (left := _turns_left(recording)) is not None and left > _LEFT:
-        yield Finding(
-            kind="reference_foreign",
-            what=f"the wheels explain {max(0.0, 1 - left):.0%} of how the reference turns",
-            where="the reference",
-            severity="error",
-            fix="see whether wheels and poses of each run are of the same drive, and name the robot's wheels right",
-        )
+def unrelated_references(evidence: Evidence) -> Iterator[Finding]:
+    """The finding that no matrix explains how the reference turns, as where poses are of other drives.
 
-
-def _turns_left(recording: Recorded) -> float | None:
-    """Share of the squares of the runs' turns that the best matrix does not explain; None: they turn too little."""
-    some = recording.some()
+    It is judged by the share of the squares of the runs' turns that the best matrix does not explain.
+    """
+    some = evidence.seen.some()
     windows = Windows.of(some.logs, some.poses)
-    fit = None if windows is None else windows.fit(recording.robot.reach)
+    fit = None if windows is None else windows.fit(some.robot.reach)
     if windows is None or fit is None or len(some.logs) < _FEWEST:
-        return None
+        return
     turned = np.bincount(windows.run, windows.turned)
-    if np.sqrt(np.mean(turned**2)) < _TURNED:
-        return None
     missed = turned - np.bincount(windows.run, windows.driven @ fit.matrix[2])
-    return float((missed**2).sum() / (turned**2).sum())
+    if np.sqrt(np.mean(turned**2)) < _TURNED:
+        return
+    if (left := float((missed**2).sum() / (turned**2).sum())) > _LEFT:
+        what = f"the wheels explain {max(0.0, 1 - left):.0%} of how the reference turns"
+        fix = "see whether wheels and poses of each run are of the same drive, and name the robot's wheels right"
+        yield error("reference_foreign", what, "the reference", fix=fix)
 
 
-def left_open(dataset: Dataset) -> Iterator[Finding]:
+def left_open(evidence: Evidence) -> Iterator[Finding]:
     """Findings on what the training runs leave open: with no reference of turning, or none of lengths, a warning."""
-    training = dataset.split("train")
-    for number, sentence in enumerate(open_sentences(dataset.robot, training) if training else ()):
+    training = evidence.dataset.split("train")
+    for number, sentence in enumerate(open_sentences(evidence.dataset.robot, training) if training else ()):
         what, _, fix = sentence.rpartition("; " if "; " in sentence else ": ")
         missing = what.startswith(("no reference tells of turning", "no reference tells of lengths"))
         yield Finding(

@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from omnibench.check.hypotheses import mistake
+from omnibench.check.hypotheses import RATE_UNITS
 from omnibench.check.misreadings import Recorded
 from omnibench.config import as_yaml, validate
 from omnibench.data.dataset import Dataset
-from omnibench.data.finding import Finding
+from omnibench.data.finding import Finding, error
 from omnibench.data.importers.dataset_folder import DatasetOptions, recordings_of
 from omnibench.data.importing import importer_of, read_dataset
 from omnibench.data.recording import Recording, ReferenceOptions, quantity_of
@@ -28,12 +28,11 @@ from omnibench.files import check_source
 from omnibench.registry import importers
 
 _BAGS = (".mcap", ".bag", ".db3")
+_FILES = {"command.csv": "table1", "*_metadata.csv": "optiodom", "*.csv": "csv", "*.txt": "csv"}  # names of importers
 _ANY_RATE = 1e9  # rad/s: the option ``fastest`` with which rates in any unit are read
 # Periods, s, of wheels and of poses that are more likely in another unit; chosen: no encoder is read less often.
 _SLOWEST, _SLOWEST_POSES, _FASTEST = 1.5, 5.0, 3e-4
-_TIME_UNITS = ("ms", "us", "ns")
 _EXPLAINED = 0.35  # share of the way that the wheels may leave unexplained with the right unit of time; chosen
-_RATES = {"rpm": 2 * np.pi / 60, "deg/s": np.pi / 180, "rev/s": 2 * np.pi}
 _COLUMNS = {"wheel_order": ("joints", "wheel_columns"), "steering_order": ("steering_joints", "steering_columns")}
 
 
@@ -66,9 +65,12 @@ class RecordingSource:
         if self.places:
             return None
         try:
-            return (
-                _recordings(self.importer, self.source, self.options) if self.readable else _of_runs(self.dataset, {})
-            )
+            if not self.readable:
+                return _of_runs(self.dataset, {})
+            importer, again = importer_of(self.importer, self.source, self.options)
+            if not again and isinstance(importer.options, ReferenceOptions) and hasattr(importer, "recordings"):
+                return importer.recordings(self.source, []), importer.options
+            return _of_runs(importer.read(self.source), again)
         except (DataError, ConfigError):
             return None
 
@@ -80,7 +82,9 @@ class RecordingSource:
         changed = {key: value for key, value in options.items() if self.options.get(key) != value}
         try:
             read = validate(type(present), {**present.model_dump(exclude_unset=True), **changed}, "options")
-            return dataset_of([_as_said(recording, read, changed) for recording in recordings], read, [])
+            if "wheel_unit" in changed:
+                recordings = [replace(each, wheels=replace(each.wheels, unit=read.wheel_unit)) for each in recordings]
+            return dataset_of(recordings, read, [])
         except (DataError, ConfigError):
             return None
 
@@ -92,25 +96,10 @@ class RecordingSource:
         return list(wheels.columns if key == "wheel_order" else wheels.steering_columns)
 
 
-def _recordings(name: str, source: Path, given: Mapping[str, Any]) -> tuple[list[Recording], ReferenceOptions]:
-    """The recordings of a source, and the options. DataError, ConfigError: it cannot be read."""
-    importer, again = importer_of(name, source, given)
-    if not again and isinstance(importer.options, ReferenceOptions) and hasattr(importer, "recordings"):
-        return importer.recordings(source, []), importer.options
-    return _of_runs(importer.read(source), again)
-
-
 def _of_runs(dataset: Dataset, given: Mapping[str, Any]) -> tuple[list[Recording], ReferenceOptions]:
     """The runs of a data set as recordings."""
     options = DatasetOptions(robot=dataset.robot, **given)
     return recordings_of(dataset.trajectories, dataset.robot, None, options), options
-
-
-def _as_said(recording: Recording, options: ReferenceOptions, changed: Mapping[str, Any]) -> Recording:
-    """A recording whose wheels are read in another unit, where that is changed."""
-    if "wheel_unit" not in changed:
-        return recording
-    return replace(recording, wheels=replace(recording.wheels, unit=options.wheel_unit))
 
 
 def read_source(
@@ -165,12 +154,7 @@ def recognised(source: Path) -> str:
         return "rosbag" if source.suffix in _BAGS else "csv"
     if (source / "metadata.yaml").is_file() or any(source.glob("*.mcap")) or any(source.glob("*.bag")):
         return "rosbag"
-    for pattern, name in (
-        ("command.csv", "table1"),
-        ("*_metadata.csv", "optiodom"),
-        ("*.csv", "csv"),
-        ("*.txt", "csv"),
-    ):
+    for pattern, name in _FILES.items():
         if next(source.rglob(pattern), None) is not None:
             return name
     raise ConfigError(f"{source}: no recording is recognised there; name the importer with --format (omnibench list)")
@@ -193,25 +177,23 @@ def _read(name: str, source: Path, given: Mapping[str, Any]) -> Dataset:
     options = dict(given)
     if "name" in importers.entry(name, "--format").options.model_fields:
         options.setdefault("name", source.resolve().stem)
+
+    def read(options: Mapping[str, Any]) -> Dataset:
+        importer, again = importer_of(name, source, options)
+        return read_dataset(importer, source, again)
+
     try:
-        dataset = _read_by(name, source, options)
+        dataset = read(options)
     except DataError as refusal:
         if "fastest" in given:
             raise
         try:
-            dataset = _read_by(name, source, {**options, "fastest": _ANY_RATE})
+            dataset = read({**options, "fastest": _ANY_RATE})
         except (DataError, ConfigError):
             raise refusal from None
-    if not dataset.referenced:
-        raise DataError(
-            f"{source}: it has no reference poses; import it, which makes them from its scans, and check that"
-        )
-    return dataset
-
-
-def _read_by(name: str, source: Path, options: Mapping[str, Any]) -> Dataset:
-    importer, again = importer_of(name, source, options)
-    return read_dataset(importer, source, again)
+    if dataset.referenced:
+        return dataset
+    raise DataError(f"{source}: it has no reference poses; import it, which makes them from its scans, and check that")
 
 
 def sensible(dataset: Dataset) -> bool:
@@ -239,13 +221,13 @@ def odd_times(dataset: Dataset) -> bool:
 def other_times(given: Mapping[str, Any]) -> Iterator[Finding]:
     """Findings that another unit of time would mend: of all times, of the poses' and of the wheels'."""
     wheels, poses = "wheel_time_unit", "pose_time_unit"
-    for unit in _TIME_UNITS:
+    for unit in ("ms", "us", "ns"):
         for changes, which, where in (
             ({wheels: unit, poses: unit}, "all times", "the recording"),
             ({poses: unit}, "the times of the poses", "the reference"),
             ({wheels: unit, poses: given.get(poses) or "s"}, "the times of the wheels", "all wheels"),
         ):
-            yield mistake("time_unit", f"{which} look like {unit}; they are read in s", where, changes)
+            yield error("time_unit", f"{which} look like {unit}; they are read in s", where, changes)
 
 
 def with_fixes(read: RecordingSource, findings: Sequence[Finding]) -> list[Finding]:
@@ -297,15 +279,14 @@ def import_command(read: RecordingSource, options: Mapping[str, Any]) -> str:
 def mended_options(read: RecordingSource, findings: Sequence[Finding]) -> dict[str, Any]:
     """The options with the changes of findings, which are relative to those by which the recording was read."""
     options = dict(read.options)
-    for finding in findings:
-        for key, value in finding.changes.items():
-            options |= _changed(read, options, key, value)
-            if key in _COLUMNS and options.get("columns"):  # names that now stand in the lists
-                names = {
-                    str(name) for other in _COLUMNS.values() for option in other for name in options.get(option) or ()
-                }
-                options["columns"] = {k: name for k, name in options["columns"].items() if str(name) not in names}
-                options = {k: v for k, v in options.items() if k != "columns" or v}
+    changes = [change for finding in findings for change in finding.changes.items()]
+    for key, value in changes:
+        options |= _changed(read, options, key, value)
+        if key in _COLUMNS and options.get("columns"):  # names that now stand in the lists
+            lists = [options.get(option) or () for other in _COLUMNS.values() for option in other]
+            listed = {str(name) for names in lists for name in names}
+            options["columns"] = {k: name for k, name in options["columns"].items() if str(name) not in listed}
+            options = {k: v for k, v in options.items() if k != "columns" or v}
     return options
 
 
@@ -334,7 +315,12 @@ def _changed(read: RecordingSource, options: Mapping[str, Any], key: str, value:
     if key == "wheel_quantity":
         return {"wheel_unit": value}
     if key == "wheel_unit":
-        return _wheel_unit(read, options, value)
+        unit = str(options.get(key) or (read.reading[0][0].wheels.unit if read.reading else "rad/s"))
+        if unit == "rad/s":
+            return {key: value}
+        if unit.startswith("rad") and value != "rpm":
+            return {key: f"{value.partition('/')[0]}{unit.removeprefix('rad')}"}
+        return _geared(options, [float(f"{RATE_UNITS[value]:.6g}")] * len(read.dataset.robot.wheel_names))
     if key == "steering_factors":
         return {"steering_scale": _one_or_all(_product(options.get("steering_scale"), value))}
     if key == "steering_offsets_deg":
@@ -345,19 +331,7 @@ def _changed(read: RecordingSource, options: Mapping[str, Any], key: str, value:
     if key == "leave_out":
         before = [present] if isinstance(present, str) else list(present or ())
         return {key: [*before, *(name for name in map(escape, value) if name not in before)]}
-    if key == "wheels":
-        return {key: {**(present or {}), **value}}
-    return {key: value}
-
-
-def _wheel_unit(read: RecordingSource, options: Mapping[str, Any], unit: str) -> dict[str, Any]:
-    present = str(options.get("wheel_unit") or (read.reading[0][0].wheels.unit if read.reading else "rad/s"))
-    if present == "rad/s":
-        return {"wheel_unit": unit}
-    base = unit.partition("/")[0]
-    if present.startswith("rad") and unit != "rpm":
-        return {"wheel_unit": f"{base}{present.removeprefix('rad')}"}
-    return _geared(options, [float(f"{1 / _RATES[unit]:.6g}")] * len(read.dataset.robot.wheel_names))
+    return {key: {**(present or {}), **value} if key == "wheels" else value}
 
 
 def _geared(options: Mapping[str, Any], factors: Sequence[float]) -> dict[str, Any]:
@@ -374,13 +348,9 @@ def other_quantities(read: RecordingSource) -> Iterator[Finding]:
     unit = present.partition("/")[0]
     names = {"": "positions", "/sample": "increments since the row before", "/s": "rates"}
     for ending, quantity in names.items():
-        if unit != "rpm" and f"{unit}{ending}" != present:
-            yield mistake(
-                "wheel_unit",
-                f"the wheels look like {quantity} ({unit}{ending}); read as {quantity_of(present)} ({present})",
-                "all wheels",
-                {"wheel_quantity": f"{unit}{ending}"},
-            )
+        if unit != "rpm" and (other := f"{unit}{ending}") != present:
+            what = f"the wheels look like {quantity} ({other}); read as {quantity_of(present)} ({present})"
+            yield error("wheel_unit", what, "all wheels", {"wheel_quantity": other})
 
 
 def _listed(present: Any, count: int, default: float) -> list[float]:
@@ -391,9 +361,8 @@ def _listed(present: Any, count: int, default: float) -> list[float]:
 def _product(present: Any, factors: Sequence[float]) -> list[float]:
     count = max(len(factors), len(present) if isinstance(present, list | tuple) else 1)
     both = zip(_listed(present, count, 1), _listed(list(factors), count, 1), strict=True)
-    return [
-        value if isinstance(value, int) else float(f"{value:.6g}") for value in (one * other for one, other in both)
-    ]
+    values = [one * other for one, other in both]
+    return [value if isinstance(value, int) else float(f"{value:.6g}") for value in values]
 
 
 def _one_or_all(values: Sequence[float]) -> Any:

@@ -8,30 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from omnibench.cli.options import (
-    BackendName,
-    CalibrationFile,
-    DatasetFolder,
-    DatasetFolders,
-    Figures,
-    FitCommand,
-    Force,
-    Json,
-    Plugins,
-    Settings,
-    TlsAuthority,
-    TlsCertificate,
-    TlsKey,
-    Workers,
-    asked_backend,
-    chosen_settings,
-    load_given_plugins,
-    output_option,
-    plugin_folders,
-    refuse_figures_without_browser,
-    tls_files,
-    write_asked_figures,
-)
+from omnibench.cli import options as shared
 from omnibench.cli.terminal.console import make_console, print_ending, print_json, print_verdict, warn
 from omnibench.errors import ConfigError, DataError
 
@@ -54,7 +31,7 @@ def compare(
     ],
     output: Annotated[
         Path | None,
-        output_option("Folder for the results; finished runs in it are kept. Default: results/NAME/TIME."),
+        shared.output_option("Folder for the results; finished runs in it are kept. Default: results/NAME/TIME."),
     ] = None,
     data: Annotated[
         list[str] | None,
@@ -64,15 +41,15 @@ def compare(
             help="Where the recordings of the config's data set NAME are on this disk; of a study, the folder of all.",
         ),
     ] = None,
-    backend: BackendName = None,
+    backend: shared.BackendName = None,
     workers: Annotated[
         int | None, typer.Option(min=1, help="Processes, or Dask workers started here. Default: the config's.")
     ] = None,
-    tls_ca: TlsAuthority = None,
-    tls_cert: TlsCertificate = None,
-    tls_key: TlsKey = None,
-    figures: Figures = None,
-    force: Force = False,
+    tls_ca: shared.TlsAuthority = None,
+    tls_cert: shared.TlsCertificate = None,
+    tls_key: shared.TlsKey = None,
+    figures: shared.Figures = None,
+    force: shared.Force = False,
     plugins: Annotated[
         list[Path] | None,
         typer.Option("--plugins", metavar="DIR", help="Folder of plug-ins besides the config's; may be repeated."),
@@ -91,9 +68,9 @@ def compare(
     from omnibench.progress import Progress
     from omnibench.study.study import is_study, read_study_config
 
-    refuse_figures_without_browser(figures)
-    asked = plugin_folders(plugins or [])
-    given = {"backend": backend, "workers": workers, "tls": tls_files(tls_ca, tls_cert, tls_key)}
+    shared.refuse_figures_without_browser(figures)
+    asked = shared.plugin_folders(plugins or [])
+    given = {"backend": backend, "workers": workers, "tls": shared.tls_files(tls_ca, tls_cert, tls_key)}
     given = {name: value for name, value in given.items() if value is not None}
     if len(config) == 1 and config[0].is_file() and is_study(config[0]):
         study = read_study_config(config[0], _named_paths(data))
@@ -107,7 +84,7 @@ def compare(
         result = run_comparison(comparison, output, watch, force=force)
         if figures is not None:
             watch(Progress("drawing the figures"))
-            write_asked_figures(comparison_document(result), figures)
+            shared.write_asked_figures(comparison_document(result), figures)
     warn(result.warnings)
     print_result(make_console(), result)
     for name, entry in result.held_out.items():
@@ -133,7 +110,7 @@ def _run_study(config: "StudyConfig", output: Path | None, figures: Path | None,
         answer = run_study(config, output, watch, force=force)
         if figures is not None:
             watch(Progress("drawing the figures"))
-            write_asked_figures(study_document(answer), figures)
+            shared.write_asked_figures(study_document(answer), figures)
     warn(answer.warnings)
     print_study(make_console(), answer)
     typer.echo(f"report: {answer.output / 'report.html'}")
@@ -181,22 +158,22 @@ def _named_paths(data: list[str] | None) -> dict[str, Path]:
     return paths
 
 
-@calibration_app.command(cls=FitCommand)
+@calibration_app.command(cls=shared.FitCommand)
 def calibrate(
     context: typer.Context,
-    dataset: DatasetFolders,
+    dataset: shared.DatasetFolders,
     output: Annotated[
-        Path | None, output_option("Calibration file to write. Default: it is only shown.", metavar="FILE.yaml")
+        Path | None, shared.output_option("Calibration file to write. Default: it is only shown.", metavar="FILE.yaml")
     ] = None,
-    backend: BackendName = None,
-    workers: Workers = None,
-    tls_ca: TlsAuthority = None,
-    tls_cert: TlsCertificate = None,
-    tls_key: TlsKey = None,
-    settings: Settings = None,
-    force: Force = False,
-    plugins: Plugins = None,
-    as_json: Json = False,
+    backend: shared.BackendName = None,
+    workers: shared.Workers = None,
+    tls_ca: shared.TlsAuthority = None,
+    tls_cert: shared.TlsCertificate = None,
+    tls_key: shared.TlsKey = None,
+    settings: shared.Settings = None,
+    force: shared.Force = False,
+    plugins: shared.Plugins = None,
+    as_json: shared.Json = False,
 ) -> None:
     """Fit a robot's odometry model; write it with -o.
 
@@ -209,14 +186,14 @@ def calibrate(
     from omnibench.files import refuse_existing, write_text
     from omnibench.fit.calibrate import calibrate as fit
 
-    load_given_plugins(plugins)
-    chosen = chosen_settings(context, parse_settings(settings))
+    shared.load_given_plugins(plugins)
+    chosen = shared.chosen_settings(context, parse_settings(settings))
     refuse_existing(output, force=force)
-    tls, preload = tls_files(tls_ca, tls_cert, tls_key), ("omnibench.fit.bootstrap",)
+    tls, preload = shared.tls_files(tls_ca, tls_cert, tls_key), ("omnibench.fit.bootstrap",)
     with (
         redirect_stdout(sys.stderr),
         ProgressDisplay() as watch,
-        asked_backend(backend, workers, tls, preload, watch) as jobs,
+        shared.asked_backend(backend, workers, tls, preload, watch) as jobs,
     ):
         recordings = load_dataset(dataset)
         run = fit(recordings, chosen, watch=watch, backend=jobs)
@@ -248,15 +225,15 @@ def calibrate(
 
 @calibration_app.command()
 def evaluate(
-    calibration: CalibrationFile,
-    dataset: DatasetFolders,
-    backend: BackendName = None,
-    workers: Workers = None,
-    tls_ca: TlsAuthority = None,
-    tls_cert: TlsCertificate = None,
-    tls_key: TlsKey = None,
-    plugins: Plugins = None,
-    as_json: Json = False,
+    calibration: shared.CalibrationFile,
+    dataset: shared.DatasetFolders,
+    backend: shared.BackendName = None,
+    workers: shared.Workers = None,
+    tls_ca: shared.TlsAuthority = None,
+    tls_cert: shared.TlsCertificate = None,
+    tls_key: shared.TlsKey = None,
+    plugins: shared.Plugins = None,
+    as_json: shared.Json = False,
 ) -> None:
     """Show the cost and the errors of a calibration on a data set.
 
@@ -268,9 +245,9 @@ def evaluate(
     from omnibench.fit.evaluate import evaluate as evaluate_calibration
     from omnibench.robot.calibration import read_calibration
 
-    load_given_plugins(plugins)
-    tls = tls_files(tls_ca, tls_cert, tls_key)
-    with ProgressDisplay() as watch, asked_backend(backend, workers, tls, (), watch):
+    shared.load_given_plugins(plugins)
+    tls = shared.tls_files(tls_ca, tls_cert, tls_key)
+    with ProgressDisplay() as watch, shared.asked_backend(backend, workers, tls, (), watch):
         recordings = load_dataset(dataset)
         evaluated = read_calibration(calibration)
         evaluation = evaluate_calibration(evaluated, recordings)
@@ -285,8 +262,8 @@ def evaluate(
 
 @calibration_app.command()
 def certify(
-    calibration: CalibrationFile,
-    dataset: DatasetFolders,
+    calibration: shared.CalibrationFile,
+    dataset: shared.DatasetFolders,
     box: Annotated[
         Literal["paper", "row"] | None,
         typer.Option(help="Matrices to compare with; see calibrate. Default: the box of the calibration's search."),
@@ -300,13 +277,13 @@ def certify(
     parts: Annotated[
         int | None, typer.Option(min=1, help="Stop after so many parts of the box: a limit that no machine changes.")
     ] = None,
-    backend: BackendName = None,
-    workers: Workers = None,
-    tls_ca: TlsAuthority = None,
-    tls_cert: TlsCertificate = None,
-    tls_key: TlsKey = None,
-    plugins: Plugins = None,
-    as_json: Json = False,
+    backend: shared.BackendName = None,
+    workers: shared.Workers = None,
+    tls_ca: shared.TlsAuthority = None,
+    tls_cert: shared.TlsCertificate = None,
+    tls_key: shared.TlsKey = None,
+    plugins: shared.Plugins = None,
+    as_json: shared.Json = False,
 ) -> None:
     """Prove how far a calibration's cost is from the lowest possible.
 
@@ -318,9 +295,9 @@ def certify(
     from omnibench.fit.certify import certify_optimum
     from omnibench.robot.calibration import read_calibration
 
-    load_given_plugins(plugins)
-    tls, preload = tls_files(tls_ca, tls_cert, tls_key), ("omnibench.fit.certify",)
-    with ProgressDisplay() as watch, asked_backend(backend, workers, tls, preload, watch) as jobs:
+    shared.load_given_plugins(plugins)
+    tls, preload = shared.tls_files(tls_ca, tls_cert, tls_key), ("omnibench.fit.certify",)
+    with ProgressDisplay() as watch, shared.asked_backend(backend, workers, tls, preload, watch) as jobs:
         recordings = load_dataset(dataset)
         certified = certify_optimum(
             read_calibration(calibration),
@@ -343,13 +320,15 @@ def certify(
 
 @calibration_app.command()
 def export(
-    calibration: CalibrationFile,
+    calibration: shared.CalibrationFile,
     to: Annotated[
         str, typer.Option("--to", metavar="FORMAT", help="ros2_controllers, robot_localization or c_header.")
     ],
-    output: Annotated[Path | None, output_option("File or folder to write to. Default: standard output.")] = None,
-    force: Force = False,
-    plugins: Plugins = None,
+    output: Annotated[
+        Path | None, shared.output_option("File or folder to write to. Default: standard output.")
+    ] = None,
+    force: shared.Force = False,
+    plugins: shared.Plugins = None,
 ) -> None:
     """Convert a calibration for ROS 2 or C programs.
 
@@ -360,7 +339,7 @@ def export(
     from omnibench.robot.calibration import read_calibration
     from omnibench.robot.export.formats import export_calibration
 
-    load_given_plugins(plugins)
+    shared.load_given_plugins(plugins)
     exported = export_calibration(read_calibration(calibration), to)
     file = output / exported.file_name if output is not None and output.is_dir() else output
     refuse_existing(file, force=force)
@@ -375,12 +354,12 @@ def export(
 
 @calibration_app.command()
 def discover(
-    dataset: DatasetFolder,
+    dataset: shared.DatasetFolder,
     model: Annotated[
         Path | None,
         typer.Option("--model", metavar="CALIBRATION", help="Start from this calibration. Default: fit a matrix."),
     ] = None,
-    output: Annotated[Path | None, output_option("Folder for the results. Default: results/NAME/TIME.")] = None,
+    output: Annotated[Path | None, shared.output_option("Folder for the results. Default: results/NAME/TIME.")] = None,
     without: Annotated[
         list[str] | None, typer.Option("--without", metavar="NAME", help="Effect not to try; may be repeated.")
     ] = None,
@@ -389,10 +368,10 @@ def discover(
         typer.Option(help="Where no name is sure, close the gap all the same, by a term without a name."),
     ] = True,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random numbers.")] = 0,
-    figures: Figures = None,
-    force: Force = False,
-    plugins: Plugins = None,
-    as_json: Json = False,
+    figures: shared.Figures = None,
+    force: shared.Force = False,
+    plugins: shared.Plugins = None,
+    as_json: shared.Json = False,
 ) -> None:
     """Find and name the physics that a robot's model lacks.
 
@@ -411,8 +390,8 @@ def discover(
     from omnibench.registry import effects
     from omnibench.robot.calibration import read_calibration
 
-    refuse_figures_without_browser(figures)
-    load_given_plugins(plugins)
+    shared.refuse_figures_without_browser(figures)
+    shared.load_given_plugins(plugins)
     for name in without or ():
         effects.entry(name, "--without")
     options = DiscoverOptions(
@@ -438,7 +417,7 @@ def discover(
         watch(Progress("writing the report"))
         folder = write_discovery(discovery, options, output, force=force)
         if figures is not None:
-            write_asked_figures(discovery_report(discovery, to_yaml(options)), figures)
+            shared.write_asked_figures(discovery_report(discovery, to_yaml(options)), figures)
     warn(recordings.warnings)
     if as_json:
         return print_json(discovery_document(discovery, folder))

@@ -111,7 +111,7 @@ guide_app.add_typer(_plugin, name="plugin")
 # Where the config of each command is: module and class.
 _CONFIGS = {
     "compare": ("omnibench.compare.config", "CompareConfig"),
-    "design": ("omnibench.design.config", "DesignConfig"),
+    "design": ("omnibench.design.candidates", "DesignConfig"),
     "live": ("omnibench.live.config", "LiveConfig"),
     "simulate": ("omnibench.simulate.source", "SimulationConfig"),
     "study": ("omnibench.study.config", "StudyConfig"),

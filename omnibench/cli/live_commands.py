@@ -203,7 +203,7 @@ def swap(
 
     It holds from the next wheel sample on; the odometry goes on from where it is.
     """
-    from omnibench.live.control.request_queue import swap_calibration
+    from omnibench.live.control.query_server import swap_calibration
 
     load_given_plugins(plugins)
     with _client(config, connect, None, "swap") as (session, _):

@@ -9,28 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from typer.core import TyperCommand
 
-from omnibench.cli.options import (
-    BackendName,
-    DatasetFolders,
-    Figures,
-    Force,
-    Json,
-    PluginFiles,
-    Plugins,
-    Settings,
-    TableFormat,
-    TlsAuthority,
-    TlsCertificate,
-    TlsKey,
-    WhichDataset,
-    Workers,
-    asked_backend,
-    load_given_plugins,
-    output_option,
-    refuse_figures_without_browser,
-    tls_files,
-    write_asked_figures,
-)
+from omnibench.cli import options as shared
 from omnibench.cli.terminal.console import make_console, print_ending, print_json, say, warn
 from omnibench.errors import ConfigError, DataError
 from omnibench.words import plural
@@ -55,7 +34,7 @@ class HelpOfImporters(TyperCommand):
             if (name := given.get("importer")) is not None:
                 from omnibench.cli.terminal.importer_help import importer_help
 
-                load_given_plugins(_paths(given.get("plugins")), _paths(given.get("plugin_files")))
+                shared.load_given_plugins(_paths(given.get("plugins")), _paths(given.get("plugin_files")))
                 typer.echo(importer_help(str(name), ctx.command_path))
                 ctx.exit()
         return super().parse_args(ctx, args)
@@ -72,8 +51,8 @@ def import_(
         typer.Argument(metavar="FORMAT", help="Format of the recordings; import FORMAT --help shows its options."),
     ],
     source: Annotated[Path | None, typer.Argument(help="File or folder with the recordings.")] = None,
-    output: Annotated[Path | None, output_option("Data set folder to write.")] = None,
-    settings: Settings = None,
+    output: Annotated[Path | None, shared.output_option("Data set folder to write.")] = None,
+    settings: shared.Settings = None,
     accept_units: Annotated[
         bool, typer.Option("--accept-units", help="Write the data set even if units look wrong by magnitude.")
     ] = False,
@@ -92,10 +71,10 @@ def import_(
         ),
     ] = False,
     no_check: Annotated[bool, typer.Option("--no-check", help="Leave out the check of what was recorded.")] = False,
-    table_format: TableFormat = "parquet",
-    force: Force = False,
-    plugins: Plugins = None,
-    plugin_files: PluginFiles = None,
+    table_format: shared.TableFormat = "parquet",
+    force: shared.Force = False,
+    plugins: shared.Plugins = None,
+    plugin_files: shared.PluginFiles = None,
 ) -> None:
     """Convert recordings into a data set.
 
@@ -113,7 +92,7 @@ def import_(
     from omnibench.registry import importers
     from omnibench.slam.import_dataset import import_dataset
 
-    load_given_plugins(plugins, plugin_files)
+    shared.load_given_plugins(plugins, plugin_files)
     entry, given = importers.entry(importer, "import"), parse_settings(settings)
     if template is not None:
         if importer != "csv":
@@ -203,13 +182,13 @@ def fetch(
     ] = None,
     output: Annotated[
         Path | None,
-        output_option("Data set folder to write; of several data sets, the folder above. Default: data/NAME."),
+        shared.output_option("Data set folder to write; of several data sets, the folder above. Default: data/NAME."),
     ] = None,
     commit: Annotated[
         str | None,
         typer.Option(metavar="SHA", help="Commit to take; HEAD: the newest. Default: the one that was tested."),
     ] = None,
-    force: Force = False,
+    force: shared.Force = False,
 ) -> None:
     """Clone a public recording from GitHub and import it.
 
@@ -270,21 +249,21 @@ def check(
     robot: Annotated[
         Path | None, typer.Option(metavar="FILE", help="robot.yaml, where the source does not say the robot.")
     ] = None,
-    settings: Settings = None,
+    settings: shared.Settings = None,
     report: Annotated[
         Path | None, typer.Option(metavar="FILE.html", help="Write a page with figures of clocks and findings.")
     ] = None,
-    figures: Figures = None,
+    figures: shared.Figures = None,
     plugin: Annotated[
         list[Path] | None, typer.Option("--plugin", metavar="FILE", help="A plug-in with an importer; may be repeated.")
     ] = None,
-    backend: BackendName = None,
-    workers: Workers = None,
-    tls_ca: TlsAuthority = None,
-    tls_cert: TlsCertificate = None,
-    tls_key: TlsKey = None,
-    force: Force = False,
-    as_json: Json = False,
+    backend: shared.BackendName = None,
+    workers: shared.Workers = None,
+    tls_ca: shared.TlsAuthority = None,
+    tls_cert: shared.TlsCertificate = None,
+    tls_key: shared.TlsKey = None,
+    force: shared.Force = False,
+    as_json: shared.Json = False,
 ) -> None:
     """Say what is wrong with a recording, and what to type.
 
@@ -299,13 +278,13 @@ def check(
     from omnibench.registry import load_plugin_file, load_plugins
 
     refuse_existing(report, force=force)
-    refuse_figures_without_browser(figures)
+    shared.refuse_figures_without_browser(figures)
     load_plugins()
     for file in plugin or ():
         if (failure := load_plugin_file(file)) is not None:
             raise PluginError(f"plug-in {failure.origin} cannot be imported: {failure.error}")
-    tls = tls_files(tls_ca, tls_cert, tls_key)
-    with ProgressDisplay() as watch, asked_backend(backend, workers, tls, (), watch):
+    tls = shared.tls_files(tls_ca, tls_cert, tls_key)
+    with ProgressDisplay() as watch, shared.asked_backend(backend, workers, tls, (), watch):
         read = read_source(source, importer, parse_settings(settings), robot)
         checked = check_recording(read)
     if report is not None or figures is not None:
@@ -316,7 +295,7 @@ def check(
         if report is not None:
             write_document(document, report)
             typer.echo(f"report: {report}", err=True)
-        write_asked_figures(document, figures)
+        shared.write_asked_figures(document, figures)
     if as_json:
         print_json(checked.model_dump(mode="json", include={"verdict", "needed", "findings", "command"}))
     else:
@@ -364,19 +343,19 @@ def _print_check(console: "Console", checked: "CheckReport", next_step: str) -> 
 
 @recording_app.command()
 def inspect(
-    dataset: DatasetFolders,
+    dataset: shared.DatasetFolders,
     report: Annotated[
         Path | None,
         typer.Option(metavar="FILE.html", help="Write a page: paths, motions driven, wheel rates, runs step by step."),
     ] = None,
-    figures: Figures = None,
-    backend: BackendName = None,
-    workers: Workers = None,
-    tls_ca: TlsAuthority = None,
-    tls_cert: TlsCertificate = None,
-    tls_key: TlsKey = None,
-    force: Force = False,
-    as_json: Json = False,
+    figures: shared.Figures = None,
+    backend: shared.BackendName = None,
+    workers: shared.Workers = None,
+    tls_ca: shared.TlsAuthority = None,
+    tls_cert: shared.TlsCertificate = None,
+    tls_key: shared.TlsKey = None,
+    force: shared.Force = False,
+    as_json: shared.Json = False,
 ) -> None:
     """Show what a data set holds, and what can be identified from it."""
     from omnibench.cli.terminal.inspection_summary import print_inspection
@@ -388,9 +367,9 @@ def inspect(
     from omnibench.report.render import write_document
 
     refuse_existing(report, force=force)
-    refuse_figures_without_browser(figures)
-    tls = tls_files(tls_ca, tls_cert, tls_key)
-    with ProgressDisplay() as watch, asked_backend(backend, workers, tls, (), watch):
+    shared.refuse_figures_without_browser(figures)
+    tls = shared.tls_files(tls_ca, tls_cert, tls_key)
+    with ProgressDisplay() as watch, shared.asked_backend(backend, workers, tls, (), watch):
         recordings = load_dataset(dataset)
         inspection = inspect_dataset(recordings)
     if report is not None or figures is not None:
@@ -398,7 +377,7 @@ def inspect(
         if report is not None:
             write_document(document, report)
             typer.echo(f"report: {report}", err=True)
-        write_asked_figures(document, figures)
+        shared.write_asked_figures(document, figures)
     if as_json:
         return print_json(inspection)
     print_inspection(make_console(), inspection)
@@ -430,7 +409,7 @@ def design(
         int | None, typer.Option(min=1, help="Runs to choose. Default: the fewest within 1 % of the optimum.")
     ] = None,
     repetitions: Annotated[int | None, typer.Option(min=1, help="How often a command may be chosen at most.")] = None,
-    dataset: WhichDataset = None,
+    dataset: shared.WhichDataset = None,
     integration: Annotated[
         Literal["euler", "arc"] | None,
         typer.Option(help="Path within a sample; see calibrate. Default: the config's, or arc for a data set."),
@@ -463,12 +442,12 @@ def design(
         float | None, typer.Option(help="With --robot: of the reference's headings, deg. Default: 0.3.")
     ] = None,
     output: Annotated[
-        Path | None, output_option("Folder for report.html and design.json. Default: nothing is written.")
+        Path | None, shared.output_option("Folder for report.html and design.json. Default: nothing is written.")
     ] = None,
-    figures: Figures = None,
-    force: Force = False,
-    plugins: Plugins = None,
-    as_json: Json = False,
+    figures: shared.Figures = None,
+    force: shared.Force = False,
+    plugins: shared.Plugins = None,
+    as_json: shared.Json = False,
 ) -> None:
     """Choose the motion commands that are most worth driving.
 
@@ -483,10 +462,10 @@ def design(
     from omnibench.files import refuse_existing, write_text
     from omnibench.report.render import write_document
 
-    refuse_figures_without_browser(figures)
+    shared.refuse_figures_without_browser(figures)
     if output is not None:
         refuse_existing(output / "design.json", output / "report.html", force=force)
-    load_given_plugins(plugins)
+    shared.load_given_plugins(plugins)
     limits = RobotOptions(max_speed, max_turn_rate, max_wheel_rate, steering_limit, area, position_noise, heading_noise)
     chosen = design_experiment(
         design_source(source, robot, limits, dataset=dataset, integration=integration),
@@ -500,7 +479,7 @@ def design(
     if output is not None:
         write_text(output / "design.json", to_json(chosen) + "\n")
         write_document(design_document(chosen), output / "report.html")
-    write_asked_figures(design_document(chosen), figures)
+    shared.write_asked_figures(design_document(chosen), figures)
     if as_json:
         return print_json(chosen)
     print_design(make_console(), chosen)
@@ -514,7 +493,7 @@ def design(
 @recording_app.command()
 def slam(
     dataset: Annotated[Path, typer.Argument(help="Data set folder with laser scans.")],
-    output: Annotated[Path | None, output_option("Data set folder to write, with the new poses.")] = None,
+    output: Annotated[Path | None, shared.output_option("Data set folder to write, with the new poses.")] = None,
     start: Annotated[
         Literal["odometry", "last_pose"] | None,
         typer.Option(help="First guess of each scan's pose. Default: odometry."),
@@ -533,12 +512,12 @@ def slam(
     report: Annotated[
         Path | None, typer.Option(metavar="FILE.html", help="Write a page with figures of scans, paths and wheels.")
     ] = None,
-    figures: Figures = None,
-    settings: Settings = None,
-    table_format: TableFormat = "parquet",
-    force: Force = False,
-    plugins: Plugins = None,
-    as_json: Json = False,
+    figures: shared.Figures = None,
+    settings: shared.Settings = None,
+    table_format: shared.TableFormat = "parquet",
+    force: shared.Force = False,
+    plugins: shared.Plugins = None,
+    as_json: shared.Json = False,
 ) -> None:
     """Compute reference poses from the laser scans of a data set.
 
@@ -554,14 +533,14 @@ def slam(
     from omnibench.slam.slam_options import SlamOptions
     from omnibench.slam.slam_request import SlamRequest
 
-    load_given_plugins(plugins)
+    shared.load_given_plugins(plugins)
     given: dict[str, Any] = {} if start is None else {"start": start}
     given |= {"deskew": False} if no_deskew else {}
     request = SlamRequest(
         dataset, output, validate(SlamOptions, parse_settings(settings) | given, "slam --set"), model, truth, force
     )
     refuse_existing(report, force=force)
-    refuse_figures_without_browser(figures)
+    shared.refuse_figures_without_browser(figures)
     if output is None and report is None and figures is None and not as_json:
         raise ConfigError("say where the poses go: -o DATASET; or ask for figures alone: --json, --report FILE.html")
     with ProgressDisplay() as watch:
@@ -571,7 +550,7 @@ def slam(
             document = recording_document(result.dataset, truth=result.truth, accuracy=result.summary.accuracy)
             if report is not None:
                 write_document(document, report)
-            write_asked_figures(document, figures)
+            shared.write_asked_figures(document, figures)
     warn(result.summary.warnings)
     if as_json:
         return print_json(result.summary)
@@ -587,13 +566,13 @@ def slam(
 
 @recording_app.command()
 def simulate(
-    output: Annotated[Path, output_option("Data set folder to write.")],
+    output: Annotated[Path, shared.output_option("Data set folder to write.")],
     config: Annotated[Path | None, typer.Argument(help="Config with a simulated data set.")] = None,
     truth: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="Folder for the truth: matrix, effects, true poses. Default: not written."),
     ] = None,
-    dataset: WhichDataset = None,
+    dataset: shared.WhichDataset = None,
     effects: Annotated[
         list[str] | None,
         typer.Option("--effect", metavar="YAML", help="Add an effect, 'name: {parameter: value}'; may be repeated."),
@@ -609,13 +588,13 @@ def simulate(
         bool, typer.Option("--noise", help="With --like: add the noise that the calibration states.")
     ] = False,
     seed: Annotated[int | None, typer.Option(min=0, help="With --noise: its seed. Default: 0.")] = None,
-    table_format: TableFormat = "parquet",
+    table_format: shared.TableFormat = "parquet",
     report: Annotated[
         Path | None, typer.Option(metavar="FILE.html", help="Write a page with figures of the recording and the truth.")
     ] = None,
-    figures: Figures = None,
-    force: Force = False,
-    plugins: Plugins = None,
+    figures: shared.Figures = None,
+    force: shared.Force = False,
+    plugins: shared.Plugins = None,
 ) -> None:
     """Simulate recordings of a robot whose true model is known.
 
@@ -632,8 +611,8 @@ def simulate(
     hidden = tuple(effects or ())
     request = SimulationRequest(output, config, truth, dataset, hidden, like, model, noise, seed, force)
     refuse_existing(report, force=force)
-    refuse_figures_without_browser(figures)
-    load_given_plugins([*(plugins or []), *request.plugins] or None)
+    shared.refuse_figures_without_browser(figures)
+    shared.load_given_plugins([*(plugins or []), *request.plugins] or None)
     with ProgressDisplay() as watch:
         made = request.write(table_format, watch)
         if report is not None or figures is not None:
@@ -643,7 +622,7 @@ def simulate(
             document = recording_document(made.dataset, accuracy=made.accuracy, **known)
             if report is not None:
                 write_document(document, report)
-            write_asked_figures(document, figures)
+            shared.write_asked_figures(document, figures)
     warn(made.dataset.warnings)
     if made.accuracy is not None:
         print_slam_accuracy(make_console(), made.accuracy)

@@ -11,20 +11,12 @@ from typing import Any, get_type_hints
 
 import polars as pl
 
+from omnibench import files as disk
 from omnibench.compare.config import CompareConfig, NamedConfig
 from omnibench.compare.result import THEORETICAL_NAME, ComparisonResult, EntryStatistics, RunRecord, ScoredRun
 from omnibench.config import read_yaml, to_json, to_yaml
 from omnibench.data.dataset import SPLITS, Dataset
 from omnibench.errors import DataError
-from omnibench.files import (
-    RESULTS,
-    check_results_folder,
-    link_latest,
-    new_results_folder,
-    remove,
-    write_table,
-    write_text,
-)
 from omnibench.fit.calibrator import calibration_of_fit
 from omnibench.fit.ratio_intervals import Interval
 from omnibench.robot.calibration import Calibration, ModelExtension, Row, covariance_rows, write_calibration
@@ -40,7 +32,7 @@ def check_output(folder: Path | None, config: NamedConfig, noun: str = "comparis
     """
     if folder is None:
         return
-    check_results_folder(folder, _MARK.format(noun), noun, force=force)
+    disk.check_results_folder(folder, _MARK.format(noun), noun, force=force)
     if force or not (folder / "config.yaml").is_file():
         return
     earlier = read_yaml(folder / "config.yaml")
@@ -61,10 +53,10 @@ def prepare_output(config: NamedConfig, folder: Path | None, noun: str = "compar
     ``check_output`` does.
     """
     check_output(folder, config, noun, force=force)
-    chosen = folder or new_results_folder(RESULTS / config.name)
-    write_text(chosen / "config.yaml", f"{_MARK.format(noun)}\n{to_yaml(config)}")
+    chosen = folder or disk.new_results_folder(disk.RESULTS / config.name)
+    disk.write_text(chosen / "config.yaml", f"{_MARK.format(noun)}\n{to_yaml(config)}")
     if folder is None:
-        link_latest(chosen)
+        disk.link_latest(chosen)
     return chosen
 
 
@@ -77,11 +69,11 @@ def write_results(result: ComparisonResult) -> None:
         earlier = _calibration_files(result.output, [(row["dataset"], row["label"]) for row in before])
     except (OSError, ValueError, KeyError, TypeError):
         earlier = []
-    write_text(result.output / "summary.json", to_json(summary(result)) + "\n")
+    disk.write_text(result.output / "summary.json", to_json(summary(result)) + "\n")
     for name, table in _tables(result).items():
-        write_table(result.output / f"{name}.parquet", table)
+        disk.write_table(result.output / f"{name}.parquet", table)
     for file in earlier:
-        remove(file)
+        disk.remove(file)
     fitted = _fitted(result)
     files = _calibration_files(result.output, [(entry.dataset, entry.label) for entry in fitted])
     for entry, file in zip(fitted, files, strict=True):

@@ -11,7 +11,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Protocol
 
-from omnibench.compare.config import CalibratorEntry, CompareConfig
+from omnibench.compare.config import CompareConfig
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.splits import training_split
 from omnibench.errors import ConfigError
@@ -201,7 +201,19 @@ def make_plan(config: CompareConfig, datasets: Mapping[str, Dataset]) -> list[Pl
                 box_name = name_of_bounds(settings, dataset.robot, training)
             except ConfigError as error:
                 raise ConfigError(f"config {config.name}: calibrator {entry.name!r}: {error}") from None
-            label = _label(config, entry, settings, box_name, labels)
+            # The entry's label, by default its name with the parameterisation or box that is not the usual one
+            cls = calibrators.entry(entry.name).cls
+            label = entry.label or entry.name
+            if not entry.label:
+                if settings.parameterisation != cls.parameterisation:
+                    label += f" ({settings.parameterisation})"
+                elif entry.box is not None and entry.box != config.box:
+                    label += f" ({box_name} box)"
+            if label in labels:
+                raise ConfigError(
+                    f"config {config.name}: two entries are called {label!r}; give one a label of its own"
+                )
+            labels.add(label)
             seeds = config.seeds if calibrators.entry(entry.name).cls.stochastic else config.seeds[:1]
             plan += [
                 PlannedRun(config, name, dataset, training, settings.model_copy(update={"seed": seed}), label, box_name)
@@ -216,18 +228,3 @@ def name_of_bounds(settings: CompleteSettings, robot: Robot, training: Sequence[
         return UNBOUNDED
     box, limits = settings.box, settings.limits
     return make_parameterisation(settings.parameterisation, robot, training, box=box, limits=limits).bounds.name
-
-
-def _label(config: CompareConfig, entry: CalibratorEntry, settings: CompleteSettings, box: str, taken: set[str]) -> str:
-    """The entry's label, by default its name with the parameterisation or box that is not the usual one."""
-    cls = calibrators.entry(entry.name).cls
-    label = entry.label or entry.name
-    if not entry.label:
-        if settings.parameterisation != cls.parameterisation:
-            label += f" ({settings.parameterisation})"
-        elif entry.box is not None and entry.box != config.box:
-            label += f" ({box} box)"
-    if label in taken:
-        raise ConfigError(f"config {config.name}: two entries are called {label!r}; give one a label of its own")
-    taken.add(label)
-    return label

@@ -123,7 +123,7 @@ def fitted_together(windows: Sequence[Windows], search: float) -> tuple[list[Arr
         fitted, before = _coefficients(windows, clocks), clocks
         clocks = [each.improved(fitted, clock) for each, clock in zip(windows, clocks, strict=True)]
         pairs = zip(windows, before, clocks, strict=True)
-        if max(each.farthest_step(old[0] - new[0], old[1] - new[1]) for each, old, new in pairs) < _SETTLED:
+        if max(each.farthest_step(*np.subtract(old, new)) for each, old, new in pairs) < _SETTLED:
             break
     return fitted, clocks
 
@@ -164,9 +164,8 @@ class Windows:
         apart = max(_WINDOW, 1.5 * float(np.median(np.diff(moments)))) if len(moments) > 1 else _WINDOW
         last = np.searchsorted(moments, moments + apart - _BIN / 2)
         first = np.flatnonzero(last < len(moments))
-        last = last[first]
-        near = moments[last] - moments[first] < 1.5 * apart  # others have a gap between them
-        first, last = first[near], last[near]
+        first = first[moments[last[first]] - moments[first] < 1.5 * apart]
+        last = last[first]  # windows with a gap between their ends are left out
         if len(first) < _FEWEST:
             return None
         poses = _means(run.poses, starts)
@@ -196,15 +195,18 @@ class Windows:
 
     def columns(self, clock: Clock, later: Array) -> Array:
         """Changes (L, W, C) of what the wheels count over the windows, ``later`` (L,), s, than by a clock."""
-        taken = self.stamps + clock[0] + clock[1] * (self.stamps - self.middle) + later[:, None]
+        taken = self._taken(self.stamps, clock) + later[:, None]
         means = _means(_between(taken, self.edges, self.counted), self.starts)
         changes: Array = means[:, self.last] - means[:, self.first]
         return changes
 
+    def _taken(self, stamps: Array, clock: Clock) -> Array:
+        taken: Array = stamps + clock[0] + clock[1] * (stamps - self.middle)
+        return taken
+
     def within(self, clock: Clock) -> NDArray[np.bool_]:
         """True (W,) for windows that lie within the wheels' samples by a clock."""
-        begins = self.stamps[self.starts]
-        return self._inside(begins + clock[0] + clock[1] * (begins - self.middle))
+        return self._inside(self._taken(self.stamps[self.starts], clock))
 
     def _inside(self, taken: Array) -> NDArray[np.bool_]:
         """True (..., W) for windows whose bins begin, at times (..., B), within the wheels' samples."""
@@ -229,7 +231,8 @@ class Windows:
         Bins count at their mean time, which is near enough for steps of _COARSE.
         """
         within = self._inside(self.stamps[self.starts] + offsets[:, None])
-        counts = _between(_means(self.stamps[:, None], self.starts)[:, 0] + offsets[:, None], self.edges, self.counted)
+        moments = _means(self.stamps[:, None], self.starts)[:, 0]
+        counts = _between(moments + offsets[:, None], self.edges, self.counted)
         columns = counts[:, self.last] - counts[:, self.first]
         shares = np.ones(len(offsets))
         for number, (channel, shown) in enumerate(zip(self.channels(), self.shown, strict=True)):
@@ -243,26 +246,33 @@ class Windows:
         shares[within.sum(axis=1) < max(_FEWEST, within.shape[1] / 2)] = np.inf
         return shares
 
-    def residuals(self, fitted: Sequence[Array], clock: Clock) -> tuple[Array, Array, Array, Array]:
-        """Residuals (2, W), in their standard deviations, their slopes by the middle's offset, Huber's weights, and the
-        changes (2, W) that the wheels explain.
+    def _system(self, fitted: Sequence[Array], clock: Clock) -> tuple[Array, Array, Array]:
+        """Residuals (2, W) in their standard deviations, Huber's weights, and derivatives (P, 2, W) of what is shown.
+
+        These are by the gains of both channels in this run, since slip makes every window longer, and a drift does,
+        too; by the offset; and, of a run that is long enough, by the drift, which the moments tell at which the motion
+        changes.
         """
         before, now, after = self.columns(clock, np.array([-_DELTA, 0.0, _DELTA]))
-        rates = (after - before) / (2 * _DELTA)
         left = self._left(fitted, now)
         deviations = self._deviations(left, clock)[:, None]
         residuals = left / deviations
-        slopes = np.array([rates[:, channel] @ each for channel, each in zip(self.channels(), fitted, strict=True)])
-        weights: Array = np.where(
-            self.within(clock), np.minimum(1.0, _HUBER / np.maximum(np.abs(residuals), 1e-12)), 0.0
-        )
+        weights = np.minimum(1.0, _HUBER / np.maximum(np.abs(residuals), 1e-12)) * self.within(clock)
         weights[: int(self.steers)] = 0.0
-        return residuals, slopes / deviations, weights, (self.shown - left) / deviations
+        slopes = self._explained(fitted, (after - before) / (2 * _DELTA)) / deviations
+        rows = [*(np.eye(2)[:, :, None] * ((self.shown - left) / deviations)), slopes]
+        if self.length >= _LEAST_DRIFTING:
+            begins = self.stamps[self.starts]
+            rows.append(slopes * ((begins[self.first] + begins[self.last]) / 2 - self.middle))
+        return residuals, weights, np.array(rows)
+
+    def _explained(self, fitted: Sequence[Array], columns: Array) -> Array:
+        """Changes (2, W), rad and m, that changes (W, C) of the wheels' counts explain."""
+        return np.array([columns[:, channel] @ each for channel, each in zip(self.channels(), fitted, strict=True)])
 
     def _left(self, fitted: Sequence[Array], columns: Array) -> Array:
-        """Residuals (2, W), rad and m, of the reference less what changes (W, C) of the wheels' counts explain."""
-        explained = [columns[:, channel] @ each for channel, each in zip(self.channels(), fitted, strict=True)]
-        return self.shown - np.array(explained)
+        left: Array = self.shown - self._explained(fitted, columns)
+        return left
 
     def _deviations(self, left: Array, clock: Clock) -> Array:
         """Robust standard deviations (2,) of what is left (2, W)."""
@@ -273,15 +283,13 @@ class Windows:
     def improved(self, fitted: Sequence[Array], clock: Clock, steps: int = _STEPS) -> Clock:
         """The clock after some steps of Gauss-Newton."""
         for _ in range(steps):
-            residuals, slopes, weights, explained = self.residuals(fitted, clock)
-            design = self._design(slopes, explained)
+            residuals, weights, derivatives = self._system(fitted, clock)
+            design = derivatives.reshape(len(derivatives), -1)
             normal, wanted = (design * weights.ravel()) @ design.T, design @ (weights * residuals).ravel()
-            step = np.linalg.lstsq(normal, wanted)[0][2:]
-            clock = (
-                clock[0] + float(np.clip(step[0], -0.2, 0.2)),
-                float(np.clip(clock[1] + (step[1] if len(step) > 1 else 0.0), -_LARGEST_DRIFT, _LARGEST_DRIFT)),
-            )
-            if self.farthest_step(*step) < _SETTLED / 10:
+            offset, drift = [*np.linalg.lstsq(normal, wanted)[0][2:].tolist(), 0.0][:2]
+            limited = float(np.clip(clock[1] + drift, -_LARGEST_DRIFT, _LARGEST_DRIFT))
+            clock = clock[0] + float(np.clip(offset, -0.2, 0.2)), limited
+            if self.farthest_step(offset, drift) < _SETTLED / 10:
                 break
         return clock
 
@@ -301,19 +309,6 @@ class Windows:
                 return False
         return True
 
-    def _design(self, slopes: Array, explained: Array) -> Array:
-        """Derivatives (P, 2 W) of the shown changes by the offset and, of a run that is long enough, by the drift.
-
-        Before them stand those by the gains of both channels in this run: slip makes every window longer, and a drift
-        does, too; what tells a drift are the moments at which the motion changes.
-        """
-        none = np.zeros_like(explained[0])
-        moments = (self.stamps[self.starts][self.first] + self.stamps[self.starts][self.last]) / 2 - self.middle
-        rows = [np.append(explained[0], none), np.append(none, explained[1]), slopes.ravel()]
-        if self.length >= _LEAST_DRIFTING:
-            rows.append((slopes * moments).ravel())
-        return np.array(rows)
-
     def match(self, fitted: Sequence[Array], clock: Clock, search: float) -> ClockMatch | None:
         """The clock with its standard errors; None if the run does not tell it.
 
@@ -321,18 +316,14 @@ class Windows:
         """
         if abs(clock[0]) > search + _WINDOW or not self._told(fitted, clock):
             return None
-        residuals, slopes, weights, explained = self.residuals(fitted, clock)
-        design = self._design(slopes, explained)
-        normal = (design * weights.ravel()) @ design.T
-        scores = (design * (weights * residuals).ravel()).reshape(len(design), *residuals.shape)
+        residuals, weights, derivatives = self._system(fitted, clock)
+        design = derivatives.reshape(len(derivatives), -1)
         blocks = np.floor((self.stamps[self.starts][self.first] - self.stamps[0]) / _BLOCK)
-        sums = np.add.reduceat(scores, np.flatnonzero(np.diff(blocks, prepend=-1.0)), axis=2)
-        sums = sums.reshape(len(design), -1)
-        inverse = np.linalg.pinv(normal)
+        scores = derivatives * (weights * residuals)
+        sums = np.add.reduceat(scores, np.flatnonzero(np.diff(blocks, prepend=-1.0)), axis=2).reshape(len(design), -1)
+        inverse = np.linalg.pinv((design * weights.ravel()) @ design.T)
         # Chords, and the ticks of coarse counters, which scatter less than they are long, but in a pattern.
-        least = np.array([_CHORDS, _CHORDS * np.sqrt(12.0) / self.length]) + self.tick * np.array(
-            [0.25, 1 / self.length]
-        )
+        least = _CHORDS * np.array([1, np.sqrt(12.0) / self.length]) + self.tick * np.array([0.25, 1 / self.length])
         errors = np.sqrt(np.diag(inverse @ (sums @ sums.T) @ inverse)[2:] + least[: len(design) - 2] ** 2)
         told = len(errors) > 1 and abs(clock[1]) < _LARGEST_DRIFT
         drift_error = float(errors[1]) if told else np.inf
@@ -355,17 +346,12 @@ def _tick_time(driven: Array, durations: Array) -> float:
 def _coefficients(windows: Sequence[Windows], clocks: Sequence[Clock]) -> list[Array]:
     """The coefficients h and s of Eq. (2) and (3) that fit all runs best by their clocks."""
     fitted = []
-    by_run = [
-        (each, each.within(clock), each.columns(clock, np.zeros(1))[0])
-        for each, clock in zip(windows, clocks, strict=True)
-    ]
-    for row in range(2):
-        columns, shown = [], []
-        for each, within, changes in by_run:
-            columns.append(changes[within, each.channels()[row]])
-            shown.append(each.shown[row][within])
-        rows = np.concatenate(shown)
-        fitted.append(_solved(np.concatenate(columns), rows, np.ones(len(rows), dtype=bool)))
+    within = [each.within(clock) for each, clock in zip(windows, clocks, strict=True)]
+    changes = [each.columns(clock, np.zeros(1))[0] for each, clock in zip(windows, clocks, strict=True)]
+    for row, channel in enumerate(windows[0].channels()):
+        columns = np.concatenate([every[chosen, channel] for every, chosen in zip(changes, within, strict=True)])
+        shown = np.concatenate([each.shown[row][chosen] for each, chosen in zip(windows, within, strict=True)])
+        fitted.append(_solved(columns, shown, np.ones(len(shown), dtype=bool)))
     return fitted
 
 
@@ -464,13 +450,16 @@ def align(begin: float, wheel_times: Array, pose_times: Array, poses: Array) -> 
     after_start = wheel_times > zero + _SAME_TIME
     if not shown.any() or not after_start.any():
         return None
-    start = _pose_at(zero, pose_times, poses)
-    return Alignment(
-        zero,
-        after_start,
-        np.concatenate([[0.0], pose_times[shown] - zero]),
-        np.vstack([start, poses[shown]]),
-    )
+    after = int(np.searchsorted(pose_times, zero))
+    if after < len(pose_times) and abs(pose_times[after] - zero) <= _SAME_TIME:
+        start = poses[after]
+    else:
+        step = poses[after] - poses[after - 1]
+        step[2] -= TURN * np.round(step[2] / TURN)
+        share = (zero - pose_times[after - 1]) / (pose_times[after] - pose_times[after - 1])
+        start = poses[after - 1] + share * step
+    times = np.concatenate([[0.0], pose_times[shown] - zero])
+    return Alignment(zero, after_start, times, np.vstack([start, poses[shown]]))
 
 
 _BUNCHED, _TOGETHER = 1.2, 10  # factor of the mean period from the median, and samples that it is taken over; chosen
@@ -490,15 +479,3 @@ def usual_period(times: Sequence[Array]) -> float:
 
 
 median_period = usual_period  # as plug-ins know it
-
-
-def _pose_at(time: float, times: Array, poses: Array) -> Array:
-    after = int(np.searchsorted(times, time))
-    if after < len(times) and abs(times[after] - time) <= _SAME_TIME:
-        exact: Array = poses[after]
-        return exact
-    share = (time - times[after - 1]) / (times[after] - times[after - 1])
-    step = poses[after] - poses[after - 1]
-    step[2] -= TURN * np.round(step[2] / TURN)
-    between: Array = poses[after - 1] + share * step
-    return between

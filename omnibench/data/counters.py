@@ -76,12 +76,8 @@ def _agreed_range(runs: Sequence[Array], spread: float, turn: float) -> float | 
     wrap, step = float(np.median(ranges)), max(max(local), 1.0)
     if np.abs(ranges - wrap).max() > _LONGER * step or wrap < spread:
         return None
-    whole = turn * round(wrap / turn)
-    nearest = spread + 1
-    for candidate in (whole, nearest):
-        if spread < candidate and abs(candidate - wrap) <= step:
-            return float(candidate)
-    return float(round(wrap))
+    likely = [each for each in (turn * round(wrap / turn), spread + 1) if spread < each and abs(each - wrap) <= step]
+    return float([*likely, round(wrap)][0])
 
 
 def counted_on(counts: Array, wrap: float) -> Array:
@@ -101,21 +97,15 @@ def counted_on(counts: Array, wrap: float) -> Array:
 
 def jumping_readings(counts: Array, times: Array) -> NDArray[np.bool_]:
     """True (F,) for single readings that jump off the line between their neighbours, which lie on one."""
-    jumping = np.zeros(len(counts), dtype=bool)
-    if len(counts) < _FEWEST:
+    jumping, steps = np.zeros(len(counts), dtype=bool), np.abs(np.diff(counts))
+    if len(counts) < _FEWEST or not steps.any():
         return jumping
     share = (times[1:-1] - times[:-2]) / (times[2:] - times[:-2])
     off = counts[1:-1] - (counts[:-2] + share * (counts[2:] - counts[:-2]))  # (F - 2,)
-    steps = np.abs(np.diff(counts))
     moved = steps[steps > 0]
-    if not len(moved):
-        return jumping
-    usual = 1.4826 * float(np.median(np.abs(off)))
-    least = max(
-        _DEVIATIONS * usual,
-        float(np.quantile(steps, _NEARLY_ALL)),
-        _TICKS * float(np.median(moved[moved <= 2 * moved.min()])),
-    )
+    usual = _DEVIATIONS * 1.4826 * float(np.median(np.abs(off)))
+    tick = float(np.median(moved[moved <= 2 * moved.min()]))
+    least = max(usual, float(np.quantile(steps, _NEARLY_ALL)), _TICKS * tick)
     beside = np.minimum(-np.sign(off[1:-1]) * off[:-2], -np.sign(off[1:-1]) * off[2:])
     jumping[2:-2] = (np.abs(off[1:-1]) > least) & (beside > _MIRRORED * np.abs(off[1:-1]))
     return jumping
@@ -211,8 +201,7 @@ def repeated_readings(times: Array, counts: Array, steering: Array | None) -> ND
     still = (steps == 0) & (durations < _USUAL * np.median(durations))
     if steering is not None:
         still &= (np.diff(steering, axis=0) == 0).all(axis=1)
-    moved = steps[steps > 0]
-    repeated = np.zeros(len(counts), dtype=bool)
+    moved, repeated = steps[steps > 0], np.zeros(len(counts), dtype=bool)
     if not len(moved) or len(steps) < 3:
         return repeated
     sizes = np.unique(moved)

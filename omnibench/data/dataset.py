@@ -20,6 +20,10 @@ from omnibench.config import Model
 from omnibench.data.references import NUMBERS, References, reference_flaw, references_of, with_whole_turns
 from omnibench.data.scans import Scans
 from omnibench.data.stored import (
+    COVARIANCES,
+    POSES,
+    REQUIRED,
+    SENT,
     Flaw,
     Table,
     arrays_of_runs,
@@ -45,13 +49,6 @@ TURN = 2 * np.pi  # rad
 Split = Literal["train", "validation"]
 SPLITS: tuple[Split, ...] = ("train", "validation")
 
-# Columns of the arrays of a run's reference, and of its motion commands.
-POSES = {"poses": ["x", "y", "theta"]}
-COVARIANCES = {"pose_covariances": [f"cov_{name}" for name in ("xx", "xy", "xtheta", "yy", "ytheta", "thetatheta")]}
-SENT = {"sent": ["t", "v", "alpha", "omega", "t_r"]}
-RUN_COLUMNS = ("trajectory", "split")  # those that every table of runs has
-POSE_COLUMNS = ("trajectory", "t", *POSES["poses"])  # of poses
-REFERENCE_COLUMNS = ("trajectory", "kind")  # of references
 RUN_NUMBERS = ("started_at", "v", "alpha", "omega", "duration", "distance")
 _ARRAYS = (
     *("times", "rates", "pose_times", "poses", "angles", "targets", "pose_covariances", "steering"),
@@ -303,11 +300,10 @@ def make_dataset(
         runs = [_checked(f"data set {name}", robot, run) for run in trajectories]
     else:
         runs = _runs_of_frames(robot, trajectories, wheels, poses, references)
-    period: Any = sample_period
-    if period is None:  # the median; that there is no run is said next
-        period = round(median_period(runs), _PERIOD_DECIMALS) if runs else 1.0
-    texts: dict[str, Any] = {"description": description, "source": source, "licence": licence}
-    return dataset_of_runs(name, robot, period, runs, simulated=simulated, scans=scans, **texts)
+    if sample_period is None:  # the median; that there is no run is said next
+        sample_period = round(median_period(runs), _PERIOD_DECIMALS) if runs else 1.0
+    made = Dataset(name, robot, sample_period, tuple(runs), description, source, licence, simulated, scans=scans)
+    return checked(made)
 
 
 def _checked(place: str, robot: Robot, run: Any) -> Trajectory:
@@ -349,7 +345,7 @@ def _checked(place: str, robot: Robot, run: Any) -> Trajectory:
     flaws += [("times", wheel_times_flaw(arrays["times"], run.id))]
     flaws += [("pose_times", pose_times_flaw(arrays["pose_times"], run.id))]
     if run.references is not None:
-        flaws += [("references", reference_flaw(run.references, arrays["times"]))]
+        flaws += [("references", reference_flaw(run.references, float(arrays["times"][-1])))]
     for name, flaw in flaws:
         if flaw is not None:
             raise DataError(f"{where}: {name}, row {flaw[0] + 1}: {flaw[1]}")
@@ -358,7 +354,7 @@ def _checked(place: str, robot: Robot, run: Any) -> Trajectory:
 
 def _runs_of_frames(robot: Robot, trajectories: Any, wheels: Any, poses: Any, references: Any) -> list[Trajectory]:
     """The runs of the tables that a user gave."""
-    required = {"wheels": required_columns(robot), "poses": POSE_COLUMNS, "references": REFERENCE_COLUMNS}
+    required = REQUIRED | {"wheels": required_columns(robot)}
     given = {"wheels": wheels, "poses": poses, "references": references}
     frames = {name: _frame(name, content) for name, content in given.items() if content is not None}
     if all("trajectory" not in frame.columns for frame in frames.values()):
@@ -369,7 +365,7 @@ def _runs_of_frames(robot: Robot, trajectories: Any, wheels: Any, poses: Any, re
     if "split" not in runs.columns:
         commands = runs["command"].to_list() if "command" in runs.columns else [None] * len(runs)
         runs = runs.with_columns(pl.Series("split", every_second(commands), dtype=pl.String))
-    of_runs = check_runs(Table(Path("trajectories"), runs, RUN_COLUMNS))
+    of_runs = check_runs(Table(Path("trajectories"), runs, REQUIRED["trajectories"]))
     samples = samples_in_memory(tables["wheels"], of_runs, robot)
     return runs_of_tables(of_runs, samples, tables.get("poses"), tables.get("references"))
 
@@ -382,12 +378,12 @@ def _frame(name: str, content: Any) -> pl.DataFrame:
     if names is None:
         raise DataError(f"{name}: expected a data frame or a dict of arrays, found {type(content).__name__}")
     arrays = {str(column): np.atleast_1d(np.asarray(content[column])) for column in names}
-    first, rows = next(((column, len(array)) for column, array in arrays.items()), ("", 0))
     for column, array in arrays.items():
+        first = next(iter(arrays))
         if array.ndim != 1:
             raise DataError(f"{name}: column {column!r} has shape {array.shape}; give a column for each wheel or axis")
-        if len(array) != rows:
-            raise DataError(f"{name}: column {column!r} has {len(array)} rows, {first!r} has {rows}")
+        if len(array) != len(arrays[first]):
+            raise DataError(f"{name}: column {column!r} has {len(array)} rows, {first!r} has {len(arrays[first])}")
     return pl.DataFrame(
         {column: array.tolist() if array.dtype == object else array for column, array in arrays.items()}, strict=False
     )
@@ -467,28 +463,21 @@ def _references(table: Table, runs: Table, ends: Sequence[float], started: set[s
     for index, rows in table.rows_by_run(runs.ids, runs.file.name):
         run, of_run = runs.ids[index], {name: values[rows] for name, values in numbers.items()}
         references = references_of(kinds[rows], of_run, start_known=run in started).of_run(0.0, ends[index])
-        if (flaw := reference_flaw(references, np.array([ends[index]]))) is not None:
+        if (flaw := reference_flaw(references, ends[index])) is not None:
             raise table.fail(int(rows[flaw[0]]), flaw[1])
         measured[run] = references.by_time()
     return measured
 
 
-def dataset_of_runs(
-    name: str,
-    robot: Robot,
-    sample_period: float,
-    trajectories: Iterable[Trajectory],
-    *,
-    scans: Scans | None = None,
-    **described: Any,
-) -> Dataset:
+def checked(dataset: Dataset) -> Dataset:
     """A data set of runs whose arrays are checked, with unwrapped headings, and with warnings about the runs.
 
-    described: further fields of the data set. DataError: there is no run, two have the same id, a pose is farther away
-    than wheels roll, or the sample period is far from that of the stamps.
+    DataError: there is no run, two have the same id, a pose is farther away than wheels roll, or the sample period is
+    far from that of the stamps.
     """
-    place, drive = f"data set {name}", None if robot.drive.direct else robot.drive
-    runs = [run if run.drive == drive else replace(run, drive=drive) for run in trajectories]
+    robot, sample_period, place = dataset.robot, dataset.sample_period, f"data set {dataset.name}"
+    drive = None if robot.drive.direct else robot.drive
+    runs = [run if run.drive == drive else replace(run, drive=drive) for run in dataset.trajectories]
     if not runs:
         raise DataError(f"{place}: it has no trajectory")
     for identity, count in Counter(run.id for run in runs).items():
@@ -496,17 +485,33 @@ def dataset_of_runs(
             raise DataError(f"{place}: trajectory {identity} is there twice; give each its own id")
     moving, standing = 0, list[str]()
     for each in runs:
-        _refuse_far_poses(f"{place}: trajectory {each.id}", robot, each)
+        steps = np.diff(each.times, prepend=0.0)
+        travel = float((np.abs(each.rates) * robot.radii).max(axis=1) @ steps)  # m, of the fastest wheel
+        distances = np.linalg.norm(each.poses[:, :2] - each.poses[0, :2], axis=1)
+        for row in np.flatnonzero(distances > _FARTHEST * (travel + 1.0))[:1]:
+            x, y = each.poses[row, :2]
+            raise DataError(
+                f"{place}: trajectory {each.id}: the pose at {each.pose_times[row]:g} s, x {x:g} and y {y:g}, is "
+                f"{distances[row]:.3g} m from the run's start, whose wheels rolled {travel:.3g} m; remove or repair it"
+            )
         moved = np.abs(each.poses - each.poses[0]).max(axis=0)
         if (far := moved > (_MOVED, _MOVED, _TURNED)).any():
             # The reference moves: do the wheels, by the design matrix, travel more than hardly any of it?
-            driven = np.abs(each.signals @ robot.inverse_kinematic_matrix.T) * np.diff(each.times, prepend=0.0)[:, None]
+            driven = np.abs(each.signals @ robot.inverse_kinematic_matrix.T) * steps[:, None]
             moving += 1
             standing += [each.id] if driven.sum(axis=0).max() < _HARDLY * moved[far].max() else []
         each.samples.summarise()  # while they are at hand
-    period = median_period(runs)
-    _refuse_sample_period(place, sample_period, period)
-
+    period, (shortest, longest) = median_period(runs), SAMPLE_PERIODS
+    if not period / _MOST_PERIODS < sample_period < period * _MOST_PERIODS:
+        raise DataError(
+            f"{place}: sample_period is {sample_period:g} s, but the wheel samples come every {period:g} s (the "
+            f"median); set it to {period:.3g}"
+        )
+    if not shortest <= sample_period <= longest:
+        raise DataError(
+            f"{place}: sample_period is {sample_period:g} s, expected {shortest:g} to {longest:g} s; "
+            "check the units of the times"
+        )
     warnings = []
     recorded = [run.poses[:, 2] for run in runs]
     headings, ambiguous = unwrap(robot, [run.log(run.pose_times) for run in runs], recorded)
@@ -541,11 +546,9 @@ def dataset_of_runs(
             f"sample_period is {sample_period:g} s, but the wheel samples come every {period:g} s (the median)"
         )
     for index, (run, heading) in enumerate(zip(runs, headings, strict=True)):
-        references = run.references
-        if references is not None:
-            references = with_whole_turns(robot, run.log([0.0]), references)
+        references = None if run.references is None else with_whole_turns(robot, run.log([0.0]), run.references)
         runs[index] = replace(run, poses=np.column_stack([run.poses[:, :2], heading]), references=references)
-    return with_warnings(Dataset(name, robot, sample_period, tuple(runs), scans=scans, **described), warnings)
+    return with_warnings(replace(dataset, trajectories=tuple(runs)), warnings)
 
 
 def with_warnings(dataset: Dataset, warnings: Iterable[str]) -> Dataset:
@@ -555,33 +558,6 @@ def with_warnings(dataset: Dataset, warnings: Iterable[str]) -> Dataset:
         are = "is a copy of a training run and is" if len(copies) == 1 else "are copies of training runs and are"
         warnings.append(f"{plural(len(copies), 'trajectory')} {are} left out of validation: {some(copies, _SHOWN)}")
     return replace(dataset, warnings=tuple(warnings))
-
-
-def _refuse_far_poses(where: str, robot: Robot, run: Trajectory) -> None:
-    """DataError: a pose is farther from the start than the wheels can have rolled, by orders of magnitude."""
-    travel = float((np.abs(run.rates) * robot.radii).max(axis=1) @ np.diff(run.times, prepend=0.0))  # m, the fastest's
-    distances = np.linalg.norm(run.poses[:, :2] - run.poses[0, :2], axis=1)
-    for row in np.flatnonzero(distances > _FARTHEST * (travel + 1.0))[:1]:
-        x, y = run.poses[row, :2]
-        raise DataError(
-            f"{where}: the pose at {run.pose_times[row]:g} s, x {x:g} and y {y:g}, is {distances[row]:.3g} m from the "
-            f"run's start, whose wheels rolled {travel:.3g} m; remove or repair it"
-        )
-
-
-def _refuse_sample_period(place: str, sample_period: float, median: float) -> None:
-    """DataError: a nominal sample period, s, cannot be meant, as the wheel samples come every ``median`` s."""
-    if not median / _MOST_PERIODS < sample_period < median * _MOST_PERIODS:
-        raise DataError(
-            f"{place}: sample_period is {sample_period:g} s, but the wheel samples come every {median:g} s (the "
-            f"median); set it to {median:.3g}"
-        )
-    shortest, longest = SAMPLE_PERIODS
-    if not shortest <= sample_period <= longest:
-        raise DataError(
-            f"{place}: sample_period is {sample_period:g} s, expected {shortest:g} to {longest:g} s; "
-            "check the units of the times"
-        )
 
 
 def unwrap(robot: Robot, logs: Sequence[WheelLog], headings: Sequence[Array]) -> tuple[list[Array], list[int]]:
@@ -611,8 +587,7 @@ def every_second(groups: Sequence[Hashable]) -> list[Split]:
 
 def repetitions(commands: Sequence[Hashable]) -> list[int]:
     """Number of each run among the runs of its command, from 1, in the order given."""
-    seen: Counter[Hashable] = Counter()
-    numbers = []
+    seen, numbers = Counter[Hashable](), []
     for command in commands:
         seen[command] += 1
         numbers.append(seen[command])

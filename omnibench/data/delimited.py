@@ -226,10 +226,10 @@ def _frame(
     """The rows of a text below the header, as texts. DataError: it cannot be read, or a row has too many fields."""
     reason: Exception | None = None
     try:
-        read = BytesIO(source) if isinstance(source, bytes) else source
         frame = pl.read_csv(
-            read, has_header=False, separator=separator, skip_lines=skipped, infer_schema_length=0, glob=False
-        )
+            BytesIO(source) if isinstance(source, bytes) else source,
+            has_header=False, separator=separator, skip_lines=skipped, infer_schema_length=0, glob=False,
+        )  # fmt: skip
     except (pl.exceptions.PolarsError, OSError) as error:
         reason = error
     if reason or frame.width > len(names):

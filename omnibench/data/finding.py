@@ -3,59 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from pydantic import Field
 
 from omnibench.config import Model
 
 Severity = Literal["error", "warning", "note"]
-Kind = Literal[
-    "wheels_swapped",
-    "wheel_negated",
-    "wheels_negated",
-    "wheel_scale",
-    "wheel_unit",
-    "wheel_dead",
-    "wheel_unsigned",
-    "wheel_dropout",
-    "counter_restart",
-    "steering_unit",
-    "steering_sign",
-    "steering_zero",
-    "steering_swapped",
-    "steering_frozen",
-    "steering_lag",
-    "design_distance",
-    "design_rollers",
-    "design_mount",
-    "design_unknown",
-    "heading_unit",
-    "position_unit",
-    "time_unit",
-    "clock_offset",
-    "clock_drift",
-    "reference_mirrored",
-    "reference_turned",
-    "reference_dropout",
-    "reference_jump",
-    "reference_frozen",
-    "reference_is_odometry",
-    "not_at_rest",
-    "motion_missing",
-    "references_leave_open",
-    "few_repetitions",
-    "few_runs",
-    "simulated_like",
-    "copies",
-    "headings_ambiguous",
-    "sample_period",
-    "late_reference",
-    "reference_foreign",
-    "runs_drawn",
-]
+WheelReading = Literal["wheels_swapped", "wheel_negated", "wheels_negated", "wheel_scale", "wheel_unit"]
+SteeringReading = Literal["steering_unit", "steering_sign", "steering_zero", "steering_swapped", "steering_lag"]
+ReferenceReading = Literal["heading_unit", "position_unit", "time_unit", "reference_mirrored", "reference_turned"]
+DesignMistake = Literal["design_distance", "design_rollers", "design_mount", "design_unknown"]
+Misreading = Literal[WheelReading, SteeringReading, ReferenceReading, DesignMistake]
+Spoiled = Literal["reference_frozen", "reference_is_odometry"]
+Unreadable = Literal[Spoiled, "reference_foreign", "steering_frozen", "wheel_dead", "wheel_unsigned"]
+Disturbed = Literal["wheel_dropout", "reference_dropout", "reference_jump", "counter_restart", "not_at_rest", "copies"]
+Clock = Literal["clock_offset", "clock_drift"]
+Lacking = Literal["motion_missing", "few_runs", "few_repetitions"]
+Kind = Literal[Misreading, Unreadable, Disturbed, Clock, Lacking, "references_leave_open", "runs_drawn"]
 
 UNITS: tuple[Kind, ...] = ("wheel_unit", "steering_unit", "heading_unit", "position_unit", "time_unit")
+MISREAD, LACKING, CLOCKS = frozenset(get_args(Misreading)), get_args(Lacking), frozenset(get_args(Clock))
+SPOILED = frozenset(get_args(Spoiled))  # the reference tells nothing
+UNREAD = frozenset(get_args(Unreadable))  # no other reading mends it
 
 
 class Finding(Model):
@@ -73,26 +43,22 @@ class Finding(Model):
     changes: Mapping[str, Any] = Field(default_factory=dict, exclude=True)
 
 
-class FindingWarning(str):
-    """A warning of a data set that holds a finding.
+def error(kind: Kind, what: str, where: str, changes: Mapping[str, Any] | None = None, *, fix: str = "") -> Finding:
+    """The finding of an error, with the options that mend it, or what to do."""
+    return Finding(kind=kind, what=what, where=where, severity="error", fix=fix, changes=changes or {})
 
-    finding: what ``check`` says of it. unit: a unit cannot be right, by the magnitude of what was recorded.
-    """
+
+class FindingWarning(str):
+    """A warning of a data set that holds a finding: what ``check`` says of it."""
 
     finding: Finding
-    unit: bool
-
-    @classmethod
-    def of(cls, finding: Finding, text: str = "", *, unit: bool = False) -> FindingWarning:
-        """The warning of a finding, in its words unless a text is given."""
-        warning = cls(text or finding.what)
-        warning.finding, warning.unit = finding, unit
-        return warning
 
     @classmethod
     def of_restart(cls, note: str) -> FindingWarning:
         """An importer's note on counters that began again, which it has mended."""
-        return cls.of(Finding(kind="counter_restart", what=note, where="all wheels", severity="note"))
+        warning = cls(note)
+        warning.finding = Finding(kind="counter_restart", what=note, where="all wheels", severity="note")
+        return warning
 
 
 def findings_of(warnings: Iterable[str]) -> list[Finding]:

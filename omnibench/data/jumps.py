@@ -53,36 +53,27 @@ def reference_jumps(robot: Robot, odometry: Array, poses: Array) -> Jumps:
     if agree(steps, steps + 1).all():
         return Jumps(none, none)
 
-    def fitting(first: int, others: NDArray[np.intp]) -> NDArray[np.bool_]:
+    def fitting(first: int, begin: int, count: int) -> NDArray[np.bool_]:
+        others = np.arange(begin, min(begin + count, len(poses)))
         return agree(np.full(len(others), first), others)
 
     # The first pose with which most of the next ones agree.
-    count = len(poses)
-    good = next(
-        (
-            first
-            for first in range(_MOST_AWAY)
-            if fitting(first, np.arange(first + 1, first + 1 + _MOST_AWAY)).mean() > 0.5
-        ),
-        0,
-    )
+    begins = (first for first in range(_MOST_AWAY) if fitting(first, first + 1, _MOST_AWAY).mean() > 0.5)
+    good = next(begins, 0)
     lone, shifts = list(range(good)), list[int]()
-    while good < count - 1:
-        ahead = np.arange(good + 1, min(good + 2 + _MOST_AWAY, count))
-        near = np.flatnonzero(fitting(good, ahead))
+    while good < len(poses) - 1:
+        near = np.flatnonzero(fitting(good, good + 1, _MOST_AWAY + 1))
         if len(near):
-            lone += ahead[: near[0]].tolist()
-            good = int(ahead[near[0]])
+            lone += range(good + 1, good + 1 + int(near[0]))
+            good += 1 + int(near[0])
             continue
         # It goes on from the first of the next poses with which others agree.
-        begun = next(
-            (first for first in ahead.tolist() if fitting(first, np.arange(first + 1, min(first + 4, count))).any()),
-            None,
-        )
+        ahead = range(good + 1, min(good + 2 + _MOST_AWAY, len(poses)))
+        begun = next((first for first in ahead if fitting(first, first + 1, 3).any()), None)
         if begun is None:
-            lone += ahead.tolist()
+            lone += ahead
             break
-        lone += list(range(good + 1, begun))
+        lone += range(good + 1, begun)
         shifts.append(good)
         good = begun
     return Jumps(np.array(lone, dtype=np.intp), np.array(shifts, dtype=np.intp))

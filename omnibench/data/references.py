@@ -6,7 +6,7 @@ from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,12 +85,15 @@ class References(Brief):
             ],
             dtype=float,
         )
+        kinds = np.array([each.kind for each in given], dtype=str)
+        # One number stands for both, and the second of kinds of one number is NaN.
         values, sigmas = (
-            np.array([_pair(each.kind, pair) for each, pair in zip(given, pairs, strict=True)]).reshape(-1, 2)
+            np.array([np.resize(pair, 2) for pair in pairs], dtype=float).reshape(-1, 2)
             for pairs in ([each.value for each in given], [each.sigma for each in given])
         )
-        kinds = np.array([each.kind for each in given], dtype=str)
-        return cls(kinds, t0, t1, values, sigmas, start_known, rate_sigma).by_time()
+        measured = cls(kinds, t0, t1, values, sigmas, start_known, rate_sigma)
+        values[~measured.planar, 1] = sigmas[~measured.planar, 1] = np.nan
+        return measured.by_time()
 
     def __len__(self) -> int:
         return len(self.kinds)
@@ -112,23 +115,20 @@ class References(Brief):
 
     def by_time(self) -> References:
         """These measurements in the order of t1, then t0."""
-        order = np.lexsort((self.t0, self.t1))
-        t0, t1, values, sigmas = (array[order] for array in (self.t0, self.t1, self.values, self.sigmas))
-        return replace(self, kinds=self.kinds[order], t0=t0, t1=t1, values=values, sigmas=sigmas)
+        return self.only(np.lexsort((self.t0, self.t1)))
 
-    def with_values(self, values: Array) -> References:
-        """These measurements with other values (R, 2)."""
-        return replace(self, values=values)
+    def only(self, rows: NDArray[Any]) -> References:
+        """Some of these measurements, by their indices, or by True (R,)."""
+        return replace(self, **{name: getattr(self, name)[rows] for name in ("kinds", "t0", "t1", "values", "sigmas")})
 
-    def of_run(self, zero: float, end: float, kept: NDArray[np.bool_] | slice = slice(None)) -> References:
-        """These measurements, or those kept (R,), by the time of a run that began at ``zero`` and lasted ``end`` s.
+    def of_run(self, zero: float, end: float) -> References:
+        """These measurements by the time of a run that began at ``zero`` and lasted ``end`` s.
 
         t0 = -inf becomes the run's start, and t1 = inf its end.
         """
-        kinds, t0, t1 = self.kinds[kept], self.t0[kept] - zero, self.t1[kept] - zero
-        t0, t1 = np.where(np.isneginf(t0), 0.0, t0), np.where(np.isposinf(t1), end, t1)
-        t0 = np.where(np.isposinf(t0), t1, t0)
-        return replace(self, kinds=kinds, t0=t0, t1=t1, values=self.values[kept], sigmas=self.sigmas[kept])
+        t1 = np.where(np.isposinf(self.t1), end, self.t1 - zero)
+        t0 = np.where(np.isneginf(self.t0), 0.0, self.t0 - zero)
+        return replace(self, t0=np.where(np.isposinf(t0), t1, t0), t1=t1)
 
     def open_ended(self, end: float) -> References:
         """These measurements of a run of ``end`` s, with -inf for its start and inf for its end: see ``of_run``."""
@@ -146,14 +146,6 @@ class References(Brief):
         return (tuple(self.kinds.tolist()), self.start_known, *(array.tobytes() for array in arrays), *offset)
 
 
-def _pair(kind: str, given: float | tuple[float, float]) -> tuple[float, float]:
-    """Two numbers; the second is NaN for kinds of one number, and the first again where one is given for both."""
-    first, *others = np.atleast_1d(np.asarray(given, dtype=float)).tolist()
-    if kind not in PLANAR:
-        return first, np.nan
-    return first, others[0] if others else first
-
-
 NUMBERS = ("t0", "t1", "value", "value_x", "value_y", "sigma", "sigma_x", "sigma_y", "sigma_rate")
 
 
@@ -166,34 +158,28 @@ def references_of(kinds: NDArray[np.str_], numbers: Mapping[str, Array], *, star
     planar, instant = np.isin(kinds, list(PLANAR)), np.isin(kinds, list(AT_ONE_TIME))
     t1 = np.where(np.isnan(numbers["t1"]), np.inf, numbers["t1"])
     t0 = np.where(np.isnan(numbers["t0"]), np.where(instant, t1, -np.inf), numbers["t0"])
-    both = numbers["sigma"]
     values = np.column_stack([np.where(planar, numbers["value_x"], numbers["value"]), numbers["value_y"]])
-    sigmas = np.column_stack(
-        [np.where(planar, _filled(numbers["sigma_x"], both), both), _filled(numbers["sigma_y"], both)]
-    )
+    both = np.column_stack([numbers["sigma"], numbers["sigma"]])
+    sigmas = np.column_stack([numbers["sigma_x"], numbers["sigma_y"]])
+    sigmas = np.where(np.isnan(sigmas) | ~planar[:, None], both, sigmas)
     values[~planar, 1] = sigmas[~planar, 1] = np.nan
     rates = np.append(np.nan_to_num(numbers["sigma_rate"]), 0.0)
     return References(kinds, t0, t1, values, sigmas, start_known, float(rates[np.abs(rates).argmax()]))
 
 
-def _filled(values: Array, others: Array) -> Array:
-    return np.where(np.isnan(values), others, values)
-
-
 _LATE = 0.5  # s after the last wheel sample: a later reference is not of this run
 
 
-def reference_flaw(references: References, times: Array | None) -> Flaw | None:
+def reference_flaw(references: References, end: float | None) -> Flaw | None:
     """The first flaw in a run's references, None if there is none.
 
-    times (F,): ends of its wheel samples, s; None: whatever the times of the references are.
+    end: of its wheel samples, s; None: whatever the times of the references are.
     """
     for row, kind in enumerate(references.kinds.tolist()):
         if kind not in KINDS:
             return row, f"kind is {kind!r}; {nearest(kind, KINDS)}it must be one of {', '.join(KINDS)}"
-        what = ""
-        if times is not None:
-            what = _times_flaw(kind, float(references.t0[row]), float(references.t1[row]), float(times[-1]))
+        t0, t1 = float(references.t0[row]), float(references.t1[row])
+        what = "" if end is None else _times_flaw(kind, t0, t1, end)
         if what := what or _numbers_flaw(kind, references.values[row], references.sigmas[row]):
             return row, what
     if np.isfinite(references.rate_sigma) and 0 <= references.rate_sigma <= LARGEST:
@@ -221,11 +207,11 @@ def _times_flaw(kind: str, t0: float, t1: float, end: float) -> str:
 
 def _numbers_flaw(kind: str, values: Array, sigmas: Array) -> str:
     """What is wrong with the values and standard deviations (2,) of a reference; empty if nothing is."""
-    names = ("x", "y") if kind in ("displacement", "position") else ("",)
-    for axis, name in enumerate(names):
-        value, sigma = (f"{word}_{name}" if name else word for word in ("value", "sigma"))
+    axes = ("_x", "_y") if kind in PLANAR else ("",)
+    for axis, name in enumerate(axes):
+        value, sigma = f"value{name}", f"sigma{name}"
         if np.isnan(values[axis]):
-            return f"{value} is missing; a {kind} needs {' and '.join(_named('value', names))}"
+            return f"{value} is missing; a {kind} needs {' and '.join(f'value{name}' for name in axes)}"
         if np.isnan(sigmas[axis]):
             return f"{sigma} is missing: how exactly the {kind} is known, a standard deviation"
         if not np.isfinite(values[axis]) or abs(values[axis]) > LARGEST:
@@ -235,10 +221,6 @@ def _numbers_flaw(kind: str, values: Array, sigmas: Array) -> str:
     if kind == "distance" and values[0] < 0:
         return f"value is {values[0]:g}; a distance driven is not negative, backwards or not"
     return ""
-
-
-def _named(word: str, names: tuple[str, ...]) -> list[str]:
-    return [f"{word}_{name}" if name else word for name in names]
 
 
 TURN = 2 * np.pi  # rad
@@ -263,4 +245,4 @@ def with_whole_turns(robot: Robot, log: WheelLog, references: References) -> Ref
             steps = np.diff(headings, prepend=before[0])
             turns = np.round((np.diff(driven, prepend=before[1]) - steps) / TURN)
             values[chosen, 0] = headings + TURN * np.cumsum(turns)
-    return references.with_values(values)
+    return replace(references, values=values)

@@ -13,9 +13,9 @@ from __future__ import annotations
 
 import errno
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -143,23 +143,31 @@ class TrajectoryScans:
     ranges: Ranges
 
 
-class Scans(ABC):
-    """The scans of a data set, one trajectory at a time, so that no more than that is in memory."""
+class Scans:
+    """The scans of a data set, which are read one trajectory at a time, so that no more than that is in memory.
 
-    scanner: Scanner
+    recorded: of each trajectory that has scans their stamps (S,), s, and what reads their ranges (S, R), m.
+    """
+
+    _place = ""  # where they are, for messages
+
+    def __init__(self, scanner: Scanner, recorded: Mapping[str, tuple[Array, Callable[[], Ranges]]]) -> None:
+        self.scanner, self._recorded = scanner, dict(recorded)
 
     @property
-    @abstractmethod
     def trajectories(self) -> tuple[str, ...]:
         """Ids of the trajectories that have scans."""
-
-    @abstractmethod
-    def of(self, trajectory: str) -> TrajectoryScans:
-        """The scans of a trajectory. DataError in one line: there are none, or they are broken."""
+        return tuple(self._recorded)
 
     def times(self, trajectory: str) -> Array:
-        """The stamps of a trajectory's scans (S,), s. DataError as for ``of``."""
-        return self.of(trajectory).times
+        """The stamps of a trajectory's scans (S,), s. DataError: there are none."""
+        if trajectory not in self._recorded:
+            raise DataError(f"{self._place}trajectory {trajectory} has no scans")
+        return self._recorded[trajectory][0]
+
+    def of(self, trajectory: str) -> TrajectoryScans:
+        """The scans of a trajectory. DataError in one line: there are none, or they are broken."""
+        return TrajectoryScans(self.times(trajectory), self._recorded[trajectory][1]())
 
     def __iter__(self) -> Iterator[tuple[str, TrajectoryScans]]:
         return ((trajectory, self.of(trajectory)) for trajectory in self.trajectories)
@@ -169,17 +177,7 @@ class ScansInMemory(Scans):
     """Scans in memory."""
 
     def __init__(self, scanner: Scanner, scans: Mapping[str, TrajectoryScans]) -> None:
-        self.scanner = scanner
-        self._scans = dict(scans)
-
-    @property
-    def trajectories(self) -> tuple[str, ...]:
-        return tuple(self._scans)
-
-    def of(self, trajectory: str) -> TrajectoryScans:
-        if trajectory not in self._scans:
-            raise DataError(f"trajectory {trajectory} has no scans")
-        return self._scans[trajectory]
+        super().__init__(scanner, {name: (run.times, partial(getattr, run, "ranges")) for name, run in scans.items()})
 
 
 class ScansOnDisk(Scans):
@@ -189,8 +187,8 @@ class ScansOnDisk(Scans):
     """
 
     def __init__(self, file: Path, scanner: Scanner, trajectories: Iterable[str]) -> None:
-        self.file, self.scanner, self._state = file, scanner, file_state(file)
-        self._in_parquet = file.suffix == ".parquet"
+        self.file, self._state, self._in_parquet = file, file_state(file), file.suffix == ".parquet"
+        self._place = f"{file}: "
         if self._in_parquet:
             parquet_shape(file)
         else:
@@ -199,36 +197,24 @@ class ScansOnDisk(Scans):
             check_columns(file, list(self._lazy().collect_schema()), _COLUMNS)
             frame = self._lazy().select("trajectory", "t").collect()
         table = Table(file, frame if self._in_parquet else unquoted_formulas(frame))
-        times = table.numbers("t")
-        self._index: dict[str, tuple[Rows, Array]] = {}  # rows and stamps of every trajectory, in its order
-        ids = list(trajectories)
+        times, ids = table.numbers("t"), list(trajectories)
+        recorded: dict[str, tuple[Array, Callable[[], Ranges]]] = {}
         for index, rows in table.rows_by_run(ids, "the table of trajectories"):
-            if (flaw := times_flaw(times[rows], times[rows] < 0, "it must not be negative")) is not None:
+            of_run = times[rows]
+            if (flaw := times_flaw(of_run, of_run < 0, "it must not be negative")) is not None:
                 raise table.fail(int(rows[flaw[0]]), flaw[1])
-            self._index[ids[index]] = rows, times[rows]
+            recorded[ids[index]] = of_run, partial(self._ranges, rows, f"trajectory {ids[index]}", of_run)
+        super().__init__(scanner, recorded)
 
-    @property
-    def trajectories(self) -> tuple[str, ...]:
-        return tuple(self._index)
-
-    def times(self, trajectory: str) -> Array:
-        return self._indexed(trajectory)[1]
-
-    def of(self, trajectory: str) -> TrajectoryScans:
-        rows, times = self._indexed(trajectory)
+    def _ranges(self, rows: Rows, whose: str, times: Array) -> Ranges:
+        """The ranges (S, R) of some rows, which are read in parts."""
         check_unchanged(self.file, self._state)
         ranges, begin = np.empty((len(rows), self.scanner.rays), np.float32), 0
-        while begin < len(rows):  # some rows of the file at a time
+        while begin < len(rows):
             end = int(np.searchsorted(rows, rows[begin] + (_MOST_ROWS if self._in_parquet else _ROWS_OF_CSV)))
-            part = slice(begin, end)
-            ranges[part] = self._read(rows[part], f"trajectory {trajectory}", times[part])
+            ranges[begin:end] = self._read(rows[begin:end], whose, times[begin:end])
             begin = end
-        return TrajectoryScans(times, ranges)
-
-    def _indexed(self, trajectory: str) -> tuple[Rows, Array]:
-        if trajectory not in self._index:
-            raise DataError(f"{self.file}: trajectory {trajectory} has no scans")
-        return self._index[trajectory]
+        return ranges
 
     def _lazy(self) -> pl.LazyFrame:
         if self._in_parquet:

@@ -144,22 +144,18 @@ def joined(first: Dataset, others: Sequence[Dataset]) -> Dataset:
     """
     if not others:
         return first
-    datasets = (first, *others)
-    warnings = [warning for dataset in datasets for warning in dataset.warnings]
-    return with_warnings(Dataset(**joined_fields(datasets, datasets)), warnings)
+    parts = (first, *others)
+    return with_warnings(put_together(parts), [warning for part in parts for warning in part.warnings])
 
 
-def joined_fields(
-    parts: Sequence[Any], described: Sequence[Any], places: Sequence[str] | None = None
-) -> dict[str, Any]:
-    """The fields of the data set that joins others, see ``joined``.
+def put_together(parts: Sequence[Dataset], places: Sequence[str] | None = None) -> Dataset:
+    """The data set that joins others as ``joined`` does, without their warnings.
 
-    parts: have ``trajectories`` and ``scans``. described: their names, robots and the like. places: what messages call
-    them, default: their names. DataError: another robot or sample period than the first's.
+    places: what messages call them, default: their names. DataError: another robot or sample period than the first's.
     """
-    first, places = described[0], places or [part.name for part in described]
+    first, places = parts[0], places or [part.name for part in parts]
     robot = _flat(first.robot.model_dump(exclude={"name"}))
-    for place, other in zip(places, described, strict=True):
+    for place, other in zip(places, parts, strict=True):
         another = _flat(other.robot.model_dump(exclude={"name"}))
         for key in robot | another:
             if robot.get(key) != another.get(key):
@@ -173,13 +169,21 @@ def joined_fields(
                 f"data set {place}: its wheels were sampled every {other.sample_period:g} s, those of {places[0]} "
                 f"every {first.sample_period:g} s; take each by itself"
             )
-    fields: dict[str, Any] = {name: getattr(first, name) for name in ("name", "robot", "sample_period")}
+    runs, names = list[Trajectory](), list[str]()
+    for part in parts:
+        names.append(part.name if part.name not in names else f"{part.name}-{len(names) + 1}")
+        prefix, ids, sessions = f"{names[-1]}/", {run.id for run in runs}, {run.session for run in runs}
+        for run in part.trajectories:
+            session = run.session or names[-1]
+            session = prefix + session if session in sessions else session
+            runs.append(replace(run, id=prefix + run.id if run.id in ids else run.id, session=session))
+    texts: dict[str, Any] = {}
     for name in ("description", "source", "licence"):
-        fields[name] = "; ".join(dict.fromkeys(text for part in described if (text := getattr(part, name))))
+        texts[name] = "; ".join(dict.fromkeys(text for part in parts if (text := getattr(part, name))))
     if any(part.scans is not None for part in parts):
-        fields["warnings"] = ("scans are left out of joined data sets",)
-    runs = _distinct_runs([(of.name, part.trajectories) for of, part in zip(described, parts, strict=True)])
-    return fields | {"simulated": any(part.simulated for part in described), "trajectories": tuple(complete(runs))}
+        texts["warnings"] = ("scans are left out of joined data sets",)
+    simulated = any(part.simulated for part in parts)
+    return Dataset(first.name, first.robot, first.sample_period, tuple(complete(runs)), simulated=simulated, **texts)
 
 
 def _flat(document: Any, place: str = "") -> dict[str, Any]:
@@ -188,16 +192,3 @@ def _flat(document: Any, place: str = "") -> dict[str, Any]:
         return {place: document}
     items = document.items() if isinstance(document, Mapping) else enumerate(document)
     return {key: value for name, part in items for key, value in _flat(part, f"{place}.{name}".lstrip(".")).items()}
-
-
-def _distinct_runs(recordings: Sequence[tuple[str, Sequence[Trajectory]]]) -> list[Trajectory]:
-    """The runs of recordings, which are given with their names, under ids and sessions that no two recordings share."""
-    runs, names = list[Trajectory](), list[str]()
-    for name, trajectories in recordings:
-        names.append(name if name not in names else f"{name}-{len(names) + 1}")
-        prefix, ids, sessions = f"{names[-1]}/", {run.id for run in runs}, {run.session for run in runs}
-        for run in trajectories:
-            session = run.session or names[-1]
-            session = prefix + session if session in sessions else session
-            runs.append(replace(run, id=prefix + run.id if run.id in ids else run.id, session=session))
-    return runs

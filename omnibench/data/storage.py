@@ -6,7 +6,7 @@ import glob
 import os
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -17,32 +17,27 @@ from pydantic import Field, model_validator
 
 from omnibench.config import Model, Name, Positive, read_yaml, to_yaml, validate
 from omnibench.data.dataset import (
-    COVARIANCES,
-    POSE_COLUMNS,
-    POSES,
-    REFERENCE_COLUMNS,
-    RUN_COLUMNS,
     RUN_NUMBERS,
-    SENT,
     Dataset,
     Imported,
     Trajectory,
     check_runs,
-    dataset_of_runs,
+    checked,
     runs_of_tables,
 )
 from omnibench.data.parquet import parquet_shape
-from omnibench.data.references import AT_ONE_TIME, NUMBERS, PLANAR, References
+from omnibench.data.references import AT_ONE_TIME, References
 from omnibench.data.scans import Scanner, ScansOnDisk, write_scans
-from omnibench.data.splits import joined_fields
+from omnibench.data.splits import put_together
 from omnibench.data.stored import (
+    COVARIANCES,
     MOST_IN_MEMORY,
+    POSES,
+    SENT,
     Table,
     pose_times_flaw,
+    read_samples,
     read_table,
-    required_columns,
-    samples_in_file,
-    samples_in_memory,
     table_file,
     wheel_columns,
 )
@@ -62,7 +57,6 @@ from omnibench.robot.kinematics import Array, Robot
 from omnibench.words import plural, some
 
 FORMAT: Final = "omnibench-dataset/1"
-_MAGIC = "*?["  # signs of a glob
 _TABLES = ("trajectories", "wheels", "poses", "references", "commands", "scans")
 
 
@@ -114,33 +108,18 @@ def read_header(folder: Path) -> Header:
         raise DataError(str(error)) from None
 
 
-@dataclass(frozen=True, eq=False)
-class RecordedDataset:
-    """The content of a data set folder as it was recorded: headings are not unwrapped."""
-
-    header: Header
-    trajectories: list[Trajectory]
-    scans: ScansOnDisk | None
-
-
-def read_recorded(folder: Path, *, left_in_files: bool = False) -> RecordedDataset:
-    """Read a data set folder and check its tables. DataError as for ``load_dataset``.
+def read_recorded(folder: Path, *, left_in_files: bool = False) -> Dataset:
+    """A data set folder as it was recorded, with checked tables: headings are not unwrapped. DataError in one line.
 
     left_in_files: the wheel samples of a Parquet file stay there, if its rows allow to read it run by run.
     """
     header, tables = read_header(folder), dict[str, Table]()
-    required = {"references": REFERENCE_COLUMNS, "poses": POSE_COLUMNS, "commands": ("trajectory", *SENT["sent"])}
-    runs = check_runs(read_table(folder, "trajectories", RUN_COLUMNS))
-    for name, columns in required.items():
+    runs = check_runs(read_table(folder, "trajectories"))
+    for name in ("references", "poses", "commands"):
         # Without references there must be poses.
         if table_file(folder, name) is not None or (name == "poses" and not tables):
-            tables[name] = read_table(folder, name, columns)
-    file, samples = table_file(folder, "wheels"), None
-    if left_in_files and file is not None and file.suffix == ".parquet":
-        samples = samples_in_file(file, runs, header.robot)
-    if samples is None:
-        wheels = read_table(folder, "wheels", required_columns(header.robot))
-        samples = samples_in_memory(wheels, runs, header.robot)
+            tables[name] = read_table(folder, name)
+    samples = read_samples(folder, runs, header.robot, left_in_files=left_in_files)
     trajectories = runs_of_tables(runs, samples, *(tables.get(name) for name in ("poses", "references", "commands")))
     scans = None
     if (file := table_file(folder, "scans")) is not None:
@@ -149,8 +128,9 @@ def read_recorded(folder: Path, *, left_in_files: bool = False) -> RecordedDatas
                 f"{folder / 'dataset.yaml'}: scanner is missing, which {file.name} needs: rays, angle_min, "
                 "angle_increment, range_max (rad, m)"
             )
-        scans = ScansOnDisk(file, header.scanner, [trajectory.id for trajectory in trajectories])
-    return RecordedDataset(header, trajectories, scans)
+        scans = ScansOnDisk(file, header.scanner, runs.ids)
+    described = {name: getattr(header, name) for name in _DESCRIBED}
+    return Dataset(trajectories=tuple(trajectories), scans=scans, **described)
 
 
 def dataset_folders(places: Path | str | Sequence[Path | str]) -> list[Path]:
@@ -174,7 +154,7 @@ def dataset_folders(places: Path | str | Sequence[Path | str]) -> list[Path]:
 
 def is_glob(place: Path) -> bool:
     """True for a pattern, which no file or folder has as its name."""
-    return any(sign in str(place) for sign in _MAGIC) and not place.exists()
+    return glob.has_magic(str(place)) and not place.exists()
 
 
 def in_few_words(folders: Sequence[Path]) -> str:
@@ -208,18 +188,15 @@ def load_dataset(path: Path | str | Sequence[Path | str], *, most_in_memory: int
     if left_in_files:
         expect_reading(samples, "sample")
     recorded = [read_recorded(folder, left_in_files=left_in_files) for folder in folders]
-    headers = [part.header for part in recorded]
-    first, last = headers[0], headers[-1]
-    if len(folders) > 1:
-        fields = joined_fields(recorded, headers, list(map(str, folders)))
-        if any(header.name != first.name for header in headers):
-            fields["name"] = f"{first.name} to {last.name}"
-    else:
-        fields = {name: getattr(first, name) for name in _DESCRIBED}
-        fields |= {"trajectories": recorded[0].trajectories, "scans": recorded[0].scans}
-    dataset = dataset_of_runs(**fields)
-    originals = {run.fingerprint: run.id for run in reversed(dataset.trajectories if len(folders) > 1 else ())}
-    copies = [run.id for run in dataset.trajectories if originals.get(run.fingerprint, run.id) != run.id]
+    if len(recorded) == 1:
+        return checked(recorded[0])
+    names = [part.name for part in recorded]
+    dataset = put_together(recorded, list(map(str, folders)))
+    if len({*names}) > 1:
+        dataset = replace(dataset, name=f"{names[0]} to {names[-1]}")
+    dataset = checked(dataset)
+    originals = {run.fingerprint: run.id for run in reversed(dataset.trajectories)}
+    copies = [run.id for run in dataset.trajectories if originals[run.fingerprint] != run.id]
     if not copies:
         return dataset
     twice = f"{plural(len(copies), 'run')} of another folder there twice, counted as repetitions: {some(copies, 5)}"
@@ -259,8 +236,7 @@ def save_dataset(
     scans = dataset.scans if dataset.scans is not None and {*ids} & {*dataset.scans.trajectories} else None
     described: dict[str, Any] = {name: getattr(dataset, name) for name in _DESCRIBED}
     header = Header(wheels=dataset.robot.wheel_names, scanner=None if scans is None else scans.scanner, **described)
-    unknown = None if header.imported else {"imported"}
-    text = to_yaml(header.model_dump(mode="json", by_alias=True, exclude=unknown))
+    text = to_yaml(header.model_dump(mode="json", by_alias=True, exclude=None if header.imported else {"imported"}))
     contents: dict[Path, FileContent] = {folder / "dataset.yaml": text.encode()}
     for name, frame in tables_of(dataset).items():
         # A column that only some trajectories have is left out of the sample tables, which may have no gaps.
@@ -317,18 +293,15 @@ def _frame_of(run: Trajectory, times: Array, groups: Mapping[str, list[str]]) ->
 
 def reference_frame(references: Sequence[tuple[str, References]]) -> pl.DataFrame:
     """The table of the references of some runs, given with their ids."""
-    rows: list[dict[str, Any]] = []
+    frames = []
     for run, of_run in references:
-        for kind, t0, t1, value, sigma, gyro in zip(
-            of_run.kinds.tolist(), of_run.t0, of_run.t1, of_run.values, of_run.sigmas, of_run.gyro, strict=True
-        ):
-            numbers = {"value": value[0], "sigma": sigma[0]}
-            if kind in PLANAR:
-                numbers = {"value_x": value[0], "value_y": value[1], "sigma_x": sigma[0], "sigma_y": sigma[1]}
-            if gyro and of_run.rate_sigma:
-                numbers["sigma_rate"] = of_run.rate_sigma
-            start = None if kind in AT_ONE_TIME and t0 == t1 else t0
-            rows.append({"trajectory": run, "t0": start, "t1": t1, "kind": kind} | numbers)
-    schema = {"trajectory": pl.String, "t0": pl.Float64, "t1": pl.Float64, "kind": pl.String}
-    frame = pl.DataFrame(rows, schema=schema | dict.fromkeys(NUMBERS[2:], pl.Float64))
+        instant = np.isin(of_run.kinds, list(AT_ONE_TIME)) & (of_run.t0 == of_run.t1)
+        columns: dict[str, Any] = {"t0": np.where(instant, np.nan, of_run.t0), "t1": of_run.t1, "kind": of_run.kinds}
+        for name, numbers in (("value", of_run.values), ("sigma", of_run.sigmas)):
+            columns[name] = np.where(of_run.planar, np.nan, numbers[:, 0])
+            columns[f"{name}_x"] = np.where(of_run.planar, numbers[:, 0], np.nan)
+            columns[f"{name}_y"] = numbers[:, 1]
+        columns["sigma_rate"] = np.where(of_run.gyro & (of_run.rate_sigma > 0), of_run.rate_sigma, np.nan)
+        frames.append(pl.DataFrame({"trajectory": [run] * len(of_run)} | columns).fill_nan(None))
+    frame = pl.concat(frames)
     return frame.select(column for column in frame.iter_columns() if column.null_count() < len(frame))

@@ -42,6 +42,16 @@ _BLOCKS_HELD = 3  # blocks in memory, those of all files together, beside one th
 _FEWEST = 20  # runs that are drawn at least (chosen)
 _OF_EACH = 2  # runs of every command and session that are drawn before others (chosen): a rare one is not missed
 
+# Columns of the arrays of a run's reference, and of its motion commands; those that every table but the wheels' has.
+POSES = {"poses": ["x", "y", "theta"]}
+COVARIANCES = {"pose_covariances": [f"cov_{name}" for name in ("xx", "xy", "xtheta", "yy", "ytheta", "thetatheta")]}
+SENT = {"sent": ["t", "v", "alpha", "omega", "t_r"]}
+REQUIRED = {
+    "trajectories": ["trajectory", "split"],
+    "poses": ["trajectory", "t", *POSES["poses"]],
+    "references": ["trajectory", "kind"],
+    "commands": ["trajectory", *SENT["sent"]],
+}
 # Names may consist of digits: 007 is not 7.
 _TEXTS = dict.fromkeys(("trajectory", "command", "split", "session"), pl.String)
 _OF_ODOMETRY = ("times", "rates", "steering")  # arrays that are read at once
@@ -237,9 +247,9 @@ def table_file(folder: Path, name: str) -> Path | None:
     return files[0] if files else None
 
 
-def read_table(folder: Path, name: str, required: Sequence[str]) -> Table:
+def read_table(folder: Path, name: str, required: Sequence[str] = ()) -> Table:
     """The table called ``name`` of a data set. DataError when it, its rows or a required column are missing."""
-    file = table_file(folder, name)
+    file, required = table_file(folder, name), required or REQUIRED[name]
     if file is None:
         raise DataError(f"{folder}: {name}.parquet (or {name}.csv) is missing")
     if file.suffix == ".parquet":
@@ -283,13 +293,21 @@ def _present_columns(file: Path, columns: Sequence[str], robot: Robot) -> dict[s
     return present_groups(file, wheel_columns(robot), columns)
 
 
+def read_samples(folder: Path, runs: Table, robot: Robot, *, left_in_files: bool) -> list[Samples]:
+    """The wheel samples of each run of a data set, which stay in a Parquet file if its rows allow it. DataError."""
+    file, samples = table_file(folder, "wheels"), None
+    if left_in_files and file is not None and file.suffix == ".parquet":
+        samples = _samples_in_file(file, runs, robot)
+    return samples or samples_in_memory(read_table(folder, "wheels", required_columns(robot)), runs, robot)
+
+
 def samples_in_memory(table: Table, runs: Table, robot: Robot) -> list[Samples]:
     """The wheel samples of each run. DataError names the table, the row and what is wrong."""
     columns = _present_columns(table.file, table.frame.columns, robot)
     return [Samples(arrays) for arrays in arrays_of_runs(table, runs, columns, wheel_times_flaw)]
 
 
-def samples_in_file(file: Path, runs: Table, robot: Robot) -> list[Samples] | None:
+def _samples_in_file(file: Path, runs: Table, robot: Robot) -> list[Samples] | None:
     """The wheel samples of each run in a Parquet file, which are checked piece by piece and stay there.
 
     None: the rows of a run do not stand together, or numbers are texts, so that the table must be read whole. DataError

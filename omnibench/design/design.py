@@ -1,6 +1,8 @@
 """Optimal experiment design: which commands to drive so that a calibration becomes most precise.
 
 Candidate runs are judged by their Fisher information: the precision and the effort of a design made of them.
+
+The result of a design: the document of ``omnibench design --json``.
 """
 
 from __future__ import annotations
@@ -11,42 +13,159 @@ from pathlib import Path
 from typing import get_args
 
 import numpy as np
+from pydantic import Field
 
+from omnibench.config import Model
 from omnibench.data.dataset import Dataset
-from omnibench.design.candidates import CandidatePool, CandidateRun, read_candidates
-from omnibench.design.config import Per, Use
-from omnibench.design.d_optimality import (
-    Candidates,
-    ContinuousDesign,
-    Counts,
-    continuous_optimum,
-    equal_design,
-    exact_designs,
-    scale_of,
-)
-from omnibench.design.result import (
-    Baseline,
-    Candidate,
-    Chosen,
-    Design,
-    Effort,
-    Equivalent,
-    MotionPrecision,
-    Optimum,
-    PhysicalSpread,
-    Precision,
-    SetDesign,
-    Step,
-)
+from omnibench.design import d_optimality
+from omnibench.design.candidates import CandidatePool, CandidateRun, Per, Use, read_candidates
 from omnibench.errors import ConfigError, require_choice, require_range
 from omnibench.fit.geometry import WheelGeometry
 from omnibench.fit.identifiability import is_invertible
-from omnibench.fit.information import information_of_runs
 from omnibench.fit.span import direction_in_words, driven_span
+from omnibench.fit.trajectory_fit import information_of_runs
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array, Robot, relative
 from omnibench.robot.odometry import Integration
 from omnibench.words import plural
+
+
+class Candidate(Model):
+    """A command that a design may choose. speed m/s, direction rad, turn_rate rad/s: None where it is not known."""
+
+    name: str
+    speed: float | None
+    direction: float | None
+    turn_rate: float | None
+    duration_s: float
+    distance_m: float = Field(description="way of the robot's centre")
+    rolled_m: float = Field(description="way that the wheels roll, mean of the wheels")
+    path: tuple[tuple[float, float, float], ...] = Field(
+        exclude=True, repr=False, description="poses along a run from (0, 0, 0), for drawing: m, m, rad"
+    )
+
+
+class Effort(Model):
+    """Number, time and distance of some runs."""
+
+    runs: int
+    seconds: float
+    metres: float = Field(description="way of the robot's centre")
+    wheel_metres: float = Field(description="way that the wheels roll, mean of the wheels")
+
+
+class PhysicalSpread(Model):
+    """Largest standard deviation of each kind of physical parameter."""
+
+    radius_percent: float
+    distance_percent: float
+    angle_deg: float
+
+
+class MotionPrecision(Model):
+    """Standard deviations of a calibrated robot's odometry after 1 m or a full turn, from the matrix alone."""
+
+    motion: str
+    position_mm: float
+    heading_deg: float
+
+
+class Precision(Model):
+    """Precision of the matrix that some runs give.
+
+    relative: the geometric mean of the standard deviations as a multiple of the baseline's. row_percent: the largest
+    standard deviation of an element of each row, % of the row's largest element. motions: of odometry. physical: for
+    three omni wheels.
+    """
+
+    effort: Effort
+    relative: float
+    row_percent: tuple[float, float, float]
+    motions: tuple[MotionPrecision, ...]
+    physical: PhysicalSpread | None
+
+
+class Step(Precision):
+    """A design of some runs. efficiency: its det(M)^(1/p) per run (or s, m) as a share of the bound on all designs."""
+
+    efficiency: float
+
+
+class Chosen(Model):
+    """A command and how often it is driven."""
+
+    command: str
+    runs: int
+
+
+class Equivalent(Model):
+    """The smallest design found that gives as much information as the baseline.
+
+    effort: None when there is none within the repetitions allowed. least: lower bound on the cost of any such design,
+    in runs, s or m; None where this use leaves part of the matrix undetermined.
+    """
+
+    use: Use
+    effort: Effort | None
+    least: float | None
+    chosen: tuple[Chosen, ...]
+
+
+class Optimum(Model):
+    """The continuous optimum. shares: of the cost, by command. gap: how far it can be below the bound, relative."""
+
+    shares: dict[str, float]
+    gap: float
+    iterations: int
+
+
+class SetDesign(Model):
+    """The design from one set of candidates. reached: the chosen runs are within 1 % of the D-optimum."""
+
+    name: str
+    commands: tuple[str, ...]
+    optimum: Optimum
+    chosen: tuple[Chosen, ...]
+    step: Step
+    reached: bool
+    baseline_efficiency: float
+    steps: tuple[Step, ...] = Field(description="the best runs found, more and more of them")
+    equivalents: tuple[Equivalent, ...]
+
+
+class Baseline(Model):
+    """The experiment that designs are compared with."""
+
+    name: str
+    precision: Precision
+
+
+class Design(Model):
+    """The commands that are worth driving, and the precision that they give."""
+
+    source: str
+    name: str
+    description: str
+    robot: str
+    simulated: bool = Field(description="nothing of it was measured on a robot")
+    recorded: bool = Field(description="the candidates' wheel logs are recordings")
+    integration: Integration
+    use: Use
+    per: Per
+    runs_asked: int | None
+    most_repetitions: int | None
+    parameters: int = Field(description="elements of the matrix that the commands determine")
+    noise: Noise
+    noise_source: str
+    candidates: tuple[Candidate, ...]
+    baseline: Baseline
+    sets: tuple[SetDesign, ...]
+    notes: tuple[str, ...]
+
+    def candidate(self, name: str) -> Candidate:
+        """The candidate called ``name``."""
+        return next(candidate for candidate in self.candidates if candidate.name == name)
+
 
 USES: tuple[Use, ...] = get_args(Use)
 _PATH_POINTS = 160  # points that a path is drawn with, one for each few pixels of a figure
@@ -66,7 +185,7 @@ class DesignProblem:
         directions = driven_span([run for candidate in pool.candidates for run in candidate.runs]).strong
         self.basis: Array = np.kron(np.eye(3), directions.T)
         self.information = {name: self._information(name) for name in USES}
-        self._everything: dict[Use, Candidates] = {}
+        self._everything: dict[Use, d_optimality.Candidates] = {}
         # Of three omni wheels the derivatives (9, 9) of the physical parameters by the matrix elements.
         self._physical: Array | None = None
         if len(directions) == 3 and is_invertible(pool.robot):
@@ -85,21 +204,21 @@ class DesignProblem:
         ]
         return self.basis.T @ np.array(means) @ self.basis
 
-    def everything(self, use: Use) -> Candidates:
+    def everything(self, use: Use) -> d_optimality.Candidates:
         """All candidates, as a common measure for designs from different sets."""
         if use not in self._everything:
             self._everything[use] = self.candidates(use)
         return self._everything[use]
 
-    def candidates(self, use: Use, name: str | None = None) -> Candidates:
+    def candidates(self, use: Use, name: str | None = None) -> d_optimality.Candidates:
         """The candidates of a set, or all. ConfigError when they leave part of the matrix undetermined."""
         chosen = list(range(len(self.described)) if name is None else self.pool.sets[name])
         information = self.information[use][chosen]
         try:
-            return Candidates(information, self.costs[chosen], self.repetitions)
+            return d_optimality.Candidates(information, self.costs[chosen], self.repetitions)
         except ValueError:
             mean = information.mean(axis=0)
-            scale = scale_of(mean)
+            scale = d_optimality.scale_of(mean)
             weakest = np.linalg.eigh(mean * scale * scale[:, None])[1][:, 0] * scale
             elements = (self.basis @ weakest).reshape(3, -1)
             direction = np.linalg.svd(elements)[2][0]
@@ -110,18 +229,18 @@ class DesignProblem:
                 f"along {direction_in_words(direction, self.pool.robot.drive.names)}; add commands that determine it"
             ) from None
 
-    def of_all(self, name: str, counts: Counts) -> Counts:
+    def of_all(self, name: str, counts: d_optimality.Counts) -> d_optimality.Counts:
         """Counts of a set's candidates as counts (C,) of all."""
-        every: Counts = np.zeros(len(self.described), dtype=np.intp)
+        every: d_optimality.Counts = np.zeros(len(self.described), dtype=np.intp)
         every[list(self.pool.sets[name])] = counts
         return every
 
-    def effort(self, counts: Counts) -> Effort:
+    def effort(self, counts: d_optimality.Counts) -> Effort:
         """Time and distance of driving ``counts`` runs (C,) of the candidates."""
         sums = np.array([[run.duration_s, run.distance_m, run.rolled_m] for run in self.described]).T @ counts
         return Effort(runs=int(counts.sum()), seconds=sums[0], metres=sums[1], wheel_metres=sums[2])
 
-    def precision(self, counts: Counts) -> Precision:
+    def precision(self, counts: d_optimality.Counts) -> Precision:
         """Standard deviations that ``counts`` runs (C,) of the candidates give."""
         everything = self.everything(self.use)
         covariance = self.basis @ everything.covariance(counts) @ self.basis.T
@@ -138,12 +257,12 @@ class DesignProblem:
             physical=physical,
         )
 
-    def step(self, counts: Counts, bound: float) -> Step:
+    def step(self, counts: d_optimality.Counts, bound: float) -> Step:
         """The precision of ``counts`` (C,), with its efficiency as a share of ``bound``."""
         efficiency = self.everything(self.use).criterion(counts) / bound
         return Step(**dict(self.precision(counts)), efficiency=efficiency)
 
-    def chosen(self, counts: Counts) -> tuple[Chosen, ...]:
+    def chosen(self, counts: d_optimality.Counts) -> tuple[Chosen, ...]:
         """The commands that are driven at least once."""
         return tuple(
             Chosen(command=candidate.name, runs=int(count))
@@ -275,12 +394,12 @@ def design_experiment(
 
 def _design_of_set(problem: DesignProblem, name: str, runs: int | None) -> SetDesign:
     candidates = problem.candidates(problem.use, name)
-    optimum = continuous_optimum(candidates)
+    optimum = d_optimality.continuous_optimum(candidates)
     baseline = problem.pool.baseline
     most = max(min(max(int(baseline.sum()), 4 * candidates.parameters), _MOST_STEPS), runs or 0)
     designs = [
         problem.of_all(name, counts)
-        for counts in exact_designs(candidates, optimum, most)
+        for counts in d_optimality.exact_designs(candidates, optimum, most)
         if candidates.identifies(counts)
     ]
     steps = [problem.step(counts, optimum.bound) for counts in designs]
@@ -325,14 +444,18 @@ def _wanted(steps: Sequence[Step], runs: int | None, place: str) -> int:
 def _equal_otherwise(problem: DesignProblem, name: str, use: Use) -> Equivalent:
     """The equivalent for the use that the design is not made for, which may leave part of the matrix undetermined."""
     try:
-        optimum = continuous_optimum(problem.candidates(use, name))
+        optimum = d_optimality.continuous_optimum(problem.candidates(use, name))
     except ConfigError:
         return Equivalent(use=use, effort=None, least=None, chosen=())
     return _equal(problem, name, use, optimum)
 
 
 def _equal(
-    problem: DesignProblem, name: str, use: Use, optimum: ContinuousDesign, designs: Sequence[Counts] = ()
+    problem: DesignProblem,
+    name: str,
+    use: Use,
+    optimum: d_optimality.ContinuousDesign,
+    designs: Sequence[d_optimality.Counts] = (),
 ) -> Equivalent:
     """The smallest design for a use that tells as much about the matrix as the baseline.
 
@@ -342,7 +465,7 @@ def _equal(
     target = everything.root(problem.pool.baseline)
     counts = next((design for design in designs if everything.root(design) >= target), None)
     if counts is None:
-        in_set = equal_design(problem.candidates(use, name), optimum, target)
+        in_set = d_optimality.equal_design(problem.candidates(use, name), optimum, target)
         counts = None if in_set is None else problem.of_all(name, in_set)
     return Equivalent(
         use=use,

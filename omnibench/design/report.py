@@ -10,30 +10,9 @@ from typing import Any
 import numpy as np
 import plotly.graph_objects as go
 
-from omnibench.design.config import Per, Use
-from omnibench.design.result import Candidate, Design, Effort, Precision, SetDesign, Step
-from omnibench.report.blocks import (
-    Badge,
-    Block,
-    Callout,
-    Cell,
-    Column,
-    Dash,
-    Details,
-    Document,
-    Fact,
-    Facts,
-    Figure,
-    FigureGrid,
-    LegendItem,
-    Paragraph,
-    Row,
-    RowRole,
-    Section,
-    Table,
-    answer_section,
-    simulated_badge,
-)
+from omnibench.design.candidates import Per, Use
+from omnibench.design.design import Candidate, Design, Effort, Precision, SetDesign, Step
+from omnibench.report import blocks as page
 from omnibench.report.figures import ORIGIN, line, marks
 from omnibench.report.numbers import (
     NOTHING,
@@ -176,24 +155,24 @@ def baseline_runs(design: Design) -> str:
     return count(design.baseline.precision.effort.runs)
 
 
-_LEFT = LegendItem("left", "turning left", PALETTE[0])
-_STRAIGHT = LegendItem("straight", "straight", "#5b6772")
+_LEFT = page.LegendItem("left", "turning left", PALETTE[0])
+_STRAIGHT = page.LegendItem("straight", "straight", "#5b6772")
 # Left and right turns may run along the same circle: dashes over a line show both.
-_RIGHT = LegendItem("right", "turning right", PALETTE[1], "dash")
-_UNUSED = LegendItem("unused", "candidates not chosen", "#d4d9df")
-_BASELINE = LegendItem("", "baseline", QUIET, symbol="diamond")
+_RIGHT = page.LegendItem("right", "turning right", PALETTE[1], "dash")
+_UNUSED = page.LegendItem("unused", "candidates not chosen", "#d4d9df")
+_BASELINE = page.LegendItem("", "baseline", QUIET, symbol="diamond")
 # rad: a run that turns by less is drawn as straight; nothing else hangs on it. Before calibration the simulated APR-02
 # seems to turn by 0.1 to 2.7 degrees in six straight runs: five are drawn as straight, three with half of it and six
 # with twice (tests/studies/constants_fit.py).
 _STRAIGHT_BELOW = math.radians(2)
 _HEIGHT = 380  # px: the paths end within the first 900 of the page
-_ROW_DASHES: tuple[Dash, ...] = ("solid", "dash", "dot")
+_ROW_DASHES: tuple[page.Dash, ...] = ("solid", "dash", "dot")
 
 
-def path_figures(design: Design) -> FigureGrid:
+def path_figures(design: Design) -> page.FigureGrid:
     """Paths of each set's commands; a chosen one is in colour, and the wider the more often it is driven."""
     figures = tuple(
-        Figure(
+        page.Figure(
             f"{of_set.name}: {plural(of_set.step.effort.runs, 'run')} of {plural(len(of_set.chosen), 'command')}",
             _flower(design, of_set),
             f"Paths of the {plural(len(of_set.commands), 'command')} of {of_set.name}; chosen: "
@@ -205,7 +184,7 @@ def path_figures(design: Design) -> FigureGrid:
         for of_set in design.sets
     )
     drawn = {trace.legendgroup for figure in figures for trace in figure.plot.data}
-    return FigureGrid(
+    return page.FigureGrid(
         figures,
         tuple(item for item in (_LEFT, _STRAIGHT, _RIGHT, _UNUSED) if item.key in drawn),
         2 if len(figures) > 1 else 1,
@@ -215,16 +194,16 @@ def path_figures(design: Design) -> FigureGrid:
     )
 
 
-def precision_figures(design: Design) -> FigureGrid:
+def precision_figures(design: Design) -> page.FigureGrid:
     """Standard deviations of the best runs found against their number and against the time that they take."""
     baseline = plural(design.baseline.precision.effort.runs, "run")
     figures = [
-        Figure(
+        page.Figure(
             f"All elements together, as a multiple of the baseline's ({baseline})",
             _curves(design, _runs, "runs", [(lambda step: step.relative, "solid")], "standard deviation / baseline's"),
             "Geometric mean of the standard deviations against the number of runs, on logarithmic scales",
         ),
-        Figure(
+        page.Figure(
             "All elements together, against the time of driving",
             _curves(
                 design,
@@ -235,7 +214,7 @@ def precision_figures(design: Design) -> FigureGrid:
             ),
             "Geometric mean of the standard deviations against the time of driving, on logarithmic scales",
         ),
-        Figure(
+        page.Figure(
             "Rows of the matrix: x solid, y dashed, heading dotted",
             _curves(
                 design,
@@ -249,13 +228,13 @@ def precision_figures(design: Design) -> FigureGrid:
     ]
     if design.baseline.precision.physical is not None:
         figures.append(
-            Figure(
+            page.Figure(
                 "Wheels: radius solid, distance dashed",
                 _curves(design, _runs, "runs", [(_radius, "solid"), (_distance, "dash")], "% of the design value"),
                 "Largest standard deviation of the wheels' radii and distances against the number of runs",
             )
         )
-    return FigureGrid(
+    return page.FigureGrid(
         tuple(figures),
         _legend(design),
         2,
@@ -264,7 +243,7 @@ def precision_figures(design: Design) -> FigureGrid:
     )
 
 
-def efficiency_figure(design: Design) -> FigureGrid:
+def efficiency_figure(design: Design) -> page.FigureGrid:
     """Efficiency of exact designs against the number of runs; 100 % is the bound that no design exceeds."""
     traces = []
     lowest = min(step.efficiency for of_set in design.sets for step in of_set.steps)
@@ -278,9 +257,9 @@ def efficiency_figure(design: Design) -> FigureGrid:
     figure.add_hline(y=100, line={"color": INK, "width": 1.2})
     figure.add_hline(y=99, line={"color": QUIET, "width": 1, "dash": "dot"})
     baselines = ", ".join(f"{percent(of_set.baseline_efficiency)} of {of_set.name}'s" for of_set in design.sets)
-    return FigureGrid(
+    return page.FigureGrid(
         (
-            Figure(
+            page.Figure(
                 "Information per run against the bound" if design.per == "run" else "Information for its cost",
                 figure,
                 "Efficiency of the exact designs against the number of runs, and the bound at 100 %",
@@ -298,7 +277,7 @@ def _curves(
     design: Design,
     across: Callable[[Precision], float],
     x_title: str,
-    upwards: Sequence[tuple[Callable[[Precision], float], Dash]],
+    upwards: Sequence[tuple[Callable[[Precision], float], page.Dash]],
     y_title: str,
 ) -> go.Figure:
     baseline = design.baseline.precision
@@ -338,11 +317,11 @@ def _distance(step: Precision) -> float:
 
 
 def _curve(
-    item: LegendItem,
+    item: page.LegendItem,
     of_set: SetDesign,
     across: Callable[[Step], float],
     upwards: Callable[[Step], float],
-    dash: Dash = "solid",
+    dash: page.Dash = "solid",
 ) -> list[go.Scatter]:
     """A line through the steps of a set, with a ring around the chosen one."""
     x, y = ([value(step) for step in of_set.steps] for value in (across, upwards))
@@ -358,9 +337,9 @@ def _curve(
     ]
 
 
-def _legend(design: Design) -> tuple[LegendItem, ...]:
+def _legend(design: Design) -> tuple[page.LegendItem, ...]:
     colours = cycle(PALETTE)
-    return tuple(LegendItem(of_set.name, of_set.name, next(colours)) for of_set in design.sets)
+    return tuple(page.LegendItem(of_set.name, of_set.name, next(colours)) for of_set in design.sets)
 
 
 def _flower(design: Design, of_set: SetDesign) -> go.Figure:
@@ -416,14 +395,14 @@ def _arc(candidate: Candidate, radius: float) -> Array:
 # on it: 6 and 15 lines in the place of 9 with half of it and with twice (tests/studies/constants_fit.py).
 _ROWS = 7
 _COMMAND_COLUMNS = (
-    Column("Command", numeric=False),
-    Column("Duration", "s"),
-    Column("Distance", "m"),
-    Column("Wheels roll", "m", priority=2),
+    page.Column("Command", numeric=False),
+    page.Column("Duration", "s"),
+    page.Column("Distance", "m"),
+    page.Column("Wheels roll", "m", priority=2),
 )
 
 
-def equal_table(design: Design) -> Table:
+def equal_table(design: Design) -> page.Table:
     """The smallest designs that give as much information as the baseline, set by set."""
     rows = []
     for of_set in design.sets:
@@ -434,22 +413,22 @@ def equal_table(design: Design) -> Table:
                 if equal.least is None
                 else "not within the repetitions allowed"
             )
-            cells: tuple[Cell | str, ...] = (Cell(NOTHING, reason), NOTHING, NOTHING)
+            cells: tuple[page.Cell | str, ...] = (page.Cell(NOTHING, reason), NOTHING, NOTHING)
             if effort is not None:
                 distance = f"{significant(effort.metres, 3)} m"
                 cells = (count(effort.runs), duration_in_words(effort.seconds), distance)
             least = NOTHING if equal.least is None else least_in_words(equal.least)
-            rows.append(Row.of(of_set.name, USE_IN_WORDS[equal.use], *cells, least))
+            rows.append(page.Row.of(of_set.name, USE_IN_WORDS[equal.use], *cells, least))
     effort = design.baseline.precision.effort
-    return Table(
+    return page.Table(
         f"As good as the baseline: {design.baseline.name} ({effort_in_words(effort)})",
         (
-            Column("Candidates", numeric=False),
-            Column("Calibrated from", numeric=False),
-            Column("Runs"),
-            Column("Time"),
-            Column("Distance"),
-            Column("Bound", UNIT_OF_COST[design.per]),
+            page.Column("Candidates", numeric=False),
+            page.Column("Calibrated from", numeric=False),
+            page.Column("Runs"),
+            page.Column("Time"),
+            page.Column("Distance"),
+            page.Column("Bound", UNIT_OF_COST[design.per]),
         ),
         tuple(rows),
         "The smallest design found whose det(information)^(1/p) is at least the baseline's; no design at all can do "
@@ -458,10 +437,10 @@ def equal_table(design: Design) -> Table:
     )
 
 
-def chosen_table(design: Design, of_set: SetDesign) -> Table:
+def chosen_table(design: Design, of_set: SetDesign) -> page.Table:
     """The chosen commands of a set."""
     rows = (
-        Row.of(
+        page.Row.of(
             *_command_cells(design.candidate(chosen.command)),
             count(chosen.runs),
             percent(of_set.optimum.shares.get(chosen.command, 0.0)),
@@ -469,38 +448,38 @@ def chosen_table(design: Design, of_set: SetDesign) -> Table:
         for chosen in of_set.chosen
     )
     unit = {"run": "runs", "second": "time", "metre": "wheels' distance"}[design.per]
-    return Table(
+    return page.Table(
         f"What to drive of {of_set.name}: {effort_in_words(of_set.step.effort)}",
-        (*_COMMAND_COLUMNS, Column("Runs"), Column("Continuous optimum", f"share of the {unit}", priority=1)),
+        (*_COMMAND_COLUMNS, page.Column("Runs"), page.Column("Continuous optimum", f"share of the {unit}", priority=1)),
         tuple(rows),
         "Other choices may be as good: turning all directions of a design by the same angle often changes nothing.",
     )
 
 
-def _command_cells(candidate: Candidate) -> tuple[Cell, ...]:
+def _command_cells(candidate: Candidate) -> tuple[page.Cell, ...]:
     words = command_in_words(candidate)
     return (
-        Cell(words, "" if candidate.name == words else candidate.name),
-        Cell(fixed(candidate.duration_s, 2)),
-        Cell(fixed(candidate.distance_m, 2)),
-        Cell(fixed(candidate.rolled_m, 2)),
+        page.Cell(words, "" if candidate.name == words else candidate.name),
+        page.Cell(fixed(candidate.duration_s, 2)),
+        page.Cell(fixed(candidate.distance_m, 2)),
+        page.Cell(fixed(candidate.rolled_m, 2)),
     )
 
 
-def promise_table(design: Design) -> Table:
+def promise_table(design: Design) -> page.Table:
     """The precision that the chosen runs of every set promise, beside the baseline's."""
     rows = [_precision_row(of_set.name, of_set.step) for of_set in design.sets]
     baseline = _precision_row(f"baseline: {design.baseline.name}", design.baseline.precision)
-    return Table(
+    return page.Table(
         "Standard deviations that the chosen runs promise",
-        _precision_columns(design, Column("Design", numeric=False)),
+        _precision_columns(design, page.Column("Design", numeric=False)),
         (*rows, baseline),
         "Of each row, and of each kind of physical parameter, the largest. They fall with the root of the number of "
         "runs when a design is repeated.",
     )
 
 
-def effort_table(design: Design, of_set: SetDesign) -> Table:
+def effort_table(design: Design, of_set: SetDesign) -> page.Table:
     """The precision against the number of runs: some of a set's best designs, the chosen one, and the baseline."""
     chosen = of_set.step.effort.runs
     rows = [
@@ -508,9 +487,9 @@ def effort_table(design: Design, of_set: SetDesign) -> Table:
         for step in _worth_a_row(of_set)
     ]
     baseline = _precision_row(percent(of_set.baseline_efficiency, 2), design.baseline.precision, "muted")
-    return Table(
+    return page.Table(
         f"Standard deviations against the number of runs of {of_set.name}",
-        _precision_columns(design, Column("Of the bound")),
+        _precision_columns(design, page.Column("Of the bound")),
         (*rows, baseline),
         f"Last line: the baseline, {design.baseline.name}.",
     )
@@ -524,24 +503,24 @@ def _worth_a_row(of_set: SetDesign) -> list[Step]:
     return [step for step in of_set.steps if step.effort.runs in shown | {of_set.step.effort.runs}]
 
 
-def _precision_columns(design: Design, first: Column) -> tuple[Column, ...]:
-    physical = [Column(*kind, priority=1) for kind in (("Radius", "%"), ("Distance", "%"), ("Angle", "°"))]
+def _precision_columns(design: Design, first: page.Column) -> tuple[page.Column, ...]:
+    physical = [page.Column(*kind, priority=1) for kind in (("Radius", "%"), ("Distance", "%"), ("Angle", "°"))]
     return (
         first,
-        Column("Runs"),
-        Column("Time"),
-        Column("Against the baseline"),
-        *(Column(f"Row {number}", "% of largest") for number in (1, 2, 3)),
+        page.Column("Runs"),
+        page.Column("Time"),
+        page.Column("Against the baseline"),
+        *(page.Column(f"Row {number}", "% of largest") for number in (1, 2, 3)),
         *(physical if design.baseline.precision.physical is not None else ()),
     )
 
 
-def _precision_row(name: str, precision: Precision, role: RowRole = "plain") -> Row:
+def _precision_row(name: str, precision: Precision, role: page.RowRole = "plain") -> page.Row:
     values = list(precision.row_percent)
     if precision.physical is not None:
         spread = precision.physical
         values += [spread.radius_percent, spread.distance_percent, spread.angle_deg]
-    return Row.of(
+    return page.Row.of(
         name,
         count(precision.effort.runs),
         duration_in_words(precision.effort.seconds),
@@ -551,29 +530,38 @@ def _precision_row(name: str, precision: Precision, role: RowRole = "plain") -> 
     )
 
 
-def design_document(design: Design) -> Document:
+def design_document(design: Design) -> page.Document:
     """The report as blocks."""
-    return Document(
+    blocks: list[page.Block] = []
+    for of_set in design.sets:
+        blocks += [
+            page.Paragraph(f"{of_set.name}: {choice_in_words(design, of_set)}"),
+            chosen_table(design, of_set),
+            page.Paragraph(motions_in_words(of_set)),
+        ]
+        equal = f"{of_set.name} equals the baseline with {equal_in_words(design, of_set, design.use)}"
+        blocks.append(page.Paragraph(f"{equal}, calibrated from {USE_IN_WORDS[design.use]}.", "note"))
+    return page.Document(
         title=f"Which commands are worth driving: {design.name}",
         subtitle=design.description,
         sections=(
             _answer(design),
-            Section("commands", "Chosen commands", _commands(design)),
-            Section(
+            page.Section("commands", "Chosen commands", tuple(blocks)),
+            page.Section(
                 "precision",
                 "Precision against runs",
                 (precision_figures(design), promise_table(design), equal_table(design)),
                 about="How well the matrix is known after so many runs, beside the baseline.",
                 folded=True,
             ),
-            Section(
+            page.Section(
                 "efficiency",
                 "Efficiency against the bound",
                 (efficiency_figure(design),),
                 about="How near the chosen runs are to the best that any choice could reach.",
                 folded=True,
             ),
-            Section(
+            page.Section(
                 "basis",
                 "What this rests on",
                 _basis(design),
@@ -585,25 +573,25 @@ def design_document(design: Design) -> Document:
     )
 
 
-def _badges(design: Design) -> tuple[Badge, ...]:
+def _badges(design: Design) -> tuple[page.Badge, ...]:
     if not design.recorded:
-        return (Badge("ASSUMED NOISE, NO RECORDINGS", "warning"),)
-    return simulated_badge(design.simulated)
+        return (page.Badge("ASSUMED NOISE, NO RECORDINGS", "warning"),)
+    return page.simulated_badge(design.simulated)
 
 
-def _answer(design: Design) -> Section:
+def _answer(design: Design) -> page.Section:
     """The section with the answer: what to drive, in words and as a picture of the paths."""
     tiles = []
     for of_set in design.sets:
         equal = next(equal for equal in of_set.equivalents if equal.use == design.use)
         effort, name = equal.effort, f"{of_set.name}: " * (len(design.sets) > 1)
         tiles += [
-            Fact(
+            page.Fact(
                 f"{name}chosen" if name else "Chosen",
                 plural(of_set.step.effort.runs, "run"),
                 f"{percent(of_set.step.efficiency, 2)} of the bound; {duration_in_words(of_set.step.effort.seconds)}",
             ),
-            Fact(
+            page.Fact(
                 f"{name}{'equal' if name else 'Equal'} to the baseline's {baseline_runs(design)}",
                 "none allowed" if effort is None else plural(effort.runs, "run"),
                 "" if effort is None else f"{duration_in_words(effort.seconds)} of driving",
@@ -612,46 +600,33 @@ def _answer(design: Design) -> Section:
     plans = []
     if not design.recorded:
         title = "What to drive" + " of {}" * (len(design.sets) > 1)
-        plans = [Callout(title.format(of_set.name), plan_in_words(design, of_set)) for of_set in design.sets]
-    notes = Callout("Before you rely on it", design.notes)
-    return answer_section(headline(design), tiles, path_figures(design), *plans, notes)
+        plans = [page.Callout(title.format(of_set.name), plan_in_words(design, of_set)) for of_set in design.sets]
+    notes = page.Callout("Before you rely on it", design.notes)
+    return page.answer_section(headline(design), tiles, path_figures(design), *plans, notes)
 
 
-def _commands(design: Design) -> tuple[Block, ...]:
-    blocks: list[Block] = []
-    for of_set in design.sets:
-        blocks += [
-            Paragraph(f"{of_set.name}: {choice_in_words(design, of_set)}"),
-            chosen_table(design, of_set),
-            Paragraph(motions_in_words(of_set)),
-        ]
-        equal = f"{of_set.name} equals the baseline with {equal_in_words(design, of_set, design.use)}"
-        blocks.append(Paragraph(f"{equal}, calibrated from {USE_IN_WORDS[design.use]}.", "note"))
-    return tuple(blocks)
-
-
-def _basis(design: Design) -> tuple[Block, ...]:
+def _basis(design: Design) -> tuple[page.Block, ...]:
     position, heading = noise_in_words(design.noise)
     facts = (
-        Fact("Source", design.source),
-        Fact("Candidates and noise", origin_in_words(design)),
-        Fact("Noise of positions", position),
-        Fact("Noise of headings", heading),
-        Fact("Robot", design.robot),
-        Fact("Elements determined", f"{design.parameters} of the inverse kinematic matrix"),
-        Fact("Odometry", "exact arcs" if design.integration == "arc" else "Euler steps, Eq. (1)"),
-        Fact("Calibrated from", USE_IN_WORDS[design.use]),
-        Fact("Measure", f"information per {design.per}"),
-        Fact(
+        page.Fact("Source", design.source),
+        page.Fact("Candidates and noise", origin_in_words(design)),
+        page.Fact("Noise of positions", position),
+        page.Fact("Noise of headings", heading),
+        page.Fact("Robot", design.robot),
+        page.Fact("Elements determined", f"{design.parameters} of the inverse kinematic matrix"),
+        page.Fact("Odometry", "exact arcs" if design.integration == "arc" else "Euler steps, Eq. (1)"),
+        page.Fact("Calibrated from", USE_IN_WORDS[design.use]),
+        page.Fact("Measure", f"information per {design.per}"),
+        page.Fact(
             "Continuous optima",
             listing([f"{of_set.name}: within {100 * of_set.optimum.gap:.1g} % of its bound" for of_set in design.sets]),
         ),
     )
-    rows = tuple(Row.of(*_command_cells(candidate)) for candidate in design.candidates)
+    rows = tuple(page.Row.of(*_command_cells(candidate)) for candidate in design.candidates)
     return (
-        Facts(facts),
-        Details(
+        page.Facts(facts),
+        page.Details(
             f"All candidates ({len(design.candidates)})",
-            (Table(f"All {len(rows)} candidates", _COMMAND_COLUMNS, rows),),
+            (page.Table(f"All {len(rows)} candidates", _COMMAND_COLUMNS, rows),),
         ),
     )

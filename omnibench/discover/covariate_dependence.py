@@ -19,9 +19,7 @@ import numpy as np
 from omnibench.discover.regressors.significance import Group, Significance
 from omnibench.discover.result import CovariateDependence
 from omnibench.discover.selection.evidence import log_evidence
-from omnibench.discover.selection.model_selection import Selection
-from omnibench.discover.selection.motor_effects import MotorEffects
-from omnibench.discover.selection.screening import Screening
+from omnibench.discover.selection.model_selection import MotorEffects, Screening, Selection
 
 # delta of the generic bases, which no effect has the form of. With it the likeliest covariate is right in 72 % of 57
 # blind sets, of which 80 % is said, and the second in 11 %, of which 7 % is said. Half of it says 99 % of 72 %, 1.5

@@ -64,7 +64,7 @@ from omnibench.robot.model import OdometryModel
 from omnibench.robot.signals import of_centre
 from omnibench.simulate.commands import DrivableCommands, Shapes, TimedCommand, Variation, is_within
 from omnibench.simulate.config import FlowerConfig
-from omnibench.simulate.flower import run_as_designed
+from omnibench.simulate.robot_simulator import run_as_designed
 from omnibench.words import plural
 
 Counts = NDArray[np.intp]

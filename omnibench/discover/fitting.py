@@ -27,29 +27,9 @@ from numpy.typing import NDArray
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.regressors.paths import Paths, blocks_of, make_paths, slopes_by
 from omnibench.discover.regressors.significance import Group
+from omnibench.fit import noise as reference_noise
+from omnibench.fit import trajectory_fit as fits
 from omnibench.fit.calibrators.trajectory_ml import FitCovariance
-from omnibench.fit.information import EstimatedCovariance
-from omnibench.fit.noise import (
-    FIRST_NOISE,
-    NoiseEstimate,
-    Whitener,
-    differences_between_repetitions,
-    estimate_noise,
-    grouped,
-    is_near,
-    whiteners,
-)
-from omnibench.fit.trajectory_fit import (
-    Nuisances,
-    TrajectoryFit,
-    Whitened,
-    given,
-    in_start_frames,
-    noise_of_fit,
-    whitened,
-    with_poses,
-    without,
-)
 from omnibench.robot.calibration import Noise
 from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect, Term
 from omnibench.robot.kinematics import Array, Robot
@@ -65,7 +45,7 @@ _SHORTEST = (
 
 def in_windows(runs: Sequence[Trajectory]) -> tuple[Trajectory, ...]:
     """The runs; where they are few, and no command is repeated, their parts of equal length."""
-    repeated = any(len(members) > 1 for members in grouped([run.command or run.id for run in runs]))
+    repeated = any(len(members) > 1 for members in reference_noise.grouped([run.command or run.id for run in runs]))
     if repeated or len(runs) >= _ENOUGH:
         return tuple(runs)
     length = max(_SHORTEST, sum(run.end for run in runs) / _MOST)
@@ -105,7 +85,7 @@ def _windows(run: Trajectory, count: int) -> Iterator[Trajectory]:
         )
 
 
-_UNKNOWN_NOISE = NoiseEstimate(FIRST_NOISE, "within runs", 1, "")
+_UNKNOWN_NOISE = reference_noise.NoiseEstimate(reference_noise.FIRST_NOISE, "within runs", 1, "")
 _TOGETHER = 30_000  # samples whose paths are computed at once (chosen)
 # Level of the tests for nuisances. It is strict, since other noise resembles them and what they explain is lost for
 # effects: where encoders tick, start headings raise twice the log-likelihood by 10, and with them an effect was named
@@ -116,14 +96,14 @@ _CHANCE = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
-class Fit(TrajectoryFit):
+class Fit(fits.TrajectoryFit):
     """A fitted model at whole runs, its noise, and which of their poses are outliers, that no weighting counts.
 
     noise_runs: runs that the noise alone sees, as repetitions of these. inliers: True (K,) for the poses of the runs,
     then of these, that are no outliers; empty if there are none.
     """
 
-    noise: NoiseEstimate
+    noise: reference_noise.NoiseEstimate
     inliers: tuple[NDArray[np.bool_], ...] = ()
     noise_runs: tuple[Trajectory, ...] = ()
 
@@ -153,7 +133,7 @@ class Fit(TrajectoryFit):
         if not self.jumps:
             return self
         pairs = zip(self.runs, self.masks, strict=True)
-        runs = [run if mask.all() else with_poses(run, np.append(True, mask)) for run, mask in pairs]
+        runs = [run if mask.all() else fits.with_poses(run, np.append(True, mask)) for run, mask in pairs]
         return self.changed(runs=tuple(runs), inliers=(), noise_runs=())
 
     @property
@@ -175,21 +155,21 @@ class Fit(TrajectoryFit):
                 made[key] = InlierWhitener(self.noise.noise, stamps, mask)
         return [made[key] for key in keys]
 
-    def whitened(self, columns: Sequence[Array], residuals: Sequence[Array] | None = None) -> Whitened:
+    def whitened(self, columns: Sequence[Array], residuals: Sequence[Array] | None = None) -> fits.Whitened:
         """Columns (K, 3, p) and residuals (K, 3) of every run, whitened under the noise, nuisances eliminated.
 
         residuals: the fit's nuisance-free ones where none are given.
         """
         return self.linearised(columns, self.weightings, residuals)
 
-    def whitened_steps(self, steps: Sequence[Array], residuals: Sequence[Array], runs: slice) -> Whitened:
+    def whitened_steps(self, steps: Sequence[Array], residuals: Sequence[Array], runs: slice) -> fits.Whitened:
         """Columns and residuals (K, 3) of some runs as ``whitened`` has them.
 
         steps (K, 3, p): differences of the columns from one stamp to the next, the first from 0.
         """
         weightings = self.weightings[runs]
         of_steps = {id(weigh): weigh.of_differences for weigh in weightings}
-        return whitened(
+        return fits.whitened(
             residuals[runs],
             steps,
             weightings,
@@ -207,7 +187,7 @@ class Fit(TrajectoryFit):
             white = weigh(residuals)
             if len(deviations):
                 nuisances = (weigh(slopes) * deviations).reshape(white.size, -1)
-                white = without(without(white.reshape(-1, 1), nuisances), nuisances).reshape(white.shape)
+                white = fits.without(fits.without(white.reshape(-1, 1), nuisances), nuisances).reshape(white.shape)
             weighted.append(weigh.weighted(white))
         return weighted
 
@@ -230,7 +210,7 @@ def first_fit(runs: Sequence[Trajectory], robot: Robot, sample_period: float, st
     The model drives exact arcs: Euler steps would leave what looks like centripetal slip.
     """
     model = OdometryModel(robot, start, "arc", (), sample_period)
-    return Fit(model, tuple(runs), Nuisances(np.zeros((len(runs), 3)), np.zeros(3)), _UNKNOWN_NOISE)
+    return Fit(model, tuple(runs), fits.Nuisances(np.zeros((len(runs), 3)), np.zeros(3)), _UNKNOWN_NOISE)
 
 
 def with_noise(fit: Fit) -> Fit:
@@ -238,13 +218,14 @@ def with_noise(fit: Fit) -> Fit:
     near = fit.noise.noise if fit.noise is not _UNKNOWN_NOISE else None
     seen = fit.with_noise_runs
     usual = seen.at_inliers
-    noise = estimate_noise(
-        differences_between_repetitions(usual.runs, in_start_frames(usual.runs, usual.residuals)), near
+    noise = reference_noise.estimate_noise(
+        reference_noise.differences_between_repetitions(usual.runs, fits.in_start_frames(usual.runs, usual.residuals)),
+        near,
     )
-    fit = fit.changed(inliers=inliers_of(seen.runs, in_start_frames(seen.runs, seen.residuals), noise.noise))
-    found = noise_of_fit(fit.with_noise_runs.at_inliers, range(3), noise.noise, _CHANCE)
+    fit = fit.changed(inliers=inliers_of(seen.runs, fits.in_start_frames(seen.runs, seen.residuals), noise.noise))
+    found = fits.noise_of_fit(fit.with_noise_runs.at_inliers, range(3), noise.noise, _CHANCE)
     values = np.where(found.deviations > 0, fit.nuisances.values, 0.0)
-    fit = fit.changed(nuisances=Nuisances(values, found.deviations), noise=found.estimate)
+    fit = fit.changed(nuisances=fits.Nuisances(values, found.deviations), noise=found.estimate)
     return fit.with_likeliest_nuisances()
 
 
@@ -276,7 +257,7 @@ def at_model(fit: Fit, model: OdometryModel) -> Fit:
 
 def at_runs(fit: Fit, runs: Sequence[Trajectory]) -> Fit:
     """The fit's model at other runs, their nuisances 0: only the sizes of these are known."""
-    nothing_known = Nuisances(np.zeros((len(runs), 3)), fit.nuisances.deviations)
+    nothing_known = fits.Nuisances(np.zeros((len(runs), 3)), fit.nuisances.deviations)
     return replace(fit, runs=tuple(runs), nuisances=nothing_known, inliers=(), noise_runs=())
 
 
@@ -300,7 +281,7 @@ def inliers_of(runs: Sequence[Trajectory], residuals: Sequence[Array], noise: No
     A score of 4.5 makes an outlier, or 4.5 times what is usual for the scores at its stamp in other runs. Where more
     than 8 % of the poses seem to be outliers they are not, and the limit rises in proportion to the usual score.
     """
-    whitening = whiteners(noise, [run.pose_times[1:] for run in runs])
+    whitening = reference_noise.whiteners(noise, [run.pose_times[1:] for run in runs])
     scores = [_scores(*each) for each in zip(whitening, residuals, strict=True)]
     every = np.concatenate(scores)
     if every.max() < _JUMP:
@@ -325,11 +306,11 @@ def _below(noise: Noise, run: Trajectory, residuals: Array, scores: Array, limit
         if len(excess) < 3 or excess.max() < 1:
             break
         inliers[np.flatnonzero(inliers)[excess.argmax()]] = False
-        scores = _scores(Whitener(noise, stamps[inliers]), residuals[inliers])
+        scores = _scores(reference_noise.Whitener(noise, stamps[inliers]), residuals[inliers])
     return inliers
 
 
-def _scores(whitener: Whitener, residuals: Array) -> Array:
+def _scores(whitener: reference_noise.Whitener, residuals: Array) -> Array:
     """Distances (K,) of poses from what the others of their run predict, in standard deviations, Eq. (1)."""
     errors, variances = whitener.left_out(residuals)
     scores: Array = np.abs(errors / np.sqrt(variances)).max(axis=1)
@@ -379,7 +360,7 @@ class InlierWhitener:
     """The whitening of a run's inliers: residuals (K, 3) or (K, 3, n) of all poses to (k, 3) or (k, 3, n)."""
 
     def __init__(self, noise: Noise, stamps: Array, inliers: NDArray[np.bool_]) -> None:
-        self._whitener, self._inliers = Whitener(noise, stamps[inliers]), inliers
+        self._whitener, self._inliers = reference_noise.Whitener(noise, stamps[inliers]), inliers
         self._whole = bool(inliers.all())
 
     def __call__(self, residuals: Array) -> Array:
@@ -424,10 +405,10 @@ class Extended:
 
     fit: Fit
     groups: tuple[Group, ...]
-    data: Whitened
+    data: fits.Whitened
     columns: tuple[Array, ...]
     values: Array
-    covariance: EstimatedCovariance
+    covariance: fits.EstimatedCovariance
 
     @property
     def residuals_without_effects(self) -> list[Array]:
@@ -480,12 +461,12 @@ def extend(plain: Fit, groups: Sequence[Group]) -> Extended:
     """Fit matrix and effects together, from the plain matrix and effects of 0; noise stays where there are none."""
     fit, values, data, columns = _in_turn(plain, groups) if groups else _descend(plain, (), np.zeros(0))
     # Covariance (p, p) of the fitted numbers: by the noise model, or by the runs where they scatter more
-    unit = given(data, []).scale(range(len(data.information)))
+    unit = fits.given(data, []).scale(range(len(data.information)))
     covariance = FitCovariance(data, fit.runs, fit.noise, unit)
     return Extended(fit, tuple(groups), data, columns, values, covariance.chosen(covariance.scatter_stands)[0])
 
 
-def _in_turn(fit: Fit, groups: Sequence[Group]) -> tuple[Fit, Array, Whitened, tuple[Array, ...]]:
+def _in_turn(fit: Fit, groups: Sequence[Group]) -> tuple[Fit, Array, fits.Whitened, tuple[Array, ...]]:
     """Matrix and effects fitted, then noise, outliers and these by turns until the outliers and the noise stay.
 
     Outliers that come back in a circle end it, too.
@@ -496,7 +477,7 @@ def _in_turn(fit: Fit, groups: Sequence[Group]) -> tuple[Fit, Array, Whitened, t
         before = fit.noise.noise
         seen.add(np.concatenate(fit.masks).tobytes())
         fit, values, data, columns = _descend(with_noise(fit), groups, values)
-        same_noise = is_near(before.model_dump(), fit.noise.noise.model_dump(), _NEAR)
+        same_noise = reference_noise.is_near(before.model_dump(), fit.noise.noise.model_dump(), _NEAR)
         if same_noise and np.concatenate(fit.masks).tobytes() in seen:
             break
     return fit, values, data, columns
@@ -546,12 +527,12 @@ def columns_at(extended: Extended, runs: Sequence[Trajectory]) -> list[Array]:
     return [part for _, part in sorted(zip(ordered, parts, strict=True), key=lambda pair: pair[0])]
 
 
-def _descend(fit: Fit, groups: Sequence[Group], values: Array) -> tuple[Fit, Array, Whitened, tuple[Array, ...]]:
+def _descend(fit: Fit, groups: Sequence[Group], values: Array) -> tuple[Fit, Array, fits.Whitened, tuple[Array, ...]]:
     columns = columns_of(fit, groups)
     elements = fit.model.matrix.size
     data = fit.whitened(columns)
     for _ in range(_STEPS):
-        step, covariance = given(data, []).estimate(range(elements + len(values)))
+        step, covariance = fits.given(data, []).estimate(range(elements + len(values)))
         before, least = (fit, values, data), _chi_square(data) * (1 + _ROUNDING)
         for share in 0.5 ** np.arange(_HALVINGS):
             values = before[1] + share * step[elements:]
@@ -574,5 +555,5 @@ def _bends(groups: Sequence[Group]) -> bool:
     return any(group.effect is not None and group.effect.stage == "steering" for group in groups)
 
 
-def _chi_square(data: Whitened) -> float:
+def _chi_square(data: fits.Whitened) -> float:
     return sum(float(np.square(of_run).sum()) for of_run in data.residuals)

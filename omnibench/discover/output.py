@@ -8,19 +8,10 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
+from omnibench import files
 from omnibench.config import Model, to_json, to_yaml
 from omnibench.discover.report.discovery_report import discovery_report
 from omnibench.discover.result import CALIBRATION_FILES, Discovery, discovery_document, experiment_file
-from omnibench.files import (
-    RESULTS,
-    check_results_folder,
-    encode_table,
-    link_latest,
-    new_results_folder,
-    remove,
-    results_locked,
-    write_files,
-)
 from omnibench.report.render import render
 from omnibench.robot.kinematics import Array
 
@@ -45,7 +36,7 @@ def check_output(folder: Path | None, options: DiscoverOptions, *, force: bool =
     DataError: it is a file, or it holds anything but an earlier discovery with these options, and not ``force``.
     """
     if folder is not None:
-        check_results_folder(folder, _config(options), "discovery with the same options", force=force)
+        files.check_results_folder(folder, _config(options), "discovery with the same options", force=force)
 
 
 def write_discovery(
@@ -56,10 +47,10 @@ def write_discovery(
     Default: ``results/<data set name>/<time>``, with a link ``latest``. Raises DataError as ``check_output`` does, or
     if the folder cannot be written to; it is then left as it was.
     """
-    chosen = folder or new_results_folder(
-        RESULTS / (re.sub(r"[^A-Za-z0-9_.-]+", "_", discovery.dataset.name).strip("_.") or "dataset")
+    chosen = folder or files.new_results_folder(
+        files.RESULTS / (re.sub(r"[^A-Za-z0-9_.-]+", "_", discovery.dataset.name).strip("_.") or "dataset")
     )
-    with results_locked(chosen):
+    with files.results_locked(chosen):
         check_output(folder, options, force=force)
         texts = {
             "config.yaml": _config(options),
@@ -71,15 +62,15 @@ def write_discovery(
             texts[CALIBRATION_FILES["extended"]] = to_yaml(discovery.extended)
         texts |= _experiments(discovery)
         contents = {chosen / name: text.encode("utf-8") for name, text in texts.items()}
-        contents[chosen / "residuals.parquet"] = encode_table(residual_table(discovery), "parquet")
-        write_files(contents)
+        contents[chosen / "residuals.parquet"] = files.encode_table(residual_table(discovery), "parquet")
+        files.write_files(contents)
         for stale in chosen.glob("experiment-*.yaml"):  # files of an earlier discovery
             if stale.name not in _experiments(discovery):
-                remove(stale)
+                files.remove(stale)
         if not discovery.extends:
-            remove(chosen / CALIBRATION_FILES["extended"])
+            files.remove(chosen / CALIBRATION_FILES["extended"])
     if folder is None:
-        link_latest(chosen)
+        files.link_latest(chosen)
     return chosen
 
 

@@ -23,10 +23,10 @@ from scipy.special import ndtr, stdtrit
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrators.closed_form import program_data
 from omnibench.fit.cost import SumOfNorms
-from omnibench.fit.information import INTERVAL, depending
 from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.fit.ratio_intervals import BOOTSTRAPPED, FEWEST, Units, units_of
+from omnibench.fit.trajectory_fit import INTERVAL, depending
 from omnibench.jobs.job import Backend, gathered
 from omnibench.progress import Reporter
 from omnibench.robot.kinematics import Array

@@ -19,15 +19,7 @@ from omnibench.fit.problem import BudgetSpent, CalibrationProblem, Improvement
 from omnibench.fit.span import Unidentified
 from omnibench.jobs.job_process import memory_limit
 from omnibench.registry import AnyOptions, Options, PluginFailure, calibrators
-from omnibench.robot.calibration import (
-    Calibration,
-    ModelExtension,
-    Noise,
-    Provenance,
-    extended_model,
-    matrix_flaw,
-    matrix_rows,
-)
+from omnibench.robot import calibration as saved
 from omnibench.robot.kinematics import Array, JsonArray, Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.views import Brief
@@ -58,9 +50,9 @@ class Solution:
     reason: str
     converged: bool = True
     covariance: Array | None = None
-    noise: Noise | None = None
+    noise: saved.Noise | None = None
     degrees_of_freedom: Array | float | None = None
-    extension: ModelExtension | None = None
+    extension: saved.ModelExtension | None = None
 
 
 class Calibrator(ABC):
@@ -161,11 +153,11 @@ class RunResult(Brief):
     at_bounds: tuple[str, ...] = ()
     held: tuple[str, ...] = ()
     covariance: JsonArray | None = None
-    noise: Noise | None = None
+    noise: saved.Noise | None = None
     degrees_of_freedom: JsonArray | None = None
     shrinkage: Shrinkage | None = None
     timing: Timing | None = None
-    extension: ModelExtension | None = None
+    extension: saved.ModelExtension | None = None
 
 
 def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunResult:
@@ -234,20 +226,22 @@ def refusal_of(calibrator: Calibrator, robot: Robot, runs: Sequence[Trajectory])
     return ""
 
 
-def model_of_answer(problem: CalibrationProblem, matrix: Array, extension: ModelExtension | None) -> OdometryModel:
+def model_of_answer(
+    problem: CalibrationProblem, matrix: Array, extension: saved.ModelExtension | None
+) -> OdometryModel:
     """The odometry model of a matrix (3, M), with what extends it. OmnibenchError: an effect does not fit the robot."""
-    return extended_model(problem.robot, matrix, problem.integration, problem.sample_period, extension)
+    return saved.extended_model(problem.robot, matrix, problem.integration, problem.sample_period, extension)
 
 
 def calibration_of_fit(
     name: str, dataset: Dataset, matrix: Array, provenance: Mapping[str, Any], **fields: Any
-) -> Calibration:
+) -> saved.Calibration:
     """The calibration with a matrix (3, M) that was fitted to a data set's training runs.
 
     provenance: fields of Provenance, without those of the data set. fields: the other fields of Calibration. DataError:
     the recordings led to values that no robot has.
     """
-    origin = Provenance(
+    origin = saved.Provenance(
         dataset=dataset.name,
         dataset_hash=dataset.hash,
         fitted=dataset.fingerprints("train"),
@@ -255,11 +249,11 @@ def calibration_of_fit(
         **provenance,
     )
     try:
-        return Calibration(
+        return saved.Calibration(
             name=name,
             robot=dataset.robot,
             sample_period=dataset.sample_period,
-            matrix=matrix_rows(matrix),
+            matrix=saved.matrix_rows(matrix),
             provenance=origin,
             **fields,
         )
@@ -300,7 +294,7 @@ def _examine(
     problem: CalibrationProblem,
     answer: Any,
     freedom: Array | None,
-    extension: ModelExtension | None,
+    extension: saved.ModelExtension | None,
 ) -> tuple[Array | None, float | None, str]:
     """The answer as a vector (n,), its cost, and its flaw in words; vector and cost are None if there is a flaw."""
     try:
@@ -320,7 +314,7 @@ def _examine(
         return None, None, f"the answer is outside the box ({', '.join(outside)})"
     if freedom is not None and not (freedom > 0).all():
         return None, None, f"degrees_of_freedom of the answer's variances must be above 0, found {freedom.min():g}"
-    if flaw := matrix_flaw(problem.matrix(vector)):
+    if flaw := saved.matrix_flaw(problem.matrix(vector)):
         return None, None, f"the answer's matrix holds {flaw}"
     if extension is None:
         cost = float(problem.values(vector[None])[0])

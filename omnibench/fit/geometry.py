@@ -19,15 +19,7 @@ from pydantic import Field, FiniteFloat, field_validator
 from omnibench.config import Model
 from omnibench.fit.parameterisation import Bounds, ParameterisationName, checked
 from omnibench.fit.prior import tolerance_of
-from omnibench.robot.kinematics import (
-    Array,
-    CarDrive,
-    Robot,
-    class_of,
-    inverse_kinematic_matrices,
-    relative_deviations,
-    wheel_rows,
-)
+from omnibench.robot import kinematics
 
 # Share of each parameter's scale: step of central differences, near the cube root of the rounding (Press et al.,
 # Numerical Recipes, 2007, section 5.7). Half of it and twice change nothing (tests/studies/constants_fit.py).
@@ -83,7 +75,7 @@ class WheelGeometry:
     fitted_mount: the place of the tracked point of a robot that cannot slide is among them.
     """
 
-    robot: Robot
+    robot: kinematics.Robot
     limits: GeometryLimits | None = None
     fitted_mount: bool = False
     tolerance: float | None = None
@@ -94,17 +86,17 @@ class WheelGeometry:
         return tuple(number.name for number in self._numbers)
 
     @property
-    def start(self) -> Array:
+    def start(self) -> kinematics.Array:
         return np.array([number.design for number in self._numbers])
 
     @property
-    def scale(self) -> Array:
+    def scale(self) -> kinematics.Array:
         """Scale (n,) of each number: of radii and distances the design, m; of places the reach; of angles 1 rad."""
         return np.array([number.scale for number in self._numbers])
 
     @property
     def bounds(self) -> Bounds:
-        skidding = GeometryLimits(distance=_SKIDDING) if class_of(self.robot) == "skid" else GeometryLimits()
+        skidding = GeometryLimits(distance=_SKIDDING) if kinematics.class_of(self.robot) == "skid" else GeometryLimits()
         limits = self.limits or skidding
         ranges = {
             "radius": deviation_range(limits.radius),
@@ -122,20 +114,20 @@ class WheelGeometry:
         return checked(Bounds("limits", self.start + low * self.scale, self.start + high * self.scale), self)
 
     @property
-    def prior_root(self) -> Array:
+    def prior_root(self) -> kinematics.Array:
         tolerance = tolerance_of(self.robot, self.tolerance)
         of_lengths = math.hypot(tolerance.elements, max(tolerance.rows))  # what shortens a motion does so as a length
         shares = [tolerance.elements if unit_of(name) == "rad" else of_lengths for name in self.names]
         return np.diag(shares * self.scale)
 
     @property
-    def projection(self) -> Array:
+    def projection(self) -> kinematics.Array:
         return np.eye(len(self._numbers))
 
-    def matrices(self, vectors: Array) -> Array:
+    def matrices(self, vectors: kinematics.Array) -> kinematics.Array:
         """Matrices (P, 3, M) of vectors (P, n)."""
         values = np.asarray(vectors, dtype=float).T
-        of_kind: dict[str, Array] = {}
+        of_kind: dict[str, kinematics.Array] = {}
         for number, column in zip(self._numbers, values, strict=True):
             known = of_kind.get(number.kind)
             of_kind[number.kind] = column[:, None] if known is None else np.column_stack([known, column])
@@ -143,11 +135,11 @@ class WheelGeometry:
         mount = self._mounts(of_kind, values.shape[1])
         return matrices if mount is None else mount @ matrices
 
-    def slopes(self, vector: Array) -> Array:
+    def slopes(self, vector: kinematics.Array) -> kinematics.Array:
         """Derivatives (3M, n) by central differences."""
         steps = _STEP * np.diag(self.scale)
         difference = self.matrices(vector + steps) - self.matrices(vector - steps)
-        slopes: Array = (difference.reshape(len(steps), -1) / (2 * _STEP * self.scale)[:, None]).T
+        slopes: kinematics.Array = (difference.reshape(len(steps), -1) / (2 * _STEP * self.scale)[:, None]).T
         return slopes
 
     @property
@@ -158,7 +150,7 @@ class WheelGeometry:
     def _numbers(self) -> tuple[_Number, ...]:
         robot = self.robot
         mounted = self._mount_numbers if self.fitted_mount and not robot.slides else ()
-        if isinstance(robot.drive, CarDrive):
+        if isinstance(robot.drive, kinematics.CarDrive):
             radius, wheelbase = float(robot.radii.mean()), float(np.mean(robot.drive.ahead, axis=0)[0])
             car = (_Number("radius", "", radius, radius), _Number("wheelbase", "", wheelbase, abs(wheelbase)))
             return (*car, *mounted)
@@ -180,27 +172,27 @@ class WheelGeometry:
         x, y, yaw = (mount.x, mount.y, mount.yaw) if mount else (0.0, 0.0, 0.0)
         return _Number("mount_x", "", x, reach), _Number("mount_y", "", y, reach), _Number("mount_yaw", "", yaw, 1.0)
 
-    def _matrices_of_centre(self, of_kind: dict[str, Array]) -> Array:
+    def _matrices_of_centre(self, of_kind: dict[str, kinematics.Array]) -> kinematics.Array:
         """Matrices (P, 3, M) of the robot's centre, from the values (P, k) of each kind of number."""
         robot, radius = self.robot, of_kind["radius"]
         rolling = [wheel for wheel in robot.measured if not wheel.has_steering]
         rollers = np.array([wheel.roller_angle for wheel in rolling])
         if self._on_rollers:
-            return inverse_kinematic_matrices(radius, of_kind["distance"], of_kind["angle"], rollers)
-        if isinstance(robot.drive, CarDrive):
+            return kinematics.inverse_kinematic_matrices(radius, of_kind["distance"], of_kind["angle"], rollers)
+        if isinstance(robot.drive, kinematics.CarDrive):
             design = robot.centre_matrix
             matrices = np.repeat(design[None], len(radius), axis=0) * (radius / robot.radii.mean())[..., None]
             matrices[..., 1] *= float(np.mean(robot.drive.ahead, axis=0)[0]) / of_kind["wheelbase"]
             return matrices
         plain = np.array([not wheel.has_steering for wheel in robot.measured])
-        rows: list[Array] = []
+        rows: list[kinematics.Array] = []
         if plain.any():
             angles = np.array([wheel.axle for wheel in rolling])
             angles = np.repeat(angles[None], len(radius), axis=0)
             turning = [index for index, wheel in enumerate(rolling) if wheel.kind != "fixed"]
             if turning:
                 angles[:, turning] = of_kind["angle"]
-            of_plain = wheel_rows(radius[:, plain], of_kind["distance"], angles, rollers)  # (P, k, 3)
+            of_plain = kinematics.wheel_rows(radius[:, plain], of_kind["distance"], angles, rollers)  # (P, k, 3)
         nth = {True: 0, False: 0}
         for wheel, is_plain in enumerate(plain):
             index = nth[bool(is_plain)]
@@ -210,10 +202,10 @@ class WheelGeometry:
             else:
                 rows += _steered_rows(radius[:, wheel], *(of_kind[kind][:, index] for kind in ("x", "y", "offset")))
         basis = robot.allowed_basis
-        inverse: Array = basis @ np.linalg.pinv(np.stack(rows, axis=1) @ basis)
+        inverse: kinematics.Array = basis @ np.linalg.pinv(np.stack(rows, axis=1) @ basis)
         return inverse
 
-    def _mounts(self, of_kind: dict[str, Array], count: int) -> Array | None:
+    def _mounts(self, of_kind: dict[str, kinematics.Array], count: int) -> kinematics.Array | None:
         """The matrices (P, 3, 3), or one, that make the tracked point's twist of the centre's; None: it is that."""
         if "mount_x" not in of_kind:
             return None if self.robot.mount is None else self.robot.mount.twist
@@ -228,7 +220,9 @@ class WheelGeometry:
         return np.moveaxis(np.array(rows), -1, 0)
 
 
-def _steered_rows(radius: Array, x: Array, y: Array, offset: Array) -> list[Array]:
+def _steered_rows(
+    radius: kinematics.Array, x: kinematics.Array, y: kinematics.Array, offset: kinematics.Array
+) -> list[kinematics.Array]:
     """The two rows (P, 3) of a steered wheel, by which a twist gives its signals: Eq. (K1) of kinematics.py, turned."""
     cosine, sine = np.cos(offset), np.sin(offset)
     along = np.stack([cosine, sine, x * sine - y * cosine], axis=-1) / radius[:, None]
@@ -257,9 +251,9 @@ class FittedParameter:
     deviation_percent: float | None  # None where the design value is 0
 
 
-def fitted_parameters(geometry: WheelGeometry, vector: Array) -> tuple[FittedParameter, ...]:
+def fitted_parameters(geometry: WheelGeometry, vector: kinematics.Array) -> tuple[FittedParameter, ...]:
     """The physical parameters in a vector (n,) of a geometry."""
-    shares = relative_deviations(vector, geometry.start)
+    shares = kinematics.relative_deviations(vector, geometry.start)
     return tuple(
         FittedParameter(
             name=name,

@@ -10,22 +10,14 @@ import numpy as np
 from omnibench.config import Model
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
+from omnibench.fit import span as spans
 from omnibench.fit.geometry import WheelGeometry, unit_of
-from omnibench.fit.information import information_of_runs, noise_of_matrix
 from omnibench.fit.linear_fit import linear_fit
 from omnibench.fit.noise import GIVEN, NoiseEstimate, roots_of
 from omnibench.fit.open_combinations import information_of_references, open_sentences, with_open_combinations
 from omnibench.fit.parameterisation import MatrixElements, ParameterisationName
 from omnibench.fit.prior import default_mount
-from omnibench.fit.span import (
-    DrivenSpan,
-    State,
-    Unidentified,
-    WheelDirection,
-    driven_span,
-    unidentified_directions,
-    wheel_directions,
-)
+from omnibench.fit.trajectory_fit import information_of_runs, noise_of_matrix
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import Integration
@@ -161,7 +153,7 @@ def _unseen_changes(geometry: WheelGeometry, kept: Array, left_open: Array | Non
     return projection
 
 
-def open_directions(directions: Sequence[WheelDirection]) -> Iterator[str]:
+def open_directions(directions: Sequence[spans.WheelDirection]) -> Iterator[str]:
     """A sentence for every direction that the runs drive little or not at all."""
     kept = "calibration keeps the design values there"
     for each in directions:
@@ -202,22 +194,22 @@ def _advice(motion: str) -> str:
 
 
 def kept_motions(
-    robot: Robot, span: DrivenSpan, parameterisation: ParameterisationName, unidentified: Unidentified
-) -> tuple[WheelDirection, ...]:
+    robot: Robot, span: spans.DrivenSpan, parameterisation: ParameterisationName, unidentified: spans.Unidentified
+) -> tuple[spans.WheelDirection, ...]:
     """Motions that runs with this span do not identify, of which a calibration keeps the design values."""
     if parameterisation == "geometry":
         return ()
-    directions = wheel_directions(robot, span)
+    directions = spans.wheel_directions(robot, span)
     open_ones = (each for each in directions if not each.identified and each.motion)
     return tuple(each for each in open_ones if not (each.state == "weak" and unidentified == "fit"))
 
 
 def warnings_of_calibration(
-    robot: Robot, span: DrivenSpan, parameterisation: ParameterisationName, unidentified: Unidentified
+    robot: Robot, span: spans.DrivenSpan, parameterisation: ParameterisationName, unidentified: spans.Unidentified
 ) -> tuple[str, ...]:
     """A sentence for every direction that runs with this span do not identify, and how a calibration treats it."""
     sentences = []
-    for each in wheel_directions(robot, span):
+    for each in spans.wheel_directions(robot, span):
         if each.identified or not each.motion:  # where the wheels only slip, no motion of the robot depends on it
             continue
         subject = f"{each.words} ({each.motion}) do"
@@ -245,7 +237,7 @@ class DirectionIdentifiability(Model):
     direction: str
     motion: str
     share: float
-    state: State
+    state: spans.State
     deviations: tuple[float, float, float] | None
 
 
@@ -277,7 +269,7 @@ def identifiability(
     trajectories: Sequence[Trajectory],
     integration: Integration = "arc",
     *,
-    span: DrivenSpan | None = None,
+    span: spans.DrivenSpan | None = None,
 ) -> Identifiability:
     """Precision with which runs determine the matrix, along every direction of wheel rates, and the wheels' geometry.
 
@@ -285,14 +277,14 @@ def identifiability(
     not fit has larger ones. The noise is estimated from repetitions of commands or, without any, from all residuals of
     a quick linear fit. span: what the runs drive; default: computed here. DataError when there are no trajectories.
     """
-    span = span or driven_span(trajectories)
+    span = span or spans.driven_span(trajectories)
     estimate, matrix = _quick_noise(robot, trajectories, span, integration)
     posed = [run for run in trajectories if run.has_poses]
     information = information_of_runs(posed, matrix, integration, estimate.noise).sum(axis=0)
     if measured := [run for run in trajectories if run.references is not None]:
         information = information + information_of_references(robot, measured, integration, poses=False)
     rows = robot.row_scales
-    every = wheel_directions(robot, span)
+    every = spans.wheel_directions(robot, span)
     driven = np.array([each.rates for each in every if each.state != "undriven"]).reshape(-1, matrix.shape[1])
     deviations = iter((deviations_along(information, driven) / rows).tolist())
     directions = tuple(
@@ -306,7 +298,7 @@ def identifiability(
         for each in every
     )
     # The physical parameters, the matrix being unknown along unidentified directions and open combinations.
-    kept, geometry = unidentified_directions(robot, span), _geometry(robot)
+    kept, geometry = spans.unidentified_directions(robot, span), _geometry(robot)
     left_open = with_open_combinations(MatrixElements(robot, "row", kept, known_mount=False), trajectories).open
     told = identified_parameters(geometry, kept, left_open)
     slopes = known_slopes(geometry, kept, left_open)
@@ -361,7 +353,7 @@ def _open_parameters(robot: Robot, parameters: Sequence[ParameterIdentifiability
 
 
 def _quick_noise(
-    robot: Robot, trajectories: Sequence[Trajectory], span: DrivenSpan, integration: Integration
+    robot: Robot, trajectories: Sequence[Trajectory], span: spans.DrivenSpan, integration: Integration
 ) -> tuple[NoiseEstimate, Array]:
     """Noise of the poses by a linear fit, and the fit's matrix (3, N). Undriven directions keep the design values."""
     usable = [run for run in trajectories if run.has_poses]
@@ -381,17 +373,13 @@ def deviations_along(information: Array, directions: Array) -> Array:
     information (3N, 3N): Fisher information of the matrix elements, row by row.
     """
     basis = np.kron(np.eye(3), directions)
-    variances = np.diag(_inverse(basis @ information @ basis.T))
-    deviations: Array = np.sqrt(variances).reshape(3, -1).T
-    return deviations
-
-
-def _inverse(information: Array) -> Array:
-    """Inverse of an information matrix; huge but finite in directions without information."""
-    values, vectors = np.linalg.eigh(information)
+    # Inverse of an information matrix; huge but finite in directions without information
+    values, vectors = np.linalg.eigh(basis @ information @ basis.T)
     values = np.maximum(values, _OPEN * max(float(values.max(initial=0.0)), 1e-300))
     inverse: Array = (vectors / values) @ vectors.T
-    return inverse
+    variances = np.diag(inverse)
+    deviations: Array = np.sqrt(variances).reshape(3, -1).T
+    return deviations
 
 
 def _geometry(robot: Robot) -> WheelGeometry:

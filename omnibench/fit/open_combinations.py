@@ -125,7 +125,10 @@ def _sentences(searched: MatrixElements, runs: Sequence[Trajectory], end: str) -
             f"no reference tells of lengths: rows 1 (x) and 2 (y) of the matrix {_of_several(end)}; "
             "measure distances or displacements"
         )
-    turned = _turned(searched)
+    # The change (3M,) of the elements, in units of their rows' largest, when the robot's frame is turned
+    design = searched.start.reshape(3, -1)
+    change = np.vstack([-design[1], design[0], np.zeros(design.shape[1])]).ravel()
+    turned: Array = replace(searched, open=None).projection @ change / searched.units
     if searched.rows[1, 1] and np.linalg.norm(left @ turned) ** 2 > _MOST * float(turned @ turned) > 0:
         said = np.vstack([said, turned])
         yield (
@@ -157,11 +160,3 @@ def _element(left: Array, row: int, motion: Array) -> Array:
     element[row] = motion
     assert element.size == left.shape[1]
     return element.ravel()
-
-
-def _turned(searched: MatrixElements) -> Array:
-    """The change (3M,) of the elements, in units of their rows' largest, when the robot's frame is turned."""
-    design = searched.start.reshape(3, -1)
-    change = np.vstack([-design[1], design[0], np.zeros(design.shape[1])]).ravel()
-    turned: Array = replace(searched, open=None).projection @ change / searched.units
-    return turned

@@ -14,14 +14,8 @@ from numpy.typing import NDArray
 from omnibench.data.dataset import Trajectory
 from omnibench.data.stored import median_period
 from omnibench.errors import DataError
+from omnibench.fit import evaluator as fast
 from omnibench.fit.cost import Cost
-from omnibench.fit.evaluator import (
-    DrivenFrame,
-    ElementBox,
-    PartedEvaluator,
-    PoseEvaluator,
-    evaluator_of_runs,
-)
 from omnibench.fit.geometry import GeometryLimits, WheelGeometry
 from omnibench.fit.loss import RobustCost, moved_ends_in_words, norms_of, with_ends_from_others, with_loss
 from omnibench.fit.open_combinations import with_open_combinations
@@ -228,8 +222,8 @@ class CalibrationProblem(SearchBox):
         super().__init__(parameterisation.names, start, lower, upper)
         self.record = Record(budget, self.start, watch)
         self._span = span
-        self._evaluator: PoseEvaluator | PartedEvaluator | None = None
-        self._frame: DrivenFrame | None = None  # of the evaluator's matrices, where directions are kept
+        self._evaluator: fast.PoseEvaluator | fast.PartedEvaluator | None = None
+        self._frame: fast.DrivenFrame | None = None  # of the evaluator's matrices, where directions are kept
         self._evaluator_tried = False
 
     # What the runs identify.
@@ -339,7 +333,7 @@ class CalibrationProblem(SearchBox):
         """Costs (P,) of candidates (P, n) by direct integration, not counted: for scoring an answer."""
         return self._costs(candidates, None)
 
-    def build_evaluator(self) -> PoseEvaluator | PartedEvaluator | None:
+    def build_evaluator(self) -> fast.PoseEvaluator | fast.PartedEvaluator | None:
         """Build the fast evaluator, which ``cost`` then uses in the place of direct integration, and return it.
 
         None where direct integration is faster, or the runs have references other than poses. ``cost`` calls this when
@@ -348,9 +342,9 @@ class CalibrationProblem(SearchBox):
         if not self._evaluator_tried and isinstance(self.odometry, OdometryBatch):
             logs, searched = self.objective.logs(self.trajectories), self.parameterisation
             if isinstance(searched, MatrixElements) and len(searched.null):
-                self._frame = DrivenFrame.of(searched)
-            box = ElementBox.of(self._frame or searched, self.lower, self.upper)
-            self._evaluator = evaluator_of_runs(logs, self.integration, box, self._frame)
+                self._frame = fast.DrivenFrame.of(searched)
+            box = fast.ElementBox.of(self._frame or searched, self.lower, self.upper)
+            self._evaluator = fast.evaluator_of_runs(logs, self.integration, box, self._frame)
         self._evaluator_tried = True
         return self._evaluator
 
@@ -386,7 +380,7 @@ class CalibrationProblem(SearchBox):
             return 1  # the first candidate tells the time that one takes
         return max(int(min(self.seconds_left / self.seconds * self.evaluations, self.budget.evaluations)), 1)
 
-    def _costs(self, candidates: Array, evaluator: PoseEvaluator | PartedEvaluator | None) -> Array:
+    def _costs(self, candidates: Array, evaluator: fast.PoseEvaluator | fast.PartedEvaluator | None) -> Array:
         """Costs (P,) by the fast evaluator for candidates in its box, by direct integration for the others."""
         together = max(_MOST_POSES // max(len(self.odometry.trajectory), 1), 1)  # matrices whose poses are held at once
         values = []

@@ -67,9 +67,8 @@ from scipy.special import fdtrc, stdtrit
 from omnibench.data.dataset import Trajectory
 from omnibench.data.stored import drawn_runs
 from omnibench.errors import DataError
-from omnibench.fit.information import INTERVAL
+from omnibench.fit import trajectory_fit
 from omnibench.fit.noise import common_poses, grouped, roots_of, whiteners
-from omnibench.fit.trajectory_fit import Nuisances, TrajectoryFit, in_start_frames, noise_of_fit, usable_runs, whitened
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
@@ -118,7 +117,7 @@ class SessionScores:
     wheels: tuple[str, ...]
 
     @classmethod
-    def of(cls, fit: TrajectoryFit, noise: Noise) -> SessionScores:
+    def of(cls, fit: trajectory_fit.TrajectoryFit, noise: Noise) -> SessionScores:
         """The scores of the runs that have poses in common with the others of their command. DataError: none has."""
         elements = fit.model.matrix.size
         values = [
@@ -127,7 +126,7 @@ class SessionScores:
                 fit.nuisance_free_residuals, fit.matrix_jacobian(), fit.estimated_slopes, strict=True
             )
         ]
-        values = in_start_frames(fit.runs, values)
+        values = trajectory_fit.in_start_frames(fit.runs, values)
         used: list[int] = []
         parts: list[tuple[Array, Array, Array]] = []  # residuals, columns, slopes by nuisances
         stamps_of: list[Array] = []
@@ -146,7 +145,7 @@ class SessionScores:
         if not parts:
             raise DataError("the runs of a command have no reference poses at common times")
         residuals, fitted, slopes = zip(*parts, strict=True)
-        data = whitened(residuals, fitted, whiteners(noise, stamps_of), slopes, deviations)
+        data = trajectory_fit.whitened(residuals, fitted, whiteners(noise, stamps_of), slopes, deviations)
         names = sessions_of(fit.runs)
         return cls(
             tuple(fit.runs[index] for index in used),
@@ -360,7 +359,7 @@ def compare_sessions(model: OdometryModel, trajectories: Sequence[Trajectory]) -
     if len(set(sessions_of(trajectories))) < 2:
         return SessionComparison(untested=_ALONE)
     try:
-        runs = usable_runs(drawn_runs(trajectories), "all")
+        runs = trajectory_fit.usable_runs(drawn_runs(trajectories), "all")
     except DataError as error:
         return SessionComparison(untested=str(error))
     names = sessions_of(runs)
@@ -371,9 +370,9 @@ def compare_sessions(model: OdometryModel, trajectories: Sequence[Trajectory]) -
         return SessionComparison(
             untested="no session repeats a command, so that nothing says how much its runs scatter"
         )
-    fit = TrajectoryFit(model, runs, Nuisances(np.zeros((len(runs), 3)), np.zeros(3)))
-    noise = noise_of_fit(fit, range(3), None, _NUISANCES)
-    fit = replace(fit, nuisances=Nuisances(fit.nuisances.values, noise.deviations))
+    fit = trajectory_fit.TrajectoryFit(model, runs, trajectory_fit.Nuisances(np.zeros((len(runs), 3)), np.zeros(3)))
+    noise = trajectory_fit.noise_of_fit(fit, range(3), None, _NUISANCES)
+    fit = replace(fit, nuisances=trajectory_fit.Nuisances(fit.nuisances.values, noise.deviations))
     # The matrix is fitted to all runs, by one step, so that the sessions' changes about it are small.
     whitened_fit = fit.linearised(fit.matrix_jacobian(), whiteners(noise.estimate.noise, fit.stamps))
     step, _ = whitened_fit.given([]).estimate(range(model.matrix.size))
@@ -411,7 +410,7 @@ def _differences(data: SessionScores) -> Iterator[SessionDifference]:
         total, scatter, freedom = contrast.scatter(roots)
         change, inverse = roots @ total, np.linalg.pinv(directions)
         values, deviations = inverse @ change, np.sqrt(np.diag(inverse @ roots @ scatter @ roots.T @ inverse.T))
-        reach = float(stdtrit(freedom, (1 + INTERVAL) / 2)) * deviations
+        reach = float(stdtrit(freedom, (1 + trajectory_fit.INTERVAL) / 2)) * deviations
         count = contrast.sessions.count(session)
         share = count / len(contrast.sessions)
         radii = []

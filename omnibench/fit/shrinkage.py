@@ -18,12 +18,12 @@ from dataclasses import replace
 import numpy as np
 
 from omnibench.fit.calibrator import Calibrator, Outcome, RunResult, Shrinkage
-from omnibench.fit.information import MANY, information_of_runs, noise_of_matrix
 from omnibench.fit.loss import loss_of
 from omnibench.fit.noise import GIVEN
 from omnibench.fit.open_combinations import information_of_references
 from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.problem import CalibrationProblem
+from omnibench.fit.trajectory_fit import MANY, information_of_runs, noise_of_matrix
 from omnibench.fit.uncertainty import NoCovarianceError, covariance_of_answer, runs_without_heading
 from omnibench.registry import calibrators
 from omnibench.robot.calibration import Noise

@@ -31,6 +31,8 @@ A deviation is zero unless a likelihood ratio test rejects that, all components 
 before being fitted anew. Nuisances and noise resemble each other: an error of the start heading shifts the headings by
 as much, like a bias, and only the path that turns about the start distinguishes it; so does an error of the clock by
 what differs between fast and slow runs. An error of the start position is a bias, exactly.
+
+Noise of the reference poses about a matrix, and the Fisher information of its elements under a noise.
 """
 
 from __future__ import annotations
@@ -39,32 +41,135 @@ import operator
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize, minimize_scalar
-from scipy.special import chdtri
+from scipy.special import chdtri, stdtrit
 
 from omnibench.data.dataset import Trajectory
 from omnibench.data.stored import median_period
 from omnibench.errors import DataError
-from omnibench.fit.noise import (
-    LEAST_WHITE,
-    Differences,
-    NoiseEstimate,
-    Whitener,
-    differences_between_repetitions,
-    estimate_noise,
-    grouped,
-)
+from omnibench.fit import noise as noises
+from omnibench.fit.loss import LossName, make_loss
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array, rotation
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.odometry import OdometryBatch, WheelLog, split_by
+from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog, split_by
+from omnibench.robot.stored_odometry import of_runs, poses_of_runs
 
-NUISANCES = ("start heading", "clock offset", "clock slope")
-TURN, OFFSET, SLOPE = range(3)  # their columns
+INTERVAL = 0.95  # probability of the intervals, by convention; every table of the program says 95 %
+# Degrees of freedom that stand for infinity: the quantile of Student's t differs from the normal one by 2e-9 there.
+MANY = 1e9
+Stamps = Literal["reference", "final"]
+_ROUNDING = 1e-12  # share of the largest derivative: a smaller one is rounding
+
+
+@dataclass(frozen=True, eq=False)
+class EstimatedCovariance:
+    """Covariance (n, n) of n numbers, and degrees of freedom (n,) of their variances, or one for all."""
+
+    matrix: Array
+    degrees_of_freedom: Array | float = np.inf
+
+    def of(self, slopes: Array) -> EstimatedCovariance:
+        """Covariance of q functions of the numbers, with derivatives (q, n), and degrees of freedom of their variances.
+
+        The reciprocal of a function's degrees of freedom is the mean of those of the numbers, weighted by their shares
+        in its variance: what depends on one number has that number's, and numbers that agree give theirs.
+        """
+        weights = np.abs(slopes * (slopes @ self.matrix))
+        freedom = np.broadcast_to(np.minimum(self.degrees_of_freedom, MANY), len(self.matrix))
+        reciprocals = (weights / freedom).sum(axis=1) / np.maximum(weights.sum(axis=1), 1e-300)
+        return EstimatedCovariance(slopes @ self.matrix @ slopes.T, 1 / np.maximum(reciprocals, 1 / MANY))
+
+    @property
+    def standard_deviations(self) -> Array:
+        """Standard deviations (n,)."""
+        return np.sqrt(np.maximum(np.diag(self.matrix), 0.0))
+
+    @property
+    def reach(self) -> Array:
+        """Half-widths (n,) of the 95 % intervals."""
+        quantile = stdtrit(np.minimum(self.degrees_of_freedom, MANY), (1 + INTERVAL) / 2)
+        return np.asarray(quantile * self.standard_deviations)
+
+
+def depending(slopes: Array, inputs: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which functions (q,) with derivatives (q, n) depend on one of the n inputs that are marked."""
+    return np.asarray((np.abs(slopes[:, inputs]) > _ROUNDING * np.abs(slopes).max()).any(axis=1))
+
+
+def noise_of_matrix(
+    runs: Sequence[Trajectory], matrix: Array, integration: Integration, loss: LossName = "squares"
+) -> noises.NoiseEstimate:
+    """Noise of the reference poses, estimated from the residuals that ``matrix`` (3, N) leaves in some runs.
+
+    With a robust loss poses that are far off are left out. Runs without poses tell nothing of it; DataError where none
+    has any.
+    """
+    runs = [run for run in runs if run.has_poses]
+    odometry = poses_of_runs([run.reference_log for run in runs], matrix, integration)
+    residuals: list[Array] = [poses - run.poses[1:] for poses, run in zip(odometry, runs, strict=True)]
+    near, residuals = without_jumps(runs, residuals, loss)
+    return noises.estimate_noise(noises.differences_between_repetitions(near, residuals))
+
+
+def information_of_runs(
+    runs: Sequence[Trajectory | WheelLog],
+    matrix: Array,
+    integration: Integration,
+    noise: Noise,
+    *,
+    stamps: Stamps = "reference",
+) -> Array:
+    """Fisher information (Z, 3N, 3N) of the elements of ``matrix`` (3, N), row by row, of each run; 1/element squared.
+
+    J^T C^-1 J with the derivatives J of the poses and their covariance C under ``noise``, at all reference poses after
+    the start or at the last alone. A WheelLog has its own stamps, > 0. Wheel rates and start pose count as exact; a
+    noisy start position is part of the noise's bias. The sum is the information of all runs together.
+    """
+    name = "final_log" if stamps == "final" else "reference_log"
+    logs: list[WheelLog] = [run if isinstance(run, WheelLog) else getattr(run, name) for run in runs]
+    by_parts = of_runs(_informations, logs, integration, matrix, noise)
+    return np.concatenate([np.zeros((0, matrix.size, matrix.size)), *by_parts])
+
+
+def _informations(odometry: OdometryBatch, logs: Sequence[WheelLog], matrix: Array, noise: Noise) -> Array:
+    """Fisher information (Z, 3N, 3N) of logs."""
+    information = np.empty((len(logs), matrix.size, matrix.size))
+    jacobians = split_by(odometry.jacobian(matrix), [log.stamps for log in logs])
+    for of_run, log, jacobian in zip(information, logs, jacobians, strict=True):
+        whitened = noises.Whitener(noise, log.stamps)(jacobian.reshape(len(jacobian), 3, -1))
+        columns = whitened.reshape(-1, whitened.shape[-1])
+        of_run[:] = columns.T @ columns
+    return information
+
+
+def without_jumps(
+    runs: Sequence[Trajectory], residuals: Sequence[Array], loss: LossName
+) -> tuple[list[Trajectory], list[Array]]:
+    """Runs and their residuals (K, 3) at the poses that have not jumped, m and rad alike.
+
+    Where most of a run's poses are off, its start is, which shifts or turns them all: the run is left out.
+    """
+    chosen = make_loss(loss, 3)
+    if chosen is None:
+        return list(runs), list(residuals)
+    counts = np.array([len(of_run) for of_run in residuals])
+    shares = np.repeat(1 / (np.maximum(counts, 1) * max(np.count_nonzero(counts), 1)), counts)
+    all_near = chosen.is_near(np.linalg.norm(np.concatenate(residuals), axis=1), shares)
+    near = [of_run & (of_run.mean() > 1 / 2) for of_run in np.split(all_near, np.cumsum(counts)[:-1])]
+    shortened = [
+        (with_poses(run, np.append(0, 1 + np.flatnonzero(used))), of_run[used])
+        for run, of_run, used in zip(runs, residuals, near, strict=True)
+        if used.any()
+    ]
+    return [run for run, _ in shortened], [of_run for _, of_run in shortened]
+
+
+TURN, OFFSET, SLOPE = range(3)  # columns of the nuisances: start heading, clock offset, clock slope
 # A function from a run's residuals (K, 3), or their derivatives (K, 3, n), to weighted ones (k, 3) or (k, 3, n).
 Weighting = Callable[[Array], Array]
 
@@ -210,7 +315,7 @@ def weighed_together(
 
     values (K, 3, n): of every run.
     """
-    for members in grouped([id(weigh) for weigh in weightings]):
+    for members in noises.grouped([id(weigh) for weigh in weightings]):
         columns = values[members[0]].shape[2]
         together = np.stack([values[index] for index in members], axis=2, dtype=float)
         white = weightings[members[0]](together.reshape(*together.shape[:2], -1))
@@ -496,7 +601,7 @@ class TrajectoryFit:
 class FitNoise:
     """The noise of the reference poses, and the standard deviations (3,) of the nuisances: rad, s, s per s."""
 
-    estimate: NoiseEstimate
+    estimate: noises.NoiseEstimate
     deviations: Array
 
     @property
@@ -514,12 +619,12 @@ def noise_of_fit(
     level of the tests.
     """
     differences = differences_without_nuisances(fit, kinds)
-    estimate = estimate_noise(differences, near)
+    estimate = noises.estimate_noise(differences, near)
     separate = separate_nuisances(differences, estimate.noise, kinds, chance)
     return FitNoise(replace(estimate, noise=separate.noise), separate.deviations)
 
 
-def differences_without_nuisances(fit: TrajectoryFit, kinds: Sequence[int]) -> Differences:
+def differences_without_nuisances(fit: TrajectoryFit, kinds: Sequence[int]) -> noises.Differences:
     """Differences between repetitions of the residuals that a fit leaves if nuisances of some kinds are 0."""
     values = fit.nuisances.values.copy()
     values[:, kinds] = 0.0
@@ -527,7 +632,7 @@ def differences_without_nuisances(fit: TrajectoryFit, kinds: Sequence[int]) -> D
         fit = replace(fit, nuisances=replace(fit.nuisances, values=values))
     slopes = fit.slopes if kinds else [np.zeros((*residuals.shape, 3)) for residuals in fit.residuals]
     residuals, slopes = (in_start_frames(fit.runs, of_runs) for of_runs in (fit.residuals, slopes))
-    return differences_between_repetitions(fit.runs, residuals, slopes)
+    return noises.differences_between_repetitions(fit.runs, residuals, slopes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -543,13 +648,13 @@ class SeparateNoise:
     slopes: Array
 
     @classmethod
-    def of(cls, differences: Differences, noise: Noise, deviations: Array) -> SeparateNoise:
+    def of(cls, differences: noises.Differences, noise: Noise, deviations: Array) -> SeparateNoise:
         """This noise with these deviations, as likely as differences between repetitions make them."""
         estimated = np.flatnonzero(deviations)
         sizes = deviations[estimated]
         total, slopes = 0.0, np.zeros(len(_NAMES) + 3)
         for stamps, values, columns in differences.by_stamps:
-            whitener = Whitener(noise, stamps)
+            whitener = noises.Whitener(noise, stamps)
             white = _whitened(whitener, values, columns[..., estimated])
             products = _Products.of(whitener, white)
             total += products.minus_log_likelihood(sizes)
@@ -583,7 +688,7 @@ class _Products:
     inner: Array
 
     @classmethod
-    def of(cls, whitener: Whitener, white: Array) -> _Products:
+    def of(cls, whitener: noises.Whitener, white: Array) -> _Products:
         """Products of white (K, 3, n, 1 + m), differences and nuisances."""
         of_runs = white.reshape(-1, *white.shape[2:]).transpose(1, 0, 2)
         products = of_runs.transpose(0, 2, 1) @ of_runs
@@ -602,23 +707,23 @@ class _Products:
         return float(total)
 
 
-def _whitened(whitener: Whitener, values: Array, columns: Array) -> Array:
+def _whitened(whitener: noises.Whitener, values: Array, columns: Array) -> Array:
     """Differences (K, 3, n) and columns (K, 3, n, m), whitened: (K, 3, n, 1 + m)."""
     both = np.concatenate([values[..., None], columns], axis=3)
     return whitener(both.reshape(*values.shape[:2], -1)).reshape(both.shape)
 
 
-def _products(differences: Differences, noise: Noise, used: NDArray[np.intp]) -> list[_Products]:
+def _products(differences: noises.Differences, noise: Noise, used: NDArray[np.intp]) -> list[_Products]:
     """The products of all differences with the columns of the nuisances ``used``, by stamps."""
     products = []
     for stamps, values, columns in differences.by_stamps:
-        whitener = Whitener(noise, stamps)
+        whitener = noises.Whitener(noise, stamps)
         products.append(_Products.of(whitener, _whitened(whitener, values, columns[..., used])))
     return products
 
 
 def separate_nuisances(
-    differences: Differences, noise: Noise, kinds: Sequence[int], chance: float = CHANCE
+    differences: noises.Differences, noise: Noise, kinds: Sequence[int], chance: float = CHANCE
 ) -> SeparateNoise:
     """Maximum likelihood estimate of the noise and of the deviations of nuisances of some kinds.
 
@@ -643,7 +748,7 @@ def separate_nuisances(
         now = likeliest
 
 
-def _along(differences: Differences, now: SeparateNoise, kind: int) -> SeparateNoise:
+def _along(differences: noises.Differences, now: SeparateNoise, kind: int) -> SeparateNoise:
     """The best deviation of one more nuisance, other noise held.
 
     The bias of the headings has stood in for start headings and becomes smaller by as much.
@@ -671,13 +776,13 @@ def _along(differences: Differences, now: SeparateNoise, kind: int) -> SeparateN
     return SeparateNoise.of(differences, noise_with(deviation), deviations_with(deviation))
 
 
-def _polished(differences: Differences, near: SeparateNoise) -> SeparateNoise:
+def _polished(differences: noises.Differences, near: SeparateNoise) -> SeparateNoise:
     """All components of the noise and the deviations that are not 0 estimated together, from a good start."""
     estimated = near.deviations > 0
     start = np.array([*(getattr(near.noise, name) for name in _NAMES), *near.deviations[estimated]])
     # The search is on a logarithmic scale, where zero cannot be left. Start headings are the first of the nuisances.
     for of_one_unit in (start[:3], start[3 : 6 + estimated[TURN]]):
-        np.maximum(of_one_unit, 0.1 * max(of_one_unit.max(), LEAST_WHITE), out=of_one_unit)
+        np.maximum(of_one_unit, 0.1 * max(of_one_unit.max(), noises.LEAST_WHITE), out=of_one_unit)
 
     moved = np.concatenate([np.ones(len(_NAMES), dtype=bool), estimated])
 

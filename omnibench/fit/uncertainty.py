@@ -30,13 +30,13 @@ from omnibench.fit.calibrator import RunResult
 from omnibench.fit.cost import SumOfNorms
 from omnibench.fit.geometry import WheelGeometry, unit_of
 from omnibench.fit.identifiability import ParameterEstimate, geometry_of, identified_parameters, is_invertible
-from omnibench.fit.information import EstimatedCovariance, depending, noise_of_matrix
 from omnibench.fit.loss import RobustCost, loss_of, norms_of
 from omnibench.fit.noise import GIVEN, covariance_of_sums, roots_of
 from omnibench.fit.open_combinations import elements_open
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.fit.reference_rows import ReferenceBatch
 from omnibench.fit.sandwich import Sandwich, Scores, covariance_of_rows, sandwich, scores_of_references, scores_of_runs
+from omnibench.fit.trajectory_fit import EstimatedCovariance, depending, noise_of_matrix
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import OdometryBatch

@@ -36,19 +36,7 @@ from distributed.comm.core import CommClosedError, connect
 from distributed.core import send_recv
 
 from omnibench.errors import ConfigError, DataError, OmnibenchError, one_line
-from omnibench.jobs.dask_worker import (
-    JobEvent,
-    JobOutcome,
-    Parcel,
-    Requirements,
-    UnfitWorkerError,
-    carry_out,
-    content,
-    differences,
-    prepare,
-    read_events,
-    software,
-)
+from omnibench.jobs import dask_worker
 from omnibench.jobs.job import TRIES, BackendError, Ended, Failure, Job, JobWatch, Store, TlsFiles
 from omnibench.jobs.job_process import JobEnd, Packer
 from omnibench.processes import interrupts_blocked, main_module_hidden
@@ -196,9 +184,9 @@ def _joined_client(address: str, tls: TlsFiles | None, report: Reporter) -> Iter
         packages = client.get_versions()["scheduler"]["packages"]
         there, here = (
             {name: versions[name] for name in ("dask", "distributed") if name in versions}
-            for versions in (packages, software())
+            for versions in (packages, dask_worker.software())
         )
-        if wrong := differences(there, here):
+        if wrong := dask_worker.differences(there, here):
             raise ConfigError(f"scheduler {address} has {', '.join(wrong)}; install the same on both sides")
         if not client.nthreads():
             report(Progress("waiting for a worker"))
@@ -241,20 +229,22 @@ def checked_requirements(client: Any, preload: Sequence[str]) -> bytes:
     """What workers must have, after a check of those that are there. UnfitWorkerError in one line."""
     plugins = loaded_plugin_files()
     requirements = pickle.dumps(
-        Requirements(
-            software=software(),
+        dask_worker.Requirements(
+            software=dask_worker.software(),
             plugins={path: plugin_text(path) for path in plugins},
             failing=frozenset(failure.origin for failure in plugins.values() if failure is not None),
             preload=tuple(preload),
         )
     )
-    answers = client.run(prepare, requirements, on_error="return")
+    answers = client.run(dask_worker.prepare, requirements, on_error="return")
     for worker, answer in answers.items():
-        if isinstance(answer, UnfitWorkerError):
+        if isinstance(answer, dask_worker.UnfitWorkerError):
             raise answer
         if isinstance(answer, BaseException):  # another Python, or no omnibench
             reason = one_line(f"{type(answer).__name__}: {answer}")
-            raise UnfitWorkerError(f"worker {worker} cannot run omnibench's jobs ({reason}); install the same there")
+            raise dask_worker.UnfitWorkerError(
+                f"worker {worker} cannot run omnibench's jobs ({reason}); install the same there"
+            )
     return requirements
 
 
@@ -315,7 +305,9 @@ class DaskBackend:
     def data(self, name: str, value: bytes) -> Any:
         """The future of data, which go to the scheduler once, and from there to each worker that needs them."""
         if name not in self._data or self._data[name].status == "error":  # workers were killed that were to hold them
-            self._data[name] = self.client.submit(content, value, key=f"omnibench-data-{name}-{uuid4().hex[:8]}")
+            self._data[name] = self.client.submit(
+                dask_worker.content, value, key=f"omnibench-data-{name}-{uuid4().hex[:8]}"
+            )
         return self._data[name]
 
 
@@ -357,8 +349,8 @@ class _Run:
             self.pending[item.number] = item
         self._numbers[key] = {item.number for item in items}
         self._futures[key] = self._client.submit(
-            carry_out,
-            Parcel(self._backend.topic, self._number, self._store, tuple(jobs), tuple(shared)),
+            dask_worker.carry_out,
+            dask_worker.Parcel(self._backend.topic, self._number, self._store, tuple(jobs), tuple(shared)),
             self._backend.data("requirements", self._backend.requirements),
             *(self._backend.data(name, value) for name, value in shared.items()),
             key=key,
@@ -373,7 +365,7 @@ class _Run:
             while True:
                 texts.append(self._backend.events.get_nowait())
         for text in texts:
-            number, events = read_events(text)
+            number, events = dask_worker.read_events(text)
             for event in events if number == self._number else ():  # others are of a call that was interrupted
                 if (item := self.pending.get(event.number)) is not None:
                     yield from self._heard(item, event)
@@ -388,7 +380,7 @@ class _Run:
             with suppress(OSError):  # a scheduler that does not answer in time
                 self._client.cancel([*self._futures.values()], force=True)
 
-    def _heard(self, item: _Pending, event: JobEvent) -> Iterator[Ended]:
+    def _heard(self, item: _Pending, event: dask_worker.JobEvent) -> Iterator[Ended]:
         if event.progress is not None:
             self._watch.moved(item.number, event.progress)
         if event.fetch:
@@ -401,7 +393,7 @@ class _Run:
                     if (fetched := self.pending.get(outcome.number)) is not None:
                         yield self._ended(fetched, outcome)
         elif event.answer is not None:
-            yield self._ended(item, JobOutcome(item.number, JobEnd(event.answer), event.seconds))
+            yield self._ended(item, dask_worker.JobOutcome(item.number, JobEnd(event.answer), event.seconds))
         elif event.progress is None:
             item.begins += 1
             if item.begins > TRIES:
@@ -410,7 +402,7 @@ class _Run:
                 item.worker = event.worker
                 self._watch.began(item.number)
 
-    def _ended(self, item: _Pending, outcome: JobOutcome) -> Ended:
+    def _ended(self, item: _Pending, outcome: dask_worker.JobOutcome) -> Ended:
         self._forget(item)
         self._seconds += _WEIGHT * (outcome.seconds - self._seconds)
         failure = outcome.end.failure(item.job)

@@ -21,15 +21,9 @@ from pathlib import Path
 from signal import SIG_DFL, SIG_IGN, SIGABRT, SIGHUP, SIGINT, SIGKILL, SIGSEGV, SIGTERM, Signals
 from typing import Any, TypeVar
 
+from omnibench import processes
 from omnibench.errors import one_line
 from omnibench.jobs.job import Backend, Ended, Failure, Job, JobWatch, Store
-from omnibench.processes import (
-    end_with_parent,
-    interrupts_deferred,
-    main_module_hidden,
-    one_thread,
-    one_thread_processes,
-)
 from omnibench.progress import Progress, Reporter
 from omnibench.registry import import_copies
 
@@ -145,11 +139,6 @@ def run_packed(packed: PackedJob, report: Reporter) -> Any:
     return function(argument, report)
 
 
-def in_job() -> bool:
-    """True in a process that does a job: there are no further processes beneath."""
-    return _in_job
-
-
 @dataclass(frozen=True)
 class JobEnd:
     """The end of a job, in parts that any process can read.
@@ -179,7 +168,7 @@ class JobProcess:
     def __init__(self, context: Any) -> None:
         self.connection, far = context.Pipe()
         self._process = context.Process(target=_serve, args=(far,), daemon=True)
-        with interrupts_deferred(), main_module_hidden():
+        with processes.interrupts_deferred(), processes.main_module_hidden():
             self._process.start()
         far.close()
         self.young_since = time.monotonic()
@@ -281,9 +270,9 @@ def _serve(connection: Connection) -> None:
     signal.signal(SIGINT, SIG_IGN)  # the parent ends it
     signal.signal(SIGTERM, SIG_DFL)  # end at once: Python's handlers would wait for compiled code
     os.setpgid(0, 0)  # all that a plug-in starts can be ended with the process
-    threading.Thread(target=end_with_parent, daemon=True).start()
+    threading.Thread(target=processes.end_with_parent, daemon=True).start()
     process, home = os.getpid(), _folder()
-    with one_thread():
+    with processes.one_thread():
         while True:
             try:
                 if not connection.poll(2 * _OWN):  # nobody gives it a job so late
@@ -390,7 +379,7 @@ class InPlace:
             watch.began(number)
             failure = None
             try:
-                with one_thread():
+                with processes.one_thread():
                     job.run(store, partial(watch.moved, number))
             except (Exception, SystemExit) as error:
                 failure = raised(job, error)
@@ -416,13 +405,14 @@ class Processes:
 
     def run(self, jobs: Iterable[tuple[int, Job[T]]], store: Store[T], watch: JobWatch[T]) -> Iterator[Ended]:
         """Run the jobs, see Backend."""
-        if in_job():
+        # A process that does a job starts no further ones
+        if _in_job:
             yield from InPlace().run(jobs, store, watch)
             return
         waiting = iter(jobs)
         active: dict[JobProcess, tuple[int, Job[Any]]] = {}
         idle, packer = self._idle, Packer()
-        with one_thread_processes((*PRELOAD, *self.preload)) as context:
+        with processes.one_thread_processes((*PRELOAD, *self.preload)) as context:
             try:
                 while True:
                     while len(active) < self.workers and (item := next(waiting, None)) is not None:

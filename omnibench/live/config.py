@@ -14,8 +14,7 @@ from omnibench.live.fusion.pose_fusion import FusionSettings
 from omnibench.live.network.session_config import SessionConfig
 from omnibench.live.replay.concatenated_drive import ReplayConfig
 from omnibench.live.wheels.wheel_input import WheelSettings
-from omnibench.live.wire.outputs import Frames
-from omnibench.live.wire.topics import Profile
+from omnibench.live.wire.topics import Frames, Profile
 
 # The form of a choice, a name or settings, so that a mistake in one is not explained as one in the other.
 _Form = Discriminator(lambda value: "settings" if isinstance(value, Mapping | Model) else "name")

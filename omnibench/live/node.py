@@ -34,9 +34,8 @@ from omnibench.live.network.presence import Claim
 from omnibench.live.network.session import close_session, open_session
 from omnibench.live.stopping import Closing, RateLimiter, Stop
 from omnibench.live.wire.messages import Diagnostics, MissedMessages, flow_of
-from omnibench.live.wire.outputs import OUTPUTS, Update
 from omnibench.live.wire.recorder import PORT, FoxgloveServer, Recorder, free_path
-from omnibench.live.wire.topics import TOPICS, AcknowledgedFlows, GraphNode, KeySpace
+from omnibench.live.wire.topics import OUTPUTS, TOPICS, AcknowledgedFlows, GraphNode, KeySpace, Update
 from omnibench.registry import load_plugins
 from omnibench.robot.calibration import read_calibration
 from omnibench.words import plural

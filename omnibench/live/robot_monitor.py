@@ -15,7 +15,7 @@ import zenoh
 from pydantic_core import to_jsonable_python
 
 from omnibench.errors import DataError
-from omnibench.live.control.request_queue import source_of
+from omnibench.live.control.query_server import source_of
 from omnibench.live.estimation.health import anomalies_among
 from omnibench.live.network.presence import Presence, checked_robot, nothing_received
 from omnibench.live.stopping import Closing, direct, wait_until

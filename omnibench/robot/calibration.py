@@ -18,18 +18,7 @@ from pydantic import (
     model_validator,
 )
 
-from omnibench.config import (
-    LONGEST_NAME,
-    MOST_VALUES,
-    Model,
-    Name,
-    NonNegative,
-    parse_yaml,
-    printable,
-    read_yaml,
-    to_yaml,
-    validate,
-)
+from omnibench import config
 from omnibench.errors import ConfigError, DataError, require_type, shown
 from omnibench.files import write_text
 from omnibench.robot.corrections import Fade
@@ -45,17 +34,17 @@ SAMPLE_PERIODS: Final = (1e-6, 3600.0)  # s: no robot samples its wheels faster 
 _LARGEST_ELEMENT = 1e3  # m or rad per rad of wheel: no wheel is so large
 Row = tuple[FiniteFloat, ...]
 Fingerprint = Annotated[str, Field(pattern="^[0-9a-f]{16}$")]
-Deviation = Annotated[NonNegative, Field(le=1e3)]
+Deviation = Annotated[config.NonNegative, Field(le=1e3)]
 
 
 def _is_none(value: object) -> bool:
     return value is None
 
 
-class EffectTerm(Model):
+class EffectTerm(config.Model):
     """An effect by its name, with the values of its parameters."""
 
-    name: Name
+    name: config.Name
     parameters: dict[str, FiniteFloat] = {}
     weights: str | None = Field(
         None, description="of a learned effect: base64 of float32, at most 48 KiB", exclude_if=_is_none
@@ -79,7 +68,7 @@ class EffectTerm(Model):
         return make_term(self.name, self.parameters, robot, where, weights=self.weights)
 
 
-class Noise(Model):
+class Noise(config.Model):
     """Standard deviations of the reference's noise: white noise, random walk over time, bias of a run."""
 
     pose_position: Deviation = Field(0.0, description="white noise of each pose, m")
@@ -90,7 +79,7 @@ class Noise(Model):
     bias_heading: Deviation = Field(0.0, description="constant over a run, rad")
 
 
-class HeldOutVerdict(Model):
+class HeldOutVerdict(config.Model):
     """Verdict on a calibration by held-out runs, beside the design values.
 
     basis: the runs that were held out from this fit, or, where these are few, quick fits to four fifths of the commands
@@ -118,17 +107,17 @@ class HeldOutVerdict(Model):
     detail: str
 
 
-class Provenance(Model):
+class Provenance(config.Model):
     """Origin of a calibration: data set, calibrator with options, versions, costs, outcome, what held-out runs say.
 
     fitted: None in files of versions that did not write it. on_bounds: no interval is stated of what depends on these.
     """
 
-    dataset: Name
+    dataset: config.Name
     dataset_hash: str
     fitted: tuple[Fingerprint, ...] | None = Field(None, description="fingerprints of the runs that it was fitted to")
     simulated: bool = False
-    calibrator: Name
+    calibrator: config.Name
     options: dict[str, Any] = {}
     seed: int
     cost: str
@@ -149,7 +138,7 @@ class Provenance(Model):
     held_out: HeldOutVerdict | None = None
 
 
-class ModelExtension(Model):
+class ModelExtension(config.Model):
     """Effects beside a matrix (3, M), and how they fade outside the motions that they were fitted to.
 
     driven, plain, covariance: as in ``Calibration``; without them the effects do not fade.
@@ -189,11 +178,13 @@ def _signal_names(content: dict[str, Any]) -> tuple[str, ...] | None:
     return None if robot is None or robot.drive.direct else robot.drive.names
 
 
-class Calibration(Shown, Model):
+class Calibration(Shown, config.Model):
     """The content of a calibration file."""
 
     format: Literal["omnibench-calibration/1"] = FORMAT
-    name: Annotated[str, Field(max_length=2 * LONGEST_NAME + 1), AfterValidator(printable)]  # data set and calibrator
+    name: Annotated[
+        str, Field(max_length=2 * config.LONGEST_NAME + 1), AfterValidator(config.printable)
+    ]  # data set and calibrator
     created: datetime = Field(default_factory=lambda: datetime.now(UTC).replace(microsecond=0))
     robot: Robot
     sample_period: float = Field(ge=SAMPLE_PERIODS[0], le=SAMPLE_PERIODS[1], description="s")
@@ -205,7 +196,7 @@ class Calibration(Shown, Model):
     effects: tuple[EffectTerm, ...] = ()
     noise: Noise | None = None
     covariance: tuple[Row, ...] | None = Field(None, description="of the matrix, row by row, then of the effects")
-    session: Name | None = Field(None, description="what drift terms are measured from")
+    session: config.Name | None = Field(None, description="what drift terms are measured from")
     driven: tuple[tuple[FiniteFloat, FiniteFloat, FiniteFloat], ...] | None = Field(
         None, description="motions that it was fitted to, m/s, m/s, rad/s; its effects are not known to hold beyond"
     )
@@ -320,18 +311,18 @@ def covariance_rows(covariance: Array) -> tuple[Row, ...]:
 def read_calibration(path: Path | str) -> Calibration:
     """Read and check a calibration file. DataError names the file and what is wrong."""
     try:
-        return _checked(read_yaml(Path(path)), str(path))
+        return _checked(config.read_yaml(Path(path)), str(path))
     except ConfigError as error:
         raise DataError(str(error)) from None
 
 
-def parse_calibration(text: str, where: str, most: int = MOST_VALUES) -> Calibration:
+def parse_calibration(text: str, where: str, most: int = config.MOST_VALUES) -> Calibration:
     """Parse and check the text of a calibration file. DataError begins with ``where`` and says what is wrong.
 
     most: values that the text may have.
     """
     try:
-        return _checked(parse_yaml(text, where, most), where)
+        return _checked(config.parse_yaml(text, where, most), where)
     except ConfigError as error:
         raise DataError(str(error)) from None
 
@@ -340,7 +331,7 @@ def _checked(content: Any, where: str) -> Calibration:
     version = content.get("format") if isinstance(content, dict) else None
     if version != FORMAT:
         raise DataError(f"{where}: format is {shown(version)}, expected {FORMAT!r}; is this a calibration file?")
-    calibration = validate(Calibration, content, where)
+    calibration = config.validate(Calibration, content, where)
     for term in calibration.effects:
         term.term(calibration.robot, where)
     return calibration
@@ -354,4 +345,4 @@ def write_calibration(calibration: Calibration, path: Path | str) -> None:
     True
     """
     require_type(calibration, Calibration, "read_calibration")
-    write_text(Path(path), to_yaml(calibration))
+    write_text(Path(path), config.to_yaml(calibration))

@@ -74,7 +74,20 @@ class WheelContacts:
         """
         if self.has_differential:
             assert steering is not None  # a car steers
-            return self._twists_of_car(rates, steering)
+            # Twists (F, 3) of a car, of which the mean of the rates (F, N) counts
+            samples = len(rates)
+            rows = [np.tile(_along(wheel, np.pi / 2), (samples, 1)) for wheel in self._wheels if wheel.kind == "fixed"]
+            guiding = [wheel for wheel in self._wheels if wheel.has_steering]
+            for wheel, angles, offset in zip(guiding, steering.T, self._offsets, strict=True):
+                across = angles + offset + np.pi / 2
+                rows.append(np.column_stack([np.cos(across), np.sin(across)]) @ _contact(wheel))
+            # At unit speed ahead no wheel is to slide along its axle: a . (1, vy, w) = 0, in least squares.
+            axles = np.stack(rows, axis=1)
+            free = axles[:, :, 1:]
+            normal, asked = np.swapaxes(free, 1, 2) @ free, -np.swapaxes(free, 1, 2) @ axles[:, :, :1]
+            directions = np.column_stack([np.ones(samples), np.linalg.solve(normal, asked)[..., 0]])
+            speeds = rates.mean(axis=1) / self.rolling_rates(directions).mean(axis=1)
+            return speeds[:, None] * directions
         return self._driven(rates, steering) @ self._least_sliding.T
 
     def tracked(self, twists: Array) -> Array:
@@ -137,22 +150,6 @@ class WheelContacts:
             columns += [] if driven is None else [driven * np.cos(wheel.roller_angle)]
             columns += [np.zeros(len(rates))] if wheel.kind == "fixed" else []
         return np.column_stack(columns)
-
-    def _twists_of_car(self, rates: Array, steering: Array) -> Array:
-        """Twists (F, 3) of a car, of which the mean of the rates (F, N) counts."""
-        samples = len(rates)
-        rows = [np.tile(_along(wheel, np.pi / 2), (samples, 1)) for wheel in self._wheels if wheel.kind == "fixed"]
-        guiding = [wheel for wheel in self._wheels if wheel.has_steering]
-        for wheel, angles, offset in zip(guiding, steering.T, self._offsets, strict=True):
-            across = angles + offset + np.pi / 2
-            rows.append(np.column_stack([np.cos(across), np.sin(across)]) @ _contact(wheel))
-        # At unit speed ahead no wheel is to slide along its axle: a . (1, vy, w) = 0, in least squares.
-        axles = np.stack(rows, axis=1)
-        free = axles[:, :, 1:]
-        normal, asked = np.swapaxes(free, 1, 2) @ free, -np.swapaxes(free, 1, 2) @ axles[:, :, :1]
-        directions = np.column_stack([np.ones(samples), np.linalg.solve(normal, asked)[..., 0]])
-        speeds = rates.mean(axis=1) / self.rolling_rates(directions).mean(axis=1)
-        return speeds[:, None] * directions
 
 
 def _contact(wheel: Wheel) -> Array:

@@ -1,28 +1,66 @@
-"""Simulated data sets that the YAML of a comparison, or of a simulation alone, describes."""
+"""Simulated data sets that the YAML of a comparison, or of a simulation alone, describes.
+
+Simulation of a data set by the generator that its config names.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import ConfigDict, Field, ValidationInfo, field_validator, model_validator
+from pydantic import ConfigDict, Discriminator, Field, Tag, ValidationInfo, field_validator, model_validator
 
 from omnibench.config import Model, RelativePath, folder_of, parse_yaml, read_yaml, validate
 from omnibench.data.dataset import Dataset
 from omnibench.data.storage import load_dataset
-from omnibench.errors import ConfigError, UnknownNameError
+from omnibench.errors import CHOSEN, ConfigError, UnknownNameError, require_type
 from omnibench.progress import Reporter, no_progress
 from omnibench.registry import effects
 from omnibench.robot.calibration import EffectTerm
 from omnibench.robot.odometry import Integration
 from omnibench.simulate.config import FlowerConfig, Truth
 from omnibench.simulate.robot_config import RobotConfig
-from omnibench.simulate.simulate import SimulatedConfig, simulate_dataset
+from omnibench.simulate.robot_simulator import simulate_flower
 from omnibench.simulate.truth import Simulation
 from omnibench.slam.import_dataset import import_dataset
 from omnibench.views import Brief
+
+_FLOWER, _ROBOT = CHOSEN + FlowerConfig.__name__, CHOSEN + RobotConfig.__name__
+
+
+def _generator(config: Any) -> str | None:
+    """Tag of the config's class by its key ``generator``; None for an unknown generator."""
+    name = config.get("generator", "flower") if isinstance(config, Mapping) else getattr(config, "generator", "flower")
+    return {"flower": _FLOWER, "robot": _ROBOT}.get(str(name))
+
+
+SimulatedConfig = Annotated[
+    Annotated[FlowerConfig, Tag(_FLOWER)] | Annotated[RobotConfig, Tag(_ROBOT)],
+    Discriminator(
+        _generator, custom_error_type="generator", custom_error_message="generator must be 'flower' or 'robot'"
+    ),
+]
+
+
+def simulate_dataset(
+    config: FlowerConfig | RobotConfig,
+    name: str = "flower",
+    description: str = "",
+    watch: Reporter = no_progress,
+) -> Simulation:
+    """Simulate the training session and, if there is one, the validation session.
+
+    ConfigError or DataError in one line: an effect of the truth, or a parameter of one, is not known or is missing; a
+    command is faster than the motors, or leads out of the room.
+    """
+    if isinstance(config, FlowerConfig):
+        return simulate_flower(config, name, description, watch)
+    require_type(config, RobotConfig, "read_simulation(...).config")
+    from omnibench.simulate.robot_simulator import simulate_robot  # loads for a second (numba)
+
+    return simulate_robot(config, name, description, watch)
 
 
 class ImportSource(Model):

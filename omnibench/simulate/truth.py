@@ -14,41 +14,21 @@ from omnibench.data.dataset import Dataset
 from omnibench.data.true_poses import TruePath
 from omnibench.errors import UnknownNameError
 from omnibench.registry import effects
+from omnibench.robot import kinematics
 from omnibench.robot.calibration import EffectTerm, Noise, Row, matrix_rows
 from omnibench.robot.corrections import Corrected, check_needs, corrected, needs_of
 from omnibench.robot.effects.effect import ActuatorEffect, Term, check_applies
-from omnibench.robot.kinematics import (
-    Array,
-    Mount,
-    Robot,
-    Wheel,
-    in_the_middle,
-    inverse_kinematic_matrix,
-    published_matrix,
-)
 from omnibench.robot.model import OdometryModel, reported_poses
 from omnibench.robot.odometry import Integration, WheelLog
 from omnibench.robot.signals import of_centre, signals_of
+from omnibench.simulate import mechanics as physics
 from omnibench.simulate.commands import Variation
 from omnibench.simulate.config import EncoderNoise, Truth
 from omnibench.simulate.floor_plan import FloorPlan
-from omnibench.simulate.mechanics import (
-    BODY,
-    COUPLING,
-    LIGHT_WHEEL,
-    MECHANICS,
-    STEERING,
-    TrueMotion,
-    WheelContacts,
-    body_truth,
-    lost_by_light_wheels,
-    steering_truth,
-    turned_by_steering,
-)
 from omnibench.views import Brief
 
 
-def reference_noise(noise: Noise, times: Array, rng: np.random.Generator) -> Array:
+def reference_noise(noise: Noise, times: kinematics.Array, rng: np.random.Generator) -> kinematics.Array:
     """Noise (K, 3) of the reference poses in m, m, rad; none at t = 0, where the start pose is exact."""
     white = np.array([noise.pose_position, noise.pose_position, noise.pose_heading])
     walk = np.array([noise.walk_position, noise.walk_position, noise.walk_heading])
@@ -74,14 +54,14 @@ class TrueRobot:
     """
 
     model: OdometryModel
-    contacts: WheelContacts | None = None
+    contacts: physics.WheelContacts | None = None
 
     @property
     def has_differential(self) -> bool:
         """True for a car, of whose rear wheels the mean rate is driven."""
         return self.contacts is not None and self.contacts.has_differential
 
-    def driven(self, times: Array, targets: Array) -> Array:
+    def driven(self, times: kinematics.Array, targets: kinematics.Array) -> kinematics.Array:
         """True mean wheel rates (F, N), rad/s, for targets (F, N) in samples that end at times (F,), s."""
         rates = targets
         for term in self.model.terms:
@@ -91,14 +71,14 @@ class TrueRobot:
 
     def log(
         self,
-        times: Array,
-        rates: Array,
-        start: Array,
-        stamps: Array,
-        angles: Array,
+        times: kinematics.Array,
+        rates: kinematics.Array,
+        start: kinematics.Array,
+        stamps: kinematics.Array,
+        angles: kinematics.Array,
         started_at: float | None,
         session: str | None,
-        steering: Array | None = None,
+        steering: kinematics.Array | None = None,
     ) -> WheelLog:
         """Log of what exact encoders would measure, from a start pose (3,) and angles of the wheels (N,), rad, on.
 
@@ -118,11 +98,11 @@ class TrueRobot:
             log = replace(log, rates=rates, wheel_angles=turned)
         return log
 
-    def poses(self, log: WheelLog) -> Array:
+    def poses(self, log: WheelLog) -> kinematics.Array:
         """True poses (S, 3) of the tracked point at the log's stamps."""
         return self.model.poses([log])[0] if self._by_model else self._path(log).poses(log.stamps)
 
-    def reported(self, log: WheelLog) -> Array:
+    def reported(self, log: WheelLog) -> kinematics.Array:
         """Poses (S, 3) that an exact reference reports at the log's stamps, with the effects on it."""
         if self._by_model:
             return self.model.reported([log])[0]
@@ -132,9 +112,9 @@ class TrueRobot:
     @property
     def _by_model(self) -> bool:
         """True if the model has the whole motion: without contacts, and without mechanics beside them."""
-        return self.contacts is None and MECHANICS.isdisjoint(term.name for term in self.model.motion_terms)
+        return self.contacts is None and physics.MECHANICS.isdisjoint(term.name for term in self.model.motion_terms)
 
-    def _path(self, log: WheelLog) -> TrueMotion:
+    def _path(self, log: WheelLog) -> physics.TrueMotion:
         twists, true = self._motion(log)
         if true.body is not None:
             twists = twists + true.body
@@ -143,14 +123,14 @@ class TrueRobot:
             twists = self.contacts.tracked(twists)
         elif mount is not None:
             twists = twists @ mount.twist.T
-        return TrueMotion(log.times, log.start, twists, self.model.integration, true.world)
+        return physics.TrueMotion(log.times, log.start, twists, self.model.integration, true.world)
 
-    def _motion(self, log: WheelLog) -> tuple[Array, Corrected]:
+    def _motion(self, log: WheelLog) -> tuple[kinematics.Array, Corrected]:
         """Twists (F, 3) of the centre that the true wheels give, and the effects of motion on a log."""
         model = self.model
         check_needs(model.motion_terms, log)
-        mechanics = [term for term in model.motion_terms if term.name in MECHANICS]
-        terms = [term for term in model.motion_terms if term.name not in MECHANICS]
+        mechanics = [term for term in model.motion_terms if term.name in physics.MECHANICS]
+        terms = [term for term in model.motion_terms if term.name not in physics.MECHANICS]
         true = Corrected(log.rates, log.middle_steering)
         if terms:
             assert model.sample_period is not None  # there are terms
@@ -159,7 +139,7 @@ class TrueRobot:
             true = self._with_mechanics(log, true, mechanics)
         return self._twists(true), true
 
-    def _twists(self, true: Corrected) -> Array:
+    def _twists(self, true: Corrected) -> kinematics.Array:
         """Twists (F, 3) of the centre that wheels give by their contacts, or by the matrix."""
         if self.contacts is not None:
             return self.contacts.twists(true.rates, true.steering)
@@ -173,22 +153,24 @@ class TrueRobot:
             assert true.steering is not None
             ends = log.steering
             for term in terms:
-                if term.name in STEERING:
-                    ends = steering_truth(term.name, term.values, ends, durations)
-            true = replace(true, steering=true.steering + in_the_middle(ends) - in_the_middle(log.steering))
+                if term.name in physics.STEERING:
+                    ends = physics.steering_truth(term.name, term.values, ends, durations)
+            true = replace(
+                true, steering=true.steering + kinematics.in_the_middle(ends) - kinematics.in_the_middle(log.steering)
+            )
             for term in terms:
-                if term.name == COUPLING:
-                    turned = turned_by_steering(term.values, robot.wheels, log.steering, durations)
+                if term.name == physics.COUPLING:
+                    turned = physics.turned_by_steering(term.values, robot.wheels, log.steering, durations)
                     true = replace(true, rates=true.rates + turned)
         for term in terms:
-            if term.name == LIGHT_WHEEL:
+            if term.name == physics.LIGHT_WHEEL:
                 twists = self._twists(true)
-                lost = lost_by_light_wheels(term.values, robot.wheels, true.steering, twists, durations)
+                lost = physics.lost_by_light_wheels(term.values, robot.wheels, true.steering, twists, durations)
                 true = replace(true, rates=true.rates - lost)
         twists = self._twists(true)
         for term in terms:
-            if term.name in BODY:
-                added = body_truth(term.name, term.values, robot, twists, durations)
+            if term.name in physics.BODY:
+                added = physics.body_truth(term.name, term.values, robot, twists, durations)
                 true = replace(true, body=added if true.body is None else true.body + added)
         return true
 
@@ -197,15 +179,17 @@ class TruthRecord(Model):
     """Record of the truth; it goes to its own folder, which fitting and comparing never read."""
 
     dataset: str
-    robot: Robot
+    robot: kinematics.Robot
     sample_period: float
     matrix: tuple[Row, Row, Row]
     integration: Integration
     noise: EncoderNoise
     effects: tuple[EffectTerm, ...] = ()
-    wheels: tuple[Wheel, ...] | None = Field(None, description="the true wheels, if they were drawn about the design")
+    wheels: tuple[kinematics.Wheel, ...] | None = Field(
+        None, description="the true wheels, if they were drawn about the design"
+    )
     steering_offsets: dict[str, float] = Field({}, description="drawn: true steering angle less the measured one, rad")
-    mount: Mount | None = Field(None, description="the true tracked point, if it is not the robot's centre")
+    mount: kinematics.Mount | None = Field(None, description="the true tracked point, if it is not the robot's centre")
     lateral_friction: float = 0.0
     variation: Variation = Field(Variation(), description="of the commands within a run")
 
@@ -221,13 +205,13 @@ class TruthRecord(Model):
         contacts = None
         if self.wheels is not None and not _moved_by_matrix(self.robot, self.mount):
             offsets = [self.steering_offsets[name] for name in self.robot.drive.steered]
-            contacts = WheelContacts(self.robot, self.wheels, offsets, self.mount, self.lateral_friction)
+            contacts = physics.WheelContacts(self.robot, self.wheels, offsets, self.mount, self.lateral_friction)
         return TrueRobot(model, contacts)
 
 
 def true_record(
     truth: Truth,
-    robot: Robot,
+    robot: kinematics.Robot,
     sample_period: float,
     sessions: tuple[str, ...],
     dataset: str,
@@ -258,35 +242,35 @@ def true_record(
     )
 
 
-def true_matrix(truth: Truth, robot: Robot) -> Array:
+def true_matrix(truth: Truth, robot: kinematics.Robot) -> kinematics.Array:
     """The hidden inverse kinematic matrix (3, M); of a car with steering offsets the one for small angles."""
     if truth.published is not None:
-        return published_matrix(truth.published)
+        return kinematics.published_matrix(truth.published)
     if truth.matrix is not None:
         return np.array(truth.matrix)
     drawn = _drawn(truth, robot)
     assert drawn is not None  # one of the three is given
     if _moved_by_matrix(robot, drawn.mount):
-        return inverse_kinematic_matrix(drawn.wheels)
+        return kinematics.inverse_kinematic_matrix(drawn.wheels)
     offsets = list(drawn.steering_offsets.values())
-    return WheelContacts(robot, drawn.wheels, offsets, drawn.mount, truth.lateral_friction).matrix
+    return physics.WheelContacts(robot, drawn.wheels, offsets, drawn.mount, truth.lateral_friction).matrix
 
 
 @dataclass(frozen=True)
 class _Drawn:
     """A robot drawn about its design. steering_offsets: rad, of each wheel whose steering angle is measured."""
 
-    wheels: tuple[Wheel, ...]
+    wheels: tuple[kinematics.Wheel, ...]
     steering_offsets: dict[str, float]
-    mount: Mount | None
+    mount: kinematics.Mount | None
 
 
-def _moved_by_matrix(robot: Robot, mount: Mount | None) -> bool:
+def _moved_by_matrix(robot: kinematics.Robot, mount: kinematics.Mount | None) -> bool:
     """True for omni and mecanum wheels placed by distance and angle, whose matrix is Eq. (3) or its general form."""
     return mount is None and all(wheel.distance is not None and wheel.measured for wheel in robot.wheels)
 
 
-def _drawn(truth: Truth, robot: Robot) -> _Drawn | None:
+def _drawn(truth: Truth, robot: kinematics.Robot) -> _Drawn | None:
     """The robot drawn about the design, if the truth says so."""
     given = truth.tolerances
     if given is None:
@@ -311,8 +295,8 @@ def _drawn(truth: Truth, robot: Robot) -> _Drawn | None:
     mount = robot.mount
     if given.mount or given.mount_deg:
         x, y, yaw = rng.standard_normal(3).tolist()
-        design = robot.mount or Mount()
-        mount = Mount(
+        design = robot.mount or kinematics.Mount()
+        mount = kinematics.Mount(
             x=design.x + given.mount * x,
             y=design.y + given.mount * y,
             yaw=design.yaw + math.radians(given.mount_deg) * yaw,
@@ -320,7 +304,7 @@ def _drawn(truth: Truth, robot: Robot) -> _Drawn | None:
     return _Drawn(tuple(wheels), dict(zip(steered, offsets, strict=True)), mount)
 
 
-def _complete(term: EffectTerm, robot: Robot, sessions: tuple[str, ...], where: str) -> EffectTerm:
+def _complete(term: EffectTerm, robot: kinematics.Robot, sessions: tuple[str, ...], where: str) -> EffectTerm:
     """An effect with parameters that are left out set to 0, so that one wheel of several may be eccentric.
 
     One without any parameter is left as it is.
@@ -354,4 +338,4 @@ class Simulation(Brief):
     truth: TruthRecord
     paths: Mapping[str, TruePath] = field(default_factory=dict)
     plan: FloorPlan | None = None
-    starts: Mapping[str, Array] = field(default_factory=dict)
+    starts: Mapping[str, kinematics.Array] = field(default_factory=dict)

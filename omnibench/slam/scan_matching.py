@@ -287,7 +287,7 @@ def _moved(points: Array, motions: Array) -> Array:
 _OUTLIER = 4.0  # standard deviations: a point farther from a surface does not match it
 _PARALLEL = 0.9  # least cosine between the normals of a point and of its surface
 # Standard deviations of a normal: information that so large an error explains does not count. Without it a large round
-# room seems to tell the heading (tests/slam/matching/test_slam_shapes.py).
+# room seems to tell the heading (tests/slam/matching/test_slam_matching.py).
 _FEIGNED = 4.0
 _GRAZING = 0.25  # least share of a range's variance across a surface that is seen at a grazing angle
 

@@ -17,39 +17,14 @@ import numpy as np
 import plotly.graph_objects as go
 
 from omnibench.compare.report.view import interval_in_words
-from omnibench.report.blocks import (
-    Block,
-    Callout,
-    Cell,
-    Choice,
-    Column,
-    Document,
-    Fact,
-    Figure,
-    FigureGrid,
-    LegendItem,
-    Paragraph,
-    Row,
-    Section,
-    Table,
-    answer_section,
-    simulated_badge,
-)
+from omnibench.report import blocks as page
 from omnibench.report.figures import joined, line, marks
 from omnibench.report.numbers import NOTHING, count, fixed, listing, seconds, significant
 from omnibench.report.render import reproduction_section
 from omnibench.report.style import INK, PALETTE, QUIET, THEORETICAL, colours, logarithmic, plot, text, wrapped
 from omnibench.robot.kinematics import Robot
+from omnibench.study import study_result as results
 from omnibench.study.study_plan import AS_RECORDED
-from omnibench.study.study_result import (
-    AgainstBest,
-    MethodInCell,
-    StudyCell,
-    StudyResult,
-    mean_ratio,
-    profiles,
-    ranking,
-)
 from omnibench.words import plural
 
 _FAMILIES = {"ours": "omnibench", "published": "published", "baseline": "baseline", "other": ""}
@@ -59,9 +34,9 @@ _FAMILIES = {"ours": "omnibench", "published": "published", "baseline": "baselin
 class StudyView:
     """styles: of each method, the same in the whole report. methods: their names, in the config's order."""
 
-    result: StudyResult
+    result: results.StudyResult
     methods: tuple[str, ...]
-    styles: Mapping[str, LegendItem]
+    styles: Mapping[str, page.LegendItem]
 
     @property
     def robots(self) -> tuple[str, ...]:
@@ -72,11 +47,11 @@ class StudyView:
         """The robot called ``name`` as it was drawn."""
         return next(robot.dataset.robot for robot in self.result.robots if robot.name == name)
 
-    def judged(self, robot: str | None = None) -> tuple[StudyCell, ...]:
+    def judged(self, robot: str | None = None) -> tuple[results.StudyCell, ...]:
         """The cells that verdicts rest on, of one robot or of all."""
         return tuple(cell for cell in self.result.judged_cells if robot in (None, cell.key.robot))
 
-    def plain(self, robot: str) -> tuple[StudyCell, ...]:
+    def plain(self, robot: str) -> tuple[results.StudyCell, ...]:
         """The cells of a robot as recorded: judged ones, then training errors."""
         keys = [(cell, cell.key) for cell in self.result.cells]
         mine = [cell for cell, key in keys if key.robot == robot and key.regime == AS_RECORDED]
@@ -88,27 +63,19 @@ class StudyView:
         return _FAMILIES[families[method]]
 
 
-def study_view(result: StudyResult) -> StudyView:
-    """The view of a result."""
-    wanted = {choice.shown: THEORETICAL if choice.name == "theoretical" else None for choice in result.config.methods}
-    drawn = colours(wanted)
-    styles = {name: LegendItem(f"method-{i}", name, *drawn[name]) for i, name in enumerate(wanted)}
-    return StudyView(result, tuple(wanted), styles)
-
-
-def cell_words(cell: StudyCell) -> str:
+def cell_words(cell: results.StudyCell) -> str:
     """A cell within its robot: ``circular → square``."""
     return f"{cell.key.training} → {cell.key.judged}"
 
 
 _COLUMNS = (
-    Column("Method", numeric=False),
-    Column("Position", "mm"),
-    Column("Heading", "°"),
-    Column("Eq. (6) / design"),
-    Column("Verdict", numeric=False),
-    Column("Time", priority=1),
-    Column("What it found", numeric=False, priority=2),
+    page.Column("Method", numeric=False),
+    page.Column("Position", "mm"),
+    page.Column("Heading", "°"),
+    page.Column("Eq. (6) / design"),
+    page.Column("Verdict", numeric=False),
+    page.Column("Time", priority=1),
+    page.Column("What it found", numeric=False, priority=2),
 )
 # Blue where the design values' error falls, white where it stays, red where it grows: log2 of the ratio, cut at an
 # eighth and eight times (chosen).
@@ -118,20 +85,20 @@ _LEAST_SHARE = 0.05  # %: smaller changes of an element are rounded away
 _LABELS, _COLUMN = 320, 62  # px that the names of cells and each method need
 
 
-def robot_cells(view: StudyView, robot: str) -> Section:
+def robot_cells(view: StudyView, robot: str) -> page.Section:
     """All cells of one robot."""
     cells = view.plain(robot)
     judged = len(view.result.judged_cells)
-    tables: dict[str, tuple[Block, ...]] = {_column(cell): (cell_table(cell, view, judged),) for cell in cells}
-    return Section(
+    tables: dict[str, tuple[page.Block, ...]] = {_column(cell): (cell_table(cell, view, judged),) for cell in cells}
+    return page.Section(
         f"cells-{robot}",
         robot,
-        (heat_map(view, robot), Choice("Cell", tables)),
+        (heat_map(view, robot), page.Choice("Cell", tables)),
         about="Method by cell, against the design.",
     )
 
 
-def heat_map(view: StudyView, robot: str) -> FigureGrid:
+def heat_map(view: StudyView, robot: str) -> page.FigureGrid:
     """Ratio of every method's error to the design values' in every cell of a robot: a row a cell, a column a method."""
     cells = view.plain(robot)
     answered = [name for name in view.methods if any(_ratio(cell, name) is not None for cell in cells)]
@@ -175,10 +142,10 @@ def heat_map(view: StudyView, robot: str) -> FigureGrid:
         f"runs trained. {NOTHING}: no answer, or not asked (see the tables).{without}"
     )
     height, width = 110 + 26 * len(cells), _LABELS + _COLUMN * len(methods)
-    return FigureGrid((Figure(title, figure, described, height, width),), (), 1, caption, f"cells-{robot}")
+    return page.FigureGrid((page.Figure(title, figure, described, height, width),), (), 1, caption, f"cells-{robot}")
 
 
-def cell_table(cell: StudyCell, view: StudyView, judged: int) -> Table:
+def cell_table(cell: results.StudyCell, view: StudyView, judged: int) -> page.Table:
     """Every method in one cell, the least error first, those without an answer last. judged: cells of the family."""
     rows = sorted(cell.methods.values(), key=lambda each: (each.errors is None, each.mean("cost") or 0.0))
     answered = [each for each in rows if each.errors is not None]
@@ -190,7 +157,7 @@ def cell_table(cell: StudyCell, view: StudyView, judged: int) -> Table:
     )
     ratios = [ratio for each in answered if (ratio := cell.against_design(each.method, judged)) is not None]
     unit = f"; intervals by {ratios[0].units}" if ratios else ""
-    return Table(
+    return page.Table(
         f"{cell.key.robot}: {cell_words(cell)}",
         _COLUMNS,
         tuple(_row(each, cell, view, judged, each.method == best) for each in rows),
@@ -201,27 +168,27 @@ def cell_table(cell: StudyCell, view: StudyView, judged: int) -> Table:
     )
 
 
-def _row(each: MethodInCell, cell: StudyCell, view: StudyView, judged: int, best: bool) -> Row:
-    name = Cell(each.method, view.family(each.method))
+def _row(each: results.MethodInCell, cell: results.StudyCell, view: StudyView, judged: int, best: bool) -> page.Row:
+    name = page.Cell(each.method, view.family(each.method))
     position, heading = each.mean("position"), each.mean("heading")
     if position is None or heading is None:
-        return Row.of(name, NOTHING, NOTHING, NOTHING, each.status, NOTHING, each.reason, role="failed")
+        return page.Row.of(name, NOTHING, NOTHING, NOTHING, each.status, NOTHING, each.reason, role="failed")
     ratio = cell.against_design(each.method, judged)
     assert ratio is not None  # it has an answer
     partly = "" if each.answers == each.fits else f"{each.status}; else the design"
-    return Row.of(
+    return page.Row.of(
         name,
         fixed(1e3 * position, 1),
         fixed(math.degrees(heading), 2),
-        Cell(fixed(ratio.value, 3), interval_in_words(ratio.alone, 2)),
-        Cell("" if cell.key.fitted or ratio.equal else ratio.verdict, partly),
+        page.Cell(fixed(ratio.value, 3), interval_in_words(ratio.alone, 2)),
+        page.Cell("" if cell.key.fitted or ratio.equal else ratio.verdict, partly),
         seconds(each.seconds if view.result.config.timing else None),
-        Cell(each.numbers, _change(each, view.design(cell.key.robot))),
+        page.Cell(each.numbers, _change(each, view.design(cell.key.robot))),
         role="best" if best else "plain",
     )
 
 
-def _change(each: MethodInCell, robot: Robot) -> str:
+def _change(each: results.MethodInCell, robot: Robot) -> str:
     """Change of the elements of each row of the matrix, in % of the row's largest; empty for the design values."""
     if each.matrix is None:
         return ""
@@ -234,13 +201,13 @@ def _change(each: MethodInCell, robot: Robot) -> str:
     return f"matrix: {'; '.join(rows)} % of the row" if rows else ""
 
 
-def _is_for_none(cells: Sequence[StudyCell], method: str) -> bool:
+def _is_for_none(cells: Sequence[results.StudyCell], method: str) -> bool:
     """True if a method was asked in some cells and applicable in none."""
     asked = [cell.methods[method] for cell in cells if method in cell.methods]
     return bool(asked) and all(each.status == "not applicable" for each in asked)
 
 
-def _ratio(cell: StudyCell, method: str) -> float | None:
+def _ratio(cell: results.StudyCell, method: str) -> float | None:
     mean, design = cell.mean(method), float(cell.design["cost"].mean())
     return None if mean is None or design == 0 else mean / design
 
@@ -249,7 +216,7 @@ def _log(ratio: float | None) -> float | None:
     return None if ratio is None else float(np.clip(np.log2(max(ratio, 1e-9)), -_CUT, _CUT))
 
 
-def _column(cell: StudyCell) -> str:
+def _column(cell: results.StudyCell) -> str:
     return f"{cell_words(cell)}{' (training errors)' if cell.key.fitted else ''}"
 
 
@@ -257,31 +224,31 @@ _CURVE = re.compile(r"^(?P<kind>.+), (?P<count>\d+) runs? a command$")
 _BROKEN = 1.5  # times the method's own error as recorded, from which on it counts as broken; chosen
 
 
-def regime_section(view: StudyView) -> tuple[Section, ...]:
+def regime_section(view: StudyView) -> tuple[page.Section, ...]:
     """Which method breaks where; nothing without regimes."""
     regimes = tuple(view.result.config.regimes)
     if not regimes:
         return ()
-    tables: dict[str, tuple[Block, ...]] = {}
+    tables: dict[str, tuple[page.Block, ...]] = {}
     for robot in view.robots:
         cells = _by_regime(view, robot)
         for place, of_place in cells.items():
             if len(of_place) > 1:
                 tables[f"{robot}: {place}"] = (_regime_table(view, f"{robot}: {place}", of_place, regimes),)
-    blocks: tuple[Block, ...] = (_breaking_table(view, regimes), Choice("Cell", tables))
+    blocks: tuple[page.Block, ...] = (_breaking_table(view, regimes), page.Choice("Cell", tables))
     about = "Fewer runs, noise, outliers and drifting clocks in the training runs; those that judge stay as recorded."
-    return (Section("regimes", "Which method breaks where", blocks, about=about),)
+    return (page.Section("regimes", "Which method breaks where", blocks, about=about),)
 
 
-def _by_regime(view: StudyView, robot: str) -> dict[str, dict[str, StudyCell]]:
-    places: dict[str, dict[str, StudyCell]] = {}
+def _by_regime(view: StudyView, robot: str) -> dict[str, dict[str, results.StudyCell]]:
+    places: dict[str, dict[str, results.StudyCell]] = {}
     for cell in view.result.cells:
         if cell.key.robot == robot and not cell.key.fitted:
             places.setdefault(cell_words(cell), {})[cell.key.regime] = cell
     return places
 
 
-def _breaking_table(view: StudyView, regimes: Sequence[str]) -> Table:
+def _breaking_table(view: StudyView, regimes: Sequence[str]) -> page.Table:
     """Over all cells: geometric mean of a method's error as a multiple of its own as recorded."""
     rows = []
     for method in view.methods:
@@ -298,17 +265,17 @@ def _breaking_table(view: StudyView, regimes: Sequence[str]) -> Table:
                 for robot in view.robots
                 for of_place in _by_regime(view, robot).values()
             )
-            if (mean := mean_ratio(ratios)) is None:
-                cells.append(Cell(NOTHING))
+            if (mean := results.mean_ratio(ratios)) is None:
+                cells.append(page.Cell(NOTHING))
                 continue
             broken = sum(ratio > _BROKEN for ratio in ratios)
             note = f"{broken} of {len(ratios)} break; {worse} worse"
-            cells.append(Cell(fixed(mean, 2), note))
+            cells.append(page.Cell(fixed(mean, 2), note))
         if any(cell.text != NOTHING for cell in cells):
-            rows.append(Row.of(method, *cells))
-    return Table(
+            rows.append(page.Row.of(method, *cells))
+    return page.Table(
         "Error as a multiple of the method's own as recorded",
-        (Column("Method", numeric=False), *(Column(regime) for regime in regimes)),
+        (page.Column("Method", numeric=False), *(page.Column(regime) for regime in regimes)),
         tuple(rows),
         f"Eq. (6), geometric mean over cells. Break: cells with more than {_BROKEN:g} times its own error as recorded; "
         "worse: with more error than the design. "
@@ -316,39 +283,41 @@ def _breaking_table(view: StudyView, regimes: Sequence[str]) -> Table:
     )
 
 
-def _regime_table(view: StudyView, title: str, of_place: Mapping[str, StudyCell], regimes: Sequence[str]) -> Table:
+def _regime_table(
+    view: StudyView, title: str, of_place: Mapping[str, results.StudyCell], regimes: Sequence[str]
+) -> page.Table:
     rows = []
     for method in view.methods:
         if method not in of_place[AS_RECORDED].methods:
             continue
         cells = [_errors(of_place.get(regime), method) for regime in (AS_RECORDED, *regimes)]
-        rows.append(Row.of(method, *cells))
-    columns = (Column("Method", numeric=False), *(Column(name, "mm") for name in (AS_RECORDED, *regimes)))
-    return Table(title, columns, tuple(rows), "Mean final position error; small print: heading.")
+        rows.append(page.Row.of(method, *cells))
+    columns = (page.Column("Method", numeric=False), *(page.Column(name, "mm") for name in (AS_RECORDED, *regimes)))
+    return page.Table(title, columns, tuple(rows), "Mean final position error; small print: heading.")
 
 
-def _errors(cell: StudyCell | None, method: str) -> Cell:
+def _errors(cell: results.StudyCell | None, method: str) -> page.Cell:
     each = None if cell is None else cell.methods.get(method)
     position, heading = (None, None) if each is None else (each.mean("position"), each.mean("heading"))
     if each is None or position is None or heading is None:
-        return Cell(NOTHING, "" if each is None else each.status)
-    return Cell(fixed(1e3 * position, 1), f"{fixed(np.degrees(heading), 2)}°")
+        return page.Cell(NOTHING, "" if each is None else each.status)
+    return page.Cell(fixed(1e3 * position, 1), f"{fixed(np.degrees(heading), 2)}°")
 
 
-def _growth(of_place: Mapping[str, StudyCell], regime: str, method: str) -> float | None:
+def _growth(of_place: Mapping[str, results.StudyCell], regime: str, method: str) -> float | None:
     before, after = (of_place[name].mean(method) if name in of_place else None for name in (AS_RECORDED, regime))
     return None if not before or not after else after / before
 
 
-def _worse_than_design(of_place: Mapping[str, StudyCell], regime: str, method: str) -> bool:
+def _worse_than_design(of_place: Mapping[str, results.StudyCell], regime: str, method: str) -> bool:
     cell = of_place.get(regime)
     mean = None if cell is None else cell.mean(method)
     return cell is not None and mean is not None and mean > float(cell.design["cost"].mean()) * (1 + 1e-9)
 
 
-def curve_section(view: StudyView) -> tuple[Section, ...]:
+def curve_section(view: StudyView) -> tuple[page.Section, ...]:
     """Learning curves; nothing where no training is on one."""
-    curves: dict[str, dict[int, StudyCell]] = {}
+    curves: dict[str, dict[int, results.StudyCell]] = {}
     for cell in view.judged():
         if match := _CURVE.match(cell.key.training):
             name = f"{cell.key.robot}: {match['kind']} → {cell.key.judged}"
@@ -359,14 +328,14 @@ def curve_section(view: StudyView) -> tuple[Section, ...]:
     figures = tuple(_curve(view, name, points) for name, points in drawn.items())
     cells = [cell for points in drawn.values() for cell in points.values()]
     shown = [name for name in view.methods if any(cell.mean(name) is not None for cell in cells)]
-    grid = FigureGrid(
+    grid = page.FigureGrid(
         figures, tuple(view.styles[name] for name in shown), 2,
         "Runs of each command that train, against the mean final error, Eq. (6), of runs that never train.", "curves",
     )  # fmt: skip
-    return (Section("curves", "Learning curves", (grid,), about="How many runs a method needs."),)
+    return (page.Section("curves", "Learning curves", (grid,), about="How many runs a method needs."),)
 
 
-def _curve(view: StudyView, name: str, points: Mapping[int, StudyCell]) -> Figure:
+def _curve(view: StudyView, name: str, points: Mapping[int, results.StudyCell]) -> page.Figure:
     counts = sorted(points)
     traces: list[go.Scatter] = []
     least, most = [], []
@@ -386,29 +355,29 @@ def _curve(view: StudyView, name: str, points: Mapping[int, StudyCell]) -> Figur
     if least:
         logarithmic(figure, "y", 0.9 * min(least), 1.1 * max(most))
     figure.update_xaxes(tickvals=counts)
-    return Figure(name, figure, f"{name}: error against {', '.join(map(str, counts))} runs of a command", 340)
+    return page.Figure(name, figure, f"{name}: error against {', '.join(map(str, counts))} runs of a command", 340)
 
 
 _VERDICTS = ("better", "undecided", "worse")
 _STYLES = {
-    "better": LegendItem("better", "less error than the best published method", PALETTE[0]),
-    "undecided": LegendItem("undecided", "chance could explain the difference", QUIET),
-    "worse": LegendItem("worse", "more error", "#c8102e"),
+    "better": page.LegendItem("better", "less error than the best published method", PALETTE[0]),
+    "undecided": page.LegendItem("undecided", "chance could explain the difference", QUIET),
+    "worse": page.LegendItem("worse", "more error", "#c8102e"),
 }
 _ROW = 20  # px of a cell
 
 
-def study_answer(view: StudyView) -> Section:
+def study_answer(view: StudyView) -> page.Section:
     """The section that the report begins with."""
     result, reference = view.result, view.result.config.reference
     compared = result.against_best
     cells, robots = len(view.judged()), len(view.robots)
     size = f"{plural(len(view.methods), 'method')}, {plural(robots, 'robot')}, {plural(cells, 'cell')}"
     asked = sum(fit.result is not None for fit in result.fits)
-    tiles = [Fact("Size", size, f"a cell: robot, training runs, judged kind; {plural(asked, 'fit')}")]
+    tiles = [page.Fact("Size", size, f"a cell: robot, training runs, judged kind; {plural(asked, 'fit')}")]
     if not compared or result.geometric_mean is None:
         words = f"{size}: every method was fitted to the same runs, and judged on runs that it had not seen."
-        return answer_section(words, tiles, None)
+        return page.answer_section(words, tiles, None)
     verdicts = [each.ratio.verdict for each in compared]
     counts = [sum(one == verdict for one in verdicts) for verdict in _VERDICTS]
     worse = str(counts[-1] or "none")
@@ -417,17 +386,17 @@ def study_answer(view: StudyView) -> Section:
         f"each cell (geometric mean of {plural(len(compared), 'cell')}); it is worse beyond chance in {worse}."
     )
     tiles += [
-        Fact("Ratio of errors, geometric mean", fixed(result.geometric_mean, 2), "below 1: less error"),
-        Fact("Better, undecided, worse", ", ".join(str(count) for count in counts), "cells, family-wise"),
+        page.Fact("Ratio of errors, geometric mean", fixed(result.geometric_mean, 2), "below 1: less error"),
+        page.Fact("Better, undecided, worse", ", ".join(str(count) for count in counts), "cells, family-wise"),
     ]
     note = (
         "The best published method is chosen after the fact in every cell, which no user could: the comparison favours "
         "it. Errors are Eq. (6), of runs that did not train."
     )
-    return answer_section(words, tiles, _chart(compared, reference or ""), Paragraph(note, "note"))
+    return page.answer_section(words, tiles, _chart(compared, reference or ""), page.Paragraph(note, "note"))
 
 
-def _chart(compared: tuple[AgainstBest, ...], reference: str) -> FigureGrid:
+def _chart(compared: tuple[results.AgainstBest, ...], reference: str) -> page.FigureGrid:
     """Ratios of errors by cell, with the interval of the family."""
     rows = list(reversed(list(enumerate(compared))))
     names = [text(f"{each.cell.key.robot}: {cell_words(each.cell)}  [{each.best}]") for each in compared]
@@ -461,10 +430,12 @@ def _chart(compared: tuple[AgainstBest, ...], reference: str) -> FigureGrid:
     title = "Beside the best published method, cell by cell"
     picture = "; ".join(_hover(each, reference) for each in compared)
     height = 90 + _ROW * len(compared)
-    return FigureGrid((Figure(title, figure, picture, height),), items, 1, caption, "against-the-best-published")
+    return page.FigureGrid(
+        (page.Figure(title, figure, picture, height),), items, 1, caption, "against-the-best-published"
+    )
 
 
-def _hover(each: AgainstBest, reference: str) -> str:
+def _hover(each: results.AgainstBest, reference: str) -> str:
     interval = interval_in_words(each.ratio.in_family, 2)
     return (
         f"{each.cell.key.words}: {reference} {fixed(each.ratio.value, 2)} x {each.best} "
@@ -475,12 +446,12 @@ def _hover(each: AgainstBest, reference: str) -> str:
 _ALL = "all robots"
 _ASKED = "cells in which every method was asked"
 _FACTORS = np.geomspace(1.0, 8.0, 80)  # multiples of the best error at which profiles are drawn; chosen
-_BAR = LegendItem("alike", "not told apart", QUIET)
+_BAR = page.LegendItem("alike", "not told apart", QUIET)
 
 
-def rank_section(view: StudyView) -> Section:
+def rank_section(view: StudyView) -> page.Section:
     """Ranks and profiles over all cells, and robot by robot."""
-    choices: dict[str, tuple[Block, ...]] = {}
+    choices: dict[str, tuple[page.Block, ...]] = {}
     asked = tuple(cell for cell in view.judged() if all(name in cell.methods for name in view.methods))
     parts = {_ALL: view.judged(), _ASKED: asked, **{name: view.judged(name) for name in view.robots}}
     if len(view.robots) == 1:
@@ -490,19 +461,19 @@ def rank_section(view: StudyView) -> Section:
     for name, cells in parts.items():
         if drawn := (*_diagram(view, cells, name), *_profiles(view, cells, name)):
             choices[name] = drawn
-    blocks: tuple[Block, ...] = (Choice("Robots", choices),)
+    blocks: tuple[page.Block, ...] = (page.Choice("Robots", choices),)
     if not choices:
-        blocks = (Paragraph("There is no cell that a method has answered.", "note"),)
+        blocks = (page.Paragraph("There is no cell that a method has answered.", "note"),)
     about = "Which method is best over many cells, and how often each is near the best."
-    return Section("ranks", "Ranks and profiles", blocks, about=about)
+    return page.Section("ranks", "Ranks and profiles", blocks, about=about)
 
 
-def _diagram(view: StudyView, cells: Sequence[StudyCell], name: str) -> tuple[Block, ...]:
+def _diagram(view: StudyView, cells: Sequence[results.StudyCell], name: str) -> tuple[page.Block, ...]:
     """The critical-difference diagram of the methods that answered in every cell."""
-    ranked = ranking(cells, view.methods)
+    ranked = results.ranking(cells, view.methods)
     if ranked is None:
         return (
-            Paragraph(
+            page.Paragraph(
                 "Fewer than three methods answered in all of these cells, or there is one cell: no ranks.", "note"
             ),
         )
@@ -525,8 +496,8 @@ def _diagram(view: StudyView, cells: Sequence[StudyCell], name: str) -> tuple[Bl
     title = f"Mean ranks of methods, {name}"
     words = ", ".join(f"{m} {fixed(r, 2)}" for m, r in zip(ranked.methods, ranked.ranks, strict=True))
     height = 90 + 24 * (rows + len(ranked.groups))
-    grid = FigureGrid(
-        (Figure(title, figure, words, height),),
+    grid = page.FigureGrid(
+        (page.Figure(title, figure, words, height),),
         (_BAR,) if ranked.groups else (),
         1,
         f"Methods that answered in all {plural(ranked.cells, 'cell')}. Bars join methods whose mean ranks differ by "
@@ -538,9 +509,9 @@ def _diagram(view: StudyView, cells: Sequence[StudyCell], name: str) -> tuple[Bl
     return (grid,)
 
 
-def _profiles(view: StudyView, cells: Sequence[StudyCell], name: str) -> tuple[Block, ...]:
+def _profiles(view: StudyView, cells: Sequence[results.StudyCell], name: str) -> tuple[page.Block, ...]:
     """Performance profiles of all methods with an answer."""
-    drawn = profiles(cells, view.methods)
+    drawn = results.profiles(cells, view.methods)
     if not drawn:
         return ()
     traces = []
@@ -562,8 +533,8 @@ def _profiles(view: StudyView, cells: Sequence[StudyCell], name: str) -> tuple[B
         "that is not for a robot has no answer in its cells, which count; one that was not asked in all of these is "
         "left out."
     )
-    grid = FigureGrid(
-        (Figure(f"Performance profiles, {name}", figure, words, 380),),
+    grid = page.FigureGrid(
+        (page.Figure(f"Performance profiles, {name}", figure, words, 380),),
         tuple(view.styles[each.method] for each in drawn),
         1,
         caption,
@@ -575,16 +546,20 @@ def _profiles(view: StudyView, cells: Sequence[StudyCell], name: str) -> tuple[B
 _SHOWN = 12  # failures that are listed; the others are counted
 
 
-def study_document(result: StudyResult) -> Document:
+def study_document(result: results.StudyResult) -> page.Document:
     """The report as blocks."""
-    view = study_view(result)
-    return Document(
+    # A method has the same colour and line in the whole report
+    wanted = {choice.shown: THEORETICAL if choice.name == "theoretical" else None for choice in result.config.methods}
+    drawn = colours(wanted)
+    styles = {name: page.LegendItem(f"method-{i}", name, *drawn[name]) for i, name in enumerate(wanted)}
+    view = StudyView(result, tuple(wanted), styles)
+    return page.Document(
         title=f"Calibration methods on several robots: {result.config.name}",
         subtitle=result.config.description,
         sections=(
             study_answer(view),
             *_notes(result),
-            Section("cells", "Every cell", sections=tuple(robot_cells(view, robot) for robot in view.robots)),
+            page.Section("cells", "Every cell", sections=tuple(robot_cells(view, robot) for robot in view.robots)),
             rank_section(view),
             *curve_section(view),
             *regime_section(view),
@@ -592,49 +567,49 @@ def study_document(result: StudyResult) -> Document:
             _data_section(result),
             _reproduction(result),
         ),
-        badges=simulated_badge(*(robot.dataset.simulated for robot in result.robots)),
+        badges=page.simulated_badge(*(robot.dataset.simulated for robot in result.robots)),
     )
 
 
-def _notes(result: StudyResult) -> tuple[Section, ...]:
-    blocks: list[Block] = []
+def _notes(result: results.StudyResult) -> tuple[page.Section, ...]:
+    blocks: list[page.Block] = []
     if result.config.notes:
-        blocks.append(Callout("Notes of the config", result.config.notes))
+        blocks.append(page.Callout("Notes of the config", result.config.notes))
     if result.broken:
         items = tuple(f"{name}: {reason}" for name, reason in result.broken.items())
-        blocks.append(Callout("Recordings that cannot be read", items, "warning"))
+        blocks.append(page.Callout("Recordings that cannot be read", items, "warning"))
     if result.failures:
         more = len(result.failures) - _SHOWN
         rest = (f"and {more} more, see study.parquet",) if more > 0 else ()
-        blocks.append(Callout("Fits that failed", (*result.failures[:_SHOWN], *rest), "warning"))
+        blocks.append(page.Callout("Fits that failed", (*result.failures[:_SHOWN], *rest), "warning"))
     if result.warnings:
-        blocks.append(Callout("Warnings", result.warnings, "warning"))
-    return (Section("notes", "Before you rely on it", tuple(blocks)),) if blocks else ()
+        blocks.append(page.Callout("Warnings", result.warnings, "warning"))
+    return (page.Section("notes", "Before you rely on it", tuple(blocks)),) if blocks else ()
 
 
-def _method_section(view: StudyView) -> Section:
+def _method_section(view: StudyView) -> page.Section:
     """Outcomes, time and first numbers of every method, robot by robot."""
     rows = []
     for robot in view.robots:
-        rows.append(Row.of(robot, role="group"))
+        rows.append(page.Row.of(robot, role="group"))
         rows += [row for method in view.methods if (row := _method_row(view, robot, method)) is not None]
-    table = Table(
+    table = page.Table(
         "Outcomes and time",
         (
-            Column("Method", numeric=False),
-            Column("Fits"),
-            Column("Outcomes", numeric=False),
-            Column("Median time"),
-            Column("Says of its first answer, or why it has none", numeric=False),
+            page.Column("Method", numeric=False),
+            page.Column("Fits"),
+            page.Column("Outcomes", numeric=False),
+            page.Column("Median time"),
+            page.Column("Says of its first answer, or why it has none", numeric=False),
         ),
         tuple(rows),
         "Not applicable: the method is not for this robot, or not for such paths.",
     )
     about = "How each method ended on each robot, what it took and what it found."
-    return Section("methods", "Methods, time and parameters", (table,), about=about, folded=True)
+    return page.Section("methods", "Methods, time and parameters", (table,), about=about, folded=True)
 
 
-def _method_row(view: StudyView, robot: str, method: str) -> Row | None:
+def _method_row(view: StudyView, robot: str, method: str) -> page.Row | None:
     fits = [each for each in view.result.fits if each.fit.robot.name == robot and each.fit.method.shown == method]
     if not fits:
         return None
@@ -642,8 +617,8 @@ def _method_row(view: StudyView, robot: str, method: str) -> Row | None:
     answered = [each for each in fits if each.answered]
     spent = sorted(each.result.seconds for each in answered if each.result is not None)
     first = answered[0] if answered else fits[0]
-    return Row.of(
-        Cell(method, view.family(method)),
+    return page.Row.of(
+        page.Cell(method, view.family(method)),
         count(len(fits)),
         ", ".join(f"{number} {outcome}" for outcome, number in outcomes.items()),
         seconds(spent[len(spent) // 2] if spent and view.result.config.timing else None),
@@ -652,42 +627,44 @@ def _method_row(view: StudyView, robot: str, method: str) -> Row | None:
     )
 
 
-def _data_section(result: StudyResult) -> Section:
+def _data_section(result: results.StudyResult) -> page.Section:
     rows = []
     for robot in result.robots:
         dataset = robot.dataset
         sessions = {run.session for run in dataset.trajectories} - {None}
         rows.append(
-            Row.of(
-                Cell(robot.name, "simulated" if dataset.simulated else "recorded"),
+            page.Row.of(
+                page.Cell(robot.name, "simulated" if dataset.simulated else "recorded"),
                 count(len(dataset.trajectories)),
                 count(len(sessions)) if sessions else "not known",
                 listing([training.name for training in robot.trainings], 20),
-                Cell(dataset.source, dataset.licence),
+                page.Cell(dataset.source, dataset.licence),
             )
         )
     rows += [
-        Row.of(name, "", "", Cell("cannot be read", reason), "", role="failed")
+        page.Row.of(name, "", "", page.Cell("cannot be read", reason), "", role="failed")
         for name, reason in result.broken.items()
     ]
-    table = Table(
+    table = page.Table(
         "Robots",
         (
-            Column("Robot", numeric=False),
-            Column("Runs"),
-            Column("Sessions"),
-            Column("Trainings", numeric=False),
-            Column("Source", numeric=False),
+            page.Column("Robot", numeric=False),
+            page.Column("Runs"),
+            page.Column("Sessions"),
+            page.Column("Trainings", numeric=False),
+            page.Column("Source", numeric=False),
         ),
         tuple(rows),
     )
-    return Section("data", "Data", (table,), about="Where the recordings come from.", folded=True)
+    return page.Section("data", "Data", (table,), about="Where the recordings come from.", folded=True)
 
 
-def _reproduction(result: StudyResult) -> Section:
+def _reproduction(result: results.StudyResult) -> page.Section:
     config = result.config
     settings = (
-        Fact("Budget of each fit", f"{plural(config.budget.evaluations, 'evaluation')} or {config.budget.seconds:g} s"),
-        Fact("Seeds", listing([str(seed) for seed in config.seeds], 20)),
+        page.Fact(
+            "Budget of each fit", f"{plural(config.budget.evaluations, 'evaluation')} or {config.budget.seconds:g} s"
+        ),
+        page.Fact("Seeds", listing([str(seed) for seed in config.seeds], 20)),
     )
     return reproduction_section(config, settings, result.environment)

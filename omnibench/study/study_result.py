@@ -49,8 +49,8 @@ from scipy.special import stdtrit
 from scipy.stats import friedmanchisquare, rankdata, studentized_range
 
 from omnibench.environment import Environment
-from omnibench.fit.information import INTERVAL
 from omnibench.fit.ratio_intervals import FEWEST, Interval
+from omnibench.fit.trajectory_fit import INTERVAL
 from omnibench.registry import calibrators
 from omnibench.robot.kinematics import Array
 from omnibench.study.config import StudyConfig
@@ -463,19 +463,13 @@ def ranking(cells: Sequence[StudyCell], methods: Sequence[str]) -> Ranking | Non
     alike = bool(np.ptp(errors, axis=1).max() == 0)
     p_value = 1.0 if alike else float(friedmanchisquare(*errors.T).pvalue)
     ordered = ranks[order]
-    return Ranking(
-        tuple(names[index] for index in order), ordered, count, p_value, difference, _groups(ordered, difference)
-    )
-
-
-def _groups(ranks: Array, difference: float) -> tuple[tuple[int, int], ...]:
-    """The longest stretches of ordered ranks whose ends are closer than a difference."""
+    # The longest stretches of ordered ranks whose ends are closer than a difference
     spans: list[tuple[int, int]] = []
-    for first in range(len(ranks)):
-        last = int(np.searchsorted(ranks, ranks[first] + difference, side="right")) - 1
+    for first in range(len(ordered)):
+        last = int(np.searchsorted(ordered, ordered[first] + difference, side="right")) - 1
         if last > first and (not spans or last > spans[-1][1]):
             spans.append((first, last))
-    return tuple(spans)
+    return Ranking(tuple(names[index] for index in order), ordered, count, p_value, difference, tuple(spans))
 
 
 @dataclass(frozen=True, eq=False)

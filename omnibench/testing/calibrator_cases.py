@@ -20,21 +20,13 @@ from omnibench.fit.parameterisation import ParameterisationName
 from omnibench.fit.problem import BudgetSpent, CalibrationProblem
 from omnibench.registry import calibrators, costs
 from omnibench.robot.kinematics import Array, Robot
+from omnibench.testing import synthetic
 from omnibench.testing.conformance import (
     Conformance,
     Nonconformance,
     global_random_fingerprint,
     global_random_state,
     require,
-)
-from omnibench.testing.synthetic import (
-    ObservedProblem,
-    Runaway,
-    synthetic_problem,
-    synthetic_robot,
-    synthetic_robots,
-    synthetic_trajectories,
-    true_robot,
 )
 from omnibench.words import plural
 
@@ -105,14 +97,14 @@ class CostConformance(Conformance):
     def test_exact_recordings_cost_nothing(self) -> None:
         """The true matrix costs 0 on recordings without noise, the design matrix more."""
         cost: Cost = self.make()
-        robot = synthetic_robot()
-        runs = synthetic_trajectories(robot)
+        robot = synthetic.synthetic_robot()
+        runs = synthetic.synthetic_trajectories(robot)
         batch, reference = cost.batch(runs, "arc"), cost.reference(runs)
         require(
             reference.shape == (len(batch.trajectory), 3),
             f"reference gives {reference.shape[0]} poses for the {len(batch.trajectory)} stamps of batch",
         )
-        matrices = np.array([true_robot(robot).inverse_kinematic_matrix, robot.inverse_kinematic_matrix])
+        matrices = np.array([synthetic.true_robot(robot).inverse_kinematic_matrix, robot.inverse_kinematic_matrix])
         true, design = cost.combine(batch.poses(matrices) - reference, batch.trajectory)
         require(true <= 1e-9, f"the true matrix costs {true:.4g} on recordings without noise")
         require(design > true, "the design matrix costs no more than the true one")
@@ -127,7 +119,7 @@ class Attempt:
     """
 
     result: RunResult
-    problem: ObservedProblem
+    problem: synthetic.ObservedProblem
     solution: Any
     error: Exception | None
     uncounted: int
@@ -149,26 +141,28 @@ class CalibratorConformance(Conformance):
     solved: ClassVar[float] = 1.0
     evaluations: ClassVar[int] = 20_000
 
-    def problem(self, parameterisation: ParameterisationName | None = None, **changes: Any) -> ObservedProblem:
+    def problem(
+        self, parameterisation: ParameterisationName | None = None, **changes: Any
+    ) -> synthetic.ObservedProblem:
         """A synthetic problem in the calibrator's own parameterisation; see ``synthetic_problem``."""
         calibrator = self.make()
         if "wheels" not in changes:
-            robot = next((robot for robot in synthetic_robots() if calibrator.applies(robot)), None)
-            names = ", ".join(robot.name for robot in synthetic_robots())
+            robot = next((robot for robot in synthetic.synthetic_robots() if calibrator.applies(robot)), None)
+            names = ", ".join(robot.name for robot in synthetic.synthetic_robots())
             require(
                 robot is not None,
                 f"applies() is false for every synthetic robot ({names}), so nothing can be tested",
             )
             changes = {"robot": robot} | changes
-        return synthetic_problem(parameterisation or calibrator.parameterisation, **changes)
+        return synthetic.synthetic_problem(parameterisation or calibrator.parameterisation, **changes)
 
-    def attempt(self, problem: ObservedProblem, calibrator: Calibrator | None = None) -> Attempt:
+    def attempt(self, problem: synthetic.ObservedProblem, calibrator: Calibrator | None = None) -> Attempt:
         """Run the calibrator; Nonconformance if it raises a forbidden exception or does not end."""
         calibrator = calibrator or self.make()
         watched = (_Watching if calibrator.bounded else _WatchingUnbounded)(calibrator)
         try:
             result = run_calibrator(watched, problem)
-        except Runaway:
+        except synthetic.Runaway:
             require(False, f"it went on for {problem.refusals} calls after BudgetSpent; let that exception through")
         if watched.error is not None and not isinstance(watched.error, BudgetSpent | OmnibenchError):
             require(False, f"calibrate raised {type(watched.error).__name__}: {watched.error}")
@@ -294,7 +288,7 @@ class CalibratorConformance(Conformance):
 
     def test_four_wheels_work(self) -> None:
         """The number of elements may differ from nine."""
-        if not self.make().applies(synthetic_robot(4)):
+        if not self.make().applies(synthetic.synthetic_robot(4)):
             raise SkipTest(f"it is for {self.make().only_for or 'other robots'}")
         attempt = self.attempt(self.problem(wheels=4))
         if self.make().bounded:
@@ -324,7 +318,7 @@ class _Watching(Calibrator):
         return self.inner.applies(robot)
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
-        assert isinstance(problem, ObservedProblem)
+        assert isinstance(problem, synthetic.ObservedProblem)
         before = problem.uncounted
         try:
             self.solution = self.inner.calibrate(problem)

@@ -12,15 +12,7 @@ from unittest import SkipTest
 import numpy as np
 
 from omnibench.registry import effects
-from omnibench.robot.effects.effect import (
-    ActuatorEffect,
-    Effect,
-    MotionEffect,
-    Need,
-    Parameter,
-    ReferenceEffect,
-    Values,
-)
+from omnibench.robot.effects import effect as contract
 from omnibench.robot.kinematics import Array, Robot, in_the_middle
 from omnibench.robot.signals import Caster, Signals, SteeringGears
 from omnibench.testing.conformance import Conformance, global_random_fingerprint, global_random_state, require
@@ -30,9 +22,9 @@ PERIOD: Final = 0.01  # s, of the wheel samples
 SAMPLES: Final = 200
 SESSIONS: Final = ("morning", "evening")
 _KINDS = {
-    "MotionEffect": (MotionEffect, ("wheel", "steering", "clock", "body", "world")),
-    "ReferenceEffect": (ReferenceEffect, ("reference",)),
-    "ActuatorEffect": (ActuatorEffect, ("actuator",)),
+    "MotionEffect": (contract.MotionEffect, ("wheel", "steering", "clock", "body", "world")),
+    "ReferenceEffect": (contract.ReferenceEffect, ("reference",)),
+    "ActuatorEffect": (contract.ActuatorEffect, ("actuator",)),
 }
 _OPTIONAL = {"wheel_angles", "session_time", "session", "poses", "steering_side", "caster_rates"}
 _ROUNDING = 1e-9  # relative to the largest value
@@ -76,13 +68,13 @@ def driven_signals(robot: Robot, samples: int = SAMPLES, speed: float = 1.0) -> 
     )
 
 
-def robots(effect: Effect) -> tuple[Robot, ...]:
+def robots(effect: contract.Effect) -> tuple[Robot, ...]:
     """A robot on three omni wheels and one on four; robots on other wheels for an effect that applies to neither."""
     applies = tuple(robot for robot in synthetic_robots() if effect.applies(robot))
     return tuple(robot for robot in applies if robot.name in _OMNI) or applies
 
 
-def trial_values(effect: Effect, robot: Robot, seed: int = 0) -> Iterator[Values]:
+def trial_values(effect: contract.Effect, robot: Robot, seed: int = 0) -> Iterator[contract.Values]:
     """Parameters within their ranges, once for each choice of those that have choices."""
     rng = np.random.default_rng(seed)
     parameters = effect.parameters(robot, SESSIONS)
@@ -93,22 +85,22 @@ def trial_values(effect: Effect, robot: Robot, seed: int = 0) -> Iterator[Values
         yield {item.name: chosen[item.name] if item.choices else free[item.name] for item in parameters}
 
 
-def trials(effect: Effect) -> Iterator[tuple[Robot, Values]]:
+def trials(effect: contract.Effect) -> Iterator[tuple[Robot, contract.Values]]:
     """Every trial robot with its trial parameters."""
     return ((robot, values) for robot in robots(effect) for values in trial_values(effect, robot))
 
 
-def without(effect: Effect, robot: Robot, values: Values) -> Values:
+def without(effect: contract.Effect, robot: Robot, values: contract.Values) -> contract.Values:
     """The values with every parameter that has no choices set to 0, at which the effect changes nothing."""
     shapes = {item.name for item in effect.parameters(robot, SESSIONS) if item.choices}
     return {name: value if name in shapes else 0.0 for name, value in values.items()}
 
 
-def trial_input(effect: Effect, robot: Robot, speed: float = 1.0, samples: int = SAMPLES) -> Input:
+def trial_input(effect: contract.Effect, robot: Robot, speed: float = 1.0, samples: int = SAMPLES) -> Input:
     """Input for an effect of this kind; speed as for ``driven_signals``."""
-    if isinstance(effect, MotionEffect):
+    if isinstance(effect, contract.MotionEffect):
         return driven_signals(robot, samples, speed)
-    if isinstance(effect, ActuatorEffect):
+    if isinstance(effect, contract.ActuatorEffect):
         return motor_input(robot, samples, speed)
     poses = trial_poses(samples)
     return 0.25 * np.arange(1, samples + 1), poses[0] + speed * (poses - poses[0]), poses[0]
@@ -125,17 +117,17 @@ def motor_input(robot: Robot, samples: int = SAMPLES, speed: float = 1.0) -> Mot
     return np.full(samples, PERIOD), driven_signals(robot, samples, speed).rates
 
 
-def results(effect: Effect, inputs: Input, values: Values) -> dict[str, Array]:
+def results(effect: contract.Effect, inputs: Input, values: contract.Values) -> dict[str, Array]:
     """Results of the effect's methods, by name; an effect that has weights gets its trial weights."""
     if isinstance(inputs, Signals):
         if effect.weighted:
             effect = effect.with_weights(effect.trial_weights(inputs.robot), inputs.robot, f"effect {effect.name!r}")
-        assert isinstance(effect, MotionEffect)
+        assert isinstance(effect, contract.MotionEffect)
         return {"correction": effect.correction(inputs, values)}
     if len(inputs) == 2:
-        assert isinstance(effect, ActuatorEffect)
+        assert isinstance(effect, contract.ActuatorEffect)
         return {"driven": effect.driven(inputs[0], inputs[1], values)}
-    assert isinstance(effect, ReferenceEffect)
+    assert isinstance(effect, contract.ReferenceEffect)
     stamps, poses, start = inputs
     position, heading = effect.delays(stamps, values)
     return {
@@ -146,7 +138,7 @@ def results(effect: Effect, inputs: Input, values: Values) -> dict[str, Array]:
     }
 
 
-def changes(effect: Effect, inputs: Input, values: Values) -> Array:
+def changes(effect: contract.Effect, inputs: Input, values: contract.Values) -> Array:
     """Changes by the effect: of wheel rates or twists (F, n), or of delays and poses, reported and corrected (K, 8)."""
     outputs = results(effect, inputs, values)
     changed = {"driven": inputs[1], "reported": inputs[1], "corrected": inputs[1]} if isinstance(inputs, tuple) else {}
@@ -200,14 +192,14 @@ class EffectConformance(Conformance):
 
     def test_needs_are_known(self) -> None:
         """``needs`` holds names of the contract only."""
-        unknown = set(self.make().needs) - set(get_args(Need))
-        require(not unknown, f"needs holds {sorted(map(str, unknown))}; known are {', '.join(get_args(Need))}")
+        unknown = set(self.make().needs) - set(get_args(contract.Need))
+        require(not unknown, f"needs holds {sorted(map(str, unknown))}; known are {', '.join(get_args(contract.Need))}")
 
     def test_parameters_have_units_and_plausible_ranges(self) -> None:
         """Every parameter has a unit, a description and a finite range."""
         for robot in robots(self.make()):
             parameters = self.make().parameters(robot, SESSIONS)
-            valid = isinstance(parameters, tuple) and all(isinstance(item, Parameter) for item in parameters)
+            valid = isinstance(parameters, tuple) and all(isinstance(item, contract.Parameter) for item in parameters)
             require(valid, "parameters must give a tuple of Parameter")
             require(
                 any(not item.choices for item in parameters), "it needs a parameter without choices, 0 for no effect"
@@ -268,10 +260,10 @@ class EffectConformance(Conformance):
     def test_it_is_linear_in_its_parameters(self) -> None:
         """Fits and ``discover`` rely on it; parameters with choices are exempt."""
         effect = self.make()
-        if isinstance(effect, ActuatorEffect):
+        if isinstance(effect, contract.ActuatorEffect):
             raise SkipTest("only for effects that are fitted")
         # reported poses need be linear for small parameters only: rotations are not linear in their angle
-        size, tolerance = (1.0, _ROUNDING) if isinstance(effect, MotionEffect) else (1e-5, 1e-3)
+        size, tolerance = (1.0, _ROUNDING) if isinstance(effect, contract.MotionEffect) else (1e-5, 1e-3)
         for robot in robots(effect):
             inputs = trial_input(effect, robot)
             for first, second in zip(trial_values(effect, robot, 1), trial_values(effect, robot, 2), strict=True):
@@ -323,7 +315,7 @@ class EffectConformance(Conformance):
     def test_needs_names_all_that_is_used(self) -> None:
         """It works on recordings that lack everything which ``needs`` does not name."""
         effect = self.make()
-        if not isinstance(effect, MotionEffect):
+        if not isinstance(effect, contract.MotionEffect):
             raise SkipTest("only for effects of motion")
         unused = _OPTIONAL - set(effect.needs)
         bare: dict[str, Any] = dict.fromkeys(unused)
@@ -337,7 +329,7 @@ class EffectConformance(Conformance):
     def test_corrected_poses_are_the_true_ones(self) -> None:
         """``corrected`` is the inverse of ``reported``."""
         effect = self.make()
-        if not isinstance(effect, ReferenceEffect):
+        if not isinstance(effect, contract.ReferenceEffect):
             raise SkipTest("only for effects of the reference")
         poses = trial_poses()
         for _, values in trials(effect):
@@ -348,7 +340,7 @@ class EffectConformance(Conformance):
     def test_motors_are_causal(self) -> None:
         """Wheel rates depend on earlier targets only, and are 0 until the first target."""
         effect = self.make()
-        if not isinstance(effect, ActuatorEffect):
+        if not isinstance(effect, contract.ActuatorEffect):
             raise SkipTest("only for effects of the motors")
         for robot, values in trials(effect):
             durations, targets = motor_input(robot)

@@ -28,7 +28,7 @@ from omnibench.data.references import Reference, References
 from omnibench.fit.evaluate import command_names
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import DrivenPath, WheelLog
-from omnibench.simulate.simulate import simulate_dataset
+from omnibench.simulate.source import simulate_dataset
 
 Change = Callable[[Trajectory], Trajectory]
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from omnibench.check.misreadings import Explained, Recorded, search
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.robot.kinematics import Array
-from omnibench.simulate.simulate import simulate_dataset
+from omnibench.simulate.source import simulate_dataset
 
 Change = Callable[[Trajectory], Trajectory]
 
@@ -40,10 +40,6 @@ def rates(change: Callable[[Array], Array]) -> Change:
 
 def poses(change: Callable[[Array], Array]) -> Change:
     return lambda run: replace(run, poses=change(run.poses))
-
-
-def steering(change: Callable[[Array], Array]) -> Change:
-    return lambda run: run if run.steering is None else replace(run, steering=change(run.steering))
 
 
 def turned(degrees: float) -> Change:
@@ -101,23 +97,6 @@ def test_exchanged_wheels_come_with_the_way_back(robot: str) -> None:
     found = explained(recorded(robot), rates(lambda values: values[:, order]))
     changes = [mistake.changes for mistakes in (found.mistakes, *found.alike) for mistake in mistakes]
     assert {"wheel_order": order} in changes
-
-
-@pytest.mark.parametrize(
-    ("change", "kind", "robot"),
-    [
-        pytest.param(change, kind, robot, id=f"{kind}-{robot}", marks=[pytest.mark.slow] * (robot != quick))
-        for quick, kind, change in (
-            ("tricycle", "steering_sign", steering(np.negative)),
-            ("car", "steering_unit", steering(np.degrees)),
-            ("tricycle", "steering_zero", steering(lambda angles: angles + math.radians(14))),
-        )
-        for robot in ("tricycle", "car", "swerve")
-    ],
-)
-def test_misread_steering_angles_are_named(change: Change, kind: str, robot: str) -> None:
-    found = explained(recorded(robot), change)
-    assert kind in {mistake.kind for mistakes in (found.mistakes, *found.alike) for mistake in mistakes}
 
 
 @settings(max_examples=8, deadline=None)

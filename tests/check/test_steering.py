@@ -20,7 +20,7 @@ from omnibench.data.dataset import Dataset, make_dataset
 from omnibench.data.finding import Finding
 from omnibench.robot.kinematics import Array
 from omnibench.simulate.config import FlowerConfig
-from omnibench.simulate.simulate import simulate_dataset
+from omnibench.simulate.source import simulate_dataset
 
 STEERED = {"tricycle": ("front",), "car": ("fl", "fr"), "swerve": ("fl", "fr", "rl", "rr")}
 WHEELS = {"diff": 2, "tricycle": 1, "car": 2, "swerve": 4, "skid": 4, "mecanum": 4}

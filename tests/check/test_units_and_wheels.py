@@ -21,7 +21,7 @@ from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.finding import Finding
 from omnibench.robot.kinematics import Array
 from omnibench.simulate.config import FlowerConfig
-from omnibench.simulate.simulate import simulate_dataset
+from omnibench.simulate.source import simulate_dataset
 
 RPM = 2 * math.pi / 60
 Change = Callable[[Trajectory], Trajectory]

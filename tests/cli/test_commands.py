@@ -21,7 +21,6 @@ from commands import (
     Prepared,
     Printed,
     assert_refused,
-    run_here,
     succeeded,
     write_config,
     write_plugin,
@@ -31,7 +30,6 @@ from recording_samples import sample
 from timing import PATIENCE
 
 from omnibench.data.storage import load_dataset, save_dataset
-from omnibench.fit.span import driven_span
 from omnibench.robot.calibration import EffectTerm, read_calibration, write_calibration
 from omnibench.robot.kinematics import published_matrix
 from omnibench.testing.synthetic import synthetic_robot
@@ -228,15 +226,6 @@ def test_export_to_ros2_says_what_its_parameters_cannot_hold(command: Command, p
     assert printed.stderr.startswith("warning: ")
 
 
-def test_simulate_writes_the_truth_to_its_own_folder_only(prepared: Prepared) -> None:
-    truth = yaml.safe_load((prepared.truth / "truth.yaml").read_text())
-    assert np.array_equal(truth["matrix"], published_matrix("palacin2023_eq8"))
-    assert {file.name for file in prepared.data.iterdir()} == {
-        *("dataset.yaml", "trajectories.parquet", "wheels.parquet", "poses.parquet")
-    }
-    assert "palacin" not in (prepared.data / "dataset.yaml").read_text()
-
-
 @pytest.mark.slow
 def test_import_turns_recordings_into_a_data_set(command: Command, tmp_path: Path) -> None:
     source = RECORDINGS / "optiodom" / "omni3"
@@ -305,42 +294,6 @@ def test_design_prints_one_document_and_writes_its_report(command: Command, tmp_
     assert json.loads((tmp_path / "out" / "design.json").read_text(encoding="utf-8")) == found
     assert found["sets"][0]["step"]["efficiency"] > 0.99
     assert (tmp_path / "out" / "report.html").stat().st_size > 10_000
-
-
-@pytest.fixture(scope="module")
-def mecanum(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with simulated data of four mecanum wheels, the hidden truth and a calibration."""
-    folder = tmp_path_factory.mktemp("mecanum")
-    for arguments in (
-        ("simulate", CONFIGS / "mecanum.yaml", "-o", folder / "data", "--truth", folder / "truth"),
-        ("calibrate", folder / "data", "-o", folder / "calibration.yaml"),
-    ):
-        succeeded(run_here(*arguments, cwd=folder))
-    return folder
-
-
-def test_four_wheels_are_calibrated_to_the_hidden_matrix_where_they_were_driven(mecanum: Path) -> None:
-    truth = np.array(yaml.safe_load((mecanum / "truth" / "truth.yaml").read_text())["matrix"])
-    calibration = read_calibration(mecanum / "calibration.yaml")
-    dataset = load_dataset(mecanum / "data")
-    span = driven_span(dataset.split("train"))
-    design = dataset.robot.inverse_kinematic_matrix
-    assert truth.shape == calibration.matrix_array.shape == (3, 4)
-    on_span, size = span.driven.T @ span.driven, np.abs(truth).max(axis=1)
-    missed = np.abs((calibration.matrix_array - truth) @ on_span).max(axis=1) / size
-    to_be_found = np.abs((design - truth) @ on_span).max(axis=1) / size
-    assert missed.max() < 0.003
-    assert to_be_found.min() > 0.015
-    assert np.abs((calibration.matrix_array - design) @ span.null.T).max() < 1e-12
-    assert np.abs((truth - design) @ span.null.T).max() > 1e-4  # which the data cannot tell
-
-
-def test_inspection_names_the_direction_that_was_not_driven(command: Command, mecanum: Path) -> None:
-    found = document(command("inspect", mecanum / "data", "--json"))
-    assert found["undriven"] == ["fl - fr - rl + rr"]
-    assert found["driven_directions"] == 3
-    shown = command("inspect", mecanum / "data").stdout
-    assert "no run drives the wheels along fl - fr - rl + rr, as for any robot on four wheels" in shown
 
 
 QUICK = ("inspect", "{data}", "--report", "out/report.html")

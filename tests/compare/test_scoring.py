@@ -1,4 +1,4 @@
-"""From an answer to its row and file: gaps within one box, costs of plug-ins, effects beside the matrix."""
+"""Scores of a comparison: costs, statistics, losses and certificates."""
 
 from __future__ import annotations
 
@@ -9,19 +9,26 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import compared_here, flower, prepare, refused, small, write_plugin
+from commands import compared_here, flower, prepare, refused, search, small, summary, write_plugin
+from contamination import with_jumps
 from numpy.typing import NDArray
+from report_page import on_terminal
+from report_samples import page, run, usual
 
-from omnibench.compare.config import CompareConfig, effective_config
-from omnibench.compare.plan import PlannedRun, load_datasets, make_plan
-from omnibench.compare.result import RunRecord
-from omnibench.compare.scoring import SplitScorer, heading_error, position_error, score
-from omnibench.data.dataset import make_dataset
+from omnibench.cli.terminal.comparison_tables import print_result
+from omnibench.compare.config import Bootstrap, CertificateChoice, CompareConfig, effective_config
+from omnibench.compare.plan import PlannedRun, SearchSpace, load_datasets, make_plan
+from omnibench.compare.result import ComparisonResult, EntryStatistics, RunRecord, ScoredRun, SplitScore
+from omnibench.compare.run import SplitScorer, heading_error, position_error, score
+from omnibench.compare.statistics import NEGLIGIBLE_SHARE, entry_statistics
+from omnibench.data.dataset import Dataset, Split, make_dataset
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import PluginError
+from omnibench.fit.calibrate import calibrate
 from omnibench.fit.calibrator import Outcome, RunResult, run_calibrator
-from omnibench.fit.cost import Cost
+from omnibench.fit.cost import Cost, SumOfNorms
 from omnibench.fit.evaluate import evaluate
+from omnibench.fit.ratio_intervals import Interval, Units
 from omnibench.registry import calibrators, costs, effects
 from omnibench.robot.calibration import EffectTerm, ModelExtension, read_calibration
 from omnibench.robot.kinematics import Array, Robot, published_matrix
@@ -105,13 +112,6 @@ def test_a_gap_is_measured_from_the_optimum_of_the_same_box_or_of_one_that_conta
     rows = records(entries, shares).values()
     assert tuple(row.gap_box for row in rows) == gap_boxes
     assert all((row.gap is None) == (row.gap_box is None) for row in rows)
-
-
-def test_each_box_has_its_own_optimum() -> None:
-    entries = ["closed_form", entry("closed_form", "paper"), "crs", entry("crs", "paper")]
-    rows = records(entries, (0.0, 0.05, 0.1, 0.1))
-    assert (rows["crs"].gap_box, rows["crs (paper box)"].gap_box) == ("row", "paper")
-    assert rows["crs"].gap != rows["crs (paper box)"].gap
 
 
 def test_no_gap_is_measured_against_an_optimum_that_was_not_reached() -> None:
@@ -277,3 +277,307 @@ def test_an_effect_that_does_not_act_on_a_run_is_a_failed_row() -> None:
     (scored,) = score(config, [replace(run, dataset=bare)], [extended], datasets | {run.dataset_name: bare})
     assert scored.record.outcome == Outcome.FAILED
     assert "effect 'wheel_eccentricity' needs" in scored.record.reason
+
+
+# Statistics of entries: what intervals cover, what is paired, what is practically equal.
+
+BOOTSTRAP = Bootstrap(resamples=1000, seed=3)
+
+
+def scored(
+    label: str,
+    train: Array | None,
+    validation: Array | None = None,
+    *,
+    seed: int = 1,
+    dataset: str = "flower",
+    theoretical: Array | None = None,
+    gap: float | None = None,
+    evaluations: int = 10,
+) -> ScoredRun:
+    """A run whose trajectories have these costs; None: no answer."""
+    design = np.ones(8 if train is None else len(train)) if theoretical is None else theoretical
+    answered = Outcome.FAILED if train is None else Outcome.CONVERGED
+    names = {"dataset": dataset, "label": label, "calibrator": "crs", "parameterisation": "matrix", "box": "row"}
+    counts = {"seed": seed, "evaluations": evaluations, "seconds": 1.0}
+    measures = {
+        "train_cost": None if train is None else float(train.mean()),
+        "validation_cost": None if validation is None else float(validation.mean()),
+        "theoretical_train_cost": float(design.mean()),
+        "theoretical_validation_cost": None if validation is None else float(design.mean()),
+        "gap": gap,
+    }
+    others = {"options": {}, "outcome": answered, "reason": "", "at_bounds": (), "held": ()}
+    record = RunRecord(**dict.fromkeys(RunRecord.model_fields) | names | counts | measures | others)
+    costs: dict[Split, Array | None] = {"train": train, "validation": validation}
+    scores = {split: split_score(values) for split, values in costs.items() if values is not None}
+    designs: dict[Split, SplitScore] = {"train": split_score(design)}
+    if validation is not None:
+        designs["validation"] = split_score(design)
+    return ScoredRun(record, SearchSpace("matrix", "row", bounded=True), (), scores, designs)
+
+
+def split_score(costs: Array) -> SplitScore:
+    units = Units("run", np.arange(len(costs)))
+    return SplitScore(float(costs.mean()), costs, np.zeros((len(costs), 3)), units, SumOfNorms.rounding)
+
+
+def train_cost(entry: EntryStatistics) -> Interval:
+    cost = entry.cost("train")
+    assert cost is not None
+    return cost
+
+
+def of(runs: list[ScoredRun], bootstrap: Bootstrap = BOOTSTRAP) -> dict[str, EntryStatistics]:
+    return {entry.label: entry for entry in entry_statistics(runs, bootstrap)}
+
+
+def test_the_same_seed_draws_the_same_intervals() -> None:
+    runs = [scored("a", np.random.default_rng(6).normal(5.0, 1.0, 40))]
+    assert entry_statistics(runs, BOOTSTRAP) == entry_statistics(runs, BOOTSTRAP)
+    assert entry_statistics(runs, BOOTSTRAP) != entry_statistics(runs, Bootstrap(resamples=1000, seed=4))
+
+
+def test_an_interval_is_as_wide_as_the_standard_error_says() -> None:
+    costs = np.random.default_rng(1).normal(5.0, 1.0, 400)
+    entry = of([scored("a", costs)], Bootstrap(resamples=20_000))["a"]
+    train = train_cost(entry)
+    error = costs.std(ddof=1) / np.sqrt(400)
+    assert train.value == pytest.approx(costs.mean())
+    assert train.low == pytest.approx(costs.mean() - 1.96 * error, abs=0.05 * error)
+    assert train.high == pytest.approx(costs.mean() + 1.96 * error, abs=0.05 * error)
+
+
+def test_the_interval_of_an_improvement_pairs_each_trajectory_with_its_own_theoretical_cost() -> None:
+    theoretical = np.array([1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0])
+    entry = of([scored("a", 0.25 * theoretical, theoretical=theoretical)])["a"]
+    improvement = entry.improvement("train")
+    assert improvement is not None
+    assert (improvement.value, improvement.low, improvement.high) == (
+        pytest.approx(0.75),
+        pytest.approx(0.75),
+        pytest.approx(0.75),
+    )
+
+
+def test_a_difference_is_paired_by_trajectory() -> None:
+    rng = np.random.default_rng(2)
+    hard_and_easy = rng.uniform(1.0, 100.0, 50)
+    entries = of([scored("best", hard_and_easy), scored("other", hard_and_easy + rng.normal(0.5, 0.05, 50))])
+    difference = entries["other"].difference
+    assert difference is not None
+    assert difference.value == pytest.approx(0.5, abs=0.05)
+    assert difference.high - difference.low < 0.1  # unpaired it would be about 20
+    assert entries["other"].practically_equal is False
+
+
+def test_the_best_entry_has_the_lowest_validation_cost_not_the_lowest_training_cost() -> None:
+    entries = of([scored("a", np.full(8, 1.0), np.full(8, 3.0)), scored("b", np.full(8, 2.0), np.full(8, 2.0))])
+    assert (entries["a"].is_best, entries["b"].is_best) == (False, True)
+    difference = entries["a"].difference
+    assert difference is not None
+    assert difference.value == pytest.approx(1.0)
+    best = entries["b"].difference
+    assert best is not None
+    assert (best.value, best.low, best.high) == (0.0, 0.0, 0.0)
+    assert entries["b"].practically_equal is True
+
+
+def test_between_entries_within_the_noise_the_training_cost_decides_which_is_best() -> None:
+    noise = np.random.default_rng(0).normal(size=100)
+    lowest = scored("lowest", np.full(100, 2.0), 2 + 0.1 * noise)
+    level = scored("level", np.full(100, 1.0), 2 + 0.1 * noise + 1e-4)
+    worse = scored("worse", np.full(100, 0.5), 3 + 0.1 * noise)
+    entries = of([lowest, level, worse])
+    assert [label for label, entry in entries.items() if entry.is_best] == ["level"]
+    assert (entries["lowest"].practically_equal, entries["worse"].practically_equal) == (True, False)
+
+
+def test_without_validation_data_the_training_cost_decides_for_every_data_set_apart() -> None:
+    runs = [scored("a", np.full(8, cost), dataset=name) for name, cost in (("one", 1.0), ("two", 5.0))]
+    runs += [scored("b", np.full(8, cost), dataset=name) for name, cost in (("one", 2.0), ("two", 4.0))]
+    best = {(entry.dataset, entry.label) for entry in entry_statistics(runs, BOOTSTRAP) if entry.is_best}
+    assert best == {("one", "a"), ("two", "b")}
+
+
+def test_a_difference_of_one_sign_everywhere_is_practically_equal_where_chance_explains_it() -> None:
+    more = np.array([1e-4, 2e-4, 1e-4, 3e-4, 0.05])
+    entries = of([scored("best", np.full(5, 1.0)), scored("other", 1.0 + more)])
+    difference = entries["other"].difference
+    assert difference is not None
+    assert difference.known is not None
+    assert difference.known[0] < 0 < difference.known[1] < 0.1
+    assert entries["other"].practically_equal is True
+
+
+def test_a_certain_difference_is_practically_equal_below_a_tenth_of_the_standard_error_of_the_best() -> None:
+    costs = np.random.default_rng(5).uniform(1.0, 2.0, 40)
+    limit = NEGLIGIBLE_SHARE * costs.std(ddof=1) / np.sqrt(40)
+    entries = of([scored("best", costs), scored("below", costs + 0.99 * limit), scored("above", costs + 1.01 * limit)])
+    assert entries["below"].difference is not None
+    assert entries["below"].difference.low > 0  # the interval does not contain zero
+    assert (entries["below"].practically_equal, entries["above"].practically_equal) == (True, False)
+
+
+def test_the_median_and_the_spread_are_over_seeds() -> None:
+    runs = [
+        scored("a", np.full(8, cost), seed=seed, evaluations=10 * seed) for seed, cost in enumerate((5, 1, 3, 9, 2), 1)
+    ]
+    entry = of(runs)["a"]
+    assert (entry.train_median, entry.train_spread, entry.evaluations_median) == (3.0, 3.0, 30.0)
+    assert (entry.runs, entry.answers) == (5, 5)
+
+
+@pytest.mark.parametrize(("costs", "seed"), [((5.0, 1.0, 3.0), 3), ((5.0, 1.0), 1)])
+def test_the_typical_run_has_the_median_training_cost_and_of_two_the_worse(costs: tuple[float, ...], seed: int) -> None:
+    entry = of([scored("a", np.full(8, cost), seed=seed) for seed, cost in enumerate(costs, 1)])["a"]
+    assert entry.typical is not None
+    assert entry.typical.record.seed == seed
+
+
+def test_runs_without_an_answer_are_counted_and_left_out() -> None:
+    entry = of([scored("a", None, seed=1), scored("a", np.full(8, 2.0), seed=2)])["a"]
+    assert (entry.runs, entry.answers, entry.train_median) == (2, 1, 2.0)
+    assert entry.typical is not None
+    assert entry.typical.record.seed == 2
+
+
+def test_an_entry_without_any_answer_has_no_statistics_and_is_never_best() -> None:
+    entry = of([scored("a", None), scored("b", np.full(8, 2.0))])["a"]
+    assert (entry.typical, entry.cost("train"), entry.train_median, entry.difference) == (None, None, None, None)
+    assert (entry.practically_equal, entry.is_best) == (None, False)
+
+
+def test_the_gap_of_an_entry_is_the_median_of_its_runs() -> None:
+    runs = [scored("a", np.full(8, 1.0), seed=seed, gap=gap) for seed, gap in enumerate((0.3, None, 0.1, 0.2))]
+    assert of(runs)["a"].gap_median == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_one_or_two_runs_have_no_interval_and_nothing_is_said_to_differ(number: int) -> None:
+    runs = [
+        scored(name, np.full(number, cost), theoretical=np.full(number, 4.0)) for name, cost in (("a", 2), ("b", 3))
+    ]
+    entries = of(runs)
+    improvement, difference = entries["a"].improvement("train"), entries["b"].difference
+    assert (train_cost(entries["a"]).value, train_cost(entries["a"]).known) == (2.0, None)
+    assert improvement is not None
+    assert (improvement.value, improvement.known) == (0.5, None)
+    assert difference is not None
+    assert (difference.known, entries["b"].practically_equal) == (None, None)
+
+
+# Comparisons with a loss that bounds the influence of reference poses that are far off.
+
+_SHARE, _OFF = 0.1, 1.0  # of the poses; m
+
+
+@pytest.fixture(scope="module")
+def jumping(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The small recordings, a tenth of whose training poses are a metre off, and comparisons of them beside them."""
+    folder = tmp_path_factory.mktemp("jumping")
+    dataset = load_dataset(prepare().data)
+    spoilt = with_jumps(dataset.split("train"), _SHARE, _OFF, np.random.default_rng(3))
+    runs = [*spoilt, *dataset.split("validation")]
+    save_dataset(make_dataset("jumping", dataset.robot, dataset.sample_period, runs, simulated=True), folder / "data")
+    return folder
+
+
+def compared(data: Path, folder: Path, **changes: object) -> ComparisonResult:
+    sets, entries = {"jumping": {"path": str(data)}}, ["theoretical", "closed_form"]
+    return compared_here(folder / str(changes["loss"]), datasets=sets, calibrators=entries, **changes)
+
+
+@pytest.fixture(scope="module")
+def squares(jumping: Path) -> ComparisonResult:
+    return compared(jumping / "data", jumping, loss="squares")
+
+
+@pytest.fixture(scope="module")
+def huber(jumping: Path) -> ComparisonResult:
+    return compared(jumping / "data", jumping, loss="huber")
+
+
+def far_ends(result: ComparisonResult) -> list[str]:
+    """Warnings of runs whose ends were taken from other poses."""
+    return [warning for warning in result.warnings if "beside it say" in warning]
+
+
+def test_a_robust_loss_is_better_on_runs_without_jumps_and_is_said(
+    squares: ComparisonResult, huber: ComparisonResult
+) -> None:
+    robust, other = (result.runs[1].record.validation_cost for result in (huber, squares))
+    assert robust is not None
+    assert other is not None
+    assert robust < other
+    assert "loss" not in summary(squares.output)
+    assert summary(huber.output)["loss"] == "huber"
+    assert huber.config.objective == "final_pose, loss huber"
+
+
+def test_answer_and_warning_are_those_of_calibrate(squares: ComparisonResult, huber: ComparisonResult) -> None:
+    dataset: Dataset = huber.datasets["jumping"]
+    alone = calibrate(dataset, loss="huber", cost="final_pose", unidentified="keep")
+    np.testing.assert_array_equal(np.array(huber.runs[1].record.matrix), alone.calibration.matrix)
+    (of_calibrate,) = (warning for warning in alone.warnings if "beside it say" in warning)
+    assert far_ends(huber) == [f"data set jumping: {of_calibrate}"]
+    assert far_ends(squares) == []
+
+
+def test_nothing_is_proven_of_a_robust_loss_and_without_jumps_no_end_is_moved(tmp_path: Path) -> None:
+    result = compared(prepare().data, tmp_path, loss="student_t", certificate={"gap": 0.5, "seconds": 5})
+    assert result.certificates == ()
+    assert far_ends(result) == []
+
+
+# A comparison proves what no optimiser can beat, and says of every run how much it could gain at most.
+
+PROVEN = {"gap": 0.05, "seconds": 1e9, "parts": 2000}
+ENTRIES = ["theoretical", "closed_form", {"name": "closed_form", "box": "paper"}, search(), "parametric"]
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> ComparisonResult:
+    return compared_here(tmp_path_factory.mktemp("proven") / "out", calibrators=ENTRIES, certificate=PROVEN)
+
+
+def test_every_box_of_matrices_has_its_bound_and_no_run_is_below_it(result: ComparisonResult) -> None:
+    assert [certificate.box for certificate in result.certificates] == ["row", "paper"]
+    for certificate in result.certificates:
+        assert certificate.finished
+        assert 0 <= certificate.gap <= 0.05
+        assert certificate.lower_bound <= certificate.best_cost
+    bounds = {certificate.box: certificate.lower_bound for certificate in result.certificates}
+    for record in (done.record for done in result.runs):
+        assert record.train_cost is not None
+        assert record.proven_gap is not None  # of a geometry in a box that contains its matrix
+        if record.box in bounds:
+            assert record.train_cost >= bounds[record.box]
+            assert record.proven_gap == pytest.approx(1 - bounds[record.box] / record.train_cost)
+
+
+def test_the_exact_optimum_has_little_to_gain_and_a_poor_search_much(result: ComparisonResult) -> None:
+    gaps = {done.record.label: done.record.proven_gap or 0.0 for done in result.runs}
+    assert gaps["closed_form"] <= 0.05
+    assert gaps["theoretical"] > 0.5
+    assert gaps["search"] > gaps["closed_form"]
+
+
+def test_terminal_and_report_say_what_is_proven(result: ComparisonResult, tmp_path: Path) -> None:
+    assert "Proven: what share of the cost" in on_terminal(print_result, result, width=200)
+    text = page(result, tmp_path).text
+    assert "What no optimiser can beat" in text
+    assert "proven: ≤" in text
+
+
+def test_a_number_of_parts_ends_a_proof_whatever_the_machine(result: ComparisonResult) -> None:
+    config = result.config.model_copy(update={"certificate": CertificateChoice(gap=1e-9, seconds=1e9, parts=5)})
+    (found,) = run(config.model_copy(update={"calibrators": config.calibrators[1:2]})).certificates
+    assert (found.parts, found.finished) == (5, False)
+
+
+def test_nothing_is_proven_where_nobody_asks_but_by_default() -> None:
+    assert usual().certificates == ()
+    assert all(done.record.proven_gap is None for done in usual().runs)
+    content = {name: value for name, value in small().items() if name != "certificate"}
+    assert CompareConfig.model_validate(content).certificate is not None

@@ -26,7 +26,7 @@ from omnibench.errors import ConfigError, DataError, OmnibenchError
 from omnibench.fit.calibrate import calibrate
 from omnibench.live.replay.concatenated_drive import concatenate_runs
 from omnibench.simulate.config import FlowerConfig
-from omnibench.simulate.simulate import simulate_dataset
+from omnibench.simulate.source import simulate_dataset
 
 T = np.arange(1, 101) * 0.02
 

@@ -19,15 +19,14 @@ from omnibench.config import validate
 from omnibench.data.dataset import Dataset, make_dataset
 from omnibench.data.storage import save_dataset
 from omnibench.design import candidates
-from omnibench.design.config import DesignConfig
-from omnibench.design.design import design_experiment
+from omnibench.design.candidates import DesignConfig
+from omnibench.design.design import Design, SetDesign, design_experiment
 from omnibench.design.report import equal_in_words, plan_in_words
-from omnibench.design.result import Design, SetDesign
 from omnibench.errors import ConfigError, DataError, OmnibenchError
-from omnibench.fit.information import information_of_runs
+from omnibench.fit.trajectory_fit import information_of_runs
 from omnibench.robot.kinematics import Array
 from omnibench.simulate.config import FlowerConfig
-from omnibench.simulate.simulate import simulate_dataset
+from omnibench.simulate.source import simulate_dataset
 
 NOISE = {"pose_position": 0.005, "pose_heading": 0.005, "bias_position": 0.008, "bias_heading": 0.008}
 
@@ -135,12 +134,6 @@ def test_an_equal_design_is_as_precise_as_the_baseline_and_one_run_less_is_not(p
     assert relative[runs] <= 1 < relative[runs - 1]
     assert [step.effort.runs for step in set_of(papers, "richer").steps] == list(range(3, 181))
     assert all(step.efficiency <= 1 + 1e-9 for found in papers.sets for step in found.steps)
-
-
-def test_deviations_fall_with_the_root_of_the_runs(papers: Design) -> None:
-    steps = {step.effort.runs: step for step in set_of(papers, "flower").steps}
-    assert steps[12].relative == pytest.approx(steps[6].relative / math.sqrt(2), rel=1e-3)
-    assert steps[12].row_percent == pytest.approx([value / math.sqrt(2) for value in steps[6].row_percent], rel=0.05)
 
 
 def test_deviations_are_those_of_the_covariance_of_the_elements(papers: Design) -> None:

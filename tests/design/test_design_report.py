@@ -15,14 +15,12 @@ from sample_robots import APR02, LEVER_MECANUM
 from syrupy.assertion import SnapshotAssertion
 
 from omnibench.cli.terminal.design_summary import print_design
-from omnibench.design.candidates import candidates_of_config, candidates_of_dataset
-from omnibench.design.config import DesignConfig
-from omnibench.design.design import design_experiment
+from omnibench.design.candidates import DesignConfig, candidates_of_config, candidates_of_dataset
+from omnibench.design.design import Design, design_experiment
 from omnibench.design.report import design_document
-from omnibench.design.result import Design
 from omnibench.report.render import write_document
 from omnibench.simulate.config import FlowerConfig
-from omnibench.simulate.simulate import simulate_dataset
+from omnibench.simulate.source import simulate_dataset
 
 STAR = {"speeds": [0.2], "directions_deg": [0, 90, 180, 270], "turn_rates": [-0.35, 0, 0.35], "distance": 1}
 SPOT = {"speed": 0, "turn_rate": 1.0, "duration": 6}

@@ -22,7 +22,7 @@ from omnibench.discover.result import (
 )
 from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.simulate.config import FlowerConfig
-from omnibench.simulate.simulate import simulate_dataset
+from omnibench.simulate.source import simulate_dataset
 
 Effects = tuple[dict[str, Any], ...]
 COUPLING: Effects = ({"name": "rotation_translation_coupling", "parameters": {"kx": 0.3, "ky": -0.2}},)

@@ -10,9 +10,8 @@ from discovery_samples import APR02
 
 from omnibench.data.dataset import Split, Trajectory
 from omnibench.discover.fitting import Extended, Fit
-from omnibench.fit.information import EstimatedCovariance
 from omnibench.fit.noise import NoiseEstimate
-from omnibench.fit.trajectory_fit import Nuisances
+from omnibench.fit.trajectory_fit import EstimatedCovariance, Nuisances
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Robot
 from omnibench.robot.model import OdometryModel

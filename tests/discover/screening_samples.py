@@ -14,7 +14,7 @@ import numpy as np
 from omnibench.discover.regressors.covariate_bases import Basis
 from omnibench.discover.regressors.significance import ColumnStore, Group
 from omnibench.discover.selection.evidence import Groups
-from omnibench.discover.selection.screening import Screening
+from omnibench.discover.selection.model_selection import Screening
 from omnibench.fit.trajectory_fit import Whitened
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import Parameter

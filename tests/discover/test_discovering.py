@@ -18,8 +18,7 @@ from omnibench.discover import discover
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.held_out import validation_runs
 from omnibench.discover.result import Discovery
-from omnibench.discover.selection.model_selection import Selection
-from omnibench.discover.selection.screening import Screening
+from omnibench.discover.selection.model_selection import Screening, Selection
 from omnibench.errors import DataError, UnknownNameError
 from omnibench.fit.evaluate import evaluate
 from omnibench.fit.trajectory_fit import Given

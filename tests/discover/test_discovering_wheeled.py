@@ -18,7 +18,7 @@ from omnibench.discover.discover import discover_effects
 from omnibench.discover.report.discovery_report import discovery_report
 from omnibench.report.render import render
 from omnibench.simulate.config import FlowerConfig
-from omnibench.simulate.simulate import simulate_dataset
+from omnibench.simulate.source import simulate_dataset
 
 WEAVE = {"variation": {"weave": 0.3, "period": 3.0}}
 RAMP = {"ramp": 0.5}

@@ -20,7 +20,7 @@ from hidden.sets import LEVELS, Kind, make_set, recorded
 from omnibench.data.dataset import Dataset, make_dataset
 from omnibench.discover.discover import discover_effects
 from omnibench.robot.calibration import read_calibration, write_calibration
-from omnibench.simulate.simulate import simulate_dataset
+from omnibench.simulate.source import simulate_dataset
 
 FEW: dict[str, Any] = {
     "commands": {"speeds": [0.2], "directions_deg": [0, 120, 240], "turn_rates": [-0.35, 0.0, 0.35]},

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 from syrupy.assertion import SnapshotAssertion
 
-from omnibench.discover.conclude import headline_of, lacks_a_name, verdict_of
+from omnibench.discover.discover import headline_of, lacks_a_name, verdict_of
 from omnibench.discover.result import CovariateDependence, NamedEffect, Verdict
 from omnibench.robot.effects.effect import Stage
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import gc
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
-from types import BuiltinFunctionType, FunctionType, MethodDescriptorType, ModuleType
 from typing import Any
 
 import numpy as np
@@ -18,7 +16,7 @@ from hypothesis import strategies as st
 from sample_robots import APR_02, CAR, DIFFERENTIAL, MECANUM, SKID, SWERVE, TRICYCLE, WHEELED
 
 from omnibench.config import validate
-from omnibench.data.dataset import Trajectory, make_dataset
+from omnibench.data.dataset import make_dataset
 from omnibench.errors import ConfigError, DataError
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.calibrator import Calibrator, Outcome, RunResult, Solution, run_calibrator, unloadable
@@ -76,21 +74,6 @@ def test_a_candidate_without_a_cost_leaves_the_others_alone(wheels: Any, paramet
     assert costs[0] == pytest.approx(problem.values(problem.start[None])[0], rel=1e-12)
     assert costs[2] == pytest.approx(costs[0], rel=1e-14)  # some processors' BLAS rounds rows of a product apart
     assert not costs[1] <= costs[0]
-
-
-def test_candidates_that_are_nan_cost_nan_and_are_never_the_best() -> None:
-    problem = make_problem()
-    assert np.isnan(problem.cost(np.full((2, 9), np.nan))).all()
-    assert problem.best_cost == np.inf
-    np.testing.assert_array_equal(problem.best_vector, problem.start)
-
-
-def test_a_candidate_outside_the_box_costs_but_is_never_the_best() -> None:
-    problem = make_problem(box="paper")
-    outside = problem.start.copy()
-    outside[0] = problem.lower[0] - 1e-6
-    assert np.isfinite(problem.cost(outside)[0])
-    assert problem.best_cost == np.inf
 
 
 def test_candidates_of_another_shape_are_a_programming_error() -> None:
@@ -218,75 +201,20 @@ def test_no_trajectories_are_refused() -> None:
         make_problem(())
 
 
-# What a module, class or function drags along is the program, not the problem's data.
-_PROGRAM = (ModuleType, type, FunctionType, BuiltinFunctionType, MethodDescriptorType)
+def test_a_calibrator_is_given_the_runs_to_train_and_no_others() -> None:
+    problems: list[CalibrationProblem] = []
 
+    @calibrators.register("spy")
+    class Spy(Calibrator):
+        """Keeps its problem; tests/compare/test_runs.py follows all that a problem leads to."""
 
-def reachable(root: object) -> Iterator[object]:
-    """Every object that attributes, items, closures and array bases lead to."""
-    seen: set[int] = set()
-    waiting: list[object] = [root]
-    while waiting:
-        item = waiting.pop()
-        if id(item) in seen:
-            continue
-        seen.add(id(item))
-        yield item
-        if isinstance(item, np.ndarray):
-            waiting.append(item.base)
-        if isinstance(item, FunctionType):
-            waiting += [cell.cell_contents for cell in item.__closure__ or ()]
-        elif not isinstance(item, _PROGRAM):
-            waiting += gc.get_referents(item)
+        def calibrate(self, problem: CalibrationProblem) -> Solution:
+            problems.append(problem)
+            return Solution(problem.start, "seen enough")
 
-
-def arrays_of(runs: tuple[Trajectory, ...]) -> list[Array]:
-    return [array for run in runs for array in (run.rates, run.poses, run.angles, run.targets) if array is not None]
-
-
-def holds(owner: Array, array: Array) -> bool:
-    """Whether the numbers of ``array`` lie somewhere in ``owner``."""
-    if owner.dtype != array.dtype or owner.size < array.size:
-        return False
-    return np.ascontiguousarray(array).tobytes() in np.ascontiguousarray(owner).tobytes()
-
-
-class TestValidationData:
-    """A calibrator cannot see the validation data, whatever it follows from its problem."""
-
-    @pytest.fixture
-    def seen(self) -> tuple[CalibrationProblem, tuple[Trajectory, ...], tuple[Trajectory, ...]]:
-        """The problem that a calibrator was given, and the runs of both splits."""
-        problems: list[CalibrationProblem] = []
-
-        @calibrators.register("spy")
-        class Spy(Calibrator):
-            """Keeps its problem."""
-
-            def calibrate(self, problem: CalibrationProblem) -> Solution:
-                problems.append(problem)
-                problem.cost(problem.start)
-                return Solution(problem.start, "seen enough")
-
-        train = noisy_trajectories(seed=1)
-        held_out = [replace(run, id=f"v{run.id}", split="validation") for run in noisy_trajectories(seed=2)]
-        runs = [
-            replace(run, rates=run.rates + 1e-6 * index, angles=np.cumsum(run.rates, axis=0) + index)
-            for index, run in enumerate((*train, *held_out))
-        ]
-        dataset = make_dataset("both", synthetic_robot(), 0.2, runs)
-        calibrate(dataset, "spy")
-        return problems[0], dataset.split("train"), dataset.split("validation")
-
-    def test_training_runs_are_reachable_and_no_array_of_a_validation_run_is(self, seen: Any) -> None:
-        problem, training, validation = seen
-        items = list(reachable(problem))
-        arrays = [item for item in items if isinstance(item, np.ndarray)]
-        for hidden in arrays_of(validation):
-            assert not any(np.shares_memory(array, hidden) or holds(array, hidden) for array in arrays)
-        for shown in arrays_of(training):
-            assert any(holds(array, shown) for array in arrays)
-        assert {run.id for run in items if isinstance(run, Trajectory)} == {run.id for run in training}
+    held_out = [replace(run, id=f"v{run.id}", split="validation") for run in noisy_trajectories(seed=2)]
+    calibrate(make_dataset("both", synthetic_robot(), 0.2, [*RUNS, *held_out]), "spy")
+    assert [run.id for run in problems[0].trajectories] == [run.id for run in RUNS]
 
 
 def test_elements_that_the_cost_does_not_see_keep_their_start_values() -> None:

@@ -9,8 +9,9 @@ import numpy as np
 
 from omnibench.live.estimation.live_odometry import Motion
 from omnibench.live.estimation.tracker import RobotTracker
+from omnibench.live.wheels.wheel_input import joints_of
 from omnibench.live.wire.messages import JOINT_STATE, POSE_ESTIMATE, JointState, PoseEstimate
-from omnibench.live.wire.outputs import Update
+from omnibench.live.wire.topics import Update
 from omnibench.robot.calibration import Calibration, EffectTerm, Noise, covariance_rows, matrix_rows
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, WheelLog
@@ -52,48 +53,60 @@ def with_effects(*terms: EffectTerm, plain: Calibration | None = None, **changes
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """times (F,) s; angles (F + 1, N) rad at 0 and at times; stamps (F + 1,) ns."""
+    """angles (F + 1, N) rad and, of robots that steer, steering (F + 1, S) rad, at 0 and at every period."""
 
-    times: Array
     angles: Array
     calibration: Calibration
+    steering: Array | None = None
+
+    @property
+    def times(self) -> Array:
+        return PERIOD * np.arange(1, len(self.angles))
 
     @property
     def stamps(self) -> list[int]:
         return [ORIGIN, *(ORIGIN + np.round(self.times * SECOND).astype(int)).tolist()]
 
     @property
+    def log(self) -> WheelLog:
+        """The samples, with poses wanted at 0 and at every period. The baseline steers as the first sample ends."""
+        rates, stamps = np.diff(self.angles, axis=0) / PERIOD, np.append(0.0, self.times)
+        steered = (
+            {} if self.steering is None else {"steering": self.steering[1:], "drive": self.calibration.robot.drive}
+        )
+        known = {"wheel_angles": self.angles[1:], "started_at": 0.0, "session": self.calibration.session}
+        return WheelLog(self.times, rates, np.zeros(3), stamps, **known, **steered)
+
+    @property
     def poses(self) -> Array:
-        """Batch odometry at 0 and at times, (F + 1, 3)."""
-        durations = np.diff(self.times, prepend=0.0)
-        rates = np.diff(self.angles, axis=0) / durations[:, None]
-        log = WheelLog(self.times, rates, np.zeros(3), np.concatenate([[0.0], self.times]))
-        return self.calibration.model.poses([log])[0]
+        """Batch odometry at 0 and at every period, (F + 1, 3)."""
+        return self.calibration.model.poses([self.log])[0]
 
     def samples(self) -> list[JointState]:
-        """Every wheel message, positions and rates."""
-        durations = np.diff(self.times, prepend=0.0)
-        rates = np.vstack([np.zeros(self.angles.shape[1]), np.diff(self.angles, axis=0) / durations[:, None]])
-        names = self.calibration.robot.wheel_names
+        """Every message as ros2_control sends it: positions of all joints, velocities of the wheels."""
+        rates = np.vstack([np.zeros(self.angles.shape[1]), np.diff(self.angles, axis=0) / PERIOD])
+        steering = np.zeros((len(rates), 0)) if self.steering is None else self.steering
+        positions, velocities = np.hstack([self.angles, steering]), np.hstack([rates, np.full_like(steering, np.nan)])
+        names = joints_of(self.calibration.robot).names
         return [
-            JointState(stamp, names, position, rate)
-            for stamp, position, rate in zip(self.stamps, self.angles, rates, strict=True)
+            JointState(stamp, names, position, velocity)
+            for stamp, position, velocity in zip(self.stamps, positions, velocities, strict=True)
         ]
 
     def payloads(self) -> list[bytes]:
         return [JOINT_STATE.encode(sample) for sample in self.samples()]
 
 
-def drive(seconds: float = 2.0, *, seed: int = 1, using: Calibration | None = None, period: float = PERIOD) -> Drive:
+def drive(seconds: float = 2.0, *, seed: int = 1, using: Calibration | None = None) -> Drive:
     """A lively drive: wheel rates that wander by some rad/s."""
     chosen = using or calibration()
     rng = np.random.default_rng(seed)
-    count = round(seconds / period)
-    times = period * np.arange(1, count + 1)
+    count = round(seconds / PERIOD)
+    times = PERIOD * np.arange(1, count + 1)
     phase = rng.uniform(0, 6, (len(chosen.robot.wheels), 1))
     rates = 1.5 * np.sin(0.8 * times + phase) + 0.7 + 0.2 * rng.standard_normal((len(phase), count))
-    angles = np.vstack([np.zeros(len(phase)), np.cumsum(period * rates.T, axis=0)])
-    return Drive(times, angles + rng.uniform(-3, 3, len(phase)), chosen)
+    angles = np.vstack([np.zeros(len(phase)), np.cumsum(PERIOD * rates.T, axis=0)])
+    return Drive(angles + rng.uniform(-3, 3, len(phase)), chosen)
 
 
 def slam(stamp: int, pose: Array, covariance: Array = EXACT, frame: str = "map") -> bytes:

@@ -15,7 +15,7 @@ from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
 from omnibench.simulate.commands import Commands
 from omnibench.simulate.config import EncoderNoise, FlowerConfig, Session, Tolerances, Truth
-from omnibench.simulate.simulate import simulate_dataset
+from omnibench.simulate.source import simulate_dataset
 from omnibench.testing import synthetic_robot
 
 PERIOD = 0.02  # s

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
-from drives import NOISE, ORIGIN, PERIOD, SECOND
+from drives import NOISE, PERIOD, Drive
 from sample_robots import fixed, make_robot, steered
 
 from omnibench.data.dataset import Trajectory, make_dataset
 from omnibench.live.replay.concatenated_drive import Recording
-from omnibench.live.wheels.wheel_input import joints_of
-from omnibench.live.wire.messages import JOINT_STATE, JointState
+from omnibench.live.wire.messages import JointState
 from omnibench.robot.calibration import Calibration, covariance_rows, matrix_rows
-from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.odometry import WheelLog
+from omnibench.robot.kinematics import Robot
 
 _CORNERS = {"fl": (0.2, 0.15), "fr": (0.2, -0.15), "rl": (-0.2, 0.15), "rr": (-0.2, -0.15)}
 
@@ -47,46 +45,7 @@ def calibration(robot: Robot = SWERVE, **changes: Any) -> Calibration:
     return plain.model_copy(update=changes)
 
 
-@dataclass(frozen=True, eq=False)
-class SteeredDrive:
-    """angles (F + 1, N) and steering (F + 1, S), rad, at 0 and at every period."""
-
-    angles: Array
-    steering: Array
-    using: Calibration
-
-    @property
-    def times(self) -> Array:
-        return PERIOD * np.arange(1, len(self.angles))
-
-    @property
-    def log(self) -> WheelLog:
-        """The samples, with poses wanted at 0 and at every period. The baseline steers as the first sample ends."""
-        drive = self.using.robot.drive
-        stamps = np.append(0.0, self.times)
-        rates = np.diff(self.angles, axis=0) / PERIOD
-        start, session = np.zeros(3), self.using.session
-        return WheelLog(self.times, rates, start, stamps, self.angles[1:], 0.0, session, self.steering[1:], drive)
-
-    @property
-    def poses(self) -> Array:
-        """Batch odometry at 0 and at every period, (F + 1, 3)."""
-        return self.using.model.poses([self.log])[0]
-
-    def samples(self) -> list[JointState]:
-        """Every message as ros2_control sends it: positions of all joints, velocities of the wheels."""
-        rates = np.vstack([np.zeros(self.angles.shape[1]), np.diff(self.angles, axis=0) / PERIOD])
-        positions = np.hstack([self.angles, self.steering])
-        velocities = np.hstack([rates, np.full_like(self.steering, np.nan)])
-        stamps = (ORIGIN + np.round(PERIOD * np.arange(len(positions)) * SECOND).astype(int)).tolist()
-        names = joints_of(self.using.robot).names
-        return [JointState(*each) for each in zip(stamps, [names] * len(stamps), positions, velocities, strict=True)]
-
-    def payloads(self) -> list[bytes]:
-        return [JOINT_STATE.encode(sample) for sample in self.samples()]
-
-
-def drive(seconds: float = 1.0, *, seed: int = 1, using: Calibration | None = None) -> SteeredDrive:
+def drive(seconds: float = 1.0, *, seed: int = 1, using: Calibration | None = None) -> Drive:
     """A lively drive: wheel rates that wander by some rad/s, and steering that swings within half a right angle."""
     chosen = using or calibration()
     rng = np.random.default_rng(seed)
@@ -98,7 +57,7 @@ def drive(seconds: float = 1.0, *, seed: int = 1, using: Calibration | None = No
     rates, steering = 1.5 * wandering[:wheels] + 0.7, 0.7 * wandering[wheels:]
     steering[:, 0] = steering[:, 1]
     angles = np.vstack([np.zeros(wheels), np.cumsum(PERIOD * rates.T[1:], axis=0)]) + rng.uniform(-3, 3, wheels)
-    return SteeredDrive(angles, steering.T, chosen)
+    return Drive(angles, chosen, steering.T)
 
 
 def only(sample: JointState, *names: str) -> JointState:

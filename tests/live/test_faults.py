@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import re
 import signal
@@ -21,7 +20,6 @@ from chaos.run import run
 from drives import SECOND, calibration, drive, slam
 from nodes import Command, asked, config_of, connected, running, sent, sent_one_by_one, wheels_of, write_node
 from sessions import free_port, until
-from timing import PATIENCE
 
 from omnibench.config import to_yaml
 from omnibench.live.wire.messages import JOINT_STATE, ODOMETRY, JointState, Odometry
@@ -100,49 +98,6 @@ def test_a_node_ends_in_order_although_a_subscriber_is_frozen(tmp_path: Path) ->
             _, said = node.stop(signal.SIGTERM)
     assert node.process.returncode == 0, said
     assert "Traceback" not in said
-
-
-def test_a_killed_router_is_found_again_when_it_is_back(tmp_path: Path) -> None:
-    port = free_port()
-    (tmp_path / "router").mkdir()
-    router_config = write_node(tmp_path / "router", port=port)
-    to_router = {"mode": "client", "connect": [f"tcp/127.0.0.1:{port}"], "wait": PATIENCE}
-    (tmp_path / "node").mkdir()
-    node_config = write_node(tmp_path / "node", "apr", zenoh=to_router)
-    path = drive(20.0)
-    payloads = path.payloads()
-    with Command("live", router_config) as router, Command("live", node_config):
-        robot, listener = connected(port), connected(port)
-        heard = heard_odometry(listener)
-        wheels = wheels_of(robot)
-        sent_one_by_one(wheels, path.samples()[:100], heard)
-        router.kill()
-        with Command("live", router_config):
-            # the robot goes on sending all the time; some samples are lost until all three are connected again
-            taken = 100
-
-            def again() -> bool:
-                nonlocal taken
-                wheels.put(payloads[taken])
-                taken += 1
-                time.sleep(0.02)
-                return len(heard) > 105
-
-            until(again, "odometry after")
-            for payload in payloads[taken:]:
-                wheels.put(payload)
-
-            def last() -> bool:
-                wheels.put(payloads[-1])  # once more: of the burst some may be lost, too
-                time.sleep(0.02)
-                return heard[-1].stamp == path.stamps[-1]
-
-            until(last, "the last odometry")
-        # the wheels' angles hold what was lost; one arc in its place is off by the more, the longer the way back took
-        turned = heard[-1].pose[2] - path.poses[-1, 2]
-        assert abs(math.remainder(turned, 2 * math.pi)) < 1e-6
-        robot.close()
-        listener.close()
 
 
 def test_a_killed_node_goes_on_with_its_pose_and_calibration(tmp_path: Path) -> None:
@@ -230,16 +185,6 @@ def linked(pid: int, port: int) -> bool:
             if str(file.readlink()) in links:
                 return True
     return False
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_node_ends_at_once_and_without_a_word_too_many_when_told(tmp_path: Path, number: int) -> None:
-    port = free_port()
-    with Command("live", write_node(tmp_path, "apr", port=port)) as node:
-        connected(port).close()
-        _, said = node.stop(number)
-        assert node.process.returncode == 0
-        assert "Traceback" not in said
 
 
 def test_every_sample_is_accounted_for_through_random_faults() -> None:

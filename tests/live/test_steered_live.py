@@ -62,14 +62,14 @@ def retracked(one: Calibration, robot: Robot) -> Array:
 def test_odom_is_the_batch_odometry(robot: Robot, integration: Integration, effects: bool) -> None:
     plain = calibration(robot, integration=integration)
     path = drive(using=with_effects(*EFFECTS, plain=plain) if effects else plain)
-    updates = fed(RobotTracker("base", path.using), path.payloads())
+    updates = fed(RobotTracker("base", path.calibration), path.payloads())
     np.testing.assert_allclose(odometry(updates), path.poses, atol=1e-12)
 
 
 @pytest.mark.parametrize("use", ["positions", "velocities"])
 def test_wheels_are_read_by_what_the_config_says_and_steering_by_positions(use: Any) -> None:
     path = drive()
-    robot = RobotTracker("base", path.using, wheels=WheelSettings(use=use))
+    robot = RobotTracker("base", path.calibration, wheels=WheelSettings(use=use))
     np.testing.assert_allclose(odometry(fed(robot, path.payloads())), path.poses, atol=1e-12)
 
 
@@ -77,7 +77,7 @@ def test_the_first_sample_steers_by_the_mean_of_its_own_angle_and_that_of_the_me
     path = drive(0.01)
     turned = path.steering.copy()
     turned[0] -= 0.3
-    updates = fed(RobotTracker("base", path.using), replace(path, steering=turned).payloads())
+    updates = fed(RobotTracker("base", path.calibration), replace(path, steering=turned).payloads())
     middle = replace(path, steering=path.steering - 0.15)
     np.testing.assert_allclose(odometry(updates), middle.poses, atol=1e-12)
 
@@ -85,7 +85,7 @@ def test_the_first_sample_steers_by_the_mean_of_its_own_angle_and_that_of_the_me
 def test_messages_that_are_lost_cost_the_turns_of_the_steering_and_no_way() -> None:
     path = drive(2.0)
     kept = [path.payloads()[0], *(each for number, each in enumerate(path.payloads()[1:], 1) if number % 3 == 0)]
-    robot = RobotTracker("base", path.using)
+    robot = RobotTracker("base", path.calibration)
     last = [update for number, each in enumerate(kept) for update in robot.take_wheels(each, 3 * PERIOD * number)][-1]
     np.testing.assert_allclose(last.pose, path.poses[198], atol=0.02)
     assert np.hypot(*last.pose[:2]) > 0.05
@@ -93,7 +93,7 @@ def test_messages_that_are_lost_cost_the_turns_of_the_steering_and_no_way() -> N
 
 def test_steering_joints_in_messages_of_their_own_give_the_same_poses() -> None:
     path = drive()
-    robot, updates = RobotTracker("base", path.using), []
+    robot, updates = RobotTracker("base", path.calibration), []
     for number, sample in enumerate(path.samples()):
         for joints in (sample.names[4:], sample.names[:4]):
             updates += robot.take_wheels(JOINT_STATE.encode(only(sample, *joints)), PERIOD * number)
@@ -113,13 +113,13 @@ def test_the_covariance_of_the_matrix_spreads_as_the_batch_derivatives_say() -> 
 @pytest.mark.parametrize("robot", [SWERVE, CAR], ids=lambda robot: robot.name)
 def test_the_twist_is_the_matrix_times_the_signals(robot: Robot) -> None:
     path = drive(0.5, using=calibration(robot))
-    update = fed(RobotTracker("base", path.using), path.payloads())[-1]
-    np.testing.assert_allclose(update.twist, path.using.matrix_array @ path.log.signals[-1], atol=1e-9)
+    update = fed(RobotTracker("base", path.calibration), path.payloads())[-1]
+    np.testing.assert_allclose(update.twist, path.calibration.matrix_array @ path.log.signals[-1], atol=1e-9)
 
 
 def test_health_says_what_a_robot_without_steering_angles_waits_for_and_how_old_its_last_ones_are() -> None:
     path = drive(0.6)
-    robot = RobotTracker("base", path.using)
+    robot = RobotTracker("base", path.calibration)
     wheels = [JOINT_STATE.encode(only(sample, *sample.names[:4])) for sample in path.samples()]
     robot.take_wheels(wheels[0], 0.0)
     assert robot.health(0.0).status == "waiting"
@@ -132,7 +132,7 @@ def test_health_says_what_a_robot_without_steering_angles_waits_for_and_how_old_
 
 def test_what_is_driven_by_old_angles_makes_the_pose_as_uncertain_as_the_way_is_long() -> None:
     path = drive(3.0)
-    robot = RobotTracker("base", path.using)
+    robot = RobotTracker("base", path.calibration)
     fed(robot, [path.payloads()[0]])
     wheels = [JOINT_STATE.encode(only(sample, *sample.names[:4])) for sample in path.samples()[1:]]
     deviations = np.sqrt([update.covariance[0, 0] for update in fed(robot, wheels, PERIOD)])
@@ -153,20 +153,20 @@ def saved(**state: Any) -> SavedState:
 def test_a_node_that_starts_again_goes_on_exactly(tmp_path: Path, robot: Robot) -> None:
     path = drive(using=calibration(robot))
     memory = RobotMemory(tmp_path, "base")
-    first = RobotTracker("base", path.using, memory=memory)
+    first = RobotTracker("base", path.calibration, memory=memory)
     before = fed(first, path.payloads()[:51])
     first.close()
     saved = RobotMemory(tmp_path, "base").load()
-    second = RobotTracker("base", path.using)
+    second = RobotTracker("base", path.calibration)
     second.resume(saved, 0.5, saved.wall)
     found = odometry(before + fed(second, path.payloads()[51:], 0.51))
-    uninterrupted = odometry(fed(RobotTracker("base", path.using), path.payloads()))
+    uninterrupted = odometry(fed(RobotTracker("base", path.calibration), path.payloads()))
     np.testing.assert_allclose(found, uninterrupted, atol=1e-12)
 
 
 def test_a_robot_whose_saved_state_has_no_steering_waits_for_it() -> None:
     path = drive(0.1)
-    robot = RobotTracker("base", path.using)
+    robot = RobotTracker("base", path.calibration)
     robot.resume(saved(positions=path.angles[0].tolist()), 0.0, 1.8e9)
     bare = path.samples()[1]
     assert robot.take_wheels(JOINT_STATE.encode(only(bare, *bare.names[:4])), PERIOD) == []
@@ -224,12 +224,12 @@ def test_a_matrix_row_without_design_is_compared_with_the_size_of_the_other() ->
 def test_the_tracked_point_may_move_and_the_centre_does_not_jump() -> None:
     path = drive(using=calibration(mounted(SWERVE)))
     other = calibration(mounted(SWERVE, Mount(x=-0.5, y=0.4, yaw=2.0)))
-    other = other.model_copy(update={"matrix": matrix_rows(retracked(path.using, other.robot))})
-    robot = RobotTracker("base", path.using)
+    other = other.model_copy(update={"matrix": matrix_rows(retracked(path.calibration, other.robot))})
+    robot = RobotTracker("base", path.calibration)
     before = fed(robot, path.payloads()[:51])
     robot.swap(other)
     found = odometry(before + fed(robot, path.payloads()[51:], 0.51))
-    alone = fed(RobotTracker("base", path.using), path.payloads())
+    alone = fed(RobotTracker("base", path.calibration), path.payloads())
     np.testing.assert_allclose(found, odometry(alone), atol=1e-12)
 
 
@@ -240,13 +240,13 @@ def test_the_tracked_point_may_move_and_the_centre_does_not_jump() -> None:
 def test_the_pose_is_of_the_point_from_which_the_tracked_one_is_mounted(effects: bool) -> None:
     plain = calibration(mounted(SWERVE))
     path = drive(using=with_effects(*EFFECTS, plain=plain) if effects else plain)
-    updates = fed(RobotTracker("base", path.using), path.payloads())
+    updates = fed(RobotTracker("base", path.calibration), path.payloads())
     np.testing.assert_allclose(updates[0].pose, np.zeros(3), atol=1e-15)
     tracked = compose(odometry(updates), np.array([MOUNT.x, MOUNT.y, MOUNT.yaw]))
     if not effects:
         np.testing.assert_allclose(moved_to(np.zeros(3), tracked), path.poses, atol=1e-12)
     log = replace(path.log, start=tracked[0])
-    np.testing.assert_allclose(tracked, path.using.model.poses([log])[0], atol=1e-12)
+    np.testing.assert_allclose(tracked, path.calibration.model.poses([log])[0], atol=1e-12)
 
 
 def test_twist_and_covariances_are_those_of_a_calibration_of_the_centre_itself() -> None:
@@ -256,10 +256,10 @@ def test_twist_and_covariances_are_those_of_a_calibration_of_the_centre_itself()
     centred = calibration(
         SWERVE,
         noise=noise,
-        matrix=matrix_rows(retracked(path.using, SWERVE)),
-        covariance=covariance_rows(carry @ np.array(path.using.covariance) @ carry.T),
+        matrix=matrix_rows(retracked(path.calibration, SWERVE)),
+        covariance=covariance_rows(carry @ np.array(path.calibration.covariance) @ carry.T),
     )
-    (found, expected) = (fed(RobotTracker("base", each), path.payloads())[-1] for each in (path.using, centred))
+    (found, expected) = (fed(RobotTracker("base", each), path.payloads())[-1] for each in (path.calibration, centred))
     np.testing.assert_allclose(found.pose, expected.pose, atol=1e-12)
     np.testing.assert_allclose(found.twist, expected.twist, atol=1e-12)
     np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-3, atol=1e-10)
@@ -272,7 +272,7 @@ def test_poses_of_the_tracked_point_locate_the_centre(late: float) -> None:
     path = drive(3.0, using=calibration(mounted(SWERVE), effects=terms, covariance=None))
     at = np.array([2.0, -1.0, 0.7])
     tracked = moved_to(at, path.poses)
-    robot = RobotTracker("base", path.using, fusion=FusionSettings())
+    robot = RobotTracker("base", path.calibration, fusion=FusionSettings())
     behind = round(late / PERIOD)
     for number, payload in enumerate(path.payloads()):
         updates = robot.take_wheels(payload, PERIOD * number)
@@ -361,10 +361,10 @@ def heard(session: zenoh.Session, samples: list[JointState]) -> Array:
 
 def test_a_node_of_a_swerve_base_is_at_the_batch_odometry_and_says_how_it_steers(tmp_path: Path) -> None:
     path = drive(using=calibration(MOUNTED, effects=SLIPPING, covariance=None))
-    with running(config(tmp_path, path.using)) as (_, session):
+    with running(config(tmp_path, path.calibration)) as (_, session):
         poses = heard(session, path.samples())
         info = asked(session, "omnibench/base/info")
-    alone = odometry(fed(RobotTracker("base", path.using), path.payloads()))
+    alone = odometry(fed(RobotTracker("base", path.calibration), path.payloads()))
     np.testing.assert_allclose(poses[:, :2], alone[:, :2], atol=1e-12)
     np.testing.assert_allclose(np.exp(1j * poses[:, 2]), np.exp(1j * alone[:, 2]), atol=1e-12)
     assert info["steered"] == ["fl", "fr", "rl", "rr"]

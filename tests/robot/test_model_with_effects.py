@@ -364,24 +364,6 @@ def test_smoothing_takes_a_share_that_depends_on_the_period(period: float) -> No
     assert smoothing_share(period) == pytest.approx(1 - math.exp(-period / 0.05), rel=1e-9)
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
-@given(seed=st.integers(0, 2**32 - 1), samples=st.integers(1, 60))
-def test_a_stream_has_the_signals_of_a_batch(robot: str, seed: int, samples: int) -> None:
-    chosen = ROBOTS[robot]
-    log, matrix = a_drive(seed, samples, chosen), chosen.inverse_kinematic_matrix
-    batch = signals_of(log, chosen, matrix, PERIOD)
-    stream = SignalStream(chosen, matrix, PERIOD, log.session, log.started_at)
-    for sample, duration in enumerate(np.diff(log.times, prepend=0.0)):
-        found = stream.next(log.rates[sample], duration, log.wheel_angles[sample])
-        assert (found.robot, found.session) == (batch.robot, batch.session)
-        for name in ("durations", "rates", "elapsed", "twists", "travelled", "wheel_angles", "session_time"):
-            expected = getattr(batch, name)[sample : sample + 1]
-            assert getattr(found, name).shape == expected.shape
-            np.testing.assert_allclose(getattr(found, name), expected, rtol=1e-15, atol=1e-12)
-        gained = batch.accelerations[sample : sample + 1] * duration
-        np.testing.assert_allclose(found.accelerations * duration, gained, rtol=0, atol=1e-12)
-
-
 def test_a_stream_counts_angles_that_it_is_not_told_from_zero_or_the_last_told_on() -> None:
     stream = SignalStream(APR_02, MATRIX, PERIOD)
     for expected in ([0.5, -1.0, 0.0], [1.5, -3.0, 0.0]):

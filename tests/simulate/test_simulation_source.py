@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from commands import CONFIGS, Command, Prepared, assert_refused, flower, refused, small
+from commands import CONFIGS, Command, Prepared, assert_refused, flower, refused, small, write_effect
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.storage import load_dataset
@@ -21,27 +21,6 @@ from omnibench.testing import synthetic_robot, synthetic_trajectories
 
 DRIFT = "heading_drift: {b: 0.01}"
 AGAIN = ("--like", "DATA", "--model", "CALIBRATION")
-PLUGIN = """
-import numpy as np
-from omnibench.registry import effects
-from omnibench.robot.effects.effect import MotionEffect, Parameter
-
-
-@effects.register("side_wind")
-class SideWind(MotionEffect):
-    '''Wind from the left.'''
-
-    stage = "world"
-    physics = "Wind."
-    source = "first principles"
-    shows_in = "heading"
-
-    def parameters(self, robot, sessions=()):
-        return (Parameter("v", "m/s", -0.01, 0.01, "wind"),)
-
-    def correction(self, signals, values):
-        return np.tile([0.0, values["v"]], (len(signals.durations), 1))
-"""
 
 
 def write(folder: Path, **content: Any) -> Path:
@@ -138,8 +117,8 @@ def test_the_command_hides_an_effect_and_writes_the_truth_elsewhere(command: Com
 
 
 def test_the_command_hides_an_effect_of_a_plugin(command: Command, tmp_path: Path) -> None:
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "side_wind.py").write_text(PLUGIN)
+    across = 'np.tile([0.0, values["v"]], (len(signals.durations), 1))'
+    write_effect(tmp_path / "mine" / "side_wind.py", "world", '"v", "m/s", -0.01, 0.01, "wind"', across)
     wind = [{"name": "side_wind", "parameters": {"v": 0.005}}]
     sets = {"flower": {"simulate": flower(truth={"published": "palacin2023_eq8", "effects": wind}, noise={})}}
     by_config = write(tmp_path, plugins=["mine"], datasets=sets)

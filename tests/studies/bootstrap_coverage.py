@@ -21,8 +21,7 @@ from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
 from omnibench.fit.ratio_intervals import UnitName, units_of
 from omnibench.registry import calibrators, costs
-from omnibench.simulate.simulate import simulate_dataset
-from omnibench.simulate.source import read_simulation
+from omnibench.simulate.source import read_simulation, simulate_dataset
 
 CONFIG = Path(__file__).parents[2] / "configs" / "apr02.yaml"
 

@@ -19,8 +19,7 @@ from typing import Any
 from omnibench import discover_effects
 from omnibench.discover.result import Discovery
 from omnibench.simulate.robot_config import RobotConfig
-from omnibench.simulate.simulate import simulate_dataset
-from omnibench.simulate.source import read_simulation
+from omnibench.simulate.source import read_simulation, simulate_dataset
 from omnibench.slam.slam_request import slam_accuracy
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "apr02_robot.yaml"

@@ -22,8 +22,7 @@ from named_constants import Constant, constants_of, modules_of
 
 from omnibench.config import Model
 from omnibench.data.dataset import Dataset
-from omnibench.discover.conclude import Request
-from omnibench.discover.discover import discover_effects
+from omnibench.discover.discover import Request, discover_effects
 from omnibench.discover.result import Discovery
 from omnibench.processes import one_thread
 

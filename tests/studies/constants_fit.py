@@ -20,9 +20,8 @@ from omnibench.data.checks.implausible import implausible
 
 from omnibench.data.dataset import Dataset
 from omnibench.design.candidates import candidates_of_dataset
-from omnibench.design.design import design_experiment
+from omnibench.design.design import Chosen, design_experiment
 from omnibench.design.report import effort_table, path_figures
-from omnibench.design.result import Chosen
 from omnibench.fit.calibrate import CalibrationRun, calibrate
 from omnibench.fit.certify import certify_optimum
 from omnibench.fit.identifiability import identifiability
@@ -32,7 +31,7 @@ from omnibench.registry import costs
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.simulate.config import FlowerConfig
-from omnibench.simulate.simulate import simulate_dataset
+from omnibench.simulate.source import simulate_dataset
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "fit"))
 from motions import RING, driven

@@ -18,15 +18,15 @@ import numpy as np
 from scipy import stats
 
 from omnibench.fit.calibrator import run_calibrator
-from omnibench.fit.information import EstimatedCovariance
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
+from omnibench.fit.trajectory_fit import EstimatedCovariance
 from omnibench.registry import calibrators, costs
 from omnibench.robot.kinematics import Array, Robot, Wheel, wheel_equations
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
 from omnibench.simulate.commands import Commands
 from omnibench.simulate.config import EncoderNoise, FlowerConfig, Session, Truth
-from omnibench.simulate.simulate import simulate_dataset
+from omnibench.simulate.source import simulate_dataset
 from omnibench.simulate.truth import true_matrix
 
 ROBOT = Robot(

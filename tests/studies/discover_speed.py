@@ -31,7 +31,7 @@ from omnibench.discover.discover import discover_effects
 from omnibench.processes import one_thread
 from omnibench.robot.kinematics import Array
 from omnibench.simulate.config import FlowerConfig
-from omnibench.simulate.simulate import simulate_dataset
+from omnibench.simulate.source import simulate_dataset
 
 CONFIG = Path(__file__).parents[2] / "configs" / "hidden_effect.yaml"
 Result = TypeVar("Result")

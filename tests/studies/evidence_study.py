@@ -29,8 +29,7 @@ from omnibench.config import Model
 from omnibench.discover.fitting import extend, fit_matrix
 from omnibench.discover.regressors.significance import Group, significance_of
 from omnibench.discover.selection.evidence import credibility_of, effect_sets, indices_of, joint_share
-from omnibench.discover.selection.model_selection import ABSORBED, SURE
-from omnibench.discover.selection.screening import Screening, screen_again, screen_plain
+from omnibench.discover.selection.model_selection import ABSORBED, SURE, Screening, screen_again, screen_plain
 from omnibench.fit.trajectory_fit import Given, usable_runs
 from omnibench.processes import one_thread
 

@@ -21,8 +21,7 @@ from omnibench.discover import covariate_dependence
 from omnibench.discover.covariate_dependence import weights_of_covariates
 from omnibench.discover.fitting import fit_matrix
 from omnibench.discover.regressors.significance import Significance, significance_of
-from omnibench.discover.selection.model_selection import CHANCE
-from omnibench.discover.selection.screening import screen_plain
+from omnibench.discover.selection.model_selection import CHANCE, screen_plain
 from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.processes import one_thread
 from omnibench.registry import effects

@@ -19,8 +19,7 @@ from omnibench.data.dataset import Dataset
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.certify import certify_optimum
 from omnibench.progress import Progress
-from omnibench.simulate.simulate import simulate_dataset
-from omnibench.simulate.source import read_simulation
+from omnibench.simulate.source import read_simulation, simulate_dataset
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 GAPS = (0.1, 0.01, 0.001)

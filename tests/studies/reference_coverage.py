@@ -37,8 +37,7 @@ from omnibench.processes import one_thread
 from omnibench.robot.calibration import matrix_rows
 from omnibench.robot.kinematics import Robot
 from omnibench.simulate.config import FlowerConfig, Truth
-from omnibench.simulate.simulate import simulate_dataset
-from omnibench.simulate.source import read_simulation
+from omnibench.simulate.source import read_simulation, simulate_dataset
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 TAPE, ANGLE, GPS, COMPASS = 0.003, 0.01, 0.02, 0.03  # m, rad, m, rad: standard deviations of what is measured

@@ -20,8 +20,7 @@ from scipy.stats import binomtest
 
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.identifiability import geometry_of
-from omnibench.simulate.simulate import simulate_dataset
-from omnibench.simulate.source import read_simulation
+from omnibench.simulate.source import read_simulation, simulate_dataset
 
 CONFIG = Path(__file__).parents[2] / "configs" / "apr02.yaml"
 

@@ -10,19 +10,7 @@ from rich.console import Console
 
 from omnibench.cli.terminal.console import print_ending
 from omnibench.cli.terminal.tables import in_brief, print_table
-from omnibench.discover.report.tables import (
-    chance,
-    data_in_words,
-    dependence_table,
-    experiment_table,
-    extrapolations_in_words,
-    gap_table,
-    held_out_table,
-    hidden_table,
-    parameter_table,
-    verdict_in_words,
-    worst_of_each,
-)
+from omnibench.discover.report import tables
 from omnibench.discover.result import CALIBRATION_FILES, Discovery, experiment_file
 from omnibench.report.blocks import Table
 from omnibench.report.numbers import listing
@@ -39,8 +27,8 @@ _LINES = 3  # notes, and as many warnings
 def print_discovery(console: Console, discovery: Discovery, folder: Path) -> None:
     """Print verdict, effects, what the residuals depend on, the gap, what could still hide, and the files' paths."""
     width = min(console.width, _WIDTH)
-    console.print(data_in_words(discovery), soft_wrap=True)
-    console.print(f"verdict: {discovery.verdict} ({verdict_in_words(discovery)})", style="bold", width=width)
+    console.print(tables.data_in_words(discovery), soft_wrap=True)
+    console.print(f"verdict: {discovery.verdict} ({tables.verdict_in_words(discovery)})", style="bold", width=width)
     console.print(discovery.headline, width=width)
     for table in _tables(discovery):
         console.print()
@@ -71,15 +59,15 @@ def print_discovery(console: Console, discovery: Discovery, folder: Path) -> Non
 def _tables(discovery: Discovery) -> Iterator[Table]:
     if discovery.effects:
         effects = [replace(effect, parameters=effect.parameters[:_PARAMETERS]) for effect in discovery.effects]
-        yield parameter_table(effects, discovery.dataset)
+        yield tables.parameter_table(effects, discovery.dataset)
     if discovery.where:
         strongest = {found.covariate: found for found in reversed(discovery.where)}  # the first of each covariate
         shown = [found for found in discovery.where if strongest[found.covariate] is found][:_MOST_DEPENDENCES]
-        yield dependence_table(shown, "Where the plain matrix fails")
-    yield held_out_table(discovery) if discovery.held_out else gap_table(discovery)
+        yield tables.dependence_table(shown, "Where the plain matrix fails")
+    yield tables.held_out_table(discovery) if discovery.held_out else tables.gap_table(discovery)
     if discovery.hidden:
-        yield hidden_table(worst_of_each(discovery.hidden)[:_HIDDEN])
-    yield from (experiment_table(each) for each in discovery.experiments if each.commands)
+        yield tables.hidden_table(tables.worst_of_each(discovery.hidden)[:_HIDDEN])
+    yield from (tables.experiment_table(each) for each in discovery.experiments if each.commands)
 
 
 def _remarks(discovery: Discovery) -> Iterator[str]:
@@ -89,11 +77,13 @@ def _remarks(discovery: Discovery) -> Iterator[str]:
     for effect in discovery.effects:
         if len(effect.parameters) > _PARAMETERS:
             yield f"{effect.name}: {plural(len(effect.parameters) - _PARAMETERS, 'more parameter')} in the report"
-    if (more := len(worst_of_each(discovery.hidden)) - _HIDDEN) > 0:
+    if (more := len(tables.worst_of_each(discovery.hidden)) - _HIDDEN) > 0:
         yield f"Of what could still hide, the largest are shown; {plural(more, 'more effect')} in the report."
     if discovery.left:
         first = {dependence.covariate: dependence for dependence in reversed(discovery.left)}
-        left = listing([f"{p.covariate} ({chance(p.p_value)})" for p in discovery.left if first[p.covariate] is p])
+        left = listing(
+            [f"{p.covariate} ({tables.chance(p.p_value)})" for p in discovery.left if first[p.covariate] is p]
+        )
         yield f"Left over: the residuals still depend on {left}."
     for effect in discovery.effects:
         if effect.in_doubt:
@@ -104,7 +94,7 @@ def _remarks(discovery: Discovery) -> Iterator[str]:
         absorbed = listing(list(discovery.absorbed), 12)
         yield f"Absorbed by any matrix, and so never named: {absorbed}."
     yield from _first(
-        extrapolations_in_words(discovery.extrapolations), "warning: not driven in training: ", "such warning"
+        tables.extrapolations_in_words(discovery.extrapolations), "warning: not driven in training: ", "such warning"
     )
     yield from _first(discovery.notes, "- ", "note")
 

@@ -9,17 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from omnibench.compare.config import PublishedResult
-from omnibench.compare.report.view import (
-    NO_INTERVAL,
-    SPLIT_NAMES,
-    DatasetView,
-    cost_decimals,
-    cost_in_words,
-    entry_cell,
-    improvement_in_words,
-    interval_basis,
-    interval_in_words,
-)
+from omnibench.compare.report import view as views
 from omnibench.compare.result import THEORETICAL_NAME, EntryStatistics
 from omnibench.data.dataset import SPLITS, Split, Trajectory
 from omnibench.fit.noise import grouped
@@ -35,7 +25,7 @@ _UNKNOWN = "not known"
 _MET = 1e-4  # share of the lowest cost: searches that end nearer to it are in one minimum (chosen)
 
 
-def published_blocks(view: DatasetView) -> tuple[Block, ...]:
+def published_blocks(view: views.DatasetView) -> tuple[Block, ...]:
     """Our figures beside the published ones, and the circumstances of both; nothing where none are published."""
     if not view.config.published_results:
         return ()
@@ -49,7 +39,7 @@ def published_blocks(view: DatasetView) -> tuple[Block, ...]:
     return (_figure_table(view), _circumstance_table(view), *_effort_tables(view), *claims, *about)
 
 
-def _claims(view: DatasetView) -> tuple[str, ...]:
+def _claims(view: views.DatasetView) -> tuple[str, ...]:
     """Two claims of the paper: curves show systematic errors best, and a genetic algorithm avoids local minima."""
     lines, split, turns = [], view.scored, [run.omega for run in view.dataset.split(view.scored)]
     turning = np.array([bool(turn) for turn in turns])
@@ -59,7 +49,8 @@ def _claims(view: DatasetView) -> tuple[str, ...]:
         seen = "so here" if curved > straight else "not here"
         lines.append(
             f"Curves show systematic errors best (section 4.1): {seen}, Eq. (6) of the design values is "
-            f"{fixed(curved, 3)} on the {SPLIT_NAMES[split]} runs in curves and {fixed(straight, 3)} on straight ones."
+            f"{fixed(curved, 3)} on the {views.SPLIT_NAMES[split]} runs in curves and {fixed(straight, 3)} on straight "
+            "ones."
         )
     genetic = next((run for _, entry, run in view.published_entries if entry.parameterisation == "matrix"), None)
     costs_of: dict[str, list[float]] = {}
@@ -83,7 +74,7 @@ def _claims(view: DatasetView) -> tuple[str, ...]:
         ]
         lines.append(
             f"Local minima (section 5): from random starts in the box {box}, {listing(met)} ended within "
-            f"{percent(_MET, 2)} of one cost, {fixed(lowest, cost_decimals(view))}{''.join(proven)}."
+            f"{percent(_MET, 2)} of one cost, {fixed(lowest, views.cost_decimals(view))}{''.join(proven)}."
         )
     return tuple(lines)
 
@@ -116,7 +107,7 @@ class ComparedFigure:
         return percent(self.ours.value / nearest - 1, signed=True)
 
 
-def compared_figures(view: DatasetView) -> list[ComparedFigure]:
+def compared_figures(view: views.DatasetView) -> list[ComparedFigure]:
     """The design values beside all published results, then each published method beside the entry that is the same.
 
     Costs and improvements on each split, and the change of the cost from training to validation. A result that names no
@@ -148,11 +139,11 @@ def _compared(
     printed = {split: [pair for result in published if (pair := result.costs(split))] for split in SPLITS}
     for split, pairs in printed.items():
         if pairs and split in costs:
-            words = f"{name.capitalize()} cost, {SPLIT_NAMES[split]}{entry}"
+            words = f"{name.capitalize()} cost, {views.SPLIT_NAMES[split]}{entry}"
             yield ComparedFigure(words, costs[split], tuple(pair[kind] for pair in pairs), False, 4, methods)
         shares = tuple(share for result in published if (share := result.improvement(split)) is not None)
         if shares and split in improvements:
-            words = f"Improvement, {SPLIT_NAMES[split]}{entry}"
+            words = f"Improvement, {views.SPLIT_NAMES[split]}{entry}"
             yield ComparedFigure(words, improvements[split], shares, True, 2, methods)
     known = [(costs[split].value, ends) for split in SPLITS if split in costs and (ends := costs[split].known)]
     splits = [(result.costs("train"), result.costs("validation")) for result in published]
@@ -167,7 +158,7 @@ def _compared(
     yield ComparedFigure(f"Change of the {name} cost to validation{entry}", ours, changes, True, 1, methods)
 
 
-def _figure_table(view: DatasetView) -> Table:
+def _figure_table(view: views.DatasetView) -> Table:
     columns: tuple[Column, ...] = (
         Column("Figure", numeric=False),
         Column("Here"),
@@ -184,9 +175,9 @@ def _figure_table(view: DatasetView) -> Table:
         )
     rows = []
     for figure in compared_figures(view):
-        ours, decimals = figure.ours, 1 if figure.is_share else cost_decimals(view)
+        ours, decimals = figure.ours, 1 if figure.is_share else views.cost_decimals(view)
         factor, unit = (100.0, " %") if figure.is_share else (1.0, "")
-        interval = NO_INTERVAL
+        interval = views.NO_INTERVAL
         if ours.known is not None:
             interval = f"{span(factor * ours.known[0], factor * ours.known[1], decimals)}{unit}"
         theirs = (f"{fixed(factor * value, figure.decimals)}{unit}" for value in figure.published)
@@ -207,7 +198,7 @@ def _figure_table(view: DatasetView) -> Table:
     )
 
 
-def _effort_tables(view: DatasetView) -> tuple[Table, ...]:
+def _effort_tables(view: views.DatasetView) -> tuple[Table, ...]:
     """Published computing times beside the evaluations and times of the entries that are the same methods."""
     pairs = [
         (result, entry, result.seconds)
@@ -222,7 +213,7 @@ def _effort_tables(view: DatasetView) -> tuple[Table, ...]:
             seconds(published),
             count(entry.evaluations_median),
             seconds(entry.seconds_median),
-            fixed(entry.train_median, cost_decimals(view)),
+            fixed(entry.train_median, views.cost_decimals(view)),
         )
         for result, entry, published in pairs
     ]
@@ -260,14 +251,14 @@ def _change(value: float | None, base: float | None) -> str:
     return percent(value / base - 1, 1, signed=True) if value is not None and base else NOTHING
 
 
-def _circumstance_table(view: DatasetView) -> Table:
+def _circumstance_table(view: views.DatasetView) -> Table:
     config, dataset, split = view.config, view.dataset, view.scored
     runs = dataset.split(split)
     origin = "simulated" if dataset.simulated else "recorded by another robot, or at another time"
     systematic, _ = _parts(view.design_errors[split], runs)
     boxes = {entry.box for entry, _ in view.calibrated if entry.parameterisation == "matrix"}
     rows = [
-        Row.of("Data", Cell(origin, plural(len(runs), f"{SPLIT_NAMES[split]} run")), NOTHING),
+        Row.of("Data", Cell(origin, plural(len(runs), f"{views.SPLIT_NAMES[split]} run")), NOTHING),
         Row.of("Distance of a run, mean", f"{fixed(float(np.mean([_length(run) for run in runs])), 2)} m", _UNKNOWN),
         Row.of("Miss of a command's mean end by the design values", fixed(systematic, 4), _UNKNOWN),
         *_scatter_rows(view, runs),
@@ -284,7 +275,7 @@ def _circumstance_table(view: DatasetView) -> Table:
     )
 
 
-def _scatter_rows(view: DatasetView, runs: Sequence[Trajectory]) -> Iterator[Row]:
+def _scatter_rows(view: views.DatasetView, runs: Sequence[Trajectory]) -> Iterator[Row]:
     """The share of the calibrated cost that no matrix could remove: the scatter of repetitions of one command."""
     best = view.best
     if best is None or best.typical is None or best.calibrator == THEORETICAL_NAME:
@@ -325,11 +316,11 @@ def _length(run: Trajectory) -> float:
     return float(np.hypot(*np.diff(run.poses[:, :2], axis=0).T).sum())
 
 
-def cost_section(view: DatasetView) -> Section:
+def cost_section(view: views.DatasetView) -> Section:
     """A table of costs for each split, then what is like the published results and what is not."""
     scored = cost_table(view, view.scored)
     others = (
-        Details(f"Costs of the {SPLIT_NAMES[split]} runs", (cost_table(view, split),))
+        Details(f"Costs of the {views.SPLIT_NAMES[split]} runs", (cost_table(view, split),))
         for split in view.splits
         if split != view.scored
     )
@@ -339,48 +330,50 @@ def cost_section(view: DatasetView) -> Section:
     return Section("costs", "Costs", (scored, *others, *beside), about=about, folded=True)
 
 
-def cost_table(view: DatasetView, split: Split) -> Table:
+def cost_table(view: views.DatasetView, split: Split) -> Table:
     """Table 2 (training) or 3 (validation) of the paper, with intervals."""
     theoretical = view.theoretical_cost(split)
-    decimals = cost_decimals(view)
+    decimals = views.cost_decimals(view)
     before = fixed(theoretical, decimals)
-    design = Cell(before, interval_in_words(view.design_costs.get(split), decimals))
-    rows = [Row.of(entry_cell(view, None), design, NOTHING, NOTHING)]
+    design = Cell(before, views.interval_in_words(view.design_costs.get(split), decimals))
+    rows = [Row.of(views.entry_cell(view, None), design, NOTHING, NOTHING)]
     searched = [entry for entry in view.statistics if entry.calibrator != THEORETICAL_NAME]
     rows += [_cost_row(view, entry, split, before) for entry in searched]
     rows += _published_rows(view, split)
     number = len(view.dataset.split(split))
     paper = f"As Table {2 if split == 'train' else 3} of the paper. " if view.of_the_paper else ""
     return Table(
-        caption=f"Cost of {plural(number, f'{SPLIT_NAMES[split]} run')}",
+        caption=f"Cost of {plural(number, f'{views.SPLIT_NAMES[split]} run')}",
         columns=(
             Column("Entry", numeric=False),
             Column("Cost, design values", priority=1),
-            Column(f"Cost, {SPLIT_NAMES[split]}"),
+            Column(f"Cost, {views.SPLIT_NAMES[split]}"),
             Column("Improvement"),
         ),
         rows=tuple(rows),
-        note=f"{paper}The cost is {cost_in_words(view)} "
-        f"Small print: 95 % intervals, {interval_basis(view, split)}, of the run with the median training cost.",
+        note=f"{paper}The cost is {views.cost_in_words(view)} "
+        f"Small print: 95 % intervals, {views.interval_basis(view, split)}, of the run with the median training cost.",
     )
 
 
-def _cost_row(view: DatasetView, entry: EntryStatistics, split: Split, before: str) -> Row:
+def _cost_row(view: views.DatasetView, entry: EntryStatistics, split: Split, before: str) -> Row:
     reached = entry.cost(split)
     if reached is None:
         failed = [run.record for run in view.runs if run.record.label == entry.label]
         outcome = failed[0].outcome.value if failed else "no run"
-        return Row.of(entry_cell(view, entry), before, Cell("no answer", outcome), NOTHING, role="failed")
+        return Row.of(views.entry_cell(view, entry), before, Cell("no answer", outcome), NOTHING, role="failed")
     return Row.of(
-        entry_cell(view, entry),
+        views.entry_cell(view, entry),
         before,
-        Cell(fixed(reached.value, cost_decimals(view)), interval_in_words(reached, cost_decimals(view))),
-        Cell(*improvement_in_words(entry, split, 2)),
+        Cell(
+            fixed(reached.value, views.cost_decimals(view)), views.interval_in_words(reached, views.cost_decimals(view))
+        ),
+        Cell(*views.improvement_in_words(entry, split, 2)),
         role="best" if entry.is_best else "plain",
     )
 
 
-def _published_rows(view: DatasetView, split: Split) -> list[Row]:
+def _published_rows(view: views.DatasetView, split: Split) -> list[Row]:
     rows = []
     for result in view.config.published_results:
         published = result.costs(split)

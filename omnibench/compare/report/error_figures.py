@@ -21,18 +21,7 @@ from omnibench.compare.report.view import (
 from omnibench.compare.result import EntryStatistics, ScoredRun
 from omnibench.data.dataset import Split, Trajectory
 from omnibench.fit.evaluate import positions_and_headings
-from omnibench.report.blocks import (
-    Block,
-    Column,
-    Details,
-    Figure,
-    FigureGrid,
-    LegendItem,
-    Paragraph,
-    Row,
-    Section,
-    Table,
-)
+from omnibench.report import blocks as page
 from omnibench.report.figures import START, coordinates, line, marks, path
 from omnibench.report.numbers import MOST_MOTIONS, Motion, direction_of, fixed, listing, motion_items, motion_of, moves
 from omnibench.report.recording.recording_figures import describe, evenly
@@ -53,12 +42,12 @@ _PAPER_TURN_RATE = 0.35  # rad/s
 class DrawnModel:
     """A model that stands for every entry whose paths cannot be told from its own. entries: their labels."""
 
-    style: LegendItem
+    style: page.LegendItem
     model: OdometryModel
     entries: tuple[str, ...] = ()
 
 
-def path_section(view: DatasetView) -> Section:
+def path_section(view: DatasetView) -> page.Section:
     """A few trajectories of the scored split: whole paths, each beside the detail of its end."""
     chosen = chosen_trajectories(view.dataset.split(view.scored))
     models = drawn_models(view, chosen)
@@ -77,9 +66,11 @@ def path_section(view: DatasetView) -> Section:
     if groups:
         near = f"within {100 * _SEEN:.0f} % of the window of each other"
         caption += f" Entries that end {near} are drawn as one. {groups}."
-    grid = FigureGrid(tuple(figures), (REFERENCE_STYLE, *(each.style for each in models)), 2, caption, "paths-and-ends")
+    grid = page.FigureGrid(
+        tuple(figures), (REFERENCE_STYLE, *(each.style for each in models)), 2, caption, "paths-and-ends"
+    )
     about = "The paths of every entry that can be told from the others, and where they end."
-    return Section("paths", "Paths of all entries", (grid,), about=about, folded=True)
+    return page.Section("paths", "Paths of all entries", (grid,), about=about, folded=True)
 
 
 def drawn_models(view: DatasetView, trajectories: Sequence[Trajectory]) -> list[DrawnModel]:
@@ -106,7 +97,7 @@ def drawn_models(view: DatasetView, trajectories: Sequence[Trajectory]) -> list[
     return [DrawnModel(THEORETICAL_STYLE, view.model(view.design_matrix)), *drawn]
 
 
-def _group(style: LegendItem, model: OdometryModel, members: Sequence[str], published: str | None) -> DrawnModel:
+def _group(style: page.LegendItem, model: OdometryModel, members: Sequence[str], published: str | None) -> DrawnModel:
     if published is not None:
         style = replace(style, label=f"{style.label}, as the paper's {published}")
     if len(members) > 1:
@@ -140,7 +131,7 @@ def _with_command(trajectories: Sequence[Trajectory], degrees: float) -> Traject
     return None
 
 
-def _path_figure(trajectory: Trajectory, models: Sequence[DrawnModel]) -> Figure:
+def _path_figure(trajectory: Trajectory, models: Sequence[DrawnModel]) -> page.Figure:
     reference = trajectory.poses[evenly(len(trajectory.poses), 2 * _POINTS)]
     stamps = np.linspace(0.0, trajectory.end, _POINTS)
     traces = [path(REFERENCE_STYLE, reference, 3.5), _end_mark(REFERENCE_STYLE, reference, 9)]
@@ -150,14 +141,14 @@ def _path_figure(trajectory: Trajectory, models: Sequence[DrawnModel]) -> Figure
     traces.append(marks(START, 9, trajectory.start[:1], trajectory.start[1:2], hover="start"))
     title = describe(trajectory)
     description = f"Paths of {title}: reference, odometry by the design values and calibrated, x and y in metres"
-    return Figure(title, plan(*traces), description, 400)
+    return page.Figure(title, plan(*traces), description, 400)
 
 
-def _end_mark(style: LegendItem, poses: Array, size: int) -> go.Scatter:
+def _end_mark(style: page.LegendItem, poses: Array, size: int) -> go.Scatter:
     return marks(style, size, poses[-1:, 0], poses[-1:, 1], marker_line_width=2)
 
 
-def _end_figure(view: DatasetView, trajectory: Trajectory, models: Sequence[DrawnModel]) -> Figure:
+def _end_figure(view: DatasetView, trajectory: Trajectory, models: Sequence[DrawnModel]) -> page.Figure:
     final = trajectory.final_pose
     duration = trajectory.end
     stamps = np.linspace((1 - _TAIL) * duration, duration, 60)
@@ -169,7 +160,7 @@ def _end_figure(view: DatasetView, trajectory: Trajectory, models: Sequence[Draw
     for style, poses in tails:
         traces += _tail_traces(style, poses, final, half, width=1.6)
     window = half * np.array([[-1.0, 1.0]] * 2)
-    return Figure(
+    return page.Figure(
         f"Its end: {_ends_in_words(view, trajectory)}",
         plan(*traces, window=window, x_title="x − x of reference (mm)", y_title="y − y of reference (mm)"),
         f"Final poses of {describe(trajectory)} about the reference's final position, in millimetres",
@@ -177,7 +168,7 @@ def _end_figure(view: DatasetView, trajectory: Trajectory, models: Sequence[Draw
     )
 
 
-def _tail_traces(style: LegendItem, poses: Array, final: Array, half: float, width: float) -> list[go.Scatter]:
+def _tail_traces(style: page.LegendItem, poses: Array, final: Array, half: float, width: float) -> list[go.Scatter]:
     millimetres = 1e3 * (poses[:, :2] - final[:2])
     end = millimetres[-1]
     stroke = end + 0.28 * half * np.array([[0.0, 0.0], [math.cos(poses[-1, 2]), math.sin(poses[-1, 2])]])
@@ -213,19 +204,19 @@ def _distance_mm(pose: Array, reference: Array) -> float:
 _MANY_GROUPS = 12  # commands or sessions: with more, all trajectories of a split share one box plot (chosen)
 
 
-def error_section(view: DatasetView) -> Section:
+def error_section(view: DatasetView) -> page.Section:
     """Final errors on the scored split as table and figures; the table of the other split is folded away."""
     others = (
-        Details(f"Final errors on the {SPLIT_NAMES[split]} runs", (final_error_table(view, split),))
+        page.Details(f"Final errors on the {SPLIT_NAMES[split]} runs", (final_error_table(view, split),))
         for split in view.splits
         if split != view.scored
     )
     blocks = (final_error_table(view, view.scored), *_figures(view), *others)
     about = "How far from the reference the odometry ends: every entry, and by direction of motion."
-    return Section("errors", "Final errors", blocks, about=about, folded=True)
+    return page.Section("errors", "Final errors", blocks, about=about, folded=True)
 
 
-def final_error_table(view: DatasetView, split: Split) -> Table:
+def final_error_table(view: DatasetView, split: Split) -> page.Table:
     """A table of mean and worst final errors in position and heading, design values first."""
     errors: list[tuple[EntryStatistics | None, Array]] = [(None, view.design_errors[split])]
     for entry, run in view.calibrated:
@@ -239,21 +230,21 @@ def final_error_table(view: DatasetView, split: Split) -> Table:
         cells = [fixed(factor * value, decimals) for value in mean_and_worst(positions)]
         cells += [fixed(np.degrees(value), 2) for value in mean_and_worst(headings)]
         is_best = entry_or_none is not None and entry_or_none.is_best
-        rows.append(Row.of(entry_cell(view, entry_or_none), *cells, role="best" if is_best else "plain"))
-    return Table(
+        rows.append(page.Row.of(entry_cell(view, entry_or_none), *cells, role="best" if is_best else "plain"))
+    return page.Table(
         caption=f"Error of the final pose, {SPLIT_NAMES[split]} runs",
         columns=(
-            Column("Entry", numeric=False),
-            Column("position, mean", unit),
-            Column("position, worst", unit),
-            Column("heading, mean", "°"),
-            Column("heading, worst", "°"),
+            page.Column("Entry", numeric=False),
+            page.Column("position, mean", unit),
+            page.Column("position, worst", unit),
+            page.Column("heading, mean", "°"),
+            page.Column("heading, worst", "°"),
         ),
         rows=tuple(rows),
     )
 
 
-def _figures(view: DatasetView) -> tuple[Block, ...]:
+def _figures(view: DatasetView) -> tuple[page.Block, ...]:
     """Final errors before and after calibration: by direction where those were commanded, else in groups."""
     best = view.best
     if best is None or best.typical is None:
@@ -302,7 +293,7 @@ def _is_flower(trajectories: Sequence[Trajectory]) -> bool:
 
 def _flower_blocks(
     view: DatasetView, trajectories: Sequence[Trajectory], after: Array, label: str
-) -> tuple[Block, ...]:
+) -> tuple[page.Block, ...]:
     motions = sorted({motion_of(t) for t in trajectories if moves(t)})
     legend = motion_items(motions)
     figures = []
@@ -317,7 +308,7 @@ def _flower_blocks(
         ):
             curves = [(petals[0], petals[column]) for petals in means]
             figures.append(
-                Figure(
+                page.Figure(
                     f"Mean final {quantity.name} ({quantity.unit}), {title}",
                     _polar(curves, legend, quantity, 1.08 * limit),
                     f"Mean final {quantity.name} in {quantity.unit} by direction of motion and rate of turn, {title}",
@@ -328,7 +319,7 @@ def _flower_blocks(
         f"Mean over the repetitions of each command, {SPLIT_NAMES[view.scored]} runs. The angle is the commanded "
         "direction α in the robot's frame, forward up and left to the left; the radius is the error."
     )
-    grid = FigureGrid(tuple(figures), tuple(legend), 3, caption)
+    grid = page.FigureGrid(tuple(figures), tuple(legend), 3, caption)
     return (grid, *_turns_on_the_spot(view, trajectories, after))
 
 
@@ -345,7 +336,7 @@ def _petals(trajectories: Sequence[Trajectory], motion: Motion, quantity: _Quant
 
 
 def _polar(
-    curves: Sequence[tuple[Array, Array]], legend: Sequence[LegendItem], quantity: _Quantity, limit: float
+    curves: Sequence[tuple[Array, Array]], legend: Sequence[page.LegendItem], quantity: _Quantity, limit: float
 ) -> go.Figure:
     hover = f"%{{r:.{quantity.decimals}f}} {quantity.unit}"
     traces = [
@@ -371,7 +362,7 @@ def _polar(
     return figure
 
 
-def _turns_on_the_spot(view: DatasetView, trajectories: Sequence[Trajectory], after: Array) -> tuple[Block, ...]:
+def _turns_on_the_spot(view: DatasetView, trajectories: Sequence[Trajectory], after: Array) -> tuple[page.Block, ...]:
     still = np.array([not moves(t) for t in trajectories])
     if not still.any():
         return ()
@@ -380,10 +371,10 @@ def _turns_on_the_spot(view: DatasetView, trajectories: Sequence[Trajectory], af
         f"{fixed(quantity.after[still].mean(), quantity.decimals)} {quantity.unit}"
         for quantity in _quantities(view.design_errors[view.scored], after)
     ]
-    return (Paragraph(f"Turns on the spot have no direction and are not drawn: {', '.join(parts)}.", "note"),)
+    return (page.Paragraph(f"Turns on the spot have no direction and are not drawn: {', '.join(parts)}.", "note"),)
 
 
-def _box_plots(view: DatasetView, best: EntryStatistics, typical: ScoredRun) -> FigureGrid:
+def _box_plots(view: DatasetView, best: EntryStatistics, typical: ScoredRun) -> page.FigureGrid:
     """Box plots over the trajectories of each command or session, on both splits."""
     groups: list[str] = []
     before, after = [], []
@@ -397,7 +388,7 @@ def _box_plots(view: DatasetView, best: EntryStatistics, typical: ScoredRun) -> 
     style = view.styles[best.label]
     styles = [THEORETICAL_STYLE] if style is THEORETICAL_STYLE else [THEORETICAL_STYLE, style]
     figures = tuple(
-        Figure(
+        page.Figure(
             f"Final {quantity.name} ({quantity.unit})",
             _box_figure(groups, quantity, styles),
             f"Final {quantity.name} in {quantity.unit} of each group of trajectories, theoretical and {best.label}",
@@ -405,7 +396,7 @@ def _box_plots(view: DatasetView, best: EntryStatistics, typical: ScoredRun) -> 
         )
         for quantity in quantities
     )
-    return FigureGrid(
+    return page.FigureGrid(
         figures,
         tuple(styles),
         1,
@@ -421,7 +412,7 @@ def _groups(view: DatasetView, split: Split) -> list[str]:
     return [SPLIT_NAMES[split]] * len(trajectories)
 
 
-def _box_figure(groups: Sequence[str], quantity: _Quantity, styles: Sequence[LegendItem]) -> go.Figure:
+def _box_figure(groups: Sequence[str], quantity: _Quantity, styles: Sequence[page.LegendItem]) -> go.Figure:
     traces = [
         go.Box(
             y=[text(wrapped(group)) for group in groups],

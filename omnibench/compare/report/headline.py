@@ -10,35 +10,12 @@ from typing import Literal
 import numpy as np
 import plotly.graph_objects as go
 
-from omnibench.compare.report.view import (
-    NO_INTERVAL,
-    SPLIT_NAMES,
-    THEORETICAL_STYLE,
-    DatasetView,
-    cost_decimals,
-    difference_in_words,
-    improvement_in_words,
-    interval_basis,
-    interval_in_words,
-    mean_and_worst,
-    on_bounds,
-    position_unit,
-)
+from omnibench.compare.report import view as views
 from omnibench.compare.result import THEORETICAL_NAME, EntryStatistics
 from omnibench.fit.cost import NO_ERROR
 from omnibench.fit.evaluate import positions_and_headings
 from omnibench.fit.ratio_intervals import Interval
-from omnibench.report.blocks import (
-    Block,
-    Callout,
-    Fact,
-    Figure,
-    FigureGrid,
-    LegendItem,
-    Paragraph,
-    Section,
-    answer_section,
-)
+from omnibench.report import blocks
 from omnibench.report.figures import joined, line, marks
 from omnibench.report.numbers import fixed, listing, percent, significant, span, typeset, with_unit
 from omnibench.report.path_pictures import CALIBRATED, paths_before_after
@@ -46,30 +23,32 @@ from omnibench.report.style import INK, PALETTE, QUIET, plot, text, wrapped
 from omnibench.words import plural
 
 _ROW, _LINE = 11, 14  # px of an entry, and of each line of its label
-_BEST = LegendItem("best", "best", PALETTE[0])
-_OTHER = LegendItem("other", "differs by more than chance", PALETTE[1])
-_OPEN = LegendItem("open", "not told apart", QUIET)
+_BEST = blocks.LegendItem("best", "best", PALETTE[0])
+_OTHER = blocks.LegendItem("other", "differs by more than chance", PALETTE[1])
+_OPEN = blocks.LegendItem("open", "not told apart", QUIET)
 
 
 @dataclass(frozen=True)
 class _Line:
     label: str
     cost: Interval
-    item: LegendItem
+    item: blocks.LegendItem
 
 
-def entry_chart(view: DatasetView) -> FigureGrid | None:
+def entry_chart(view: views.DatasetView) -> blocks.FigureGrid | None:
     """Every entry's cost on the scored split, the lowest on top; None where no entry was calibrated."""
     lines = _lines(view)
     if not lines:
         return None
     design = view.design_costs.get(view.scored)
     if design is not None:
-        lines.append(_Line("design values", design, THEORETICAL_STYLE))
-    decimals = cost_decimals(view)
-    items = [item for item in (_BEST, _OTHER, _OPEN, THEORETICAL_STYLE) if any(each.item is item for each in lines)]
+        lines.append(_Line("design values", design, views.THEORETICAL_STYLE))
+    decimals = views.cost_decimals(view)
+    items = [
+        item for item in (_BEST, _OTHER, _OPEN, views.THEORETICAL_STYLE) if any(each.item is item for each in lines)
+    ]
     traces = [trace for item in items for trace in _traces(item, lines, decimals)]
-    split = SPLIT_NAMES[view.scored]
+    split = views.SPLIT_NAMES[view.scored]
     figure = plot(*traces, x_title=f"cost of the {split} runs")
     reach = max(max(each.cost.known or (each.cost.value,)) for each in lines)
     figure.update_xaxes(range=[0.0, 1.04 * reach])
@@ -81,14 +60,16 @@ def entry_chart(view: DatasetView) -> FigureGrid | None:
     title = f"All entries: cost of the {split} runs, with 95 % intervals"
     silent = [entry.label for entry in view.statistics if not entry.answers and entry.calibrator != THEORETICAL_NAME]
     caption = (
-        f"The lower, the better. Lines: 95 % intervals, {interval_basis(view, view.scored)}; whether entries differ is "
-        "judged from paired differences, which is finer. An entry stands with its run of median training cost."
-        + (f" Without an answer: {', '.join(silent)}." if silent else "")
+        f"The lower, the better. Lines: 95 % intervals, {views.interval_basis(view, view.scored)}; whether entries "
+        "differ is judged from paired differences, which is finer. An entry stands with its run of median training "
+        "cost." + (f" Without an answer: {', '.join(silent)}." if silent else "")
     )
-    return FigureGrid((Figure(title, figure, f"{title}: {words}", height),), tuple(items), 1, caption, "all-entries")
+    return blocks.FigureGrid(
+        (blocks.Figure(title, figure, f"{title}: {words}", height),), tuple(items), 1, caption, "all-entries"
+    )
 
 
-def _lines(view: DatasetView) -> list[_Line]:
+def _lines(view: views.DatasetView) -> list[_Line]:
     lines = []
     for entry, _ in view.calibrated:
         cost = entry.cost(view.scored)
@@ -99,11 +80,11 @@ def _lines(view: DatasetView) -> list[_Line]:
     return sorted(lines, key=lambda each: each.cost.value)
 
 
-def _traces(item: LegendItem, lines: Sequence[_Line], decimals: int) -> list[go.Scatter]:
+def _traces(item: blocks.LegendItem, lines: Sequence[_Line], decimals: int) -> list[go.Scatter]:
     rows = [(row, each) for row, each in enumerate(lines) if each.item is item]
     spans = [np.column_stack([each.cost.known, [row, row]]) for row, each in rows if each.cost.known is not None]
     words = [
-        f"{each.label}: {fixed(each.cost.value, decimals)} ({interval_in_words(each.cost, decimals)})"
+        f"{each.label}: {fixed(each.cost.value, decimals)} ({views.interval_in_words(each.cost, decimals)})"
         for _, each in rows
     ]
     values, places = [each.cost.value for _, each in rows], [float(row) for row, _ in rows]
@@ -116,58 +97,58 @@ _ARRIVED = 0.01  # relative: a search whose training cost is further above the l
 _SEEDS_DIFFER = 0.25
 
 
-def answer_of(view: DatasetView) -> Section:
+def answer_of(view: views.DatasetView) -> blocks.Section:
     """The section with the answer: what calibration gained, paths before and after, all entries, and doubts."""
     best = view.best
     chart = entry_chart(view)
-    more: list[Block] = [*_held_out(view), _remarks(view, best)]
+    more: list[blocks.Block] = [*_held_out(view), _remarks(view, best)]
     if best is None or best.calibrator == THEORETICAL_NAME:
         drawn = None if best is None else path_picture(view)
-        return answer_section(_no_winner(view, best), (), drawn, *((chart,) if chart else ()), *more)
-    standing = Paragraph(_standing_at_length(view, best))
-    return answer_section(
+        return blocks.answer_section(_no_winner(view, best), (), drawn, *((chart,) if chart else ()), *more)
+    standing = blocks.Paragraph(_standing_at_length(view, best))
+    return blocks.answer_section(
         _verdict(view, best), _tiles(view, best), path_picture(view), *((chart,) if chart else ()), standing, *more
     )
 
 
-def path_picture(view: DatasetView) -> FigureGrid | None:
+def path_picture(view: views.DatasetView) -> blocks.FigureGrid | None:
     """Paths of a few runs of the scored split: reference, design values and the best calibration."""
-    models = [(THEORETICAL_STYLE, view.model(view.design_matrix))]
+    models = [(views.THEORETICAL_STYLE, view.model(view.design_matrix))]
     best = view.best
     if best is not None and best.calibrator != THEORETICAL_NAME and best.typical is not None:
         run = best.typical
         if run.matrix is not None:
-            style = LegendItem("calibrated", f"calibrated by {best.label}", CALIBRATED)
+            style = blocks.LegendItem("calibrated", f"calibrated by {best.label}", CALIBRATED)
             models.append((style, view.model(run.matrix, run.extension)))
-    return paths_before_after(view.dataset.split(view.scored), models, SPLIT_NAMES[view.scored])
+    return paths_before_after(view.dataset.split(view.scored), models, views.SPLIT_NAMES[view.scored])
 
 
-def _held_out(view: DatasetView) -> tuple[Block, ...]:
+def _held_out(view: views.DatasetView) -> tuple[blocks.Block, ...]:
     """The verdict of held-out runs on the best calibration, in the words of ``calibrate`` and ``evaluate``."""
-    sessions = (Callout("Sessions", view.sessions, "warning"),) if view.sessions else ()
+    sessions = (blocks.Callout("Sessions", view.sessions, "warning"),) if view.sessions else ()
     if view.held_out is None:
         return sessions
     verdict = view.held_out.verdict
     manner: Literal["plain", "warning"] = "plain" if verdict.verdict == "better" else "warning"
     words = typeset(f"{view.held_out.label}, {verdict.sentence}")
-    return (Callout(words, (typeset(verdict.detail),), manner), *sessions)
+    return (blocks.Callout(words, (typeset(verdict.detail),), manner), *sessions)
 
 
-def _no_winner(view: DatasetView, best: EntryStatistics | None) -> str:
+def _no_winner(view: views.DatasetView, best: EntryStatistics | None) -> str:
     if best is None:
         return f"No calibrator gave an answer: {plural(len(view.runs), 'run')}, none usable; the reasons are below."
     answers = [entry.label for entry, _ in view.calibrated]
     if not answers:
         return "Only the design values gave an answer; there is no calibration to compare them with."
     return (
-        f"No calibrator did better than the design values on the {SPLIT_NAMES[view.scored]} runs: {listing(answers)} "
-        f"ended above their cost, or are not told apart from them."
+        f"No calibrator did better than the design values on the {views.SPLIT_NAMES[view.scored]} runs: "
+        f"{listing(answers)} ended above their cost, or are not told apart from them."
     )
 
 
-def _verdict(view: DatasetView, best: EntryStatistics) -> str:
+def _verdict(view: views.DatasetView, best: EntryStatistics) -> str:
     split = view.scored
-    runs = plural(len(view.dataset.split(split)), f"{SPLIT_NAMES[split]} run")
+    runs = plural(len(view.dataset.split(split)), f"{views.SPLIT_NAMES[split]} run")
     errors = _errors(view, best)
     words = f"On the {runs}, "
     if errors is not None:
@@ -180,14 +161,14 @@ def _verdict(view: DatasetView, best: EntryStatistics) -> str:
         words += f"{best.label} has the best calibration"
     interval = best.improvement(split)
     if interval is not None:
-        fell, sure = improvement_in_words(best, split, 1)
+        fell, sure = views.improvement_in_words(best, split, 1)
         words += f": the cost fell by {fell}{_with_interval(sure)}"
         chance = interval.known is not None and interval.holds(0.0)
         words += ", which the noise alone could explain" if chance else ""
     return f"{words}. {_standing(view, best)}."
 
 
-def _errors(view: DatasetView, best: EntryStatistics) -> tuple[str, str] | None:
+def _errors(view: views.DatasetView, best: EntryStatistics) -> tuple[str, str] | None:
     """Mean final errors in words, by the design values and by the best entry: position and heading, where known."""
     parts = list(_changes(view, best))
     if not parts:
@@ -196,24 +177,24 @@ def _errors(view: DatasetView, best: EntryStatistics) -> tuple[str, str] | None:
     return " and ".join(before), " and ".join(after)
 
 
-def _changes(view: DatasetView, best: EntryStatistics) -> Iterator[tuple[tuple[str, str], str]]:
+def _changes(view: views.DatasetView, best: EntryStatistics) -> Iterator[tuple[tuple[str, str], str]]:
     """Mean errors of positions, then of headings, before and after calibration, and the worst one after, in words."""
     after = None if best.typical is None else view.errors(best.typical, view.scored)
     if after is None:
         return
     (p0, h0), (p1, h1) = positions_and_headings(view.design_errors[view.scored]), positions_and_headings(after)
-    factor, unit, digits = position_unit(mean_and_worst(p0)[0], mean_and_worst(p1)[0])
+    factor, unit, digits = views.position_unit(views.mean_and_worst(p0)[0], views.mean_and_worst(p1)[0])
     for was, now, scale, decimals, of_scale in (
         (p0, p1, factor, digits, unit),
         (h0, h1, math.degrees(1.0), 2, "°"),
     ):
-        (mean, worst), (before, _) = mean_and_worst(now), mean_and_worst(was)
+        (mean, worst), (before, _) = views.mean_and_worst(now), views.mean_and_worst(was)
         old, new, most = (with_unit(fixed(scale * value, decimals), of_scale) for value in (before, mean, worst))
         if not math.isnan(mean):
             yield (old, new), most
 
 
-def _standing(view: DatasetView, best: EntryStatistics) -> str:
+def _standing(view: views.DatasetView, best: EntryStatistics) -> str:
     """The best entry beside the others, in short."""
     if len(view.calibrated) == 1:
         return f"{best.label} is the only calibrator with an answer"
@@ -229,7 +210,7 @@ def _standing(view: DatasetView, best: EntryStatistics) -> str:
     return f"{number} {entries} not told apart from it{', the design values among them' if design else ''}"
 
 
-def _standing_at_length(view: DatasetView, best: EntryStatistics) -> str:
+def _standing_at_length(view: views.DatasetView, best: EntryStatistics) -> str:
     """The entries that are not told apart from the best one; of these the lowest training cost decides."""
     basis = f"The intervals: {view.units[view.scored].words}."
     if len(view.calibrated) > 1 and view.undecided:
@@ -240,13 +221,13 @@ def _standing_at_length(view: DatasetView, best: EntryStatistics) -> str:
     if len(rivals) < 2:
         return basis
     return (
-        f"Not told apart on the {SPLIT_NAMES[view.scored]} runs: {listing(rivals, 20)}; {best.label} has the lowest "
-        f"training cost of them. {basis}"
+        f"Not told apart on the {views.SPLIT_NAMES[view.scored]} runs: {listing(rivals, 20)}; {best.label} has the "
+        f"lowest training cost of them. {basis}"
     )
 
 
-def _tiles(view: DatasetView, best: EntryStatistics) -> tuple[Fact, ...]:
-    split, decimals = view.scored, cost_decimals(view)
+def _tiles(view: views.DatasetView, best: EntryStatistics) -> tuple[blocks.Fact, ...]:
+    split, decimals = view.scored, views.cost_decimals(view)
     reached, before = best.cost(split), view.theoretical_cost(split)
     tiles = []
     for (old, new), worst in _changes(view, best):
@@ -255,29 +236,29 @@ def _tiles(view: DatasetView, best: EntryStatistics) -> tuple[Fact, ...]:
         if view.without_poses:
             name = f"Error of {'angles' if kind == 'heading' else 'lengths and places'}, mean"
         shared = old if kind == "heading" else old.rpartition(" ")[0]
-        tiles.append(Fact(name, f"{shared} → {new}", f"worst {worst}"))
+        tiles.append(blocks.Fact(name, f"{shared} → {new}", f"worst {worst}"))
     if reached is not None:
         tiles.append(
-            Fact(
-                f"Cost, {SPLIT_NAMES[split]} runs",
+            blocks.Fact(
+                f"Cost, {views.SPLIT_NAMES[split]} runs",
                 f"{fixed(before, decimals)} → {fixed(reached.value, decimals)}",
-                _with_interval(interval_in_words(reached, decimals)).strip(" ()"),
+                _with_interval(views.interval_in_words(reached, decimals)).strip(" ()"),
             )
         )
     if best.improvement(split) is not None:
-        fell, sure = improvement_in_words(best, split, 1)
-        tiles.append(Fact("Improvement of the cost", fell, _with_interval(sure).strip(" ()")))
+        fell, sure = views.improvement_in_words(best, split, 1)
+        tiles.append(blocks.Fact("Improvement of the cost", fell, _with_interval(sure).strip(" ()")))
     return tuple(tiles)
 
 
 def _with_interval(words: str) -> str:
-    return "" if words == NO_INTERVAL else f" (95 % interval {words})"
+    return "" if words == views.NO_INTERVAL else f" (95 % interval {words})"
 
 
-def _doubts(view: DatasetView, best: EntryStatistics) -> list[str]:
+def _doubts(view: views.DatasetView, best: EntryStatistics) -> list[str]:
     """Reasons to doubt the first place: seeds that differ, a minimum that was missed, others with a lower cost."""
     doubts = []
-    split, decimals = view.scored, cost_decimals(view)
+    split, decimals = view.scored, views.cost_decimals(view)
     runs = [run for run in view.runs if run.record.label == best.label]
     values = [run.scores[split].cost for run in runs if split in run.scores]
     reached = best.cost(split)
@@ -285,7 +266,7 @@ def _doubts(view: DatasetView, best: EntryStatistics) -> list[str]:
     width = high - low
     if len(values) > 1 and max(values) - min(values) > _SEEDS_DIFFER * width:
         doubts.append(
-            f"{best.label} depends on its seed: over {len(values)} seeds its {SPLIT_NAMES[split]} cost goes from "
+            f"{best.label} depends on its seed: over {len(values)} seeds its {views.SPLIT_NAMES[split]} cost goes from "
             f"{span(min(values), max(values), decimals)}. The verdict is about the run of median training cost."
         )
     lowest = min((entry.train_median for entry in view.statistics if entry.train_median is not None), default=None)
@@ -300,22 +281,22 @@ def _doubts(view: DatasetView, best: EntryStatistics) -> list[str]:
     lower = _apart(view, -1)
     if lower:
         doubts.append(
-            f"Below {best.label} in {SPLIT_NAMES[split]} cost, as the mean difference with its 95 % interval, though "
-            f"above it in training cost: {listing(lower, 20)}."
+            f"Below {best.label} in {views.SPLIT_NAMES[split]} cost, as the mean difference with its 95 % interval, "
+            f"though above it in training cost: {listing(lower, 20)}."
         )
     return doubts
 
 
-def _apart(view: DatasetView, sign: Literal[-1, 1]) -> list[str]:
+def _apart(view: views.DatasetView, sign: Literal[-1, 1]) -> list[str]:
     """Entries whose cost is below (-1) or above (1) the best entry's by more than the noise, with the difference."""
     return [
-        "{}: {} ({})".format(entry.label, *difference_in_words(entry.difference))
+        "{}: {} ({})".format(entry.label, *views.difference_in_words(entry.difference))
         for entry, _ in view.calibrated
         if entry.difference is not None and entry.practically_equal is False and sign * entry.difference.value > 0
     ]
 
 
-def _worse_commands(view: DatasetView, best: EntryStatistics) -> list[str]:
+def _worse_commands(view: views.DatasetView, best: EntryStatistics) -> list[str]:
     """Commands on which the best entry does worse than the design values, the worst first."""
     if best.typical is None or best.calibrator == THEORETICAL_NAME:
         return []
@@ -329,21 +310,21 @@ def _worse_commands(view: DatasetView, best: EntryStatistics) -> list[str]:
     worse = sorted((row for row in means if row[2] > row[1]), key=lambda row: row[1] - row[2])
     if not worse:
         return []
-    digits = cost_decimals(view)
+    digits = views.cost_decimals(view)
     changes = [f"{name} {fixed(was, digits)} → {fixed(now, digits)}" for name, was, now in worse]
     return [
         f"{best.label} does worse than the design values on {len(worse)} of {plural(len(means), 'command')} of the "
-        f"{SPLIT_NAMES[split]} runs, as the mean cost of each, design values → {best.label}: "
+        f"{views.SPLIT_NAMES[split]} runs, as the mean cost of each, design values → {best.label}: "
         f"{listing(changes, len(changes))}."
     ]
 
 
-def _repeats_commands(view: DatasetView) -> bool:
+def _repeats_commands(view: views.DatasetView) -> bool:
     commands = [trajectory.command for trajectory in view.dataset.split(view.scored) if trajectory.command is not None]
     return len(set(commands)) < len(commands)
 
 
-def _remarks(view: DatasetView, best: EntryStatistics | None) -> Callout:
+def _remarks(view: views.DatasetView, best: EntryStatistics | None) -> blocks.Callout:
     items: list[str] = []
     doubts: list[str] = []
     split = view.scored
@@ -355,15 +336,15 @@ def _remarks(view: DatasetView, best: EntryStatistics | None) -> Callout:
         worse = _apart(view, 1)
         if worse:
             items.append(
-                f"Worse than {best.label} by more than the noise, as the mean difference in {SPLIT_NAMES[split]} cost "
-                f"with its 95 % interval: {listing(worse)}."
+                f"Worse than {best.label} by more than the noise, as the mean difference in {views.SPLIT_NAMES[split]} "
+                f"cost with its 95 % interval: {listing(worse)}."
             )
     for entry in view.statistics:
         bad = [run.record for run in view.runs if run.record.label == entry.label and run.matrix is None]
         if bad:
             reasons = listing(list(dict.fromkeys(f"{record.outcome}: {record.reason}" for record in bad)), 2)
             items.append(f"{entry.label} gave no answer in {len(bad)} of {plural(entry.runs, 'run')} ({reasons}).")
-    bound = [entry.label for entry, run in view.calibrated if on_bounds(run.record)]
+    bound = [entry.label for entry, run in view.calibrated if views.on_bounds(run.record)]
     if bound:
         items.append(f"Held back by the box, with elements on a bound: {listing(bound)}. A wider box may do better.")
     if view.units[split].name == "run" and _repeats_commands(view):
@@ -372,4 +353,4 @@ def _remarks(view: DatasetView, best: EntryStatistics | None) -> Callout:
             "commands that were not driven here the spread is larger (bootstrap: {unit: command})."
         )
     failed = any(entry.answers < entry.runs for entry in view.statistics)
-    return Callout("To be kept in mind", tuple(items), "warning" if doubts or failed else "plain")
+    return blocks.Callout("To be kept in mind", tuple(items), "warning" if doubts or failed else "plain")

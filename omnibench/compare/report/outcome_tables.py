@@ -6,15 +6,7 @@ import json
 import math
 from collections.abc import Sequence
 
-from omnibench.compare.report.view import (
-    SPLIT_NAMES,
-    DatasetView,
-    difference_in_words,
-    entry_cell,
-    interval_basis,
-    on_bounds,
-    rivals_in_words,
-)
+from omnibench.compare.report import view as views
 from omnibench.compare.result import BoxCertificate, EntryStatistics, RunRecord
 from omnibench.fit.geometry import FittedParameter
 from omnibench.fit.span import driven_span
@@ -24,13 +16,13 @@ from omnibench.report.numbers import NOTHING, count, decimals_for, fixed, listin
 from omnibench.robot.kinematics import Array, relative_deviations
 
 
-def matrix_section(view: DatasetView) -> Section:
+def matrix_section(view: views.DatasetView) -> Section:
     """Matrices, their differences from the design values and from the reference entry, parameters, all digits."""
     about = "All elements, their differences from the design values, and the wheels that they stand for."
     return Section("matrices", "Matrices", _blocks(view), about=about, folded=True)
 
 
-def _blocks(view: DatasetView) -> tuple[Block, ...]:
+def _blocks(view: views.DatasetView) -> tuple[Block, ...]:
     if not view.calibrated:
         return (Paragraph("No run gave a matrix.", "note"),)
     blocks: list[Block] = [_element_table(view), _difference_table(view, None)]
@@ -51,7 +43,7 @@ def _blocks(view: DatasetView) -> tuple[Block, ...]:
     return tuple(blocks)
 
 
-def parameter_table(view: DatasetView) -> Table | None:
+def parameter_table(view: views.DatasetView) -> Table | None:
     """Physical parameters and their deviation from the design values, as in section 4.2; None without any."""
     fitted = [(entry, run.record) for entry, run in view.calibrated if run.record.parameters]
     if not fitted:
@@ -79,8 +71,8 @@ def parameter_table(view: DatasetView) -> Table | None:
     )
 
 
-def _element_table(view: DatasetView) -> Table:
-    rows = [Row.of(entry_cell(view, None), *(fixed(float(v), 6) for v in view.design_matrix.ravel()))]
+def _element_table(view: views.DatasetView) -> Table:
+    rows = [Row.of(views.entry_cell(view, None), *(fixed(float(v), 6) for v in view.design_matrix.ravel()))]
     for entry, run in view.calibrated:
         if run.matrix is None:
             continue
@@ -89,7 +81,7 @@ def _element_table(view: DatasetView) -> Table:
             fixed(float(value), 6) + marks.get(name, "")
             for name, value in zip(_element_names(view), run.matrix.ravel(), strict=True)
         ]
-        rows.append(Row.of(entry_cell(view, entry), *cells, role="best" if entry.is_best else "plain"))
+        rows.append(Row.of(views.entry_cell(view, entry), *cells, role="best" if entry.is_best else "plain"))
     drive = view.dataset.robot.drive
     held = any(run.record.held for entry, run in view.calibrated if entry.parameterisation == "matrix")
     return Table(
@@ -102,7 +94,7 @@ def _element_table(view: DatasetView) -> Table:
     )
 
 
-def _published_differences(view: DatasetView) -> list[Table]:
+def _published_differences(view: views.DatasetView) -> list[Table]:
     """Eq. (11) of the paper with its methods here: the parametric matrix over the non-parametric one."""
     labels = {entry.parameterisation: entry.label for _, entry, _ in view.published_entries}
     if not {"geometry", "matrix"} <= labels.keys():
@@ -110,7 +102,7 @@ def _published_differences(view: DatasetView) -> list[Table]:
     return [_difference_table(view, labels["matrix"], labels["geometry"])]
 
 
-def _difference_table(view: DatasetView, against: str | None, only: str | None = None) -> Table:
+def _difference_table(view: views.DatasetView, against: str | None, only: str | None = None) -> Table:
     """Differences from the design values or the entry called ``against``: of all entries, or of one ``only``."""
     matrices = {entry.label: run.matrix for entry, run in view.calibrated if run.matrix is not None}
     reference = view.design_matrix if against is None else matrices[against]
@@ -124,7 +116,7 @@ def _difference_table(view: DatasetView, against: str | None, only: str | None =
         moved = (matrix - reference).ravel()
         columns = zip(share, moved, _element_units(view), strict=True)
         cells = [_difference_cell(float(s), float(d), unit) for s, d, unit in columns]
-        rows.append(Row.of(entry_cell(view, entry), *cells))
+        rows.append(Row.of(views.entry_cell(view, entry), *cells))
     name = "the design values" if against is None else against
     note = "Element by element, as a share of the value compared with; where that is 0, the change itself is given."
     note += " Eq. (10) and (11) of the paper." if view.of_the_paper else ""
@@ -145,7 +137,7 @@ def _difference_cell(share: float, moved: float, unit: str) -> Cell:
     return Cell(f"{fixed(100 * share, 3, signed=True)} %")
 
 
-def _span_projector(view: DatasetView) -> Array | None:
+def _span_projector(view: views.DatasetView) -> Array | None:
     robot, training = view.dataset.robot, view.dataset.split("train")
     if len(robot.drive.names) == len(robot.motions) or not training:
         return None
@@ -154,11 +146,11 @@ def _span_projector(view: DatasetView) -> Array | None:
     return projector
 
 
-def _element_names(view: DatasetView) -> list[str]:
+def _element_names(view: views.DatasetView) -> list[str]:
     return [f"m{row}{column}" for row in (1, 2, 3) for column in range(1, len(view.dataset.robot.drive.names) + 1)]
 
 
-def _element_units(view: DatasetView) -> list[str]:
+def _element_units(view: views.DatasetView) -> list[str]:
     return ["rad/rad" if name.startswith("m3") else "m/rad" for name in _element_names(view)]
 
 
@@ -168,7 +160,7 @@ def _shown(value: float, unit: str) -> str:
 
 
 def _marks(record: RunRecord) -> dict[str, str]:
-    return {**dict.fromkeys(on_bounds(record), "†"), **dict.fromkeys(record.held, "‡")}
+    return {**dict.fromkeys(views.on_bounds(record), "†"), **dict.fromkeys(record.held, "‡")}
 
 
 def _parameter_cell(parameter: FittedParameter | None, mark: str) -> Cell:
@@ -184,7 +176,7 @@ def _parameter_cell(parameter: FittedParameter | None, mark: str) -> Cell:
 _FOLDED_ABOVE = 20  # runs: a longer table of runs is folded away (chosen)
 
 
-def outcome_section(view: DatasetView) -> Section:
+def outcome_section(view: views.DatasetView) -> Section:
     """The section "Outcomes": tables of the entries, of the proven bounds if there are any, and of all runs."""
     proofs = (certificate_table(view.certificates),) if view.certificates else ()
     runs: Block = run_table(view)
@@ -194,14 +186,14 @@ def outcome_section(view: DatasetView) -> Section:
     return Section("outcomes", "Outcomes", (entry_table(view), *proofs, runs), about=about, folded=True)
 
 
-def entry_table(view: DatasetView) -> Table:
+def entry_table(view: views.DatasetView) -> Table:
     """A table of the entries: costs over their seeds, and the difference from the best."""
     rows = []
     for entry in view.statistics:
         digits = decimals_for(entry.train_median, 5)
         rows.append(
             Row.of(
-                entry_cell(view, entry),
+                views.entry_cell(view, entry),
                 f"{entry.answers} of {entry.runs}",
                 Cell(fixed(entry.train_median, digits), _spread(entry)),
                 Cell(gap(entry.gap_median), proven(entry.proven_gap_median)),
@@ -222,7 +214,7 @@ def entry_table(view: DatasetView) -> Table:
             Column("Cost, training, median"),
             Column(gap_title(view), "relative", priority=2),
             Column("Evaluations and time, median", priority=3),
-            Column(f"Difference from the best in {SPLIT_NAMES[view.scored]} cost"),
+            Column(f"Difference from the best in {views.SPLIT_NAMES[view.scored]} cost"),
             Column("Verdict", numeric=False),
         ),
         rows=tuple(rows),
@@ -230,14 +222,14 @@ def entry_table(view: DatasetView) -> Table:
         f"box, minus one; {NOTHING} where it has no answer or leaves no error. Proven: what share of the "
         "cost any optimiser could still save in that box, at most. "
         f"Difference: paired by {view.units[view.scored].name}, with its 95 % interval, "
-        f"{interval_basis(view, view.scored)}. Not told apart: that interval contains zero, "
+        f"{views.interval_basis(view, view.scored)}. Not told apart: that interval contains zero, "
         "or the difference is below a tenth of the standard error of the best entry's cost; undecided: there is no "
         "interval. Best: the lowest training cost of the entries that are not known to differ from the one of lowest "
-        f"{SPLIT_NAMES[view.scored]} cost.{_held_in_words(view)}{_time_in_words(view)}",
+        f"{views.SPLIT_NAMES[view.scored]} cost.{_held_in_words(view)}{_time_in_words(view)}",
     )
 
 
-def gap_title(view: DatasetView) -> str:
+def gap_title(view: views.DatasetView) -> str:
     """Heading of gaps above closed_form, with how near the optimum that is, if this is proven for all boxes."""
     exact = [run.record for entry, run in view.calibrated if calibrators.entry(entry.calibrator).cls.exact]
     proofs = [record.proven_gap for record in exact if record.proven_gap is not None]
@@ -246,7 +238,7 @@ def gap_title(view: DatasetView) -> str:
     return f"Gap above closed_form, proven within {percent(max(*proofs, 0.0), 2)} of the optimum"
 
 
-def run_table(view: DatasetView, typical: bool = False) -> Table:
+def run_table(view: views.DatasetView, typical: bool = False) -> Table:
     """A table of every run, or of each entry's ``typical`` one, including those without an answer."""
     runs = view.typical_runs if typical else view.runs
     return Table(
@@ -313,16 +305,16 @@ def _spread(entry: EntryStatistics) -> str:
 def _difference(entry: EntryStatistics) -> Cell:
     if entry.difference is None or entry.is_best:
         return Cell(NOTHING)
-    return Cell(*difference_in_words(entry.difference))
+    return Cell(*views.difference_in_words(entry.difference))
 
 
-def _verdict(view: DatasetView, entry: EntryStatistics) -> Cell:
+def _verdict(view: views.DatasetView, entry: EntryStatistics) -> Cell:
     if entry.typical is None:
         return Cell("no answer")
     if entry.is_best:
-        return Cell("lowest training cost" if view.undecided else "best", rivals_in_words(view))
+        return Cell("lowest training cost" if view.undecided else "best", views.rivals_in_words(view))
     if entry.practically_equal is None or entry.difference is None:
-        return Cell("undecided", interval_basis(view, view.scored))
+        return Cell("undecided", views.interval_basis(view, view.scored))
     if entry in view.not_told_apart:
         return Cell("not told apart")
     if entry.practically_equal:  # the design values, as the headline has them
@@ -332,7 +324,7 @@ def _verdict(view: DatasetView, entry: EntryStatistics) -> Cell:
     return Cell("lower cost here", "higher training cost")
 
 
-def _time_in_words(view: DatasetView) -> str:
+def _time_in_words(view: views.DatasetView) -> str:
     """A sentence on times that are no seconds; empty where they are."""
     if not view.config.timing:
         return " The runs were not timed."
@@ -344,7 +336,7 @@ def _time_in_words(view: DatasetView) -> str:
     )
 
 
-def _held_in_words(view: DatasetView) -> str:
+def _held_in_words(view: views.DatasetView) -> str:
     """A sentence on elements that a box holds, and on the entries concerned; empty where there are none."""
     held: dict[tuple[str, ...], list[str]] = {}
     for entry, run in view.calibrated:
@@ -354,7 +346,7 @@ def _held_in_words(view: DatasetView) -> str:
     return f" Held at the design value by a box without width there: {'; '.join(parts)}." if parts else ""
 
 
-def _run_row(view: DatasetView, record: RunRecord) -> Row:
+def _run_row(view: views.DatasetView, record: RunRecord) -> Row:
     answered = record.matrix is not None
     return Row.of(
         Cell(record.label, colour=view.styles[record.label].colour),
@@ -369,6 +361,6 @@ def _run_row(view: DatasetView, record: RunRecord) -> Row:
                 record.seconds, record.seconds / record.reference_seconds if record.reference_seconds else None
             ),
         ),
-        ", ".join(on_bounds(record)) if answered and on_bounds(record) else NOTHING,
+        ", ".join(views.on_bounds(record)) if answered and views.on_bounds(record) else NOTHING,
         role="plain" if answered else "failed",
     )

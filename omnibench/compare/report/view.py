@@ -7,17 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from omnibench.compare import result as results
 from omnibench.compare.config import CompareConfig, PublishedResult
 from omnibench.compare.plan import UNBOUNDED
-from omnibench.compare.result import (
-    THEORETICAL_NAME,
-    BoxCertificate,
-    ComparisonResult,
-    EntryStatistics,
-    EntryVerdict,
-    RunRecord,
-    ScoredRun,
-)
 from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory
 from omnibench.fit.evaluate import final_errors
 from omnibench.fit.ratio_intervals import Interval, Units, units_of
@@ -61,15 +53,15 @@ class DatasetView:
     name: str
     config: CompareConfig
     dataset: Dataset
-    runs: tuple[ScoredRun, ...]
-    statistics: tuple[EntryStatistics, ...]
-    certificates: tuple[BoxCertificate, ...]
+    runs: tuple[results.ScoredRun, ...]
+    statistics: tuple[results.EntryStatistics, ...]
+    certificates: tuple[results.BoxCertificate, ...]
     warnings: tuple[str, ...]
     styles: Mapping[str, LegendItem]
     design_costs: Mapping[Split, Interval]
     design_errors: Mapping[Split, Array]
     units: Mapping[Split, Units]
-    held_out: EntryVerdict | None
+    held_out: results.EntryVerdict | None
     sessions: tuple[str, ...]
 
     @property
@@ -96,12 +88,12 @@ class DatasetView:
         return "validation" if "validation" in self.design_errors else "train"
 
     @property
-    def best(self) -> EntryStatistics | None:
+    def best(self) -> results.EntryStatistics | None:
         """The best entry, unless nothing gave an answer."""
         return next((entry for entry in self.statistics if entry.is_best and entry.typical is not None), None)
 
     @property
-    def not_told_apart(self) -> list[EntryStatistics]:
+    def not_told_apart(self) -> list[results.EntryStatistics]:
         """Entries whose difference from the best may be chance, itself among them.
 
         The design values are not, where the best one's improvement on them is more than chance.
@@ -111,7 +103,8 @@ class DatasetView:
         return [
             entry
             for entry in self.statistics
-            if entry.is_best or (entry.practically_equal and not (better and entry.calibrator == THEORETICAL_NAME))
+            if entry.is_best
+            or (entry.practically_equal and not (better and entry.calibrator == results.THEORETICAL_NAME))
         ]
 
     @property
@@ -125,29 +118,29 @@ class DatasetView:
         return any(entry.practically_equal is None and entry.answers for entry in self.statistics)
 
     @property
-    def calibrated(self) -> list[tuple[EntryStatistics, ScoredRun]]:
+    def calibrated(self) -> list[tuple[results.EntryStatistics, results.ScoredRun]]:
         """Entries with an answer, and their typical run; without the design values."""
         return [
             (entry, entry.typical)
             for entry in self.statistics
-            if entry.typical is not None and entry.calibrator != THEORETICAL_NAME
+            if entry.typical is not None and entry.calibrator != results.THEORETICAL_NAME
         ]
 
     @property
-    def typical_runs(self) -> list[ScoredRun]:
+    def typical_runs(self) -> list[results.ScoredRun]:
         """The run of each entry with the median training cost; its first where none gave an answer."""
         first = {run.record.label: run for run in reversed(self.runs)}
         return [entry.typical or first[entry.label] for entry in self.statistics]
 
     @property
-    def reference_entry(self) -> tuple[EntryStatistics, ScoredRun] | None:
+    def reference_entry(self) -> tuple[results.EntryStatistics, results.ScoredRun] | None:
         """The entry that matrices are compared with: closed_form's, else the best calibration."""
         exact = [pair for pair in self.calibrated if calibrators.entry(pair[0].calibrator).cls.exact]
         best = [pair for pair in self.calibrated if pair[0].is_best]
         return next(iter(exact + best + self.calibrated), None)
 
     @property
-    def published_entries(self) -> list[tuple[PublishedResult, EntryStatistics, ScoredRun]]:
+    def published_entries(self) -> list[tuple[PublishedResult, results.EntryStatistics, results.ScoredRun]]:
         """Published results whose method is an entry here that gave an answer, with that entry and its typical run."""
         answers = {entry.label: (entry, run) for entry, run in self.calibrated if run.matrix is not None}
         return [(result, *answers[result.entry]) for result in self.config.published_results if result.entry in answers]
@@ -156,7 +149,7 @@ class DatasetView:
         """The cost of the design values on a split; None where there is no run, or no such split."""
         return self.runs[0].design[split].cost if self.runs and split in self.runs[0].design else None
 
-    def errors(self, run: ScoredRun, split: Split) -> Array | None:
+    def errors(self, run: results.ScoredRun, split: Split) -> Array | None:
         """Final pose errors (Z, 3) of a run's answer, m, m, rad; NaN where the references do not tell them."""
         return _told(run.scores[split].errors, self.dataset.split(split)) if split in run.scores else None
 
@@ -176,12 +169,12 @@ class DatasetView:
         return self.dataset.robot.inverse_kinematic_matrix
 
 
-def views(result: ComparisonResult) -> list[DatasetView]:
+def views(result: results.ComparisonResult) -> list[DatasetView]:
     """The data sets of a comparison, in the config's order."""
     # A style for each label; the design values have theirs
     names = {entry.label: entry.calibrator for entry in result.statistics}
     names |= {run.record.label: run.record.calibrator for run in result.runs}
-    searches = {label: name for label, name in names.items() if name != THEORETICAL_NAME}
+    searches = {label: name for label, name in names.items() if name != results.THEORETICAL_NAME}
     drawn = colours({label: _CUSTOMARY.get(name) for label, name in searches.items()})
     by_label = {
         label: LegendItem(f"entry-{index}", label, colour, dash, SYMBOLS[index % len(SYMBOLS)])
@@ -191,7 +184,7 @@ def views(result: ComparisonResult) -> list[DatasetView]:
     return [_view(result, name, styles) for name in result.datasets]
 
 
-def _view(result: ComparisonResult, name: str, styles: Mapping[str, LegendItem]) -> DatasetView:
+def _view(result: results.ComparisonResult, name: str, styles: Mapping[str, LegendItem]) -> DatasetView:
     dataset = result.datasets[name]
     design = OdometryModel.of_design(dataset.robot, result.config.integration)
     return DatasetView(
@@ -229,7 +222,7 @@ def _told(errors: Array, runs: Sequence[Trajectory]) -> Array:
 NO_INTERVAL = "no interval"
 
 
-def improvement_in_words(entry: EntryStatistics, split: Split, decimals: int) -> tuple[str, str]:
+def improvement_in_words(entry: results.EntryStatistics, split: Split, decimals: int) -> tuple[str, str]:
     """An entry's improvement on a split and its interval, in per cent."""
     share = entry.improvement(split)
     if share is None:
@@ -257,11 +250,11 @@ def rivals_in_words(view: DatasetView) -> str:
     return f"not told apart from {plural(others, 'other')}" if others > 0 else ""
 
 
-def entry_cell(view: DatasetView, entry: EntryStatistics | None) -> Cell:
+def entry_cell(view: DatasetView, entry: results.EntryStatistics | None) -> Cell:
     """An entry's name with its colour; None stands for the design values."""
     if entry is None:
-        return Cell(THEORETICAL_NAME, "design values", THEORETICAL_STYLE.colour)
-    if entry.calibrator == THEORETICAL_NAME:
+        return Cell(results.THEORETICAL_NAME, "design values", THEORETICAL_STYLE.colour)
+    if entry.calibrator == results.THEORETICAL_NAME:
         note = "design values"
     elif entry.box == UNBOUNDED:
         note = f"{entry.parameterisation}, as given"
@@ -270,7 +263,7 @@ def entry_cell(view: DatasetView, entry: EntryStatistics | None) -> Cell:
     return Cell(entry.label, note, view.styles[entry.label].colour)
 
 
-def on_bounds(record: RunRecord) -> list[str]:
+def on_bounds(record: results.RunRecord) -> list[str]:
     """Elements that the search moved to a bound; not those that the box holds at their start value."""
     return [name for name in record.at_bounds if name not in record.held]
 

@@ -220,13 +220,13 @@ _ANGLES = {"deg": "deg", "degree": "deg", "degrees": "deg", "°": "deg"}
 _TICKS = dict.fromkeys(("tick", "ticks", "count", "counts", "pulses", "enc", "encoder"), "ticks")
 _WHEELS = {**_ANGLES, **_TICKS, **dict.fromkeys(("rev", "revs", "revolutions"), "rev"), "rpm": "rpm", **_LENGTHS}
 _PER_SECOND = ("s", "sec")  # behind a unit, of rates
-_UNITS = {
+_UNITS: dict[str, tuple[str, dict[str, str]]] = {
     "t": ("wheel_time_unit", _TIME_UNITS),
     "pose_t": ("pose_time_unit", _TIME_UNITS),
     "theta": ("heading_unit", _ANGLES),
     "steer": ("steering_unit", {**_ANGLES, **_TICKS}),
     **dict.fromkeys("xyz", ("position_unit", _LENGTHS)),
-    **dict.fromkeys(QUATERNION, ("wheel_unit", {})),
+    **dict.fromkeys(QUATERNION, ("wheel_unit", dict[str, str]())),
 }
 """Options of the units of columns by their keys, and the words that say these units; others are wheels."""
 _NEEDS = {"wheel_unit=ticks": "ticks_per_turn=N", "steering_unit=ticks": "steering_ticks_per_turn=N"}

@@ -25,7 +25,7 @@ from omnibench.data.recording import (
 from omnibench.data.runs import dataset_of
 from omnibench.data.scans import Ranges, Scans
 from omnibench.data.splits import Names, joined
-from omnibench.data.storage import Header, load_dataset, read_recorded
+from omnibench.data.storage import load_dataset, read_recorded
 from omnibench.errors import ConfigError, DataError, nearest
 from omnibench.registry import importers
 from omnibench.robot.kinematics import Robot
@@ -78,15 +78,14 @@ class DatasetFolder(Importer):
 
     def read(self, source: Path) -> Dataset:
         """The data set as the options say. DataError as for ``load_dataset``."""
-        recorded = read_recorded(source)
-        header, options = recorded.header, self.options
-        said = {key: getattr(options, key) or getattr(header, key) for key in ("description", "source", "licence")}
-        return _reread(recorded.trajectories, header, recorded.scans, options.model_copy(update=said), [])
+        recorded, options = read_recorded(source), self.options
+        said = {key: getattr(options, key) or getattr(recorded, key) for key in ("description", "source", "licence")}
+        return _reread(recorded.trajectories, recorded, recorded.scans, options.model_copy(update=said), [])
 
     def recordings(self, source: Path, notes: list[str]) -> list[Recording]:  # noqa: ARG002 (as of other importers)
         """The runs of the data set as recordings, as they stand in its tables."""
         recorded = read_recorded(source)
-        return recordings_of(recorded.trajectories, recorded.header.robot, recorded.scans, self.options)
+        return recordings_of(recorded.trajectories, recorded.robot, recorded.scans, self.options)
 
 
 def read_again(dataset: Dataset, settings: Mapping[str, Any], place: str) -> Dataset:
@@ -107,7 +106,7 @@ def read_again(dataset: Dataset, settings: Mapping[str, Any], place: str) -> Dat
 
 
 def _reread(
-    runs: Sequence[Trajectory], header: Header | Dataset, scans: Scans | None, options: DatasetOptions, notes: list[str]
+    runs: Sequence[Trajectory], header: Dataset, scans: Scans | None, options: DatasetOptions, notes: list[str]
 ) -> Dataset:
     """The data set of runs by the options; its sample period stays unless these say another, or another unit of times.
 

@@ -207,7 +207,7 @@ def read_log(session: Session) -> SessionLog | None:
             header.append(fields)
     if not rows:
         raise DataError(f"{file}: it holds no run")
-    runs, table = np.array(rows)[:, 0].astype(int), np.array(rows)[:, 1:]
+    runs, table = np.array(rows)[:, 0].astype(np.intp), np.array(rows)[:, 1:]
     times, ticks, commands = table[:, 0], table[:, kind.log_ticks] * kind.log_signs, None
     if len(kind.log_commands) == 3:
         commands = table[:, kind.log_commands]

@@ -16,28 +16,8 @@ import numpy as np
 
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.regressors.paths import Paths, slopes_by, slopes_by_delay
+from omnibench.robot.effects import smooth
 from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect, Stage
-from omnibench.robot.effects.smooth import (
-    HARMONICS,
-    SmoothAcceleration,
-    SmoothCommand,
-    SmoothCourse,
-    SmoothEffect,
-    SmoothElapsedTime,
-    SmoothHeading,
-    SmoothMap,
-    SmoothOrderOfRuns,
-    SmoothPatch,
-    SmoothPlace,
-    SmoothStamps,
-    SmoothStampWave,
-    SmoothWheelAngle,
-    SmoothWheelRate,
-    bump,
-    hat_functions,
-    lever,
-    mean_waves,
-)
 from omnibench.robot.kinematics import Array
 
 # tests/studies/constants.py varies each number by 0.5 and 2: on a small set with heading drift no verdict and no
@@ -106,18 +86,20 @@ def _in_modes(along: Paths, modes: Sequence[str], shares: Array) -> Array:
     return np.concatenate([along.respond(along.by_modes[mode], shares) for mode in modes], axis=2)
 
 
-def _smooth(effect: SmoothEffect, shapes: Mapping[str, float] | None = None, functions: int | None = None) -> Columns:
+def _smooth(
+    effect: smooth.SmoothEffect, shapes: Mapping[str, float] | None = None, functions: int | None = None
+) -> Columns:
     """Slopes by a smooth effect, of its first so many functions, or of all, in each of its modes."""
     return lambda along: _in_modes(along, effect.modes, effect.shares(along.signals, shapes or {})[:, :functions])
 
 
 def _elapsed(paths: Paths) -> Iterator[Basis]:
-    effect, shapes = SmoothElapsedTime(), {"duration": max(float(paths.signals.elapsed.max()), _SMALL)}
+    effect, shapes = smooth.SmoothElapsedTime(), {"duration": max(float(paths.signals.elapsed.max()), _SMALL)}
     yield _of_effect(effect, "the time since the start of a run", _smooth(effect, shapes, _ORDERS), shapes)
 
 
 def _heading() -> Iterator[Basis]:
-    heading, course = SmoothHeading(), SmoothCourse()
+    heading, course = smooth.SmoothHeading(), smooth.SmoothCourse()
     yield _of_effect(heading, "the robot's heading", _smooth(heading))
 
     def steady_and_course(along: Paths) -> Array:
@@ -133,7 +115,7 @@ def _place(paths: Paths) -> Iterator[Basis]:
     area = area_of(places)
     if area["reach"] < _SMALL:
         return
-    floor, bent, patch = SmoothPlace(), SmoothMap(), SmoothPatch()
+    floor, bent, patch = smooth.SmoothPlace(), smooth.SmoothMap(), smooth.SmoothPatch()
     yield _of_effect(floor, "where on the floor the robot is", _smooth(floor, area), area)
 
     bent_map = _by_parameters(bent, paths, area)
@@ -173,14 +155,14 @@ def patches_on_grid(places: Array, along: int) -> Iterator[dict[str, float]]:
     for steps in product(range(along), repeat=2):
         x, y = (low + spacing * steps).tolist()
         patch = {"centre_x": x, "centre_y": y, "radius": radius}
-        if (bump(places, patch) > np.exp(-1)).mean() > _SEEN:
+        if (smooth.bump(places, patch) > np.exp(-1)).mean() > _SEEN:
             yield patch
 
 
 def _order(paths: Paths, trajectories: Sequence[Trajectory]) -> Iterator[Basis]:
     time = paths.signals.session_time
     if time is not None and len(paths.logs) > 3:  # any three times lie on a parabola
-        effect, shapes = SmoothOrderOfRuns(), {"duration": max(float(time.max()), _SMALL)}
+        effect, shapes = smooth.SmoothOrderOfRuns(), {"duration": max(float(time.max()), _SMALL)}
         columns = _smooth(effect, shapes, _ORDERS)
         yield _of_effect(effect, "the time since the start of the session", columns, shapes, stage="wheel")
     sessions = list(dict.fromkeys(run.session for run in trajectories))
@@ -199,10 +181,10 @@ def _wheel_rate(paths: Paths) -> Iterator[Basis]:
     top = float(np.quantile(np.abs(rates), _TOP))
     if top < _SMALL:
         return
-    effect, shapes = SmoothWheelRate(), {"top": top}
+    effect, shapes = smooth.SmoothWheelRate(), {"top": top}
 
     def of_wheels(along: Paths) -> list[Array]:
-        changes = hat_functions(along.signals.rates, top)
+        changes = smooth.hat_functions(along.signals.rates, top)
         return [along.of_wheel(wheel, changes[:, wheel]) for wheel in range(changes.shape[1])]
 
     yield _of_effect(effect, "how fast the wheels turn", lambda along: np.sum(of_wheels(along), axis=0), shapes)
@@ -214,20 +196,20 @@ def _wheel_rate(paths: Paths) -> Iterator[Basis]:
 def _wheel_angle(paths: Paths) -> Iterator[Basis]:
     if paths.signals.wheel_angles is None:
         return
-    effect = SmoothWheelAngle()
+    effect = smooth.SmoothWheelAngle()
 
     def of_waves(along: Paths) -> Array:
         columns = []
         for wheel in range(along.signals.rates.shape[1]):
-            waves = [mean_waves(along.signals, wheel, harmonic) for harmonic in HARMONICS]
+            waves = [smooth.mean_waves(along.signals, wheel, harmonic) for harmonic in smooth.HARMONICS]
             slopes = along.of_wheel(wheel, np.concatenate(waves, axis=1))
-            columns.append(slopes.reshape(*slopes.shape[:2], len(HARMONICS), -1))
+            columns.append(slopes.reshape(*slopes.shape[:2], len(smooth.HARMONICS), -1))
         return np.concatenate(columns, axis=3)
 
-    for number, harmonic in enumerate(HARMONICS):
+    for number, harmonic in enumerate(smooth.HARMONICS):
         words = f"the angle of the wheels, {harmonic:g} times a turn"
         columns = partial(_part_of, of_waves, number)
-        yield _of_effect(effect, words, columns, {"harmonic": harmonic}, tries=len(HARMONICS))
+        yield _of_effect(effect, words, columns, {"harmonic": harmonic}, tries=len(smooth.HARMONICS))
 
 
 def _acceleration(paths: Paths) -> Iterator[Basis]:
@@ -235,7 +217,7 @@ def _acceleration(paths: Paths) -> Iterator[Basis]:
     top, turning = float(np.hypot(forward, left).max()), float(np.abs(angular).max())
     if max(top, turning) < _SMALL:
         return
-    effect, shapes = SmoothAcceleration(), {"top": max(top, _SMALL), "top_turning": max(turning, _SMALL)}
+    effect, shapes = smooth.SmoothAcceleration(), {"top": max(top, _SMALL), "top_turning": max(turning, _SMALL)}
     yield _of_effect(effect, "how the robot accelerates", _by_parameters(effect, paths, shapes), shapes)
 
 
@@ -255,10 +237,10 @@ def _stamps(paths: Paths) -> Iterator[Basis]:
 
     steps = [np.diff(log.stamps) for log in paths.logs if len(log.stamps) > 1]
     finest = float(np.median(np.concatenate(steps)) if steps else stamps.max())
-    effect, shapes = SmoothStamps(), {"duration": float(stamps.max()), "period": finest}
+    effect, shapes = smooth.SmoothStamps(), {"duration": float(stamps.max()), "period": finest}
     yield _of_effect(effect, "when the reference's poses are stamped", by_delays(effect, shapes), shapes)
     frequencies = np.arange(1, _FREQUENCIES + 1) / (2 * finest * _FREQUENCIES) if steps else np.zeros(0)
-    wave = SmoothStampWave()
+    wave = smooth.SmoothStampWave()
     for frequency in frequencies.tolist():
         words = f"the stamps' place in a period of {1 / frequency:.2g} s"
         shapes = {"frequency": frequency}
@@ -281,7 +263,7 @@ def _command(paths: Paths, trajectories: Sequence[Trajectory]) -> Iterator[Basis
         return
     number = {name: index for index, name in enumerate(names)}
     commands = np.array([-1 if run.command is None else number[run.command] for run in trajectories])
-    of_samples, effect, count = commands[paths.owner], SmoothCommand(), len(names)
+    of_samples, effect, count = commands[paths.owner], smooth.SmoothCommand(), len(names)
     order = np.argsort(of_samples, kind="stable")
     ends = np.searchsorted(of_samples[order], np.arange(count + 1))
     motions = np.array(
@@ -305,7 +287,7 @@ def _command(paths: Paths, trajectories: Sequence[Trajectory]) -> Iterator[Basis
 
 def _near_motions(paths: Paths, motions: Array) -> Iterator[dict[str, float]]:
     """Centre and width of a bump about each of several motions (n, 3), which ends before the nearest other motion."""
-    at_wheels = motions * [1.0, 1.0, lever(paths.robot)]
+    at_wheels = motions * [1.0, 1.0, smooth.lever(paths.robot)]
     away = np.linalg.norm(at_wheels[:, None] - at_wheels, axis=2) + np.diag(np.full(len(motions), np.inf))
     least = _SMALL + _NARROW * float(np.linalg.norm(at_wheels, axis=1).max())
     for (forward, left, turn), nearest in zip(motions.tolist(), away.min(axis=1).tolist(), strict=True):

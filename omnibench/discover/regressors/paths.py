@@ -245,7 +245,13 @@ def make_paths(
         )
         for _, (low, high), _ in sessions
     ]
-    signals = _joined(of_sessions)
+    # The signals of all runs one after another; a signal that one run lacks is left out for all
+    joined: dict[str, Any] = {}
+    for item in fields(Signals):
+        values = [getattr(each, item.name) for each in of_sessions]
+        if isinstance(values[0], np.ndarray) or item.name in ("wheel_angles", "session_time"):
+            joined[item.name] = None if any(value is None for value in values) else np.concatenate(values)
+    signals = replace(of_sessions[0], **joined)
     driven = robot.drive.signals(signals.rates, signals.steering)
     path = PathBatch(samples, starts, (driven @ matrix.T) * signals.durations[:, None], "arc")
     edges = np.cumsum([0, *(len(log.stamps) for log in logs)])
@@ -310,16 +316,6 @@ def part_of(signals: Signals, part: slice, session: str | None) -> Signals:
     chosen: dict[str, Any] = {name: value[part] for name, value in values.items() if isinstance(value, np.ndarray)}
     chosen["session"] = session
     return replace(signals, **chosen)
-
-
-def _joined(signals: Sequence[Signals]) -> Signals:
-    """The signals of all runs one after another; a signal that one run lacks is left out for all."""
-    joined: dict[str, Any] = {}
-    for item in fields(Signals):
-        values = [getattr(each, item.name) for each in signals]
-        if isinstance(values[0], np.ndarray) or item.name in ("wheel_angles", "session_time"):
-            joined[item.name] = None if any(value is None for value in values) else np.concatenate(values)
-    return replace(signals[0], **joined)
 
 
 # tests/studies/constants.py varies it by 0.5 and 2: on a small set with heading drift no verdict and no name

@@ -10,47 +10,12 @@ from itertools import pairwise
 import numpy as np
 import plotly.graph_objects as go
 
-from omnibench.discover.report.residuals import (
-    AFTER,
-    ALONE,
-    BAND,
-    CIRCLE_95,
-    EXTENDED,
-    FLOOR,
-    NOISE,
-    NORMAL_95,
-    PLAIN,
-    CommandResidual,
-    ModelStyle,
-    Residuals,
-    legend,
-)
-from omnibench.discover.report.tables import (
-    METRICS,
-    added,
-    closed_in_words,
-    decisive,
-    floor_in_words,
-    gap_decimals,
-    held_out_in_words,
-    reading,
-    weight_in_words,
-    worst_of_each,
-)
+from omnibench.discover.report import residuals as fits
+from omnibench.discover.report import tables
 from omnibench.discover.result import Discovery, Gap, Hidden, Step
+from omnibench.report import numbers
 from omnibench.report.blocks import Block, Figure, FigureGrid, LegendItem, Paragraph
 from omnibench.report.figures import ORIGIN, area, arrows, coordinates, joined, line, marks
-from omnibench.report.numbers import (
-    MOST_MOTIONS,
-    decimals_for,
-    direction_of,
-    fixed,
-    motion_in_words,
-    motion_items,
-    motion_of,
-    moves,
-    round_down,
-)
 from omnibench.report.style import INK, QUIET, logarithmic, plan, plot, text, wrapped
 from omnibench.robot.kinematics import Array
 from omnibench.words import plural
@@ -58,13 +23,13 @@ from omnibench.words import plural
 EvidenceFigure = Callable[[Discovery], FigureGrid | None]
 _NAME = 20  # characters of a line of an effect's name
 _CANDIDATES = 8  # shown of each step, at most; only the drawing hangs on it
-_CHOSEN, _UNCHOSEN = LegendItem("chosen", "added", AFTER), LegendItem("other", "not added", "#b9c0c8")
-_FLOOR = LegendItem("floor", "floor", FLOOR)
-_FLOOR_LINE = LegendItem("floor", "floor", FLOOR, "dash")
+_CHOSEN, _UNCHOSEN = LegendItem("chosen", "added", fits.AFTER), LegendItem("other", "not added", "#b9c0c8")
+_FLOOR = LegendItem("floor", "floor", fits.FLOOR)
+_FLOOR_LINE = LegendItem("floor", "floor", fits.FLOOR, "dash")
 _GAINED = LegendItem("down", "gained by an effect", "#7fb8d8")
 _LOST = LegendItem("up", "lost by an effect", "#e3a3a3")
-_RESULT = LegendItem("after", "extended model", AFTER)
-_LIMIT = LegendItem("limit", "dot: could be this large (95 %)", AFTER)
+_RESULT = LegendItem("after", "extended model", fits.AFTER)
+_LIMIT = LegendItem("limit", "dot: could be this large (95 %)", fits.AFTER)
 _DETECTABLE = LegendItem("detectable", "diamond: found nearly always from here on", INK, symbol="diamond-open")
 
 
@@ -76,7 +41,7 @@ def candidate_grid(discovery: Discovery) -> FigureGrid | None:
         shown = sorted((each for each in tried if each.chi_square > 0), key=lambda each: -each.chi_square)[:_CANDIDATES]
         if not shown:
             continue
-        step = added(discovery.steps[number]) if number < len(discovery.steps) else None
+        step = tables.added(discovery.steps[number]) if number < len(discovery.steps) else None
         chosen = next((each.name for each in shown if each.name in found and each.name == step), None)
         title = f"Step {number}: {f'{chosen} is added' if chosen else 'nothing is added'}"
         bars = [
@@ -84,7 +49,7 @@ def candidate_grid(discovery: Discovery) -> FigureGrid | None:
                 wrapped(each.name, _NAME),
                 0.0,
                 each.chi_square,
-                f"{weight_in_words(each.weight)}, {each.degrees_of_freedom} df",
+                f"{tables.weight_in_words(each.weight)}, {each.degrees_of_freedom} df",
                 _CHOSEN if each.name == chosen else _UNCHOSEN,
             )
             for each in shown
@@ -95,7 +60,7 @@ def candidate_grid(discovery: Discovery) -> FigureGrid | None:
                 _bars(bars, "gain in whitened χ²", 1.55),
                 "Fall of the whitened chi2 with each candidate: "
                 + ", ".join(
-                    f"{each.name} {each.chi_square:.3g}, weight {weight_in_words(each.weight)}" for each in shown
+                    f"{each.name} {each.chi_square:.3g}, weight {tables.weight_in_words(each.weight)}" for each in shown
                 ),
                 80 + 34 * len(shown),
             )
@@ -155,16 +120,16 @@ def waterfall_grid(discovery: Discovery) -> FigureGrid | None:
     steps = discovery.steps
     if len(steps) < 2:
         return None
-    held = decisive(discovery)
+    held = tables.decisive(discovery)
     unseen = held is not None and all(step.eq6_held_out is not None and step.held_out is not None for step in steps)
     if unseen and held is not None:
-        where = held_out_in_words(discovery, held)
+        where = tables.held_out_in_words(discovery, held)
         values = [[step.eq6_held_out for step in steps], [step.held_out for step in steps]]
         floors: list[float | None] = [held.eq6.floor, held.chi2.floor]
     else:
         where, gap = "training runs", discovery.gap
         values = [[step.eq6_train for step in steps], [step.train for step in steps]]
-        floors = [gap.floor if gap.metric == metric and not discovery.held_out else None for metric in METRICS]
+        floors = [gap.floor if gap.metric == metric and not discovery.held_out else None for metric in tables.METRICS]
     figures = tuple(
         Figure(
             f"{title}, {where}",
@@ -172,11 +137,11 @@ def waterfall_grid(discovery: Discovery) -> FigureGrid | None:
             f"{title} of the plain matrix and after each effect that was added, {where}",
             110 + 44 * (len(steps) + 1),
         )
-        for title, own, floor in zip(METRICS.values(), values, floors, strict=True)
+        for title, own, floor in zip(tables.METRICS.values(), values, floors, strict=True)
     )
     lost = (_LOST,) if any(_rises(own) for own in values) else ()
     line = (_FLOOR_LINE,) if any(floor is not None for floor in floors) else ()
-    return FigureGrid(figures, (ALONE, _GAINED, *lost, _RESULT, *line), 2)
+    return FigureGrid(figures, (fits.ALONE, _GAINED, *lost, _RESULT, *line), 2)
 
 
 def _rises(values: Sequence[float | None]) -> bool:
@@ -185,16 +150,18 @@ def _rises(values: Sequence[float | None]) -> bool:
 
 
 def _waterfall(steps: Sequence[Step], values: Sequence[float], floor: float | None, title: str) -> go.Figure:
-    decimals = max(2, min(6, decimals_for(min(value for value in values if value > 0))))
-    bars = [_Bar("plain matrix", 0.0, values[0], fixed(values[0], decimals), ALONE)]
+    decimals = max(2, min(6, numbers.decimals_for(min(value for value in values if value > 0))))
+    bars = [_Bar("plain matrix", 0.0, values[0], numbers.fixed(values[0], decimals), fits.ALONE)]
     for step, (before, after) in zip(steps[1:], pairwise(values), strict=True):
         item = _GAINED if after <= before else _LOST
-        label = fixed(after - before, decimals, signed=True)
-        bars.append(_Bar(wrapped(f"+ {added(step)}", _NAME), min(before, after), max(before, after), label, item))
-    bars.append(_Bar("extended model", 0.0, values[-1], fixed(values[-1], decimals), _RESULT))
+        label = numbers.fixed(after - before, decimals, signed=True)
+        bars.append(
+            _Bar(wrapped(f"+ {tables.added(step)}", _NAME), min(before, after), max(before, after), label, item)
+        )
+    bars.append(_Bar("extended model", 0.0, values[-1], numbers.fixed(values[-1], decimals), _RESULT))
     figure = _bars(bars, title, 1.25)
     if floor is not None:
-        figure.add_vline(x=floor, line={"color": FLOOR, "width": 2, "dash": "dash"})
+        figure.add_vline(x=floor, line={"color": fits.FLOOR, "width": 2, "dash": "dash"})
     return figure
 
 
@@ -202,7 +169,7 @@ def gap_grid(discovery: Discovery) -> FigureGrid:
     """Errors before and after and the noise floor, on the training runs and on the held-out runs."""
     gaps: list[tuple[str, Gap]] = []
     for held in discovery.held_out:
-        where = held_out_in_words(discovery, held)
+        where = tables.held_out_in_words(discovery, held)
         gaps += [(where, held.eq6), (where, held.chi2)]
     if not gaps:
         gaps.append(("training runs", discovery.gap))
@@ -211,13 +178,13 @@ def gap_grid(discovery: Discovery) -> FigureGrid:
             _gap_title(discovery, gap, name),
             _bars(
                 [
-                    _Bar(bar, 0.0, value, fixed(value, gap_decimals(gap)), item)
+                    _Bar(bar, 0.0, value, numbers.fixed(value, tables.gap_decimals(gap)), item)
                     for bar, value, item in _gap_values(gap, discovery.extends)
                 ],
-                METRICS[gap.metric],
+                tables.METRICS[gap.metric],
                 1.25,
             ),
-            f"{METRICS[gap.metric]} on {name}: "
+            f"{tables.METRICS[gap.metric]} on {name}: "
             + ", ".join(f"{bar} {value:.4g}" for bar, value, _ in _gap_values(gap, discovery.extends)),
             190 if discovery.extends else 150,
         )
@@ -226,30 +193,30 @@ def gap_grid(discovery: Discovery) -> FigureGrid:
     line = (_FLOOR,) if any(gap.floor is not None for _, gap in gaps) else ()
     return FigureGrid(
         figures,
-        (*((PLAIN, EXTENDED) if discovery.extends else (ALONE,)), *line),
+        (*((fits.PLAIN, fits.EXTENDED) if discovery.extends else (fits.ALONE,)), *line),
         2 if len(figures) > 1 else 1,
-        floor_in_words(discovery),
+        tables.floor_in_words(discovery),
     )
 
 
 def _gap_title(discovery: Discovery, gap: Gap, name: str) -> str:
-    title = f"{METRICS[gap.metric]}, {name}"
+    title = f"{tables.METRICS[gap.metric]}, {name}"
     if not discovery.extends:
         return title
-    return f"{title}: {closed_in_words(gap)}{'' if gap.closed is None else ' closed'}"
+    return f"{title}: {tables.closed_in_words(gap)}{'' if gap.closed is None else ' closed'}"
 
 
 def _gap_values(gap: Gap, extends: bool) -> tuple[tuple[str, float, LegendItem], ...]:
     """Names, values and legend of the bars: the plain matrix alone and the floor where nothing was added."""
     floor = () if gap.floor is None else (("floor", gap.floor, _FLOOR),)
     if not extends:
-        return ("plain matrix", gap.before, ALONE), *floor
-    return ("before", gap.before, PLAIN), ("after", gap.after, EXTENDED), *floor
+        return ("plain matrix", gap.before, fits.ALONE), *floor
+    return ("before", gap.before, fits.PLAIN), ("after", gap.after, fits.EXTENDED), *floor
 
 
 def hidden_grid(hidden: Sequence[Hidden]) -> FigureGrid | None:
     """The largest size at which each effect could stay unseen, as a share of its plausible size."""
-    shown = [each for each in reversed(worst_of_each(hidden)) if each.plausible > 0 and each.limit > 0]
+    shown = [each for each in reversed(tables.worst_of_each(hidden)) if each.plausible > 0 and each.limit > 0]
     if not shown:
         return None
     names = [wrapped(f"{each.name}: {each.parameter}") for each in shown]
@@ -259,7 +226,9 @@ def hidden_grid(hidden: Sequence[Hidden]) -> FigureGrid | None:
         (_DETECTABLE, [each.detectable for each in shown], "found nearly always from"),
     ):
         shares = [100 * value / each.plausible for value, each in zip(values, shown, strict=True)]
-        sizes = [f"{words} ±{reading(each.unit).words(value, 2)}" for value, each in zip(values, shown, strict=True)]
+        sizes = [
+            f"{words} ±{tables.reading(each.unit).words(value, 2)}" for value, each in zip(values, shown, strict=True)
+        ]
         traces.append(marks(item, 9, shares, names, hover="%{y}<br>%{text}", words=sizes, marker_line_width=1.5))
     figure = plot(*traces, x_title="% of the plausible range")
     shares = [100 * value / each.plausible for each in shown for value in (each.limit, each.detectable)]
@@ -293,13 +262,13 @@ def drawn(figures: Sequence[EvidenceFigure], discovery: Discovery) -> tuple[Figu
     return tuple(grid for figure in figures if (grid := figure(discovery)) is not None)
 
 
-def command_maps(commands: Sequence[CommandResidual], styles: Sequence[ModelStyle]) -> FigureGrid:
+def command_maps(commands: Sequence[fits.CommandResidual], styles: Sequence[fits.ModelStyle]) -> FigureGrid:
     """The residual of each command as an arrow at its end, enlarged."""
     reach = float(np.median([np.hypot(*each.end[:2]) for each in commands]))
     sizes = [np.hypot(*each.means[style.index][:2]) for each in commands for style in styles]
-    circle = CIRCLE_95 * float(np.median([each.error[0] for each in commands]))
+    circle = fits.CIRCLE_95 * float(np.median([each.error[0] for each in commands]))
     # A step of 1, 2 or 5: the longest arrow is about a third of the way to the ends.
-    factor = round_down(0.35 * reach / max(float(np.quantile(sizes, 0.95)), circle, 1e-6))
+    factor = numbers.round_down(0.35 * reach / max(float(np.quantile(sizes, 0.95)), circle, 1e-6))
     tips = [each.end[:2] + factor * each.means[style.index][:2] for each in commands for style in styles]
     points = np.array([*tips, *(each.end[:2] for each in commands), np.zeros(2)])
     margin = 0.04 * float(np.ptp(points, axis=0).max()) + factor * circle / 2
@@ -318,12 +287,12 @@ def command_maps(commands: Sequence[CommandResidual], styles: Sequence[ModelStyl
         f"ends by the reference, and is the residual (reference minus odometry) enlarged {factor:g} times; grey "
         "circles hold 95 % of what noise alone would do to that mean, enlarged alike."
     )
-    return FigureGrid(figures, legend(styles), 2, caption)
+    return FigureGrid(figures, fits.legend(styles), 2, caption)
 
 
-def _map(commands: Sequence[CommandResidual], style: ModelStyle, factor: float, window: Array) -> go.Figure:
+def _map(commands: Sequence[fits.CommandResidual], style: fits.ModelStyle, factor: float, window: Array) -> go.Figure:
     turn = np.linspace(0, 2 * np.pi, 33)
-    circle = CIRCLE_95 * factor * np.column_stack([np.cos(turn), np.sin(turn)])
+    circle = fits.CIRCLE_95 * factor * np.column_stack([np.cos(turn), np.sin(turn)])
     circles = joined([each.end[:2] + each.error[0] * circle for each in commands])
     residuals = [each.means[style.index] for each in commands]
     words = [
@@ -333,7 +302,7 @@ def _map(commands: Sequence[CommandResidual], style: ModelStyle, factor: float, 
     ends = np.array([each.end[:2] for each in commands])
     shafts, heads = arrows(style, ends, ends + factor * np.array(residuals)[:, :2], words)
     return plan(
-        area(NOISE.key, BAND, *circles.T),
+        area(fits.NOISE.key, fits.BAND, *circles.T),
         shafts,
         marks(LegendItem("", "end", QUIET), 3, *ends.T, hover="%{text}", words=words),
         heads,
@@ -342,9 +311,9 @@ def _map(commands: Sequence[CommandResidual], style: ModelStyle, factor: float, 
     )
 
 
-def command_in_words(each: CommandResidual) -> str:
+def command_in_words(each: fits.CommandResidual) -> str:
     """A command described by speed, direction and rate of turn; by its name if these are unknown."""
-    return motion_in_words(each.name, each.run.v, each.run.alpha, each.run.omega)
+    return numbers.motion_in_words(each.name, each.run.v, each.run.alpha, each.run.omega)
 
 
 def _in_words(residual: Array) -> str:
@@ -356,7 +325,7 @@ _ROWS = 16  # commands listed, at most; only the drawing hangs on it
 _ON_MAP = 200  # commands on the map, at most: beyond them circles hide each other; only the drawing hangs on it
 
 
-def command_blocks(residuals: Residuals, styles: Sequence[ModelStyle]) -> tuple[Block, ...]:
+def command_blocks(residuals: fits.Residuals, styles: Sequence[fits.ModelStyle]) -> tuple[Block, ...]:
     """Final residuals of every command, before and after."""
     commands = residuals.commands
     if _is_flower(commands):
@@ -365,7 +334,7 @@ def command_blocks(residuals: Residuals, styles: Sequence[ModelStyle]) -> tuple[
     return (_rows(commands, styles),)
 
 
-def _is_flower(commands: Sequence[CommandResidual]) -> bool:
+def _is_flower(commands: Sequence[fits.CommandResidual]) -> bool:
     """True if the ends of the commands lie so far apart that residuals can be drawn at them."""
     if not 3 <= len(commands) <= _ON_MAP:
         return False
@@ -375,30 +344,34 @@ def _is_flower(commands: Sequence[CommandResidual]) -> bool:
     return bool(np.quantile(apart.min(axis=1), 0.2) > max(float(residual), 0.02))
 
 
-def _headings_by_direction(commands: Sequence[CommandResidual], styles: Sequence[ModelStyle]) -> tuple[Block, ...]:
+def _headings_by_direction(
+    commands: Sequence[fits.CommandResidual], styles: Sequence[fits.ModelStyle]
+) -> tuple[Block, ...]:
     """Mean final heading residuals over the commanded direction, a colour for each rate of turn."""
     known = [each for each in commands if each.run.alpha is not None and each.run.omega is not None]
-    moving = sorted((each for each in known if moves(each.run)), key=lambda each: direction_of(each.run))
+    moving = sorted(
+        (each for each in known if numbers.moves(each.run)), key=lambda each: numbers.direction_of(each.run)
+    )
     still = [each for each in known if each.run.v == 0]
-    motions = sorted({motion_of(each.run) for each in moving})
-    distinct = {(direction_of(each.run), *motion_of(each.run)) for each in moving}
+    motions = sorted({numbers.motion_of(each.run) for each in moving})
+    distinct = {(numbers.direction_of(each.run), *numbers.motion_of(each.run)) for each in moving}
     directions = {direction for direction, *_ in distinct}
-    if len(motions) > MOST_MOTIONS or len(distinct) < len(moving) or len(directions) < 3:
+    if len(motions) > numbers.MOST_MOTIONS or len(distinct) < len(moving) or len(directions) < 3:
         return (_rows(commands, styles),)
-    items = motion_items(motions)
+    items = numbers.motion_items(motions)
     curves = [
-        (item, [each for each in moving if motion_of(each.run) == motion])
+        (item, [each for each in moving if numbers.motion_of(each.run) == motion])
         for motion, item in zip(motions, items, strict=True)
     ]
-    half = math.degrees(NORMAL_95 * float(np.median([each.error[2] for each in moving])))
+    half = math.degrees(fits.NORMAL_95 * float(np.median([each.error[2] for each in moving])))
     low, high = min(directions) - 10, max(directions) + 10
     panels, reach = [], 1.4 * half
     for style in styles:
-        traces = [area(NOISE.key, BAND, [low, high, high, low], [half, half, -half, -half])]
+        traces = [area(fits.NOISE.key, fits.BAND, [low, high, high, low], [half, half, -half, -half])]
         for item, own in curves:
             values = np.degrees([each.means[style.index][2] for each in own])
             reach = max(reach, 1.1 * float(np.abs(values).max()))
-            x, words = [direction_of(each.run) for each in own], [command_in_words(each) for each in own]
+            x, words = [numbers.direction_of(each.run) for each in own], [command_in_words(each) for each in own]
             traces.append(line(item, 2.0, x, values, hover="%{text}<br>%{y:.3f}°", words=words, mode="lines+markers"))
         panels.append(plot(*traces, x_title="commanded direction α (°)", y_title="heading residual (°)"))
     figures = []
@@ -415,20 +388,22 @@ def _headings_by_direction(commands: Sequence[CommandResidual], styles: Sequence
             )
         )
     grid = FigureGrid(
-        tuple(figures), (*items, NOISE), 2,
+        tuple(figures), (*items, fits.NOISE), 2,
         "Mean over the runs of each command; the band holds 95 % of what noise alone would do.",
     )  # fmt: skip
     if not still:
         return (grid,)
     parts = []
-    for each in sorted(still, key=lambda each: motion_of(each.run)):
-        turns = " → ".join(f"{fixed(math.degrees(each.means[style.index][2]), 2, signed=True)}°" for style in styles)
-        noise = fixed(math.degrees(NORMAL_95 * each.error[2]), 2)
+    for each in sorted(still, key=lambda each: numbers.motion_of(each.run)):
+        turns = " → ".join(
+            f"{numbers.fixed(math.degrees(each.means[style.index][2]), 2, signed=True)}°" for style in styles
+        )
+        noise = numbers.fixed(math.degrees(fits.NORMAL_95 * each.error[2]), 2)
         parts.append(f"{command_in_words(each)}: {turns} (noise ±{noise}°)")
     return grid, Paragraph(f"Turns on the spot, mean heading residual: {'; '.join(parts)}.", "note")
 
 
-def _rows(commands: Sequence[CommandResidual], styles: Sequence[ModelStyle]) -> FigureGrid:
+def _rows(commands: Sequence[fits.CommandResidual], styles: Sequence[fits.ModelStyle]) -> FigureGrid:
     """One row for each command; if there are many, the 16 with the largest residuals."""
     shown = sorted(commands, key=lambda each: -float(np.abs(each.means[0] / each.error).max()))[:_ROWS]
     shown = [each for each in commands if each in shown]
@@ -437,7 +412,7 @@ def _rows(commands: Sequence[CommandResidual], styles: Sequence[ModelStyle]) -> 
         (("forward", 1e3, "mm"), ("to the left", 1e3, "mm"), ("heading", math.degrees(1.0), "°"))
     ):
         names = [wrapped(each.name) for each in shown]
-        half = NORMAL_95 * factor * np.array([each.error[axis] for each in shown])
+        half = fits.NORMAL_95 * factor * np.array([each.error[axis] for each in shown])
         traces: list[go.Bar | go.Scatter] = [
             go.Bar(
                 y=[text(name) for name in names],
@@ -446,7 +421,7 @@ def _rows(commands: Sequence[CommandResidual], styles: Sequence[ModelStyle]) -> 
                 orientation="h",
                 marker={"color": "#d9dde2", "line": {"width": 0}},
                 width=0.6,
-                legendgroup=NOISE.key,
+                legendgroup=fits.NOISE.key,
                 hovertemplate="noise ±%{customdata:.3g} " + unit + "<extra></extra>",
                 customdata=coordinates(half),
             )
@@ -470,4 +445,6 @@ def _rows(commands: Sequence[CommandResidual], styles: Sequence[ModelStyle]) -> 
         f"{words if len(shown) < len(commands) else ''}Mean over the runs of each command, seen from its start pose; "
         "grey bars hold 95 % of what noise alone would do to that mean."
     )
-    return FigureGrid(tuple(figures), legend(styles), 3 if max(len(each.name) for each in shown) < 14 else 1, caption)
+    return FigureGrid(
+        tuple(figures), fits.legend(styles), 3 if max(len(each.name) for each in shown) < 14 else 1, caption
+    )

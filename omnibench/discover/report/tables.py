@@ -8,19 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from omnibench.data.dataset import Dataset
-from omnibench.discover.result import (
-    CovariateDependence,
-    Discovery,
-    EstimatedParameter,
-    Experiment,
-    Extrapolation,
-    Gap,
-    HeldOut,
-    Hidden,
-    NamedEffect,
-    Step,
-    Verdict,
-)
+from omnibench.discover import result
 from omnibench.discover.selection.model_selection import SURE
 from omnibench.registry import effects
 from omnibench.report.blocks import Cell, Column, Row, Table
@@ -28,14 +16,14 @@ from omnibench.report.numbers import NOTHING, count, decimals_for, fixed, listin
 from omnibench.robot.effects.effect import Effect, Stage
 from omnibench.words import plural
 
-VERDICTS: Mapping[Verdict, str] = {
+VERDICTS: Mapping[result.Verdict, str] = {
     "none": "nothing is missing",
     "named": "found and named",
     "class": "found; which of a class is open",
     "incomplete": "found and named, but something is left",
     "unknown": "something is missing that has no name",
 }
-VERDICTS_AT_LENGTH: Mapping[Verdict, str] = {
+VERDICTS_AT_LENGTH: Mapping[result.Verdict, str] = {
     "none": "The residuals of the plain matrix are what the noise leaves: no effect is missing that these data show.",
     "named": "Every effect that was added has a weight of 95 % or more, and the residuals that are left are noise.",
     "class": "An effect is missing, and the data cannot tell the members of its class apart.",
@@ -98,7 +86,7 @@ def reading(unit: str) -> Reading:
     return Reading(*_READ_AS.get(unit, (1.0, unit.replace("s2", "s²"))))
 
 
-def value_and_interval(parameter: EstimatedParameter) -> tuple[str, str, str]:
+def value_and_interval(parameter: result.EstimatedParameter) -> tuple[str, str, str]:
     """A parameter's value, 95 % interval (empty if it has none) and unit, with the same decimals."""
     shown = Reading(1.0, "") if parameter.shape and parameter.unit in _DIMENSIONLESS else reading(parameter.unit)
     value = shown.factor * parameter.value
@@ -109,13 +97,13 @@ def value_and_interval(parameter: EstimatedParameter) -> tuple[str, str, str]:
     return fixed(value, decimals, signed=True), span(low, high, decimals, signed=True), shown.unit
 
 
-def effect_in_words(effect: NamedEffect) -> str:
+def effect_in_words(effect: result.NamedEffect) -> str:
     """An effect's name with those that it cannot be told apart from."""
     others = [name for name in effect.confusable_with if name != effect.name]
     return effect.name if not others else f"{effect.name}, or {' or '.join(others)}"
 
 
-def verdict_in_words(discovery: Discovery) -> str:
+def verdict_in_words(discovery: result.Discovery) -> str:
     """The verdict; where nothing was found, what speaks against that nothing is missing."""
     if discovery.verdict != "none":
         return VERDICTS[discovery.verdict]
@@ -128,7 +116,7 @@ def verdict_in_words(discovery: Discovery) -> str:
     return _UNTESTED if discovery.sessions.doubts else VERDICTS["none"]
 
 
-def verdict_at_length(discovery: Discovery) -> str:
+def verdict_at_length(discovery: result.Discovery) -> str:
     """The verdict in a sentence."""
     words = verdict_in_words(discovery)
     if words == VERDICTS[discovery.verdict]:
@@ -136,12 +124,12 @@ def verdict_at_length(discovery: Discovery) -> str:
     return f"{words[0].upper()}{words[1:]}: no effect of the catalogue was added."
 
 
-def added(step: Step) -> str:
+def added(step: result.Step) -> str:
     """The name of the effect that a step added."""
     return step.name.removeprefix("+ ")
 
 
-def answer_in_words(discovery: Discovery) -> str:
+def answer_in_words(discovery: result.Discovery) -> str:
     """The cause in plain words and what was gained on held-out runs; without a cause, the headline."""
     if not discovery.effects or not discovery.extends:
         return discovery.headline
@@ -156,7 +144,7 @@ def answer_in_words(discovery: Discovery) -> str:
     return f"{causes} With it in the model, the held-out error goes from {before} to {after}."
 
 
-def _cause_in_words(effect: NamedEffect) -> str:
+def _cause_in_words(effect: result.NamedEffect) -> str:
     """What an effect does to the robot, its name, and the names that the data cannot tell from it."""
     entry = effects.entry(effect.name)
     what = entry.summary.partition(":")[0].rstrip(".") if entry.cls.in_catalogue else "Something that has no name"
@@ -173,16 +161,16 @@ def weight_in_words(weight: float) -> str:
     return "< 0.1 %" if weight < 0.001 else percent(weight)
 
 
-def worst_of_each(hidden: Sequence[Hidden]) -> tuple[Hidden, ...]:
+def worst_of_each(hidden: Sequence[result.Hidden]) -> tuple[result.Hidden, ...]:
     """The parameter of each effect that could be largest as a share of its plausible size; the largest share first."""
     ordered = sorted(hidden, key=share_of_plausible, reverse=True)
-    first: dict[str, Hidden] = {}
+    first: dict[str, result.Hidden] = {}
     for each in ordered:
         first.setdefault(each.name, each)
     return tuple(first.values())
 
 
-def share_of_plausible(hidden: Hidden) -> float:
+def share_of_plausible(hidden: result.Hidden) -> float:
     """The largest size that it could have, as a share of its plausible size."""
     return hidden.limit / hidden.plausible if hidden.plausible else math.inf
 
@@ -194,28 +182,28 @@ def chance(p_value: float) -> str:
     return significant(p_value, 2) if p_value >= 1e-3 else significant(p_value, 1)
 
 
-def closed_in_words(gap: Gap) -> str:
+def closed_in_words(gap: result.Gap) -> str:
     """The share of a gap that is closed, or that there is no gap, or none that is known."""
     if gap.closed is None:
         return "no share known" if gap.after < _BETTER * gap.before else "no gap to close"
     return percent(gap.closed)
 
 
-def gap_decimals(*gaps: Gap) -> int:
+def gap_decimals(*gaps: result.Gap) -> int:
     """The decimals that show before, after and floor of these gaps to three significant digits."""
     values = [value for gap in gaps for value in (gap.before, gap.after, gap.floor or 0.0)]
     smallest = min((value for value in values if value > 0), default=0.0)
     return min(6, max(2, decimals_for(smallest, 3)))
 
 
-def gap_in_words(gap: Gap) -> str:
+def gap_in_words(gap: result.Gap) -> str:
     """``0.0412 → 0.0213 (floor 0.0205), 96.1 %``."""
     decimals = gap_decimals(gap)
     floor = "" if gap.floor is None else f" (floor {fixed(gap.floor, decimals)})"
     return f"{fixed(gap.before, decimals)} → {fixed(gap.after, decimals)}{floor}, {closed_in_words(gap)}"
 
 
-def final_errors_in_words(discovery: Discovery, held: HeldOut) -> tuple[str, str]:
+def final_errors_in_words(discovery: result.Discovery, held: result.HeldOut) -> tuple[str, str]:
     """Mean final position and heading error, before and after; alone where nothing was added."""
     before, after = held.position_m
     turned, turned_after = (math.degrees(value) for value in held.heading_rad)
@@ -225,7 +213,7 @@ def final_errors_in_words(discovery: Discovery, held: HeldOut) -> tuple[str, str
     return position, f"{fixed(turned, 2)}° → {fixed(turned_after, 2)}°"
 
 
-def held_out_in_words(discovery: Discovery, held: HeldOut) -> str:
+def held_out_in_words(discovery: result.Discovery, held: result.HeldOut) -> str:
     """The kind of held-out runs, such as ``held-out repetitions``; a session only where sessions are known."""
     if held.data == "session":
         return "held-out session" if discovery.has_other_session else "held-out runs"
@@ -235,7 +223,7 @@ def held_out_in_words(discovery: Discovery, held: HeldOut) -> str:
     return "training runs, held out in turn" if several else "held-out runs"
 
 
-def floor_in_words(discovery: Discovery) -> str:
+def floor_in_words(discovery: result.Discovery) -> str:
     """The meaning of the floor of a gap, in a sentence."""
     if discovery.noise.source != "repetitions":
         return "No command is repeated within a session: there is no floor."
@@ -245,12 +233,12 @@ def floor_in_words(discovery: Discovery) -> str:
     )
 
 
-def decisive(discovery: Discovery) -> HeldOut | None:
+def decisive(discovery: result.Discovery) -> result.HeldOut | None:
     """The held-out data that are the hardest test: another session if there is one, else repetitions."""
     return max(discovery.held_out, key=lambda held: held.data == "session", default=None)
 
 
-def extrapolations_in_words(extrapolations: tuple[Extrapolation, ...]) -> tuple[str, ...]:
+def extrapolations_in_words(extrapolations: tuple[result.Extrapolation, ...]) -> tuple[str, ...]:
     """Motions of held-out runs on which the extended model extrapolates, a sentence each."""
     sentences = []
     for each in extrapolations:
@@ -264,7 +252,7 @@ def extrapolations_in_words(extrapolations: tuple[Extrapolation, ...]) -> tuple[
     return tuple(sentences)
 
 
-def is_unbounded(extrapolation: Extrapolation) -> bool:
+def is_unbounded(extrapolation: result.Extrapolation) -> bool:
     """True if the models that the data cannot tell apart say nothing of where the run ends."""
     return not extrapolation.after_m <= _UNBOUNDED * extrapolation.before_m
 
@@ -275,14 +263,14 @@ def _millimetres(metres: float) -> str:
     return f"{significant(1e3 * metres, 3)} mm" if metres < 1 else f"{significant(metres, 3)} m"
 
 
-def data_in_words(discovery: Discovery) -> str:
+def data_in_words(discovery: result.Discovery) -> str:
     """The data in words: ``flower (simulated data): 180 training runs, 4,320 poses``."""
     kind = "simulated data" if discovery.dataset.simulated else "recorded data"
     runs = plural(len(discovery.trajectories), "training run")
     return f"{discovery.dataset.name} ({kind}): {runs}, {plural(discovery.poses, 'reference pose')}"
 
 
-def dependence_table(dependences: Sequence[CovariateDependence], caption: str) -> Table:
+def dependence_table(dependences: Sequence[result.CovariateDependence], caption: str) -> Table:
     """The covariates that the residual depends on, with their significance."""
     rows = tuple(
         Row.of(
@@ -312,7 +300,7 @@ def dependence_table(dependences: Sequence[CovariateDependence], caption: str) -
     )
 
 
-def parameter_table(found: Sequence[NamedEffect], dataset: Dataset) -> Table:
+def parameter_table(found: Sequence[result.NamedEffect], dataset: Dataset) -> Table:
     """The parameters of every effect with their intervals."""
     rows: list[Row] = []
     for effect in found:
@@ -346,7 +334,7 @@ def _meanings(name: str, dataset: Dataset) -> Mapping[str, str]:
     return {each.name: each.description for each in effect.parameters(dataset.robot, sessions)}
 
 
-def experiment_table(experiment: Experiment) -> Table:
+def experiment_table(experiment: result.Experiment) -> Table:
     """The runs of an experiment."""
     rows = [Row.of(each.motion, fixed(each.seconds, 1), count(each.runs)) for each in experiment.commands]
     return Table(
@@ -356,7 +344,7 @@ def experiment_table(experiment: Experiment) -> Table:
     )
 
 
-def held_out_table(discovery: Discovery) -> Table:
+def held_out_table(discovery: result.Discovery) -> Table:
     """Both gaps and the final errors on the held-out runs."""
     rows: list[Row] = []
     for each in discovery.held_out:
@@ -370,13 +358,13 @@ def held_out_table(discovery: Discovery) -> Table:
     return Table("On held-out runs", _gap_columns(discovery), tuple(rows), _gap_note(discovery))
 
 
-def gap_table(discovery: Discovery) -> Table:
+def gap_table(discovery: result.Discovery) -> Table:
     """The gap on the training runs."""
     title = "The gap on the training runs"
     return Table(title, _gap_columns(discovery), (_gap_row(discovery, discovery.gap),), _gap_note(discovery))
 
 
-def _gap_columns(discovery: Discovery) -> tuple[Column, ...]:
+def _gap_columns(discovery: result.Discovery) -> tuple[Column, ...]:
     """Before and after; of the plain matrix alone where nothing was added."""
     columns = [Column("Before"), Column("After"), Column("Floor"), Column("Closed")]
     if not discovery.extends:
@@ -384,7 +372,7 @@ def _gap_columns(discovery: Discovery) -> tuple[Column, ...]:
     return Column("Measure", numeric=False), *columns, Column("Std. error of the gap", priority=1)
 
 
-def _gap_note(discovery: Discovery) -> str:
+def _gap_note(discovery: result.Discovery) -> str:
     if not discovery.extends:
         return f"Nothing was added to the plain matrix. {floor_in_words(discovery)}"
     return (
@@ -393,7 +381,7 @@ def _gap_note(discovery: Discovery) -> str:
     )
 
 
-def _gap_row(discovery: Discovery, gap: Gap) -> Row:
+def _gap_row(discovery: result.Discovery, gap: result.Gap) -> Row:
     decimals = gap_decimals(gap)
     before, after = fixed(gap.before, decimals), fixed(gap.after, decimals)
     floor = NOTHING if gap.floor is None else fixed(gap.floor, decimals)
@@ -401,7 +389,7 @@ def _gap_row(discovery: Discovery, gap: Gap) -> Row:
     return Row.of(METRICS[gap.metric], *cells, significant(gap.standard_error, 2))
 
 
-def _plain_row(discovery: Discovery, name: str, words: str) -> Row:
+def _plain_row(discovery: result.Discovery, name: str, words: str) -> Row:
     if not discovery.extends:
         return Row.of(name, words, NOTHING, NOTHING)
     before, _, after = words.partition(" → ")
@@ -409,7 +397,7 @@ def _plain_row(discovery: Discovery, name: str, words: str) -> Row:
     return Row.of(name, f"{before}{unit}", after, NOTHING, NOTHING, NOTHING)
 
 
-def step_table(discovery: Discovery) -> Table:
+def step_table(discovery: result.Discovery) -> Table:
     """The error after each step."""
     rows = []
     for index, step in enumerate(discovery.steps):
@@ -429,7 +417,7 @@ def step_table(discovery: Discovery) -> Table:
     )
 
 
-def hidden_table(hidden: Sequence[Hidden]) -> Table:
+def hidden_table(hidden: Sequence[result.Hidden]) -> Table:
     """The largest size that every effect could still have, the largest share of its plausible size first."""
     rows = []
     for each in sorted(hidden, key=share_of_plausible, reverse=True):
@@ -461,7 +449,7 @@ def hidden_table(hidden: Sequence[Hidden]) -> Table:
     )
 
 
-def absorbed_table(discovery: Discovery) -> Table:
+def absorbed_table(discovery: result.Discovery) -> Table:
     """Effects that a matrix reproduces, and the measurement that would show them."""
     rows = tuple(
         Row.of(each.name, Cell(each.stage, STAGES[each.stage]), each.measurement or NOTHING)
@@ -475,14 +463,14 @@ def absorbed_table(discovery: Discovery) -> Table:
     )
 
 
-def not_looked_for_table(discovery: Discovery) -> Table:
+def not_looked_for_table(discovery: result.Discovery) -> Table:
     """Effects that these recordings cannot show."""
     rows = tuple(Row.of(each.name, each.reason) for each in discovery.not_looked_for)
     columns = (Column("Effect", numeric=False), Column("Why", numeric=False))
     return Table("Not looked for", columns, rows)
 
 
-def extrapolation_table(extrapolations: Sequence[Extrapolation]) -> Table:
+def extrapolation_table(extrapolations: Sequence[result.Extrapolation]) -> Table:
     """Motions that no training run had, with the error bounds there."""
     rows = tuple(
         Row.of(

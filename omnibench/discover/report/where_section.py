@@ -17,24 +17,8 @@ import plotly.graph_objects as go
 from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
+from omnibench.discover.report import residuals as residual
 from omnibench.discover.report.evidence_figures import command_blocks
-from omnibench.discover.report.residuals import (
-    AFTER,
-    ALONE,
-    BEFORE,
-    CIRCLE_95,
-    EXTENDED,
-    NORMAL_95,
-    PLAIN,
-    Curve,
-    ModelStyle,
-    Panel,
-    Residuals,
-    fitted_curves,
-    fitted_panels,
-    grid,
-    shares,
-)
 from omnibench.discover.report.tables import dependence_table
 from omnibench.discover.result import Discovery, NamedEffect
 from omnibench.registry import effects
@@ -52,7 +36,7 @@ _STILL = 1e-3  # rad/s, m/s; slower counts as standing
 # Harmonics per turn, as in the bases of covariate dependence: by halves, then whole ones up to 16.
 _HARMONICS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, *map(float, range(4, 17)))
 # A figure over a covariate; None where the recordings do not show it.
-CovariateFigure = Callable[[Residuals, Sequence[ModelStyle]], FigureGrid | None]
+CovariateFigure = Callable[[residual.Residuals, Sequence[residual.ModelStyle]], FigureGrid | None]
 # Modes of the error of the motion: name, factor from SI, unit.
 MODES = (
     ("along the way", 100.0, "% of the way"),
@@ -62,15 +46,15 @@ MODES = (
 
 
 def motion_panels(
-    residuals: Residuals,
-    styles: Sequence[ModelStyle],
+    residuals: residual.Residuals,
+    styles: Sequence[residual.ModelStyle],
     bins: Array,
     x: Array,
     x_title: str,
     over: str,
     words: tuple[str, ...] = (),
     ticks: float | None = None,
-) -> list[Panel]:
+) -> list[residual.Panel]:
     """Three panels: the error along the path, across it and in turning, constant in each bin.
 
     bins (F, B): the share of each sample in each bin. x (B,): the position at which a bin is drawn.
@@ -87,12 +71,12 @@ def motion_panels(
     parts = []
     for direction, (name, factor, unit) in zip(directions, MODES, strict=True):
         title, y_title = f"Error {name}, over {over}", f"error ({unit})"
-        panel = Panel(title, x, (), x_title, y_title, unit, words=words, ticks=ticks)
+        panel = residual.Panel(title, x, (), x_title, y_title, unit, words=words, ticks=ticks)
         parts.append((paths.of_twist(paths.tracked(direction), bins), factor, panel))
-    return fitted_panels(residuals, styles, parts)
+    return residual.fitted_panels(residuals, styles, parts)
 
 
-def heading_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGrid | None:
+def heading_grid(residuals: residual.Residuals, styles: Sequence[residual.ModelStyle]) -> FigureGrid | None:
     """The error over the robot's heading and over its direction of travel, both in the frame of the reference."""
     paths = residuals.paths
     heading = paths.middle[:, 2]
@@ -109,10 +93,10 @@ def heading_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGr
         bins = _binned(wrapped, edges, chosen)
         if bins is not None:
             panels += motion_panels(residuals, styles, bins, _middles(edges), title, over, ticks=90)
-    return grid(panels, styles, "Heading and direction of travel are those of the reference's frame.")
+    return residual.grid(panels, styles, "Heading and direction of travel are those of the reference's frame.")
 
 
-def wheel_rate_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGrid | None:
+def wheel_rate_grid(residuals: residual.Residuals, styles: Sequence[residual.ModelStyle]) -> FigureGrid | None:
     """The error of each wheel's rim speed over its rate."""
     paths = residuals.paths
     parts = []
@@ -125,12 +109,12 @@ def wheel_rate_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> Figur
         bins = _binned(paths.signals.rates[:, index], edges, rates > _STILL)
         if bins is not None:
             title = f"Wheel {wheel.name}"
-            panel = Panel(title, _middles(edges), (), "wheel rate (rad/s)", "error (mm/s at the rim)", "mm/s")
+            panel = residual.Panel(title, _middles(edges), (), "wheel rate (rad/s)", "error (mm/s at the rim)", "mm/s")
             parts.append((paths.of_wheel(index, bins), 1e3 * wheel.radius, panel))
-    return grid(fitted_panels(residuals, styles, parts), styles)
+    return residual.grid(residual.fitted_panels(residuals, styles, parts), styles)
 
 
-def wheel_angle_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGrid | None:
+def wheel_angle_grid(residuals: residual.Residuals, styles: Sequence[residual.ModelStyle]) -> FigureGrid | None:
     """The error over the angle of each wheel: amplitudes by harmonic, and its course over the strongest harmonic."""
     paths = residuals.paths
     angles, rates = paths.signals.wheel_angles, paths.signals.rates
@@ -147,14 +131,14 @@ def wheel_angle_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> Figu
     for index, wheel in enumerate(paths.robot.measured):
         turned = np.degrees(strongest * angles[:, index]) % 360
         title, x_title = f"Wheel {wheel.name}, over its angle", f"{times}wheel angle (°)"
-        panel = Panel(title, _middles(edges), (), x_title, "error of the rate (%)", "%", ticks=90)
-        parts.append((paths.of_wheel(index, shares(turned, edges) * rates[:, [index]]), 100.0, panel))
+        panel = residual.Panel(title, _middles(edges), (), x_title, "error of the rate (%)", "%", ticks=90)
+        parts.append((paths.of_wheel(index, residual.shares(turned, edges) * rates[:, [index]]), 100.0, panel))
     over = "the angle itself" if strongest == 1 else f"{strongest:g} times the angle, the harmonic that stands out most"
     caption = f"Top: the amplitude of each harmonic, fitted alone. Below: over {over}."
-    return grid([*spectrum, *fitted_panels(residuals, styles, parts)], styles, caption)
+    return residual.grid([*spectrum, *residual.fitted_panels(residuals, styles, parts)], styles, caption)
 
 
-def acceleration_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGrid | None:
+def acceleration_grid(residuals: residual.Residuals, styles: Sequence[residual.ModelStyle]) -> FigureGrid | None:
     """The error of each component of the twist over its own acceleration."""
     paths = residuals.paths
     degrees = math.degrees(1.0)
@@ -174,12 +158,14 @@ def acceleration_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> Fig
         bins = _binned(accelerations, edges, least=5e-4)
         if bins is not None:
             x_title, y_title = f"acceleration ({x_unit})", f"error ({unit})"
-            panel = Panel(title, x_factor * _middles(edges), (), x_title, y_title, unit)
+            panel = residual.Panel(title, x_factor * _middles(edges), (), x_title, y_title, unit)
             parts.append((paths.of_twist(np.tile(np.eye(3)[axis], (len(accelerations), 1)), bins), factor, panel))
-    return grid(fitted_panels(residuals, styles, parts), styles)
+    return residual.grid(residual.fitted_panels(residuals, styles, parts), styles)
 
 
-def _spectrum_panels(residuals: Residuals, styles: Sequence[ModelStyle], angles: Array) -> list[Panel]:
+def _spectrum_panels(
+    residuals: residual.Residuals, styles: Sequence[residual.ModelStyle], angles: Array
+) -> list[residual.Panel]:
     """The amplitude of every harmonic for each wheel; each harmonic is fitted by itself, for all wheels together."""
     paths = residuals.paths
     rates = paths.signals.rates
@@ -195,11 +181,13 @@ def _spectrum_panels(residuals: Residuals, styles: Sequence[ModelStyle], angles:
         amplitudes[:, :, index] = np.hypot(*np.moveaxis(fitted.values.reshape(wheels, 2, 2), (1, 2), (0, 1)))
         noise[:, :, index] = np.sqrt(np.square(fitted.errors.reshape(wheels, 2, 2)).mean(axis=1)).T
     return [
-        Panel(
+        residual.Panel(
             f"Wheel {paths.robot.wheel_names[wheel]}, amplitudes",
             np.array(_HARMONICS),
             tuple(
-                Curve(style, 100 * amplitudes[style.index][wheel], 100 * CIRCLE_95 * noise[style.index][wheel])
+                residual.Curve(
+                    style, 100 * amplitudes[style.index][wheel], 100 * residual.CIRCLE_95 * noise[style.index][wheel]
+                )
                 for style in styles
             ),
             "periods in a turn of the wheel",
@@ -219,7 +207,7 @@ def _binned(
 
     least: share of the samples; a bin with fewer stays empty, so that nothing is fitted there.
     """
-    bins = shares(values, edges) * (1.0 if chosen is None else chosen[:, None])
+    bins = residual.shares(values, edges) * (1.0 if chosen is None else chosen[:, None])
     bins = bins * (bins.mean(axis=0) > least)
     return bins if bins.any(axis=0).sum() >= 3 else None
 
@@ -237,7 +225,7 @@ _TURNING = math.radians(2.0)  # rad/s; slower counts as straight: a turn of 20 d
 _QUANTITIES = (("along the way", 1e3, "mm"), ("across, to the left", 1e3, "mm"), ("heading", math.degrees(1.0), "°"))
 
 
-def elapsed_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGrid | None:
+def elapsed_grid(residuals: residual.Residuals, styles: Sequence[residual.ModelStyle]) -> FigureGrid | None:
     """Mean residuals over the time of a run, for runs that turn left, right or not."""
     groups: dict[str, list[int]] = {}
     for index, run in enumerate(residuals.runs):
@@ -250,12 +238,12 @@ def elapsed_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGr
         end = float(np.median([each[-1] for each in stamps]))
         times = np.linspace(min(float(np.median([each[1] for each in stamps])), end), end, _TIMES)
         means = {style.key: _means(residuals, members, style, times) for style in styles}
-        half = NORMAL_95 * residuals.deviations(times) / np.sqrt(_running(residuals, members, times))[:, None]
+        half = residual.NORMAL_95 * residuals.deviations(times) / np.sqrt(_running(residuals, members, times))[:, None]
         for axis, (quantity, factor, unit) in enumerate(_QUANTITIES):
             band = factor * half[:, axis]
-            curves = tuple(Curve(style, factor * means[style.key][:, axis], band) for style in styles)
+            curves = tuple(residual.Curve(style, factor * means[style.key][:, axis], band) for style in styles)
             panels.append(
-                Panel(
+                residual.Panel(
                     f"{name} ({plural(len(members), 'run')}): {quantity}",
                     times,
                     curves,
@@ -265,7 +253,7 @@ def elapsed_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGr
                     shared=True,
                 )
             )
-    return grid(
+    return residual.grid(
         panels,
         styles,
         "Mean over runs of the pose residuals (reference minus odometry), along and across the direction of travel at "
@@ -273,7 +261,7 @@ def elapsed_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGr
     )
 
 
-def order_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGrid | None:
+def order_grid(residuals: residual.Residuals, styles: Sequence[residual.ModelStyle]) -> FigureGrid | None:
     """The error of the motion over the runs in the order in which they were driven, in blocks of runs."""
     runs = residuals.runs
     if any(run.started_at is None for run in runs) and len({run.session for run in runs}) < 2:
@@ -289,10 +277,10 @@ def order_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGrid
     panels = motion_panels(residuals, styles, bins, centres, "run, in the order driven", "the runs", words)
     sessions = len({run.session for run in runs})
     several = f" The runs are of {sessions} sessions, one after another." if sessions > 1 else ""
-    return grid(panels, styles, f"Each point stands for some runs in a row.{several}")
+    return residual.grid(panels, styles, f"Each point stands for some runs in a row.{several}")
 
 
-def stamps_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGrid | None:
+def stamps_grid(residuals: residual.Residuals, styles: Sequence[residual.ModelStyle]) -> FigureGrid | None:
     """The time by which reference poses seem to be taken earlier than their stamps say."""
     paths = residuals.paths
     # Velocities (S, 3) of the poses at the paths' stamps, over 100 ms, m/s and rad/s
@@ -312,14 +300,14 @@ def stamps_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGri
     panels = []
     for name, part in (("pose", [1.0, 1.0, 1.0]), ("heading alone", [0.0, 0.0, 1.0])):
         title = f"Delay of the reference's {name}, over the stamps of a run"
-        panel = Panel(title, x, (), "stamp (s)", "apparent delay (ms)", "ms")
+        panel = residual.Panel(title, x, (), "stamp (s)", "apparent delay (ms)", "ms")
         columns = -(velocity * part)[:, :, None] * bins[:, None, :]
-        panels += fitted_panels(residuals, styles, [(columns, 1e3, panel)])
+        panels += residual.fitted_panels(residuals, styles, [(columns, 1e3, panel)])
     panels.append(
-        Panel(
+        residual.Panel(
             "Delay of the reference's pose, run by run",
             np.arange(1.0, len(residuals.runs) + 1),
-            fitted_curves(residuals.fit_runs(-velocity[:, :, None]), styles, 1e3),
+            residual.fitted_curves(residuals.fit_runs(-velocity[:, :, None]), styles, 1e3),
             "run, in the order driven",
             "apparent delay (ms)",
             "ms",
@@ -327,7 +315,7 @@ def stamps_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGri
             words=tuple(run.id for run in residuals.runs),
         )
     )
-    return grid(
+    return residual.grid(
         panels,
         styles,
         "By how much earlier than its stamp a pose would have to be taken to explain the residuals best.",
@@ -342,13 +330,13 @@ def _turning(run: Trajectory) -> str:
     return "Runs that turn left" if turned > 0 else "Runs that turn right"
 
 
-def _running(residuals: Residuals, members: Sequence[int], times: Array) -> Array:
+def _running(residuals: residual.Residuals, members: Sequence[int], times: Array) -> Array:
     """The number of runs that have poses up to each time, at least 1."""
     ends = np.array([residuals.runs[index].pose_times[-1] for index in members])
     return np.maximum((ends[:, None] >= times - 1e-6).sum(axis=0), 1)
 
 
-def _means(residuals: Residuals, members: Sequence[int], style: ModelStyle, times: Array) -> Array:
+def _means(residuals: residual.Residuals, members: Sequence[int], style: residual.ModelStyle, times: Array) -> Array:
     """Mean residuals (T, 3) along the path, across it and of the heading, at the stamps nearest to each time."""
     total = np.zeros((len(times), 3))
     for index in members:
@@ -438,7 +426,7 @@ class _Cells:
         return np.array([(edges[i] + edges[i + 1]) / 2 for edges, i in zip(self.edges, place, strict=True)])
 
 
-def _cells(residuals: Residuals) -> _Cells | None:
+def _cells(residuals: residual.Residuals) -> _Cells | None:
     """A grid over the floor that the robot drove on; None if it stays in its place."""
     points = residuals.paths.middle[:, :2]
     low, high = points.min(axis=0), points.max(axis=0)
@@ -451,7 +439,7 @@ def _cells(residuals: Residuals) -> _Cells | None:
     return _Cells((edges[0], edges[1]))
 
 
-def arrow_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGrid | None:
+def arrow_grid(residuals: residual.Residuals, styles: Sequence[residual.ModelStyle]) -> FigureGrid | None:
     """Arrows of the mean pose residuals in each cell of the floor; None if the robot stays in its place."""
     cells = _cells(residuals)
     if cells is None:
@@ -488,7 +476,7 @@ def arrow_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGrid
     )
 
 
-def _cell_means(residuals: Residuals, style: ModelStyle, cells: _Cells) -> _Means:
+def _cell_means(residuals: residual.Residuals, style: residual.ModelStyle, cells: _Cells) -> _Means:
     """Cells with poses: mean residual (3,), standard error of its x and y (m), number of runs."""
     gathered: dict[int, list[tuple[Array, float]]] = {}
     values = residuals.each[style.index]
@@ -508,13 +496,13 @@ def _cell_means(residuals: Residuals, style: ModelStyle, cells: _Cells) -> _Mean
     return found
 
 
-def _arrows(means: _Means, style: ModelStyle, cells: _Cells, factor: float, window: Array) -> go.Figure:
+def _arrows(means: _Means, style: residual.ModelStyle, cells: _Cells, factor: float, window: Array) -> go.Figure:
     traces = []
     for outside in (False, True):
         chosen = [
             (cells.centre(number), mean, runs)
             for number, (mean, error, runs) in means.items()
-            if bool(np.hypot(*mean[:2]) > CIRCLE_95 * error) == outside
+            if bool(np.hypot(*mean[:2]) > residual.CIRCLE_95 * error) == outside
         ]
         if not chosen:
             continue
@@ -528,7 +516,7 @@ def _arrows(means: _Means, style: ModelStyle, cells: _Cells, factor: float, wind
     return plan(*traces, window=window)
 
 
-def motion_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGrid | None:
+def motion_grid(residuals: residual.Residuals, styles: Sequence[residual.ModelStyle]) -> FigureGrid | None:
     """Maps of the error of the motion over the floor; None if the robot stays in its place."""
     cells = _cells(residuals)
     if cells is None:
@@ -561,9 +549,9 @@ def motion_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGri
     return FigureGrid(tuple(figures), (), 3, caption) if figures else None
 
 
-def _map(cells: _Cells, chosen: NDArray[np.intp], curve: Curve, unit: str) -> go.Figure:
+def _map(cells: _Cells, chosen: NDArray[np.intp], curve: residual.Curve, unit: str) -> go.Figure:
     scores = np.full(cells.shape, np.nan)
-    scores.flat[chosen] = curve.values / (curve.half_width / NORMAL_95)
+    scores.flat[chosen] = curve.values / (curve.half_width / residual.NORMAL_95)
     words = np.full(cells.shape, "", dtype=object)
     words.flat[chosen] = [
         f"{value:.3g} ± {half:.2g} {unit}".replace("-", "−")
@@ -588,8 +576,8 @@ def _map(cells: _Cells, chosen: NDArray[np.intp], curve: Curve, unit: str) -> go
 
 
 _START = 2.0  # s from the start of a run that are drawn: ten time constants of a motor of 0.2 s
-_MEASURED = ModelStyle("before", "measured − target", BEFORE)
-_EXPECTED = ModelStyle("after", "measured − expected with the effects", AFTER, index=1)
+_MEASURED = residual.ModelStyle("before", "measured − target", residual.BEFORE)
+_EXPECTED = residual.ModelStyle("after", "measured − expected with the effects", residual.AFTER, index=1)
 
 
 def motor_grid(discovery: Discovery, runs: Sequence[Trajectory]) -> FigureGrid | None:
@@ -599,7 +587,7 @@ def motor_grid(discovery: Discovery, runs: Sequence[Trajectory]) -> FigureGrid |
     if not driven or max(float(np.abs(each).max()) for each in before) == 0:
         return None
     motor_effects = [effect for effect in discovery.effects if effect.stage == "actuator"]
-    errors: list[tuple[ModelStyle, list[Array]]] = [(_MEASURED, before)]
+    errors: list[tuple[residual.ModelStyle, list[Array]]] = [(_MEASURED, before)]
     if motor_effects:
         changes = [_changes(run, targets, motor_effects) for run, targets in driven]
         errors.append((_EXPECTED, [own - change for own, change in zip(before, changes, strict=True)]))
@@ -608,18 +596,18 @@ def motor_grid(discovery: Discovery, runs: Sequence[Trajectory]) -> FigureGrid |
     edges = np.linspace(-top, top, _BINS + 1) * (1 + 1e-9)
     panels = []
     for index, wheel in enumerate(discovery.dataset.robot.measured):
-        bins = [shares(each[:, index], edges) * (each[:, [index]] != 0) for each in targets]
+        bins = [residual.shares(each[:, index], edges) * (each[:, [index]] != 0) for each in targets]
         curves = tuple(_curve(style, bins, [each[:, index] for each in own]) for style, own in errors)
         panels.append(_panel(f"Wheel {wheel.name}, over its target", edges, curves, "target rate (rad/s)"))
     edges = np.linspace(0.0, min(_START, max(float(run.times[-1]) for run, _ in driven)), _BINS + 1)
-    bins = [shares(run.times, edges) for run, _ in driven]
+    bins = [residual.shares(run.times, edges) for run, _ in driven]
     curves = tuple(
         _curve(style, bins, [100 * _share(e, t) for e, t in zip(own, targets, strict=True)]) for style, own in errors
     )
     panels.append(
         _panel("All wheels, at the start of the runs", edges, curves, "time since the start (s)", "% of the target")
     )
-    return grid(
+    return residual.grid(
         panels,
         [style for style, _ in errors],
         "Mean over the runs; the bands hold 95 % of what the scatter of the runs does to the mean.",
@@ -638,7 +626,7 @@ def _changes(run: Trajectory, targets: Array, motor_effects: Sequence[NamedEffec
     return total
 
 
-def _curve(style: ModelStyle, bins: Sequence[Array], errors: Sequence[Array]) -> Curve:
+def _curve(style: residual.ModelStyle, bins: Sequence[Array], errors: Sequence[Array]) -> residual.Curve:
     """Mean over the runs of each run's mean in a bin, with the scatter of the runs."""
     counts = np.array([each.sum(axis=0) for each in bins])
     sums = np.array([each.T @ own for each, own in zip(bins, errors, strict=True)])
@@ -648,7 +636,7 @@ def _curve(style: ModelStyle, bins: Sequence[Array], errors: Sequence[Array]) ->
     value, spread = np.full(len(runs), np.nan), np.full(len(runs), np.nan)
     value[enough] = np.nanmean(means[:, enough], axis=0)
     spread[enough] = np.nanstd(means[:, enough], axis=0, ddof=1) / np.sqrt(runs[enough])
-    return Curve(style, value, NORMAL_95 * spread)
+    return residual.Curve(style, value, residual.NORMAL_95 * spread)
 
 
 def _share(errors: Array, targets: Array) -> Array:
@@ -658,8 +646,10 @@ def _share(errors: Array, targets: Array) -> Array:
     return share
 
 
-def _panel(title: str, edges: Array, curves: tuple[Curve, ...], x_title: str, unit: str = "rad/s") -> Panel:
-    return Panel(title, (edges[1:] + edges[:-1]) / 2, curves, x_title, f"difference ({unit})", unit)
+def _panel(
+    title: str, edges: Array, curves: tuple[residual.Curve, ...], x_title: str, unit: str = "rad/s"
+) -> residual.Panel:
+    return residual.Panel(title, (edges[1:] + edges[:-1]) / 2, curves, x_title, f"difference ({unit})", unit)
 
 
 # Figures over each covariate: a figure that is added here is shown.
@@ -697,10 +687,10 @@ _NOT_DRAWN = {
 
 def where_section(discovery: Discovery) -> Section:
     """The section on where: residuals by command, then over each covariate, the significant ones first."""
-    residuals = Residuals(discovery)
+    residuals = residual.Residuals(discovery)
     # The styles of both models, or of the plain one alone if nothing was added
     pairs = zip(discovery.before, discovery.after, strict=True)
-    styles = (ALONE,) if all(np.array_equal(*pair) for pair in pairs) else (PLAIN, EXTENDED)
+    styles = (residual.ALONE,) if all(np.array_equal(*pair) for pair in pairs) else (residual.PLAIN, residual.EXTENDED)
     motors = motor_grid(discovery, residuals.runs)
     order = list(_NOT_DRAWN)  # new covariates come last
     figures: dict[str, tuple[Block, ...]] = {

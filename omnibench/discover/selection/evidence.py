@@ -86,15 +86,7 @@ from omnibench.discover.regressors.paths import Paths, correction_along, slopes_
 from omnibench.discover.regressors.significance import ColumnStore, Group, Significance
 from omnibench.fit.trajectory_fit import Given
 from omnibench.registry import effects
-from omnibench.robot.effects.effect import (
-    Effect,
-    Forms,
-    MotionEffect,
-    Parameter,
-    ReferenceEffect,
-    form_profile,
-    forms_of,
-)
+from omnibench.robot.effects import effect as kinds
 from omnibench.robot.kinematics import Array
 
 # Shapes of an effect: with more of them, one comes near enough to any other form. tests/studies/constants.py varies
@@ -134,7 +126,7 @@ def make_groups(paths: Paths, trajectories: Sequence[Trajectory], without: Seque
     sessions = tuple(dict.fromkeys(run.session for run in trajectories if run.session is not None))
     for effect in catalogue(without):
         if (
-            not isinstance(effect, MotionEffect | ReferenceEffect)
+            not isinstance(effect, kinds.MotionEffect | kinds.ReferenceEffect)
             or effect.run_nuisance
             or not effect.applies(paths.robot)
         ):
@@ -181,17 +173,19 @@ def make_groups(paths: Paths, trajectories: Sequence[Trajectory], without: Seque
     )
 
 
-def _of_effect(effect: MotionEffect | ReferenceEffect, linear: Sequence[Parameter], group: Group) -> Columns:
+def _of_effect(
+    effect: kinds.MotionEffect | kinds.ReferenceEffect, linear: Sequence[kinds.Parameter], group: Group
+) -> Columns:
     """Slopes by the parameters of an effect, then by those of its forms, if it has any."""
     values, forms = {each.name: 0.0 for each in linear} | dict(group.shapes), group.family
     varied = [] if forms is None else [each.name.partition(":")[::2] for each in forms.parameters]
 
     def columns(along: Paths) -> Array:
-        if isinstance(effect, ReferenceEffect):
+        if isinstance(effect, kinds.ReferenceEffect):
             return slopes_by(along, effect, [each.name for each in linear], values)
         units = {each.name: correction_along(along, effect, {**values, each.name: 1.0}) for each in linear}
         scales = {} if forms is None else forms.scales
-        profiles = {key: form_profile(key, effect, along.signals, scales) for _, key in varied}
+        profiles = {key: kinds.form_profile(key, effect, along.signals, scales) for _, key in varied}
         every = [*units.values(), *(units[name] * profiles[key] for name, key in varied)]
         return slopes_by_corrections(along, effect, every)
 
@@ -204,14 +198,14 @@ def _of_matrix(paths: Paths) -> Array:
     return np.concatenate([paths.of_twist(np.tile(row, (len(driven), 1)), driven) for row in np.eye(3)], axis=2)
 
 
-def catalogue(without: Sequence[str]) -> Iterator[Effect]:
+def catalogue(without: Sequence[str]) -> Iterator[kinds.Effect]:
     """The effects of the catalogue but for some of these names."""
     for entry in effects.entries():
         if entry.name not in without and (effect := effects.create(entry.name)).in_catalogue:
             yield effect
 
 
-def _lacks(effect: Effect, paths: Paths, sessions: tuple[str, ...]) -> Missing | None:
+def _lacks(effect: kinds.Effect, paths: Paths, sessions: tuple[str, ...]) -> Missing | None:
     """Why an effect cannot be looked for; None if it can."""
     if "wheel_angles" in effect.needs and paths.signals.wheel_angles is None:
         return Missing.WHEEL_ANGLES
@@ -224,12 +218,14 @@ def _lacks(effect: Effect, paths: Paths, sessions: tuple[str, ...]) -> Missing |
     return None
 
 
-def _family(paths: Paths, effect: Effect, names: Sequence[str], values: Mapping[str, float]) -> Forms | None:
+def _family(
+    paths: Paths, effect: kinds.Effect, names: Sequence[str], values: Mapping[str, float]
+) -> kinds.Forms | None:
     """The forms of an effect, which these recordings can tell; None for one that has no others."""
-    if not isinstance(effect, MotionEffect):
+    if not isinstance(effect, kinds.MotionEffect):
         return None
     corrections = {name: correction_along(paths, effect, {**values, name: 1.0}) for name in names}
-    forms = forms_of(effect, paths.signals, corrections)
+    forms = kinds.forms_of(effect, paths.signals, corrections)
     return forms if forms.parameters else None
 
 

@@ -31,8 +31,7 @@ from omnibench.discover.held_out import folds_of_kinds, is_gain, without_runs
 from omnibench.discover.regressors.covariate_bases import Basis
 from omnibench.discover.regressors.significance import Group, Significance, best_shapes
 from omnibench.discover.selection.competing_models import CompetingModels
-from omnibench.discover.selection.model_selection import CHANCE
-from omnibench.discover.selection.screening import Screening
+from omnibench.discover.selection.model_selection import CHANCE, Screening
 from omnibench.fit.trajectory_fit import Given, Whitened, given
 from omnibench.registry import effects
 from omnibench.robot.effects.smooth import SmoothJoint
@@ -245,16 +244,6 @@ def _terms_of(basis: Basis) -> Iterator[tuple[str, Mapping[str, float]]]:
             yield "smooth_patch", {
                 "centre_x": x + east * radius, "centre_y": y + north * radius, "radius": radius / 2
             }  # fmt: skip
-
-
-def chosen_functions(base: Extended, groups: Sequence[Group]) -> list[Group]:
-    """Groups with only those functions that gain more than Eq. (2) beyond matrix, effects and each other.
-
-    All other parameters are 0; groups without any function are left out. Functions are chosen one after another, the
-    largest gain first. Those that the data hardly determine beyond the chosen ones are passed over, and those that
-    would need a coefficient far outside its plausible range.
-    """
-    return _restricted(groups, _kept_functions(given(_linearised(base, groups), []), _limits_of(groups)))
 
 
 def _linearised(base: Extended, groups: Sequence[Group]) -> Whitened:

@@ -47,10 +47,10 @@ from scipy.linalg import block_diag
 from omnibench.config import NonNegative
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError, NotApplicableError
+from omnibench.fit.calibrate import corrected_runs
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.prior import physical_prior_root, physical_tolerance
 from omnibench.fit.problem import CalibrationProblem
-from omnibench.fit.steering_fit import corrected_runs
 from omnibench.registry import Options, calibrators
 from omnibench.robot.calibration import EffectTerm, ModelExtension, covariance_rows
 from omnibench.robot.effects.effect import Term, make_term

@@ -70,23 +70,14 @@ from scipy.special import chdtri
 from omnibench.config import Positive
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import ConfigError, DataError
+from omnibench.fit import trajectory_fit
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.gauss_newton import BoxedFit, Descent, descend, first_fit
-from omnibench.fit.information import EstimatedCovariance
 from omnibench.fit.loss import OFF, Loss, LossName, RobustCost, cost_weightings, loss_of, make_loss, mean_curvature
 from omnibench.fit.noise import FIRST_NOISE, ExtraVariance, NoiseEstimate, Whitener, is_near, roots_of, whiteners
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.fit.sandwich import CHANCE, Sandwich, Scores, sandwich
-from omnibench.fit.trajectory_fit import (
-    TURN,
-    FitNoise,
-    Nuisances,
-    TrajectoryFit,
-    Weighting,
-    Whitened,
-    noise_of_fit,
-    with_poses,
-)
+from omnibench.fit.trajectory_fit import EstimatedCovariance
 from omnibench.registry import Options, calibrators
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
@@ -149,17 +140,19 @@ class RobustNoise:
             for times, of_run in zip(stamps, self.runs, strict=True)
         ]
 
-    def without_jumps(self, fit: TrajectoryFit) -> TrajectoryFit:
+    def without_jumps(self, fit: trajectory_fit.TrajectoryFit) -> trajectory_fit.TrajectoryFit:
         """The fit without the poses, and without the runs, that are off; the whole fit if nothing were left."""
         chosen = [np.flatnonzero(of_run.poses >= OFF) for of_run in self.runs]
         near = [index for index, of_run in enumerate(self.runs) if of_run.near and len(chosen[index])]
         if not near:
             return fit
-        runs = tuple(with_poses(fit.runs[index], np.append(0, 1 + chosen[index])) for index in near)
+        runs = tuple(trajectory_fit.with_poses(fit.runs[index], np.append(0, 1 + chosen[index])) for index in near)
         return replace(fit, runs=runs, nuisances=replace(fit.nuisances, values=fit.nuisances.values[near]))
 
 
-def robust_noise(noise: Noise, fit: TrajectoryFit, loss: LossName, before: RobustNoise | None = None) -> RobustNoise:
+def robust_noise(
+    noise: Noise, fit: trajectory_fit.TrajectoryFit, loss: LossName, before: RobustNoise | None = None
+) -> RobustNoise:
     """The weights of a fit's runs under a noise, from earlier ones."""
     of_pose, of_position, of_heading = (make_loss(loss, coordinates) for coordinates in (3, 2, 1))
     assert of_pose is not None  # the calibrator has checked that it is no loss of squares
@@ -230,7 +223,7 @@ class FitCovariance:
 
     def __init__(
         self,
-        data: Whitened,
+        data: trajectory_fit.Whitened,
         runs: Sequence[Trajectory],
         noise: NoiseEstimate,
         unit: Array,
@@ -323,7 +316,7 @@ class TrajectoryEstimate:
     vector: Array
     covariance: EstimatedCovariance
     noise: NoiseEstimate
-    nuisances: Nuisances
+    nuisances: trajectory_fit.Nuisances
     misfit: str
     description: str
     rounds: int
@@ -371,17 +364,17 @@ class TrajectoryML(Calibrator):
         for _ in range(0 if loss == "squares" else _FIRST_WEIGHTS):  # Student's t needs a start near its minimum
             heavy = robust_noise(FIRST_NOISE, now.fit.trajectories, "huber", heavy)
             now = descend(now.fit, heavy.weightings(stamps), _STILL)
-        noise: FitNoise | None = None
+        noise: trajectory_fit.FitNoise | None = None
         rounds, settled = 0, False
         while not settled and rounds < _MOST_ROUNDS:
             before, earlier = now.fit, noise
             usual = before.trajectories if heavy is None else heavy.without_jumps(before.trajectories)
-            kinds = [] if self.options.start == "exact" else [TURN]
-            noise = noise_of_fit(usual, kinds, None if earlier is None else earlier.estimate.noise)
+            kinds = [] if self.options.start == "exact" else [trajectory_fit.TURN]
+            noise = trajectory_fit.noise_of_fit(usual, kinds, None if earlier is None else earlier.estimate.noise)
             least = noise.estimate.noise.pose_heading if self.options.start == "noisy" else 0.0
             noise = replace(noise, deviations=np.maximum(noise.deviations, [least, 0.0, 0.0]))
-            fit = self._with_deviations(before, noise.deviations[TURN]).with_walk()
-            weightings: Sequence[Weighting] = whiteners(noise.estimate.noise, stamps)
+            fit = self._with_deviations(before, noise.deviations[trajectory_fit.TURN]).with_walk()
+            weightings: Sequence[trajectory_fit.Weighting] = whiteners(noise.estimate.noise, stamps)
             if heavy is not None:
                 heavy = robust_noise(noise.estimate.noise, fit.trajectories, loss, heavy)
                 weightings = heavy.weightings(stamps)
@@ -445,7 +438,7 @@ class TrajectoryML(Calibrator):
         clock, offset, slope = self.options.clock, self.options.clock_offset, self.options.clock_slope
         deviations = np.array([start_heading, offset * (clock != "none"), slope * (clock == "offset_and_slope")])
         values = np.where(deviations > 0, fit.trajectories.nuisances.values, 0.0)
-        return fit.with_nuisances(Nuisances(values, deviations))
+        return fit.with_nuisances(trajectory_fit.Nuisances(values, deviations))
 
 
 def _descend_cost(fit: BoxedFit, tolerance: float) -> tuple[Descent, float]:

@@ -20,22 +20,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from omnibench.errors import DataError, OmnibenchError
+from omnibench.live.estimation import robot_state
 from omnibench.live.estimation.health import Counts, FusionHealth, Health, Status, SwapRecord
 from omnibench.live.estimation.live_odometry import Motion
-from omnibench.live.estimation.robot_state import (
-    ExtrapolationMonitor,
-    RobotMemory,
-    RobotState,
-    SavedState,
-    StateWriter,
-    new_state,
-    resume_state,
-    wheel_angle_effects,
-)
 from omnibench.live.fusion.pose_fusion import Entry, Fusion, FusionSettings, Outcome, PoseInput
 from omnibench.live.wheels.wheel_input import WheelSettings, WheelStep
 from omnibench.live.wire.messages import JointState, MessageError, arrival_stamp
-from omnibench.live.wire.outputs import Frames, JointStateDecoder, Update
+from omnibench.live.wire.topics import Frames, JointStateDecoder, Update
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
 from omnibench.robot.signals import of_centre
@@ -54,7 +45,7 @@ class HealthReporter:
         self._rate = 0.0  # Hz
         self._behind = 0.0  # s, in the last whole window
 
-    def report(self, state: RobotState, now: float, waiting_since: float | None = None) -> Health:
+    def report(self, state: robot_state.RobotState, now: float, waiting_since: float | None = None) -> Health:
         """The health at ``now`` (s, monotonic). waiting_since: when the oldest message that waits came."""
         # Rate and waiting time of samples, measured once a window.
         since, counted = self._counted
@@ -95,7 +86,9 @@ class HealthReporter:
             unfitted_motion_s=state.monitor.seconds,
         )
 
-    def _status(self, state: RobotState, now: float, age: float | None, behind: float) -> tuple[Status, str]:
+    def _status(
+        self, state: robot_state.RobotState, now: float, age: float | None, behind: float
+    ) -> tuple[Status, str]:
         """The status and its reason in words.
 
         age: of the last wheel sample, s; None before the first. behind: longest time that samples waited, s.
@@ -124,7 +117,7 @@ class HealthReporter:
         return "ok", "odometry and SLAM"
 
 
-def _covariance(state: RobotState, silence: float | None) -> Array:
+def _covariance(state: robot_state.RobotState, silence: float | None) -> Array:
     """Covariance (3, 3) of the fused pose, or of odometry's; it grows in a silence of the wheels (s)."""
     odometry, fusion = state.odometry, state.fusion
     if fusion is None:
@@ -146,7 +139,7 @@ class PoseAt:
 _OTHER_ROBOT = 0.5  # share of a row's largest element; chosen: no calibration moves a matrix so far from its design
 
 
-def swap_calibration(state: RobotState, calibration: Calibration) -> None:
+def swap_calibration(state: robot_state.RobotState, calibration: Calibration) -> None:
     """Continue with another calibration; poses do not jump. DataError: it is not this robot's, or cannot be run."""
     try:
         check_same_robot(calibration, state.calibration)
@@ -156,13 +149,13 @@ def swap_calibration(state: RobotState, calibration: Calibration) -> None:
         record_refused_swap(state, calibration.name, str(error))
         raise DataError(str(error)) from None
     state.calibration, state.odometry, state.reference = calibration, odometry, reference
-    state.monitor = ExtrapolationMonitor(state.name, calibration)
-    state.guessed_angles = wheel_angle_effects(calibration)
+    state.monitor = robot_state.ExtrapolationMonitor(state.name, calibration)
+    state.guessed_angles = robot_state.wheel_angle_effects(calibration)
     state.counts.swaps += 1
     state.last_swap = SwapRecord(accepted=True, name=calibration.name, reason="runs", at=time.time())
 
 
-def record_refused_swap(state: RobotState, name: str | None, reason: str) -> None:
+def record_refused_swap(state: robot_state.RobotState, name: str | None, reason: str) -> None:
     """Count a calibration that was sent and refused. name: the calibration's, if it could be read."""
     state.counts.swaps_refused += 1
     state.last_swap = SwapRecord(accepted=False, name=name, reason=reason, at=time.time())
@@ -204,15 +197,15 @@ class RobotTracker:
         fusion: FusionSettings | None = None,
         frames: Frames | None = None,
         stale_after: float = 0.5,
-        memory: RobotMemory | None = None,
+        memory: robot_state.RobotMemory | None = None,
     ) -> None:
         self.name = name
         self.frames = frames or Frames()
-        self._state = new_state(name, calibration, wheels or WheelSettings(), fusion)
+        self._state = robot_state.new_state(name, calibration, wheels or WheelSettings(), fusion)
         self._decoder = JointStateDecoder()
         self._by_arrival = wheels is not None and wheels.stamps == "arrival"
         self._pose_input = PoseInput(self.frames.map, fusion or FusionSettings(), self.counts)
-        self._state_writer = StateWriter(memory)
+        self._state_writer = robot_state.StateWriter(memory)
         self._health = HealthReporter(stale_after)
         self._state_lock = threading.Lock()  # held while the state is read or changed
         self._closed = False
@@ -383,10 +376,10 @@ class RobotTracker:
             self._required_fusion("reset").reset()
             self._state.reference.restart()
 
-    def resume(self, saved: SavedState, now: float, wall: float) -> None:
+    def resume(self, saved: robot_state.SavedState, now: float, wall: float) -> None:
         """Continue where another node stopped. now, wall: monotonic and unix time, s."""
         with self._state_lock:
-            self._add_to_timeline(resume_state(self._state, saved, now, wall))
+            self._add_to_timeline(robot_state.resume_state(self._state, saved, now, wall))
 
     def count_failure(self) -> None:
         """Count a message on which omnibench itself failed."""

@@ -28,7 +28,7 @@ from omnibench.progress import Reporter, no_progress
 from omnibench.registry import load_plugins
 from omnibench.robot.kinematics import Array, Robot, compose, moved_to, relative, rotation
 from omnibench.robot.odometry import WheelLog
-from omnibench.simulate.flower import true_steering
+from omnibench.simulate.robot_simulator import true_steering
 from omnibench.simulate.source import read_simulation
 from omnibench.simulate.truth import TruthRecord
 

@@ -24,19 +24,11 @@ import numpy as np
 import zenoh
 
 from omnibench.errors import ConfigError, OmnibenchError
-from omnibench.live.control.request_queue import source_of
+from omnibench.live.control.query_server import source_of
 from omnibench.live.estimation.health import anomalies_among
 from omnibench.live.network.presence import alive_robots, checked_robot
 from omnibench.live.network.session import is_connected
-from omnibench.live.replay.concatenated_drive import (
-    TOPICS_PLAYED,
-    WHEELS,
-    ConcatenatedDrive,
-    PoseDeviation,
-    ReplayConfig,
-    SlamChannel,
-    make_schedule,
-)
+from omnibench.live.replay import concatenated_drive as drives
 from omnibench.live.stopping import Closing, answers, direct, wait_until
 from omnibench.live.wheels.wheel_input import check_joints, joints_of
 from omnibench.live.wire.messages import JointState, PoseEstimate
@@ -272,8 +264,8 @@ class ReplayMessages:
 
     def __init__(
         self,
-        drive: ConcatenatedDrive,
-        config: ReplayConfig,
+        drive: drives.ConcatenatedDrive,
+        config: drives.ReplayConfig,
         noise: Noise | None = None,
         names: Sequence[str] | None = None,
     ) -> None:
@@ -281,7 +273,7 @@ class ReplayMessages:
         self._origin = config.stamp_origin
         self._joints = joints_of(drive.robot).names if names is None else tuple(names)
         check_joints(self._joints, (*drive.robot.wheel_names, *drive.robot.drive.steered), "joints")
-        self._schedule = make_schedule(drive, config)
+        self._schedule = drives.make_schedule(drive, config)
         self._sampled, self._posed = (
             np.round(times * 1e9).astype(np.int64) for times in (drive.wheel_times, drive.slam_times)
         )
@@ -296,14 +288,14 @@ class ReplayMessages:
         start, schedule = origin or self._origin or time.time_ns(), self._schedule
         for arrival, topic, row in zip(schedule.arrivals, schedule.topics, schedule.rows, strict=True):
             message: JointState | PoseEstimate
-            if topic == WHEELS:
+            if topic == drives.WHEELS:
                 positions = None if self._positions is None else self._positions[row]
                 velocities = None if self._velocities is None else self._velocities[row]
                 message = JointState(start + int(self._sampled[row]), self._joints, positions, velocities)
             else:
                 stamp, pose = start + int(self._posed[row]), self._drive.slam_poses[row]
                 message = PoseEstimate(stamp, MAP, pose, self._covariances[row])
-            yield Event(float(arrival), TOPICS_PLAYED[topic], message)
+            yield Event(float(arrival), drives.TOPICS_PLAYED[topic], message)
 
 
 @dataclass(frozen=True)
@@ -351,8 +343,8 @@ class Player:
         self,
         graph: GraphNode,
         robot: str,
-        drive: ConcatenatedDrive,
-        config: ReplayConfig,
+        drive: drives.ConcatenatedDrive,
+        config: drives.ReplayConfig,
         names: Sequence[str] | None = None,
         noise: Noise | None = None,
     ) -> None:
@@ -360,7 +352,7 @@ class Player:
         self._config = config
         self._messages = ReplayMessages(drive, config, noise, names)
         self._session = graph.session
-        self._publishers = {topic: graph.publisher(robot, topic, lossless=True) for topic in TOPICS_PLAYED}
+        self._publishers = {topic: graph.publisher(robot, topic, lossless=True) for topic in drives.TOPICS_PLAYED}
 
     def play(
         self,
@@ -376,7 +368,7 @@ class Player:
         second and at the end. hold: while it is true, nothing is sent.
         """
         stop = stop or threading.Event()
-        sent, interrupted = dict.fromkeys(TOPICS_PLAYED, 0), False
+        sent, interrupted = dict.fromkeys(drives.TOPICS_PLAYED, 0), False
         begin, arrival, late = time.perf_counter(), 0.0, 0.0
         delivery: Delivery | None = None
         before, anomalies = Counter[str](), Counter[str]()
@@ -446,7 +438,7 @@ class Player:
 
     def _wait_for_subscriber(self, stop: threading.Event) -> None:
         """Wait until the wheel samples have a subscriber, and then up to _SLAM_WAIT s for one of the SLAM poses."""
-        wheels, slam = (self._publishers[topic] for topic in TOPICS_PLAYED)
+        wheels, slam = (self._publishers[topic] for topic in drives.TOPICS_PLAYED)
         wait = self._config.wait
         if wait and not wait_until(lambda: wheels.matched, wait, stop) and not stop.is_set():
             raise ConfigError(
@@ -456,7 +448,7 @@ class Player:
         wait_until(lambda: slam.matched, min(wait, _SLAM_WAIT), stop)
 
 
-def _joint_values(drive: ConcatenatedDrive, use: str) -> tuple[Array | None, Array | None]:
+def _joint_values(drive: drives.ConcatenatedDrive, use: str) -> tuple[Array | None, Array | None]:
     """Positions and velocities (n, N + S) of the joints; NaN of those that tell none beside others that do."""
     angles = None if use == "velocities" else drive.angles
     rates = None if use == "positions" else drive.rates
@@ -466,7 +458,7 @@ def _joint_values(drive: ConcatenatedDrive, use: str) -> tuple[Array | None, Arr
     return positions, None if rates is None else np.hstack([rates, np.full_like(drive.steering, np.nan)])
 
 
-def _pose_covariances(drive: ConcatenatedDrive, slam: SlamChannel, noise: Noise | None) -> Array:
+def _pose_covariances(drive: drives.ConcatenatedDrive, slam: drives.SlamChannel, noise: Noise | None) -> Array:
     """Covariances (m, 3, 3) of the SLAM poses' errors."""
     if drive.slam_covariances is not None:
         return drive.slam_covariances
@@ -476,7 +468,7 @@ def _pose_covariances(drive: ConcatenatedDrive, slam: SlamChannel, noise: Noise 
         position = np.sqrt(noise.pose_position**2 + noise.bias_position**2 + noise.walk_position**2 * seconds)
         heading = np.sqrt(noise.pose_heading**2 + noise.bias_heading**2 + noise.walk_heading**2 * seconds)
     else:
-        given = slam.covariance or PoseDeviation()
+        given = slam.covariance or drives.PoseDeviation()
         position, heading = np.full(count, given.position), np.full(count, given.heading)
     deviations = np.maximum(np.column_stack([position, position, heading]), _LEAST_DEVIATION)
     covariances: Array = deviations[:, :, None] ** 2 * np.eye(3)

@@ -19,24 +19,7 @@ from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.finding import Finding
 from omnibench.fit.identifiability import ROWS, UNTOLD
 from omnibench.fit.inspect import Inspection
-from omnibench.report.blocks import (
-    Block,
-    Callout,
-    Cell,
-    Code,
-    Column,
-    Document,
-    Fact,
-    Figure,
-    FigureGrid,
-    LegendItem,
-    Paragraph,
-    Row,
-    Section,
-    Table,
-    answer_section,
-    simulated_badge,
-)
+from omnibench.report import blocks as page
 from omnibench.report.figures import line, marks
 from omnibench.report.numbers import NOTHING, count, fixed, listing, percent, significant, typeset, with_unit
 from omnibench.report.recording.recording_figures import evenly
@@ -51,7 +34,7 @@ def driven_by(inspection: Inspection) -> str:
     return "wheel rates" if len(inspection.driven_shares) == len(inspection.wheels) else "drive signals"
 
 
-def split_table(inspection: Inspection) -> Table:
+def split_table(inspection: Inspection) -> page.Table:
     """The content of each split: runs, commands, repetitions, sessions, time, distance, turns."""
     rows = []
     for name, split in inspection.splits.items():
@@ -60,19 +43,19 @@ def split_table(inspection: Inspection) -> Table:
             repetitions += f" to {split.repetitions_max}"
         counts = (str(split.trajectories), str(split.commands), repetitions, str(split.sessions))
         amounts = (f"{split.duration_s:.0f}", f"{split.distance_m:.1f}", f"{math.degrees(split.turned_rad):.0f}")
-        rows.append(Row.of(name, *counts, *amounts))
+        rows.append(page.Row.of(name, *counts, *amounts))
     columns = (
-        Column("split", numeric=False),
-        Column("runs"),
-        Column("commands"),
-        Column("repetitions", priority=1),
-        Column("sessions"),
-        *(Column(*quantity) for quantity in (("duration", "s"), ("distance", "m"), ("turned", "°"))),
+        page.Column("split", numeric=False),
+        page.Column("runs"),
+        page.Column("commands"),
+        page.Column("repetitions", priority=1),
+        page.Column("sessions"),
+        *(page.Column(*quantity) for quantity in (("duration", "s"), ("distance", "m"), ("turned", "°"))),
     )
-    return Table("", columns, tuple(rows))
+    return page.Table("", columns, tuple(rows))
 
 
-def identifiability_table(inspection: Inspection) -> Table:
+def identifiability_table(inspection: Inspection) -> page.Table:
     """The precision of a calibration along each direction of wheel rates."""
     what, identifiability = driven_by(inspection), inspection.identifiability
     rows = []
@@ -81,18 +64,18 @@ def identifiability_table(inspection: Inspection) -> Table:
         if direction.state == "driven" and direction.deviations is not None:
             deviations = ["open" if value > UNTOLD else f"{100 * value:.2g} %" for value in direction.deviations]
         motion = direction.motion or "slip of the wheels"
-        rows.append(Row.of(direction.direction, motion, f"{100 * direction.share:.3g} %", *deviations))
+        rows.append(page.Row.of(direction.direction, motion, f"{100 * direction.share:.3g} %", *deviations))
     columns = (
-        Column(f"{what} along", numeric=False),
-        Column("motion", numeric=False),
-        Column("driven"),
-        *(Column(f"row {row}") for row in ROWS),
+        page.Column(f"{what} along", numeric=False),
+        page.Column("motion", numeric=False),
+        page.Column("driven"),
+        *(page.Column(f"row {row}") for row in ROWS),
     )
     caption = "Precision of a calibration from these data, ± % of the row's largest element"
-    return Table(caption, columns, tuple(rows))
+    return page.Table(caption, columns, tuple(rows))
 
 
-def parameter_table(inspection: Inspection) -> Table:
+def parameter_table(inspection: Inspection) -> page.Table:
     """How precisely the runs tell each physical parameter."""
     rows = []
     for parameter in inspection.identifiability.parameters:
@@ -105,23 +88,23 @@ def parameter_table(inspection: Inspection) -> Table:
         )
         design = with_unit(fixed(factor * parameter.design, digits), unit)
         known_now = "determined" if parameter.told else "not determined"
-        rows.append(Row.of(f"{kind} of {wheel}" if wheel else kind, design, known, known_now))
+        rows.append(page.Row.of(f"{kind} of {wheel}" if wheel else kind, design, known, known_now))
     columns = (
-        Column("Parameter", numeric=False),
-        Column("Design"),
-        Column("Could be known to"),
-        Column("By these runs", numeric=False),
+        page.Column("Parameter", numeric=False),
+        page.Column("Design"),
+        page.Column("Could be known to"),
+        page.Column("By these runs", numeric=False),
     )
     note = "One standard deviation of the best that any calibration from these runs could do (the Cramér-Rao bound)."
-    return Table("Wheels, as these runs determine them", columns, tuple(rows), note)
+    return page.Table("Wheels, as these runs determine them", columns, tuple(rows), note)
 
 
 _BLOCK = 0.5  # s: motions are means over so long, which smooths encoder ticks (chosen)
 _RESTS = 0.05  # share of the fastest motion below which the robot stands (chosen)
 _DRAWN = 2500  # dots of a figure
-_LEFT = LegendItem("left", "turning left", PALETTE[0])
-_STRAIGHT_ON = LegendItem("straight", "straight", "#5b6772")
-_RIGHT = LegendItem("right", "turning right", PALETTE[1])
+_LEFT = page.LegendItem("left", "turning left", PALETTE[0])
+_STRAIGHT_ON = page.LegendItem("straight", "straight", "#5b6772")
+_RIGHT = page.LegendItem("right", "turning right", PALETTE[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,23 +157,23 @@ def _twists(runs: Sequence[Trajectory], robot: Robot) -> tuple[Array, Array]:
     return twists[moving], seconds[moving]
 
 
-def motion_table(motions: Sequence[DrivenMotion]) -> Table:
+def motion_table(motions: Sequence[DrivenMotion]) -> page.Table:
     """How long each motion was driven, at which speeds and rates of turn."""
     rows = []
     for motion in motions:
         if not motion.driven:
-            rows.append(Row.of(motion.name, Cell("not driven"), NOTHING, NOTHING, role="failed"))
+            rows.append(page.Row.of(motion.name, page.Cell("not driven"), NOTHING, NOTHING, role="failed"))
             continue
         speeds = np.hypot(motion.twists[:, 0], motion.twists[:, 1])
         rates = np.degrees(np.abs(motion.twists[:, 2]))
-        rows.append(Row.of(motion.name, percent(motion.share, 0), _range(speeds, 2), _range(rates, 0)))
-    return Table(
+        rows.append(page.Row.of(motion.name, percent(motion.share, 0), _range(speeds, 2), _range(rates, 0)))
+    return page.Table(
         "Motions driven",
         (
-            Column("Motion", numeric=False),
-            Column("Share of the time in motion"),
-            Column("Speed", "m/s"),
-            Column("Rate of turn", "°/s"),
+            page.Column("Motion", numeric=False),
+            page.Column("Share of the time in motion"),
+            page.Column("Speed", "m/s"),
+            page.Column("Rate of turn", "°/s"),
         ),
         tuple(rows),
         "By the design values, as means over 0.5 s; ranges hold nine tenths. A motion counts as straight or curved and "
@@ -206,7 +189,7 @@ def _range(values: Array, decimals: int) -> str:
     return shown[0] if shown[0] == shown[1] else f"{shown[0]} to {shown[1]}"
 
 
-def motion_figures(runs: Sequence[Trajectory], robot: Robot) -> FigureGrid:
+def motion_figures(runs: Sequence[Trajectory], robot: Robot) -> page.FigureGrid:
     """Velocities seen from above, and speeds against rates of turn, a dot for every half second."""
     twists, _ = _twists(runs, robot)
     twists = twists[evenly(len(twists), _DRAWN)] if len(twists) else twists
@@ -221,7 +204,7 @@ def motion_figures(runs: Sequence[Trajectory], robot: Robot) -> FigureGrid:
         above.append(marks(item, 5, aside, ahead, hover=words, marker_opacity=0.6))
         speeds, degrees = np.hypot(ahead, aside), np.degrees(rate)
         beside.append(marks(item, 5, degrees, speeds, hover="%{x:.0f}°/s, %{y:.2f} m/s", marker_opacity=0.6))
-    middle = marks(LegendItem("", "", INK, symbol="cross-thin-open"), 10, [0.0], [0.0])
+    middle = marks(page.LegendItem("", "", INK, symbol="cross-thin-open"), 10, [0.0], [0.0])
     velocity = plot(*above, middle, x_title="to the left (m/s)", y_title="ahead (m/s)")
     reach = 1.1 * max(float(np.abs(twists[:, :2]).max(initial=0.0)), 0.01)
     velocity.update_layout(
@@ -230,10 +213,14 @@ def motion_figures(runs: Sequence[Trajectory], robot: Robot) -> FigureGrid:
     rates = plot(*beside, x_title="rate of turn, to the left (°/s)", y_title="speed (m/s)")
     rates.update_xaxes(autorange="reversed")
     rates.update_yaxes(rangemode="tozero")
-    return FigureGrid(
+    return page.FigureGrid(
         (
-            Figure("Velocities, seen from above", velocity, "Velocity ahead against velocity to the left, m/s", 360),
-            Figure("Speeds and rates of turn", rates, "Speed in m/s against the rate of turn in degrees a second", 360),
+            page.Figure(
+                "Velocities, seen from above", velocity, "Velocity ahead against velocity to the left, m/s", 360
+            ),
+            page.Figure(
+                "Speeds and rates of turn", rates, "Speed in m/s against the rate of turn in degrees a second", 360
+            ),
         ),
         tuple(item for item, _ in groups),
         2,
@@ -242,35 +229,35 @@ def motion_figures(runs: Sequence[Trajectory], robot: Robot) -> FigureGrid:
     )
 
 
-def inspection_document(dataset: Dataset, inspection: Inspection) -> Document:
+def inspection_document(dataset: Dataset, inspection: Inspection) -> page.Document:
     """The report as blocks. DataError in one line: scans that cannot be read."""
     training = dataset.split("train") or dataset.trajectories
     motions = driven_motions(training, dataset.robot)
     identified = inspection.identifiability
-    return Document(
+    return page.Document(
         title=f"What is in {dataset.name}",
         subtitle=dataset.description,
         sections=(
             _answer(dataset, inspection, motions),
-            Section(
+            page.Section(
                 "motions",
                 "Motions driven",
                 (motion_figures(training, dataset.robot), motion_table(motions)),
                 about="By the training runs, from which a calibration is fitted.",
             ),
-            Section(
+            page.Section(
                 "identified",
                 "What can be identified",
                 (
-                    *map(Paragraph, _identified_in_words(inspection)),
+                    *map(page.Paragraph, _identified_in_words(inspection)),
                     identifiability_table(inspection),
                     *((parameter_table(inspection),) if identified.parameters else ()),
-                    Paragraph(f"Noise: {identified.noise_source}.", "note"),
+                    page.Paragraph(f"Noise: {identified.noise_source}.", "note"),
                 ),
                 about="What a calibration from these runs could know, and what it could not.",
             ),
             *pictures(dataset),
-            Section(
+            page.Section(
                 "recorded",
                 "What was recorded",
                 (split_table(inspection), contents_table(dataset), about_table(dataset)),
@@ -278,11 +265,11 @@ def inspection_document(dataset: Dataset, inspection: Inspection) -> Document:
                 folded=True,
             ),
         ),
-        badges=simulated_badge(dataset.simulated),
+        badges=page.simulated_badge(dataset.simulated),
     )
 
 
-def _answer(dataset: Dataset, inspection: Inspection, motions: list[DrivenMotion]) -> Section:
+def _answer(dataset: Dataset, inspection: Inspection, motions: list[DrivenMotion]) -> page.Section:
     splits = inspection.splits
     names = {"train": "to train", "validation": "held out"}
     parts = " and ".join(f"{of_split.trajectories:,} {names[name]}" for name, of_split in splits.items())
@@ -294,32 +281,32 @@ def _answer(dataset: Dataset, inspection: Inspection, motions: list[DrivenMotion
     seconds = sum(of_split.duration_s for of_split in splits.values())
     metres = sum(of_split.distance_m for of_split in splits.values())
     tiles = (
-        Fact("Runs", count(inspection.trajectories), parts),
-        Fact("Driven", f"{significant(metres, 3)} m", f"in {fixed(seconds / 60, 1)} min"),
-        Fact(
+        page.Fact("Runs", count(inspection.trajectories), parts),
+        page.Fact("Driven", f"{significant(metres, 3)} m", f"in {fixed(seconds / 60, 1)} min"),
+        page.Fact(
             "Wheel samples",
             f"every {significant(1e3 * inspection.sample_period_s)} ms",
             count(inspection.wheel_samples),
         ),
         _reference_tile(inspection),
     )
-    return answer_section(
+    return page.answer_section(
         sentence,
         tiles,
         path_overview(dataset),
-        Callout("Findings", inspection.findings, "warning" if open_ones else "plain"),
-        Callout("Warnings on reading the data", inspection.warnings, "warning"),
+        page.Callout("Findings", inspection.findings, "warning" if open_ones else "plain"),
+        page.Callout("Warnings on reading the data", inspection.warnings, "warning"),
     )
 
 
-def _reference_tile(inspection: Inspection) -> Fact:
+def _reference_tile(inspection: Inspection) -> page.Fact:
     """The reference poses or, where there are none, how many references of which kinds there are."""
     kinds = ", ".join(f"{number} of {kind}" for kind, number in inspection.references.items())
     if inspection.pose_period_s is None:
-        return Fact("References", count(sum(inspection.references.values())), kinds)
+        return page.Fact("References", count(sum(inspection.references.values())), kinds)
     every = f"every {significant(1e3 * inspection.pose_period_s)} ms"
     beside = f"; beside them {kinds}" if kinds else ""
-    return Fact("Reference poses", every, f"{count(inspection.reference_poses)}{beside}")
+    return page.Fact("Reference poses", every, f"{count(inspection.reference_poses)}{beside}")
 
 
 def _identified_in_words(inspection: Inspection) -> list[str]:
@@ -333,54 +320,56 @@ def _identified_in_words(inspection: Inspection) -> list[str]:
     return [*words, *(f"{sentence[:1].upper()}{sentence[1:]}." for sentence in inspection.identifiability.sentences)]
 
 
-_WHEELS = LegendItem("wheels", "by the wheels, at the design", PALETTE[0])
-_REFERENCE = LegendItem("reference", "by the reference", REFERENCE)
+_WHEELS = page.LegendItem("wheels", "by the wheels, at the design", PALETTE[0])
+_REFERENCE = page.LegendItem("reference", "by the reference", REFERENCE)
 _SMOOTH = 0.3  # s over which rates of turn are taken, so that the reference's noise does not hide them; chosen
 _SHOWN = 12.0  # s that are drawn, where matching shows best; chosen
 _LOOKED_AT = 8  # runs whose clocks are farthest off, of which the one is drawn that shows it best; chosen
 _WORDS = {"error": "Errors", "warning": "Warnings", "note": "Notes"}
 
 
-def check_document(dataset: Dataset, checked: CheckReport) -> Document:
+def check_document(dataset: Dataset, checked: CheckReport) -> page.Document:
     """The report on a data set as blocks."""
     runs = [run for run in dataset.trajectories if run.has_poses]
     picture = _clock_picture(dataset.robot, runs, checked.clocks) or path_overview(dataset)
     counts = {severity: sum(each.severity == severity for each in checked.findings) for severity in _WORDS}
-    tiles = [Fact(_WORDS[severity], str(count)) for severity, count in counts.items()]
-    tiles.append(Fact("Runs", str(len(dataset.trajectories))))
+    tiles = [page.Fact(_WORDS[severity], str(count)) for severity, count in counts.items()]
+    tiles.append(page.Fact("Runs", str(len(dataset.trajectories))))
     gain = f"What a calibration would gain on runs that it was not fitted to, each in turn; {typeset(checked.gain)}."
     sections = [
-        answer_section(
+        page.answer_section(
             f"{checked.sentence}.",
             tiles,
             picture,
-            *([Paragraph(gain, "note")] if checked.gain else []),
+            *([page.Paragraph(gain, "note")] if checked.gain else []),
             title="Verdict",
         ),
-        Section("findings", "Findings, each with what to type", tuple(_blocks(checked.findings))),
+        page.Section("findings", "Findings, each with what to type", tuple(_blocks(checked.findings))),
     ]
-    return Document(
+    return page.Document(
         title=f"Check: {dataset.name}",
         subtitle=dataset.description,
         sections=tuple(sections),
-        badges=simulated_badge(dataset.simulated),
+        badges=page.simulated_badge(dataset.simulated),
     )
 
 
-def _blocks(findings: Sequence[Finding]) -> list[Block]:
+def _blocks(findings: Sequence[Finding]) -> list[page.Block]:
     if not findings:
-        return [Paragraph("Nothing was found that spoils a calibration.")]
-    blocks: list[Block] = []
+        return [page.Paragraph("Nothing was found that spoils a calibration.")]
+    blocks: list[page.Block] = []
     for finding in findings:
-        blocks.append(Paragraph(f"{finding.severity.capitalize()}, {finding.where}: {finding.what}."))
+        blocks.append(page.Paragraph(f"{finding.severity.capitalize()}, {finding.where}: {finding.what}."))
         if finding.fix.startswith("omnibench "):
-            blocks.append(Code(finding.fix))
+            blocks.append(page.Code(finding.fix))
         elif finding.fix:
-            blocks.append(Paragraph(finding.fix, "note"))
+            blocks.append(page.Paragraph(finding.fix, "note"))
     return blocks
 
 
-def _clock_picture(robot: Robot, runs: Sequence[Trajectory], clocks: Sequence[ClockMatch | None]) -> FigureGrid | None:
+def _clock_picture(
+    robot: Robot, runs: Sequence[Trajectory], clocks: Sequence[ClockMatch | None]
+) -> page.FigureGrid | None:
     """Rates of turn by wheels and reference in the run whose clock is farthest off, before and after matching."""
     known = [(run, clock) for run, clock in zip(runs, clocks, strict=True) if clock is not None]
     if not known:
@@ -400,7 +389,7 @@ def _clock_picture(robot: Robot, runs: Sequence[Trajectory], clocks: Sequence[Cl
     for figure in figures:
         figure.plot.update_yaxes(range=[min(values) - margin, max(values) + margin])
     caption = f"Rate of turn in run {run.id}, whose stamps are among those that differ most."
-    return FigureGrid(figures, (_WHEELS, _REFERENCE), caption=caption, name="clocks")
+    return page.FigureGrid(figures, (_WHEELS, _REFERENCE), caption=caption, name="clocks")
 
 
 def _view(robot: Robot, run: Trajectory, clock: ClockMatch) -> tuple[float, float]:
@@ -425,7 +414,7 @@ def _turned(robot: Robot, run: Trajectory) -> tuple[Array, Array]:
     return edges, np.append(0.0, np.cumsum((run.signals @ robot.inverse_kinematic_matrix[2]) * np.diff(edges)))
 
 
-def _rates(robot: Robot, run: Trajectory, stamps: Array, span: tuple[float, float], title: str) -> Figure:
+def _rates(robot: Robot, run: Trajectory, stamps: Array, span: tuple[float, float], title: str) -> page.Figure:
     edges, turns = _turned(robot, run)
     moments = np.arange(span[0], span[1], _SMOOTH / 3)
     traces = [
@@ -433,7 +422,7 @@ def _rates(robot: Robot, run: Trajectory, stamps: Array, span: tuple[float, floa
         for item, turned in ((_WHEELS, (edges, turns)), (_REFERENCE, (stamps, run.poses[:, 2])))
     ]
     figure = plot(*traces, x_title="time by the wheels' clock (s)", y_title="rate of turn (rad/s)")
-    return Figure(title, figure, "Rate of turn over time, by the wheels and by the reference", 300)
+    return page.Figure(title, figure, "Rate of turn over time, by the wheels and by the reference", 300)
 
 
 def _slopes(moments: Array, times: Array, headings: Array) -> Array:

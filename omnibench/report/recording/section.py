@@ -18,43 +18,10 @@ from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.stored import drawn_runs
 from omnibench.data.true_poses import TruePath
 from omnibench.errors import DataError
-from omnibench.report.blocks import (
-    Block,
-    Callout,
-    Cell,
-    Choice,
-    Column,
-    Document,
-    Fact,
-    Facts,
-    Figure,
-    FigureGrid,
-    LegendItem,
-    Player,
-    Row,
-    Section,
-    Table,
-    answer_section,
-    simulated_badge,
-)
+from omnibench.report import blocks
 from omnibench.report.figures import coordinates, is_placed, joined, line
 from omnibench.report.numbers import NOTHING, count, fixed, listing, significant
-from omnibench.report.recording.recording_figures import (
-    ODOMETRY_ITEM,
-    PLAN_ITEM,
-    REFERENCE_ITEM,
-    SCANS,
-    SCANS_ITEM,
-    TRUTH_ITEM,
-    all_runs,
-    evenly,
-    one_run,
-    poses_at,
-    rate_step,
-    representative_runs,
-    scan_points,
-    wheel_rates,
-)
+from omnibench.report.recording import recording_figures
 from omnibench.report.style import INK, PALETTE, QUIET, plot
 from omnibench.robot.kinematics import Array, compose, interpolated, placed, seen_from
 from omnibench.robot.model import OdometryModel
@@ -66,7 +33,7 @@ _MEAN_OVER = 0.1  # s; wheel rates are means over this time before each frame
 _SCANS = 60  # scans drawn of a run (chosen: keeps the file small)
 _RAYS = 270  # rays drawn of a scan (chosen: keeps the file small)
 _MARGIN = 0.4  # m around everything that is drawn
-_SEEN = LegendItem("scan", "this moment's scan", "#d97706")
+_SEEN = blocks.LegendItem("scan", "this moment's scan", "#d97706")
 
 
 def player(
@@ -75,7 +42,7 @@ def player(
     odometry: OdometryModel,
     truth: Mapping[str, TruePath],
     outlines: Mapping[str, Sequence[Array]],
-) -> Player:
+) -> blocks.Player:
     """A player for these runs, chosen by the menu's names and moved through with a slider.
 
     outlines: for each run the walls of the floor plan in the frame of its reference poses, each (n, 2), m.
@@ -83,7 +50,7 @@ def player(
     shown = ["the robot"]
     shown += ["its last scan, and what it saw before"] if dataset.scans is not None else []
     shown += ["the path so far and its wheel rates"]
-    return Player(
+    return blocks.Player(
         {name: _run(dataset, run, odometry, truth.get(run.id), outlines.get(run.id, ())) for name, run in runs.items()},
         f"A plan of the room with {listing(shown)}, at the time that the slider names",
         "Between reference poses the robot is drawn on a straight line; wheel rates are means over the 100 ms before. "
@@ -96,7 +63,7 @@ def _run(
 ) -> dict[str, Any]:
     end, steered = run.end, dataset.robot.drive.steered
     times = np.linspace(0.0, end, min(_FRAMES, max(2, round(end / 0.02) + 1)))
-    poses = poses_at(run, times)
+    poses = recording_figures.poses_at(run, times)
     (driven,) = odometry.poses([run.log(times)])
     true_poses = None if truth is None else placed(run.start, truth.at(times))
     scans = _played_scans(dataset, run)
@@ -133,14 +100,14 @@ def _run(
         ],
         "radius": max(math.hypot(wheel.reach, wheel.radius) for wheel in dataset.robot.wheels),
         "colours": {
-            "reference": REFERENCE_ITEM.colour,
-            "odometry": ODOMETRY_ITEM.colour,
-            "truth": TRUTH_ITEM.colour,
-            "plan": PLAN_ITEM.colour,
-            "map": SCANS + "66",
+            "reference": recording_figures.REFERENCE_ITEM.colour,
+            "odometry": recording_figures.ODOMETRY_ITEM.colour,
+            "truth": recording_figures.TRUTH_ITEM.colour,
+            "plan": recording_figures.PLAN_ITEM.colour,
+            "map": recording_figures.SCANS + "66",
             "scan": _SEEN.colour,
             "ray": _SEEN.colour + "44",
-            "whole": REFERENCE_ITEM.colour + "55",
+            "whole": recording_figures.REFERENCE_ITEM.colour + "55",
             "robot": INK,
         },
         "key": _key(bool(scans), truth is not None, bool(outlines)),
@@ -154,10 +121,10 @@ def _played_scans(dataset: Dataset, run: Trajectory) -> list[dict[str, Any]]:
     scanner, scans = dataset.scans.scanner, dataset.scans.of(run.id)
     stride = -(-scanner.rays // _RAYS)
     documents = []
-    for scan in evenly(len(scans.times), _SCANS):
+    for scan in recording_figures.evenly(len(scans.times), _SCANS):
         stamp = scans.times[scan]
-        origin = compose(poses_at(run, stamp), scanner.mount.pose)
-        points = scan_points(run, scanner, scans, int(scan), stride)
+        origin = compose(recording_figures.poses_at(run, stamp), scanner.mount.pose)
+        points = recording_figures.scan_points(run, scanner, scans, int(scan), stride)
         documents.append(
             {"t": round(float(stamp), 4), "from": _rounded(origin[:2]), "points": _rounded(points.ravel())}
         )
@@ -177,8 +144,12 @@ def _means(run: Trajectory, values: Array, times: Array) -> Array:
 
 
 def _key(scans: bool, truth: bool, plan: bool) -> list[dict[str, Any]]:
-    items = [REFERENCE_ITEM, ODOMETRY_ITEM] + [TRUTH_ITEM] * truth + [PLAN_ITEM] * plan
-    points = [_SEEN, LegendItem("map", "earlier scans", SCANS_ITEM.colour)] * scans
+    items = (
+        [recording_figures.REFERENCE_ITEM, recording_figures.ODOMETRY_ITEM]
+        + [recording_figures.TRUTH_ITEM] * truth
+        + [recording_figures.PLAN_ITEM] * plan
+    )
+    points = [_SEEN, blocks.LegendItem("map", "earlier scans", recording_figures.SCANS_ITEM.colour)] * scans
     entries: list[dict[str, Any]] = [{"label": item.label, "colour": item.colour, "points": False} for item in items]
     return entries + [{"label": item.label, "colour": item.colour, "points": True} for item in points]
 
@@ -187,76 +158,80 @@ def _rounded(values: Array, decimals: int = 3) -> Any:
     return np.round(values, decimals).tolist()
 
 
-def accuracy_tiles(accuracy: SlamAccuracy) -> tuple[Fact, ...]:
+def accuracy_tiles(accuracy: SlamAccuracy) -> tuple[blocks.Fact, ...]:
     """The errors of reference poses against the truth as a few figures."""
     final = accuracy.final
     position, heading = _mm(final.position_mean_m), _degrees(final.heading_mean_rad)
     drift, turn = _mm(accuracy.drift_position), _degrees(accuracy.drift_heading)
     return (
-        Fact("Final position error, mean", f"{position} mm", f"95 % below {_mm(final.position_p95_m)} mm"),
-        Fact("Final heading error, mean", f"{heading}°", f"95 % below {_degrees(final.heading_p95_rad)}°"),
-        Fact("Drift", f"{drift} mm per metre", f"heading {turn}° per metre"),
-        Fact("NEES, mean of all poses", _nees(accuracy.every), "3 where covariances are right"),
+        blocks.Fact("Final position error, mean", f"{position} mm", f"95 % below {_mm(final.position_p95_m)} mm"),
+        blocks.Fact("Final heading error, mean", f"{heading}°", f"95 % below {_degrees(final.heading_p95_rad)}°"),
+        blocks.Fact("Drift", f"{drift} mm per metre", f"heading {turn}° per metre"),
+        blocks.Fact("NEES, mean of all poses", _nees(accuracy.every), "3 where covariances are right"),
     )
 
 
-def error_table(accuracy: SlamAccuracy) -> Table:
+def error_table(accuracy: SlamAccuracy) -> blocks.Table:
     """The errors of the last pose of each run, and of all poses."""
     rows = []
     for name, summary in _summaries(accuracy):
         positions = (summary.position_mean_m, summary.position_p95_m, summary.position_max_m)
         headings = (summary.heading_mean_rad, summary.heading_p95_rad, summary.heading_max_rad)
-        rows.append(Row.of(Cell(name, plural(summary.poses, "pose")), *_figures(positions, headings), _nees(summary)))
-    return Table(
+        rows.append(
+            blocks.Row.of(
+                blocks.Cell(name, plural(summary.poses, "pose")), *_figures(positions, headings), _nees(summary)
+            )
+        )
+    return blocks.Table(
         caption="Errors of the reference poses against the truth",
-        columns=(*_FIGURES, Column("NEES, mean")),
+        columns=(*_FIGURES, blocks.Column("NEES, mean")),
         rows=tuple(rows),
         note=f"{plural(accuracy.runs, 'run')}, {significant(accuracy.distance_m, 4)} m in all. Drift: the "
         "growth k of the error over the distance s, from error² = noise² + (k s)²; 0 where it does not grow.",
     )
 
 
-def bias_table(accuracy: SlamAccuracy) -> Table:
+def bias_table(accuracy: SlamAccuracy) -> blocks.Table:
     """The mean errors along the robot's axes."""
     rows = []
     for name, summary in _summaries(accuracy):
         lengths = (_mm(v, signed=True) for v in (summary.bias_forward_m, summary.bias_left_m))
-        rows.append(Row.of(name, *lengths, _degrees(summary.bias_heading_rad, signed=True)))
-    return Table(
+        rows.append(blocks.Row.of(name, *lengths, _degrees(summary.bias_heading_rad, signed=True)))
+    return blocks.Table(
         caption="Mean error along the robot's axes",
         columns=(
-            Column("Poses", numeric=False),
-            Column("forward", "mm"),
-            Column("to the left", "mm"),
-            Column("heading", "°"),
+            blocks.Column("Poses", numeric=False),
+            blocks.Column("forward", "mm"),
+            blocks.Column("to the left", "mm"),
+            blocks.Column("heading", "°"),
         ),
         rows=tuple(rows),
         note="The signed mean of the errors: 0 for a reference without bias.",
     )
 
 
-def summary_table(summary: SlamSummary) -> Table:
+def summary_table(summary: SlamSummary) -> blocks.Table:
     """The deviations that SLAM states, and the distances from the reference poses that were recorded."""
     deviations = _figures(
         (summary.position_deviation_mean_m, None, summary.position_deviation_max_m),
         (summary.heading_deviation_mean_rad, None, summary.heading_deviation_max_rad),
     )
-    rows = [Row.of("deviation stated at the end of a run", *deviations)]
+    rows = [blocks.Row.of("deviation stated at the end of a run", *deviations)]
     if summary.recorded is not None:
         recorded = summary.recorded
-        name = Cell("distance from the recorded reference", plural(recorded.poses, "pose"))
+        name = blocks.Cell("distance from the recorded reference", plural(recorded.poses, "pose"))
         distances = _figures(
             (recorded.position_mean_m, recorded.position_p95_m, None),
             (recorded.heading_mean_rad, recorded.heading_p95_rad, None),
         )
-        rows.append(Row.of(name, *distances))
-    return Table("Reference poses from the scans", _FIGURES, tuple(rows))
+        rows.append(blocks.Row.of(name, *distances))
+    return blocks.Table("Reference poses from the scans", _FIGURES, tuple(rows))
 
 
 _FIGURES = (
-    Column("Poses", numeric=False),
-    *(Column(f"position, {which}", "mm") for which in ("mean", "95 %", "worst")),
-    *(Column(f"heading, {which}", "°") for which in ("mean", "95 %", "worst")),
+    blocks.Column("Poses", numeric=False),
+    *(blocks.Column(f"position, {which}", "mm") for which in ("mean", "95 %", "worst")),
+    *(blocks.Column(f"heading, {which}", "°") for which in ("mean", "95 %", "worst")),
 )
 
 
@@ -282,10 +257,10 @@ def _nees(summary: ErrorSummary) -> str:
     return NOTHING if summary.nees_mean is None else significant(summary.nees_mean, 3)
 
 
-def contents_table(dataset: Dataset) -> Table:
+def contents_table(dataset: Dataset) -> blocks.Table:
     """A table of the quantities from motion command to SLAM pose: recorded or not, how many, at what interval."""
     runs = dataset.trajectories
-    steers, step = runs[0].steering is not None, rate_step(runs[0])
+    steers, step = runs[0].steering is not None, recording_figures.rate_step(runs[0])
     rows = [
         _commands(runs),
         _sent(runs),
@@ -304,13 +279,13 @@ def contents_table(dataset: Dataset) -> Table:
         _scans(dataset),
         _reference(dataset),
     ]
-    return Table(
+    return blocks.Table(
         caption="What was recorded",
         columns=(
-            Column("Recorded", numeric=False),
-            Column("Number"),
-            Column("Every"),
-            Column("Remarks", numeric=False),
+            blocks.Column("Recorded", numeric=False),
+            blocks.Column("Number"),
+            blocks.Column("Every"),
+            blocks.Column("Remarks", numeric=False),
         ),
         rows=tuple(rows),
         note="Small print: symbols. Every: the median interval; where they "
@@ -326,7 +301,7 @@ def _rates(symbol: str, dataset: Dataset) -> str:
     return f"{symbol} of {', '.join(names)}"
 
 
-def _commands(runs: Sequence[Trajectory]) -> Row:
+def _commands(runs: Sequence[Trajectory]) -> blocks.Row:
     commanded = [run for run in runs if run.omega is not None]
     if not commanded:
         return _missing("Motion command", "(v, α, ω, d)")
@@ -336,7 +311,7 @@ def _commands(runs: Sequence[Trajectory]) -> Row:
     return _row("Motion command", "(v, α, ω, d)", len(commanded), "runs", "", remark)
 
 
-def _sent(runs: Sequence[Trajectory]) -> Row:
+def _sent(runs: Sequence[Trajectory]) -> blocks.Row:
     sent = [run.sent for run in runs if run.sent is not None and len(run.sent)]
     if not sent:
         return _missing("Sent commands", "(v, α, ω, t_r)")
@@ -345,7 +320,7 @@ def _sent(runs: Sequence[Trajectory]) -> Row:
     return _row("Sent commands", "(v, α, ω, t_r)", number, "commands", every, f"valid for up to {longest:g} s")
 
 
-def _wheels(name: str, symbol: str, runs: Sequence[Trajectory], field: str, remark: str) -> Row:
+def _wheels(name: str, symbol: str, runs: Sequence[Trajectory], field: str, remark: str) -> blocks.Row:
     recorded = [run for run in runs if getattr(run, field) is not None]
     if not recorded:
         return _missing(name, symbol)
@@ -354,7 +329,7 @@ def _wheels(name: str, symbol: str, runs: Sequence[Trajectory], field: str, rema
     return _row(name, symbol, sum(run.samples.count for run in recorded), "samples", _every_sample(recorded), remark)
 
 
-def _scans(dataset: Dataset) -> Row:
+def _scans(dataset: Dataset) -> blocks.Row:
     if dataset.scans is None:
         return _missing("LIDAR scans", "LIDAR")
     scanner = dataset.scans.scanner
@@ -367,7 +342,7 @@ def _scans(dataset: Dataset) -> Row:
     return _row("LIDAR scans", "LIDAR", sum(map(len, times)), "scans", _every(times), remark)
 
 
-def _reference(dataset: Dataset) -> Row:
+def _reference(dataset: Dataset) -> blocks.Row:
     runs = dataset.trajectories
     times = [run.pose_times for run in runs]
     with_covariance = sum(run.pose_covariances is not None for run in runs)
@@ -394,25 +369,25 @@ def _every(times: Sequence[Array]) -> str:
     return f"{significant(float(middle), 3)} ms ({significant(float(low), 3)} to {significant(float(high), 3)})"
 
 
-def _row(name: str, symbol: str, number: int, noun: str, every: str, remark: str) -> Row:
-    return Row.of(Cell(name, symbol), f"{count(number)} {noun}", every or NOTHING, remark)
+def _row(name: str, symbol: str, number: int, noun: str, every: str, remark: str) -> blocks.Row:
+    return blocks.Row.of(blocks.Cell(name, symbol), f"{count(number)} {noun}", every or NOTHING, remark)
 
 
-def _missing(name: str, symbol: str) -> Row:
-    return Row.of(Cell(name, symbol), "not recorded", NOTHING, "", role="muted")
+def _missing(name: str, symbol: str) -> blocks.Row:
+    return blocks.Row.of(blocks.Cell(name, symbol), "not recorded", NOTHING, "", role="muted")
 
 
 _RUNS = 150  # runs drawn as thin lines (chosen)
 _BINS = 16  # bins of time or distance (chosen)
 _LEAST = 5  # poses; a bin with fewer shows no mean (chosen)
 
-_RUN = LegendItem("run", "a run", "#c3c9d0")
-_MEAN = LegendItem("mean", "mean", PALETTE[0])
-_HIGH = LegendItem("high", "95th percentile", PALETTE[2], "dash")
-_EXPECTED = LegendItem("", "expected", INK)
+_RUN = blocks.LegendItem("run", "a run", "#c3c9d0")
+_MEAN = blocks.LegendItem("mean", "mean", PALETTE[0])
+_HIGH = blocks.LegendItem("high", "95th percentile", PALETTE[2], "dash")
+_EXPECTED = blocks.LegendItem("", "expected", INK)
 
 
-def error_figures(dataset: Dataset, truth: Mapping[str, TruePath]) -> tuple[Block, ...]:
+def error_figures(dataset: Dataset, truth: Mapping[str, TruePath]) -> tuple[blocks.Block, ...]:
     """Figures of the errors of the reference poses; the true path of every run must be known."""
     errors = [run_errors(run, truth[run.id]) for run in dataset.trajectories]
     figures = [
@@ -428,11 +403,11 @@ def error_figures(dataset: Dataset, truth: Mapping[str, TruePath]) -> tuple[Bloc
         f"{plural(len(errors), 'run')}{drawn}; mean and percentile in bins of time or distance. Errors are "
         "magnitudes at the stamps of the reference poses, without the start."
     )
-    curves = FigureGrid(tuple(figures), (_RUN, _MEAN, _HIGH), 2, caption)
+    curves = blocks.FigureGrid(tuple(figures), (_RUN, _MEAN, _HIGH), 2, caption)
     return (curves, *_nees_figures(errors))
 
 
-def _nees_figures(errors: Sequence[RunErrors]) -> tuple[Block, ...]:
+def _nees_figures(errors: Sequence[RunErrors]) -> tuple[blocks.Block, ...]:
     """The normalised estimation error squared (NEES): its distribution and its course over time."""
     known = [run.of(np.isfinite(run.nees)) for run in errors if run.nees is not None]
     if not sum(len(run.times) for run in known):
@@ -445,7 +420,7 @@ def _nees_figures(errors: Sequence[RunErrors]) -> tuple[Block, ...]:
     x = np.linspace(0.0, limit, 200)
     bars = _bars(edges, share, 0.6, "%{y:.3f} at %{x:.1f}")
     density = np.sqrt(x / (2 * np.pi)) * np.exp(-x / 2)  # chi-squared with three degrees of freedom
-    distribution = Figure(
+    distribution = blocks.Figure(
         f"NEES of all poses: mean {significant(float(values.mean()), 3)}",
         plot(bars, line(_EXPECTED, 2.0, x, density), x_title="NEES", y_title="density"),
         "Histogram of the normalised squared errors with the density that right covariances give",
@@ -458,7 +433,7 @@ def _nees_figures(errors: Sequence[RunErrors]) -> tuple[Block, ...]:
         "NEES: the squared error weighted by the inverse covariance. Its mean is 3 (line) where covariances are right, "
         f"and larger where they are too small. {outside}"
     )
-    return (FigureGrid((distribution, time), (_RUN, _MEAN, _HIGH), 2, caption.strip()),)
+    return (blocks.FigureGrid((distribution, time), (_RUN, _MEAN, _HIGH), 2, caption.strip()),)
 
 
 def _squares(errors: RunErrors) -> Array:
@@ -473,9 +448,9 @@ def _curves(
     x_title: str,
     y_title: str,
     level: float | None = None,
-) -> Figure:
+) -> blocks.Figure:
     """The errors of runs as thin lines, with mean and 95th percentile in bins."""
-    drawn = [errors[index] for index in evenly(len(errors), _RUNS)]
+    drawn = [errors[index] for index in recording_figures.evenly(len(errors), _RUNS)]
     lines = joined([np.column_stack([along(run), value(run)]) for run in drawn])
     x, y = (np.concatenate([quantity(run) for run in errors]) for quantity in (along, value))
     edges = np.linspace(0.0, float(x.max()) * (1 + 1e-9) or 1.0, _BINS + 1)
@@ -492,17 +467,17 @@ def _curves(
         figure.add_hline(level, line={"color": QUIET, "width": 1})
     name, by = y_title.split(" (")[0], "time" if x_title.startswith("t ") else "distance driven"
     title = f"{name[:1].upper()}{name[1:]} over {by}"
-    return Figure(title, figure, f"{title} of every run, with its mean and 95th percentile", 340)
+    return blocks.Figure(title, figure, f"{title} of every run, with its mean and 95th percentile", 340)
 
 
-def _histogram(values: Sequence[float], unit: str, title: str) -> Figure:
+def _histogram(values: Sequence[float], unit: str, title: str) -> blocks.Figure:
     heights, edges = np.histogram(values, bins=min(40, max(8, len(values) // 8)))
     bars = _bars(edges, heights, 0.75, f"%{{y}} runs about %{{x:.3g}} {unit}")
     mean, high = float(np.mean(values)), float(np.quantile(values, 0.95))
     gap = "" if unit == "°" else " "
     headline = f"{title}: mean {significant(mean, 2)}{gap}{unit}, 95 % below {significant(high, 2)}{gap}{unit}"
     figure = plot(bars, x_title=f"error ({unit})", y_title="runs", bargap=0)
-    return Figure(headline, figure, f"Histogram of {title.lower()} in {unit}", 320)
+    return blocks.Figure(headline, figure, f"Histogram of {title.lower()} in {unit}", 320)
 
 
 def _bars(edges: Array, heights: Array, opacity: float, hover: str) -> go.Bar:
@@ -537,7 +512,7 @@ def recording_document(
     starts: Mapping[str, Array] | None = None,
     accuracy: SlamAccuracy | None = None,
     notes: Sequence[str] = (),
-) -> Document:
+) -> blocks.Document:
     """The report on a recording as blocks: its contents, the room, the wheels, a run step by step.
 
     For simulated data: truth: true path of each run, which the reference poses are compared with. plan: the room.
@@ -559,51 +534,53 @@ def recording_document(
         errors = error_figures(dataset, known) if known else ()
         about = "Errors of the reference poses, over time and distance, and whether their covariances are right."
         tables = (error_table(accuracy), bias_table(accuracy))
-        sections.append(Section("slam", "SLAM against the truth", (*tables, *errors), about=about, folded=True))
+        sections.append(blocks.Section("slam", "SLAM against the truth", (*tables, *errors), about=about, folded=True))
     sections += pictures(dataset, truth=known, plan=plan, starts=starts)
     contents = (contents_table(dataset), about_table(dataset))
     about = "Quantities, numbers and intervals, from motion command to reference pose."
-    sections.append(Section("recorded", "What was recorded", contents, about=about, folded=True))
-    return Document(
+    sections.append(blocks.Section("recorded", "What was recorded", contents, about=about, folded=True))
+    return blocks.Document(
         title=f"Recording: {dataset.name}",
         subtitle=dataset.description,
         sections=tuple(sections),
-        badges=simulated_badge(dataset.simulated),
+        badges=blocks.simulated_badge(dataset.simulated),
     )
 
 
-def _answer(dataset: Dataset, notes: Sequence[str], accuracy: SlamAccuracy | None, picture: FigureGrid) -> Section:
+def _answer(
+    dataset: Dataset, notes: Sequence[str], accuracy: SlamAccuracy | None, picture: blocks.FigureGrid
+) -> blocks.Section:
     """What is in a recording or, where the truth is known, how accurate its reference poses are; and its paths."""
     runs = dataset.trajectories
     seconds = sum(run.end for run in runs)
     metres = sum(float(np.hypot(*np.diff(run.poses[:, :2], axis=0).T).sum()) for run in runs)
     sentence = f"{plural(len(runs), 'run')} of {dataset.robot.name}, {significant(metres, 3)} m in {_minutes(seconds)}"
-    tiles: tuple[Fact, ...] = (
-        Fact("Runs", count(len(runs))),
-        Fact("Driven", f"{significant(metres, 3)} m", f"in {_minutes(seconds)}"),
-        Fact("Wheel samples", f"every {significant(1e3 * dataset.sample_period, 3)} ms"),
-        Fact("Reference poses", count(sum(len(run.poses) for run in runs))),
+    tiles: tuple[blocks.Fact, ...] = (
+        blocks.Fact("Runs", count(len(runs))),
+        blocks.Fact("Driven", f"{significant(metres, 3)} m", f"in {_minutes(seconds)}"),
+        blocks.Fact("Wheel samples", f"every {significant(1e3 * dataset.sample_period, 3)} ms"),
+        blocks.Fact("Reference poses", count(sum(len(run.poses) for run in runs))),
     )
     if accuracy is not None:
         final = accuracy.final
         errors = f"{_mm(final.position_mean_m)} mm and {_degrees(final.heading_mean_rad)}°"
         sentence += f". Their reference poses end {errors} from the truth on average"
         tiles = accuracy_tiles(accuracy)
-    return answer_section(
+    return blocks.answer_section(
         f"{sentence}.",
         tiles,
         picture,
-        Callout("Before you rely on it", tuple(notes)),
-        Callout("Warnings on reading the data", dataset.warnings, "warning"),
+        blocks.Callout("Before you rely on it", tuple(notes)),
+        blocks.Callout("Warnings on reading the data", dataset.warnings, "warning"),
     )
 
 
 def path_overview(
     dataset: Dataset, plan: RoomPlan | None = None, starts: Mapping[str, Array] | None = None
-) -> FigureGrid:
+) -> blocks.FigureGrid:
     """The paths of all runs from one start, and the room where there are scans."""
-    first = next(iter(representative_runs(dataset).values()))
-    return all_runs(dataset, first, _outlines(plan, (starts or {}).get(first.id)))
+    first = next(iter(recording_figures.representative_runs(dataset).values()))
+    return recording_figures.all_runs(dataset, first, _outlines(plan, (starts or {}).get(first.id)))
 
 
 def _minutes(seconds: float) -> str:
@@ -615,24 +592,24 @@ def has_recording(dataset: Dataset) -> bool:
     return dataset.scans is not None or any(run.targets is not None for run in dataset.trajectories)
 
 
-def recording_section(dataset: Dataset) -> Section:
+def recording_section(dataset: Dataset) -> blocks.Section:
     """The section on a recording for another report. DataError in one line: broken scans."""
-    paths = Section("recording-paths", "Paths of all runs", (path_overview(dataset),))
+    paths = blocks.Section("recording-paths", "Paths of all runs", (path_overview(dataset),))
     parts = (paths, *pictures(dataset, prefix="recording-"))
     about = "What was recorded, all paths, wheel rates, and runs step by step."
-    return Section("recording", "Recording", (contents_table(dataset),), parts, about=about, folded=True)
+    return blocks.Section("recording", "Recording", (contents_table(dataset),), parts, about=about, folded=True)
 
 
-def about_table(dataset: Dataset) -> Facts:
+def about_table(dataset: Dataset) -> blocks.Facts:
     """Name, source, licence and robot of a data set."""
     facts = [
-        Fact("Data set", dataset.name, "simulated" if dataset.simulated else ""),
-        Fact("Description", dataset.description),
-        Fact("Source", dataset.source),
-        Fact("Licence", dataset.licence),
-        Fact("Robot", dataset.robot.name),
+        blocks.Fact("Data set", dataset.name, "simulated" if dataset.simulated else ""),
+        blocks.Fact("Description", dataset.description),
+        blocks.Fact("Source", dataset.source),
+        blocks.Fact("Licence", dataset.licence),
+        blocks.Fact("Robot", dataset.robot.name),
     ]
-    return Facts(tuple(fact for fact in facts if fact.value))
+    return blocks.Facts(tuple(fact for fact in facts if fact.value))
 
 
 def pictures(
@@ -642,17 +619,20 @@ def pictures(
     truth: Mapping[str, TruePath] | None = None,
     plan: RoomPlan | None = None,
     starts: Mapping[str, Array] | None = None,
-) -> list[Section]:
+) -> list[blocks.Section]:
     """The sections on single runs: in their room, wheel rates, and the step-by-step player."""
     known, begun = truth or {}, starts or {}
-    runs = representative_runs(dataset)
+    runs = recording_figures.representative_runs(dataset)
     odometry = OdometryModel.of_design(dataset.robot, "arc")
     from_start = {run.id: _outlines(plan, begun.get(run.id)) for run in runs.values()}
     walls = {run.id: [placed(run.start, outline) for outline in from_start[run.id]] for run in runs.values()}
-    rooms: dict[str, tuple[Block, ...]] = {
-        name: (one_run(dataset, run, odometry, known.get(run.id), walls[run.id]),) for name, run in runs.items()
+    rooms: dict[str, tuple[blocks.Block, ...]] = {
+        name: (recording_figures.one_run(dataset, run, odometry, known.get(run.id), walls[run.id]),)
+        for name, run in runs.items()
     }
-    wheels: dict[str, tuple[Block, ...]] = {name: (wheel_rates(run, dataset.robot),) for name, run in runs.items()}
+    wheels: dict[str, tuple[blocks.Block, ...]] = {
+        name: (recording_figures.wheel_rates(run, dataset.robot),) for name, run in runs.items()
+    }
     exactness: tuple[str, ...] = ()
     if plan is not None and not all(run.id in begun for run in runs.values()):
         exactness = (
@@ -660,12 +640,12 @@ def pictures(
             "shifted by that distance.",
         )
     return [
-        Section(f"{prefix}player", "Step by step", (player(dataset, runs, odometry, known, walls),)),
-        Section(f"{prefix}wheels", "Wheel rates", (Choice("Run", wheels),)),
-        Section(
+        blocks.Section(f"{prefix}player", "Step by step", (player(dataset, runs, odometry, known, walls),)),
+        blocks.Section(f"{prefix}wheels", "Wheel rates", (blocks.Choice("Run", wheels),)),
+        blocks.Section(
             f"{prefix}room",
             "Runs in their room" if dataset.scans is not None else "Single runs",
-            (Callout("Floor plan", exactness), Choice("Run", rooms)),
+            (blocks.Callout("Floor plan", exactness), blocks.Choice("Run", rooms)),
         ),
     ]
 

@@ -14,8 +14,7 @@ from omnibench.compare.config import CompareConfig
 from omnibench.compare.plan import PlannedRun, load_datasets, make_plan
 from omnibench.compare.report.comparison_report import comparison_document
 from omnibench.compare.result import ComparisonResult, EntryStatistics
-from omnibench.compare.run import certify
-from omnibench.compare.scoring import score
+from omnibench.compare.run import certify, score
 from omnibench.compare.statistics import design_costs, entry_statistics, held_out_verdicts
 from omnibench.data.dataset import Dataset
 from omnibench.environment import environment

@@ -1,4 +1,4 @@
-"""The report of a comparison: what it says, first and further down, of small comparisons that were really run."""
+"""The report of a comparison: its words, tables and figures, and published figures beside them."""
 
 from __future__ import annotations
 
@@ -10,26 +10,48 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import plotly.graph_objects as go
 import pytest
 from browser import assert_picture_comes_first, opened
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 from recording_samples import sample, with_a_tape
 from report_page import NUMBER, Page
 from report_samples import config, flower, page, run, statistics, usual
 from sample_robots import APR02, LEVER_MECANUM
 from syrupy.assertion import SnapshotAssertion
+from wheeled_samples import CAR, ROBOTS, TRICYCLE
 
 from omnibench.compare.plan import load_datasets
-from omnibench.compare.report.comparison_report import comparison_document
+from omnibench.compare.report.comparison_report import comparison_document, data_section, robot_section
+from omnibench.compare.report.cost_tables import ComparedFigure, compared_figures, cost_table, published_blocks
+from omnibench.compare.report.error_figures import chosen_trajectories, drawn_models
+from omnibench.compare.report.outcome_tables import matrix_section
+from omnibench.compare.report.search_figures import (
+    TARGETS,
+    courses,
+    search_diagram,
+    search_section,
+    targets_reached,
+    thinned,
+)
+from omnibench.compare.report.view import DatasetView, views
 from omnibench.compare.result import ComparisonResult
 from omnibench.data.dataset import Dataset, make_dataset
+from omnibench.data.importers.table1 import APR_02
 from omnibench.data.storage import load_dataset, save_dataset
+from omnibench.fit.identifiability import geometry_of
 from omnibench.fit.problem import Improvement
 from omnibench.fit.ratio_intervals import Interval
+from omnibench.report.blocks import Callout, Facts, Figure, FigureGrid, Row, Table
+from omnibench.report.figures import motion_system, parameters
 from omnibench.report.numbers import fixed
+from omnibench.report.recording.recording_figures import describe
 from omnibench.report.render import write_document
-from omnibench.robot.kinematics import Robot
+from omnibench.robot.kinematics import Array, Robot, relative_deviations, wheel_equations
 from omnibench.simulate.config import FlowerConfig
-from omnibench.simulate.simulate import simulate_dataset
+from omnibench.simulate.source import simulate_dataset
 
 FAILING = {"name": "parametric", "label": "hopeless", "parameterisation": "matrix"}
 HOSTILE = "<script>alert(1)</script>"
@@ -318,3 +340,485 @@ def test_a_browser_draws_every_plot_and_finds_no_fault(result: ComparisonResult,
 def test_the_paths_before_and_after_stand_in_the_first_900_pixels(result: ComparisonResult, tmp_path: Path) -> None:
     write_document(comparison_document(result), tmp_path / "report.html")
     assert_picture_comes_first(tmp_path / "report.html")
+
+
+# What the report's plots and differences are made of, and the robot as it draws it.
+
+
+def test_an_element_of_rounding_size_counts_as_zero() -> None:
+    reference = np.array([[1.0, -1.2e-17, 1.0]] * 3)
+    assert np.isnan(relative_deviations(np.ones((3, 3)), reference)[:, 1]).all()
+
+
+def trajectories(**changes: object):
+    return simulate_dataset(FlowerConfig.model_validate(flower(**changes))).dataset.split("validation")
+
+
+def test_the_papers_four_commands_are_shown_where_they_were_driven() -> None:
+    chosen = chosen_trajectories(trajectories())
+    assert [round(np.degrees(t.alpha)) for t in chosen] == [30, 210, 120, 300]
+    assert {t.omega for t in chosen} == {0.35}
+    assert chosen_trajectories(chosen[:1]) == chosen[:1]
+
+
+def test_other_commands_are_shown_as_a_spread_of_the_strongest_turns() -> None:
+    commands = {"directions_deg": [0, 72, 144, 216, 288], "turn_rates": [0.0, 0.2, 0.6]}
+    chosen = chosen_trajectories(trajectories(commands=commands))
+    assert len({t.command for t in chosen}) == 4
+    assert {t.omega for t in chosen} == {0.6}
+
+
+def test_a_command_is_described_as_the_paper_writes_it() -> None:
+    trajectory = next(t for t in trajectories() if t.command == "v0.2_a30_w0.35")
+    assert describe(trajectory) == f"(0.2 m/s, 30°, 0.35 rad/s), {trajectory.id}"
+
+
+def test_the_design_values_are_no_search() -> None:
+    assert {course.run.record.label for course in courses(usual_view())} == {"closed_form", "random_search"}
+
+
+def test_a_course_ends_with_the_answer() -> None:
+    for course in courses(usual_view()):
+        assert course.costs[-1] == pytest.approx(course.run.record.train_cost, rel=1e-12)
+        assert course.evaluations[-1] == course.run.record.evaluations
+
+
+def test_the_exact_optimum_reaches_every_target() -> None:
+    exact = [course for course in courses(usual_view()) if course.run.record.label == "closed_form"]
+    times, share = targets_reached(exact, 1, "evaluations")
+    assert share[-1] == 1.0
+    assert (np.diff(times) >= 0).all()
+
+
+def test_targets_are_counted_by_hand_for_a_random_search() -> None:
+    course = next(course for course in courses(usual_view()) if course.run.record.label == "random_search")
+    _, share = targets_reached([course], 1, "evaluations")
+    lowest = course.costs.min() / course.best_known - 1
+    assert len(share) == np.count_nonzero(lowest <= TARGETS)
+
+
+def explicit(share: float) -> dict:
+    """A box of so wide a share of the row's largest element on both sides."""
+    start = Robot.model_validate(APR02).inverse_kinematic_matrix
+    width = share * np.abs(start).max(axis=1, keepdims=True)
+    return {"lower": (start - width).tolist(), "upper": (start + width).tolist()}
+
+
+def test_boxes_that_share_a_name_do_not_share_a_best_known_cost() -> None:
+    calibrators = [
+        {"name": name, "label": f"{name} {share}", "box": explicit(share)}
+        for share in (0.02, 0.2)
+        for name in ("closed_form", "random_search")
+    ]
+    (found,) = views(run(config(calibrators=calibrators, seeds=[1])))
+    drawn = {course.run.record.label: course for course in courses(found)}
+    assert {course.run.record.box for course in drawn.values()} == {"custom"}
+    for course in drawn.values():
+        assert course.costs[-1] / course.best_known - 1 == pytest.approx(course.run.record.gap, abs=1e-12)
+    assert drawn["closed_form 0.02"].best_known > drawn["closed_form 0.2"].best_known
+
+
+def test_without_an_exact_optimum_equal_boxes_share_the_lowest_cost() -> None:
+    calibrators = [
+        {"name": "random_search", "label": label, "box": explicit(share), "options": {"candidates": candidates}}
+        for label, share, candidates in (("few", 0.2, 20), ("many", 0.2, 1000), ("narrow", 0.02, 1000))
+    ]
+    (found,) = views(run(config(calibrators=calibrators, seeds=[1])))
+    drawn = {course.run.record.label: course for course in courses(found)}
+    costs = {label: course.run.record.train_cost for label, course in drawn.items()}
+    assert drawn["few"].best_known == drawn["many"].best_known == min(costs["few"], costs["many"])
+    assert drawn["narrow"].best_known == costs["narrow"]
+
+
+@given(
+    hnp.arrays(float, st.integers(1, 3000), elements=st.floats(0.5, 1.0)),
+    st.integers(24, 200),
+)
+def test_thinning_keeps_the_ends_the_order_and_the_limit(shrink: np.ndarray, limit: int) -> None:
+    gaps = np.maximum(np.cumprod(shrink), 1e-10)
+    along = np.arange(1.0, len(gaps) + 1)
+    kept = thinned(along, gaps, limit)
+    assert kept[0] == 0
+    assert kept[-1] == len(gaps) - 1
+    assert kept == sorted(set(kept))
+    assert len(kept) <= limit + 4
+
+
+def test_thinning_does_not_move_a_curve_by_more_than_a_hair() -> None:
+    along = np.arange(1.0, 20_001)
+    gaps = np.exp(-along / 2000)
+    kept = thinned(along, gaps, 200)
+    drawn = gaps[kept][np.searchsorted(kept, np.arange(len(along)), side="right") - 1]
+    assert np.abs(np.log10(drawn) - np.log10(gaps)).max() < 0.1
+
+
+def usual_view() -> DatasetView:
+    (view,) = views(usual())
+    return view
+
+
+def grids(view: DatasetView) -> list[FigureGrid]:
+    return [block for section in robot_section(view) for block in section.blocks if isinstance(block, FigureGrid)]
+
+
+def rectangles(trace: go.Scatter) -> list[Array]:
+    """The corners (4, 2) of each drawn wheel, in the robot's frame: x forward, y left."""
+    corners = np.array([[np.nan if v is None else v for v in values] for values in (trace.y, trace.x)]).T
+    corners[:, 1] *= -1
+    return [corners[first : first + 4] for first in range(0, len(corners), 6)]
+
+
+def labels(figure: Figure) -> list[str]:
+    return [annotation.text for annotation in figure.plot.layout.annotations]
+
+
+def test_every_wheel_stands_at_its_distance_and_angle_and_is_as_long_as_its_diameter() -> None:
+    figure = parameters(APR_02)
+    for wheel, corners in zip(APR_02.wheels, rectangles(figure.plot.data[0]), strict=True):
+        place = wheel.distance * np.array([math.cos(wheel.angle), math.sin(wheel.angle)])
+        np.testing.assert_allclose(corners.mean(axis=0), place, atol=1e-4)
+        assert np.hypot(*(corners[1] - corners[2])) == pytest.approx(2 * wheel.radius, abs=1e-4)
+    assert "<b>b</b> r 0.148 m<br>R 0.195 m<br>δ 180.0°" in labels(figure)
+
+
+@pytest.mark.parametrize("robot", ROBOTS, ids=lambda robot: robot.name)
+def test_wheels_given_by_x_and_y_stand_there_along_their_rolling(robot: Robot) -> None:
+    figure, _ = motion_system(robot)
+    for wheel, corners in zip(robot.wheels, rectangles(figure.plot.data[0]), strict=True):
+        np.testing.assert_allclose(corners.mean(axis=0), wheel.position, atol=1e-4)
+        np.testing.assert_allclose(corners[1] - corners[2], [2 * wheel.radius, 0], atol=1e-4)
+    x, y = (f"{value:g}".replace("-", "−") for value in robot.wheels[0].position)
+    first = robot.wheels[0]
+    assert f"<b>{first.name}</b> r {first.radius:g} m<br>x {x} m<br>y {y} m" in labels(parameters(robot))
+    arrows = [name for name in labels(figure) if name.startswith("V<sub>")]
+    assert arrows == [f"V<sub>{name}</sub>" for name in robot.wheel_names]
+
+
+@pytest.mark.parametrize(
+    ("robot", "first", "last"),
+    [
+        (CAR, "rl: fixed, radius 0.03 m, x 0 m, y 0.1 m; ", "steered, radius 0.03 m, x 0.3 m, y −0.1 m, not driven"),
+        (TRICYCLE, "front: steered, radius 0.0325 m, x 0.15 m, y 0 m; ", "x 0 m, y −0.08 m, not measured"),
+    ],
+)
+def test_the_section_on_the_data_says_where_wheels_stand_and_which_are_not_driven_or_not_measured(
+    robot: Robot, first: str, last: str
+) -> None:
+    view = usual_view()
+    facts = data_section(replace(view, dataset=replace(view.dataset, robot=robot))).blocks[0]
+    assert isinstance(facts, Facts)
+    (fact,) = (fact for fact in facts.items if fact.name == "Robot")
+    assert fact.note.startswith(first)
+    assert fact.note.endswith(last)
+
+
+def test_the_arrow_at_a_wheel_points_where_a_positive_rate_drives_it() -> None:
+    figure, _ = motion_system(APR_02)
+    (shafts,) = (trace for trace in figure.plot.data if trace.legendgroup == "rolling" and trace.mode == "lines")
+    ends = np.array([[np.nan if v is None else v for v in values] for values in (shafts.y, shafts.x)]).T
+    ends[:, 1] *= -1
+    for row, first in zip(wheel_equations(APR_02.wheels), range(0, 9, 3), strict=True):
+        way = ends[first + 1] - ends[first]
+        np.testing.assert_allclose(way / np.hypot(*way), row[:2] / np.hypot(*row[:2]), atol=1e-3)
+
+
+def test_the_best_entrys_geometry_is_drawn_over_the_design() -> None:
+    view = usual_view()
+    assert view.best is not None
+    assert view.best.typical is not None
+    assert view.best.typical.matrix is not None
+    _, figure = grids(view)[0].figures
+    (fitted,) = (trace for trace in figure.plot.data if trace.legendgroup == "fitted")
+    radii, distances, angles = geometry_of(view.best.typical.matrix, view.dataset.robot).reshape(3, 3)
+    places = (distances * np.array([np.cos(angles), np.sin(angles)])).T
+    drawn = rectangles(fitted)
+    np.testing.assert_allclose([corners.mean(axis=0) for corners in drawn], places, atol=1e-4)
+    np.testing.assert_allclose([np.hypot(*(each[1] - each[2])) / 2 for each in drawn], radii, atol=1e-4)
+
+
+def test_without_a_section_on_the_recording_the_tracks_of_every_command_are_drawn() -> None:
+    view = usual_view()
+    assert len(grids(view)) == 1
+    bare = [replace(run, targets=None, angles=None) for run in view.dataset.trajectories]
+    _, tracks = grids(replace(view, dataset=replace(view.dataset, trajectories=tuple(bare))))
+    assert tracks.figures[0].title == "Reference paths of 8 runs from one start, held-out"
+    assert [item.label for item in tracks.legend] == ["ω = −0.35 rad/s", "ω = 0.35 rad/s"]
+
+
+def test_wheels_whose_position_is_not_known_are_not_drawn() -> None:
+    mecanum = flower(robot=LEVER_MECANUM, truth={"tolerances": {"radius": 0.01}})
+    (view,) = views(run(config(datasets={"f": {"simulate": mecanum}}, calibrators=["theoretical"], seeds=[1])))
+    assert robot_section(view) == ()
+
+
+def test_the_diagram_of_the_search_names_the_cost_the_budget_and_the_runs() -> None:
+    *_, diagram = search_section(usual_view()).blocks
+    assert isinstance(diagram, FigureGrid)
+    told = " ".join(labels(diagram.figures[0]))
+    assert all(
+        words in told for words in ("final_pose", "Eq. (6)", "2,000 evaluations", "16 training runs", "exact arcs")
+    )
+
+
+# Our figures and methods beside those that were published: what is alike, and by how much others differ.
+
+
+@pytest.fixture(scope="module")
+def two_entries() -> ComparisonResult:
+    return run(config(calibrators=["theoretical", "closed_form"], seeds=[1]))
+
+
+def with_published(two_entries: ComparisonResult, *published: dict[str, Any], **changes: Any) -> DatasetView:
+    """The comparison's data set, with published figures beside it."""
+    given = [{"label": "theirs", "source": "an article", **figures} for figures in published]
+    wanted = config(calibrators=["theoretical", "closed_form"], published_results=given, **changes)
+    (view,) = views(ComparisonResult(**{**vars(two_entries), "config": wanted}))
+    return view
+
+
+def recorded(view: DatasetView) -> DatasetView:
+    """The view with its data set called a recording."""
+    return replace(view, dataset=replace(view.dataset, simulated=False))
+
+
+def scaled(two_entries: ComparisonResult, before: float, after: float) -> dict[str, float]:
+    """Published costs that are multiples of ours: of the design values, and of the calibrated matrix."""
+    record = two_entries.runs[0].record
+    entry = statistics(two_entries, "closed_form")
+    return {
+        "theoretical_train_cost": before * record.theoretical_train_cost,
+        "train_cost": after * entry.cost("train").value,
+        "theoretical_validation_cost": before * record.theoretical_validation_cost,
+        "validation_cost": after * entry.cost("validation").value,
+    }
+
+
+def figures(view: DatasetView, alike: bool) -> dict[str, ComparedFigure]:
+    """The figures that are like published ones, or those that are not, by name."""
+    return {figure.name: figure for figure in compared_figures(view) if figure.alike is alike}
+
+
+def circumstances(view: DatasetView) -> dict[str, Row]:
+    """The rows on circumstances, by the circumstance."""
+    _, table = published_blocks(view)
+    assert isinstance(table, Table)
+    return {row.cells[0].text: row for row in table.rows}
+
+
+def here(view: DatasetView, circumstance: str) -> str:
+    """Our side of a circumstance."""
+    return circumstances(view)[circumstance].cells[1].text
+
+
+SCATTER = "Scatter of a command's repetitions"
+
+
+def test_figures_equal_to_ours_are_alike(two_entries: ComparisonResult) -> None:
+    assert published_blocks(with_published(two_entries)) == ()
+    remarked = {**scaled(two_entries, 1.0, 1.0), "remarks": ["A misprint."]}
+    view = with_published(two_entries, remarked, remarked)
+    assert not figures(view, alike=False)
+    assert len(compared_figures(view)) == 8
+    table, _, remarks = published_blocks(recorded(view))
+    assert isinstance(table, Table)
+    assert isinstance(remarks, Callout)
+    assert remarks.items == ("A misprint.",)
+    assert [row.cells[-1].text for row in table.rows] == ["as published"] * 8
+    assert table.rows[0].cells[3].text == "0.0 %"
+
+
+def test_simulated_recordings_are_given_no_verdict_as_they_were_chosen(two_entries: ComparisonResult) -> None:
+    table, _ = published_blocks(with_published(two_entries, scaled(two_entries, 1.0, 1.0)))
+    assert isinstance(table, Table)
+    assert [column.title for column in table.columns] == ["Figure", "Here", "Published", "From the nearest"]
+    assert {len(row.cells) for row in table.rows} == {4}
+    assert "agrees with them by construction" in table.note
+
+
+def test_improvements_are_shown_as_printed_and_not_from_rounded_costs(two_entries: ComparisonResult) -> None:
+    printed = {"theoretical_train_cost": 0.1234, "train_cost": 0.0215, "train_improvement": 0.8261}
+    view = with_published(two_entries, printed)
+    assert cost_table(view, "train").rows[-1].cells[-1].text == "82.61 %"
+    (improvement,) = (figure for figure in compared_figures(view) if figure.name.startswith("Improvement"))
+    assert improvement.published == (0.8261,)
+    del printed["train_improvement"]
+    assert cost_table(with_published(two_entries, printed), "train").rows[-1].cells[-1].text == "82.58 %"
+
+
+def test_published_times_stand_beside_evaluations_of_the_same_methods() -> None:
+    two_entries = usual()
+    both = [
+        {**scaled(two_entries, 1, 1), "label": "slow", "seconds": 903, "entry": "random_search"},
+        {**scaled(two_entries, 1, 1), "label": "fast", "seconds": 637, "entry": "closed_form"},
+    ]
+    _, _, table = published_blocks(with_published(two_entries, *both))
+    assert isinstance(table, Table)
+    slow, fast, change = ([cell.text for cell in row.cells] for row in table.rows)
+    evaluations = statistics(two_entries, "closed_form").evaluations_median
+    assert slow[:3] == ["slow", "903 s", "1,001"]
+    assert fast[:3] == ["fast", "637 s", f"{evaluations:.0f}"]
+    assert change[:2] == ["fast against slow", "−29 %"]
+    assert change[2] == f"−{100 * (1 - evaluations / 1001):.1f} %"
+    assert "Hardware and program differ" in table.note
+
+
+def test_each_published_method_stands_beside_the_entry_that_it_names() -> None:
+    two_entries = usual()
+    both = [{**scaled(two_entries, 1, 1), "label": label, "entry": label} for label in ("random_search", "closed_form")]
+    calibrated = [figure for figure in compared_figures(with_published(two_entries, *both)) if figure.methods]
+    assert {figure.methods for figure in calibrated} == {("random_search",), ("closed_form",)}
+    for figure in calibrated:
+        (label,) = figure.methods
+        assert figure.name.endswith(f"({label})")
+        if figure.name.startswith("Calibrated cost, training"):
+            assert figure.ours == statistics(two_entries, label).cost("train")
+
+
+def test_a_published_floor_twice_as_high_is_not_as_ours(two_entries: ComparisonResult) -> None:
+    view = with_published(two_entries, scaled(two_entries, 1.0, 2.0))
+    differ = figures(view, alike=False)
+    assert list(differ) == [
+        "Calibrated cost, training (closed_form)",
+        "Improvement, training (closed_form)",
+        "Calibrated cost, held-out (closed_form)",
+        "Improvement, held-out (closed_form)",
+    ]
+    assert differ["Calibrated cost, training (closed_form)"].difference == "−50.0 %"
+    improvement = differ["Improvement, training (closed_form)"].difference
+    assert improvement.startswith("+")
+    assert improvement.endswith(" points")
+    assert {"Theoretical cost, training", "Theoretical cost, held-out"} <= set(figures(view, alike=True))
+    differ = figures(with_published(two_entries, scaled(two_entries, 0.5, 1.0)), alike=False)
+    assert differ["Theoretical cost, training"].difference == "+100.0 %"
+
+
+def test_a_cost_that_rises_over_time_as_ours_does_not_is_told(two_entries: ComparisonResult) -> None:
+    published = scaled(two_entries, 1.0, 1.0)
+    published["validation_cost"] *= 3
+    different = figures(with_published(two_entries, published), alike=False)
+    assert "Change of the calibrated cost to validation (closed_form)" in different
+
+
+def test_published_figures_without_validation_are_compared_on_training_only(two_entries: ComparisonResult) -> None:
+    published = {name: value for name, value in scaled(two_entries, 1, 1).items() if "validation" not in name}
+    compared = compared_figures(with_published(two_entries, published))
+    assert len(compared) == 3
+    assert not any("validation" in figure.name for figure in compared)
+
+
+def test_costs_of_another_kind_are_not_set_beside_the_published_ones(two_entries: ComparisonResult) -> None:
+    (block,) = published_blocks(with_published(two_entries, scaled(two_entries, 1, 1), cost="trajectory"))
+    assert isinstance(block, Callout)
+    assert block.items == ("They are of the cost final_pose, Eq. (6); this comparison's is trajectory.",)
+
+
+def test_the_scatter_of_repetitions_is_what_noise_alone_makes() -> None:
+    noise = {"pose_position": 0.005, "pose_heading": 0.005}
+    truth = {"published": "palacin2023_eq8"}
+    many = flower(noise=noise, truth=truth, repetitions=40)
+    two_entries = run(config(datasets={"f": {"simulate": many}}, calibrators=["closed_form"], seeds=[1]))
+    cell = circumstances(with_published(two_entries, scaled(two_entries, 1, 1)))[SCATTER].cells[1]
+    # The mean norm of three normal errors of 5 mm or mrad each.
+    assert float(cell.text) == pytest.approx(0.005 * math.sqrt(8 / math.pi), rel=0.05)
+    assert float(cell.note.split(" %")[0]) > 75
+    once = run(config(datasets={"f": {"simulate": flower(repetitions=1)}}, calibrators=["closed_form"], seeds=[1]))
+    assert here(with_published(once, scaled(once, 1, 1)), SCATTER) == "no command was repeated"
+
+
+def test_the_way_driven_and_the_odometry_are_among_the_circumstances(two_entries: ComparisonResult) -> None:
+    view = with_published(two_entries, scaled(two_entries, 1, 1))
+    assert here(view, "Distance of a run, mean") == "1.20 m"
+    assert here(view, "Odometry") == "exact arcs"
+    assert (
+        here(with_published(two_entries, scaled(two_entries, 1, 1), integration="euler"), "Odometry") == "Euler steps"
+    )
+
+
+def test_systematic_error_is_that_of_the_commands_means(two_entries: ComparisonResult) -> None:
+    view = with_published(two_entries, scaled(two_entries, 1, 1))
+    errors = view.design_errors["validation"]
+    commands = [trajectory.command for trajectory in view.dataset.split("validation")]
+    means = [np.linalg.norm(errors[[c == name for c in commands]].mean(axis=0)) for name in dict.fromkeys(commands)]
+    assert here(view, "Miss of a command's mean end by the design values") == f"{np.mean(means):.4f}"
+
+
+LABELS = {"genetic": "Non-parametric IK", "parametric (GA)": "Parametric IK"}
+COSTS = {"theoretical_train_cost": 0.1234, "train_cost": 0.0215}
+
+
+@pytest.fixture(scope="module")
+def methods() -> DatasetView:
+    """A comparison of the two methods and three others, in the paper's box, of curves and straight runs."""
+    commands = {"directions_deg": [30, 120, 210, 300], "turn_rates": [-0.35, 0.0, 0.35]}
+    chosen = config(
+        datasets={"flower": {"simulate": flower(commands=commands)}},
+        box="paper",
+        budget={"evaluations": 30_000},
+        certificate={"seconds": 1e9, "parts": 20},
+        calibrators=[
+            "closed_form",
+            "genetic",
+            {"name": "parametric", "label": "parametric (GA)", "options": {"search": "genetic"}},
+            "crs",
+            {"name": "random_search", "options": {"candidates": 200}},
+        ],
+        published_results=[
+            {"label": label, "source": "the paper", "entry": entry, **COSTS} for entry, label in LABELS.items()
+        ],
+    )
+    (found,) = views(run(chosen))
+    return found
+
+
+def test_the_papers_methods_are_drawn_as_themselves_with_their_published_names(methods: DatasetView) -> None:
+    models = drawn_models(methods, chosen_trajectories(methods.dataset.split("validation")))
+    by_itself = {model.entries: model.style.label for model in models if len(model.entries) == 1}
+    for entry, label in LABELS.items():
+        assert by_itself[(entry,)] == f"{entry}, as the paper's {label}"
+
+
+def test_eq_11_is_printed_for_the_parametric_matrix_over_the_genetic_one(methods: DatasetView) -> None:
+    (table,) = (
+        block for block in matrix_section(methods).blocks if isinstance(block, Table) and "Eq. (11)" in block.caption
+    )
+    (row,) = table.rows
+    matrices = {entry.label: np.array(run.matrix) for entry, run in methods.calibrated}
+    shares = 100 * relative_deviations(matrices["parametric (GA)"], matrices["genetic"]).ravel()
+    assert row.cells[0].text == "parametric (GA)"
+    shown = [cell.text.replace("−", "-") for cell in row.cells[1:]]
+    assert [text for text in shown if "%" in text] == [f"{share:+.3f} %" for share in shares if np.isfinite(share)]
+    assert np.flatnonzero(~np.isfinite(shares)).tolist() == [1]  # m12 is 0 in the paper's box
+    assert "%" not in shown[1]
+
+
+def test_fig_4_has_the_settings_of_the_genetic_entry(methods: DatasetView) -> None:
+    (figure,) = search_diagram(methods).figures
+    boxes = " ".join(note.text for note in figure.plot.layout.annotations)
+    for words in (
+        "Population of 200",
+        "±10 % of V",
+        "Crossover</b> of 80 %",
+        "adaptive feasible",
+        "≤ 1e-06",
+        "Eq. (6)",
+    ):
+        assert words in boxes
+
+
+def test_a_search_without_the_papers_is_drawn_in_general_words(methods: DatasetView) -> None:
+    other = DatasetView(**{**vars(methods), "config": methods.config.model_copy(update={"published_results": ()})})
+    (figure,) = search_diagram(other).figures
+    assert "by the search's own rule" in " ".join(note.text for note in figure.plot.layout.annotations)
+
+
+def test_the_papers_claims_on_curves_and_on_local_minima_are_checked_in_a_line_each(methods: DatasetView) -> None:
+    blocks = published_blocks(methods)
+    (callout,) = (block for block in blocks if isinstance(block, Callout) and "claims" in block.title)
+    curves, minima = callout.items
+    runs, errors = methods.dataset.split("validation"), np.linalg.norm(methods.design_errors["validation"], axis=1)
+    turning = np.array([trajectory.omega != 0 for trajectory in runs])
+    assert f"{errors[turning].mean():.3f} on the held-out runs in curves" in curves
+    assert f"{errors[~turning].mean():.3f} on straight ones" in curves
+    assert "2 of 2 runs of crs and 0 of 2 runs of random_search ended within 0.01 %" in minima
+    assert "by proof no matrix of the box is more than" in minima
+    assert "genetic" not in minima

@@ -35,7 +35,7 @@ from omnibench.fit.trajectory_fit import given as after_fitting
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 from omnibench.simulate.config import FlowerConfig
-from omnibench.simulate.simulate import simulate_dataset
+from omnibench.simulate.source import simulate_dataset
 
 NOISE = {
     "pose_position": 0.006,

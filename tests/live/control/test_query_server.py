@@ -33,8 +33,14 @@ from timing import PATIENCE
 
 from omnibench.config import to_yaml
 from omnibench.errors import DataError
-from omnibench.live.control.query_server import QueryServer
-from omnibench.live.control.request_queue import MOST_WAITING, Request, RequestQueue, source_of, swap_calibration
+from omnibench.live.control.query_server import (
+    MOST_WAITING,
+    QueryServer,
+    Request,
+    RequestQueue,
+    source_of,
+    swap_calibration,
+)
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.network.presence import alive_robots
 from omnibench.live.wire.messages import JOINT_STATE, ODOMETRY
@@ -332,7 +338,7 @@ def node(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[int, zenoh.
         publisher = session.declare_publisher("apr/joint_states")
 
         def drives() -> None:
-            for sample in drive(60.0, period=0.01).samples():
+            for sample in drive(60.0).samples():
                 publisher.put(JOINT_STATE.encode(sample))
                 if over.wait(0.01):
                     return

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import Command as InProcess
-from commands import assert_refused, flower, succeeded, write_config
+from commands import assert_refused, flower, succeeded, write_config, write_effect
 from drives import NOISE, ORIGIN, PERIOD, Drive, calibration, drive, fed, odometry, slam, term, with_effects
 from hypothesis import given
 from hypothesis import strategies as st
@@ -18,7 +18,7 @@ from learned_samples import a_learned_calibration
 from nodes import config_of, write_node
 
 from omnibench.config import to_yaml
-from omnibench.live.control.request_queue import LONGEST
+from omnibench.live.control.query_server import LONGEST
 from omnibench.live.estimation.live_odometry import LiveOdometry
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.fusion.pose_fusion import FusionSettings
@@ -179,9 +179,7 @@ EFFECTS: dict[str, dict[str, float]] = {
 
 def batch(path: Drive, using: Calibration) -> Array:
     """Batch odometry at every sample from the origin, with angles as the wheels count them."""
-    rates = np.diff(path.angles, axis=0) / np.diff(path.times, prepend=0.0)[:, None]
-    log = WheelLog(path.times, rates, np.zeros(3), path.times, path.angles[1:], 0.0, using.session)
-    return using.model.poses([log])[0]
+    return replace(path, calibration=using).poses[1:]
 
 
 # Agrees with the batch
@@ -357,32 +355,12 @@ def test_missing_angles_are_told(effect: str, missing: bool, caplog: pytest.LogC
     assert all(message.startswith("apr: wheel_eccentricity ") for message in told)
 
 
-PLUGIN = '''
-import numpy as np
-from omnibench.registry import effects
-from omnibench.robot.effects.effect import MotionEffect, Parameter
-
-
-@effects.register("stretched_turns")
-class StretchedTurns(MotionEffect):
-    """Turns are longer than the wheels say."""
-
-    stage = "body"
-    physics = "The robot is wider than it seems."
-    source = "first principles"
-    shows_in = "command"
-
-    def parameters(self, robot, sessions=()):
-        return (Parameter("k", "1", -0.1, 0.1, "share that is added"),)
-
-    def correction(self, signals, values):
-        return values["k"] * signals.twists * [0.0, 0.0, 1.0]
-'''
+# Turns are longer than the wheels say: the parameter, and the correction.
+STRETCHED = ('"k", "1", -0.1, 0.1, "share that is added"', 'values["k"] * signals.twists * [0.0, 0.0, 1.0]')
 
 
 def test_live_takes_the_named_plugins_and_replays_to_the_batch_odometry(command: InProcess, tmp_path: Path) -> None:
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "stretched_turns.py").write_text(PLUGIN)
+    write_effect(tmp_path / "mine" / "stretched_turns.py", "body", *STRETCHED)
     write_node(tmp_path, "apr", replay={"dataset": "small.yaml", "speed": "max"})
     hidden = [{"name": "wheel_eccentricity", "parameters": {"a_b": 0.02}}]
     simulated = flower(truth={"published": "palacin2023_eq8", "effects": hidden})
@@ -397,8 +375,7 @@ def test_live_takes_the_named_plugins_and_replays_to_the_batch_odometry(command:
 
 
 def test_a_node_runs_effects_of_the_plugins_that_its_config_names(tmp_path: Path) -> None:
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "stretched_turns.py").write_text(PLUGIN)
+    write_effect(tmp_path / "mine" / "stretched_turns.py", "body", *STRETCHED)
     config = config_of(tmp_path, "apr", plugins=["mine"])
     (tmp_path / "calibration.yaml").write_text(to_yaml(with_effects(term("stretched_turns", k=0.1), session=None)))
     path = drive(0.5)

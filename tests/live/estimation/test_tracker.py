@@ -27,7 +27,7 @@ from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.fusion.pose_fusion import FusionSettings
 from omnibench.live.wheels.wheel_input import WheelSettings, WheelStep
 from omnibench.live.wire.messages import JOINT_STATE, JointState
-from omnibench.live.wire.outputs import Update
+from omnibench.live.wire.topics import Update
 from omnibench.robot.calibration import Calibration, matrix_rows, write_calibration
 from omnibench.robot.odometry import Integration
 
@@ -102,14 +102,6 @@ def test_odom_never_jumps_and_no_stamp_comes_twice_whatever_happens(data: st.Dat
     elapsed = np.diff(arrivals) + 0.05 if len(updates) > 1 else np.zeros(0)
     assert (np.hypot(moved[:, 0], moved[:, 1]) < 0.3 * 1.3 * elapsed).all()
     assert (np.abs(moved[:, 2]) < 1.6 * 1.3 * elapsed).all()
-
-
-def test_a_correction_of_slam_moves_the_filtered_pose_and_leaves_odom_alone(robot: RobotTracker) -> None:
-    before = fed(robot, DRIVE.payloads()[:60])[-1]
-    robot.take_pose(slam(DRIVE.stamps[50], [4.0, 5.0, 2.0]), 0.6)
-    (after,) = fed(robot, DRIVE.payloads()[60:61], 0.6)
-    np.testing.assert_allclose(after.pose, DRIVE.poses[60], atol=1e-9)
-    assert np.linalg.norm(after.in_map[0][:2] - before.in_map[0][:2]) > 1
 
 
 def test_time_backwards_is_counted_and_the_stream_goes_on(robot: RobotTracker) -> None:

@@ -183,17 +183,6 @@ def test_four_poses_that_agree_are_believed(seen: list[tuple[float, float, float
     np.testing.assert_allclose(robot.fusion.pose, robot.truth[-1] + away, atol=1e-9)
 
 
-def test_a_robot_that_was_carried_away_is_found_while_it_drives_on() -> None:
-    robot = Robot(reacquire_after=5).drive(10)
-    robot.see(0.1)
-    outcomes = []
-    for k in range(1, 8):
-        robot.drive(20)
-        outcomes.append(robot.see(0.1 + 0.2 * k, (3.0, -2.0, 0.0)))
-    assert outcomes[:5] == ["rejected"] * 4 + ["reacquired"]
-    assert outcomes[5:] == ["fused", "fused"]
-
-
 def test_a_sender_with_nonsense_for_stamps_does_not_fill_the_memory() -> None:
     timeline = Timeline(2.0)
     for number in range(20_000):

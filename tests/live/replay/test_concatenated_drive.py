@@ -33,7 +33,7 @@ from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
 from omnibench.simulate.commands import Commands
 from omnibench.simulate.config import EncoderNoise, FlowerConfig, Session, Truth
-from omnibench.simulate.simulate import simulate_dataset
+from omnibench.simulate.source import simulate_dataset
 
 seeds = st.integers(0, 2**32 - 1)
 pauses = st.sampled_from([0.0, 0.1, 1.0])

@@ -33,24 +33,27 @@ from omnibench.live.wire.messages import (
     flow_of,
     packed,
 )
-from omnibench.live.wire.outputs import (
+from omnibench.live.wire.recorder import Recorder
+from omnibench.live.wire.topics import (
     OUTPUTS,
+    TOPICS,
     Frames,
+    GraphNode,
     JointStateDecoder,
+    KeySpace,
     OdometryEncoder,
     Output,
+    Profile,
+    Publisher,
     TransformsEncoder,
     Update,
     filtered_odometry,
     odometry,
     transforms,
 )
-from omnibench.live.wire.recorder import Recorder
-from omnibench.live.wire.topics import TOPICS, GraphNode, KeySpace, Profile, Publisher
 from omnibench.robot.odometry import advance
 
 PROFILES: tuple[Profile, ...] = ("plain", "rmw", "humble")
-QOS = "::,10:,:,:,,"
 
 HEADER = {"sec": 1_700_000_000, "nanosec": 123_456_789}
 

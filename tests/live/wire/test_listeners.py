@@ -90,15 +90,6 @@ def next_of(subscription: Subscription) -> Odometry:
     return message
 
 
-def test_messages_come_as_typed_odometry(subscription: Subscription, odom: Publisher[Odometry]) -> None:
-    odom.put(odometry(5))
-    message = next_of(subscription)
-    assert (message.stamp, message.frame, message.child_frame) == (STAMP + 5 * PERIOD, "odom", "base_link")
-    np.testing.assert_allclose(message.pose, odometry(5).pose, atol=1e-15)
-    np.testing.assert_array_equal(message.pose_covariance, odometry(5).pose_covariance)
-    np.testing.assert_array_equal(message.twist, odometry(5).twist)
-
-
 @pytest.mark.parametrize("buffer", [1, 3])
 def test_a_slow_reader_gets_the_newest_messages(loopback: Loopback, odom: Publisher[Odometry], buffer: int) -> None:
     session = loopback.client()

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -155,19 +154,6 @@ def test_a_tilted_scanner_meets_walls_and_floor(pitch: float, height: float, yaw
     np.testing.assert_allclose(found[seen], expected[seen], rtol=1e-6, atol=FLOAT32)
 
 
-def test_ahead_of_a_scanner_that_is_tilted_by_30_degrees_is_the_floor_and_beside_it_the_wall() -> None:
-    lidar = tilted(30.0, height=0.5)
-    angles = lidar.scanner.angles
-    ranges = look(square(3), lidar, standing(0, 0, 0)).ranges[0]
-    ahead, left = int(np.abs(angles).argmin()), int(np.abs(angles - math.pi / 2).argmin())
-    assert ranges[ahead] == pytest.approx(1.0, abs=FLOAT32)  # 0.5 m over the sine of 30 degrees
-    assert ranges[left] == pytest.approx(3.0, rel=1e-3)
-    on_floor = lidar.scanner.on_floor(ranges)
-    assert on_floor[ahead]
-    assert not on_floor[left]
-    assert not EXACT.scanner.on_floor(look(square(3), EXACT, standing(0, 0, 0)).ranges).any()
-
-
 def test_without_distortion_all_rays_start_where_the_robot_is_at_the_stamp() -> None:
     times = np.arange(0, 1000) * 0.001
     track = TruePath(times, circling(0.5, 0.2, 2.0, times))
@@ -239,13 +225,6 @@ def test_scans_follow_within_their_period(low: float, longer: float, end: float,
     assert stamps[-1] <= end
     assert stamps[-1] - latency + lidar.sweep <= end
     assert stamps[-1] + low + longer > end - lidar.sweep - 1e-9
-
-
-def test_the_time_between_scans_jitters_all_over_its_bounds() -> None:
-    between = np.diff(scan_stamps(Lidar(), 500.0, np.random.default_rng(0)))
-    assert between.min() < 0.201
-    assert between.max() > 0.299
-    assert between.mean() == pytest.approx(0.25, abs=0.005)
 
 
 def test_a_run_too_short_for_a_scan_and_a_scan_that_sees_nothing_are_refused() -> None:
@@ -446,13 +425,3 @@ def test_a_robot_that_is_far_from_the_free_area_is_told_where(place: tuple[float
     plan = make_plan(room(obstacles=[CUPBOARD]), "room")
     with pytest.raises(ConfigError, match=told):
         plan.check_path(np.array([place]), np.zeros(1), 0.1, "run")
-
-
-def test_the_free_area_is_the_boundary_without_the_obstacles() -> None:
-    plan = make_plan(RoomPlan(plan="furnished_room"), "room")
-    places = np.random.default_rng(0).uniform(-1, 9, size=(2000, 2))
-    inside = shapely.contains_xy(plan.boundary, places)
-    for obstacle in plan.obstacles:
-        inside &= ~shapely.intersects_xy(obstacle, places)
-    assert (shapely.contains_xy(plan.free, places) == inside).all()
-    assert [plan.place_of(place) is None for place in places[:200]] == inside[:200].tolist()

@@ -22,9 +22,6 @@ from omnibench.simulate.motion_commands import (
     CommandedMotion,
     CommandLink,
     MotionProfile,
-    Phase,
-    SetPoint,
-    SlewLimits,
     command_motion,
     target_rates,
 )
@@ -98,12 +95,6 @@ def test_a_motor_without_friction_runs_up_as_its_closed_form_says(motor: Motor) 
     course = 2 * middle / product * (1 - first * mean) - (2 * middle**2 / product - 1) * first * difference
     expected = supply / constant * np.real(times - course)
     assert np.abs(run.wheel_angles[:, 0] - expected).max() < 1e-9
-
-
-@given(motors)
-def test_the_fastest_rate_is_the_steady_state_at_full_voltage(motor: Motor) -> None:
-    slowest = motor.resistance * motor.inertia / motor.wheel_torque_constant**2  # time constant, s
-    assert turning(drive((FULL, 0.5 + 25 * slowest), motor=motor))[-1] == pytest.approx(motor.fastest_rate, rel=1e-6)
 
 
 def test_friction_acts_as_an_independent_integration_says() -> None:
@@ -293,9 +284,16 @@ def test_a_command_faster_than_the_motors_is_refused_with_the_greatest_speed_or_
         (Motor, {"resistence": 1.0}, "'resistance'"),
         (Motor, {"inductance": 0.0}, "inductance"),
         (Controller, {"proportional": 0, "integral": 0}, "no wheel"),
+        (CommandLink, {"watchdog": 0.2}, "watchdog 0.2 s .*refresh 0.3 s"),
+        (CommandLink, {"lost": 1.0}, "lost"),
+        (CommandLink, {"wachdog": 0.4}, "'watchdog'"),
+        (CommandLink, {"stalls_at": -1}, "stalls_at"),
+        (MotionProfile, {"shape": "s_curve"}, "'trapezoid' or 'jerk_limited'"),
     ],
 )
-def test_a_motor_or_controller_that_cannot_be_is_refused(part: Any, settings: dict[str, float], named: str) -> None:
+def test_a_motor_controller_link_or_profile_that_cannot_be_is_refused(
+    part: Any, settings: dict[str, float], named: str
+) -> None:
     with pytest.raises(ConfigError, match=named):
         validate(part, settings, "motor")
 
@@ -395,38 +393,6 @@ def test_a_trapezoid_rises_with_the_limit_of_what_is_slower_and_an_s_curve_takes
     assert motion(profile=MotionProfile(shape="jerk_limited")).times[-1] > motion().times[-1]
 
 
-@given(
-    st.floats(0.2, 20),
-    st.one_of(st.just(math.inf), st.floats(1, 500)),
-    st.lists(st.floats(1e-3, 0.5), min_size=1, max_size=12),
-)
-def test_phases_of_set_points_join_between_rest_and_full_speed(slope: float, jerk: float, pauses: list[float]) -> None:
-    course, time = SetPoint(SlewLimits(slope, jerk)), 0.0
-    for number, pause in enumerate(pauses):
-        course = course.towards((number + 1) % 2, time)
-        time += pause
-    course = course.towards(0.0, time)
-    told = [phase.at(t) for phase, t in _instants(course)]
-    scales, slopes = np.array([each.scale for each in told]), np.array([each.slope for each in told])
-    assert scales.min() >= -1e-9
-    assert scales.max() <= 1 + 1e-9
-    assert np.abs(slopes).max() <= slope * (1 + 1e-9)
-    for before, after in pairwise(course.phases):
-        end = before.at(after.start)
-        assert (end.way, end.scale) == pytest.approx((after.way, after.scale), abs=1e-9)
-        if math.isfinite(jerk):
-            assert end.slope == pytest.approx(after.slope, abs=1e-6 * slope)
-
-
-def _instants(course: SetPoint) -> list[tuple[Phase, float]]:
-    """Twenty instants in every phase but the last, which has no end."""
-    return [
-        (phase, float(t))
-        for phase, following in pairwise(course.phases)
-        for t in np.linspace(phase.start, following.start, 20)
-    ]
-
-
 def test_commands_are_refreshed_every_300_ms_and_the_last_is_shorter() -> None:
     sent = motion().commands
     assert [each.time for each in sent] == pytest.approx(0.3 * np.arange(19))
@@ -493,29 +459,6 @@ def test_the_same_seed_gives_the_same_motion() -> None:
     assert one.commands != third.commands
 
 
-@given(travels, ways)
-def test_target_rates_are_those_of_the_kinematic_matrix(command: Command, way: float) -> None:
-    driven = motion(command, way)
-    rates = target_rates(APR_02, driven)
-    assert rates.shape == (len(driven.times), 3)
-    assert np.abs(rates @ APR_02.inverse_kinematic_matrix.T - driven.twists).max() < 1e-12
-
-
 def test_a_command_that_moves_nothing_is_refused() -> None:
     with pytest.raises(ConfigError, match="v0_a0_w0"):
         motion(Command(0.0, 0.0, 0.0))
-
-
-@pytest.mark.parametrize(
-    ("part", "settings", "named"),
-    [
-        (CommandLink, {"watchdog": 0.2}, "watchdog 0.2 s .*refresh 0.3 s"),
-        (CommandLink, {"lost": 1.0}, "lost"),
-        (CommandLink, {"wachdog": 0.4}, "'watchdog'"),
-        (CommandLink, {"stalls_at": -1}, "stalls_at"),
-        (MotionProfile, {"shape": "s_curve"}, "'trapezoid' or 'jerk_limited'"),
-    ],
-)
-def test_a_link_or_profile_that_cannot_be_is_refused(part: Any, settings: dict[str, float], named: str) -> None:
-    with pytest.raises(ConfigError, match=named):
-        validate(part, settings, "link")

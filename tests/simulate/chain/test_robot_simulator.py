@@ -26,8 +26,7 @@ from omnibench.simulate.commands import MotionGrid
 from omnibench.simulate.config import Truth
 from omnibench.simulate.motors import Motor, check_reach
 from omnibench.simulate.robot_config import RobotConfig
-from omnibench.simulate.simulate import simulate_dataset
-from omnibench.simulate.source import read_simulation
+from omnibench.simulate.source import read_simulation, simulate_dataset
 from omnibench.simulate.truth import Simulation, true_matrix
 
 TOLERANCES = {"tolerances": {"radius": 0.02, "distance": 0.05, "angle_deg": 1.0, "seed": 249}}

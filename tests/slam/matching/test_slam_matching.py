@@ -16,7 +16,6 @@ from omnibench.robot.kinematics import Array, compose, relative
 from omnibench.simulate.floor_plan import RoomPlan, make_plan
 from omnibench.simulate.lidar import Lidar, measure_scans
 from omnibench.slam.motion_prior import MotionWithinScan
-from omnibench.slam.pose_errors import FLOOR, PoseErrors
 from omnibench.slam.scan_matching import (
     Correspondences,
     Lines,
@@ -29,6 +28,7 @@ from omnibench.slam.scan_matching import (
     scan_points,
     search,
 )
+from omnibench.slam.slam_dataset import FLOOR, PoseErrors
 from omnibench.slam.slam_options import SlamOptions
 
 EXACT = Lidar(noise=0.0, far_noise=0.0, dropouts=0.0, resolution=1e-6)

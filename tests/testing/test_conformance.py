@@ -1,41 +1,48 @@
-"""The cases of calibrators, costs and importers pass what keeps the contract and fail, case by case, what does not."""
+"""Conformance cases and plug-in files: what keeps the contract passes, and what breaks it fails its case."""
 
 from __future__ import annotations
 
 import random
+import re
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-from commands import refused
+from commands import ENVIRONMENT, Command, assert_refused, python, refused, succeeded, write_effect
 from lanes import slow
-from pydantic import Field
+from timing import PATIENCE, until
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.importer import Importer
 from omnibench.data.storage import load_dataset, save_dataset
-from omnibench.errors import ConfigError, DataError, NotApplicableError, PluginError
+from omnibench.errors import ConfigError, DataError, NotApplicableError, OmnibenchError, PluginError
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.cost import Cost, SumOfNorms
 from omnibench.fit.problem import BudgetSpent, CalibrationProblem
-from omnibench.registry import Options
+from omnibench.registry import Options, effects, registered_from
+from omnibench.robot.effects.effect import ActuatorEffect, Effect, MotionEffect, Parameter, ReferenceEffect, Values
 from omnibench.robot.kinematics import Array, Robot, RobotClass, class_of
+from omnibench.robot.signals import Signals
 from omnibench.testing import (
     CalibratorConformance,
     CaseOutcome,
     Conformance,
     CostConformance,
+    EffectConformance,
     ImporterConformance,
     Nonconformance,
+    load_plugin,
     run_cases,
     synthetic,
     synthetic_problem,
     synthetic_robot,
     synthetic_trajectories,
 )
+from omnibench.testing.plugin_files import PLUGIN_KINDS, CheckReport, check_plugin, check_plugin_apart, new_plugin
 
 
 def suite(base: type[Conformance], cls: type, **attributes: Any) -> Conformance:
@@ -528,11 +535,368 @@ def test_an_importer_without_a_sample_is_tried_on_refusals_only() -> None:
     assert outcomes["sample is a valid data set"] is CaseOutcome.SKIPPED
 
 
-def test_an_option_that_is_not_described_fails_an_importer() -> None:
-    class Bare(GoodImporter):
-        """Has an option."""
+# The conformance cases of effects pass all of the catalogue and fail, case by case, what breaks the contract.
 
-        class Options(Options):
-            rate: float = Field(1.0, gt=0)
+GAIN = Parameter("k", "1", -0.1, 0.1, "share that is added")
 
-    assert "rate" in failures(ImporterConformance, Bare)["class and options are documented"]
+
+class HonestEffect(MotionEffect):
+    """Wheels that are a little larger; what the bad ones below are made from."""
+
+    stage: ClassVar[Any] = "wheel"
+    physics: ClassVar[str] = "Tyres grow."
+    source: ClassVar[str] = "first principles"
+    shows_in: ClassVar[str] = "command"
+    given: ClassVar[tuple[Any, ...]] = (GAIN,)
+
+    def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
+        return self.given
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        return values["k"] * signals.rates
+
+
+class HonestReference(ReferenceEffect):
+    """Late by a constant, and a map at another scale."""
+
+    physics: ClassVar[str] = "The LIDAR is slow and the map is large."
+    source: ClassVar[str] = "first principles"
+    shows_in: ClassVar[str] = "stamps"
+
+    def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
+        return (GAIN,)
+
+    def delays(self, stamps: Array, values: Values) -> tuple[Array, Array]:
+        return values["k"] * np.ones(len(stamps)), 0 * stamps
+
+    def reported(self, poses: Array, start: Array, values: Values) -> Array:
+        return self.scaled(poses, start, 1 + values["k"])
+
+    def corrected(self, poses: Array, start: Array, values: Values) -> Array:
+        return self.scaled(poses, start, 1 / (1 + values["k"]))
+
+    def scaled(self, poses: Array, start: Array, scale: float) -> Array:
+        return start + (poses - start) * [scale, scale, 1.0]
+
+
+class HonestActuator(ActuatorEffect):
+    """Motors that turn a share faster than they are told."""
+
+    physics: ClassVar[str] = "The gain is wrong."
+    source: ClassVar[str] = "first principles"
+    shows_in: ClassVar[str] = "command"
+
+    def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
+        return (GAIN,)
+
+    def driven(self, durations: Array, targets: Array, values: Values) -> Array:  # noqa: ARG002
+        return (1 + values["k"]) * targets
+
+
+def effect_suite(cls: type[Effect]) -> EffectConformance:
+    return type("Suite", (EffectConformance,), {"name": cls.__name__, "make": lambda _: cls()})()
+
+
+def honest(**changes: Any) -> type[Effect]:
+    return type("Changed", (HonestEffect,), {"__doc__": "Changed.", **changes})
+
+
+def correcting(correction: Callable[[Signals, Values], Array], **changes: Any) -> type[Effect]:
+    return honest(correction=lambda _, signals, values: correction(signals, values), **changes)
+
+
+def with_parameter(**changes: Any) -> type[Effect]:
+    return honest(given=(replace(GAIN, **changes),))
+
+
+@pytest.mark.parametrize("name", [entry.name for entry in effects.entries() if entry.origin == "built in"])
+def test_an_effect_of_the_catalogue_keeps_the_contract(name: str) -> None:
+    results = run_cases(type("Suite", (EffectConformance,), {"name": name})())
+    assert [result for result in results if not result.passed] == []
+    assert len([result for result in results if result.outcome is CaseOutcome.PASSED]) >= 13
+
+
+@pytest.mark.parametrize("cls", [HonestEffect, HonestReference, HonestActuator])
+def test_an_honest_effect_of_each_kind_passes(cls: type[Effect]) -> None:
+    assert [result for result in run_cases(effect_suite(cls)) if not result.passed] == []
+
+
+def scales_in_place(signals: Signals, values: Values) -> Array:
+    signals.rates[:] *= 1 + values["k"]
+    return values["k"] * signals.rates
+
+
+def divides(signals: Signals, values: Values) -> Array:
+    with np.errstate(all="ignore"):
+        return values["k"] * signals.rates / signals.rates
+
+
+def trembles(signals: Signals, values: Values) -> Array:
+    return values["k"] * signals.rates * np.random.random()  # noqa: NPY002 (the fault that is to be found)
+
+
+def trembles_by_itself(signals: Signals, values: Values) -> Array:
+    return values["k"] * signals.rates * np.random.default_rng().random()
+
+
+CALLS = count()
+
+RANGES, SHAPES = "parameters have units and plausible ranges", "shapes are those of the contract"
+STAGE, PHYSICS = "stage is one of its kind", "physics and source are given"
+NAMES, ALONE = "parameters have names of their own", "each sample is corrected by itself"
+ZERO, LINEAR, CAUSAL = "zero parameters change nothing", "it is linear in its parameters", "motors are causal"
+DRAWS, NEEDS, TRUE = "results are reproducible", "needs names all that is used", "corrected poses are the true ones"
+OUT_OF_RANGE = Parameter("n", "1", 3, 16, "rollers", choices=(3.0, 17.0))
+
+
+def renamed(*_: Any) -> tuple[Parameter, ...]:
+    return (replace(GAIN, description=f"{next(CALLS)}"),)
+
+
+def reference(**changes: Any) -> type[Effect]:
+    return type("Wrong", (HonestReference,), {"__doc__": "Wrong.", **changes})
+
+
+def motors(driven: Callable[[Array, Values], Array]) -> type[Effect]:
+    by_targets = {"driven": lambda _, __, targets, values: driven(targets, values)}
+    return type("Wrong", (HonestActuator,), {"__doc__": "Wrong.", **by_targets})
+
+
+# s: signals, v: values of the parameters.
+BROKEN: dict[str, tuple[type[Effect], str, str]] = {
+    "no docstring": (honest(__doc__=None), "class and options are documented", "has no docstring"),
+    "no physics": (honest(physics=" "), PHYSICS, "physics is missing"),
+    "no source": (honest(source=""), PHYSICS, "source is missing"),
+    "no covariate": (honest(shows_in=""), PHYSICS, "shows_in is missing"),
+    "an unknown stage": (honest(stage="tyre"), STAGE, "stage is 'tyre'; of a MotionEffect"),
+    "another kind's stage": (honest(stage="reference"), STAGE, "wheel, steering, clock"),
+    "a reference effect on wheels": (reference(stage="wheel"), STAGE, "'wheel'"),
+    "an unknown need": (honest(needs=frozenset({"weather"})), "needs are known", "['weather']; known are wheel_angles"),
+    "no parameter": (honest(given=()), RANGES, "without choices"),
+    "a list of parameters": (honest(given=[GAIN]), RANGES, "tuple of Parameter"),
+    "only a shape": (with_parameter(choices=(0.05,)), RANGES, "without choices"),
+    "no unit": (with_parameter(unit=""), RANGES, "'k' has no unit"),
+    "no description": (with_parameter(description=""), RANGES, "description"),
+    "a range upside down": (with_parameter(low=0.1, high=-0.1), RANGES, "low 0.1"),
+    "a range without 0": (with_parameter(low=0.9, high=1.1), RANGES, "not within 0.9 and 1.1"),
+    "an endless range": (with_parameter(high=np.inf), RANGES, "not finite"),
+    "a choice out of range": (honest(given=(GAIN, OUT_OF_RANGE)), RANGES, "'n'"),
+    "one name twice": (honest(given=(GAIN, GAIN)), NAMES, "one name: k, k"),
+    "names that change": (honest(parameters=renamed), NAMES, "second call"),
+    "three wheels only": (correcting(lambda s, v: v["k"] * s.rates[:, :3]), SHAPES, "(1, 3), expected (1, 4)"),
+    "a body's correction on wheels": (correcting(lambda s, v: v["k"] * s.twists), SHAPES, "expected (1, 4)"),
+    "one number for all samples": (correcting(lambda s, v: v["k"] * s.rates[-1]), SHAPES, "(3,), expected (1, 3)"),
+    "a constant": (correcting(lambda s, v: (0.01 + v["k"]) * s.rates), ZERO, "parameters of 0"),
+    "nothing at all": (correcting(lambda s, _: 0 * s.rates), "parameters change something", "3 wheels"),
+    "0/0": (correcting(divides), "results are finite", "not finite"),
+    "a square": (correcting(lambda s, v: v["k"] ** 2 * s.rates), LINEAR, "not linear"),
+    "a magnitude": (correcting(lambda s, v: abs(v["k"]) * s.rates), LINEAR, "not linear"),
+    "work in place": (correcting(scales_in_place), "inputs are left unchanged", "it changed its arguments"),
+    "a sum over samples": (correcting(lambda s, v: v["k"] * np.cumsum(s.rates, axis=0)), ALONE, "row 7 differs"),
+    "a mean over samples": (correcting(lambda s, v: v["k"] * (s.rates - s.rates.mean(axis=0))), ALONE, "other"),
+    "the global generator": (correcting(trembles), DRAWS, "it draws random numbers"),
+    "a generator of its own": (correcting(trembles_by_itself), DRAWS, "results differ"),
+    "angles it did not ask for": (correcting(lambda s, v: v["k"] * np.cos(s.wheel_angles)), NEEDS, "name it in needs"),
+    "a correction the wrong way": (reference(corrected=HonestReference.reported), TRUE, "corrected(reported(poses))"),
+    "delays of one kind": (
+        reference(delays=lambda _, stamps, __: (0 * stamps,)),
+        SHAPES,
+        "not enough values to unpack",
+    ),
+    "one delay for all": (reference(delays=lambda _, __, v: (v["k"], 0.0)), SHAPES, "(), expected (1,)"),
+    "a reference that is always wrong": (reference(reported=lambda _, poses, *__: poses + 0.1), ZERO, "by 0.1"),
+    "motors that foresee": (motors(lambda targets, v: targets + v["k"] * targets[-1]), CAUSAL, "earlier"),
+    "motors that creep": (motors(lambda targets, v: targets + v["k"]), CAUSAL, "targets are 0"),
+}
+
+
+@pytest.mark.parametrize("fault", BROKEN)
+def test_a_broken_effect_fails_the_case_it_breaks(fault: str) -> None:
+    cls, case, words = BROKEN[fault]
+    with pytest.raises(Exception) as failure:
+        getattr(effect_suite(cls), f"test_{case.replace(' ', '_')}")()
+    assert words in str(failure.value)
+
+
+def test_an_effect_is_made_checked_and_listed_on_the_command_line(command: Command) -> None:
+    assert command("plugin", "new", "first_slip", "--effect").returncode == 0
+    assert command("plugin", "new", "second_slip", "--kind", "effect").returncode == 0
+    checked = succeeded(command("plugin", "check", "plugins/first_slip.py"))
+    assert "passed  effect first_slip: it is linear in its parameters" in checked.stdout
+    assert_refused(command("plugin", "new", "slip", "--effect", "--kind", "cost"), "--effect", "--kind cost")
+    listed = command("list").stdout
+    row = next(line for line in listed.splitlines() if "second_slip" in line)
+    assert "The faster the robot drives" in row
+    assert "second_slip.py" in "".join(listed.split())  # a long path is broken
+    assert "built in" in next(line for line in listed.splitlines() if "heading_drift" in line)
+
+
+@pytest.mark.slow
+def test_a_broken_effect_ends_in_exit_code_1(command: Command) -> None:
+    three_wheels_only = 'values["k"] * signals.rates[:, :3]'
+    write_effect(Path("broken_one.py"), "wheel", '"k", "1", -0.1, 0.1, "growth"', three_wheels_only)
+    checked = command("plugin", "check", "broken_one.py")
+    assert checked.returncode == 1
+    assert f"failed  effect broken_one: {SHAPES}: " in checked.stdout
+
+
+# Writing the first version of a plug-in, and checking one.
+
+FLAWED = """
+from omnibench.fit.calibrator import Calibrator, Solution
+from omnibench.registry import calibrators
+
+
+@calibrators.register("flawed_{number}")
+class Flawed(Calibrator):
+    '''Answers from outside the box.'''
+
+    def calibrate(self, problem):
+        problem.cost(problem.start[None])
+        return Solution(2 * problem.start + 1, "somewhere")
+"""
+
+
+CRASHING = FLAWED.format(number=7).replace("problem.cost(problem.start[None])", "import os; os._exit(4)")
+
+
+def outcomes(report: CheckReport) -> dict[str, CaseOutcome]:
+    return {result.case: result.outcome for result in report.results}
+
+
+@pytest.mark.parametrize("kind", PLUGIN_KINDS)
+def test_a_new_plugin_passes_its_check(kind: str, tmp_path: Path) -> None:
+    written = new_plugin("my_first", kind, tmp_path / "made" / "for_it")
+    assert [path.name for path in written] == ["my_first.py", "test_my_first.py"]
+    report = check_plugin(written[0])
+    assert report.passed, report.failures
+    assert {(result.kind, result.name) for result in report.results} == {(kind, "my_first")}
+
+
+@pytest.mark.slow
+def test_the_tests_of_new_plugins_pass_in_pytest(tmp_path: Path) -> None:
+    for kind in PLUGIN_KINDS:
+        new_plugin(f"my_{kind}", kind, tmp_path)
+    program = "import sys, pytest; sys.exit(pytest.main(sys.argv[1:]))"
+    run = python(program, "-v", "-p", "no:cacheprovider", tmp_path, cwd=tmp_path, env=ENVIRONMENT)
+    assert run.returncode == 0, run.stdout + run.stderr
+    assert run.stdout.count("SKIPPED") == 3  # the seed of a calibrator that is stochastic, other kinds of effects
+    assert all(f"test_my_{kind}.py" in run.stdout for kind in PLUGIN_KINDS)
+
+
+@pytest.mark.slow
+def test_the_cases_run_where_pytest_is_not_installed(tmp_path: Path) -> None:
+    new_plugin("bare_search", "calibrator", tmp_path)
+    program = (
+        "import sys; sys.modules['pytest'] = None\n"
+        "from omnibench.testing.plugin_files import check_plugin\n"
+        f"print(check_plugin({str(tmp_path / 'bare_search.py')!r}).passed)"
+    )
+    run = python(program)
+    assert run.stdout == "True\n", run.stderr
+
+
+@pytest.mark.parametrize("kind", PLUGIN_KINDS)
+def test_a_new_plugin_whose_class_would_hide_an_import_is_called_otherwise(kind: str, tmp_path: Path) -> None:
+    name = {"calibrator": "solution", "importer": "trajectory_", "cost": "cost_", "effect": "signals"}[kind]
+    file, _ = new_plugin(name, kind, tmp_path)
+    load_plugin(file)
+    ((_, entry),) = registered_from(file)
+    assert entry.cls.__name__ == f"{name.strip('_').capitalize()}{kind.capitalize()}"
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "folder", "named"),
+    [
+        *(
+            (name, "calibrator", "", "cannot name a plug-in")
+            for name in ("my-search", "2opt", "My", "class", "", "_private", "test_mine", "größe", "../x")
+        ),
+        ("theoretical", "calibrator", "", r"'theoretical' already \(built in\)"),
+        ("random", "calibrator", "", "Python module 'random'"),
+        ("mine", "calibrater", "", "'calibrater'; did you mean 'calibrator'"),
+        ("mine", "calibrator", "", r"test_mine\.py"),
+        ("mine", "calibrator", "test_mine.py", "cannot be written"),
+    ],
+)
+def test_what_cannot_be_written_is_named(name: str, kind: str, folder: str, named: str, tmp_path: Path) -> None:
+    (tmp_path / "test_mine.py").write_text("mine")
+    with pytest.raises((ConfigError, DataError), match=named):
+        new_plugin(name, kind, tmp_path / folder)
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
+
+
+def test_flawed_plugins_fail_the_case_they_break(tmp_path: Path) -> None:
+    (tmp_path / "two.py").write_text(FLAWED.format(number=1) + FLAWED.format(number=2))
+    report = check_plugin(tmp_path / "two.py")
+    assert {result.name for result in report.results} == {"flawed_1", "flawed_2"}
+    assert not report.passed
+    assert outcomes(report)["it works in silence"] is CaseOutcome.PASSED
+    failures = [result for result in report.failures if result.case == "bounds are kept"]
+    assert [(failure.kind, failure.name) for failure in failures] == [("calibrator", f"flawed_{k}") for k in (1, 2)]
+    assert failures[0].message.startswith("the answer is outside the box (m11")
+    demanding = "    class Options(Options):\n        rate: float\n\n    def calibrate"
+    content = FLAWED.format(number=5).replace("    def calibrate", demanding)
+    (tmp_path / "demanding.py").write_text("from omnibench.registry import Options\n" + content)
+    (result,) = check_plugin(tmp_path / "demanding.py").results
+    assert "'flawed_5': key 'rate' is missing" in result.message
+
+
+@pytest.mark.parametrize(
+    ("content", "named"),
+    [
+        ("import os; os._exit(3)", "exit code 3"),
+        pytest.param("import os; os.kill(os.getpid(), 11)", "SIGSEGV", marks=pytest.mark.slow),
+        pytest.param("while True: pass", "limit 1 s", marks=pytest.mark.slow),
+        pytest.param("1 / 0", "ZeroDivisionError: division by zero", marks=pytest.mark.slow),
+        pytest.param(CRASHING, "exit code 4) while calibrator flawed_7 is tested", marks=pytest.mark.slow),
+    ],
+    ids=["exit", "crash", "hang", "error", "exit in a case"],
+)
+def test_a_plugin_that_ends_its_process_or_never_ends_is_named(content: str, named: str, tmp_path: Path) -> None:
+    file = tmp_path / "wild.py"
+    file.write_text(content)
+    with pytest.raises(PluginError, match=re.escape(named)):
+        check_plugin_apart(file, seconds=1.0 if "limit" in named else PATIENCE)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("child", ["time.sleep(10_000)", "pass"], ids=["that stays", "that goes on as its twin"])
+def test_a_fork_is_named_and_ended(child: str, tmp_path: Path) -> None:
+    pid_file = tmp_path / "pid"
+    fork = f"import os, time\npid = os.fork()\nif pid == 0:\n    {child}\n"
+    note = f"else:\n    open({str(pid_file)!r}, 'w').write(str(pid))\n"
+    (tmp_path / "forking.py").write_text(fork + note + FLAWED.format(number=8))
+    report = check_plugin_apart(tmp_path / "forking.py", seconds=PATIENCE)
+    assert outcomes(report)["it leaves no process behind"] is CaseOutcome.FAILED
+    assert len([result for result in report.results if result.case == "bounds are kept"]) == 1
+    state = Path(f"/proc/{pid_file.read_text()}/stat")
+    until(lambda: not state.exists() or " Z " in state.read_text(), "the fork to end")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("import nowhere_at_all\n", "ModuleNotFoundError: No module named 'nowhere_at_all'"),
+        ("def broken(:\n", "SyntaxError"),
+        ("raise SystemExit(3)\n", "SystemExit: 3"),
+        ("import numpy\n", "registers nothing"),
+        (FLAWED.format(number=4).replace("flawed_4", "genetic"), "'genetic' is registered already"),
+        (None, "no such file"),
+    ],
+)
+def test_a_file_without_a_working_plugin_is_one_line(content: str | None, message: str, tmp_path: Path) -> None:
+    file = tmp_path / "faulty.py"
+    if content is not None:
+        file.write_text(content)
+    with refused(OmnibenchError, message, str(file)):
+        check_plugin(file)
+
+
+def test_an_importer_is_checked_on_the_sample_that_is_given(tmp_path: Path) -> None:
+    new_plugin("sampled", "importer", tmp_path)
+    rows = "\n".join(f"{0.1 * k:.1f},0,0,{0.05 * k:.2f},2,2,2" for k in range(11))
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "one.csv").write_text(f"t,x,y,heading,a,b,c\n{rows}\n")
+    report = check_plugin(tmp_path / "sampled.py", tmp_path / "runs")
+    assert set(outcomes(report).values()) == {CaseOutcome.PASSED}

@@ -1,0 +1,77 @@
+"""What the detectors of a check look at: a recording, and what was computed of it once for all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from omnibench.check.clocks import clocks_of
+from omnibench.check.misreadings import Explained, Recorded, search
+from omnibench.check.motion_fit import FreeFit, Windows, continuous
+from omnibench.check.source import RecordingSource, recorded
+from omnibench.check.streams import Look, looks_of
+from omnibench.data.clock_matching import ClockMatch
+from omnibench.data.dataset import Dataset, Trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """A recording and what is computed of it.
+
+    runs: those that have poses. clocks: of their references. aligned: the same runs with poses by the wheels' clock, as
+    far as it shows.
+    """
+
+    read: RecordingSource
+    runs: Sequence[Trajectory]
+    clocks: Sequence[ClockMatch | None]
+    aligned: Sequence[Trajectory]
+
+    @classmethod
+    def of(cls, read: RecordingSource) -> Evidence:
+        """The evidence of a recording."""
+        runs = [run for run in read.dataset.trajectories if run.has_poses]
+        smooth = [replace(run, poses=continuous(run.pose_times, run.poses)) for run in runs]
+        clocks = clocks_of(read.dataset.robot, smooth)
+        aligned = []
+        for run, clock in zip(runs, clocks, strict=True):
+            times = run.pose_times if clock is None else clock.corrected(run.pose_times)
+            used = np.flatnonzero((times >= 0) & (times <= run.times[-1]))
+            if clock is not None and len(used) >= max(3, len(times) // 2):
+                run = replace(run, pose_times=times[used], poses=run.poses[used], pose_covariances=None)
+            aligned.append(run)
+        return cls(read, runs, clocks, aligned)
+
+    @property
+    def dataset(self) -> Dataset:
+        """The data set of the recording."""
+        return self.read.dataset
+
+    @cached_property
+    def seen(self) -> Recorded:
+        """The runs that have poses, by the wheels' clock."""
+        return recorded(replace(self.dataset, trajectories=tuple(self.aligned)))
+
+    @cached_property
+    def explained(self) -> Explained:
+        """The mistakes that explain the motion."""
+        return search(self.seen)
+
+    @cached_property
+    def looks(self) -> list[Look]:
+        """A look at each of the runs that have poses."""
+        return looks_of(self.dataset.robot, self.aligned) if self.aligned else []
+
+    @cached_property
+    def windows(self) -> Windows | None:
+        """Windows of a second of the runs that have poses, of many some; None where poses are sparse."""
+        poses = [continuous(run.pose_times, run.poses) for run in self.aligned]
+        return Windows.of([run.log(run.pose_times) for run in self.aligned], poses)
+
+    @cached_property
+    def fit(self) -> FreeFit | None:
+        """The matrix that fits these windows best."""
+        return None if self.windows is None else self.windows.fit(self.dataset.robot.reach)
