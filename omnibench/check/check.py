@@ -108,7 +108,7 @@ DETECTORS: tuple[tuple[Callable[[Evidence], Iterator[Finding]], frozenset[str]],
     (odd_references, UNREAD),
     (unrelated_references, UNREAD | MISREAD | {"wheel_dropout", "reference_dropout"}),
     (faults.jumps, UNREAD | MISREAD),
-    (faults.clocks, SPOILED | {"reference_foreign"}),
+    (faults.clocks, UNREAD | {"reference_jump"}),
     (faults.copied_runs, frozenset()),
     (lacking, frozenset()),
 )

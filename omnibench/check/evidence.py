@@ -52,8 +52,8 @@ class Evidence:
 
     @cached_property
     def seen(self) -> Recorded:
-        """The runs that have poses, by the wheels' clock."""
-        return recorded(replace(self.dataset, trajectories=tuple(self.aligned)))
+        """The runs that have poses, by the wheels' clock; without any, those that have positions."""
+        return recorded(replace(self.dataset, trajectories=tuple(self.aligned)) if self.aligned else self.dataset)
 
     @cached_property
     def explained(self) -> Explained:

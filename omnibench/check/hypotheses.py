@@ -168,6 +168,13 @@ def reference_hypotheses(flipped: bool) -> Iterator[Hypothesis]:
         yield Hypothesis(rows, np.eye(0), _REFERENCE + 0.1 * (len(negative) + swapped), (wrong,))
 
 
+def mirrored_positions() -> Hypothesis:
+    """Positions without headings, with y to the right."""
+    words = "the reference is mirrored: y has the wrong sign"
+    wrong = error("reference_mirrored", words, _REFERENCED, {"pose_signs": [1, -1, 1]})
+    return Hypothesis(np.diag([1.0, -1.0, 1.0]), np.eye(0), _REFERENCE, (wrong,))
+
+
 def position_units() -> Iterator[Hypothesis]:
     """Positions in other units than metres."""
     for factor, unit in POSITION_UNITS:
@@ -210,7 +217,8 @@ def design_hypotheses(robot: Robot, fit: FreeFit) -> Iterator[Hypothesis]:
         shown, size = (1 / factor, "large") if factor < 1 else (factor, "small")
         cause = next((words for near, words in _CAUSES.items() if abs(factor / near - 1) < _NEAR_CAUSE), "")
         words = f"the {place} of the wheels in robot.yaml look about {_rounded(shown)} times too {size}{cause}"
-        cost = _REFERENCE if cause and robot.drive.direct else _FITTED
+        # A factor of one steered axle may be one of its angles as well.
+        cost = _REFERENCE if cause and (robot.drive.direct or len(robot.drive.steered) > 2) else _FITTED
         yield wrong("design_distance", words, {"wheels": _placed(robot, keys, factor)}, other, cost)
     mecanum = [wheel for wheel in robot.wheels if wheel.kind == "mecanum"]
     rollers = {wheel.name: {"roller_angle_deg": round(-math.degrees(wheel.roller_angle), 3)} for wheel in mecanum}

@@ -23,6 +23,7 @@ from omnibench.check.hypotheses import (
     Hypothesis,
     Reading,
     design_hypotheses,
+    mirrored_positions,
     position_units,
     reference_hypotheses,
     steering_readings,
@@ -56,16 +57,21 @@ _MOST_SAMPLES = 60_000  # of the runs that are looked at; chosen: half a second
 # below).
 _LEAST_FACTOR, _AS_GOOD = 1.8, 1.1  # least factor of rates; and misfits that are as good as the best; chosen
 _MISFIT, _LEAST_MISFIT, _EXPLAINED, _MOST_RUNS, _MOST_STAMPS = 0.15, 0.05, 0.35, 24, 300
+_POSITIONS = 30  # of a run without headings that are compared at most; chosen
 
 
 @dataclass(frozen=True, eq=False)
 class Recorded:
-    """Runs of a robot: logs, and reference poses (K, 3) at their stamps; and these poses as they were read."""
+    """Runs of a robot: logs, and reference poses (K, 3) at their stamps; and these poses as they were read.
+
+    without_headings: True if they are positions, in a frame that each run may have turned.
+    """
 
     robot: Robot
     logs: Sequence[WheelLog]
     poses: Sequence[Array]
     as_read: Sequence[Array] = ()
+    without_headings: bool = False
 
     def some(self) -> Recorded:
         """Runs from first to last that are looked at, all if they are few or short; with continuous headings."""
@@ -137,6 +143,8 @@ class _Scored:
 
 def search(recording: Recorded) -> Explained:
     """The mistakes that explain a recording best; none if its matrix is near enough to the design."""
+    if recording.without_headings:
+        return _search_sparse(recording)
     some = recording.some()
     fit = some.fit()
     if fit is None:
@@ -237,8 +245,11 @@ def _search_sparse(recording: Recorded) -> Explained:
     if not any(log.rates.any() for log in recording.logs):
         return Explained(searched=False)
     moments, hypotheses = _Moments.of(recording), list(_sparse_hypotheses(recording.robot))
+    if recording.without_headings:
+        hypotheses.append(hypotheses[0].with_reference(mirrored_positions()))
     scored = []
-    for radian, headings in ((1.0, ()), (math.pi / 180, (IN_DEGREES,))):
+    headings_as = ((1.0, ()), (math.pi / 180, (IN_DEGREES,)))
+    for radian, headings in headings_as[:1] if recording.without_headings else headings_as:
         for hypothesis, misfit in zip(hypotheses, moments.misfits(hypotheses, radian).tolist(), strict=True):
             scored.append((misfit, hypothesis.cost, (*headings, *hypothesis.mistakes)))
     present = scored[0][0]
@@ -248,13 +259,20 @@ def _search_sparse(recording: Recorded) -> Explained:
         misfits = _Moments.of(recording.meant(hypothesis)).misfits(hypotheses[:1])
         scored.append((float(misfits[0]), hypothesis.cost, hypothesis.mistakes))
     # The simplest of those that fit about as well as the best one.
-    if present <= _MISFIT:  # as far as another design goes, but for steering
+    alone = recording.without_headings
+    if present <= _MISFIT and not alone:  # as far as another design goes, but for steering
         scored = [each for each in scored if all(mistake.kind.startswith("steering") for mistake in each[2])]
     least = np.nanmin([misfit for misfit, _, _ in scored])
-    near = [each for each in scored if each[0] <= _AS_GOOD * least + _MISFIT / 4]
+    near = [each for each in scored if each[0] <= _AS_GOOD * least + (present / 10 if alone else _MISFIT / 4)]
     misfit, _, mistakes = min(near, key=lambda each: (len(each[2]), each[1], each[0]))
-    explained = bool(mistakes) and misfit < _EXPLAINED * present
-    return Explained(mistakes if explained else (), far=not explained and present > _MISFIT)
+    explained = bool(mistakes) and misfit < _EXPLAINED * present and not (alone and len(mistakes) > 1)
+    if not explained:
+        return Explained(far=present > _MISFIT and not alone)
+    kinds, alike = {mistake.kind for mistake in mistakes}, dict[frozenset[str], tuple[Finding, ...]]()
+    for others in (each[2] for each in near if alone and len(each[2]) == len(mistakes)):
+        if (other := frozenset(mistake.kind for mistake in others)) != kinds:
+            alike.setdefault(other, others)
+    return Explained(mistakes, tuple(alike.values()))
 
 
 def _contradicting(recording: Recorded) -> tuple[Finding, ...]:
@@ -302,6 +320,7 @@ class _Moments:
     poses: Array
     starts: Array
     first: NDArray[np.bool_]
+    without_headings: bool = False
 
     @classmethod
     def of(cls, recording: Recorded) -> _Moments:
@@ -315,12 +334,15 @@ class _Moments:
             headings = np.interp(log.stamps, np.append(0.0, log.times), np.append(0.0, turned))
             numbers = np.floor(np.abs(headings - headings[0])).astype(int)
             seen = np.unique([*np.flatnonzero(np.diff(numbers, prepend=0))[:_MOST_STAMPS], len(headings) - 1])
+            if recording.without_headings:
+                seen = np.unique(np.linspace(0, len(headings) - 1, _POSITIONS).round().astype(int))
             logs.append(replace(log, start=np.zeros(3), stamps=log.stamps[seen]))
             poses.append(np.vstack([of_run[:1], of_run[seen]]))
         odometry = OdometryBatch(logs, "arc")
         starts = np.array([of_run[0] for of_run in poses])[odometry.trajectory]
         first = np.diff(odometry.trajectory, prepend=-1) > 0
-        return cls(recording.robot, odometry, np.concatenate([of_run[1:] for of_run in poses]), starts, first)
+        moved = np.concatenate([of_run[1:] for of_run in poses])
+        return cls(recording.robot, odometry, moved, starts, first, recording.without_headings)
 
     def misfits(self, hypotheses: Sequence[Hypothesis], radian: float = 1.0) -> Array:
         """Misfits (P,) of the design to the poses under hypotheses, from 0 (exact) to 1 (unrelated).
@@ -333,6 +355,12 @@ class _Moments:
         moved = self.poses - self.starts
         path = metres * (moved[:, 0] + 1j * moved[:, 1]) * np.exp(-1j * radian * self.starts[:, 2])
         driven = odometry[..., 0] + 1j * odometry[..., 1]
+        if self.without_headings:
+            # From the first position of each run, which is turned to fit; and seen in a mirror.
+            path = np.where([[np.linalg.det(each.rows[:2, :2]) < 0] for each in hypotheses], path.conj(), path)
+            firsts, run = np.flatnonzero(self.first), np.cumsum(self.first) - 1
+            driven = driven - driven[:, firsts][:, run]
+            path = path * np.exp(1j * np.angle(np.add.reduceat(driven * path.conj(), firsts, axis=1)))[:, run]
         turned = self._turns(odometry[..., 2])
         # Whole turns between two moments do not show in the headings, and are no reason for a larger error.
         missed = wrapped(turned - self._turns(radian * moved[:, 2]))
@@ -344,6 +372,8 @@ class _Moments:
         position = np.abs(driven - path).sum(axis=1) / (lengths + size * (rims + count))
         heading = np.abs(missed).sum(axis=1) / (angles + count)
         runs = int(self.first.sum())
+        if self.without_headings:
+            return np.where(lengths < runs * size, np.nan, position)
         return np.where((lengths < runs * size) & (angles < runs), np.nan, np.maximum(position, heading))
 
     def _turns(self, headings: Array) -> Array:

@@ -32,6 +32,7 @@ _FILES = {"command.csv": "table1", "*_metadata.csv": "optiodom", "*.csv": "csv",
 _ANY_RATE = 1e9  # rad/s: the option ``fastest`` with which rates in any unit are read
 # Periods, s, of wheels and of poses that are more likely in another unit; chosen: no encoder is read less often.
 _SLOWEST, _SLOWEST_POSES, _FASTEST = 1.5, 5.0, 3e-4
+_FEWEST_POSITIONS = 5  # of a run without poses, from which on it is compared with the wheels; chosen
 _EXPLAINED = 0.35  # share of the way that the wheels may leave unexplained with the right unit of time; chosen
 _COLUMNS = {"wheel_order": ("joints", "wheel_columns"), "steering_order": ("steering_joints", "steering_columns")}
 
@@ -84,7 +85,7 @@ class RecordingSource:
             read = validate(type(present), {**present.model_dump(exclude_unset=True), **changed}, "options")
             if "wheel_unit" in changed:
                 recordings = [replace(each, wheels=replace(each.wheels, unit=read.wheel_unit)) for each in recordings]
-            return dataset_of(recordings, read, [])
+            return replace(dataset_of(recordings, read, []), name=self.dataset.name)
         except (DataError, ConfigError):
             return None
 
@@ -205,9 +206,18 @@ def sensible(dataset: Dataset) -> bool:
 
 
 def recorded(dataset: Dataset) -> Recorded:
-    """The runs of a data set that have poses."""
+    """The runs of a data set that have poses; where none has, those with positions in a fixed frame, headings 0."""
     runs = [run for run in dataset.trajectories if run.has_poses]
-    return Recorded(dataset.robot, [run.log(run.pose_times) for run in runs], [run.poses for run in runs])
+    if runs:
+        return Recorded(dataset.robot, [run.log(run.pose_times) for run in runs], [run.poses for run in runs])
+    logs, positions = [], []
+    for run in dataset.trajectories:
+        if run.references is not None:
+            seen = run.references.only(run.references.kinds == "position")
+            if len(seen) >= _FEWEST_POSITIONS:
+                logs.append(run.log(seen.t1))
+                positions.append(np.column_stack([seen.values, np.zeros(len(seen))]))
+    return Recorded(dataset.robot, logs, positions, without_headings=True)
 
 
 def odd_times(dataset: Dataset) -> bool:

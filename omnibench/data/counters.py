@@ -38,8 +38,10 @@ def counter_range(runs: Sequence[Array], turn: float, whole: bool) -> float | No
     ranges than a turn are possible: powers of two, and any that three crossings or more agree on.
     """
     least, most = min(counts.min() for counts in runs), max(counts.max() for counts in runs)
+    longest = max(float(np.abs(np.diff(counts)).max(initial=0.0)) for counts in runs)
     for wrap in sorted((turn, *(POWERS_OF_TWO if whole else ()))):
-        if most - least <= wrap * (1 + _ROUNDING) and any(begins_again(counts, wrap) for counts in runs):
+        within = most - least <= wrap * (1 + _ROUNDING) and longest > wrap / 2
+        if within and any(begins_again(counts, wrap) for counts in runs):
             return wrap
     return _agreed_range(runs, most - least, turn) if whole and most > least else None
 

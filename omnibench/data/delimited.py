@@ -23,6 +23,8 @@ DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+")
 _COMMAS = " (decimal commas? --set decimal=comma with --set separator)"
 _HEAD = 1 << 16  # characters in which the header and the first rows stand; chosen
 _MOST_BYTES = 1 << 34  # of a table; chosen
+# Not with leading zeros, as in names of runs.
+_NUMBER = re.compile(r"\s*[-+]?(?:(?:0|[1-9]\d*)(?:\.\d*)?|\.\d+)(?:e[-+]?\d+)?\s*", re.IGNORECASE)
 _UNIT = re.compile(r"[\[(<].*[\])>]|-|[a-zµ°%][a-zµ°%/^0-9·*. -]*", re.IGNORECASE)
 # Of times that are dates, ISO 8601 and its usual variants.
 _DATES = (
@@ -48,7 +50,7 @@ class NoRowsError(DataError):
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """A table as it stands in its file: columns of texts, of a Parquet file also of numbers.
+    """A table as it stands in its file: columns of numbers, and of texts where not all cells are numbers or blank.
 
     names: of the columns, numbers from 1 where there is no header. frame: the columns in their order. lines (rows,): of
     the file that a row came from. units: those of a row below the header. headed: the names come from a header.
@@ -74,7 +76,9 @@ class Table:
 
     def only(self, rows: NDArray[np.intp]) -> Table:
         """The table of some of the rows, by their indices."""
-        return replace(self, frame=self.frame[rows], lines=np.asarray(self.lines)[rows])
+        lines = self.lines[0] + rows if isinstance(self.lines, range) else np.asarray(self.lines)[rows]
+        at_once = len(rows) == 1 + rows[-1] - rows[0] if len(rows) else False
+        return replace(self, frame=self.frame[rows[0] : rows[-1] + 1] if at_once else self.frame[rows], lines=lines)
 
     def unit_of(self, name: str) -> str:
         """The unit that stands below a column's name; empty without one."""
@@ -193,9 +197,9 @@ def read_cells(
         way = f"; are there {above} lines above the rows? --set header_lines={above} (or pose_header_lines)"
         error = _ragged(file, rows[skipped], names, 0, int(lines[skipped]))
         raise DataError(f"{error}{way if begun > skipped else ''}")
-    frame = _frame(file, source, separator, skipped, names, lines)
+    frame = _frame(file, source, separator, skipped, rows, names, lines)
     if decimal_comma:
-        frame = frame.with_columns(pl.all().str.replace(",", ".", literal=True))
+        frame = frame.with_columns(pl.col(pl.String).str.replace(",", ".", literal=True))
     return Table(file, tuple(names), frame, lines[skipped : skipped + len(frame)], units, bool(header_lines))
 
 
@@ -221,26 +225,39 @@ def _source_of(file: Path, separator: str | None) -> tuple[Path | bytes, list[st
 
 
 def _frame(
-    file: Path, source: Path | bytes, separator: str, skipped: int, names: Sequence[str], lines: Lines
+    file: Path,
+    source: Path | bytes,
+    separator: str,
+    skipped: int,
+    first: Sequence[Sequence[str]],
+    names: Sequence[str],
+    lines: Lines,
 ) -> pl.DataFrame:
-    """The rows of a text below the header, as texts. DataError: it cannot be read, or a row has too many fields."""
+    """The rows of a text below the header. DataError: it cannot be read, or a row has too many fields.
+
+    first: the first rows, the header among them. Columns that hold numbers there are read as numbers, or, where they
+    hold a text further down, all as texts.
+    """
     reason: Exception | None = None
-    try:
-        frame = pl.read_csv(
-            BytesIO(source) if isinstance(source, bytes) else source,
-            has_header=False, separator=separator, skip_lines=skipped, infer_schema_length=0, glob=False,
-        )  # fmt: skip
-    except (pl.exceptions.PolarsError, OSError) as error:
-        reason = error
-    if reason or frame.width > len(names):
-        text = source.decode() if isinstance(source, bytes) else read_text(file)
-        for row, fields in enumerate(csv.reader(text.splitlines()[skipped:], delimiter=separator)):
-            if fields and len(fields) != len(names):
-                raise _ragged(file, fields, names, row, int(lines[skipped + row]))
-        raise DataError(f"{file}: cannot be read: {reason}")
-    # Columns whose fields are missing in all rows are blank.
-    blank = [pl.lit(None, pl.String).alias(f"blank {place}") for place in range(frame.width, len(names))]
-    return frame.with_columns(blank)
+    texts: list[type[pl.DataType]] = [pl.String] * len(names)
+    numbers = [
+        pl.Float64 if any(cells) and all(not cell or _NUMBER.fullmatch(cell) for cell in cells) else pl.String
+        for cells in zip(*(row for row in first[skipped:] if len(row) == len(names)), strict=True)
+    ]
+    for types in (numbers, texts):
+        try:
+            return pl.read_csv(
+                BytesIO(source) if isinstance(source, bytes) else source,
+                has_header=False, separator=separator, skip_lines=skipped, glob=False,
+                schema={str(place): kind for place, kind in enumerate(types)},
+            )  # fmt: skip
+        except (pl.exceptions.PolarsError, OSError) as error:
+            reason = error
+    text = source.decode() if isinstance(source, bytes) else read_text(file)
+    for row, fields in enumerate(csv.reader(text.splitlines()[skipped:], delimiter=separator)):
+        if fields and len(fields) != len(names):
+            raise _ragged(file, fields, names, row, int(lines[skipped + row]))
+    raise DataError(f"{file}: cannot be read: {reason}")
 
 
 def _ragged(file: Path, fields: Sequence[str], names: Sequence[str], row: int, line: int) -> DataError:

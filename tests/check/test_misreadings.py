@@ -14,7 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from omnibench.check.misreadings import Explained, Recorded, search
+from omnibench.check.source import recorded as read_as_recorded
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
+from omnibench.data.references import Reference, References
 from omnibench.robot.kinematics import Array
 from omnibench.simulate.source import simulate_dataset
 
@@ -97,6 +99,38 @@ def test_exchanged_wheels_come_with_the_way_back(robot: str) -> None:
     found = explained(recorded(robot), rates(lambda values: values[:, order]))
     changes = [mistake.changes for mistakes in (found.mistakes, *found.alike) for mistake in mistakes]
     assert {"wheel_order": order} in changes
+
+
+def positions_alone(run: Trajectory) -> Trajectory:
+    """A run of which only the positions of every second are known, to 5 mm, in a frame of their own."""
+    rng, rows = np.random.default_rng(len(run.times)), np.searchsorted(run.pose_times, np.arange(0, run.times[-1], 1.0))
+    seen = run.poses[rows, :2] + rng.normal(0, 0.005, (len(rows), 2))
+    fixes = [
+        Reference("position", tuple(each), 0.005, float(t)) for each, t in zip(seen, run.pose_times[rows], strict=True)
+    ]
+    references = References.of(fixes, end=float(run.times[-1]))
+    return replace(run, pose_times=np.zeros(1), poses=np.zeros((1, 3)), references=references)
+
+
+@pytest.mark.parametrize(
+    ("change", "robot"),
+    [
+        (change, robot)
+        for change in ("none", "one negated", "all times 4", "y mirrored")
+        for robot in NAMES
+        if (change, robot) != ("one negated", "car")  # the rates of both rear wheels make one signal
+    ],
+)
+def test_positions_without_headings_tell_a_misread_recording(change: str, robot: str) -> None:
+    made, kind = CHANGES.get(change, (lambda run: one(run, -1.0) if change == "one negated" else run, "wheel_negated"))
+    runs = [positions_alone(made(run)) for run in recorded(robot).trajectories]
+    found = search(read_as_recorded(replace(recorded(robot), trajectories=tuple(runs))))
+    kinds = {mistake.kind for mistakes in (found.mistakes, *found.alike) for mistake in mistakes}
+    if change == "none":
+        assert kinds == set()
+    else:
+        # One wheel that drives is every wheel.
+        assert {kind, kind.replace("wheel_", "wheels_")} & kinds
 
 
 @settings(max_examples=8, deadline=None)

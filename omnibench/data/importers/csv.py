@@ -8,7 +8,7 @@ value and standard deviation.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from itertools import pairwise
 from pathlib import Path
@@ -16,6 +16,7 @@ from shlex import quote
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
+import polars as pl
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from omnibench.config import as_yaml
@@ -368,13 +369,15 @@ def _likely(column: StreamColumn, names: Sequence[str], options: CsvOptions, bes
 class TableFiles:
     """The files of wheels and of poses of a recording; one file where they stand in the same rows.
 
-    references: that of distances, turns and the like, of this recording or of all; without poses there is one.
+    references: that of distances, turns and the like, of this recording or of all; without poses there is one. loaded:
+    the table of the wheels, where it is the only one and was read already.
     """
 
     name: str
     wheels: Path
     poses: Path | None
     references: Path | None = None
+    loaded: Table | None = field(default=None, repr=False)
 
 
 def find_tables(source: Path, options: CsvOptions, notes: list[str]) -> list[TableFiles]:
@@ -489,7 +492,8 @@ def _by_headers(
         if missing:
             without[file] = table, list(dict.fromkeys(missing))
         else:
-            fitting.append(TableFiles(name, file, file if posed else None, references))
+            alone = table if len(tables) == 1 else None
+            fitting.append(TableFiles(name, file, file if posed else None, references, alone))
     if not fitting and not without:
         raise DataError(f"{source}: none of its tables has rows ({_TEMPLATE})")
     if not fitting:
@@ -518,10 +522,12 @@ def by_run(table: Table, options: CsvOptions) -> Tables:
     column = run_column(options, table)
     if column is None:
         return {None: table}
-    names, first, order = np.unique(np.array(table.texts(column)), return_index=True, return_inverse=True)
-    if "" in names:
-        raise table.fail(int(first[0]), f"{column} is missing; name the run of every row")
-    return {str(names[run]): table.only(np.flatnonzero(order == run)) for run in np.argsort(first)}
+    names = pl.Series(table.texts(column))
+    rows = pl.DataFrame({"row": np.arange(len(names))}).group_by(names.alias("run"), maintain_order=True).agg("row")
+    of_runs = {run: of_run.to_numpy() for run, of_run in zip(rows["run"], rows["row"], strict=True)}
+    if "" in of_runs:
+        raise table.fail(int(of_runs[""][0]), f"{column} is missing; name the run of every row")
+    return {run: table.only(of_run) for run, of_run in of_runs.items()}
 
 
 def read_measured(table: Table) -> References:
@@ -649,7 +655,7 @@ def _recordings(
     measured: the references by their runs. ColumnError: columns of wheels or of poses are missing, all of which it
     names, or say another unit.
     """
-    shared, table = files.wheels == files.poses, load(files.wheels, options)
+    shared, table = files.wheels == files.poses, files.loaded or load(files.wheels, options)
     reference = files.poses or files.references or files.wheels
     tables = [(table, wheel_columns(options))]
     if files.poses is not None and files.poses.suffix != ".tum":
@@ -663,8 +669,8 @@ def _recordings(
     for table, columns in tables:
         names = {column.key: place for column in columns if (place := column.place(table))}
         check_units(table, names, options, shared=shared)
-    wheels, *others = [by_run(table, options) for table, _ in tables]
-    poses = others[0] if others else {}
+    wheels = by_run(tables[0][0], options)
+    poses = {} if len(tables) == 1 else wheels if shared else by_run(tables[1][0], options)
     runs = list(dict.fromkeys([*wheels, *poses]))
     if len(runs) > 1:
         runs = [run for run in runs if run is not None]
