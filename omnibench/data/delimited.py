@@ -22,6 +22,7 @@ BLANK = ("", "nan", "na", "n/a", "null", "none", "-")  # cells without a value, 
 DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+")
 _COMMAS = " (decimal commas? --set decimal=comma with --set separator)"
 _HEAD = 1 << 16  # characters in which the header and the first rows stand; chosen
+_FIRST = 30  # rows among which those of numbers begin; chosen
 _MOST_BYTES = 1 << 34  # of a table; chosen
 # Not with leading zeros, as in names of runs.
 _NUMBER = re.compile(r"\s*[-+]?(?:(?:0|[1-9]\d*)(?:\.\d*)?|\.\d+)(?:e[-+]?\d+)?\s*", re.IGNORECASE)
@@ -79,6 +80,13 @@ class Table:
         lines = self.lines[0] + rows if isinstance(self.lines, range) else np.asarray(self.lines)[rows]
         at_once = len(rows) == 1 + rows[-1] - rows[0] if len(rows) else False
         return replace(self, frame=self.frame[rows[0] : rows[-1] + 1] if at_once else self.frame[rows], lines=lines)
+
+    def lines_above(self) -> int:
+        """Number of the file's lines above its first row of numbers, where texts stand between it and the header."""
+        for row, cells in enumerate(self.frame.head(_FIRST).iter_rows()):
+            if 2 * sum(cell is not None and _is_float(str(cell)) for cell in cells) >= len(cells):
+                return int(self.lines[row]) - 1 if row else 0
+        return 0
 
     def unit_of(self, name: str) -> str:
         """The unit that stands below a column's name; empty without one."""
@@ -194,7 +202,7 @@ def read_cells(
     if len(rows[skipped]) != len(names):
         begun = next((row for row, cells in enumerate(rows) if 2 * sum(map(_is_float, cells)) >= len(cells) > 1), 0)
         above = int(lines[begun]) - 1
-        way = f"; are there {above} lines above the rows? --set header_lines={above} (or pose_header_lines)"
+        way = f"; are there {above} lines above the rows? --set header_lines={above}"
         error = _ragged(file, rows[skipped], names, 0, int(lines[skipped]))
         raise DataError(f"{error}{way if begun > skipped else ''}")
     frame = _frame(file, source, separator, skipped, rows, names, lines)
@@ -348,7 +356,9 @@ def _place(file: Path, name: str, names: Sequence[str]) -> int:
     if count == 0:
         raise missing_column(file, name, names)
     if count > 1:
-        raise ColumnError(f"{file}: column {name!r} is there {count} times; name each column once")
+        raise ColumnError(
+            f"{file}: column {name!r} is there {count} times; name each column once, or give its number, from 1"
+        )
     return names.index(name)
 
 

@@ -285,6 +285,7 @@ _KINDS = {
 }
 _STEERING = frozenset(("steer", "steering"))
 _SIDES = {"left": ("left", "l"), "right": ("right", "r"), "front": ("front", "f"), "rear": ("rear", "back", "b")}
+_MOTIVE = ("X", "Y", "Z", "W", "X", "Y", "Z")  # a rotation and a position, after the time
 _TURNS = frozenset(("orientation", "rotation", "quaternion", "quat", "q", "rot"))
 
 
@@ -298,7 +299,10 @@ def missing_error(table: Table, missing: Sequence[StreamColumn], options: CsvOpt
         )
     names = [f"'{column.names[0]}'" for column in missing]
     what = f"column {names[0]} is" if len(names) == 1 else f"columns {', '.join(names[:-1])} and {names[-1]} are"
-    if len(table.names) == 1:
+    if (above := table.lines_above()) > 0:
+        poses = {"x", "y", "theta"} & set(keys) and not any(column in missing for column in wheel_columns(options)[1:])
+        way = f"are there {above} lines above the rows? --set {'pose_' if poses else ''}header_lines={above}"
+    elif len(table.names) == 1:
         way = "name what separates the fields: --set separator=blanks (or another character)"
     else:
         way = _way_out(table, missing, options)
@@ -308,6 +312,13 @@ def missing_error(table: Table, missing: Sequence[StreamColumn], options: CsvOpt
 def _way_out(table: Table, missing: Sequence[StreamColumn], options: CsvOptions) -> str:
     """What to type to name the columns that are missing: by what looks like them, or by an example."""
     wheels, poses = wheel_columns(options), pose_columns(options, table, shared=False)
+    if joints := _joints_in(table, [column for column in wheels if column in missing]):
+        return joints
+    for first in range(len(table.names)):
+        if table.names[first : first + len(_MOTIVE)] == _MOTIVE and any(column.key == "theta" for column in missing):
+            numbers = dict(zip((*QUATERNION, "x", "y", "z"), range(first + 1, first + 1 + len(_MOTIVE)), strict=True))
+            shown = ", ".join(f"{key}: {number}" for key, number in ({"pose_t": first} | numbers).items() if key != "y")
+            return f'a rigid body of OptiTrack Motive? --set "columns={{{shown}}}" --set up=y'
     used = {column.place(table) for column in (*wheels, *poses)}
     turns = [name for name in table.names if not _TURNS.isdisjoint(words_of(name)) and words_of(name)[-1] in "xyzw"]
     turns.sort(key=lambda name: "xyzw".index(words_of(name)[-1]))
@@ -333,6 +344,24 @@ def _way_out(table: Table, missing: Sequence[StreamColumn], options: CsvOptions)
     if any(key not in taken for key in keys):
         return f'name {"it" if len(keys) == 1 else "them"}: --set "columns={{{shown}}}"{typed}'
     return f'did you mean --set "columns={{{shown}}}"{typed}?'
+
+
+def _joints_in(table: Table, missing: Sequence[StreamColumn]) -> str:
+    """What to type for joints that columns name in every row, as ``rostopic echo -p`` prints a JointState."""
+    named = {f"name{n}": {*table.texts(name)} for name in table.names if (n := name.partition(".name")[2]).isdecimal()}
+    taken: dict[str, str] = {}
+    for column in missing:
+        wheel = set(words_of(column.key.split("_", 1)[-1]))
+        held = [name for name, texts in named.items() if len(texts) == 1 and wheel <= set(words_of(*texts))]
+        places = [name for name in table.names if held and name.endswith(f".position{held[0].removeprefix('name')}")]
+        if len(held) == 1 and places:
+            taken[column.key] = places[0]
+    if "%time" in table.names and any(column.key == "t" for column in missing):
+        taken["t"] = "%time"
+    if not taken or len(taken) < len(missing):
+        return ""
+    shown = ", ".join(f"{key}: {_typed(name)}" for key, name in taken.items())
+    return f'did you mean --set "columns={{{shown}}}" --set wheel_unit=rad --set wheel_time_unit=ns?'
 
 
 def _typed(name: str) -> str:
@@ -434,12 +463,13 @@ def load(file: Path, options: CsvOptions, *, poses: bool = False) -> Table:
     """The table of a file as the options say it is written. poses: it holds the poses alone."""
     other = options.pose_header_lines if poses else None
     lines = options.header_lines if other is None else other
-    table = read_cells(
-        file,
-        separator=None if options.separator == BLANKS else options.separator or AUTO,
-        header_lines=lines,
-        decimal_comma=options.decimal == "comma",
-    )
+    separator = None if options.separator == BLANKS else options.separator or AUTO
+    try:
+        table = read_cells(file, separator=separator, header_lines=lines, decimal_comma=options.decimal == "comma")
+    except DataError as error:
+        if not poses or "--set header_lines" not in str(error):
+            raise
+        raise DataError(str(error).replace("--set header_lines", "--set pose_header_lines")) from None
     if lines or file.suffix == ".parquet":
         return table
     # A table without a header that has exactly the columns that are wanted of one of its streams gets their names.

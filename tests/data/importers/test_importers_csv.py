@@ -197,6 +197,32 @@ def test_a_malformed_row_is_named(tmp_path: Path, file: str, old: str | None, ne
         read(tmp_path)
 
 
+ROSTOPIC = "%time,field.name0,field.name1,field.position0,field.position1\n" + "".join(
+    f"{n}00000000,wheel_right_joint,wheel_left_joint,{n}.5,{n}\n" for n in range(1, 9)
+)
+MOTIVE = (
+    "Format Version,1.23,Take Name,take,Rotation Type,Quaternion,a,b,c\n\n,,bot,bot,bot,bot,bot,bot,bot\n"
+    "Frame,Time,X,Y,Z,W,X,Y,Z\n" + "".join(f"{n},0.{n},0,0,0,1,{n},5,0\n" for n in range(1, 9))
+)
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "message"),
+    [
+        ("wheels", ROSTOPIC, "omega_left: field.position1, omega_right: field.position0, t: '%time'}"),
+        ("poses", MOTIVE, "are there 4 lines above the rows[?] --set pose_header_lines=4"),
+        ("poses", MOTIVE.split("\n", 3)[3], "columns={pose_t: 2, qx: 3, qy: 4, qz: 5, qw: 6, x: 7, z: 9}.* --set up=y"),
+    ],
+)
+def test_tables_that_other_programs_write_are_told_how_to_be_read(
+    tmp_path: Path, file: str, text: str, message: str
+) -> None:
+    write_exact(tmp_path)
+    (tmp_path / f"run1_{file}.csv").write_text(text)
+    with refused(DataError, match=message):
+        read(tmp_path)
+
+
 def test_wheels_without_poses_and_poses_without_wheels_are_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"no tables below it; .* import csv --template DIR"):
         read(tmp_path)
