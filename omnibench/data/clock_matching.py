@@ -17,7 +17,8 @@ A (M + 1) being the integrals of the design's speed and of the signals' magnitud
 so that a wrong matrix, swapped wheels, other units and a mirrored reference do not matter: shapes are matched, not
 values. They are common to all runs that are given: a run that drives one command alone may hide its clock in them.
 
-Eq. (2) and (3) are solved by Gauss-Newton with Huber's weights. Standard errors are of the sandwich kind, of scores
+Eq. (2) and (3) are solved by Gauss-Newton with Huber's weights; a step that does not lower Huber's loss is halved, as
+without that clocks that hardly show step to and fro for ever. Standard errors are of the sandwich kind, of scores
 that are summed over blocks, as slip lasts.
 """
 
@@ -40,7 +41,7 @@ _COARSE = 0.1  # s between the offsets that are tried first, a tenth of the wind
 _MOST_BINS = 40_000  # offsets times bins that are looked at together; chosen: some MB
 _HUBER = 1.5  # standard deviations from which on a residual counts less
 ROUNDS = 30  # at most so many alternations of the fit of h and s with that of the clocks; chosen
-_STEPS = 4  # at most so many Gauss-Newton steps of a clock in each round; chosen
+_STEPS, _HALVINGS = 4, 4  # at most so many Gauss-Newton steps of a clock in each round, and halvings of each; chosen
 _SETTLED = 1e-4  # s: steps of the clocks that are shorter change nothing; below _CHORDS
 _FEWEST = 10  # windows of a run, below which its clock is not told; chosen
 _LEAST_DRIFTING = 10.0  # s: the drift of a shorter run is not told apart from its offset; chosen
@@ -246,16 +247,18 @@ class Windows:
         shares[within.sum(axis=1) < max(_FEWEST, within.shape[1] / 2)] = np.inf
         return shares
 
-    def _system(self, fitted: Sequence[Array], clock: Clock) -> tuple[Array, Array, Array]:
-        """Residuals (2, W) in their standard deviations, Huber's weights, and derivatives (P, 2, W) of what is shown.
+    def _system(
+        self, fitted: Sequence[Array], clock: Clock, deviations: Array | None = None
+    ) -> tuple[Array, Array, Array]:
+        """Residuals (2, W) in standard deviations (2,), Huber's weights, and derivatives (P, 2, W) of what is shown.
 
-        These are by the gains of both channels in this run, since slip makes every window longer, and a drift does,
-        too; by the offset; and, of a run that is long enough, by the drift, which the moments tell at which the motion
-        changes.
+        deviations: by default those of what is left. The derivatives are by the gains of both channels in this run,
+        since slip makes every window longer, and a drift does, too; by the offset; and, of a run that is long enough,
+        by the drift, which the moments tell at which the motion changes.
         """
         before, now, after = self.columns(clock, np.array([-_DELTA, 0.0, _DELTA]))
         left = self._left(fitted, now)
-        deviations = self._deviations(left, clock)[:, None]
+        deviations = (self._deviations(left, clock) if deviations is None else deviations)[:, None]
         residuals = left / deviations
         weights = np.minimum(1.0, _HUBER / np.maximum(np.abs(residuals), 1e-12)) * self.within(clock)
         weights[: int(self.steers)] = 0.0
@@ -281,17 +284,35 @@ class Windows:
         return least if not sizes.size else np.maximum(1.4826 * np.median(sizes, axis=1), least)
 
     def improved(self, fitted: Sequence[Array], clock: Clock, steps: int = _STEPS) -> Clock:
-        """The clock after some steps of Gauss-Newton."""
+        """The clock after some steps of Gauss-Newton, which are halved until the run fits better."""
+        deviations = self._deviations(self._left(fitted, self.columns(clock, np.zeros(1))[0]), clock)
         for _ in range(steps):
-            residuals, weights, derivatives = self._system(fitted, clock)
+            residuals, weights, derivatives = self._system(fitted, clock, deviations)
             design = derivatives.reshape(len(derivatives), -1)
             normal, wanted = (design * weights.ravel()) @ design.T, design @ (weights * residuals).ravel()
             offset, drift = [*np.linalg.lstsq(normal, wanted)[0][2:].tolist(), 0.0][:2]
-            limited = float(np.clip(clock[1] + drift, -_LARGEST_DRIFT, _LARGEST_DRIFT))
-            clock = clock[0] + float(np.clip(offset, -0.2, 0.2)), limited
+            offset = float(np.clip(offset, -0.2, 0.2))
+            for _ in range(_HALVINGS):
+                limited = float(np.clip(clock[1] + drift, -_LARGEST_DRIFT, _LARGEST_DRIFT))
+                tried = clock[0] + offset, limited
+                both = self.within(clock) & self.within(tried)
+                if self._cost(fitted, tried, deviations, both) < self._cost(fitted, clock, deviations, both):
+                    break
+                offset, drift = offset / 2, drift / 2
+            else:
+                return clock
+            clock = tried
             if self.farthest_step(offset, drift) < _SETTLED / 10:
                 break
         return clock
+
+    def _cost(self, fitted: Sequence[Array], clock: Clock, deviations: Array, counted: NDArray[np.bool_]) -> float:
+        """Huber's loss of the windows (W,) that count by a clock, with gains of both channels that fit this run."""
+        explained = self._explained(fitted, self.columns(clock, np.zeros(1))[0]) / deviations[:, None]
+        left = self.shown / deviations[:, None] - explained
+        weights = np.minimum(1.0, _HUBER / np.maximum(np.abs(left), 1e-12)) * counted
+        gains = (weights * left * explained).sum(axis=1) / np.maximum((weights * explained**2).sum(axis=1), 1e-300)
+        return float(_huber(left - gains[:, None] * explained)[int(self.steers) :, counted].sum())
 
     def _told(self, fitted: Sequence[Array], clock: Clock) -> bool:
         """True if other offsets fit clearly worse."""

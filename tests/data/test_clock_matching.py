@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sample_robots import APR_02, fixed, make_robot
 
+import omnibench
 from omnibench.data.clock_matching import ClockMatch, Streams, align, match_clocks, median_period
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset, unwrap
 from omnibench.robot.kinematics import Array, wheel_equations
@@ -60,6 +62,17 @@ def test_chords_in_place_of_arcs_count_in_the_error_that_is_stated() -> None:
     clocks = [matched(streams(seed, heading_noise=1e-9, position_noise=1e-9))[0] for seed in range(4)]
     assert np.abs([errors(clock) for clock in clocks]).max() < 3
     assert all(2e-4 <= clock.middle_error < 4e-4 for clock in clocks)
+
+
+def test_clocks_do_not_hang_on_the_rounding_of_the_wheels() -> None:
+    log = Path(omnibench.__file__).parent / "cli/samples/robot/log"
+    data = omnibench.import_dataset("csv", log, {"wheel_unit": "ticks/sample", "ticks_per_turn": 2796.8})
+    runs, rng = [Streams.of_run(run) for run in data.trajectories], np.random.default_rng(1)
+    rounded = [replace(run, driven=run.driven * (1 + 1e-14 * rng.normal(size=run.driven.shape))) for run in runs]
+    clocks, again = (match_clocks(data.robot, each) for each in (runs, rounded))
+    assert [clock is None for clock in clocks] == [clock is None for clock in again]
+    for clock, other in zip(filter(None, clocks), filter(None, again), strict=True):
+        assert (other.offset, other.drift) == pytest.approx((clock.offset, clock.drift), abs=1e-6)
 
 
 def errors(clock: ClockMatch, offset: float = OFFSET, drift: float = DRIFT) -> Array:
