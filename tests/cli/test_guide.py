@@ -11,7 +11,7 @@ import numpy as np
 import polars as pl
 import pytest
 import yaml
-from commands import CONFIGS, ROOT, Command, Prepared, assert_refused, succeeded
+from commands import CONFIGS, ROOT, Command, Prepared, assert_refused, run_here, succeeded
 from newcomer import ELSEWHERE, lines_of, typed_here
 from newcomer import PAGES as TYPED_PAGES
 from pydantic import TypeAdapter
@@ -90,6 +90,11 @@ def test_a_command_that_is_shown_can_be_typed(typed: str) -> None:
 def reader(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of somebody who has typed the README without its comparison."""
     return typed_here(ROOT / "README.md", tmp_path_factory.mktemp("reader"))
+
+
+def test_the_readme_shows_what_its_commands_say(reader: Path) -> None:
+    (shown,) = re.findall(r"^    (held out .*)$", (ROOT / "README.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert shown in run_here("evaluate", "calibration.yaml", "data/robot", cwd=reader).stdout
 
 
 @pytest.mark.parametrize("name", ["faq", "importing", "references", "ros2"])
