@@ -182,10 +182,10 @@ def _counted(
             notes.append(f"{place}: {plural(count, 'reading')} {repeats} while the wheels turn left out")
     if quantity == "positions" and options.wraps_at != "never":
         rows = np.flatnonzero(used)
-        jumping = [jumping_readings(column, readings.times[rows]) for column in values[rows].T]
-        used[rows[np.any(jumping, axis=0)]] = False
-        if count := int(np.sum(jumping)):
-            jump = f"{plural(count, 'reading')} of wheel positions that jump and return left out"
+        jumping = jumping_readings(values[rows], readings.times[rows])
+        used[rows[jumping.any(axis=1)]] = False
+        if count := int(jumping.sum()):
+            jump = f"{plural(count, 'single reading')} of wheel positions that jump and return left out"
             notes.append(FindingWarning.of_restart(f"{place}: {jump}"))
     if not recording.a_run and (held := held_readings(values[used])).any():
         used[np.flatnonzero(used)[held]] = False

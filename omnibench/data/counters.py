@@ -24,9 +24,9 @@ _AROUND = 1.0  # s before and after
 _KEPT, _LOST = 0.4, 0.6  # of the register's range: that other steps may be off, and that a lost turn is at least
 _RARE, _NEARLY_ALL = 0.01, 0.95  # shares of the steps
 _ROUNDS = 3  # a lost turn beside another hides it at first
-# A reading that jumps and returns: deviations of usual readings, of the longest usual steps, and ticks that it is off
-# the line between its neighbours at least (chosen).
-_DEVIATIONS, _TICKS, _MIRRORED = 8.0, 3.0, 0.25
+# A reading that jumps and returns is off the line between its neighbours by more than the longest usual step, and by
+# so many standard deviations of usual readings, and ticks, at least (chosen).
+_DEVIATIONS, _TICKS = 8.0, 3.0
 _FEWEST = 5  # readings, of fewer it is not told what is usual
 _FEWEST_TICKS, _USUAL = 10, 2.0  # ticks of a step that is not slow; periods, a longer one without a step is a rest
 
@@ -98,18 +98,29 @@ def counted_on(counts: Array, wrap: float) -> Array:
 
 
 def jumping_readings(counts: Array, times: Array) -> NDArray[np.bool_]:
-    """True (F,) for single readings that jump off the line between their neighbours, which lie on one."""
-    jumping, steps = np.zeros(len(counts), dtype=bool), np.abs(np.diff(counts))
+    """True (F, N) for lone readings of counts (F, N), one or two in a row, that jump off the line about them.
+
+    The line between the readings before and after is as steep as the wheel's usual steps, so that a counter which was
+    set anew, and stays there, does not count. A wheel that stands has the ticks of the others.
+    """
+    jumping, steps = np.zeros(counts.shape, dtype=bool), np.abs(np.diff(counts, axis=0))
     if len(counts) < _FEWEST or not steps.any():
         return jumping
-    share = (times[1:-1] - times[:-2]) / (times[2:] - times[:-2])
-    off = counts[1:-1] - (counts[:-2] + share * (counts[2:] - counts[:-2]))  # (F - 2,)
-    moved = steps[steps > 0]
-    usual = _DEVIATIONS * 1.4826 * float(np.median(np.abs(off)))
-    tick = float(np.median(moved[moved <= 2 * moved.min()]))
-    least = max(usual, float(np.quantile(steps, _NEARLY_ALL)), _TICKS * tick)
-    beside = np.minimum(-np.sign(off[1:-1]) * off[:-2], -np.sign(off[1:-1]) * off[2:])
-    jumping[2:-2] = (np.abs(off[1:-1]) > least) & (beside > _MIRRORED * np.abs(off[1:-1]))
+    tick = min(float(np.median(moved[moved <= 2 * moved.min()])) for wheel in steps.T if len(moved := wheel[wheel > 0]))
+    longest = np.quantile(steps, _NEARLY_ALL, axis=0)  # (N,)
+    for lone in (1, 2):
+        spans = times[lone + 1 :] - times[: -lone - 1]
+        across = counts[lone + 1 :] - counts[: -lone - 1]  # (F - lone - 1, N)
+        off = []
+        for row in range(1, lone + 1):
+            share = (times[row : row + len(spans)] - times[: len(spans)]) / spans
+            off.append(np.abs(counts[row : row + len(spans)] - counts[: len(spans)] - share[:, None] * across))
+        usual = _DEVIATIONS * 1.4826 * np.median(off[0], axis=0)
+        least = np.maximum(np.maximum(usual, longest), _TICKS * tick)
+        even = np.abs(across) <= (lone + 1) * (_LONGER * longest + tick)
+        apart = even & (np.min(off, axis=0) > least)
+        for row in range(1, lone + 1):
+            jumping[row : row + len(spans)] |= apart
     return jumping
 
 

@@ -281,9 +281,22 @@ class ReferenceFit:
         """Lower triangular roots (k, k) of the covariance of each run, Eq. (1)."""
         position, heading = self.walk.position**2, self.walk.heading**2
         return [
-            np.linalg.cholesky(np.diag(np.square(sigmas)) + position * lengths + heading * angles)
+            covariance_root(np.diag(np.square(sigmas)) + position * lengths + heading * angles)
             for sigmas, (lengths, angles) in zip(self._sigmas, self.wander, strict=True)
         ]
+
+
+def covariance_root(covariances: Array) -> Array:
+    """Lower triangular roots L (..., k, k) of covariances C = LL' that may be singular to rounding.
+
+    A long walk beside exact references leaves the smallest eigenvalues of C below the rounding of its elements. With
+    2 k eps of its diagonal added, which is as much as that rounding, the root exists: scaled to a diagonal of ones, no
+    eigenvalue is then below k eps (Higham, Accuracy and Stability of Numerical Algorithms, theorem 10.7).
+    """
+    size = covariances.shape[-1]
+    diagonals = np.diagonal(covariances, axis1=-2, axis2=-1)
+    rounding: Array = 2 * size * np.finfo(float).eps * diagonals[..., None] * np.eye(size)
+    return np.asarray(np.linalg.cholesky(covariances + rounding))
 
 
 def _without(values: Array, count: int) -> Array:
@@ -360,7 +373,7 @@ class _Group:
     def whitened(self, walk: Walk) -> tuple[Array, Array, Array]:
         """Values (G, k, ...) whitened under a walk, starts among them, ln |C| (G,), and roots (G, k, k) of C."""
         shared = walk.position**2 * self.lengths + walk.heading**2 * self.angles
-        roots = np.linalg.cholesky(self.variances[..., None] * np.eye(self.variances.shape[1]) + shared)
+        roots = covariance_root(self.variances[..., None] * np.eye(self.variances.shape[1]) + shared)
         logarithms = 2 * np.log(np.diagonal(roots, axis1=1, axis2=2)).sum(axis=1)
         return np.linalg.solve(roots, self.values), logarithms, roots
 

@@ -26,7 +26,7 @@ from omnibench.fit.evaluate import ModelErrors, evaluate, final_errors, judge, v
 from omnibench.fit.inspect import inspect_dataset
 from omnibench.fit.motion_windows import MotionWindows, motions_in_windows
 from omnibench.fit.problem import Budget
-from omnibench.fit.reference_fit import ReferenceFit
+from omnibench.fit.reference_fit import ReferenceFit, covariance_root
 from omnibench.fit.reference_rows import ReferenceBatch, reference_rows
 from omnibench.robot.calibration import Calibration, EffectTerm, HeldOutVerdict, matrix_rows
 from omnibench.robot.kinematics import Array, Robot
@@ -543,6 +543,17 @@ def test_a_compass_has_its_weight_beside_positions_that_tell_no_heading_of_the_s
     moments = np.arange(1, 9) + later
     turned = (0.3 / APR_02.inverse_kinematic_matrix[2].sum()) * (moments - moments.mean())
     assert information == pytest.approx(6 * np.square(turned).sum() / 0.05**2, rel=0.02)
+
+
+def test_references_nearly_without_noise_have_a_root_beside_a_long_walk() -> None:
+    steps = np.minimum.outer(np.arange(1.0, 121.0), np.arange(1.0, 121.0))  # of a random walk, which has 120 steps
+    walk = np.kron(np.ones((4, 4)), steps)  # and is seen four times at each
+    covariances = np.array([1e-18 * np.eye(480) + share * walk for share in (1e-12, 1.0, 1e6)])
+    with pytest.raises(np.linalg.LinAlgError):
+        np.linalg.cholesky(covariances)
+    roots = covariance_root(covariances)
+    for root, covariance in zip(roots, covariances, strict=True):
+        np.testing.assert_allclose(root @ root.T, covariance, rtol=1e-11)
 
 
 RADIUS, TURN = 2.0, 0.5  # m, rad/s

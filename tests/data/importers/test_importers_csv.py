@@ -558,6 +558,22 @@ def test_a_counter_that_is_set_to_zero_ends_a_run(tmp_path: Path) -> None:
     assert "counter_restart" in {finding.kind for finding in findings_of(data.warnings)}
 
 
+@pytest.mark.parametrize(("left", "right"), [([40], [40]), ([40, 90], [60, 61])])
+def test_single_readings_of_0_are_left_out_and_said_also_of_a_wheel_that_stands(
+    tmp_path: Path, left: list[int], right: list[int]
+) -> None:
+    times = np.arange(0.0, 8.0, 0.05)
+    drives, stands = 5000 + np.floor(1000 * times), np.full(len(times), 5683.0)
+    drives[left], stands[right] = 0.0, 0.0
+    poses = dict.fromkeys(("x", "y", "theta"), 0 * times)
+    write_table(tmp_path / "log.csv", {"t": times, "phi_left": drives, "phi_right": stands, **poses})
+    data = read(tmp_path / "log.csv", wheel_unit="ticks", ticks_per_turn=1440)
+    assert ids(data) == ["log"]
+    count = len(left) + len(right)
+    assert f"{count} single readings of wheel positions that jump and return left out" in str(data.warnings)
+    assert data.trajectories[0].rates[:, 1].tolist() == [0.0] * (len(times) - len({*left, *right}) - 1)
+
+
 def test_rows_that_repeat_a_time_or_the_wheels_while_they_turned_are_left_out_and_said(tmp_path: Path) -> None:
     twice = np.sort(np.append(np.arange(401), [7, 7, 50]))
     data = read_log(log(tmp_path, twice))
