@@ -12,13 +12,14 @@ import numpy as np
 from xxhash import xxh3_64_intdigest
 
 from omnibench.check.evidence import Evidence
-from omnibench.check.hypotheses import wheels_in_words
+from omnibench.check.hypotheses import another_zero, wheels_in_words
 from omnibench.check.streams import SAME, looks_of, pose_period
 from omnibench.data.dataset import Trajectory
 from omnibench.data.finding import Finding, Kind, Severity, error, findings_of
 from omnibench.data.importers.copied_reference import follows_the_wheels
 from omnibench.data.jumps import reference_jumps
 from omnibench.data.stored import count_drawn, drawn_runs, median_period
+from omnibench.robot.kinematics import CarDrive
 from omnibench.robot.model import OdometryModel
 from omnibench.words import plural, some
 
@@ -35,6 +36,9 @@ _HARDLY, _BOTH, _ALIKE = 0.005, 0.08, 0.9
 # Steps over which the reference turns that are needed, and spread of the turns, rad, that one angle cannot give: that
 # of circles seven times as wide as the robot is long and of straight lines; chosen.
 _FEWEST, _BENDS = 5, 0.3
+# Zeros of a car's steering that are reported, rad and standard errors (chosen: simulated cars without one are below);
+# beyond the most the angle is no small one, and another mistake.
+_LEAST_ZERO, _ZERO_ERRORS, _MOST_ZERO = math.radians(1.0), 5.0, math.radians(15.0)
 # A clock is reported that is off by at least so many s and so many standard errors (chosen: simulated runs, whose
 # clocks are right, are below); from _SPOILS, s, on it spoils a fit.
 _LEAST_OFF, _ERRORS, _SPOILS = 0.05, 4.0, 0.15
@@ -186,6 +190,18 @@ def _frozen_steering(evidence: Evidence) -> Iterator[Finding]:
             fix = f"read the column or topic that holds the angle of wheel {name} (steering_columns; of bags "
             fix += "steering_joints or steering_topic), or record it, and import again"
             yield error("steering_frozen", what, f"steering of wheel {name}", fix=fix)
+
+
+def steering_zero(evidence: Evidence) -> Iterator[Finding]:
+    """A car's steering that is not straight ahead at 0, which no inverse kinematic matrix can hold."""
+    robot, windows = evidence.dataset.robot, evidence.windows
+    if not isinstance(robot.drive, CarDrive) or windows is None or not windows.driven[:, 1].any():
+        return
+    zero, deviation = windows.steering_zero()
+    if abs(zero) > max(_LEAST_ZERO, _ZERO_ERRORS * deviation) and abs(zero) < _MOST_ZERO:
+        finding = another_zero(robot, np.ones(len(robot.drive.steered)), round(math.degrees(zero), 1))
+        what = f"{finding.what} (or leave the recording as it is, and fit the zero: calibrate --steering fit)"
+        yield finding.model_copy(update={"what": what, "severity": "warning"})
 
 
 def _unsigned_counts(evidence: Evidence) -> Iterator[Finding]:

@@ -1,7 +1,8 @@
 """Mistakes by which what was recorded differs from what was meant, in the log or in the robot's file.
 
-A hypothesis that is linear in the drive signals or in the reference's twist transforms a fitted matrix; one about the
-robot's file has another design; one about steering angles has logs of its own, and a fit.
+A hypothesis says what a mistake does to the rates and steering angles, to the reference's twist or to the design, and
+which option mends it. What is linear in the drive signals transforms a fitted matrix; any other reading of the wheels
+has logs of its own, and a fit.
 """
 
 from __future__ import annotations
@@ -42,17 +43,19 @@ _CAUSES = {
     math.sqrt(2): ", as where a side is given for a diagonal",
     math.sqrt(0.5): ", as where a diagonal is given for a side",
 }
-_NEAR_CAUSE = 0.08
-_LEAST_MOUNT, _MOST_MOUNT = 0.15, 10.0  # of the robot's size: a nearer tracked point is for a calibration; chosen
+_NEAR_CAUSE = 0.08  # share by which a factor may differ from that of a usual cause; chosen
+# A tracked point is a mistake of the file from this distance to that, in sizes of the robot (chosen): a calibration
+# finds what is nearer, and what is farther is no point of the robot.
+_NEAREST_MOUNT, _FARTHEST_MOUNT = 0.15, 10.0
 _LEAST_TURNED = math.radians(7.5)  # a smaller turn of the reference is what a calibration is for; chosen
-# Steering angles: zeros that are tried of driven wheels, degrees; the least zero, degrees, and factor that are told
-# (OptiOdom's tricycle is 1 degree off); how near a factor must be to that of degrees, or to -1; chosen.
-_LEAST_ZERO, _ZERO_STEP, _LEAST_GEAR, _ALIKE = 4.0, 2.0, 1.6, 1.25
+# Zeros of driven steered wheels that are tried, and the least one that is a mistake, degrees; the least factor that is
+# one; and how near a factor must be to that of degrees, or to -1 (chosen: OptiOdom's tricycle is 1 degree off).
+_ZERO_STEP, _LEAST_ZERO, _LEAST_GEAR, _ALIKE = 2.0, 4.0, 1.6, 1.25
 _LAGS = tuple(np.arange(0.0, 0.41, 0.05).tolist())  # s by which wheels may follow a commanded steering angle
-_LAGGING = 0.9  # share of what is unexplained without a lag, below which one is told; chosen
+_LAGGING = 0.9  # share of the cost without a lag, below which a lag is a mistake of its own; chosen
 _STEERING_WINDOW = 0.4  # s: short beside the changes of a steering angle; chosen
 _GENTLE = 1.0  # m/s2 of lateral acceleration, up to which tyres hardly slip; chosen
-_STEERING_SAMPLES = 5_000  # of the runs by which steering angles are fitted; chosen
+_STEERING_SAMPLES = 5_000  # wheel samples, of evenly chosen runs, that scale, zero and lag are fitted to; chosen
 _GEARS_OF_STEERING = tuple(1.25**power for power in (*range(-34, -1), *range(2, 15)))
 DEGREE = math.pi / 180
 _REFERENCED = "the reference"
@@ -61,17 +64,18 @@ IN_DEGREES = error("heading_unit", "theta looks like degrees; it must be rad", _
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """The steering angles (F, S) and rates (F, N) that were meant, of those recorded.
+    """The rates (F, N) and steering angles (F, S) that were meant, of those recorded.
 
-    order, factors, offsets, lag: of the steering angles; offsets in rad, lag in s. rate_order, rate_factors: of rates.
+    rate_order, rate_factors: of the rates. order, factors, offsets, lag: of the steering angles; offsets in rad, lag in
+    s. An empty order is the recorded one.
     """
 
-    order: tuple[int, ...] = ()
+    rate_order: Sequence[int] = ()
+    rate_factors: Array | Sequence[float] | float = 1.0
+    order: Sequence[int] = ()
     factors: Array | float = 1.0
     offsets: Array | float = 0.0
     lag: float = 0.0
-    rate_order: tuple[int, ...] = ()
-    rate_factors: Array | float = 1.0
 
     def of(self, log: WheelLog) -> WheelLog:
         """The log as it was meant."""
@@ -81,7 +85,30 @@ class Reading:
             if self.lag:
                 ordered = interpolated(log.times - self.lag, log.times, ordered)
             steering = ordered * self.factors + self.offsets
-        return replace(log, steering=steering, rates=rates * self.rate_factors)
+        return replace(log, steering=steering, rates=rates * np.asarray(self.rate_factors))
+
+    def columns(self, drive: Drive) -> Array | None:
+        """The matrix (M, M) from the drive signals that were meant to those recorded; None if they are not linear."""
+        wheels, angles, signals = len(drive.wheels), len(drive.steered), len(drive.names)
+        rate_order, order = self.rate_order or range(wheels), self.order or range(angles)
+        rate_factors = np.broadcast_to(self.rate_factors, wheels)
+        factors, offsets = np.broadcast_to(self.factors, angles), np.broadcast_to(self.offsets, angles)
+        if isinstance(drive, CarDrive):  # its signals mix the rates of all wheels
+            alike = not self.order and np.ptp(rate_factors) == 0
+            return np.eye(signals) / rate_factors[0] if alike else None
+        if self.lag or (np.abs(factors) != 1).any():
+            return None
+        begins = np.cumsum([0, *(1 if pair < 0 else 2 for pair in drive.pairs)])
+        columns = np.zeros((signals, signals))
+        for wheel, (column, pair) in enumerate(zip(rate_order, drive.pairs, strict=True)):
+            if drive.pairs[column] != (pair if pair < 0 else order[pair]):
+                return None  # the rate of one wheel, and the angle of another
+            block = np.ones((1, 1))
+            if pair >= 0:  # recorded (cos, sin) of sign x (phi - offset)
+                block = np.diag([1.0, factors[pair]]) @ rotation(-float(offsets[pair]))[:2, :2]
+            columns[begins[column] : begins[column + 1], begins[wheel] : begins[wheel + 1]] = block
+            columns[:, begins[wheel] : begins[wheel + 1]] /= rate_factors[wheel]
+        return columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +117,7 @@ class Hypothesis:
 
     rows (3, 3): from the reference's twist as recorded to the one meant. columns (M, M): from the signals that are
     meant to those recorded. cost: of the mistakes, in units of d^2. robot: the design that was meant, if another.
-    reading: steering angles and rates that were meant, for which the matrix is fitted anew.
+    reading: steering angles and rates that were meant, where the matrix must be fitted anew.
     """
 
     rows: Array
@@ -111,34 +138,53 @@ def plain_hypothesis(robot: Robot) -> Hypothesis:
 
 
 def wheel_hypotheses(robot: Robot) -> Iterator[Hypothesis]:
-    """Wheels that are exchanged, negated, or scaled; the first hypothesis is none of these."""
-    drive, names, plain = robot.drive, robot.wheel_names, plain_hypothesis(robot)
-    yield plain
+    """Rates and steering angles that are exchanged, negated, scaled or from another zero; the first is no mistake."""
+    yield (plain := plain_hypothesis(robot))
+    for reading, cost, mistake in _misread_wheels(robot):
+        if (columns := reading.columns(robot.drive)) is not None:
+            yield replace(plain, columns=columns, cost=cost, mistakes=(mistake,))
+        elif cost <= _WHEEL:  # each is a fit
+            yield replace(plain, cost=cost, mistakes=(mistake,), reading=reading)
+
+
+def _misread_wheels(robot: Robot) -> Iterator[tuple[Reading, float, Finding]]:
+    """What was meant, the cost of the mistake, and the finding that mends it."""
+    drive, names = robot.drive, robot.wheel_names
     for order, signs in _arrangements(len(names), orders=drive.direct):
-        moved, negative = sum(wheel != column for column, wheel in enumerate(order)), sum(sign < 0 for sign in signs)
+        moved, negative = sum(wheel != column for wheel, column in enumerate(order)), sum(sign < 0 for sign in signs)
         cost = _WHEEL * (moved / 2 + (1 if negative == len(signs) else negative))
-        if drive.direct:
-            columns = np.zeros((len(names), len(names)))
-            columns[np.arange(len(names)), list(order)] = signs  # recorded column = sign x rate of wheel
-        elif (factors := _signal_factors(robot, np.array(signs, dtype=float))) is not None:
-            columns = np.diag(factors)
-        else:
-            continue
-        yield replace(plain, columns=columns, cost=cost, mistakes=(_arrangement(names, order, signs),))
+        yield Reading(order, signs), cost, _arrangement(names, order, signs)
     for unit, factor in RATE_UNITS.items():
         words = f"wheel rates look like {'turns a second' if unit == 'rev/s' else unit}; omega_* must be rad/s"
-        wrong = error("wheel_unit", words, "all wheels", {"wheel_unit": unit})
-        yield replace(plain, columns=factor * plain.columns, cost=_WHEEL, mistakes=(wrong,))
-    # Counts of one wheel or of all that are off by a factor.
+        yield Reading((), 1 / factor), _WHEEL, error("wheel_unit", words, "all wheels", {"wheel_unit": unit})
     for group in _groups(len(names)):
         for factor, cost in [*((count, _WHEEL) for count in _COUNTS), *((float(gear), _FITTED) for gear in _GEARS)]:
-            factors = _signal_factors(robot, np.where(group > 0, factor, 1.0))
-            if factors is not None:
-                yield replace(plain, columns=np.diag(factors), cost=cost, mistakes=(_scaled(names, group, factor),))
+            yield Reading((), np.where(group > 0, 1 / factor, 1.0)), cost, _scaled(names, group, factor)
+    if drive.direct or isinstance(drive, CarDrive):
+        exchanged_angles = combinations(range(len(drive.steered)), 2)
+        yield from (_exchanged_angles(drive, *pair) for pair in exchanged_angles)
+        return
+    for group in _groups(len(drive.steered)):
+        yield Reading(factors=np.where(group > 0, -1.0, 1.0)), _WHEEL, _clockwise(drive.steered, group)
+        for degrees in np.arange(-180.0 + _ZERO_STEP, 180.1, _ZERO_STEP).tolist():
+            if abs(degrees) >= _LEAST_ZERO:
+                cost = _FITTED if abs(degrees) <= 90 else _REVERSED
+                yield Reading(offsets=group * degrees * DEGREE), cost, another_zero(robot, group, degrees)
+    for pair in combinations(range(len(drive.steered)), 2):
+        yield _exchanged_angles(drive, *pair)
+    for first, second in combinations(range(len(names)), 2):
+        order = exchanged(len(names), first, second)
+        rates = _arrangement(names, order, (1,) * len(names))
+        yield Reading(order), _WHEEL, rates
+        if min(drive.pairs[first], drive.pairs[second]) >= 0:
+            reading, _, angles = _exchanged_angles(drive, drive.pairs[first], drive.pairs[second])
+            words = f"wheels {names[first]} and {names[second]} look swapped, rates and steering angles"
+            both = error("wheels_swapped", words, rates.where, {**rates.changes, **angles.changes})
+            yield replace(reading, rate_order=order), _WHEEL, both
 
 
 def _arrangements(count: int, *, orders: bool) -> list[tuple[Sequence[int], Sequence[int]]]:
-    """Orders and signs of up to four wheels, every one but the right one; of more wheels one mistake alone."""
+    """The recorded column and the sign of each wheel: every one but the right one, of more than four one mistake."""
     identity = tuple(range(count))
     if count <= _ARRANGED:
         every = [*product(permutations(identity) if orders else (identity,), product((1, -1), repeat=count))]
@@ -196,7 +242,7 @@ def turned_reference(robot: Robot, fit: FreeFit, columns: Array) -> Hypothesis |
         f"the reference's heading is constantly {abs(degrees):g} degrees too {'small' if degrees > 0 else 'large'}: "
         "the tracked point is turned on the robot"
     )
-    if not any(wheel.kind == "fixed" for wheel in robot.wheels):
+    if not _has_fixed_wheels(robot):
         words += f", or the wheels' angles in robot.yaml are turned by {-degrees:g} degrees"
     turned = error("reference_turned", words, _REFERENCED, {"heading_offset_deg": degrees})
     return Hypothesis(rotation(-angle), columns, _REFERENCE, (turned,))
@@ -210,8 +256,13 @@ def design_hypotheses(robot: Robot, fit: FreeFit) -> Iterator[Hypothesis]:
         return replace(plain, cost=cost, mistakes=(error(kind, words, "robot.yaml", changes),), robot=other)
 
     for keys, place in ((("x", "y", "distance"), "distances"), (("y",), "y"), (("x",), "x")):
-        factor, other = _best_factor(robot, fit, keys)
-        if other is None or any(np.allclose(other.inverse_kinematic_matrix, design) for design in designs):
+        distance, factor, other = math.inf, 1.0, robot
+        for tried in (_FACTORS, _FINER):  # the second about the best of the first
+            for scaled in [factor * each for each in tried]:
+                if (candidate := _corrected(robot, _placed(robot, keys, scaled))) is not None:
+                    candidates = ((distance, factor, other), (DesignDistance(candidate).of(fit), scaled, candidate))
+                    distance, factor, other = min(candidates, key=itemgetter(0, 1))
+        if any(np.allclose(other.inverse_kinematic_matrix, design) for design in designs):
             continue
         designs.append(other.inverse_kinematic_matrix)
         shown, size = (1 / factor, "large") if factor < 1 else (factor, "small")
@@ -222,9 +273,9 @@ def design_hypotheses(robot: Robot, fit: FreeFit) -> Iterator[Hypothesis]:
         yield wrong("design_distance", words, {"wheels": _placed(robot, keys, factor)}, other, cost)
     mecanum = [wheel for wheel in robot.wheels if wheel.kind == "mecanum"]
     rollers = {wheel.name: {"roller_angle_deg": round(-math.degrees(wheel.roller_angle), 3)} for wheel in mecanum}
-    if (other := _corrected(robot, rollers)) is not None:
+    if (exchanged_rollers := _corrected(robot, rollers)) is not None:
         words = "the rollers of the wheels in robot.yaml look exchanged: those of left and right wheels"
-        yield wrong("design_rollers", words, {"wheels": rollers}, other, _WHEEL)
+        yield wrong("design_rollers", words, {"wheels": rollers}, exchanged_rollers, _WHEEL)
     if (offset := _tracked_point(robot, fit)) is not None:
         mount = {"x": round(float(offset[0]), 3), "y": round(float(offset[1]), 3)}
         if (present := robot.mount) is not None:
@@ -233,18 +284,6 @@ def design_hypotheses(robot: Robot, fit: FreeFit) -> Iterator[Hypothesis]:
         words = f"the tracked point looks {abs(offset[0]):.2f} m {'ahead of' if offset[0] > 0 else 'behind'} and "
         words += f"{abs(offset[1]):.2f} m to the {'left' if offset[1] > 0 else 'right'} of where robot.yaml has it"
         yield wrong("design_mount", words, {"mount": mount}, corrected_robot(robot, {}, mount), _FITTED)
-
-
-def _best_factor(robot: Robot, fit: FreeFit, keys: Sequence[str]) -> tuple[float, Robot | None]:
-    """The factor of some of the wheels' coordinates by which the design comes nearest to a fit, and that design."""
-    distance, best, design = math.inf, 1.0, None
-    for factors in (_FACTORS, _FINER):
-        for factor in [best * each for each in factors]:
-            if (other := _corrected(robot, _placed(robot, keys, factor))) is not None:
-                distance, best, design = min(
-                    (distance, best, design), (DesignDistance(other).of(fit), factor, other), key=itemgetter(0, 1)
-                )
-    return best, design
 
 
 def _placed(robot: Robot, keys: Sequence[str], factor: float) -> dict[str, dict[str, float]]:
@@ -279,143 +318,17 @@ def _tracked_point(robot: Robot, fit: FreeFit) -> Array | None:
     if not whole or not np.isfinite(whole):
         return None
     off = off / whole
-    return off if _LEAST_MOUNT * robot.reach < np.hypot(*off) < _MOST_MOUNT * robot.reach else None
-
-
-def _arrangement(names: Sequence[str], order: Sequence[int], signs: Sequence[int]) -> Finding:
-    """Recorded column i holds signs[i] times the rate of wheel order[i]."""
-    columns = [list(order).index(wheel) for wheel in range(len(names))]
-    wheel_signs = [signs[column] for column in columns]
-    moved = [names[wheel] for wheel, column in enumerate(columns) if wheel != column]
-    negative = [name for name, sign in zip(names, wheel_signs, strict=True) if sign < 0]
-    changes: dict[str, Any] = {"wheel_order": columns} if moved else {}
-    changes |= {"wheel_signs": wheel_signs} if negative else {}
-    if moved:
-        shown = ", ".join(
-            f"{name} <- {'-' if sign < 0 else ''}{names[column]}"
-            for name, column, sign in zip(names, columns, wheel_signs, strict=True)
-        )
-        flipped = " and sign-flipped" if negative else ""
-        words = f"wheels look swapped{flipped}; the reference fits with omega of {shown}"
-        return error("wheels_swapped", words, wheels_in_words(moved), changes)
-    every = len(negative) == len(names)
-    which = f"every wheel ({', '.join(names)})" if every and len(names) > 1 else wheels_in_words(negative)
-    words = f"{which} {'looks' if every or len(negative) == 1 else 'look'} counted the wrong way round"
-    return error("wheels_negated" if every else "wheel_negated", words, wheels_in_words(negative), changes)
-
-
-def _signal_factors(robot: Robot, factors: Array) -> Array | None:
-    """Factors (M,) of the drive signals if those of the wheels' rates are (N,); None where they mix, as of a car."""
-    if len(set(factors.tolist())) == 1:
-        return np.full(len(robot.drive.names), factors[0])
-    if any(not wheel.has_rate for wheel in robot.wheels if wheel.has_steering):
-        return None
-    return np.repeat(factors, [1 if pair < 0 else 2 for pair in robot.drive.pairs])
-
-
-def exchanged(count: int, first: int, second: int) -> tuple[int, ...]:
-    """The numbers below ``count`` with two of them exchanged."""
-    return tuple({first: second, second: first}.get(number, number) for number in range(count))
-
-
-def _scaled(names: Sequence[str], group: Array, factor: float) -> Finding:
-    """The wheels of a group (N,) of 0 and 1 whose rates are a factor too high."""
-    where = "all wheels" if group.all() else _wheels(names, group)
-    size, shown = ("high", factor) if factor > 1 else ("low", 1 / factor)
-    words = f"the rates of {where} look about {_rounded(shown)} times too {size}"
-    ticks = 2 * math.pi * factor
-    if factor in _COUNTS:
-        words += f", as where counts are {'not ' if factor < 1 else ''}multiplied by {shown:g}, or by a gear of "
-        words += f"{shown:g}" + (", or a diameter is given as the radius" if factor == 2 else "")
-    else:
-        words += _as_ticks(ticks) if ticks > FEWEST_TICKS else "; is there a gear between the encoder and the wheel?"
-    factors = [float(f"{factor:.3g}") if member else 1.0 for member in group]
-    return error("wheel_scale", words, where, {"rate_factors": factors})
-
-
-def _as_ticks(count: float) -> str:
-    return f", as ticks would be at about {_rounded(count)} a turn of the wheel"
-
-
-def _rounded(value: float) -> str:
-    """A value to two digits."""
-    return f"{float(f'{value:.2g}'):,.12g}"
-
-
-def wheels_in_words(names: Sequence[str]) -> str:
-    """``wheel a``, or ``wheels a, b``."""
-    return f"wheel{'' if len(names) == 1 else 's'} {', '.join(names)}"
-
-
-def _wheels(names: Sequence[str], group: Array) -> str:
-    """The members of a group (N,) of 0 and 1 in words."""
-    return wheels_in_words([name for name, member in zip(names, group.tolist(), strict=True) if member])
-
-
-def _groups(count: int) -> list[Array]:
-    """All wheels together, and each of several, as members (n,) of 0 and 1."""
-    return [np.ones(count), *(np.eye(count) if count > 1 else ())]
-
-
-def steering_transforms(robot: Robot) -> Iterator[Hypothesis]:
-    """Mistakes of steered driven wheels: angles negated or from another zero, and modules exchanged."""
-    drive, plain = robot.drive, plain_hypothesis(robot)
-    if isinstance(drive, CarDrive) or drive.direct:
-        return
-    begins = np.cumsum([0, *(1 if pair < 0 else 2 for pair in drive.pairs)])
-    for group in _groups(len(drive.steered)):
-        flip = _blocks(drive, begins, group, np.diag([1.0, -1.0]))
-        yield replace(plain, columns=flip, cost=_WHEEL, mistakes=(_clockwise(drive.steered, group),))
-        for degrees in np.arange(-180.0 + _ZERO_STEP, 180.1, _ZERO_STEP).tolist():
-            if abs(degrees) >= _LEAST_ZERO:
-                turn = _blocks(drive, begins, group, rotation(-degrees * DEGREE)[:2, :2])
-                cost = _FITTED if abs(degrees) <= 90 else _REVERSED
-                yield replace(plain, columns=turn, cost=cost, mistakes=(_another_zero(robot, group, degrees),))
-    for first, second in combinations([wheel for wheel, pair in enumerate(drive.pairs) if pair >= 0], 2):
-        order = np.arange(len(drive.names))
-        one, other = (slice(begins[wheel], begins[wheel + 1]) for wheel in (first, second))
-        order[one], order[other] = order[other].copy(), order[one].copy()
-        rates = _exchange_of_rates(drive, first, second)
-        angles = _exchange_of_angles(drive, drive.pairs[first], drive.pairs[second])
-        words = f"wheels {drive.wheels[first]} and {drive.wheels[second]} look swapped, rates and steering angles"
-        both = error("wheels_swapped", words, rates.where, {**rates.changes, **angles.changes})
-        yield replace(plain, columns=plain.columns[order], cost=_WHEEL, mistakes=(both,))
-
-
-def _blocks(drive: Drive, begins: Array, group: Array, block: Array) -> Array:
-    """The matrix (M, M) with a block at the two signals of each steered wheel of a group (S,)."""
-    whole = np.eye(int(begins[-1]))
-    for wheel, pair in enumerate(drive.pairs):
-        if pair >= 0 and group[pair]:
-            whole[begins[wheel] : begins[wheel + 1], begins[wheel] : begins[wheel + 1]] = block
-    return whole
+    return off if _NEAREST_MOUNT * robot.reach < np.hypot(*off) < _FARTHEST_MOUNT * robot.reach else None
 
 
 def steering_readings(robot: Robot, logs: Sequence[WheelLog], poses: Sequence[Array]) -> Iterator[Hypothesis]:
-    """Readings of steering angles that need a fit of their own: exchanged, or with another scale, zero and lag."""
-    drive, plain = robot.drive, plain_hypothesis(robot)
-    if drive.direct:
+    """Steering angles with another scale, zero and lag: fitted where the steering alone makes the robot turn."""
+    if robot.drive.direct:
         return
-    count = len(drive.steered)
-    for pair in combinations(range(count), 2):
-        reading, swapped = Reading(order=exchanged(count, *pair)), _exchange_of_angles(drive, *pair)
-        yield replace(plain, cost=_WHEEL, mistakes=(swapped,), reading=reading)
-    if not isinstance(drive, CarDrive):
-        for pair in combinations(range(len(drive.wheels)), 2):
-            reading, swapped = Reading(rate_order=exchanged(len(drive.wheels), *pair)), _exchange_of_rates(drive, *pair)
-            yield replace(plain, cost=_WHEEL, mistakes=(swapped,), reading=reading)
-    elif len(drive.wheels) > 1:
-        for group in _groups(len(drive.wheels))[1:]:
-            signs = np.where(group > 0, -1, 1).tolist()
-            for factor in (-1.0, *_COUNTS):
-                negated = factor < 0 and _arrangement(drive.wheels, range(len(signs)), signs)
-                reading = Reading(rate_factors=np.where(group > 0, 1 / factor, 1.0))
-                wrong = negated or _scaled(drive.wheels, group, factor)
-                yield replace(plain, cost=_WHEEL, mistakes=(wrong,), reading=reading)
-    if not any(wheel.kind == "fixed" for wheel in robot.wheels):
+    if not _has_fixed_wheels(robot):
         yield from steering_scales(robot)
         return
-    for group in _groups(count):  # the steering alone makes such a robot turn
+    for group in _groups(len(robot.drive.steered)):
         if (fitted := _fitted_steering(robot, logs, poses, group)) is not None:
             yield from _named_steering(robot, group, fitted)
 
@@ -442,10 +355,12 @@ def _fitted_steering(robot: Robot, logs: Sequence[WheelLog], poses: Sequence[Arr
     gain = way / (rolled * float(robot.radii.mean())) if rolled else 1.0
     gain = 1.0 if 1 / _LEAST_GEAR < gain < _LEAST_GEAR else gain
 
+    def reading(values: Array, lag: float) -> Reading:
+        return Reading((), gain, factors=np.where(group > 0, values[0], 1.0), offsets=group * values[1], lag=lag)
+
     def turned(values: Array, lag: float) -> tuple[Array, Array]:
-        factors, offsets = np.where(group > 0, values[0], 1.0), group * values[1]
-        reading = Reading(factors=factors, offsets=offsets, lag=lag, rate_factors=gain)
-        windows = Windows.of([reading.of(log) for log in logs], poses, _STEERING_WINDOW)
+        meant = reading(values, lag)
+        windows = Windows.of([meant.of(log) for log in logs], poses, _STEERING_WINDOW)
         if windows is None:
             return np.zeros(0), np.zeros(0)
         # Tyres slip the less, the smaller the lateral acceleration is.
@@ -473,18 +388,18 @@ def _fitted_steering(robot: Robot, logs: Sequence[WheelLog], poses: Sequence[Arr
 
     scales = (1.0, -1.0, min(1.0, 0.3 / widest), -min(1.0, 0.3 / widest))
     best = itemgetter(0)
-    at_once = min((solved(np.array([scale, 0.0]), 0.0) for scale in scales), key=best)
+    at_once = min((solved(np.array([scale, 0.0]), 0.0) for scale in dict.fromkeys(scales)), key=best)
     later = min((solved(at_once[2], lag) for lag in _LAGS[1:]), key=best)
     later = min((solved(later[2], later[1] + step) for step in (-0.02, 0.0, 0.02)), key=best)
     _, lag, values = later if later[0] < _LAGGING * at_once[0] else at_once
-    return Reading(factors=np.where(group > 0, values[0], 1.0), offsets=group * values[1], lag=lag)
+    return replace(reading(values, lag), rate_factors=1.0)
 
 
 def _named_steering(robot: Robot, group: Array, reading: Reading) -> Iterator[Hypothesis]:
-    """The mistakes that a reading of the steering angles of a group tells; none of what a calibration is for."""
+    """The mistakes that a reading of the steering angles of a group shows; none of what a calibration is for."""
     steered, every = robot.drive.steered, bool(group.all())
-    names = _wheels(steered, group)
-    where, chosen = f"steering of {names}", int(group.argmax())
+    names, chosen = _members(steered, group), int(group.argmax())
+    where = f"steering of {names}"
     factor = float(np.broadcast_to(reading.factors, len(steered))[chosen])
     zero = math.degrees(float(np.broadcast_to(reading.offsets, len(steered))[chosen]))
     wrong, cost = list[Finding](), 0.0
@@ -509,7 +424,7 @@ def _named_steering(robot: Robot, group: Array, reading: Reading) -> Iterator[Hy
         wrong += [_clockwise(steered, group)] if factor < 0 else []
         cost = _REFERENCE
     if abs(zero) >= _LEAST_ZERO or (wrong and abs(zero) >= 0.5):
-        wrong, cost = [*wrong, _another_zero(robot, group, round(zero, 1))], cost or _FITTED
+        wrong, cost = [*wrong, another_zero(robot, group, round(zero, 1))], cost or _FITTED
     if reading.lag:
         words = f"the wheels of {where} follow the column {reading.lag:.2g} s late, as a servo follows its command"
         wrong, cost = [*wrong, error("steering_lag", words, where, {"steering_lag": reading.lag})], cost or _FITTED
@@ -517,33 +432,98 @@ def _named_steering(robot: Robot, group: Array, reading: Reading) -> Iterator[Hy
         yield replace(plain_hypothesis(robot), cost=cost, mistakes=tuple(wrong), reading=reading)
 
 
+def _arrangement(names: Sequence[str], order: Sequence[int], signs: Sequence[int]) -> Finding:
+    """Wheel i is recorded in the column order[i], times signs[i]."""
+    moved = [names[wheel] for wheel, column in enumerate(order) if wheel != column]
+    negative = [name for name, sign in zip(names, signs, strict=True) if sign < 0]
+    changes: dict[str, Any] = {"wheel_order": list(order)} if moved else {}
+    changes |= {"wheel_signs": list(signs)} if negative else {}
+    if moved:
+        shown = ", ".join(
+            f"{name} <- {'-' if sign < 0 else ''}{names[column]}"
+            for name, column, sign in zip(names, order, signs, strict=True)
+        )
+        flipped = " and sign-flipped" if negative else ""
+        words = f"wheels look swapped{flipped}; the reference fits with omega of {shown}"
+        return error("wheels_swapped", words, wheels_in_words(moved), changes)
+    every = len(negative) == len(names)
+    which = f"every wheel ({', '.join(names)})" if every and len(names) > 1 else wheels_in_words(negative)
+    words = f"{which} {'looks' if every or len(negative) == 1 else 'look'} counted the wrong way round"
+    return error("wheels_negated" if every else "wheel_negated", words, wheels_in_words(negative), changes)
+
+
+def _scaled(names: Sequence[str], group: Array, factor: float) -> Finding:
+    """The wheels of a group (N,) of 0 and 1 whose rates are a factor too high."""
+    where = "all wheels" if group.all() else _members(names, group)
+    size, shown = ("high", factor) if factor > 1 else ("low", 1 / factor)
+    words = f"the rates of {where} look about {_rounded(shown)} times too {size}"
+    ticks = 2 * math.pi * factor
+    if factor in _COUNTS:
+        words += f", as where counts are {'not ' if factor < 1 else ''}multiplied by {shown:g}, or by a gear of "
+        words += f"{shown:g}" + (", or a diameter is given as the radius" if factor == 2 else "")
+    else:
+        words += _as_ticks(ticks) if ticks > FEWEST_TICKS else "; is there a gear between the encoder and the wheel?"
+    factors = [float(f"{factor:.3g}") if member else 1.0 for member in group]
+    return error("wheel_scale", words, where, {"rate_factors": factors})
+
+
 def _clockwise(steered: Sequence[str], group: Array) -> Finding:
     """Steering angles of a group (S,) of 0 and 1 that count clockwise."""
-    names, signs = _wheels(steered, group), [-1 if member else 1 for member in group.tolist()]
+    names, signs = _members(steered, group), [-1 if member else 1 for member in group.tolist()]
     words = f"the steering angle of {names} looks counted clockwise; it must count counter-clockwise"
     return error("steering_sign", words, f"steering of {names}", {"steering_signs": signs})
 
 
-def _another_zero(robot: Robot, group: Array, degrees: float) -> Finding:
+def another_zero(robot: Robot, group: Array, degrees: float) -> Finding:
     """Steering angles of a group (S,) of 0 and 1 that lack so many degrees."""
-    names = _wheels(robot.drive.steered, group)
+    names = _members(robot.drive.steered, group)
     words = f"the steering angle of {names} looks {abs(degrees):g} degrees too {'large' if degrees < 0 else 'small'}, "
     words += "its zero not straight ahead"
-    if group.all() and not any(wheel.kind == "fixed" for wheel in robot.wheels):
+    if group.all() and not _has_fixed_wheels(robot):
         words += f"; or the reference is turned: heading_offset_deg={degrees:g}"
     changes = {"steering_offsets_deg": [degrees if member else 0.0 for member in group.tolist()]}
     return error("steering_zero", words, f"steering of {names}", changes)
 
 
-def _exchange_of_angles(drive: Drive, first: int, second: int) -> Finding:
+def _exchanged_angles(drive: Drive, first: int, second: int) -> tuple[Reading, float, Finding]:
     """The steering angles of two wheels, exchanged."""
-    names = wheels_in_words((drive.steered[first], drive.steered[second]))
-    order = list(exchanged(len(drive.steered), first, second))
+    names, order = (
+        wheels_in_words((drive.steered[first], drive.steered[second])),
+        exchanged(len(drive.steered), first, second),
+    )
     words = f"the steering angles of {names} look swapped"
-    return error("steering_swapped", words, f"steering of {names}", {"steering_order": order})
+    wrong = error("steering_swapped", words, f"steering of {names}", {"steering_order": list(order)})
+    return Reading(order=order), _WHEEL, wrong
 
 
-def _exchange_of_rates(drive: Drive, first: int, second: int) -> Finding:
-    """The rates of two wheels, exchanged."""
-    count = len(drive.wheels)
-    return _arrangement(drive.wheels, exchanged(count, first, second), (1,) * count)
+def exchanged(count: int, first: int, second: int) -> tuple[int, ...]:
+    """The numbers below ``count`` with two of them exchanged."""
+    return tuple({first: second, second: first}.get(number, number) for number in range(count))
+
+
+def _groups(count: int) -> list[Array]:
+    """All wheels together, and each of several, as members (n,) of 0 and 1."""
+    return [np.ones(count), *(np.eye(count) if count > 1 else ())]
+
+
+def _has_fixed_wheels(robot: Robot) -> bool:
+    return any(wheel.kind == "fixed" for wheel in robot.wheels)
+
+
+def _as_ticks(count: float) -> str:
+    return f", as ticks would be at about {_rounded(count)} a turn of the wheel"
+
+
+def _rounded(value: float) -> str:
+    """A value to two digits."""
+    return f"{float(f'{value:.2g}'):,.12g}"
+
+
+def wheels_in_words(names: Sequence[str]) -> str:
+    """``wheel a``, or ``wheels a, b``."""
+    return f"wheel{'' if len(names) == 1 else 's'} {', '.join(names)}"
+
+
+def _members(names: Sequence[str], group: Array) -> str:
+    """The wheels of a group (N,) of 0 and 1 in words."""
+    return wheels_in_words([name for name, member in zip(names, group.tolist(), strict=True) if member])

@@ -28,7 +28,6 @@ from omnibench.check.hypotheses import (
     reference_hypotheses,
     steering_readings,
     steering_scales,
-    steering_transforms,
     turned_reference,
     wheel_hypotheses,
 )
@@ -45,26 +44,28 @@ _SUSPICIOUS, _REMAINS, _BETTER = 7.0, 0.6, 4.0
 _CONTRADICTING, _USUAL = 0.1, 0.04
 _BADLY = 0.25  # share of the motion that no matrix explains, from which on a recording is suspicious; usual: 0.08
 _MOST_WEIGHED, _CORRELATED = 60.0, 4.0  # n of Eq. (1) at most, and windows that tell as much as one; chosen
-# Share of the way and of the turns that is left where wheels and reference have nothing in common; chosen.
-UNRELATED = 0.5
+UNRELATED = 0.5  # share of the way and of the turns that wheels leave which have nothing to do with them; chosen
 _SIMPLE = 4.5  # cost of wheels' mistakes that are looked for beside one of the reference
 _IN_DEGREES = 8.0  # cost of headings in degrees; less where a run begins beyond a whole turn
 _TURN = 2 * math.pi
-_ALIKE, _SAME = 3.0, 0.5  # scores nearer than this are told as a class; and without their costs; chosen
-_MOST_SAMPLES = 60_000  # of the runs that are looked at; chosen: half a second
-# Of sparse poses: misfits of the odometry from which on a recording is suspicious, and steering is; share of it
-# that may remain; runs and stamps of each that are compared at most (chosen: errors of calibration, slip and noise stay
+# Explanations whose scores are nearer than this to the best one's, or without their costs, are named beside it; chosen.
+_ALIKE, _SAME = 3.0, 0.5
+_MOST_SAMPLES = 60_000  # wheel samples of the runs that hypotheses are fitted to: half a second of work; chosen
+# Sparse poses: misfits of the odometry from which on a recording, or its steering, is suspicious; share of it that an
+# explanation may leave, and misfits that are as good as the best (chosen: errors of calibration, slip and noise are
 # below).
-_LEAST_FACTOR, _AS_GOOD = 1.8, 1.1  # least factor of rates; and misfits that are as good as the best; chosen
-_MISFIT, _LEAST_MISFIT, _EXPLAINED, _MOST_RUNS, _MOST_STAMPS = 0.15, 0.05, 0.35, 24, 300
-_POSITIONS = 30  # of a run without headings that are compared at most; chosen
+_MISFIT, _LEAST_MISFIT, _EXPLAINED, _AS_GOOD = 0.15, 0.05, 0.35, 1.1
+_LEAST_FACTOR = 1.8  # of rates beside sparse poses: a smaller one may be another design; chosen
+# Runs that are compared at most, and poses of each: with headings, and without; chosen.
+_MOST_RUNS, _MOST_STAMPS, _MOST_POSITIONS = 24, 300, 30
 
 
 @dataclass(frozen=True, eq=False)
 class Recorded:
-    """Runs of a robot: logs, and reference poses (K, 3) at their stamps; and these poses as they were read.
+    """Runs of a robot: logs, and reference poses (K, 3) at their stamps.
 
-    without_headings: True if they are positions, in a frame that each run may have turned.
+    as_read: these poses before their headings were made continuous. without_headings: True if they are positions, in a
+    frame that each run may have turned.
     """
 
     robot: Robot
@@ -105,16 +106,14 @@ class Recorded:
 
 @dataclass(frozen=True, eq=False)
 class Explained:
-    """The best hypothesis: its mistakes, those that fit about as well, and d^2 as recorded.
+    """The best explanation of a recording: its mistakes, and those of explanations that fit about as well.
 
-    searched: False where the wheels stand. unexplained: share of the way or of the turns, whichever is less, that no
-    matrix explains if it is read so. far: the recording is far from the design, and no hypothesis explains it.
+    unexplained: share of the way or of the turns, whichever is less, that no matrix explains if it is read so. far: the
+    recording is far from the design, and no hypothesis explains it. fit: of the recording as it was read.
     """
 
     mistakes: tuple[Finding, ...] = ()
     alike: tuple[tuple[Finding, ...], ...] = ()
-    distance: float = 0.0
-    searched: bool = True
     unexplained: float = 0.0
     far: bool = False
     fit: FreeFit | None = field(default=None, repr=False)
@@ -122,68 +121,83 @@ class Explained:
 
 @dataclass(frozen=True, eq=False)
 class _Base:
-    """A fit, the mistakes under which it was made, and their cost. flipped: with headings of the other sign."""
+    """A fit, the mistakes under which it was made, and their cost.
+
+    flipped: with headings of the other sign. alone: no mistake of the reference or the design is tried beside it.
+    """
 
     fit: FreeFit
     mistakes: tuple[Finding, ...] = ()
     cost: float = 0.0
     flipped: bool = False
-    plain: bool = False  # no other hypotheses are tried with it
+    alone: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class _Scored:
+    """Mistakes by Eq. (1). remaining: share of the way or of the turns that no matrix explains."""
+
     score: float
     cost: float
     distance: float
     contradiction: float
-    left: float
+    remaining: float
     mistakes: tuple[Finding, ...]
 
 
 def search(recording: Recorded) -> Explained:
     """The mistakes that explain a recording best; none if its matrix is near enough to the design."""
-    if recording.without_headings:
-        return _search_sparse(recording)
     some = recording.some()
-    fit = some.fit()
+    fit = None if recording.without_headings else some.fit()
     if fit is None:
         return _search_sparse(recording)
     if not fit.gram.any():  # the wheels stand
-        return Explained(searched=False)
+        return Explained()
     far = DesignDistance(recording.robot)
     distance = far.of(fit)
     contradiction = float(far.contradictions(fit.gram, np.eye(len(fit.gram))[None])[0])
     if distance < _SUSPICIOUS and contradiction < _CONTRADICTING and fit.share < _BADLY:
-        return Explained(distance=distance, fit=fit)
+        return Explained(_contradicting(some), fit=fit)
     scored = sorted(_scores(some, fit), key=lambda each: each.score)
     best, present = scored[0], next(each for each in scored if not each.mistakes)
     # Hardly anything remains of what made the recording suspicious.
     likely = (
         best.score <= present.score - _BETTER
-        and best.left < UNRELATED
+        and best.remaining < UNRELATED
         and best.distance <= max(_REMAINS * present.distance, _SUSPICIOUS)
         and best.contradiction <= max(_REMAINS * present.contradiction, _CONTRADICTING)
     )
     if not best.mistakes or not likely:
-        unexplained = distance >= _SUSPICIOUS or contradiction >= _CONTRADICTING
-        return Explained(distance=distance, unexplained=present.left, far=unexplained, fit=fit)
-    kinds = {mistake.kind for mistake in best.mistakes}
-    alike: dict[frozenset[str], tuple[Finding, ...]] = {}
-    for other in scored[1:]:
-        others = frozenset(mistake.kind for mistake in other.mistakes)
-        near = other.score < best.score + _ALIKE or other.score - other.cost < best.score - best.cost + _SAME
-        if near and others != kinds and len(other.mistakes) <= len(best.mistakes):
-            alike.setdefault(others, other.mistakes)
-    return Explained(best.mistakes, tuple(alike.values()), distance, unexplained=best.left, fit=fit)
+        suspicious = distance >= _SUSPICIOUS or contradiction >= _CONTRADICTING
+        return Explained(unexplained=present.remaining, far=suspicious, fit=fit)
+    near = [
+        other.mistakes
+        for other in scored[1:]
+        if other.score < best.score + _ALIKE or other.score - other.cost < best.score - best.cost + _SAME
+    ]
+    return Explained(best.mistakes, _other_kinds(best.mistakes, near), unexplained=best.remaining, fit=fit)
+
+
+def _other_kinds(best: Sequence[Finding], others: Sequence[tuple[Finding, ...]]) -> tuple[tuple[Finding, ...], ...]:
+    """The first explanation of every other class, by kinds of mistakes, that is as simple as the best one."""
+    classes: dict[frozenset[str], tuple[Finding, ...]] = {}
+    for mistakes in others:
+        kinds = frozenset(mistake.kind for mistake in mistakes)
+        if kinds != {mistake.kind for mistake in best} and len(mistakes) <= len(best):
+            classes.setdefault(kinds, mistakes)
+    return tuple(classes.values())
 
 
 def _scores(recording: Recorded, fit: FreeFit) -> Iterator[_Scored]:
-    weight = min(fit.windows / _CORRELATED, _MOST_WEIGHED)
-    wheels = [*wheel_hypotheses(recording.robot), *steering_transforms(recording.robot)]
-    for base in _bases(recording, fit):
-        residual, left = weight * math.log(max(base.fit.share, 1e-9)), float(base.fit.left.min())
-        for robot, hypotheses in _combined(recording.robot, base, wheels):
+    """The scores of all hypotheses, without those of fits whose residual alone is beyond any explanation."""
+    weight, best = min(fit.windows / _CORRELATED, _MOST_WEIGHED), math.inf
+    every = list(wheel_hypotheses(recording.robot))
+    transforming = [hypothesis for hypothesis in every if hypothesis.reading is None]
+    for base in _bases(recording, fit, [hypothesis for hypothesis in every if hypothesis.reading is not None]):
+        residual, remaining = weight * math.log(max(base.fit.share, 1e-9)), float(base.fit.left.min())
+        if residual + weight * math.log(_USUAL) > best + _ALIKE:
+            continue
+        for robot, hypotheses in _combined(recording.robot, base, transforming):
             far = DesignDistance(robot)
             rows, columns = (np.array([getattr(each, name) for each in hypotheses]) for name in ("rows", "columns"))
             squared = far.squared(*transformed(base.fit, rows, columns))
@@ -192,7 +206,8 @@ def _scores(recording: Recorded, fit: FreeFit) -> Iterator[_Scored]:
             numbers = zip(hypotheses, scores.tolist(), squared.tolist(), against.tolist(), strict=True)
             for hypothesis, score, distance, share in numbers:
                 mistakes, cost = (*base.mistakes, *hypothesis.mistakes), base.cost + hypothesis.cost
-                yield _Scored(score + hypothesis.cost, cost, distance, share, left, mistakes)
+                best = min(best, score + hypothesis.cost)
+                yield _Scored(score + hypothesis.cost, cost, distance, share, remaining, mistakes)
 
 
 def _combined(robot: Robot, base: _Base, wheels: Sequence[Hypothesis]) -> Iterator[tuple[Robot, Sequence[Hypothesis]]]:
@@ -203,7 +218,7 @@ def _combined(robot: Robot, base: _Base, wheels: Sequence[Hypothesis]) -> Iterat
     simple = [wheel for wheel in wheels if wheel.cost <= _SIMPLE]
     if not base.flipped:
         yield robot, wheels
-        if base.plain:
+        if base.alone:
             return
         for unit in position_units():
             yield robot, [wheel.with_reference(unit) for wheel in simple]
@@ -221,7 +236,8 @@ def _combined(robot: Robot, base: _Base, wheels: Sequence[Hypothesis]) -> Iterat
         yield robot, [wheel.with_reference(mirrored) for wheel in simple]
 
 
-def _bases(recording: Recorded, fit: FreeFit) -> Iterator[_Base]:
+def _bases(recording: Recorded, fit: FreeFit, wheels: Sequence[Hypothesis]) -> Iterator[_Base]:
+    """The fits that hypotheses transform: as recorded, by other headings, and by readings of wheels and steering."""
     yield _Base(fit)
     if (flipped := recording.with_headings(-1.0).fit()) is not None:
         yield _Base(flipped, flipped=True)
@@ -235,59 +251,59 @@ def _bases(recording: Recorded, fit: FreeFit) -> Iterator[_Base]:
             if factor > 0 and (beyond or base.left[1] < fit.left[1] / 2):
                 read_as.append((degrees, (IN_DEGREES,), cost))
     for read, mistakes, more in read_as:
-        for hypothesis in steering_readings(read.robot, read.logs, read.poses):
+        for hypothesis in (*wheels, *steering_readings(read.robot, read.logs, read.poses)):
             if (base := read.meant(hypothesis).fit()) is not None:
-                yield _Base(base, (*mistakes, *hypothesis.mistakes), more + hypothesis.cost, plain=True)
+                yield _Base(base, (*mistakes, *hypothesis.mistakes), more + hypothesis.cost, alone=True)
 
 
 def _search_sparse(recording: Recorded) -> Explained:
     """The mistakes that explain sparse poses best, by the misfit of the design's odometry to them."""
     if not any(log.rates.any() for log in recording.logs):
-        return Explained(searched=False)
-    moments, hypotheses = _Moments.of(recording), list(_sparse_hypotheses(recording.robot))
-    if recording.without_headings:
+        return Explained()
+    positions, robot = recording.without_headings, recording.robot
+    moments, hypotheses = _Moments.of(recording), list(_sparse_hypotheses(robot))
+    if positions:
         hypotheses.append(hypotheses[0].with_reference(mirrored_positions()))
     scored = []
-    headings_as = ((1.0, ()), (math.pi / 180, (IN_DEGREES,)))
-    for radian, headings in headings_as[:1] if recording.without_headings else headings_as:
+    for radian, headings in ((1.0, ()), (math.pi / 180, (IN_DEGREES,)))[: 1 if positions else 2]:
         for hypothesis, misfit in zip(hypotheses, moments.misfits(hypotheses, radian).tolist(), strict=True):
             scored.append((misfit, hypothesis.cost, (*headings, *hypothesis.mistakes)))
     present = scored[0][0]
     if not present > _LEAST_MISFIT:  # nan: it hardly moved
         return Explained(_contradicting(recording))
-    for hypothesis in steering_scales(recording.robot):
+    for hypothesis in steering_scales(robot):
         misfits = _Moments.of(recording.meant(hypothesis)).misfits(hypotheses[:1])
         scored.append((float(misfits[0]), hypothesis.cost, hypothesis.mistakes))
-    # The simplest of those that fit about as well as the best one.
-    alone = recording.without_headings
-    if present <= _MISFIT and not alone:  # as far as another design goes, but for steering
+    if present <= _MISFIT and not positions:  # as far as another design goes, but for steering
         scored = [each for each in scored if all(mistake.kind.startswith("steering") for mistake in each[2])]
+    # The simplest of those that fit about as well as the best one.
     least = np.nanmin([misfit for misfit, _, _ in scored])
-    near = [each for each in scored if each[0] <= _AS_GOOD * least + (present / 10 if alone else _MISFIT / 4)]
+    near = [each for each in scored if each[0] <= _AS_GOOD * least + (present / 10 if positions else _MISFIT / 4)]
     misfit, _, mistakes = min(near, key=lambda each: (len(each[2]), each[1], each[0]))
-    explained = bool(mistakes) and misfit < _EXPLAINED * present and not (alone and len(mistakes) > 1)
-    if not explained:
-        return Explained(far=present > _MISFIT and not alone)
-    kinds, alike = {mistake.kind for mistake in mistakes}, dict[frozenset[str], tuple[Finding, ...]]()
-    for others in (each[2] for each in near if alone and len(each[2]) == len(mistakes)):
-        if (other := frozenset(mistake.kind for mistake in others)) != kinds:
-            alike.setdefault(other, others)
-    return Explained(mistakes, tuple(alike.values()))
+    if not mistakes or misfit >= _EXPLAINED * present or (positions and len(mistakes) > 1):
+        return Explained(far=present > _MISFIT and not positions)
+    alike = [each[2] for each in near if len(each[2]) == len(mistakes)] if positions else []
+    return Explained(mistakes, _other_kinds(mistakes, alike))
 
 
 def _contradicting(recording: Recorded) -> tuple[Finding, ...]:
     """The mistake of one steered wheel without which the wheels agree about the motion; empty if there is none."""
-    hypotheses = list(steering_transforms(recording.robot))
-    if max(recording.robot.drive.pairs, default=-1) < 1 or not hypotheses:
+    drive, far = recording.robot.drive, DesignDistance(recording.robot)
+    steering = [
+        hypothesis
+        for hypothesis in wheel_hypotheses(recording.robot)
+        if hypothesis.reading is None
+        and any(key.startswith("steering") for mistake in hypothesis.mistakes for key in mistake.changes)
+    ]
+    if max(drive.pairs, default=-1) < 1 or not steering:
         return ()
     signals = np.concatenate([log.signals for log in recording.logs])
     lengths = np.concatenate([np.diff(log.times, prepend=0.0) for log in recording.logs])
-    gram = (signals.T * lengths) @ signals
-    far, columns = DesignDistance(recording.robot), np.array([each.columns for each in hypotheses])
+    gram, columns = (signals.T * lengths) @ signals, np.array([each.columns for each in steering])
     present, shares = far.contradictions(gram, np.eye(len(gram))[None])[0], far.contradictions(gram, columns)
     best = int(shares.argmin())
-    told = present > _CONTRADICTING / 3 and shares[best] < _EXPLAINED * present
-    return hypotheses[best].mistakes if told else ()
+    explained = present > _CONTRADICTING / 3 and shares[best] < _EXPLAINED * present
+    return steering[best].mistakes if explained else ()
 
 
 def _sparse_hypotheses(robot: Robot) -> Iterator[Hypothesis]:
@@ -296,10 +312,11 @@ def _sparse_hypotheses(robot: Robot) -> Iterator[Hypothesis]:
     Factors of rates that a calibration is for are left out: sparse poses do not tell them from another design.
     """
     wheels = []
-    for each in (*wheel_hypotheses(robot), *steering_transforms(robot)):
-        factors = [factor for mistake in each.mistakes for factor in mistake.changes.get("rate_factors", ())]
-        if not factors or not all(1 / _LEAST_FACTOR < factor < _LEAST_FACTOR for factor in factors):
-            wheels.append(each)
+    for wheel in wheel_hypotheses(robot):
+        factors = [factor for mistake in wheel.mistakes for factor in mistake.changes.get("rate_factors", ())]
+        small = factors and all(1 / _LEAST_FACTOR < factor < _LEAST_FACTOR for factor in factors)
+        if wheel.reading is None and not small:
+            wheels.append(wheel)
     yield from wheels
     for unit in position_units():
         for wheel in wheels:
@@ -335,7 +352,7 @@ class _Moments:
             numbers = np.floor(np.abs(headings - headings[0])).astype(int)
             seen = np.unique([*np.flatnonzero(np.diff(numbers, prepend=0))[:_MOST_STAMPS], len(headings) - 1])
             if recording.without_headings:
-                seen = np.unique(np.linspace(0, len(headings) - 1, _POSITIONS).round().astype(int))
+                seen = np.unique(np.linspace(0, len(headings) - 1, _MOST_POSITIONS).round().astype(int))
             logs.append(replace(log, start=np.zeros(3), stamps=log.stamps[seen]))
             poses.append(np.vstack([of_run[:1], of_run[seen]]))
         odometry = OdometryBatch(logs, "arc")
@@ -365,10 +382,10 @@ class _Moments:
         # Whole turns between two moments do not show in the headings, and are no reason for a larger error.
         missed = wrapped(turned - self._turns(radian * moved[:, 2]))
         lengths = (np.abs(driven) + np.abs(path)).sum(axis=1)
-        told = np.minimum(np.abs(turned), _TURN)
-        angles = (told + np.minimum(np.abs(turned - missed), _TURN)).sum(axis=1)
+        by_wheels = np.minimum(np.abs(turned), _TURN)
+        angles = (by_wheels + np.minimum(np.abs(turned - missed), _TURN)).sum(axis=1)
         # Noise and slip may amount to a radian and the robot's size at every moment, and to more while it turns.
-        count, rims, size = len(moved), told.sum(axis=1), self.robot.reach
+        count, rims, size = len(moved), by_wheels.sum(axis=1), self.robot.reach
         position = np.abs(driven - path).sum(axis=1) / (lengths + size * (rims + count))
         heading = np.abs(missed).sum(axis=1) / (angles + count)
         runs = int(self.first.sum())

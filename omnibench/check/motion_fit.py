@@ -114,6 +114,19 @@ class Windows:
         share = float(np.sqrt(np.square(left) @ wholes / max(sum(wholes), 1e-300)))
         return FreeFit(matrix, covariance, np.array(left), share, count, self.driven.T @ self.driven)
 
+    def steering_zero(self) -> tuple[float, float]:
+        """The angle, rad, that a car's steering angles lack, and its standard error.
+
+        Its signals are the mean rate m and m tan phi, of which small zeros d of phi make m tan(phi + d), about
+        m tan phi + d m. By the heading changes of Eq. (1), fitted to both, d is the ratio of their coefficients.
+        """
+        columns = self.driven[:, :2].astype(complex)
+        solution, weights = _robust(columns, self.turned.astype(complex))
+        covariance = _covariance(columns, self.turned - columns @ solution, weights)
+        by_mean, by_tangent = solution.real
+        slopes = np.array([1.0, -by_mean / by_tangent]) / by_tangent
+        return float(by_mean / by_tangent), float(np.sqrt(slopes @ covariance @ slopes))
+
 
 def continuous(stamps: Array, poses: Array) -> Array:
     """Poses (K, 3) at stamps (K,) with steps of the heading of less than half a turn, where poses are near each other.
