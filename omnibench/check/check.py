@@ -148,20 +148,22 @@ def check(
 
 def check_recording(read: RecordingSource) -> CheckReport:
     """The check of a recording that was read."""
-    evidence = Evidence.of(read)
-    if not read.findings and (otherwise := _read_otherwise(evidence) or _mended(evidence)) is not None:
-        return check_recording(otherwise).model_copy(update={"clocks": tuple(evidence.clocks)})
-    found = findings_in(evidence)
-    misread = any(finding.kind in MISREAD and finding not in read.findings for finding in found)
-    findings = with_fixes(read, found)
+    evidence = Evidence(read)
+    if not read.findings and (otherwise := _read_otherwise(evidence)) is not None:
+        return check_recording(otherwise)
+    if not read.findings and (mended := _mended(evidence)) is not None:
+        return check_recording(mended).model_copy(update={"clocks": tuple(evidence.clocks)})
+    as_read = findings_in(evidence)
+    misread = any(finding.kind in MISREAD and finding not in read.findings for finding in as_read)
+    findings = with_fixes(read, as_read)
     errors = [finding for finding in findings if finding.severity == "error"]
     kinds = {finding.kind for finding in errors}
     unknown = misread or kinds & (SPOILED | {"reference_foreign", "wheel_unsigned"})
     needed, gain = (None, "") if unknown else expected_gain(read.dataset, clocks_agree=not kinds & CLOCKS)
     typed = [finding for finding in errors if finding.changes]
     missing = [finding for finding in findings if finding.kind in LACKING]
-    mended = typed or any(kind.startswith("design") for kind in kinds)
-    verdict: Verdict = "fix" if mended else "record more" if errors or missing else "ready"
+    to_mend = typed or any(kind.startswith("design") for kind in kinds)
+    verdict: Verdict = "fix" if to_mend else "record more" if errors or missing else "ready"
     if verdict == "ready":
         sentence = f"{read.dataset.name} is ready for calibration"
         sentence += f"; {plural(len(findings), 'remark')} below" if findings else ""
@@ -187,14 +189,14 @@ def _read_otherwise(evidence: Evidence) -> RecordingSource | None:
 
     They are tried where no matrix explains the motion, or the times are odd. None where none makes more sense of it.
     """
-    read = evidence.read
-    if not evidence.runs or read.reading is None:
+    read, odd = evidence.read, odd_times(evidence.dataset)
+    if not evidence.runs:
         return None
-    odd = odd_times(evidence.dataset)
-    if not odd and (evidence.explained.mistakes or evidence.explained.unexplained <= UNRELATED):
-        return None
-    if any(True for detector in (faults.dead_sensors, faults.own_odometry) for _ in detector(evidence)):
-        return None
+    if not odd:
+        if evidence.explained.mistakes or evidence.explained.unexplained <= UNRELATED:
+            return None
+        if any(True for detector in (faults.dead_sensors, faults.own_odometry) for _ in detector(evidence)):
+            return None
     quantities: list[list[Finding]] = [[], *([finding] for finding in other_quantities(read))]
     times: list[list[Finding]] = [[finding] for finding in other_times(read.options)] if odd else [[]]
     for findings in [[*time, *quantity] for quantity in quantities for time in times]:

@@ -1,4 +1,4 @@
-"""What the detectors of a check look at: a recording, and what was computed of it once for all of them."""
+"""The evidence of a recording: its runs by one clock, free fits and looks, shared by the detectors of a check."""
 
 from __future__ import annotations
 
@@ -19,36 +19,37 @@ from omnibench.data.dataset import Dataset, Trajectory
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """A recording and what is computed of it.
-
-    runs: those that have poses. clocks: of their references. aligned: the same runs with poses by the wheels' clock, as
-    far as it shows.
-    """
+    """A recording, and what detectors need to know of it, computed when the first of them does."""
 
     read: RecordingSource
-    runs: Sequence[Trajectory]
-    clocks: Sequence[ClockMatch | None]
-    aligned: Sequence[Trajectory]
-
-    @classmethod
-    def of(cls, read: RecordingSource) -> Evidence:
-        """The evidence of a recording."""
-        runs = [run for run in read.dataset.trajectories if run.has_poses]
-        smooth = [replace(run, poses=continuous(run.pose_times, run.poses)) for run in runs]
-        clocks = clocks_of(read.dataset.robot, smooth)
-        aligned = []
-        for run, clock in zip(runs, clocks, strict=True):
-            times = run.pose_times if clock is None else clock.corrected(run.pose_times)
-            used = np.flatnonzero((times >= 0) & (times <= run.times[-1]))
-            if clock is not None and len(used) >= max(3, len(times) // 2):
-                run = replace(run, pose_times=times[used], poses=run.poses[used], pose_covariances=None)
-            aligned.append(run)
-        return cls(read, runs, clocks, aligned)
 
     @property
     def dataset(self) -> Dataset:
         """The data set of the recording."""
         return self.read.dataset
+
+    @cached_property
+    def runs(self) -> Sequence[Trajectory]:
+        """The runs that have poses."""
+        return [run for run in self.dataset.trajectories if run.has_poses]
+
+    @cached_property
+    def clocks(self) -> Sequence[ClockMatch | None]:
+        """The clocks of their references."""
+        smooth = [replace(run, poses=continuous(run.pose_times, run.poses)) for run in self.runs]
+        return clocks_of(self.dataset.robot, smooth)
+
+    @cached_property
+    def aligned(self) -> Sequence[Trajectory]:
+        """The same runs with poses by the wheels' clock, as far as it shows."""
+        aligned = []
+        for run, clock in zip(self.runs, self.clocks, strict=True):
+            times = run.pose_times if clock is None else clock.corrected(run.pose_times)
+            used = np.flatnonzero((times >= 0) & (times <= run.times[-1]))
+            if clock is not None and len(used) >= max(3, len(times) // 2):
+                run = replace(run, pose_times=times[used], poses=run.poses[used], pose_covariances=None)
+            aligned.append(run)
+        return aligned
 
     @cached_property
     def seen(self) -> Recorded:

@@ -23,7 +23,7 @@ from omnibench.robot.kinematics import CarDrive
 from omnibench.robot.model import OdometryModel
 from omnibench.words import plural, some
 
-_TOLD = 12  # restarts that are told one by one; chosen
+_MOST_NOTES = 12  # notes on restarts of counters that are shown one by one; chosen
 _MOSTLY = 0.25  # share of a run for which a reference stands, from which on it counts as frozen; chosen
 _RARE = 0.02  # share of the samples: more that are too fast are another unit
 # Share of the angle of the wheel that turns most, up to which one is dead; angle, rad, and share of the largest, that
@@ -33,9 +33,10 @@ _UNEXPLAINED = 0.3  # share of a run's motion that the matrix of all runs leaves
 # Counts that never fall: share of the windows in which they may, and in which the reference must ask for either sense;
 # correlation of their sizes; chosen.
 _HARDLY, _BOTH, _ALIKE = 0.005, 0.08, 0.9
-# Steps over which the reference turns that are needed, and spread of the turns, rad, that one angle cannot give: that
-# of circles seven times as wide as the robot is long and of straight lines; chosen.
-_FEWEST, _BENDS = 5, 0.3
+# A steering angle that never changes is frozen if the reference's turns spread by more than this, rad, over steps of
+# three times the robot's size, of which there must be some (chosen: straight lines and a circle seven times as wide as
+# the robot is long spread by as much).
+_BENDS, _FEWEST = 0.3, 5
 # Zeros of a car's steering that are reported, rad and standard errors (chosen: simulated cars without one are below);
 # beyond the most the angle is no small one, and another mistake.
 _LEAST_ZERO, _ZERO_ERRORS, _MOST_ZERO = math.radians(1.0), 5.0, math.radians(15.0)
@@ -64,7 +65,8 @@ def notes(evidence: Evidence) -> Iterator[Finding]:
     """Restarts of counters that the importer has mended, and a note where not all runs are looked at together."""
     restarts = [each.what for each in findings_of(evidence.dataset.warnings) if each.kind == "counter_restart"]
     if restarts:
-        what = "; ".join(restarts[:_TOLD]) + (f" and {len(restarts) - _TOLD} more" if len(restarts) > _TOLD else "")
+        what = "; ".join(restarts[:_MOST_NOTES])
+        what += f" and {len(restarts) - _MOST_NOTES} more" if len(restarts) > _MOST_NOTES else ""
         fix = "nothing: the import has mended it"
         yield Finding(kind="counter_restart", what=what, where="all wheels", severity="note", fix=fix)
     runs = evidence.dataset.trajectories

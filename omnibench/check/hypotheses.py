@@ -96,6 +96,8 @@ class Reading:
         if isinstance(drive, CarDrive):  # its signals mix the rates of all wheels
             alike = not self.order and np.ptp(rate_factors) == 0
             return np.eye(signals) / rate_factors[0] if alike else None
+        if drive.direct:
+            return np.eye(signals)[:, list(rate_order)] / rate_factors
         if self.lag or (np.abs(factors) != 1).any():
             return None
         begins = np.cumsum([0, *(1 if pair < 0 else 2 for pair in drive.pairs)])

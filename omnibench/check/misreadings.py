@@ -24,6 +24,7 @@ from omnibench.check.hypotheses import (
     Reading,
     design_hypotheses,
     mirrored_positions,
+    plain_hypothesis,
     position_units,
     reference_hypotheses,
     steering_readings,
@@ -123,14 +124,14 @@ class Explained:
 class _Base:
     """A fit, the mistakes under which it was made, and their cost.
 
-    flipped: with headings of the other sign. alone: no mistake of the reference or the design is tried beside it.
+    flipped: with headings of the other sign. exclusive: no mistake of the reference or the design is tried beside it.
     """
 
     fit: FreeFit
     mistakes: tuple[Finding, ...] = ()
     cost: float = 0.0
     flipped: bool = False
-    alone: bool = False
+    exclusive: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,7 +195,7 @@ def _scores(recording: Recorded, fit: FreeFit) -> Iterator[_Scored]:
     every = list(wheel_hypotheses(recording.robot))
     transforming = [hypothesis for hypothesis in every if hypothesis.reading is None]
     for base in _bases(recording, fit, [hypothesis for hypothesis in every if hypothesis.reading is not None]):
-        residual, remaining = weight * math.log(max(base.fit.share, 1e-9)), float(base.fit.left.min())
+        residual, remaining = weight * math.log(max(base.fit.share, 1e-9)), float(base.fit.unexplained.min())
         if residual + weight * math.log(_USUAL) > best + _ALIKE:
             continue
         for robot, hypotheses in _combined(recording.robot, base, transforming):
@@ -218,7 +219,7 @@ def _combined(robot: Robot, base: _Base, wheels: Sequence[Hypothesis]) -> Iterat
     simple = [wheel for wheel in wheels if wheel.cost <= _SIMPLE]
     if not base.flipped:
         yield robot, wheels
-        if base.alone:
+        if base.exclusive:
             return
         for unit in position_units():
             yield robot, [wheel.with_reference(unit) for wheel in simple]
@@ -248,31 +249,32 @@ def _bases(recording: Recorded, fit: FreeFit, wheels: Sequence[Hypothesis]) -> I
     for factor in (1.0, -1.0):
         if (base := degrees.with_headings(factor).fit()) is not None:
             yield _Base(base, (IN_DEGREES,), cost, flipped=factor < 0)
-            if factor > 0 and (beyond or base.left[1] < fit.left[1] / 2):
+            if factor > 0 and (beyond or base.unexplained[1] < fit.unexplained[1] / 2):
                 read_as.append((degrees, (IN_DEGREES,), cost))
     for read, mistakes, more in read_as:
         for hypothesis in (*wheels, *steering_readings(read.robot, read.logs, read.poses)):
             if (base := read.meant(hypothesis).fit()) is not None:
-                yield _Base(base, (*mistakes, *hypothesis.mistakes), more + hypothesis.cost, alone=True)
+                yield _Base(base, (*mistakes, *hypothesis.mistakes), more + hypothesis.cost, exclusive=True)
 
 
 def _search_sparse(recording: Recorded) -> Explained:
     """The mistakes that explain sparse poses best, by the misfit of the design's odometry to them."""
     if not any(log.rates.any() for log in recording.logs):
         return Explained()
-    positions, robot = recording.without_headings, recording.robot
-    moments, hypotheses = _Moments.of(recording), list(_sparse_hypotheses(robot))
+    positions, robot, moments = recording.without_headings, recording.robot, _Moments.of(recording)
+    plain = plain_hypothesis(robot)
+    present = float(moments.misfits([plain])[0])
+    if not present > _LEAST_MISFIT:  # nan: it hardly moved
+        return Explained(_contradicting(recording))
+    hypotheses = list(_sparse_hypotheses(robot))
     if positions:
-        hypotheses.append(hypotheses[0].with_reference(mirrored_positions()))
+        hypotheses.append(plain.with_reference(mirrored_positions()))
     scored = []
     for radian, headings in ((1.0, ()), (math.pi / 180, (IN_DEGREES,)))[: 1 if positions else 2]:
         for hypothesis, misfit in zip(hypotheses, moments.misfits(hypotheses, radian).tolist(), strict=True):
             scored.append((misfit, hypothesis.cost, (*headings, *hypothesis.mistakes)))
-    present = scored[0][0]
-    if not present > _LEAST_MISFIT:  # nan: it hardly moved
-        return Explained(_contradicting(recording))
     for hypothesis in steering_scales(robot):
-        misfits = _Moments.of(recording.meant(hypothesis)).misfits(hypotheses[:1])
+        misfits = _Moments.of(recording.meant(hypothesis)).misfits([plain])
         scored.append((float(misfits[0]), hypothesis.cost, hypothesis.mistakes))
     if present <= _MISFIT and not positions:  # as far as another design goes, but for steering
         scored = [each for each in scored if all(mistake.kind.startswith("steering") for mistake in each[2])]

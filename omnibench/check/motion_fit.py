@@ -43,22 +43,21 @@ _SLIP = 0.03
 # stays 0; a wheel that slips nowhere leaves 0.003 along the direction in which it would have to slip.
 _NULL = 5e-3
 _CORRELATED_WINDOWS = 4.0  # windows that tell as much as one, since slip lasts; chosen
-_FEWEST = 8  # windows for each column of the matrix, below which it is not told; chosen
+_FEWEST = 8  # windows for each column of the matrix, of fewer it is not fitted; chosen
 
 
 @dataclass(frozen=True, eq=False)
 class FreeFit:
     """The matrix that fits a recording best.
 
-    matrix (3, M): m, m and rad per rad. covariance (3, M, M): of each row. left (2,): share of position and heading
-    that the wheels do not explain, robust; share: of both together, a turn counting at the robot's size. windows: their
-    number. gram (M, M): sum of products of the driven signals,
-    rad^2.
+    matrix (3, M): m, m and rad per rad. covariance (3, M, M): of each row. unexplained (2,): shares of the positions
+    and of the headings that the wheels do not explain, robust; share: of both together, a turn counting at the robot's
+    size. windows: their number. gram (M, M): sum of products of the driven signals, rad^2.
     """
 
     matrix: Array
     covariance: Array
-    left: Array
+    unexplained: Array
     share: float
     windows: int
     gram: Array
@@ -99,7 +98,7 @@ class Windows:
         position, position_weights = _robust(self.bent, self.moved)
         off = self.moved - self.bent @ position
         missed = self.turned - self.driven @ heading.real
-        left = [_share(off, self.moved, position_weights), _share(missed, self.turned, heading_weights)]
+        unexplained = [_share(off, self.moved, position_weights), _share(missed, self.turned, heading_weights)]
         # Slip of the wheels as a covariance (M, M) of the matrix, as a share of a row's scale squared.
         _, strengths, directions = np.linalg.svd(self.driven, full_matrices=False)
         shares = np.maximum(strengths / max(float(strengths[0]), 1e-300), 1e-4)
@@ -111,8 +110,8 @@ class Windows:
         scales[:2] = scales[:2].max()
         covariance = np.array([of_place, of_place, of_heading]) + scales[:, None, None] ** 2 * slip
         wholes = [float(position_weights @ np.abs(self.moved) ** 2), reach**2 * float(heading_weights @ self.turned**2)]
-        share = float(np.sqrt(np.square(left) @ wholes / max(sum(wholes), 1e-300)))
-        return FreeFit(matrix, covariance, np.array(left), share, count, self.driven.T @ self.driven)
+        share = float(np.sqrt(np.square(unexplained) @ wholes / max(sum(wholes), 1e-300)))
+        return FreeFit(matrix, covariance, np.array(unexplained), share, count, self.driven.T @ self.driven)
 
     def steering_zero(self) -> tuple[float, float]:
         """The angle, rad, that a car's steering angles lack, and its standard error.
@@ -177,13 +176,13 @@ def _of_run(run: int, log: WheelLog, poses: Array, length: float) -> Windows | N
     )
 
 
-def _robust(columns: Complex, wanted: Complex) -> tuple[Complex, Array]:
+def _robust(columns: Complex, observed: Complex) -> tuple[Complex, Array]:
     """Least squares (M,) with Huber's weights (W,)."""
-    weights = np.ones(len(wanted))
+    weights = np.ones(len(observed))
     for _ in range(_REWEIGHTED):
         roots = np.sqrt(weights)
-        solution = np.linalg.lstsq(columns * roots[:, None], wanted * roots, rcond=_NULL)[0]
-        sizes = np.abs(wanted - columns @ solution)
+        solution = np.linalg.lstsq(columns * roots[:, None], observed * roots, rcond=_NULL)[0]
+        sizes = np.abs(observed - columns @ solution)
         deviation = 1.4826 * float(np.median(sizes))
         if not deviation:
             break
@@ -191,18 +190,18 @@ def _robust(columns: Complex, wanted: Complex) -> tuple[Complex, Array]:
     return solution.astype(np.complex128), weights
 
 
-def _share(left: Array | Complex, wanted: Array | Complex, weights: Array) -> float:
-    """Share of what is wanted that a fit leaves."""
-    whole = float(weights @ np.abs(wanted) ** 2)
-    return float(np.sqrt(weights @ np.abs(left) ** 2 / whole)) if whole else 0.0
+def _share(residuals: Array | Complex, observed: Array | Complex, weights: Array) -> float:
+    """Root of the share of the squares of what was observed that a fit does not explain."""
+    whole = float(weights @ np.abs(observed) ** 2)
+    return float(np.sqrt(weights @ np.abs(residuals) ** 2 / whole)) if whole else 0.0
 
 
-def _covariance(columns: Complex, left: Array | Complex, weights: Array) -> Array:
+def _covariance(columns: Complex, residuals: Array | Complex, weights: Array) -> Array:
     """Covariance (M, M) of a fit's solution, huge along directions that are not driven."""
     normal = ((columns.conj() * weights[:, None]).T @ columns).real
     values, vectors = np.linalg.eigh(normal)
     values = np.maximum(values, 1e-8 * max(float(values[-1]), 1e-300))
-    variance = _CORRELATED_WINDOWS * float(weights @ np.abs(left) ** 2) / max(float(weights.sum()), 1.0)
+    variance = _CORRELATED_WINDOWS * float(weights @ np.abs(residuals) ** 2) / max(float(weights.sum()), 1.0)
     covariance: Array = (vectors / values) @ vectors.T * variance
     return covariance
 
@@ -213,7 +212,7 @@ _RADIUS, _GAINS, _ELEMENT = 0.06, (0.05, 0.05, 0.12), 0.02
 _LATERAL = 0.2  # the gain of row y of mecanum wheels, which slip sideways; chosen
 _SKID = 0.5  # the gain of row 3 of a skid-steered robot, which turns 20 to 50 % less than its design
 _YAW = 0.035  # rad of the tracked point's heading; chosen, 2 degrees
-_PLACE = 0.1  # of the robot's size: standard deviation of the tracked point's x and y from the design; chosen
+_PLACE = 0.1  # of the robot's reach: standard deviation of x and y of the tracked point; chosen
 
 
 class DesignDistance:

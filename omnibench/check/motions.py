@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.check.evidence import Evidence
-from omnibench.check.motion_fit import Windows
 from omnibench.check.references import left_open
 from omnibench.data.finding import Finding, Kind
 from omnibench.data.stored import drawn_runs
@@ -94,8 +93,7 @@ def _missing_motions(evidence: Evidence) -> Iterator[tuple[str, str]]:
     if not any(run.rates.any() for run in runs):
         yield "the robot never moved", "drive it, and see that the columns of the wheels are those that count"
         return
-    windows = Windows.of([run.log(run.pose_times) for run in runs], [run.poses for run in runs])
-    if windows is None:
+    if (windows := evidence.windows) is None:
         return
     seconds = windows.times[:, 1] - windows.times[:, 0]
     velocity, rates = windows.moved / seconds, windows.turned / seconds

@@ -8,7 +8,6 @@ import numpy as np
 
 from omnibench.check.evidence import Evidence
 from omnibench.check.hypotheses import POSITION_UNITS
-from omnibench.check.motion_fit import Windows
 from omnibench.data.dataset import Trajectory
 from omnibench.data.finding import Finding, Kind, error
 from omnibench.data.references import KINDS, UNITS, ReferenceKind, References
@@ -18,9 +17,9 @@ from omnibench.robot.model import OdometryModel
 from omnibench.words import plural
 
 _REACHED = 0.05  # share of a run's time after which its last pose comes at least; chosen
-# Share of the runs' turns (squares of the whole runs') that the best matrix leaves: at most 0.005 on OptiOdom's
+# Share of the squares of the whole runs' turns that the best matrix does not explain: at most 0.005 on OptiOdom's
 # recordings, and 0.68 to 1.45 where the poses of each run were given to one of another command.
-_LEFT = 0.25
+_UNEXPLAINED = 0.25
 _TURNED = 0.5  # rad, root mean square of the runs' turns: less of it tells nothing; chosen
 _FEWEST = 3  # runs whose turns a matrix of a few numbers cannot all follow; chosen
 # How many times too large references in another unit are, and that unit; and the option that says so.
@@ -93,17 +92,15 @@ def unrelated_references(evidence: Evidence) -> Iterator[Finding]:
 
     It is judged by the share of the squares of the runs' turns that the best matrix does not explain.
     """
-    some = evidence.seen.some()
-    windows = Windows.of(some.logs, some.poses)
-    fit = None if windows is None else windows.fit(some.robot.reach)
-    if windows is None or fit is None or len(some.logs) < _FEWEST:
+    windows, fit = evidence.windows, evidence.fit
+    if windows is None or fit is None or len(evidence.runs) < _FEWEST:
         return
     turned = np.bincount(windows.run, windows.turned)
     missed = turned - np.bincount(windows.run, windows.driven @ fit.matrix[2])
     if np.sqrt(np.mean(turned**2)) < _TURNED:
         return
-    if (left := float((missed**2).sum() / (turned**2).sum())) > _LEFT:
-        what = f"the wheels explain {max(0.0, 1 - left):.0%} of how the reference turns"
+    if (share := float((missed**2).sum() / (turned**2).sum())) > _UNEXPLAINED:
+        what = f"the wheels explain {max(0.0, 1 - share):.0%} of how the reference turns"
         fix = "see whether wheels and poses of each run are of the same drive, and name the robot's wheels right"
         yield error("reference_foreign", what, "the reference", fix=fix)
 

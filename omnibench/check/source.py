@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from glob import escape
@@ -32,8 +33,8 @@ _FILES = {"command.csv": "table1", "*_metadata.csv": "optiodom", "*.csv": "csv",
 _ANY_RATE = 1e9  # rad/s: the option ``fastest`` with which rates in any unit are read
 # Periods, s, of wheels and of poses that are more likely in another unit; chosen: no encoder is read less often.
 _SLOWEST, _SLOWEST_POSES, _FASTEST = 1.5, 5.0, 3e-4
-_FEWEST_POSITIONS = 5  # of a run without poses, from which on it is compared with the wheels; chosen
-_EXPLAINED = 0.35  # share of the way that the wheels may leave unexplained with the right unit of time; chosen
+_FEWEST_POSITIONS = 5  # positions of a run without poses, of fewer it is not compared with the wheels; chosen
+_UNEXPLAINED = 0.35  # share of the way that wheels may not explain in the right unit of time; chosen
 _COLUMNS = {"wheel_order": ("joints", "wheel_columns"), "steering_order": ("steering_joints", "steering_columns")}
 
 
@@ -124,18 +125,19 @@ def read_source(
     (source,) = places
     check_source(source)
     name = form or recognised(source)
-    is_dataset = name == "dataset" and not settings
-    # Other units of time are tried where the source cannot be read, or makes no sense, in those given.
+    stored = name == "dataset" and not settings
     try:
-        dataset = load_dataset(source) if is_dataset else _read(name, source, settings)
+        dataset = load_dataset(source) if stored else _read(name, source, settings)
     except DataError:
-        if (mended := _by_other_times(name, source, settings)) is None:
-            raise
-    else:
-        mended = _by_other_times(name, source, settings) if odd_times(dataset) else None
-    if mended is not None:
-        return replace(mended, folder=source) if is_dataset else mended
-    return of_dataset(dataset, source) if is_dataset else RecordingSource(dataset, name, source, settings)
+        # Where the times cannot be read in the units that are given, they may be in others.
+        for finding in other_times(settings):
+            with suppress(DataError, ConfigError):
+                dataset = _read(name, source, {**settings, **finding.changes})
+                if sensible(dataset):
+                    folder = source if stored else None
+                    return RecordingSource(dataset, name, source, settings, folder, (finding,))
+        raise
+    return of_dataset(dataset, source) if stored else RecordingSource(dataset, name, source, settings)
 
 
 def of_dataset(dataset: Dataset, folder: Path | None = None) -> RecordingSource:
@@ -161,35 +163,19 @@ def recognised(source: Path) -> str:
     raise ConfigError(f"{source}: no recording is recognised there; name the importer with --format (omnibench list)")
 
 
-def _by_other_times(name: str, source: Path, given: Mapping[str, Any]) -> RecordingSource | None:
-    """The source by the other units of time that make sense; None if none does."""
-    for finding in other_times(given):
-        try:
-            dataset = _read(name, source, {**given, **finding.changes})
-        except (DataError, ConfigError):
-            continue
-        if sensible(dataset):
-            return RecordingSource(dataset, name, source, given, findings=(finding,))
-    return None
-
-
 def _read(name: str, source: Path, given: Mapping[str, Any]) -> Dataset:
     """The data set of a source, also if its rates are too fast for any wheel, which is what a check tells then."""
     options = dict(given)
     if "name" in importers.entry(name, "--format").options.model_fields:
         options.setdefault("name", source.resolve().stem)
-
-    def read(options: Mapping[str, Any]) -> Dataset:
-        importer, again = importer_of(name, source, options)
-        return read_dataset(importer, source, again)
-
     try:
-        dataset = read(options)
+        importer, again = importer_of(name, source, options)
+        dataset = read_dataset(importer, source, again)
     except DataError as refusal:
         if "fastest" in given:
             raise
         try:
-            dataset = read({**options, "fastest": _ANY_RATE})
+            dataset = _read(name, source, {**options, "fastest": _ANY_RATE})
         except (DataError, ConfigError):
             raise refusal from None
     if dataset.referenced:
@@ -202,7 +188,7 @@ def sensible(dataset: Dataset) -> bool:
     if odd_times(dataset):
         return False
     fit = recorded(dataset).fit()
-    return fit is not None and bool(fit.left[0] < _EXPLAINED)
+    return fit is not None and bool(fit.unexplained[0] < _UNEXPLAINED)
 
 
 def recorded(dataset: Dataset) -> Recorded:
@@ -289,8 +275,7 @@ def import_command(read: RecordingSource, options: Mapping[str, Any]) -> str:
 def mended_options(read: RecordingSource, findings: Sequence[Finding]) -> dict[str, Any]:
     """The options with the changes of findings, which are relative to those by which the recording was read."""
     options = dict(read.options)
-    changes = [change for finding in findings for change in finding.changes.items()]
-    for key, value in changes:
+    for key, value in (change for finding in findings for change in finding.changes.items()):
         options |= _changed(read, options, key, value)
         if key in _COLUMNS and options.get("columns"):  # names that now stand in the lists
             lists = [options.get(option) or () for other in _COLUMNS.values() for option in other]
@@ -302,46 +287,53 @@ def mended_options(read: RecordingSource, findings: Sequence[Finding]) -> dict[s
 
 def _changed(read: RecordingSource, options: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]:
     """The options that one change sets, relative to the present ones."""
-    fields = importers.entry(read.importer).options.model_fields
     present = options.get(key)
-    if key in _COLUMNS:
-        option = next((name for name in _COLUMNS[key] if name in fields), _COLUMNS[key][1])
-        names = list(options.get(option) or read.columns(key))
-        changed: dict[str, Any] = {option: [names[column] for column in value]} if names else {}
-        for other in ("wheel_signs", "ticks_per_turn", "gear_ratio") if key == "wheel_order" else ():
-            if isinstance(options.get(other), list | tuple) and len(options[other]) == len(value):
-                changed[other] = [options[other][column] for column in value]
-        return changed
-    if key == "pose_order":  # x and y exchanged are mirrored, and turned by a right angle
-        signs = _product(options.get("pose_signs"), [1, -1, 1])
-        return {"pose_signs": signs, "heading_offset_deg": round(float(options.get("heading_offset_deg", 0.0)) - 90, 3)}
-    if key in ("wheel_signs", "pose_signs", "steering_signs"):
-        changed = {key: _product(present, value)}
-        if key == "steering_signs" and (offsets := options.get("steering_offsets_deg")):
-            changed["steering_offsets_deg"] = _product(offsets, value)
-        return changed
-    if key == "rate_factors":
-        return _geared(options, value)
-    if key == "wheel_quantity":
-        return {"wheel_unit": value}
-    if key == "wheel_unit":
-        unit = str(options.get(key) or (read.reading[0][0].wheels.unit if read.reading else "rad/s"))
-        if unit == "rad/s":
-            return {key: value}
-        if unit.startswith("rad") and value != "rpm":
-            return {key: f"{value.partition('/')[0]}{unit.removeprefix('rad')}"}
-        return _geared(options, [float(f"{RATE_UNITS[value]:.6g}")] * len(read.dataset.robot.wheel_names))
-    if key == "steering_factors":
-        return {"steering_scale": _one_or_all(_product(options.get("steering_scale"), value))}
-    if key == "steering_offsets_deg":
-        offsets = zip(_listed(present, len(value), 0.0), value, strict=True)
-        return {key: _one_or_all([round(before + offset, 3) for before, offset in offsets])}
-    if key in ("heading_offset_deg", "steering_lag"):
-        return {key: round(float(present or 0.0) + value, 3)}
-    if key == "leave_out":
-        before = [present] if isinstance(present, str) else list(present or ())
-        return {key: [*before, *(name for name in map(escape, value) if name not in before)]}
-    return {key: {**(present or {}), **value} if key == "wheels" else value}
+    match key:
+        case "wheel_order" | "steering_order":
+            return _reordered(read, options, key, value)
+        case "pose_order":  # x and y exchanged are mirrored, and turned by a right angle
+            turned = round(float(options.get("heading_offset_deg", 0.0)) - 90, 3)
+            return {"pose_signs": _product(options.get("pose_signs"), [1, -1, 1]), "heading_offset_deg": turned}
+        case "wheel_signs" | "pose_signs":
+            return {key: _product(present, value)}
+        case "steering_signs":  # offsets are added after the signs
+            offsets = options.get("steering_offsets_deg")
+            turned_back = {"steering_offsets_deg": _product(offsets, value)} if offsets else {}
+            return {key: _product(present, value), **turned_back}
+        case "steering_factors":
+            return {"steering_scale": _one_or_all(_product(options.get("steering_scale"), value))}
+        case "steering_offsets_deg":
+            offsets = zip(_listed(present, len(value), 0.0), value, strict=True)
+            return {key: _one_or_all([round(before + offset, 3) for before, offset in offsets])}
+        case "heading_offset_deg" | "steering_lag":
+            return {key: round(float(present or 0.0) + value, 3)}
+        case "rate_factors":
+            return _geared(options, value)
+        case "wheel_quantity":
+            return {"wheel_unit": value}
+        case "wheel_unit":
+            unit = str(present or (read.reading[0][0].wheels.unit if read.reading else "rad/s"))
+            if unit.startswith("rad") and (unit == "rad/s" or value != "rpm"):  # the same quantity in another unit
+                return {key: value if unit == "rad/s" else value.replace("/s", unit.removeprefix("rad"))}
+            return _geared(options, [float(f"{RATE_UNITS[value]:.6g}")] * len(read.dataset.robot.wheel_names))
+        case "leave_out":
+            before = [present] if isinstance(present, str) else list(present or ())
+            return {key: [*before, *(name for name in map(escape, value) if name not in before)]}
+        case "wheels":
+            return {key: {**(present or {}), **value}}
+    return {key: value}
+
+
+def _reordered(read: RecordingSource, options: Mapping[str, Any], key: str, order: Sequence[int]) -> dict[str, Any]:
+    """The option that names columns, in another order, and with it those that have a value for each wheel."""
+    fields = importers.entry(read.importer).options.model_fields
+    option = next((name for name in _COLUMNS[key] if name in fields), _COLUMNS[key][1])
+    names = list(options.get(option) or read.columns(key))
+    changed: dict[str, Any] = {option: [names[column] for column in order]} if names else {}
+    for other in ("wheel_signs", "ticks_per_turn", "gear_ratio") if key == "wheel_order" else ():
+        if isinstance(options.get(other), list | tuple) and len(options[other]) == len(order):
+            changed[other] = [options[other][column] for column in order]
+    return changed
 
 
 def _geared(options: Mapping[str, Any], factors: Sequence[float]) -> dict[str, Any]:
@@ -364,11 +356,13 @@ def other_quantities(read: RecordingSource) -> Iterator[Finding]:
 
 
 def _listed(present: Any, count: int, default: float) -> list[float]:
-    values = present if isinstance(present, list | tuple) else [] if present is None else [present]
-    return list(values) * count if len(values) == 1 else list(values) or [default] * count
+    """The values of an option: one that is given for all, or none, ``count`` times."""
+    values = list(present) if isinstance(present, list | tuple) else [] if present is None else [present]
+    return (values or [default]) * count if len(values) < 2 else values
 
 
 def _product(present: Any, factors: Sequence[float]) -> list[float]:
+    """The values of an option times factors, of which either may be one for all."""
     count = max(len(factors), len(present) if isinstance(present, list | tuple) else 1)
     both = zip(_listed(present, count, 1), _listed(list(factors), count, 1), strict=True)
     values = [one * other for one, other in both]

@@ -1,4 +1,4 @@
-"""A look at every run for what its streams show: gaps, a standing reference, angles of wheels and of steering."""
+"""Faults and motions that each run's streams show: gaps, a standing reference, angles of wheels and of steering."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from omnibench.progress import Reporter
 from omnibench.robot.kinematics import Array, Robot, rotated, wheel_equations
 from omnibench.robot.stored_odometry import together, workers
 
-# Gaps that are told, s, and as a multiple of the usual period (chosen: a Robotino's log has gaps of 0.24 s at 31 ms).
+# The shortest gap, s, and in usual periods (chosen: a sound Robotino's log has gaps of 0.24 s at 31 ms).
 _LEAST_GAP, _PERIODS = 0.4, 6.0
 _DRIVEN = 0.05  # m that the wheels drive in a gap or while the reference stands, less than which does no harm; chosen
 _STANDING, _STILL = 0.8, 0.03  # s that a reference stands, and share of the wheels' way that it may move then; chosen
@@ -23,9 +23,9 @@ _FASTEST = 8.0  # m/s of a rim: no robot of this kind is faster; chosen
 # robots that start from rest reach up to 0.32).
 _BEGIN, _MOVING = 0.12, 0.35
 # A robot that goes on slowly does not begin at rest, either: share of its usual speed, and of that over the next second
-# (chosen: a Robotino from rest has up to 0.34 of the latter, and no run of five robots is told that was not before).
+# (chosen: a Robotino that starts from rest has up to 0.34 of the latter).
 _SLOWLY, _AT_ONCE, _NEXT = 0.2, 0.5, 1.0
-_STEP = 3.0  # times the robot's size, over which turns are looked at for the steering angle; chosen
+_STEP = 3.0  # times the robot's size: steps over which the turns of a robot that steers are compared; chosen
 SAME = 1e-4  # m and rad: a pose that is repeated, below the noise of any reference; chosen
 
 

@@ -145,8 +145,13 @@ def _ranges(wheels: Sequence[WheelReadings], options: ReferenceOptions, notes: l
     if isinstance(options.wraps_at, float):
         return [options.wraps_at] * count
     turns = np.broadcast_to(options.ticks_per_turn or TURNS.get(unit, np.inf), count).tolist()
+    lone = [jumping_readings(readings.values, readings.times) for readings in wheels]  # which no counter's end explains
     ranges = [
-        counter_range([readings.values[:, index] for readings in wheels], turn, unit == "ticks")
+        counter_range(
+            [each.values[~jumps[:, index], index] for each, jumps in zip(wheels, lone, strict=True)],
+            turn,
+            unit == "ticks",
+        )
         for index, turn in enumerate(turns)
     ]
     # Wheels that never reach the end of their range have that of the others, if they keep within it.

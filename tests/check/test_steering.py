@@ -13,6 +13,7 @@ import pytest
 import yaml
 from commands import CONFIGS
 
+from omnibench import check
 from omnibench.check.misreadings import search
 from omnibench.check.source import recorded as recorded_of
 from omnibench.config import validate
@@ -120,3 +121,25 @@ def test_one_of_several_steering_angles_is_named(robot: str, wheel: int) -> None
 def test_ticks_and_a_gear_of_the_steering_are_named(robot: str, gear: float) -> None:
     factors = changes_of(mistakes_of(robot, steering=times(gear)), "steering_factors")
     assert factors[0] == pytest.approx(1 / gear, rel=0.15)
+
+
+@pytest.mark.parametrize("wheel", [0, 2])
+def test_the_zero_of_one_module_is_named_by_the_wheels_that_it_contradicts(wheel: int) -> None:
+    (mistake,) = mistakes_of("swerve", steering=plus(6.0, wheel))
+    assert mistake.kind == "steering_zero"
+    offsets = np.array(mistake.changes["steering_offsets_deg"])
+    assert offsets[wheel] == pytest.approx(-6.0, abs=2.0)
+    assert not np.delete(offsets, wheel).any()
+
+
+@pytest.mark.parametrize("degrees", [0.0, 2.0, -3.0])
+def test_a_small_zero_of_a_cars_steering_is_warned_of_with_its_option(degrees: float) -> None:
+    data = recorded("car")
+    runs = [replace(run, steering=plus(degrees)(run.steering)) for run in data.trajectories if run.steering is not None]
+    report = check(make_dataset("changed", data.robot, data.sample_period, runs))
+    zeros = [finding for finding in report.findings if finding.kind == "steering_zero"]
+    assert [finding.severity for finding in zeros] == (["warning"] if degrees else [])
+    for finding in zeros:
+        assert "calibrate --steering fit" in finding.what
+        (offset,) = set(finding.changes["steering_offsets_deg"])
+        assert offset == pytest.approx(-degrees, abs=0.4)

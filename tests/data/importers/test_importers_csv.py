@@ -574,6 +574,17 @@ def test_single_readings_of_0_are_left_out_and_said_also_of_a_wheel_that_stands(
     assert data.trajectories[0].rates[:, 1].tolist() == [0.0] * (len(times) - len({*left, *right}) - 1)
 
 
+def test_single_readings_of_the_other_sign_are_no_end_of_a_counter(tmp_path: Path) -> None:
+    times = np.arange(0.0, 8.0, 0.05)
+    counts = 10_000 + np.floor(1000 * times)
+    counts[127] = -counts[127]  # 16,350 ticks: the step is as long as a range of 2^15
+    poses = dict.fromkeys(("x", "y", "theta"), 0 * times)
+    write_table(tmp_path / "log.csv", {"t": times, "phi_left": counts, "phi_right": counts[0] + 0 * times, **poses})
+    data = read(tmp_path / "log.csv", wheel_unit="ticks", ticks_per_turn=1440)
+    assert "begin again" not in str(data.warnings)
+    assert "1 single reading of wheel positions" in str(data.warnings)
+
+
 def test_rows_that_repeat_a_time_or_the_wheels_while_they_turned_are_left_out_and_said(tmp_path: Path) -> None:
     twice = np.sort(np.append(np.arange(401), [7, 7, 50]))
     data = read_log(log(tmp_path, twice))
