@@ -267,7 +267,7 @@ def check(
 ) -> None:
     """Say what is wrong with a recording, and what to type.
 
-    Nothing is changed. Exit 0 whatever the verdict; 2 where the source cannot be read.
+    Nothing is changed. Exit 0: ready; 1: fix, or record more; 2: the source cannot be read.
     """
     from omnibench.check.check import check_recording
     from omnibench.check.source import next_command, read_source
