@@ -162,9 +162,9 @@ def _misread_wheels(robot: Robot) -> Iterator[tuple[Reading, float, Finding]]:
     for group in _groups(len(names)):
         for factor, cost in [*((count, _WHEEL) for count in _COUNTS), *((float(gear), _FITTED) for gear in _GEARS)]:
             yield Reading((), np.where(group > 0, 1 / factor, 1.0)), cost, _scaled(names, group, factor)
+    for pair in combinations(range(len(drive.steered)), 2):
+        yield _exchanged_angles(drive, *pair)
     if drive.direct or isinstance(drive, CarDrive):
-        exchanged_angles = combinations(range(len(drive.steered)), 2)
-        yield from (_exchanged_angles(drive, *pair) for pair in exchanged_angles)
         return
     for group in _groups(len(drive.steered)):
         yield Reading(factors=np.where(group > 0, -1.0, 1.0)), _WHEEL, _clockwise(drive.steered, group)
@@ -172,8 +172,6 @@ def _misread_wheels(robot: Robot) -> Iterator[tuple[Reading, float, Finding]]:
             if abs(degrees) >= _LEAST_ZERO:
                 cost = _FITTED if abs(degrees) <= 90 else _REVERSED
                 yield Reading(offsets=group * degrees * DEGREE), cost, another_zero(robot, group, degrees)
-    for pair in combinations(range(len(drive.steered)), 2):
-        yield _exchanged_angles(drive, *pair)
     for first, second in combinations(range(len(names)), 2):
         order = exchanged(len(names), first, second)
         rates = _arrangement(names, order, (1,) * len(names))
@@ -489,10 +487,8 @@ def another_zero(robot: Robot, group: Array, degrees: float) -> Finding:
 
 def _exchanged_angles(drive: Drive, first: int, second: int) -> tuple[Reading, float, Finding]:
     """The steering angles of two wheels, exchanged."""
-    names, order = (
-        wheels_in_words((drive.steered[first], drive.steered[second])),
-        exchanged(len(drive.steered), first, second),
-    )
+    names = wheels_in_words((drive.steered[first], drive.steered[second]))
+    order = exchanged(len(drive.steered), first, second)
     words = f"the steering angles of {names} look swapped"
     wrong = error("steering_swapped", words, f"steering of {names}", {"steering_order": list(order)})
     return Reading(order=order), _WHEEL, wrong

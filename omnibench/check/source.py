@@ -90,13 +90,6 @@ class RecordingSource:
         except (DataError, ConfigError):
             return None
 
-    def columns(self, key: str) -> list[str]:
-        """Names in the source of the wheels' columns, or of the steering angles', in the robot's order."""
-        if self.reading is None:
-            return []
-        wheels = self.reading[0][0].wheels
-        return list(wheels.columns if key == "wheel_order" else wheels.steering_columns)
-
 
 def _of_runs(dataset: Dataset, given: Mapping[str, Any]) -> tuple[list[Recording], ReferenceOptions]:
     """The runs of a data set as recordings."""
@@ -244,7 +237,7 @@ def settings_of(read: RecordingSource, findings: Sequence[Finding]) -> list[str]
 
 def command(read: RecordingSource, findings: Sequence[Finding]) -> str:
     """The command line that reads a recording again, mended; of a data set in memory it says that it is to be saved."""
-    if not any(finding.changes for finding in findings) or not settings_of(read, findings):
+    if not settings_of(read, findings):
         return ""
     if read.places:
         return f'for each in {in_few_words(read.places)}; do omnibench check "$each"; done'
@@ -328,7 +321,10 @@ def _reordered(read: RecordingSource, options: Mapping[str, Any], key: str, orde
     """The option that names columns, in another order, and with it those that have a value for each wheel."""
     fields = importers.entry(read.importer).options.model_fields
     option = next((name for name in _COLUMNS[key] if name in fields), _COLUMNS[key][1])
-    names = list(options.get(option) or read.columns(key))
+    names = list(options.get(option) or ())
+    if not names and read.reading is not None:  # those of the source, in the robot's order
+        wheels = read.reading[0][0].wheels
+        names = list(wheels.columns if key == "wheel_order" else wheels.steering_columns)
     changed: dict[str, Any] = {option: [names[column] for column in order]} if names else {}
     for other in ("wheel_signs", "ticks_per_turn", "gear_ratio") if key == "wheel_order" else ():
         if isinstance(options.get(other), list | tuple) and len(options[other]) == len(order):
