@@ -366,8 +366,11 @@ def _tick_time(driven: Array, durations: Array) -> float:
     ticks = moved / moved.min()
     if np.abs(ticks - np.round(ticks)).max() > 0.05 or ticks.max() > _FINE:
         return 0.0
-    rates = (steps / durations[:, None]).max(axis=1)
-    return float(moved.min() / np.median(rates[rates > 0]))
+    # Between the samples in which the wheel that turns most has counted, of which slow wheels leave many out.
+    busiest = steps[:, steps.sum(axis=0).argmax()]
+    counted = np.flatnonzero(busiest >= moved.min())
+    intervals = np.diff(np.cumsum(durations)[counted])
+    return float(np.median(intervals / busiest[counted[1:]]) * moved.min()) if len(intervals) else 0.0
 
 
 def _coefficients(windows: Sequence[Windows], clocks: Sequence[Clock]) -> list[Array]:
