@@ -290,22 +290,23 @@ def _search_sparse(recording: Recorded) -> Explained:
 
 def _contradicting(recording: Recorded) -> tuple[Finding, ...]:
     """The mistake of one steered wheel without which the wheels agree about the motion; empty if there is none."""
-    drive, far = recording.robot.drive, DesignDistance(recording.robot)
+    if max(recording.robot.drive.pairs, default=-1) < 1:
+        return ()
+    signals = np.concatenate([log.signals for log in recording.logs])
+    lengths = np.concatenate([np.diff(log.times, prepend=0.0) for log in recording.logs])
+    gram, far = (signals.T * lengths) @ signals, DesignDistance(recording.robot)
+    present = far.contradictions(gram, np.eye(len(gram))[None])[0]
+    if present <= _CONTRADICTING / 3:
+        return ()
     steering = [
         hypothesis
         for hypothesis in wheel_hypotheses(recording.robot)
         if hypothesis.reading is None
         and any(key.startswith("steering") for mistake in hypothesis.mistakes for key in mistake.changes)
     ]
-    if max(drive.pairs, default=-1) < 1 or not steering:
-        return ()
-    signals = np.concatenate([log.signals for log in recording.logs])
-    lengths = np.concatenate([np.diff(log.times, prepend=0.0) for log in recording.logs])
-    gram, columns = (signals.T * lengths) @ signals, np.array([each.columns for each in steering])
-    present, shares = far.contradictions(gram, np.eye(len(gram))[None])[0], far.contradictions(gram, columns)
+    shares = far.contradictions(gram, np.array([hypothesis.columns for hypothesis in steering]))
     best = int(shares.argmin())
-    explained = present > _CONTRADICTING / 3 and shares[best] < _EXPLAINED * present
-    return steering[best].mistakes if explained else ()
+    return steering[best].mistakes if shares[best] < _EXPLAINED * present else ()
 
 
 def _sparse_hypotheses(robot: Robot) -> Iterator[Hypothesis]:

@@ -58,6 +58,14 @@ def matched(*runs: Streams) -> list[ClockMatch]:
     return [clock for clock in clocks if clock is not None]
 
 
+def test_counts_that_come_less_often_than_samples_count_in_the_error_that_is_stated() -> None:
+    run, tick = streams(0), 2 * math.pi / 12  # rad; the wheels turn by about 3 rad/s, a tick in 0.17 s
+    coarse = replace(run, driven=np.floor(run.driven / tick) * tick)
+    (clock,) = matched(coarse)
+    assert 0.02 < clock.middle_error < 0.08
+    assert np.abs(errors(clock)).max() < 3
+
+
 def test_chords_in_place_of_arcs_count_in_the_error_that_is_stated() -> None:
     clocks = [matched(streams(seed, heading_noise=1e-9, position_noise=1e-9))[0] for seed in range(4)]
     assert np.abs([errors(clock) for clock in clocks]).max() < 3
