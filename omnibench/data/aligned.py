@@ -120,40 +120,50 @@ class AlignedRecording:
 
 def aligned_recordings(
     recordings: Sequence[Recording], options: ReferenceOptions, notes: list[str]
-) -> list[AlignedRecording]:
+) -> Iterator[AlignedRecording]:
     """The recordings in SI units, by one clock, which is matched if the options say so. DataError in one line.
 
-    notes: what was left out, mended or decided is added.
+    notes: what was left out, mended or decided is added, at the end.
     """
-    positions = [each.wheels for each in recordings if quantity_of(each.wheels.unit) == "positions"]
     ranges: Sequence[float | None] = [None] * len(options.robot.wheel_names)
-    if positions and options.wraps_at != "never":
-        ranges = _ranges(positions, options, notes)
-    counted = [_counted(recording, ranges, options, notes) for recording in recordings]
-    samples = [
-        _wheel_samples(recording, *pair, options, notes) for recording, pair in zip(recordings, counted, strict=True)
-    ]
-    aligned = [
-        AlignedRecording(*pair, _reference_stream(pair[0], options)) for pair in zip(recordings, samples, strict=True)
-    ]
-    return aligned if options.clocks == "same" else _by_matched_clocks(aligned, options, notes)
+    if options.wraps_at != "never":
+        read = (recording.wheels for recording in recordings)  # of which the positions alone are held
+        positions = [(wheels.values, wheels.unit) for wheels in read if quantity_of(wheels.unit) == "positions"]
+        if positions:
+            ranges = _ranges([values for values, _ in positions], positions[0][1], options, notes)
+            del positions
+    of_counters, of_samples = list[str](), list[str]()
+
+    def in_si(recording: Recording) -> AlignedRecording:
+        values, used = _counted(recording, ranges, options, of_counters)
+        samples = _wheel_samples(recording, values, used, options, of_samples)
+        return AlignedRecording(recording, samples, _reference_stream(recording, options))
+
+    aligned = map(in_si, recordings)
+    if options.clocks == "same":
+        yield from aligned
+        notes += [*of_counters, *of_samples]
+    else:
+        together = list(aligned)
+        notes += [*of_counters, *of_samples]
+        yield from _by_matched_clocks(together, options, notes)
 
 
-def _ranges(wheels: Sequence[WheelReadings], options: ReferenceOptions, notes: list[str]) -> list[float | None]:
-    """The range of each wheel's counter, by all recordings, or the one that is given."""
-    unit, count = wheels[0].unit, len(options.robot.wheel_names)
+def _ranges(positions: Sequence[Array], unit: str, options: ReferenceOptions, notes: list[str]) -> list[float | None]:
+    """The range of each wheel's counter, by its positions (F, N) in all recordings, or the one that is given."""
+    count = len(options.robot.wheel_names)
     if isinstance(options.wraps_at, float):
         return [options.wraps_at] * count
     turns = np.broadcast_to(options.ticks_per_turn or TURNS.get(unit, np.inf), count).tolist()
     ranges = [
-        counter_range([readings.values[:, index] for readings in wheels], turn, unit == "ticks")
+        counter_range([values[:, index] for values in positions], turn, unit == "ticks")
         for index, turn in enumerate(turns)
     ]
     # Wheels that never reach the end of their range have that of the others, if they keep within it.
     recognised = {wrap for wrap in ranges if wrap is not None}
     if len(recognised) == 1:
         (wrap,) = recognised
-        spans = [max(float(np.ptp(each.values[:, index])) for each in wheels) for index in range(count)]
+        spans = [max(float(np.ptp(values[:, index])) for values in positions) for index in range(count)]
         ranges = [wrap if span <= wrap else None for span in spans]
     for wrap in sorted(recognised):
         again = f"wheel positions begin again after {wrap:.10g} {unit}"

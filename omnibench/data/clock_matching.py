@@ -24,7 +24,8 @@ that are summed over blocks, as slip lasts.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from array import array
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -492,16 +493,21 @@ def align(begin: float, wheel_times: Array, pose_times: Array, poses: Array) -> 
 _BUNCHED, _TOGETHER = 1.2, 10  # factor of the mean period from the median, and samples that it is taken over; chosen
 
 
-def usual_period(times: Sequence[Array]) -> float:
+def usual_period(times: Iterable[Array]) -> float:
     """The usual time between samples of recordings, to the microsecond, s: the median, or the mean where stamps bunch.
 
     Messages that are stamped on arrival come in bunches: 47 ms, 3 ms, 47 ms ... at a period of 25 ms.
     """
-    steps = [np.diff(recording) for recording in times if len(recording) > 1]
-    typical = float(np.median(np.concatenate(steps))) if steps else float(times[0][0])
-    spans = [(each[_TOGETHER:] - each[:-_TOGETHER]) / _TOGETHER for each in times if len(each) > 2 * _TOGETHER]
-    if spans and not 1 / _BUNCHED < (mean := float(np.median(np.concatenate(spans)))) / typical < _BUNCHED:
-        typical = mean
+    steps, spans, firsts = array("d"), array("d"), list[float]()  # of which there may be very many
+    for stamps in times:
+        firsts += stamps[:1].tolist()
+        steps.frombytes(np.diff(stamps).tobytes())
+        if len(stamps) > 2 * _TOGETHER:
+            spans.frombytes(((stamps[_TOGETHER:] - stamps[:-_TOGETHER]) / _TOGETHER).tobytes())
+    typical = float(np.median(np.frombuffer(steps), overwrite_input=True)) if steps else firsts[0]
+    if spans:
+        mean = float(np.median(np.frombuffer(spans), overwrite_input=True))
+        typical = typical if 1 / _BUNCHED < mean / typical < _BUNCHED else mean
     return round(typical, 6) or typical
 
 

@@ -7,7 +7,9 @@ from collections import Counter
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import groupby
 from numbers import Real
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal
 
@@ -72,6 +74,7 @@ _MOST_PERIODS = 1001.0
 # Share of the runs whose headings are neither wrapped nor those of the wheels, from which on none is unwrapped (chosen:
 # in degrees most are such, in radians none); turns within which wrapped headings lie, with what rounding adds.
 _CONTRADICTED, _WITHIN = 0.25, 1.001
+_POSES_AT_ONCE = 200_000  # whose odometry is in memory when headings are unwrapped: 40 MB; chosen
 _SHOWN = 5  # ids in a warning, at most
 _ONLY_RUN = "run"  # id of the run of tables without a column "trajectory"
 _PERIOD_DECIMALS = 9  # of a sample period in s that is taken from stamps: ns
@@ -545,9 +548,11 @@ def checked(dataset: Dataset) -> Dataset:
         warnings.append(
             f"sample_period is {sample_period:g} s, but the wheel samples come every {period:g} s (the median)"
         )
-    for index, (run, heading) in enumerate(zip(runs, headings, strict=True)):
+    for index, (run, before, heading) in enumerate(zip(runs, recorded, headings, strict=True)):
+        if heading is not before:  # poses that stay need no memory for a copy
+            run = replace(run, poses=np.column_stack([run.poses[:, :2], heading]))
         references = None if run.references is None else with_whole_turns(robot, run.log([0.0]), run.references)
-        runs[index] = replace(run, poses=np.column_stack([run.poses[:, :2], heading]), references=references)
+        runs[index] = replace(run, references=references)
     return with_warnings(replace(dataset, trajectories=tuple(runs)), warnings)
 
 
@@ -561,7 +566,7 @@ def with_warnings(dataset: Dataset, warnings: Iterable[str]) -> Dataset:
 
 
 def unwrap(robot: Robot, logs: Sequence[WheelLog], headings: Sequence[Array]) -> tuple[list[Array], list[int]]:
-    """Continuous headings (rad) and the indices of trajectories in which they are ambiguous.
+    """Continuous headings (rad), as given where they are, and the indices of trajectories in which they are ambiguous.
 
     Every increment gets the whole turns that bring it closest to the design model's odometry. Where the reference is
     dense this is the nearest turn; where it is sparse, the odometry tells how often the robot turned in between. A
@@ -570,11 +575,15 @@ def unwrap(robot: Robot, logs: Sequence[WheelLog], headings: Sequence[Array]) ->
     model = OdometryModel.of_design(robot, "arc")
     unwrapped: list[Array] = []
     ambiguous: list[int] = []
-    for index, (odometry, heading) in enumerate(zip(model.poses(logs), headings, strict=True)):
+    blocks = (np.cumsum([len(heading) for heading in headings]) // _POSES_AT_ONCE).tolist()
+    parts = groupby(zip(blocks, logs, strict=True), key=itemgetter(0))
+    driven = (odometry for _, part in parts for odometry in model.poses([log for _, log in part]))
+    for index, (odometry, heading) in enumerate(zip(driven, headings, strict=True)):
         steps, expected = np.diff(heading), np.diff(odometry[:, 2])
         turns = np.round((expected - steps) / TURN)
         # Added to the headings as recorded, so that continuous ones stay as they are to the bit.
-        unwrapped.append(heading + TURN * np.concatenate([[0.0], np.cumsum(turns)]))
+        continuous = heading + TURN * np.concatenate([[0.0], np.cumsum(turns)])
+        unwrapped.append(heading if continuous.tobytes() == heading.tobytes() else continuous)
         if np.abs(steps + TURN * turns - expected).max(initial=0.0) > TURN / 4:
             ambiguous.append(index)
     return unwrapped, ambiguous

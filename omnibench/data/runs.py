@@ -17,12 +17,14 @@ from omnibench.data.aligned import aligned_recordings
 from omnibench.data.clock_matching import usual_period
 from omnibench.data.cutting import MadeRun, cut_into_runs
 from omnibench.data.dataset import SPLITS, Dataset, Trajectory, make_dataset
-from omnibench.data.recording import Recording, ReferenceOptions, scan_difference
+from omnibench.data.recording import Recording, ReferenceOptions, WheelReadings, scan_difference
 from omnibench.data.scans import Scans
+from omnibench.data.scratch import Scratch, StoredSequence
 from omnibench.data.splits import complete, divided, every_second, remaining
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Robot
 from omnibench.robot.model import OdometryModel
+from omnibench.robot.samples import Samples
 from omnibench.words import some
 
 _NUMBER = re.compile(
@@ -37,27 +39,41 @@ def dataset_of(
 
     notes: what was left out, mended or decided is added; the data set's warnings hold it.
     """
-    aligned = aligned_recordings(recordings, options, notes)
-    runs = [run for each in aligned for run in cut_into_runs(each, options, notes, alone=len(aligned) == 1)]
+    scratch = Scratch() if isinstance(recordings, StoredSequence) else None
+    runs, cuts, referenced = list[MadeRun](), list[str](), True
+    for aligned in aligned_recordings(recordings, options, notes):
+        referenced &= aligned.recording.referenced
+        made = cut_into_runs(aligned, options, cuts, alone=len(recordings) == 1)
+        runs += made if scratch is None else [_in_file(run, scratch) for run in made]
+    notes += cuts
     if not runs:
         raise DataError(f"{notes[-1] if notes else recordings[0].place}; nothing is left")
     trajectories = complete([run.trajectory for run in runs])
     trajectories = divided_runs(with_commands(trajectories, options, notes), runs, options, notes)
     kept = {run.id for run in trajectories}
     scans = _scans_of([run for run in runs if run.trajectory.id in kept])
-    period = options.sample_period or usual_period([run.times for run in trajectories])
+    period = options.sample_period or usual_period(run.times for run in trajectories)
     dataset = make_dataset(
         options.name, options.robot, period, trajectories,
         description=options.description, source=options.source, licence=options.licence,
         simulated=simulated, scans=scans,
     )  # fmt: skip
-    if all(recording.referenced for recording in recordings):
+    if referenced:
         return replace(dataset, warnings=(*notes, *dataset.warnings))
     # In the place of poses that are yet to be made stands the design's odometry, from (0, 0, 0) on.
     logs = [run.log(run.pose_times) for run in dataset.trajectories]
     poses = OdometryModel.of_design(options.robot, "arc").poses(logs)
     placed = [replace(run, poses=driven) for run, driven in zip(dataset.trajectories, poses, strict=True)]
     return replace(dataset, trajectories=tuple(placed), referenced=False, warnings=tuple(notes))
+
+
+def _in_file(run: MadeRun, scratch: Scratch) -> MadeRun:
+    """The run with its wheel samples in a temporary file, and without the readings that it was made of."""
+    held, recording = run.trajectory.samples, run.recording
+    arrays = {name: None if array is None else scratch.stored(array) for name, array in held.contents().items()}
+    trajectory = replace(run.trajectory, samples=Samples(arrays, (held.count, held.end)))
+    none = WheelReadings(np.empty(0), np.empty((0, 0)), recording.wheels.unit)
+    return replace(run, trajectory=trajectory, recording=replace(recording, wheels=none, poses=None, measured=None))
 
 
 def with_commands(runs: Sequence[Trajectory], options: ReferenceOptions, notes: list[str]) -> list[Trajectory]:

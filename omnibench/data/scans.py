@@ -11,7 +11,6 @@ lies along the floor, and from the height h it meets the floor after h/(cos a si
 
 from __future__ import annotations
 
-import errno
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -22,14 +21,13 @@ from typing import Any
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
-from polars.io.plugins import register_io_source
 from pydantic import Field, FiniteFloat, model_validator
 
 from omnibench.config import Model, NonNegative, Positive
-from omnibench.data.parquet import check_unchanged, file_state, parquet_shape, readable
+from omnibench.data.parquet import check_unchanged, file_state, parquet_shape, readable, sink_frames
 from omnibench.data.stored import Rows, Table, check_columns, times_flaw
 from omnibench.errors import DataError
-from omnibench.files import TableFormat, check_file, quoted_formulas, unquoted_formulas
+from omnibench.files import TableFormat, check_file, unquoted_formulas
 from omnibench.robot.kinematics import Array
 
 Ranges = NDArray[np.float32]
@@ -267,20 +265,10 @@ def write_scans(scans: Scans, table_format: TableFormat, trajectories: Iterable[
     chosen = [trajectory for trajectory in trajectories if trajectory in recorded]
     as_text = table_format == "csv"
 
-    def frames(*_: Any) -> Iterator[pl.DataFrame]:
-        for trajectory in chosen:
-            yield from _frames(trajectory, scans.of(trajectory), as_text)
-
     ranges = pl.String() if as_text else pl.List(pl.Float32)
-    table = register_io_source(frames, schema={"trajectory": pl.String(), "t": pl.Float64(), "ranges": ranges})
-    try:
-        with file.open("wb") as opened:  # polars would open it at any time, even after a break has removed it
-            if as_text:
-                table.sink_csv(opened, maintain_order=True)
-            else:
-                table.sink_parquet(opened, row_group_size=_ROW_GROUP, maintain_order=True)
-    except pl.exceptions.PolarsError as error:
-        raise OSError(errno.EIO, str(error)) from None
+    types = {"trajectory": pl.String(), "t": pl.Float64(), "ranges": ranges}
+    frames = (frame for trajectory in chosen for frame in _frames(trajectory, scans.of(trajectory), as_text))
+    sink_frames(frames, types, table_format, _ROW_GROUP, file)
 
 
 def _frames(trajectory: str, scans: TrajectoryScans, as_text: bool) -> Iterator[pl.DataFrame]:
@@ -290,5 +278,5 @@ def _frames(trajectory: str, scans: TrajectoryScans, as_text: bool) -> Iterator[
         columns = {"trajectory": [trajectory] * len(times), "t": times, "ranges": ranges}
         frame = pl.DataFrame(columns).with_columns(pl.col("ranges").arr.to_list(), pl.col("t").cast(pl.Float64))
         if as_text:
-            frame = quoted_formulas(frame.with_columns(pl.col("ranges").cast(pl.List(pl.String)).list.join(" ")))
+            frame = frame.with_columns(pl.col("ranges").cast(pl.List(pl.String)).list.join(" "))
         yield frame
