@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import weakref
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,9 +20,11 @@ T = TypeVar("T")
 def temporary_file(ending: str) -> Any:
     """A new file in the folder of temporary files, which is removed with the object, or when Python ends. DataError."""
     try:
-        return NamedTemporaryFile(prefix="omnibench-", suffix=ending)
+        file = NamedTemporaryFile(prefix="omnibench-", suffix=ending, delete=False)  # noqa: SIM115 (it outlives this)
     except OSError as error:
         raise DataError(f"no temporary file can be made: {error.strerror or error}; set TMPDIR to a folder") from None
+    weakref.finalize(file, Path(file.name).unlink, missing_ok=True)
+    return file
 
 
 class Scratch:
@@ -64,7 +67,7 @@ class Stored(Generic[T]):
             way = "the process that imports it has ended: save the data set, and load that"
             raise DataError(f"{self.path}: cannot be read: {error.strerror or error}; {way}") from None
         if isinstance(value, np.ndarray):  # with NumPy's own object for its type, so that asarray passes it on
-            return value.view(np.dtype(value.dtype.str))  # type: ignore[return-value]
+            return value.view(np.dtype(value.dtype.str))
         return value
 
     def __reduce__(self) -> tuple[Any, ...]:
