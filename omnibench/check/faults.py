@@ -217,8 +217,10 @@ def jumps(evidence: Evidence) -> Iterator[Finding]:
     """Poses that jump off the motion that wheels tell and return, and shifts of the reference that last."""
     robot, standing = evidence.dataset.robot, {look.run for look in evidence.looks if look.standing}
     runs = [run for run in evidence.aligned if run.id not in standing]
-    odometry = OdometryModel.of_design(robot, "arc").poses([run.log(run.pose_times) for run in runs])
-    found = {run.id: reference_jumps(robot, driven, run.poses) for run, driven in zip(runs, odometry, strict=True)}
+    model, found = OdometryModel.of_design(robot, "arc"), {}
+    for run in runs:  # of which the odometry of one is in memory
+        (driven,) = model.poses([run.log(run.pose_times)])
+        found[run.id] = reference_jumps(robot, driven, run.poses)
     lone, shifts = ([run for run, each in found.items() if len(getattr(each, kind))] for kind in ("lone", "shifts"))
     poses = sum(len(each.lone) for each in found.values())
     if shifts:
