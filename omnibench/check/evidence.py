@@ -34,14 +34,16 @@ class Evidence:
     def of(cls, read: RecordingSource) -> Evidence:
         """The evidence of a recording."""
         runs = [run for run in read.dataset.trajectories if run.has_poses]
-        smooth = [replace(run, poses=continuous(run.pose_times, run.poses)) for run in runs]
-        clocks = clocks_of(read.dataset.robot, smooth)
+        clocks = clocks_of(
+            read.dataset.robot, [replace(run, poses=continuous(run.pose_times, run.poses)) for run in runs]
+        )
         aligned = []
         for run, clock in zip(runs, clocks, strict=True):
             times = run.pose_times if clock is None else clock.corrected(run.pose_times)
             used = np.flatnonzero((times >= 0) & (times <= run.times[-1]))
             if clock is not None and len(used) >= max(3, len(times) // 2):
-                run = replace(run, pose_times=times[used], poses=run.poses[used], pose_covariances=None)
+                poses = run.poses if len(used) == len(times) else run.poses[used]
+                run = replace(run, pose_times=times[used], poses=poses, pose_covariances=None)
             aligned.append(run)
         return cls(read, runs, clocks, aligned)
 

@@ -83,12 +83,14 @@ def import_(
     scans but without reference poses get these by SLAM.
     """
     from omnibench.check.source import RecordingSource
+    from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.config import parse_settings
     from omnibench.data.dataset import Imported
     from omnibench.data.finding import UNITS
     from omnibench.data.splits import division_in_words
     from omnibench.data.storage import check_dataset_folder, save_dataset
     from omnibench.files import refuse_existing, resolved
+    from omnibench.progress import reading_told_to
     from omnibench.registry import importers
     from omnibench.slam.import_dataset import import_dataset
 
@@ -115,9 +117,10 @@ def import_(
     options, folder = dict(given), output.resolve().name
     if "name" in entry.cls.Options.model_fields and folder.isprintable() and folder:
         options.setdefault("name", folder)
-    dataset = import_dataset(importer, source, options)
-    read = RecordingSource(dataset, importer, source, given, output)
-    report = None if no_check else _checked(read)
+    with ProgressDisplay() as watch, reading_told_to(watch):
+        dataset = import_dataset(importer, source, options)
+        read = RecordingSource(dataset, importer, source, given, output)
+        report = None if no_check else _checked(read)
     if not accept_units and report is not None:
         # Units that cannot be right are refused, with what to type.
         wrong = [finding.what for finding in report.findings if finding.severity == "error" and finding.kind in UNITS]

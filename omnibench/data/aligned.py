@@ -28,6 +28,7 @@ from omnibench.data.finding import FindingWarning
 from omnibench.data.recording import SECONDS, TURNS, Recording, ReferenceOptions, WheelReadings, quantity_of
 from omnibench.data.references import KINDS, UNITS, References
 from omnibench.errors import DataError
+from omnibench.progress import tell_reading
 from omnibench.robot.kinematics import Array, Robot, in_the_middle, interpolated
 from omnibench.robot.odometry import WheelLog
 from omnibench.words import plural, some
@@ -135,6 +136,7 @@ def aligned_recordings(
     of_counters, of_samples = list[str](), list[str]()
 
     def in_si(recording: Recording) -> AlignedRecording:
+        tell_reading(1, "run")
         values, used = _counted(recording, ranges, options, of_counters)
         samples = _wheel_samples(recording, values, used, options, of_samples)
         return AlignedRecording(recording, samples, _reference_stream(recording, options))

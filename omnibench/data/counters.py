@@ -119,7 +119,8 @@ def lost_register(counts: Array, times: Array, ranges: Sequence[float]) -> float
     So does a driver that takes the difference of two readings in a register of 16 bits, and now and then reads too
     late. The steps go backwards while the wheel turns on, and not to 0, where a counter stands that was set anew.
     """
-    possible = [wrap for wrap in sorted(ranges) if wrap <= np.ptp(counts)]
+    spread = np.ptp(counts)
+    possible = [wrap for wrap in sorted(ranges) if wrap <= spread]
     if not possible:
         return None
     off, certain = _surprises(counts, times)

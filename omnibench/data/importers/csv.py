@@ -8,7 +8,7 @@ value and standard deviation.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from itertools import pairwise
 from pathlib import Path
@@ -37,9 +37,10 @@ from omnibench.data.importers.tum import planar_headings, read_tum
 from omnibench.data.recording import PoseReadings, Recording, ReferenceOptions, RunAttributes, WheelReadings, words_of
 from omnibench.data.references import KINDS, NUMBERS, References, reference_flaw, references_of
 from omnibench.data.runs import dataset_of
-from omnibench.data.scratch import Scratch, Stored, StoredSequence
+from omnibench.data.scratch import Scratch
 from omnibench.data.splits import Names
 from omnibench.errors import DataError, nearest
+from omnibench.progress import expect_reading, tell_reading
 from omnibench.registry import importers
 from omnibench.robot.kinematics import Array
 from omnibench.words import plural, some
@@ -401,15 +402,13 @@ def _likely(column: StreamColumn, names: Sequence[str], options: CsvOptions, bes
 class TableFiles:
     """The files of wheels and of poses of a recording; one file where they stand in the same rows.
 
-    references: that of distances, turns and the like, of this recording or of all; without poses there is one. loaded:
-    the table of the wheels, where it is the only one and was read already.
+    references: that of distances, turns and the like, of this recording or of all; without poses there is one.
     """
 
     name: str
     wheels: Path
     poses: Path | None
     references: Path | None = None
-    loaded: Table | None = field(default=None, repr=False)
 
 
 def find_tables(source: Path, options: CsvOptions, notes: list[str]) -> list[TableFiles]:
@@ -525,8 +524,7 @@ def _by_headers(
         if missing:
             without[file] = table, list(dict.fromkeys(missing))
         else:
-            alone = table if len(tables) == 1 else None
-            fitting.append(TableFiles(name, file, file if posed else None, references, alone))
+            fitting.append(TableFiles(name, file, file if posed else None, references))
     if not fitting and not without:
         raise DataError(f"{source}: none of its tables has rows ({_TEMPLATE})")
     if not fitting:
@@ -647,17 +645,20 @@ def read_recordings(source: Path, options: CsvOptions, notes: list[str]) -> Sequ
         if file
     }
     attributes = read_run_attributes(source, options, notes)
+    names = list[str]()
+
+    def read() -> Iterator[Recording]:
+        if size > LARGE:
+            expect_reading(len(files), "run")
+        for each in files:
+            of_runs = measured[each.references] if each.references else {}
+            for recording in _recordings(each, of_runs, attributes, options, notes, several=len(files) > 1):
+                tell_reading(1, "run")
+                names.append(recording.name)
+                yield recording
+
     size = sum(file.stat().st_size for file in {file for each in files for file in (each.wheels, each.poses) if file})
-    scratch = Scratch() if size > LARGE else None
-    names, recordings, stored = list[str](), list[Recording](), list[Stored[Recording]]()
-    for each in files:
-        of_runs = measured[each.references] if each.references else {}
-        for recording in _recordings(each, of_runs, attributes, options, notes, several=len(files) > 1):
-            names.append(recording.name)
-            if scratch is None:
-                recordings.append(recording)
-            else:
-                stored.append(scratch.stored(recording))
+    recordings = Scratch().sequence(read()) if size > LARGE else list(read())
     for file, of_runs in measured.items():
         if len(names) > 1 and None in of_runs and sum(each.references == file for each in files) != 1:
             raise _unnamed(of_runs[None])
@@ -673,7 +674,7 @@ def read_recordings(source: Path, options: CsvOptions, notes: list[str]) -> Sequ
                 )
         if extra := [run for run in attributes if run not in names]:
             notes.append(f"the table of runs lists runs that have no samples: {', '.join(extra[:12])}")
-    return StoredSequence(tuple(stored)) if stored else recordings
+    return recordings
 
 
 def _unnamed(table: Table) -> DataError:
@@ -698,7 +699,7 @@ def _recordings(
     measured: the references by their runs. ColumnError: columns of wheels or of poses are missing, all of which it
     names, or say another unit.
     """
-    shared, table = files.wheels == files.poses, files.loaded or load(files.wheels, options)
+    shared, table = files.wheels == files.poses, load(files.wheels, options)
     reference = files.poses or files.references or files.wheels
     tables = [(table, wheel_columns(options))]
     if files.poses is not None and files.poses.suffix != ".tum":
@@ -717,6 +718,8 @@ def _recordings(
     runs = list(dict.fromkeys([*wheels, *poses]))
     if len(runs) > 1:
         runs = [run for run in runs if run is not None]
+        if files.wheels.stat().st_size > LARGE:
+            expect_reading(len(runs), "run")
     for run in runs:
         name = files.name if run is None or (several and len(runs) == 1) else f"{files.name}/{run}" if several else run
         if run not in wheels and None not in wheels:
