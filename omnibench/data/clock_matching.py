@@ -19,7 +19,8 @@ values. They are common to all runs that are given: a run that drives one comman
 
 Eq. (2) and (3) are solved by Gauss-Newton with Huber's weights; a step that does not lower Huber's loss is halved, as
 without that clocks that hardly show step to and fro for ever. Standard errors are of the sandwich kind, of scores
-that are summed over blocks, as slip lasts.
+that are summed over blocks, as slip lasts; or of independent residuals where those are larger, since few blocks scatter
+too little by chance (Angrist and Pischke 2009, section 8.2.3, take the larger of the two as well).
 """
 
 from __future__ import annotations
@@ -86,7 +87,8 @@ class ClockMatch:
     """The clock of a run's reference against its wheels', Eq. (1), with standard errors.
 
     middle, middle_error: s to add to the poses' times in the run's middle, where it shows best. drift, drift_error: s
-    per s; 0 and infinite where the run is too short to tell. length: of the reference, s.
+    per s; 0 and infinite where the run is too short to tell. length: of the reference, s. freedom: degrees of freedom
+    of Student's t that the errors have, by the windows that share nothing.
     """
 
     middle: float
@@ -94,6 +96,7 @@ class ClockMatch:
     drift: float
     drift_error: float
     length: float
+    freedom: float
 
     @property
     def offset(self) -> float:
@@ -349,12 +352,17 @@ class Windows:
         scores = derivatives * (weights * residuals)
         sums = np.add.reduceat(scores, np.flatnonzero(np.diff(blocks, prepend=-1.0)), axis=2).reshape(len(design), -1)
         inverse = np.linalg.pinv((design * weights.ravel()) @ design.T)
+        free = max(float(weights.sum()) - len(design), 1.0)
+        alike = inverse * float((weights * residuals**2).sum()) / free  # as if the residuals were independent
         # Chords, and the ticks of coarse counters, which scatter less than they are long, but in a pattern.
         least = _CHORDS * np.array([1, np.sqrt(12.0) / self.length]) + self.tick * np.array([0.25, 1 / self.length])
-        errors = np.sqrt(np.diag(inverse @ (sums @ sums.T) @ inverse)[2:] + least[: len(design) - 2] ** 2)
+        variances = np.maximum(np.diag(inverse @ (sums @ sums.T) @ inverse), np.diag(alike))[2:]
+        errors = np.sqrt(variances + least[: len(design) - 2] ** 2)
         told = len(errors) > 1 and abs(clock[1]) < _LARGEST_DRIFT
         drift_error = float(errors[1]) if told else np.inf
-        return ClockMatch(clock[0], float(errors[0]), clock[1], drift_error, self.length)
+        apart = min(len(weights[0]), self.length / _WINDOW)
+        freedom = max((2 - self.steers) * apart - len(design), 1.0)
+        return ClockMatch(clock[0], float(errors[0]), clock[1], drift_error, self.length, freedom)
 
 
 def _tick_time(driven: Array, durations: Array) -> float:

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sample_robots import APR_02, fixed, make_robot
+from scipy.stats import t
 
 import omnibench
 from omnibench.data.clock_matching import ClockMatch, Streams, align, match_clocks, median_period
@@ -87,6 +88,15 @@ def test_clocks_are_within_five_standard_errors(offset: float, drift: float, see
     (clock,) = matched(streams(seed, offset, drift))
     assert np.abs(errors(clock, offset, drift)).max() < 5.0
     assert clock.middle_error < 0.02
+
+
+def test_a_short_run_with_sparse_poses_is_not_surer_of_its_clock_than_its_scatter_allows() -> None:
+    whole = [streams(seed, heading_noise=0.02, position_noise=0.01) for seed in range(150)]
+    short = [replace(run, pose_times=run.pose_times[:221:10], poses=run.poses[:221:10]) for run in whole]
+    clocks = [clock for clock in match_clocks(ROBOT, short) if clock is not None]
+    chances = [t.sf(np.abs(errors(clock)), clock.freedom) for clock in clocks]
+    assert len(clocks) > 75
+    assert np.mean(np.array(chances) < 0.005) < 0.03  # 0.01 where errors are as stated, of either sign
 
 
 def test_a_noisy_heading_does_not_hide_the_clock() -> None:
