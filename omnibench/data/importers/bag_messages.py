@@ -6,19 +6,20 @@ Every fault of a file is one line. Messages that cannot be used are left out and
 from __future__ import annotations
 
 import re
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import reduce
 from operator import attrgetter, itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.config import read_yaml
+from omnibench.data.importers.tum import planar_headings
 from omnibench.errors import ConfigError, DataError, UnknownNameError, nearest
 from omnibench.files import check_file, read_text
 from omnibench.robot.kinematics import Array
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
 
 Stamps = NDArray[np.int64]
+Reader = Callable[[Any], Any]  # of a message
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 FIX, IMU, SCAN = (f"sensor_msgs/msg/{name}" for name in ("NavSatFix", "Imu", "LaserScan"))
 SECOND = 1_000_000_000  # ns
@@ -60,8 +62,7 @@ class Topic:
         return self.name.strip("/").rpartition("/")[0]
 
 
-@dataclass(frozen=True)
-class Record:
+class Record(NamedTuple):
     """A recorded message. number: in its topic, from 1. logged: time of recording, ns. message: None if undecodable."""
 
     number: int
@@ -73,16 +74,14 @@ class Bag:
     """An open bag; see :func:`open_bag`. recorded: names of topics of which the times of recording count."""
 
     def __init__(self, path: Path, reader: AnyReader, recorded: Sequence[str], definitions: Sequence[Path]) -> None:
-        self.path, self.definitions = path, definitions
-        self._reader = reader
+        self.path, self.definitions, self._reader = path, definitions, reader
         self._connections: dict[tuple[str, str], list[Any]] = defaultdict(list)
         for connection in reader.connections:
-            package, _, rest = connection.msgtype.partition("/")
-            kind = f"{package}/msg/{rest}" if rest and "/" not in rest else connection.msgtype
+            kind = connection.msgtype
+            kind = kind.replace("/", "/msg/") if kind.count("/") == 1 else kind
             self._connections[connection.topic, kind].append(connection)
-        self.topics = [
-            Topic(*key, sum(each.msgcount for each in self._connections[key])) for key in sorted(self._connections)
-        ]
+        counts = {key: sum(each.msgcount for each in of_topic) for key, of_topic in self._connections.items()}
+        self.topics = [Topic(*key, count) for key, count in sorted(counts.items())]
         unstamped = {self.topic(name, "recorded_stamps").name for name in recorded}
         self.topics = [replace(topic, recorded=topic.name in unstamped) for topic in self.topics]
 
@@ -170,16 +169,13 @@ def open_bag(path: Path, recorded: Sequence[str] = (), definitions: Sequence[Pat
             check_file(file)
     # Bags before ROS 2 Iron do not hold the definitions of their types; those of ROS itself hardly ever changed.
     store = get_typestore(Stores.ROS2_HUMBLE)
-    types = store.fielddefs | _defined_types(definitions)
+    store.fielddefs |= _defined_types(definitions)
     with _damage_as_error(path):
-        if definitions:
-            store = get_typestore(Stores.EMPTY)
-            store.register(types)
         reader = AnyReader([path], default_typestore=store)
         reader.open()
         if definitions:
-            types = {name: fields for name, fields in types.items() if name not in reader.typestore.fielddefs}
-            reader.typestore.register(types)
+            read = reader.typestore.fielddefs
+            reader.typestore.register({name: fields for name, fields in store.fielddefs.items() if name not in read})
     try:
         yield Bag(path, reader, recorded, definitions)
     finally:
@@ -253,34 +249,29 @@ def stamp_of(topic: Topic, record: Record, part: Any) -> int:
 class TopicMessages:
     """The messages of a topic. Useless ones are left out and counted by reason, the others sorted by their stamps.
 
-    contents: what ``read`` gives of each, or of a ``part`` of it; where either gives None, it is of something else.
-    numbers, stamps, logged (K,): from 1, and ns. rows: indices of the messages that remain. Messages without a header,
-    and those of topics for which it is asked, have the times of recording as stamps.
+    contents: what ``read`` gives of each part of a message, by default the whole; None is of something else. numbers,
+    stamps, logged (K,): from 1, and ns. rows: indices of the messages that remain. Messages without a header, and those
+    of topics for which it is asked, have the times of recording as stamps.
     """
 
-    def __init__(
-        self, bag: Bag, topic: Topic, read: Callable[[Any], Any], part: Callable[[Any], Any] = lambda message: message
-    ) -> None:
+    def __init__(self, bag: Bag, topic: Topic, read: Reader, parts: Reader = lambda message: [message]) -> None:
         self.place = f"{bag.path}: topic {topic.name}"
         self.contents: list[Any] = []
         self._bag, self._topic, self._headless = bag, topic, False
-        self._left_out: list[tuple[int, str]] = []  # numbers of messages, and why
+        self._left_out: dict[str, list[int]] = defaultdict(list)  # numbers of messages, by why
         stamped = []
         for record in bag.records(topic):
             try:
-                message = part(record.message)
-                if message is None and record.message is not None:
-                    continue
-                content, stamp = read(message), stamp_of(topic, record, message)
+                for part in parts(record.message):
+                    content, stamp = read(part), stamp_of(topic, record, part)
+                    if content is not None and stamp > 0:
+                        self.contents.append(content)
+                        stamped.append((record.number, stamp, record.logged))
+                        self._headless |= not hasattr(part, "header")
+                    elif content is not None:
+                        self._left_out[_NO_STAMP].append(record.number)
             except (AttributeError, IndexError, TypeError, ValueError):  # garbage, or a type that is defined otherwise
-                self._left_out.append((record.number, "that cannot be decoded"))
-                continue
-            if content is not None and stamp > 0:
-                self.contents.append(content)
-                stamped.append((record.number, stamp, record.logged))
-                self._headless |= not hasattr(message, "header")
-            elif content is not None:
-                self._left_out.append((record.number, _NO_STAMP))
+                self._left_out["that cannot be decoded"].append(record.number)
         self.numbers, self.stamps, self.logged = np.array(stamped, dtype=np.int64).reshape(-1, 3).T
         self.rows = np.arange(len(stamped))
 
@@ -290,8 +281,17 @@ class TopicMessages:
 
     def keep(self, good: NDArray[np.bool_], reason: str) -> None:
         """Drop the messages that are not good (K,) for ``reason``."""
-        self._left_out += [(number, reason) for number in self.numbers[self.rows[~good[self.rows]]].tolist()]
+        if len(dropped := self.numbers[self.rows[~good[self.rows]]]):
+            self._left_out[reason] += dropped.tolist()
         self.rows = self.rows[good[self.rows]]
+
+    def keep_planar(self, quaternions: Array) -> Array:
+        """Headings (K,), rad, of the quaternions (K, 4) of all messages, of which those that are flawed are dropped."""
+        orientations = planar_headings(quaternions)
+        flawed = self.rows[orientations.flawed[self.rows]]
+        flaw = f", as {orientations.flaw(int(flawed[0]))}" if len(flawed) else ""
+        self.keep(~orientations.flawed, f"with a wrong orientation{flaw}")
+        return orientations.headings
 
     def in_order(self, notes: list[str], way_out: str = "") -> NDArray[np.intp]:
         """Indices of the messages that remain, sorted by stamp, without repeated stamps.
@@ -312,20 +312,18 @@ class TopicMessages:
         fresh = np.zeros(len(self.contents), dtype=bool)
         fresh[self.rows] = np.diff(self.stamps[self.rows], prepend=-1) > 0
         self.keep(fresh, "with a repeated stamp")
-        firsts, total = {reason: number for number, reason in self._left_out[::-1]}, self._topic.messages
-        counts = Counter(reason for _, reason in self._left_out)
-        reasons = [f"{count} {reason} (first: message {firsts[reason]})" for reason, count in counts.items()]
-        left_out = f"{counts.total()} of {plural(total, 'message')} left out: {', '.join(reasons)}"
-        if len(self.rows) < max(2, counts.total()):
-            if _NO_STAMP in counts:
+        total, count = plural(self._topic.messages, "message"), sum(map(len, self._left_out.values()))
+        reasons = [f"{len(each)} {reason} (first: message {each[0]})" for reason, each in self._left_out.items()]
+        words = [f"{count} of {total} left out: {', '.join(reasons)}"] if count else []
+        if len(self.rows) < max(2, count):
+            if _NO_STAMP in self._left_out:
                 topics = [topic.name for topic in self._bag.topics if topic.recorded or topic == self._topic]
                 way_out = (
                     f"set recorded_stamps=[{','.join(topics)}] to take the times of recording, or record it anew: the "
                     "publisher must fill header.stamp"
                 )
-            problem = left_out if counts else f"it has {plural(total, 'message')}, too few"
+            problem = words[0] if count else f"it has {total}, too few"
             raise DataError(f"{self.place}: {problem}{'; ' if way_out else ''}{way_out}")
-        words = [left_out] if counts else []
         if self._headless:
             words.append("its messages have no stamps; they have the times of recording")
         if late := int(np.count_nonzero(behind)):

@@ -43,7 +43,6 @@ from omnibench.data.importers.bag_messages import (
     reader_of,
     stamp_of,
 )
-from omnibench.data.importers.tum import planar_headings
 from omnibench.data.recording import ReferenceOptions, ScanReadings, ScanShape, scan_difference
 from omnibench.data.references import Reference, ReferenceKind, References
 from omnibench.data.scans import Mount, Ranges, Scanner
@@ -85,20 +84,19 @@ def east_north(latitudes: Array, longitudes: Array, origin: tuple[float, float],
 
     height: m above the ellipsoid, of all points: the robot is on the floor.
     """
+
+    def geocentric(phi: Array, lam: Array) -> Array:  # Eq. (1)
+        normal = _SEMI_MAJOR / np.sqrt(1 - _ECCENTRICITY_SQUARED * np.sin(phi) ** 2)
+        out = (normal + height) * np.cos(phi)
+        up = (normal * (1 - _ECCENTRICITY_SQUARED) + height) * np.sin(phi)
+        return np.array([out * np.cos(lam), out * np.sin(lam), up])
+
     phi, lam = np.radians(origin)
-    start = _geocentric(np.array([phi]), np.array([lam]), height)
-    dx, dy, dz = (_geocentric(np.radians(latitudes), np.radians(longitudes), height) - start).T
+    start = geocentric(np.array([phi]), np.array([lam]))
+    dx, dy, dz = geocentric(np.radians(latitudes), np.radians(longitudes)) - start
     east = -np.sin(lam) * dx + np.cos(lam) * dy  # Eq. (2)
     north = -np.sin(phi) * (np.cos(lam) * dx + np.sin(lam) * dy) + np.cos(phi) * dz  # Eq. (3)
     return np.column_stack([east, north])
-
-
-def _geocentric(phi: Array, lam: Array, height: float) -> Array:
-    """Geocentric coordinates (K, 3), m, Eq. (1)."""
-    normal = _SEMI_MAJOR / np.sqrt(1 - _ECCENTRICITY_SQUARED * np.sin(phi) ** 2)
-    out = (normal + height) * np.cos(phi)
-    up = (normal * (1 - _ECCENTRICITY_SQUARED) + height) * np.sin(phi)
-    return np.column_stack([out * np.cos(lam), out * np.sin(lam), up])
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,9 +134,7 @@ def read_sensor(
     else:
         option, sigma = "heading_sigma_deg", options.heading_sigma_deg and math.radians(options.heading_sigma_deg)
         way = "degrees: --set heading_sigma_deg=2, or take its rates of turn: --set imu=gyro"
-        orientations = planar_headings(table[:, :4])
-        messages.keep(~orientations.flawed, "with a wrong orientation, or tilted by over 20 degrees")
-        values, variances = orientations.headings[:, None], table[:, 6:]
+        values, variances = messages.keep_planar(table[:, :4])[:, None], table[:, 6:]
     variances = np.full_like(variances, sigma**2) if sigma else variances
     exact: NDArray[np.bool_] = np.asarray((np.isfinite(variances) & (variances > 0)).all(axis=1))
     if len(messages.rows) and not exact[messages.rows].any():
@@ -171,15 +167,14 @@ class BagSensors:
         no rest, and ``gyro_offset_deg`` is not given.
         """
         rests = [rest for part in samples.stretches() for rest in find_rests(*samples.edges(part), least_rest, still)]
-        readings, sigma = [], 0.0
+        readings, offsets = [], [0.0]
         for sensor in self.readings:
             if sensor.kind == "turn":
-                resting = np.zeros(len(sensor.times), dtype=bool)
-                for begin, end in rests:
-                    resting |= (sensor.times >= begin) & (sensor.times <= end)
+                within = [(sensor.times >= begin) & (sensor.times <= end) for begin, end in rests]
+                resting = np.any(within, axis=0) if rests else np.zeros(len(sensor.times), dtype=bool)
                 if resting.any():
                     rested = float(resting.sum() * np.median(np.diff(sensor.times)))
-                    offset = math.radians(self.options.gyro_noise_deg) / math.sqrt(rested)
+                    offsets.append(math.radians(self.options.gyro_noise_deg) / math.sqrt(rested))
                     sensor = replace(sensor, values=sensor.values - sensor.values[resting].mean())
                 elif self.options.gyro_offset_deg is None:
                     raise DataError(
@@ -188,10 +183,9 @@ class BagSensors:
                         "--set gyro_offset_deg=0.5"
                     )
                 else:
-                    offset = math.radians(self.options.gyro_offset_deg)
-                sigma = max(sigma, offset)
+                    offsets.append(math.radians(self.options.gyro_offset_deg))
             readings.append(sensor)
-        return replace(self, readings=readings, rate_sigma=sigma)
+        return replace(self, readings=readings, rate_sigma=max(offsets))
 
     def of_run(self, zero: float, end: float, *, start_known: bool) -> References | None:
         """The references of a run from the time ``zero`` on, for ``end`` s; None if there are none.
@@ -218,19 +212,18 @@ class BagSensors:
 
     def _turns(self, times: Array, rates: Array, end: float) -> list[Reference]:
         """Angles turned in each period; beside the offset's, their errors are independent: a rate's white noise."""
-        angles = np.concatenate([[0.0], np.cumsum((rates[1:] + rates[:-1]) / 2 * np.diff(times))])
         begin, last = max(0.0, float(times[0])), min(end, float(times[-1]))
         if last - begin < _LEAST_SPAN:
             return []
-        count = max(1, round((last - begin) / self.options.reference_period))
-        edges = np.linspace(begin, last, count + 1)
+        edges = np.linspace(begin, last, max(1, round((last - begin) / self.options.reference_period)) + 1)
+        angles = np.concatenate([[0.0], np.cumsum((rates[1:] + rates[:-1]) / 2 * np.diff(times))])
         turned = np.diff(np.interp(edges, times, angles))
-        sigma = math.radians(self.options.gyro_noise_deg) * math.sqrt((last - begin) / count)
+        sigma = math.radians(self.options.gyro_noise_deg) * math.sqrt((last - begin) / len(turned))
         gaps = np.flatnonzero(np.diff(times) > _LONGEST_GAP)
-        seen = [not ((times[gaps] < edges[row + 1]) & (times[gaps + 1] > edges[row])).any() for row in range(count)]
         return [
-            Reference("turn", float(turned[row]), sigma, float(edges[row + 1]), float(edges[row]))
-            for row in np.flatnonzero(seen).tolist()
+            Reference("turn", angle, sigma, t1, t0)
+            for angle, t0, t1 in zip(turned.tolist(), edges[:-1].tolist(), edges[1:].tolist(), strict=True)
+            if not ((times[gaps] < t1) & (times[gaps + 1] > t0)).any()
         ]
 
 
@@ -250,17 +243,17 @@ def _transforms(bag: Bag, topic: Topic) -> Iterator[tuple[str, str, Any]]:
 
 def fixed_transforms(bag: Bag) -> Parents:
     """Parent of every frame of /tf_static, and the transform (4, 4) from the frame to its parent."""
-    from scipy.spatial.transform import Rotation  # slow to import, and needed by bags with transforms alone
+    from scipy.spatial.transform import RigidTransform, Rotation  # slow, and needed by bags with transforms alone
 
     parents: Parents = {}
     for topic in bag.of_type(TRANSFORMS):
         for child, parent, transform in _transforms(bag, topic) if topic.name.endswith("tf_static") else ():
-            turn, place, matrix = transform.rotation, transform.translation, np.eye(4)
+            turn, place = transform.rotation, transform.translation
             try:
-                matrix[:3, :3] = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
+                rotation = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w])
             except ValueError:  # all zeros: no rotation, and so no transform
                 continue
-            matrix[:3, 3] = place.x, place.y, place.z
+            matrix = RigidTransform.from_components([place.x, place.y, place.z], rotation).as_matrix()
             if np.isfinite(matrix).all():
                 parents[child] = parent, matrix
     return parents

@@ -11,7 +11,7 @@ import csv
 import math
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import cycle
 from pathlib import Path
@@ -29,7 +29,7 @@ from omnibench.data.splits import Names, complete, divided
 from omnibench.errors import DataError, nearest
 from omnibench.files import read_text
 from omnibench.registry import Options, importers
-from omnibench.robot.kinematics import Array, Robot, Wheel, in_the_middle
+from omnibench.robot.kinematics import Array, Robot, in_the_middle
 from omnibench.words import plural
 
 
@@ -37,16 +37,16 @@ from omnibench.words import plural
 class Kind:
     """A robot, and the columns of its files, counted from 0.
 
-    lengths: how many the metadata state, L, or L1 and L2. wheels: name, type, and x and y in these lengths, or of omni
-    wheels the angle of the axle, deg. columns: of its run files after t, x, y, theta; ticks first. signs: of these, to
-    the wheels' sense in omnibench. log_fields: of a row of its log, whose first is the time. log_ticks, log_signs: as
-    in the run files. log_commands: v, vn (if any) and omega; in ticks and rad a cycle, not in m/s and rad/s, where
-    there is no vn. Empty: they are not logged.
+    lengths: how many the metadata state, L, or L1 and L2. wheels: as in dataset.yaml, without radii, with x, y and
+    distances in these lengths. columns: of its run files after t, x, y, theta; ticks first. signs: of these, to the
+    wheels' sense in omnibench. log_fields: of a row of its log, whose first is the time. log_ticks, log_signs: as in
+    the run files. log_commands: v, vn (if any) and omega; in ticks and rad a cycle, not in m/s and rad/s, where there
+    is no vn. Empty: they are not logged.
     """
 
     title: str
     lengths: int
-    wheels: tuple[tuple[str, str, float, float], ...]
+    wheels: tuple[Mapping[str, Any], ...]
     columns: tuple[str, ...]
     signs: tuple[int, ...]
     log_fields: int
@@ -57,56 +57,56 @@ class Kind:
 
 KINDS = {
     "diff": Kind(
-        "differential drive, encoders at 20 Hz", 1, (("right", "fixed", 0, -0.5), ("left", "fixed", 0, 0.5)),
+        "differential drive, encoders at 20 Hz", 1,
+        ({"name": "right", "type": "fixed", "x": 0, "y": -0.5}, {"name": "left", "type": "fixed", "x": 0, "y": 0.5}),
         ("ticks_right", "ticks_left"), (1, 1), 8, (2, 1), (1, 1), (6, 7),
     ),
     "omni3": Kind(
         "three-wheeled omnidirectional robot, encoders at 25 Hz", 1,
-        (("0", "omni", 300, 0), ("1", "omni", 60, 0), ("2", "omni", 180, 0)),
+        tuple({"name": name, "type": "omni", "distance": 1, "angle_deg": angle, "roller_angle": 0}
+              for name, angle in (("0", 300), ("1", 60), ("2", 180))),
         ("ticks_0", "ticks_1", "ticks_2"), (-1, -1, -1), 10, (1, 2, 3), (1, 1, 1), (7, 8, 9),
     ),
     "omni4": Kind(
         "mecanum base, encoders at 100 Hz", 2,
-        (("front_left", "mecanum", 0.5, 0.5), ("front_right", "mecanum", 0.5, -0.5),
-         ("rear_left", "mecanum", -0.5, 0.5), ("rear_right", "mecanum", -0.5, -0.5)),
+        ({"name": "front_left", "type": "mecanum", "x": 0.5, "y": 0.5, "roller_angle_deg": 45},
+         {"name": "front_right", "type": "mecanum", "x": 0.5, "y": -0.5, "roller_angle_deg": -45},
+         {"name": "rear_left", "type": "mecanum", "x": -0.5, "y": 0.5, "roller_angle_deg": -45},
+         {"name": "rear_right", "type": "mecanum", "x": -0.5, "y": -0.5, "roller_angle_deg": 45}),
         ("turns_0", "turns_1", "turns_2", "turns_3"), (1, -1, 1, -1), 11, (1, 2, 3, 4), (-1, 1, -1, 1), (8, 9, 10),
     ),
-    "tricyc": Kind(
+    "tricyc": Kind(  # neither the radius of its rear wheels nor their distance apart counts
         "tricycle with a driven and steered front wheel, encoders at 20 Hz", 1,
-        (("front", "steered", 1, 0), ("rear_left", "fixed", 0, 0.5), ("rear_right", "fixed", 0, -0.5)),
+        ({"name": "front", "type": "steered", "x": 1, "y": 0},
+         {"name": "rear_left", "type": "fixed", "x": 0, "y": 0.5, "measured": False},
+         {"name": "rear_right", "type": "fixed", "x": 0, "y": -0.5, "measured": False}),
         ("ticks", "steering"), (1,), 3, (1,), (1,),
     ),
 }  # fmt: skip
 """The robots by their type in the metadata."""
 
 
-@dataclass(frozen=True)
-class Geometry:
+class Geometry(NamedTuple):
     """Design values by a session's metadata, m. lengths: L, or L1 and L2. diameters: of the wheels."""
 
     lengths: tuple[float, ...]
     diameters: tuple[float, ...]
 
     def __str__(self) -> str:
-        shown = [
-            f"{values[0]:g}" if len(set(values)) == 1 else ", ".join(f"{value:g}" for value in values)
-            for values in (self.lengths, self.diameters)
-        ]
-        return f"L {shown[0]} m, D {shown[1]} m"
+        lengths, diameters = (
+            ", ".join(f"{value:g}" for value in (values[:1] if len(set(values)) == 1 else values)) for values in self
+        )
+        return f"L {lengths} m, D {diameters} m"
 
     def robot(self, kind: str, name: str) -> Robot:
-        """The robot of some type. The radius of a tricycle's rear wheels, and their distance apart, do not count."""
-        wheels = []
-        for (wheel, sort, x, y), diameter in zip(KINDS[kind].wheels, cycle(self.diameters), strict=False):
-            place: dict[str, Any] = {"type": sort, "x": x * self.lengths[0], "y": y * self.lengths[-1]}
-            if sort == "omni":
-                place = {"distance": self.lengths[0], "angle": math.radians(x), "roller_angle": 0.0}
-            elif sort == "mecanum":
-                place["roller_angle"] = math.copysign(math.pi / 4, x * y)
-            elif kind == "tricyc" and sort == "fixed":
-                place["measured"] = False
-            wheels.append(Wheel(name=wheel, radius=diameter / 2, **place))
-        return Robot(name=name, wheels=tuple(wheels))
+        """The robot of some type. Of a tricycle, whose metadata state one diameter, all wheels have this."""
+        scales = {"x": self.lengths[0], "y": self.lengths[-1], "distance": self.lengths[0]}
+        wheels = [
+            {key: value * scales[key] if key in scales else value for key, value in wheel.items()}
+            | {"radius": diameter / 2}
+            for wheel, diameter in zip(KINDS[kind].wheels, cycle(self.diameters), strict=False)
+        ]
+        return Robot.model_validate({"name": name, "wheels": wheels})
 
 
 _RUN = re.compile(r"_run-(\d+)\.csv$")
@@ -132,35 +132,35 @@ class Session:
 
 def read_metadata(file: Path) -> Session:
     """Read a session's metadata and find its runs. DataError names the file and the key that is wrong."""
-    values = {fields[0].strip(): fields[1:] for fields in csv.reader(read_text(file).splitlines()) if fields}
-    robot = "".join(values.get("type", [])[:1]).strip()
+    rows = csv.reader(read_text(file).splitlines())
+    values = {key.strip(): [text.strip() for text in texts if text.strip()] for key, *texts in filter(None, rows)}
+    robot = "".join(values.get("type", [])[:1])
     if robot not in KINDS:
         raise DataError(f"{file}: type is {robot!r}; {nearest(robot, KINDS)}it must be one of {', '.join(KINDS)}")
-    numbers: dict[str, tuple[float, ...]] = {"odo_ti": ()}
+    numbers = {}
     counts = {"Di": len(KINDS[robot].signs), "Li": KINDS[robot].lengths, "ngear": 1, "encRes": 1}
-    for key, count in (counts | ({"odo_ti": 0} if "odo_ti" in values else {})).items():
+    for key, count in (counts | {"odo_ti": len(values.setdefault("odo_ti", []))}).items():
         if key not in values:
             raise DataError(f"{file}: key {key!r} is missing; {nearest(key, values)}found: {', '.join(values)}")
-        texts = [text.strip() for text in values[key] if text.strip()]
-        numbers[key] = _numbers(texts)
-        if len(numbers[key]) != (count or len(texts)):
-            raise DataError(f"{file}: {key} is {', '.join(texts)!r}, expected {count or 'finite'} numbers")
-        if count and min(numbers[key]) <= 0:
+        numbers[key] = _numbers(values[key])
+        if len(numbers[key]) != count:
+            raise DataError(f"{file}: {key} is {', '.join(values[key])!r}, expected {count} numbers")
+        if key in counts and min(numbers[key]) <= 0:
             raise DataError(f"{file}: {key} is {min(numbers[key]):g}, it must be above 0")
     name = file.name.removesuffix("_metadata.csv")
     files = sorted(file.parent.glob(f"{name}_run-*.csv"))
     runs = {int(match[1]): path for path in files if (match := _RUN.search(path.name))}
     if not runs:
         raise DataError(f"{file.parent}: no {name}_run-NN.csv beside {file.name}")
-    geometry = Geometry(numbers["Li"], numbers["Di"])
     tick = 2 * math.pi / (numbers["ngear"][0] * numbers["encRes"][0])
+    geometry = Geometry(numbers["Li"], numbers["Di"])
     return Session(file, file.parent.parent.name, name, robot, geometry, tick, numbers["odo_ti"], runs)
 
 
 def _numbers(texts: Sequence[str]) -> tuple[float, ...]:
     """Texts as numbers; empty if one is not a finite number."""
     try:
-        numbers = tuple(float(text) for text in texts)
+        numbers = tuple(map(float, texts))
     except ValueError:
         return ()
     return numbers if all(map(math.isfinite, numbers)) else ()
@@ -190,8 +190,7 @@ def read_log(session: Session) -> SessionLog | None:
         return None
     header: list[list[str]] = []
     run, rows = None, []
-    for line, text in enumerate(read_text(file).splitlines(), 1):
-        fields = text.split(",")
+    for line, fields in enumerate((text.split(",") for text in read_text(file).splitlines()), 1):
         if fields[0] == "Run:":
             if len(fields) < 2 or not fields[1].strip().isdigit():
                 raise DataError(f"{file}, line {line}: expected the number of a run after 'Run:'")
