@@ -230,7 +230,6 @@ class BagSensors:
 _BASES = ("base_link", "base_footprint", "base")  # REP-105; with or without the robot's namespace
 _LARGEST_TILT = math.radians(20)  # rad; a scanner with a larger tilt does not scan parallel to the floor (chosen)
 _SAME_INCREMENT = 0.1  # relative difference of the time between rays, which some drivers measure anew for every scan
-_WAY_OUT = "scans=false leaves the scans out"
 Parents = dict[str, tuple[str, Array]]
 
 
@@ -296,7 +295,7 @@ def frames_between(bag: Bag, topic: Topic, frames: Sequence[str]) -> tuple[list[
 def read_scans(
     bag: Bag, topic: Topic, mount: Mount | None, seconds: Callable[[Topic, Stamps], Array], notes: list[str]
 ) -> ScanReadings:
-    """Check every scan of a topic; what is left out is added to ``notes``. DataError.
+    """Check every scan of a topic; what is left out is added to ``notes``. DataError, or ConfigError: it is no scanner.
 
     mount: of the scanner; None: by /tf_static. seconds: gives times by the clock of the wheels, s, to the stamps of the
     first rays.
@@ -308,14 +307,11 @@ def read_scans(
         if difference := scan_difference(shape, other):
             raise DataError(
                 f"{place}, message {number}: {difference} as in the messages before; all scans must be of one scanner, "
-                f"of one number of rays; {_WAY_OUT}"
+                "of one number of rays"
             )
     empty = f"without a range from {shape.range_min:g} to {shape.range_max:g} m"
     messages.keep(np.array([seen for _, seen, *_ in scans], dtype=bool), empty)
-    try:
-        rows = messages.in_order(notes)
-    except DataError as error:
-        raise DataError(f"{error}; {_WAY_OUT}") from None
+    rows = messages.in_order(notes)
     _, _, frame, _, scan_time = scans[0]
     # The scanner's time between rays, s: the median of its scans.
     increments = np.array([increment for _, _, _, increment, _ in scans])
@@ -329,10 +325,7 @@ def read_scans(
     mount, sense = (mount, 1) if mount else _mounting(bag, frame, place, notes)
     angles = {"angle_min": sense * shape.angle_min, "angle_increment": sense * shape.angle_increment}
     content = {"name": topic.name, "time_increment": increment, "mount": mount, **shape._asdict(), **angles}
-    try:
-        scanner = validate(Scanner, content, place)
-    except ConfigError as error:
-        raise DataError(f"{error}; {_WAY_OUT}") from None
+    scanner = validate(Scanner, content, place)
     stamps, logged = messages.stamps[rows], messages.logged[rows]
 
     def read(chosen: NDArray[np.intp]) -> Ranges:
@@ -391,7 +384,7 @@ def _mounting(bag: Bag, frame: str, place: str, notes: list[str]) -> tuple[Mount
     if min(tilt, math.pi - tilt) > _LARGEST_TILT:
         raise DataError(
             f"{bag.path}: the scanner's frame {frame} is tilted by {math.degrees(tilt):.0f} degrees, so that it does "
-            f"not scan the plane of the floor; if it does, set scanner_mount; {_WAY_OUT}"
+            "not scan the plane of the floor; if it does, set scanner_mount"
         )
     yaw = math.atan2(whole[1, 0], whole[0, 0])
     return Mount(x=float(whole[0, 3]), y=float(whole[1, 3]), yaw=yaw), -1 if tilt > math.pi / 2 else 1

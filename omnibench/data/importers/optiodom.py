@@ -63,7 +63,7 @@ KINDS = {
     ),
     "omni3": Kind(
         "three-wheeled omnidirectional robot, encoders at 25 Hz", 1,
-        tuple({"name": name, "type": "omni", "distance": 1, "angle_deg": angle, "roller_angle": 0}
+        tuple({"name": name, "distance": 1, "angle_deg": angle, "roller_angle": 0}
               for name, angle in (("0", 300), ("1", 60), ("2", 180))),
         ("ticks_0", "ticks_1", "ticks_2"), (-1, -1, -1), 10, (1, 2, 3), (1, 1, 1), (7, 8, 9),
     ),
@@ -300,14 +300,14 @@ class Optiodom(Importer):
         if not sessions:
             raise DataError(f"{source}: no *_metadata.csv below it; name a folder with OptiOdom sessions (data/omni3)")
         kinds = sorted({session.robot for session in sessions})
+        kind = options.robot or kinds[0]
         if options.robot is None and len(kinds) > 1:
             raise DataError(
                 f"{source}: it holds recordings of {plural(len(kinds), 'robot')}, {', '.join(kinds)}; import one at a "
-                f"time: name its folder, or --set robot={kinds[0]}"
+                f"time: name its folder, or --set robot={kind}"
             )
-        if options.robot not in (None, *kinds):
-            raise DataError(f"{source}: it holds no recordings of robot {options.robot}; found: {', '.join(kinds)}")
-        kind = options.robot or kinds[0]
+        if kind not in kinds:
+            raise DataError(f"{source}: it holds no recordings of robot {kind}; found: {', '.join(kinds)}")
         sessions = [session for session in sessions if session.robot == kind]
         # The commonest geometry, of equally common ones the first session's; and a note if there are others.
         (geometry, most), *others = Counter(session.geometry for session in sessions).most_common()
@@ -318,19 +318,17 @@ class Optiodom(Importer):
                 f"sessions state different dimensions of the robot: those of {most} of {len(sessions)} are taken, "
                 f"{geometry} (others: {rest})"
             )
-        logs = [read_log(session) if options.log else None for session in sessions]
-        unlogged = [session.name for session, log in zip(sessions, logs, strict=True) if log is None]
-        if options.log and unlogged:
+        runs, groups, unlogged = list[Trajectory](), list[str](), list[str]()
+        for session in sessions:
+            log = read_log(session) if options.log else None
+            unlogged += [session.name] if log is None and options.log else []
+            runs += [_read_run(session, number, log, options.log) for number in session.runs]
+            groups += [session.group] * len(session.runs)
+        if unlogged:
             notes.append(
                 f"{len(unlogged)} of {plural(len(sessions), 'session')} have no log ({', '.join(unlogged)}): commands "
                 "are named after the motion by the wheels there, and absolute wheel angles are left out of all runs"
             )
-        runs = [
-            _read_run(session, number, log, options.log)
-            for session, log in zip(sessions, logs, strict=True)
-            for number in session.runs
-        ]
-        groups = [session.group for session in sessions for _ in session.runs]
         train = options.train
         if not train and not options.validation and len(set(groups)) > 1:
             train = (min(groups),)
@@ -347,25 +345,16 @@ class Optiodom(Importer):
         return replace(dataset, warnings=(*notes, *dataset.warnings))
 
 
-class _Motion(NamedTuple):
-    """A run's motion: medians of speed, m/s, direction, rad, and rate of turn, rad/s, while it moves; the greatest
-    speed, m/s; length, m, and turn, rad, in all."""
+def _motion(twists: Array, durations: Array) -> dict[str, Any]:
+    """The motion of twists (rows, 3) in m/s, m/s, rad/s for durations (rows,), s, as fields of a trajectory.
 
-    v: float
-    alpha: float
-    omega: float
-    fastest: float
-    distance: float
-    turned: float
-
-
-def _motion(twists: Array, durations: Array) -> _Motion:
-    """The motion of twists (rows, 3) in m/s, m/s, rad/s for durations (rows,), s."""
+    v (m/s), alpha (rad) and omega (rad/s) are medians while it moves, distance (m) is the length of it all.
+    """
     speeds = np.hypot(twists[:, 0], twists[:, 1])
     moving = (speeds > _SAME_SPEED) | (np.abs(twists[:, 2]) > _SAME_SPEED)
     vx, vy, omega = np.median(twists[moving], axis=0) if moving.any() else np.zeros(3)
-    v, alpha, turned = float(np.hypot(vx, vy)), math.atan2(vy, vx), float(twists[:, 2] @ durations)
-    return _Motion(v, alpha, float(omega), float(speeds.max()), float(speeds @ durations), turned)
+    direction = {"v": float(np.hypot(vx, vy)), "alpha": math.atan2(vy, vx), "omega": float(omega)}
+    return direction | {"distance": float(speeds @ durations)}
 
 
 def _read_run(session: Session, number: int, log: SessionLog | None, with_log: bool) -> Trajectory:
@@ -377,28 +366,24 @@ def _read_run(session: Session, number: int, log: SessionLog | None, with_log: b
         raise DataError(f"{table.file}: a run needs two rows or more")
     times = table.increasing("t")
     times = times - times[0]
+    steps, end = np.diff(times), float(times[-1])
     ticks = table.columns(kind.columns[: len(kind.signs)]) * kind.signs
-    rates = ticks[1:] * session.angle_per_tick / np.diff(times)[:, None]
+    rates, poses = ticks[1:] * session.angle_per_tick / steps[:, None], table.columns(_POSE[1:])
+    steering = table.columns(("steering",))[1:] if "steering" in table else None
+    name = f"{session.group}_{table.file.stem}"
     run = Trajectory(
-        id=f"{session.group}_{table.file.stem}",
-        split="train",
-        times=times[1:],
-        rates=rates,
-        pose_times=times,
-        poses=table.columns(_POSE[1:]),
-        session=session.name,
-        duration=float(times[-1]),
-        steering=table.columns(("steering",))[1:] if "steering" in table else None,
+        name, "train", times[1:], rates, times, poses, session=session.name, duration=end, steering=steering
     )
     if not with_log:
         return run
     robot = session.geometry.robot(session.robot, session.robot)
-    middle = None if run.steering is None else in_the_middle(run.steering)
-    driven = _motion(robot.drive.signals(rates, middle) @ robot.inverse_kinematic_matrix.T, np.diff(times))
-    alpha, speed, path = driven.alpha, "", f"_{driven.distance:.1f}m"
+    middle = None if steering is None else in_the_middle(steering)
+    driven = robot.drive.signals(rates, middle) @ robot.inverse_kinematic_matrix.T
+    motion, turned, speed = _motion(driven, steps), math.degrees(float(driven[:, 2] @ steps)), ""
+    alpha, path = motion["alpha"], f"_{motion['distance']:.1f}m"
     if log is not None:
         path, start = log.path, session.starts[number - 1] if number <= len(session.starts) else 0.0
-        first = round(start / float(np.median(np.diff(times))))
+        first = round(start / float(np.median(steps)))
         rows = np.flatnonzero(log.runs == number)[first : first + len(ticks)]
         if len(rows) < len(ticks) or not np.allclose(log.ticks[rows], ticks, rtol=0, atol=_SAME_TICKS):
             raise DataError(
@@ -407,8 +392,8 @@ def _read_run(session: Session, number: int, log: SessionLog | None, with_log: b
         logged = log.times[rows]
         run = replace(run, angles=log.angles[rows[1:]], started_at=float(logged[0] - log.times[0]))
         if log.commands is not None:
-            sent = _motion(log.commands[rows], np.diff(logged, prepend=logged[0]))
-            run = replace(run, v=sent.v, alpha=sent.alpha, omega=sent.omega, distance=sent.distance)
-            alpha, speed = sent.alpha, f"_v{sent.fastest:.2g}"
-    direction, turn = round(math.degrees(alpha) / 5) * 5, round(math.degrees(driven.turned) / 90) * 90
+            sent = log.commands[rows]
+            motion, speed = _motion(sent, np.diff(logged, prepend=logged[0])), f"_v{np.hypot(*sent[:, :2].T).max():.2g}"
+            run, alpha = replace(run, **motion), motion["alpha"]
+    direction, turn = round(math.degrees(alpha) / 5) * 5, round(turned / 90) * 90
     return replace(run, command=f"{session.group}_a{direction}_turn{turn:+d}{speed}{path}")

@@ -328,6 +328,10 @@ def read_bag(path: Path, name: str, options: RosbagOptions, notes: list[str]) ->
         sent = next((each[0] for each in (twists, beside) if len(each) == 1), None)
         wheels, clock = read_wheels(bag, topics, steering, options, notes)
         readings = [read_sensor(bag, topic, options, clock.seconds_of, notes) for topic in sensors]
+        try:
+            seen = read_scans(bag, scans[0], options.scanner_mount, clock.seconds_of, notes) if scans else None
+        except (ConfigError, DataError) as error:
+            raise DataError(f"{error}; scans=false leaves the scans out") from None
         return Recording(
             name,
             f"{path}: topic {topics[0].name}",
@@ -335,7 +339,7 @@ def read_bag(path: Path, name: str, options: RosbagOptions, notes: list[str]) ->
             read_poses(bag, references[0], options, clock, notes) if references else None,
             events=_events(bag, bag.topic(options.cut_topic, "cut_topic"), clock) if options.cut_topic else (),
             attributes=RunAttributes(sent=_sent_twists(bag, sent, clock) if sent else None),
-            scans=read_scans(bag, scans[0], options.scanner_mount, clock.seconds_of, notes) if scans else None,
+            scans=seen,
             sensors=BagSensors(readings, options) if readings else None,
             numbered=True,
         )
@@ -378,16 +382,14 @@ def read_wheels(
         nearest = np.searchsorted((stamps[1:] + stamps[:-1]) / 2, times)
         values.append(numbers[nearest])
         read_at.append(np.tile(stamps[nearest][:, None], len(stream.names)))
-    return WheelReadings(
-        times,
-        np.hstack(values[: len(turning)]),
-        first.unit.removesuffix("/sample") if several else first.unit,
-        np.hstack(values[len(turning) :]) if steered else None,
-        tuple(chain(*(stream.names for stream in turning))),
-        tuple(chain(*(stream.names for stream in steered))),
-        longest_gap=first.longest_gap,
-        read_at=np.hstack(read_at) if several else None,
-    ), clock
+    unit = first.unit.removesuffix("/sample") if several else first.unit
+    count, angles = len(turning), np.hstack(values[len(turning) :]) if steered else None
+    columns = [tuple(chain(*(stream.names for stream in part))) for part in (turning, steered)]
+    gap, read = first.longest_gap, np.hstack(read_at) if several else None
+    readings = WheelReadings(
+        times, np.hstack(values[:count]), unit, angles, columns[0], columns[1], longest_gap=gap, read_at=read
+    )
+    return readings, clock
 
 
 def read_joints(bag: Bag, topic: Topic, choice: JointChoice, options: RosbagOptions, notes: list[str]) -> _Joints:
