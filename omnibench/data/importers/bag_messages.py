@@ -13,14 +13,14 @@ from dataclasses import dataclass, replace
 from functools import reduce
 from operator import attrgetter, itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.config import read_yaml
 from omnibench.data.importers.tum import planar_headings
-from omnibench.errors import ConfigError, DataError, UnknownNameError, nearest
+from omnibench.errors import ConfigError, DataError, OmnibenchError, UnknownNameError, nearest
 from omnibench.files import check_file, read_text
 from omnibench.robot.kinematics import Array
 from omnibench.words import plural
@@ -61,13 +61,16 @@ class Topic:
         """The part of the name before the last slash."""
         return self.name.strip("/").rpartition("/")[0]
 
+    def stamp(self, message: Any, otherwise: int) -> int:
+        """The stamp of a message's header, ns; ``otherwise`` without one, or where the times of recording count."""
+        header = None if self.recorded else getattr(message, "header", None)
+        return otherwise if header is None else int(header.stamp.sec) * SECOND + int(header.stamp.nanosec)
 
-class Record(NamedTuple):
-    """A recorded message. number: in its topic, from 1. logged: time of recording, ns. message: None if undecodable."""
 
-    number: int
-    logged: int
-    message: Any
+Clock = Callable[[Topic, Stamps], Array]
+"""Gives times, s by the clock of the wheels, to the stamps of a topic's messages."""
+Record = tuple[int, int, Any]
+"""A recorded message: its number in its topic, from 1, the time of recording, ns, and itself, None if undecodable."""
 
 
 class Bag:
@@ -112,7 +115,7 @@ class Bag:
                     message = self._reader.deserialize(data, topic.type)
                 except Exception:  # garbage fails in many ways
                     message = None
-                yield Record(number, logged, message)
+                yield number, logged, message
         if first is None and number < topic.messages:  # an MCAP without its message indexes
             raise DataError(
                 f"{self.path}: only {number} of {plural(topic.messages, 'message')} on {topic.name} can be found; "
@@ -158,19 +161,15 @@ def open_bag(path: Path, recorded: Sequence[str] = (), definitions: Sequence[Pat
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
-    files = sorted(path.iterdir()) if path.is_dir() else [path]
-    for file in files:
-        if file.name == _METADATA:
-            try:
-                read_yaml(file)  # within limits, which rosbags has not
-            except ConfigError as error:
-                raise DataError(str(error)) from None
-        elif not file.is_dir():
-            check_file(file)
     # Bags before ROS 2 Iron do not hold the definitions of their types; those of ROS itself hardly ever changed.
     store = get_typestore(Stores.ROS2_HUMBLE)
     store.fielddefs |= _defined_types(definitions)
     with _damage_as_error(path):
+        for file in sorted(path.iterdir()) if path.is_dir() else [path]:
+            if file.name == _METADATA:
+                read_yaml(file)  # within limits, which rosbags has not
+            elif not file.is_dir():
+                check_file(file)
         reader = AnyReader([path], default_typestore=store)
         reader.open()
         if definitions:
@@ -220,6 +219,8 @@ def _damage_as_error(path: Path) -> Iterator[None]:
     """Turn any error of rosbags on a file that is no bag, or a damaged one, into a DataError."""
     try:
         yield
+    except OmnibenchError as error:
+        raise DataError(str(error)) from None
     except PermissionError:
         raise DataError(f"{path}: cannot be read: permission denied") from None
     except Exception as error:  # struct.error, TypeError, KeyError, ...: rosbags trusts what it reads
@@ -232,18 +233,6 @@ def reader_of(paths: Sequence[str]) -> Callable[[Any], list[float]]:
     parts = [re.split(r"\.(?=\d)|(?<=\d)\.", path) for path in paths]
     steps = [[itemgetter(int(part)) if part.isdecimal() else attrgetter(part) for part in path] for path in parts]
     return lambda message: [float(reduce(lambda value, step: step(value), path, message)) for path in steps]
-
-
-def header_stamp(message: Any) -> int | None:
-    """The stamp of a message's header, ns; None without a header."""
-    header = getattr(message, "header", None)
-    return None if header is None else int(header.stamp.sec) * SECOND + int(header.stamp.nanosec)
-
-
-def stamp_of(topic: Topic, record: Record, part: Any) -> int:
-    """The stamp, ns, of (a part of) a message: that of its header, or the time of recording where this counts."""
-    stamp = None if topic.recorded else header_stamp(part)
-    return record.logged if stamp is None else stamp
 
 
 class TopicMessages:
@@ -260,18 +249,18 @@ class TopicMessages:
         self._bag, self._topic, self._headless = bag, topic, False
         self._left_out: dict[str, list[int]] = defaultdict(list)  # numbers of messages, by why
         stamped = []
-        for record in bag.records(topic):
+        for number, logged, message in bag.records(topic):
             try:
-                for part in parts(record.message):
-                    content, stamp = read(part), stamp_of(topic, record, part)
+                for part in parts(message):
+                    content, stamp = read(part), topic.stamp(part, logged)
                     if content is not None and stamp > 0:
                         self.contents.append(content)
-                        stamped.append((record.number, stamp, record.logged))
+                        stamped.append((number, stamp, logged))
                         self._headless |= not hasattr(part, "header")
                     elif content is not None:
-                        self._left_out[_NO_STAMP].append(record.number)
+                        self._left_out[_NO_STAMP].append(number)
             except (AttributeError, IndexError, TypeError, ValueError):  # garbage, or a type that is defined otherwise
-                self._left_out["that cannot be decoded"].append(record.number)
+                self._left_out["that cannot be decoded"].append(number)
         self.numbers, self.stamps, self.logged = np.array(stamped, dtype=np.int64).reshape(-1, 3).T
         self.rows = np.arange(len(stamped))
 

@@ -35,13 +35,12 @@ from omnibench.data.importers.bag_messages import (
     FIX,
     TRANSFORMS,
     Bag,
-    Stamps,
+    Clock,
     Topic,
     TopicMessages,
     open_bag,
     possible,
     reader_of,
-    stamp_of,
 )
 from omnibench.data.recording import ReferenceOptions, ScanReadings, ScanShape, scan_difference
 from omnibench.data.references import Reference, ReferenceKind, References
@@ -112,13 +111,8 @@ class SensorReadings:
     sigmas: Array
 
 
-def read_sensor(
-    bag: Bag, topic: Topic, options: SensorOptions, seconds: Callable[[Topic, Stamps], Array], notes: list[str]
-) -> SensorReadings:
-    """The readings of a topic; what is left out is added to ``notes``. DataError: how exact they are is not known.
-
-    seconds: gives times by the clock of the wheels, s, to the stamps of the topic's messages.
-    """
+def read_sensor(bag: Bag, topic: Topic, options: SensorOptions, seconds: Clock, notes: list[str]) -> SensorReadings:
+    """The readings of a topic; what is left out is added to ``notes``. DataError: how exact they are is not known."""
     fields = _FIX if topic.type == FIX else _IMU
     messages = TopicMessages(bag, topic, reader_of(fields))
     table = messages.table(len(fields))
@@ -235,8 +229,8 @@ Parents = dict[str, tuple[str, Array]]
 
 def _transforms(bag: Bag, topic: Topic) -> Iterator[tuple[str, str, Any]]:
     """Frame, parent and transform from the frame to its parent, of all messages of a topic."""
-    for record in bag.records(topic):
-        for each in getattr(record.message, "transforms", ()):
+    for _, _, message in bag.records(topic):
+        for each in getattr(message, "transforms", ()):
             yield each.child_frame_id.strip("/"), each.header.frame_id.strip("/"), each.transform
 
 
@@ -292,13 +286,10 @@ def frames_between(bag: Bag, topic: Topic, frames: Sequence[str]) -> tuple[list[
     return links, fixed
 
 
-def read_scans(
-    bag: Bag, topic: Topic, mount: Mount | None, seconds: Callable[[Topic, Stamps], Array], notes: list[str]
-) -> ScanReadings:
+def read_scans(bag: Bag, topic: Topic, mount: Mount | None, seconds: Clock, notes: list[str]) -> ScanReadings:
     """Check every scan of a topic; what is left out is added to ``notes``. DataError, or ConfigError: it is no scanner.
 
-    mount: of the scanner; None: by /tf_static. seconds: gives times by the clock of the wheels, s, to the stamps of the
-    first rays.
+    mount: of the scanner; None: by /tf_static. The stamp of a scan is that of its first ray.
     """
     messages = TopicMessages(bag, topic, _laser_scan)
     place, scans = messages.place, messages.contents
@@ -335,10 +326,10 @@ def read_scans(
         ranges = np.empty((len(chosen), scanner.rays), np.float32)
         with open_bag(bag.path, [topic.name] if topic.recorded else [], bag.definitions) as again:
             first, last = int(logged[chosen].min()), int(logged[chosen].max())
-            for record in again.records(again.topic(topic.name, "scan_topic"), first, last):
-                index = places.pop((record.logged, stamp_of(topic, record, record.message)), None)
-                if index is not None and len(record.message.ranges) == scanner.rays:
-                    ranges[index] = _measured(record.message)
+            for _, when, message in again.records(again.topic(topic.name, "scan_topic"), first, last):
+                index = places.pop((when, topic.stamp(message, when)), None)
+                if index is not None and len(message.ranges) == scanner.rays:
+                    ranges[index] = _measured(message)
         if places:
             raise DataError(f"{place}: the bag has changed since it was opened; import it again")
         return ranges

@@ -80,7 +80,7 @@ class DatasetFolder(Importer):
         """The data set as the options say. DataError as for ``load_dataset``."""
         recorded, options = read_recorded(source), self.options
         said = {key: getattr(options, key) or getattr(recorded, key) for key in ("description", "source", "licence")}
-        return _reread(recorded.trajectories, recorded, recorded.scans, options.model_copy(update=said), [])
+        return _reread(recorded, options.model_copy(update=said), [])
 
     def recordings(self, source: Path, notes: list[str]) -> list[Recording]:  # noqa: ARG002 (as of other importers)
         """The runs of the data set as recordings, as they stand in its tables."""
@@ -96,8 +96,7 @@ def read_again(dataset: Dataset, settings: Mapping[str, Any], place: str) -> Dat
     known = {key: getattr(dataset, key) for key in ("robot", "name", "description", "source", "licence")}
 
     def by(settings: Mapping[str, Any], notes: list[str]) -> Dataset:
-        options = validate(DatasetOptions, {**known, **settings}, place)
-        return _reread(dataset.trajectories, dataset, dataset.scans, options, notes)
+        return _reread(dataset, validate(DatasetOptions, {**known, **settings}, place), notes)
 
     before = by({}, []).warnings
     notes = [warning for warning in dataset.warnings if warning not in before]
@@ -105,17 +104,12 @@ def read_again(dataset: Dataset, settings: Mapping[str, Any], place: str) -> Dat
     return again if dataset.referenced else replace(again, referenced=False, warnings=tuple(notes))
 
 
-def _reread(
-    runs: Sequence[Trajectory], header: Dataset, scans: Scans | None, options: DatasetOptions, notes: list[str]
-) -> Dataset:
-    """The data set of runs by the options; its sample period stays unless these say another, or another unit of times.
-
-    header: says the robot by which the runs were recorded, their sample period, and whether they were simulated.
-    """
-    recordings = recordings_of(runs, header.robot, scans, options)
-    dataset = dataset_of(recordings, options, notes, simulated=header.simulated)
+def _reread(recorded: Dataset, options: DatasetOptions, notes: list[str]) -> Dataset:
+    """A data set by the options; its sample period stays unless these say another, or another unit of times."""
+    recordings = recordings_of(recorded.trajectories, recorded.robot, recorded.scans, options)
+    dataset = dataset_of(recordings, options, notes, simulated=recorded.simulated)
     if not options.sample_period and options.wheel_time_unit == "s":
-        dataset = replace(dataset, sample_period=header.sample_period)
+        dataset = replace(dataset, sample_period=recorded.sample_period)
     return joined(dataset, [load_dataset(folder) for folder in options.join])
 
 

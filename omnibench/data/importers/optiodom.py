@@ -137,9 +137,10 @@ def read_metadata(file: Path) -> Session:
     robot = "".join(values.get("type", [])[:1])
     if robot not in KINDS:
         raise DataError(f"{file}: type is {robot!r}; {nearest(robot, KINDS)}it must be one of {', '.join(KINDS)}")
-    numbers = {}
+    numbers: dict[str, tuple[float, ...]] = {"odo_ti": ()}
     counts = {"Di": len(KINDS[robot].signs), "Li": KINDS[robot].lengths, "ngear": 1, "encRes": 1}
-    for key, count in (counts | {"odo_ti": len(values.setdefault("odo_ti", []))}).items():
+    optional = {"odo_ti": len(values["odo_ti"])} if "odo_ti" in values else {}
+    for key, count in (counts | optional).items():
         if key not in values:
             raise DataError(f"{file}: key {key!r} is missing; {nearest(key, values)}found: {', '.join(values)}")
         numbers[key] = _numbers(values[key])

@@ -27,7 +27,6 @@ from omnibench.data.importers.bag_messages import (
     Topic,
     TopicMessages,
     find_bags,
-    header_stamp,
     open_bag,
     possible,
     reader_of,
@@ -292,16 +291,13 @@ class _WheelClock:
         A time is that of a header, or by when the message was recorded, as the wheels' messages have both.
         """
         order = np.argsort(self.logged, kind="stable")
-        logged, stamps = self.logged[order], np.maximum.accumulate(self.stamps[order])
-        timed = []
-        for record in bag.records(topic):
-            stamp = None if topic.recorded else header_stamp(record.message)
-            if stamp:
-                time = self.seconds(np.array(stamp))
-            else:
-                time = np.interp(record.logged - logged[0], logged - logged[0], self.seconds(stamps))
-            timed.append((float(time), record.message))
-        return sorted(timed, key=lambda pair: pair[0])
+        logged, wheels = self.logged[order], self.seconds(np.maximum.accumulate(self.stamps[order]))
+        records = list(bag.records(topic))
+        stamps = np.array([topic.stamp(message, 0) for _, _, message in records], dtype=np.int64)
+        recorded = np.array([when for _, when, _ in records], dtype=np.int64)
+        by_recording = np.interp(recorded - logged[0], logged - logged[0], wheels)
+        times = np.where(stamps != 0, self.seconds(stamps), by_recording)
+        return [(float(times[row]), records[row][2]) for row in np.argsort(times, kind="stable")]
 
 
 def read_bag(path: Path, name: str, options: RosbagOptions, notes: list[str]) -> Recording:
@@ -383,13 +379,10 @@ def read_wheels(
         values.append(numbers[nearest])
         read_at.append(np.tile(stamps[nearest][:, None], len(stream.names)))
     unit = first.unit.removesuffix("/sample") if several else first.unit
-    count, angles = len(turning), np.hstack(values[len(turning) :]) if steered else None
-    columns = [tuple(chain(*(stream.names for stream in part))) for part in (turning, steered)]
+    rates, angles = np.hstack(values[: len(turning)]), np.hstack(values[len(turning) :]) if steered else None
+    columns, axles = (tuple(chain(*(stream.names for stream in part))) for part in streams)
     gap, read = first.longest_gap, np.hstack(read_at) if several else None
-    readings = WheelReadings(
-        times, np.hstack(values[:count]), unit, angles, columns[0], columns[1], longest_gap=gap, read_at=read
-    )
-    return readings, clock
+    return WheelReadings(times, rates, unit, angles, columns, axles, longest_gap=gap, read_at=read), clock
 
 
 def read_joints(bag: Bag, topic: Topic, choice: JointChoice, options: RosbagOptions, notes: list[str]) -> _Joints:
