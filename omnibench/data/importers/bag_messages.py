@@ -142,7 +142,7 @@ class Bag:
     def require_fields(self, topic: Topic, paths: Sequence[str], key: str) -> None:
         """ConfigError: the messages of a topic do not have the fields that the option ``key`` names."""
         fields, place = self.fields(topic.type), f"{self.path}: {key}: {topic.name} ({topic.type})"
-        if not fields:
+        if topic.type not in self._reader.typestore.fielddefs:
             way = "say what is in them by .msg files, or the folder of their package: --set message_definitions=FOLDER"
             raise ConfigError(f"{place}: the bag does not define its messages; {way}")
         for path in paths:

@@ -379,10 +379,10 @@ def read_wheels(
         values.append(numbers[nearest])
         read_at.append(np.tile(stamps[nearest][:, None], len(stream.names)))
     unit = first.unit.removesuffix("/sample") if several else first.unit
-    rates, angles = np.hstack(values[: len(turning)]), np.hstack(values[len(turning) :]) if steered else None
+    counted, angles = np.hstack(values[: len(turning)]), np.hstack(values[len(turning) :]) if steered else None
     columns, axles = (tuple(chain(*(stream.names for stream in part))) for part in streams)
     gap, read = first.longest_gap, np.hstack(read_at) if several else None
-    return WheelReadings(times, rates, unit, angles, columns, axles, longest_gap=gap, read_at=read), clock
+    return WheelReadings(times, counted, unit, angles, columns, axles, longest_gap=gap, read_at=read), clock
 
 
 def read_joints(bag: Bag, topic: Topic, choice: JointChoice, options: RosbagOptions, notes: list[str]) -> _Joints:

@@ -551,7 +551,7 @@ def test_wheels_are_read_from_fields_of_any_message(tmp_path: Path, write: Calla
 
 
 def test_poses_are_read_from_fields_of_any_message(tmp_path: Path) -> None:
-    source = write_mcap(tmp_path / "drive", [*WHEELS_ONLY, *located()])
+    source = write_mcap(tmp_path / "drive", [*WHEELS_ONLY, *located(), text("go", EPOCH, "/word")])
     for options in (
         {"pose_columns": ["place"]},
         {"pose_columns": ["x", "y", "yaw"], "heading_unit": "deg"},
@@ -561,6 +561,8 @@ def test_poses_are_read_from_fields_of_any_message(tmp_path: Path) -> None:
         read(source)
     with refused(ConfigError, match=r"pose_topic: /camera is .*or --set pose_columns=.*place,.*x, y, yaw"):
         read(source, pose_topic="/camera")
+    with refused(ConfigError, match=r"pose_columns: /word .* has no field 'data'; its numbers: none"):
+        read(source, pose_topic="/word", pose_columns="data")
     with refused(ConfigError, match=r"pose_columns: .* has no field 'plac'; did you mean 'place'\?"):
         read(source, pose_topic="/camera", pose_columns="plac")
     with refused(ConfigError, match="pose_columns: yaw of /camera .* is no geometry pose"):
