@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+import polars as pl
 from numpy.typing import NDArray
 from pydantic import Field
 
@@ -189,25 +190,26 @@ def read_log(session: Session) -> SessionLog | None:
     file, kind = session.file.with_name(f"{session.name}.csv"), KINDS[session.robot]
     if not file.is_file():
         return None
-    header: list[list[str]] = []
-    run, rows = None, []
-    for line, fields in enumerate((text.split(",") for text in read_text(file).splitlines()), 1):
-        if fields[0] == "Run:":
-            if len(fields) < 2 or not fields[1].strip().isdigit():
-                raise DataError(f"{file}, line {line}: expected the number of a run after 'Run:'")
-            run = int(fields[1])
-        elif fields[0] in ("RUNFINISHED", "METHODFINISHED") or fields[0].startswith("+++"):
-            run = None
-        elif run is not None:
-            numbers = _numbers(fields[: kind.log_fields])
-            if len(numbers) < kind.log_fields:
-                raise DataError(f"{file}, line {line}: expected {kind.log_fields} finite numbers; repair the row")
-            rows.append((run, *numbers))
-        elif not rows:
-            header.append(fields)
-    if not rows:
+    text, line, run = pl.col("text"), pl.col("line"), pl.col("run")
+    first = text.str.extract("^([^,]*)")
+    number = text.str.extract(r"^Run:,\s*(\d+)\s*(?:,|$)").cast(pl.Int64, strict=False)
+    ends = first.is_in(["RUNFINISHED", "METHODFINISHED"]) | first.str.starts_with("+++")
+    lines = pl.DataFrame({"text": read_text(file).splitlines()}, {"text": pl.String}).with_row_index("line", 1)
+    for row in lines.filter((first == "Run:") & number.is_null())["line"].head(1):
+        raise DataError(f"{file}, line {row}: expected the number of a run after 'Run:'")
+    # The run that each line stands in, -1 outside of runs; markers are left out.
+    lines = lines.with_columns(pl.when(ends).then(-1).otherwise(number).forward_fill().fill_null(-1).alias("run"))
+    lines = lines.filter((first != "Run:") & ~ends)
+    rows = lines.filter(run >= 0)
+    if rows.is_empty():
         raise DataError(f"{file}: it holds no run")
-    runs, table = np.array(rows)[:, 0].astype(np.intp), np.array(rows)[:, 1:]
+    fields, count = text.str.split(",").list, kind.log_fields
+    columns = [fields.get(place, null_on_oob=True).str.strip_chars().alias(f"{place}") for place in range(count)]
+    table = rows.select(columns).cast(pl.Float64, strict=False).to_numpy()
+    for row in rows["line"].filter(~np.isfinite(table).all(axis=1)).head(1):
+        raise DataError(f"{file}, line {row}: expected {count} finite numbers; repair the row")
+    header = [row.split(",") for row in lines.filter((run < 0) & (line < rows["line"][0]))["text"]]
+    runs = rows["run"].to_numpy().astype(np.intp)
     times, ticks, commands = table[:, 0], table[:, kind.log_ticks] * kind.log_signs, None
     if len(kind.log_commands) == 3:
         commands = table[:, kind.log_commands]
