@@ -450,53 +450,6 @@ def _means(values: Array, starts: NDArray[np.intp]) -> Array:
     return means
 
 
-TURN = 2 * np.pi  # rad
-_SAME_TIME = 1e-6  # s; unix time in a double has steps of 0.2 us
-
-
-@dataclass(frozen=True, eq=False)
-class Alignment:
-    """Wheel samples and poses from a common t = 0 on.
-
-    zero: time of the recording that becomes t = 0, s. after_start (F,): True for wheel samples that end after it.
-    pose_times (K,) and poses (K, 3) start with the pose at t = 0 and end with the wheels.
-    """
-
-    zero: float
-    after_start: NDArray[np.bool_]
-    pose_times: Array
-    poses: Array
-
-
-def align(begin: float, wheel_times: Array, pose_times: Array, poses: Array) -> Alignment | None:
-    """Set t = 0 of a recording to the first instant with both wheels and poses; None when they do not overlap.
-
-    begin: when the first wheel sample began, s. wheel_times (F,): when each ended, s. All times by one clock, in any
-    epoch. t = 0 is the first pose after ``begin``, or ``begin`` itself where poses reach back before it: the start
-    pose is then interpolated (heading the shortest way). The sample during which t = 0 falls keeps its mean rate.
-    Poses after the last wheel sample are left out, since no odometry predicts them.
-    """
-    zero = float(pose_times[0])
-    if zero < begin - _SAME_TIME:
-        zero = begin
-    if zero >= min(wheel_times[-1], pose_times[-1]):
-        return None
-    shown = (pose_times > zero + _SAME_TIME) & (pose_times <= wheel_times[-1] + _SAME_TIME)
-    after_start = wheel_times > zero + _SAME_TIME
-    if not shown.any() or not after_start.any():
-        return None
-    after = int(np.searchsorted(pose_times, zero))
-    if after < len(pose_times) and abs(pose_times[after] - zero) <= _SAME_TIME:
-        start = poses[after]
-    else:
-        step = poses[after] - poses[after - 1]
-        step[2] -= TURN * np.round(step[2] / TURN)
-        share = (zero - pose_times[after - 1]) / (pose_times[after] - pose_times[after - 1])
-        start = poses[after - 1] + share * step
-    times = np.concatenate([[0.0], pose_times[shown] - zero])
-    return Alignment(zero, after_start, times, np.vstack([start, poses[shown]]))
-
-
 _BUNCHED, _TOGETHER = 1.2, 10  # factor of the mean period from the median, and samples that it is taken over; chosen
 
 

@@ -9,11 +9,12 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Protocol, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, FiniteFloat, model_validator
 
 from omnibench.config import NonNegative, Positive, read_yaml, validate
@@ -23,7 +24,7 @@ from omnibench.data.scans import Ranges, Scanner
 from omnibench.data.splits import Names
 from omnibench.errors import ConfigError, nearest
 from omnibench.registry import Options
-from omnibench.robot.kinematics import Array, Robot, fastest_rates
+from omnibench.robot.kinematics import Array, Robot
 from omnibench.words import plural
 
 PositionUnit = Literal["m", "cm", "mm", "inch"]
@@ -84,6 +85,13 @@ class WheelReadings:
     read_at: Array | None = None
     others: Mapping[str, Array] = field(default_factory=dict)
 
+    def at_the_rows(self, values: Array, columns: slice) -> Array:
+        """Values (F, n) of some columns at the times of the readings, where they were read at times of their own."""
+        if self.read_at is None:
+            return values
+        read = zip(self.read_at[:, columns].T, values.T, strict=True)
+        return np.column_stack([np.interp(self.times, *pair) for pair in read])
+
 
 @dataclass(frozen=True, eq=False)
 class PoseReadings:
@@ -97,6 +105,11 @@ class PoseReadings:
     covariances: Array | None = None
     radians: bool = False
     doubtful: str = ""
+
+    def only(self, chosen: NDArray[Any]) -> PoseReadings:
+        """Some of the poses, by their indices, or by True (K,)."""
+        covariances = None if self.covariances is None else self.covariances[chosen]
+        return replace(self, times=self.times[chosen], poses=self.poses[chosen], covariances=covariances)
 
 
 @dataclass(frozen=True)
@@ -403,25 +416,9 @@ class ReferenceOptions(RecordingOptions):
         return np.broadcast_to(factors * np.array(self.wheel_signs or 1), len(self.robot.wheel_names))
 
     @property
-    def steering_as_read(self) -> bool:
-        """True if no option says how steering angles are to be read."""
-        return not any(name.startswith("steering_") for name in self.model_fields_set - {"steering_columns"})
-
-    @property
-    def fastest_rates(self) -> Array:
-        """Rates (N,), rad/s, that no wheel exceeds."""
-        radii = self.robot.radii
-        return fastest_rates(radii) if self.fastest is None else np.full(len(radii), self.fastest)
-
-    @property
     def still(self) -> float:
         """Largest angle, rad, by which a resting wheel moves within ``least_rest`` s."""
         return self.rest_rate * self.least_rest
-
-    @property
-    def cuts(self) -> bool:
-        """True if runs are cut at anything but what every recording is cut at."""
-        return self.longest_gap is not None or self.jumps != "keep" or self.start_at_rest or self.cutting != "none"
 
     @property
     def cutting(self) -> str:

@@ -48,7 +48,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from timing import PATIENCE
 
-from omnibench.data.cutting import between_rests, find_rests
+from omnibench.data.runs import between_rests, find_rests
 from omnibench.data.storage import load_dataset
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrate import calibrate
