@@ -263,17 +263,9 @@ def _steering_angles(shown: Array, recording: Recording, options: ReferenceOptio
     if as_they_are:
         return shown
     turns = np.broadcast_to(options.steering_ticks_per_turn or TURNS.get(unit, 1.0), count)
-    scales, signs, offsets = (
-        np.array(values or default)
-        for values, default in (
-            (options.steering_scale, 1.0),
-            (options.steering_signs, 1.0),
-            (options.steering_offsets_deg, 0.0),
-        )
-    )
     angles = np.column_stack([counters.about_zero(*pair) for pair in zip(shown.T, turns, strict=True)])
-    angles *= 2 * np.pi / turns * scales * signs
-    return angles + np.radians(offsets)
+    angles *= 2 * np.pi / turns * np.array(options.steering_scale or 1.0) * np.array(options.steering_signs or 1.0)
+    return angles + np.radians(options.steering_offsets_deg or 0.0)
 
 
 def _misread(recording: Recording, rates: Array, durations: Array, options: ReferenceOptions) -> DataError:

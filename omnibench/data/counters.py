@@ -37,13 +37,12 @@ def counter_range(runs: Sequence[Array], turn: float, whole: bool) -> float | No
     runs: its counts (F,) in every run of the recording. turn: counts of a turn. whole: they are ticks, of which other
     ranges than a turn are possible: powers of two, and any that three crossings or more agree on.
     """
-    least, most = min(counts.min() for counts in runs), max(counts.max() for counts in runs)
-    longest = max(float(np.abs(np.diff(counts)).max(initial=0.0)) for counts in runs)
+    spread = max(counts.max() for counts in runs) - min(counts.min() for counts in runs)
     for wrap in sorted((turn, *(POWERS_OF_TWO if whole else ()))):
-        within = most - least <= wrap * (1 + _ROUNDING) and longest > wrap / 2
+        within = wrap / 2 < spread <= wrap * (1 + _ROUNDING)
         if within and any(begins_again(counts, wrap) for counts in runs):
             return wrap
-    return _agreed_range(runs, most - least, turn) if whole and most > least else None
+    return _agreed_range(runs, spread, turn) if whole and spread > 0 else None
 
 
 def begins_again(counts: Array, wrap: float) -> bool:

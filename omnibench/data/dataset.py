@@ -411,7 +411,7 @@ def runs_of_tables(
     measured: dict[str, References] = {}
     if references is not None:
         numbers = {name: np.full(len(references.frame), np.nan) for name in NUMBERS}
-        for name in numbers.keys() & {*references.frame.columns}:
+        for name in [name for name in NUMBERS if name in references.frame.columns]:
             numbers[name] = references.floats(name).fill_null(np.nan).to_numpy()
             if name in ("t0", "t1"):
                 infinite = np.isinf(numbers[name])

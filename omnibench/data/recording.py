@@ -267,39 +267,25 @@ class RunsOptions(Options):
     source: str = Field("", description="origin of the recording")
     licence: str = Field("", description="licence of the recording")
 
-    @model_validator(mode="before")
-    @classmethod
-    def _robot_is_corrected(cls, content: Any) -> Any:
-        """The robot with the values of ``wheels`` and ``mount`` in the place of its own."""
-        if not isinstance(content, dict) or not (content.get("wheels") or content.get("mount")):
-            return content
-        if content.get("robot") is None:
-            content = {**content, "robot": getattr(cls.model_fields["robot"], "default", None)}
-        robot = _load_robot(content["robot"])
-        return {**content, "robot": corrected_robot(robot, content.get("wheels") or {}, content.get("mount"))}
+    @model_validator(mode="after")
+    def _robot_is_corrected(self) -> RunsOptions:
+        if self.wheels or self.mount:
+            self.__dict__["robot"] = corrected_robot(self.robot, self.wheels, self.mount)
+        return self
 
 
-def corrected_robot(
-    robot: Robot | Mapping[str, Any], wheels: Mapping[str, Mapping[str, Any]], mount: Mapping[str, float] | None
-) -> Robot:
+def corrected_robot(robot: Robot, wheels: Mapping[str, Mapping[str, Any]], mount: Mapping[str, float] | None) -> Robot:
     """A robot with other values of some wheels, by their names, and another tracked point. ConfigError: it is none."""
-    written = robot.model_dump(mode="json", by_alias=True) if isinstance(robot, Robot) else dict(robot)
-    names = [wheel["name"] for wheel in written["wheels"]]
-    for name in wheels:
-        if name not in names:
-            raise ConfigError(f"wheels: no wheel {name!r}; {nearest(str(name), names)}known: {', '.join(names)}")
-    written["wheels"] = [_corrected(wheel, wheels.get(wheel["name"]) or {}) for wheel in written["wheels"]]
-    return validate(
-        Robot, written | ({"mount": dict(mount)} if mount else {}), "the robot with the values of wheels and mount"
-    )
-
-
-def _corrected(wheel: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """A wheel as in a file with other values; an angle in degrees takes the place of one in rad, and the other way."""
-    gone = {key.removesuffix("_deg") for key in values} | {f"{key}_deg" for key in values}
-    if {"x", "y"} & values.keys():
-        gone.add("distance")
-    return {key: value for key, value in wheel.items() if key not in gone} | dict(values)
+    written = robot.model_dump(mode="json", by_alias=True) | ({"mount": dict(mount)} if mount else {})
+    by_name = {wheel["name"]: wheel for wheel in written["wheels"]}
+    for name, values in wheels.items():
+        if name not in by_name:
+            raise ConfigError(f"wheels: no wheel {name!r}; {nearest(str(name), by_name)}known: {', '.join(by_name)}")
+        # An angle in degrees takes the place of one in rad, and the other way; x and y that of a distance.
+        gone = {key.removesuffix("_deg") for key in values} | {f"{key}_deg" for key in values}
+        gone |= {"distance"} if {"x", "y"} & values.keys() else set()
+        by_name[name] = {key: value for key, value in by_name[name].items() if key not in gone} | dict(values)
+    return validate(Robot, written | {"wheels": [*by_name.values()]}, "the robot with the values of wheels and mount")
 
 
 class RecordingOptions(RunsOptions):

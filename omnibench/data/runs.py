@@ -516,11 +516,13 @@ def divided_runs(
     motions = {run.id: motion_of(options.robot, run) for run in runs}
     splits = [run.split for run in runs]
     if not any(source[run.id].recording.attributes.split for run in runs):
-        # Commands by sent twists or names that were driven once leave no repetition to validate on.
         counts = Counter(run.command for run in runs)
-        stated = {run.id for run in runs if source[run.id].trajectory.command}
-        alike = [run.command and (counts[run.command] > 1 or run.id in stated) for run in runs]
-        splits = every_second([run.command if by else motions[run.id] for run, by in zip(runs, alike, strict=True)])
+        groups: list[str | None] = []
+        for run in runs:
+            # A command by sent twists or names that was driven once leaves no repetition to validate on.
+            stated = run.command and (counts[run.command] > 1 or source[run.id].trajectory.command)
+            groups.append(run.command if stated else motions[run.id])
+        splits = every_second(groups)
     parted = divided(runs, options.train, options.validation, otherwise=splits)
     train, validation = ({motions[run.id] for run in parted if run.split == side} for side in SPLITS)
     if train and (missing := sorted(validation - train)):
