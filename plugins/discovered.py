@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from omnibench.data.dataset import make_dataset
-from omnibench.discover.discover import discover_effects
 from omnibench.errors import NotApplicableError
 from omnibench.fit.calibrator import Calibrator, Outcome, Solution
 from omnibench.fit.parameterisation import MatrixElements
@@ -34,6 +33,8 @@ class Discovered(Calibrator):
 
         Time is looked at between the steps of the discovery only. When it is spent, the answer is the matrix alone.
         """
+        from omnibench.discover.discover import discover_effects  # loads slowly; every command loads this plug-in
+
         if problem.integration != "arc":
             raise NotApplicableError(
                 "discover integrates arcs, since Euler steps look like slip; set integration to arc"
