@@ -10,7 +10,9 @@ import typer
 
 from omnibench.cli.options import Force, Plugins, load_given_plugins, output_option, plugin_folders
 from omnibench.cli.terminal.console import make_console, print_ending, warn
+from omnibench.cli.terminal.progress_display import ProgressDisplay
 from omnibench.errors import ConfigError
+from omnibench.files import refuse_existing, remove
 
 if TYPE_CHECKING:
     from omnibench.live.config import LiveConfig
@@ -93,7 +95,6 @@ def _replay_to_node(
 ) -> None:
     """Play a recording to a node of this process, and show the errors of its odometry."""
     from omnibench.cli.terminal.live_tables import node_log, print_demonstration
-    from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.config import validate
     from omnibench.live.replay.concatenated_drive import ReplayConfig, load_recording
     from omnibench.live.replay.demonstration import demonstrate
@@ -142,7 +143,6 @@ def replay(
     An omnibench node acknowledges what it takes, and is waited for; other programs do not, which is said.
     """
     from omnibench.cli.terminal.live_tables import print_counted, print_played
-    from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.config import parse_settings, validate
     from omnibench.live.network.presence import checked_robot
     from omnibench.live.replay.concatenated_drive import ReplayConfig, concatenate_recording, load_recording
@@ -231,7 +231,6 @@ def record(
 ) -> None:
     """Record live topics into MCAP, for Foxglove and rosbags."""
     from omnibench.cli.terminal.live_tables import record as write
-    from omnibench.files import refuse_existing, remove
     from omnibench.live.config import read_live_config
     from omnibench.live.stopping import stop_on_signals
     from omnibench.live.wire.topics import TOPICS
