@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from omnibench.errors import UnknownNameError
+from omnibench.errors import require_choice
 
 HANDBOOK = Path(__file__).with_name("handbook")
 
@@ -52,6 +52,5 @@ def topics() -> list[Topic]:
 def find_topic(name: str) -> Topic:
     """The topic called ``name``. UnknownNameError names the nearest one and lists all."""
     known = {topic.name: topic for topic in topics()}
-    if name not in known:
-        raise UnknownNameError("topic", name, known, "guide")
+    require_choice("topic", name, known, "guide")
     return known[name]

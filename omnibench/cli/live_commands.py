@@ -104,7 +104,7 @@ def _replay_to_node(
     if source is None:
         raise ConfigError(f"{file}: replay.dataset names no recording; say --replay DATASET")
     if speed is not None:
-        checked = validate(ReplayConfig, {"speed": _speed(speed)}, "--speed")
+        checked = validate(ReplayConfig, {"speed": speed}, "--speed")
         config = config.model_copy(update={"replay": config.replay.model_copy(update={"speed": checked.speed})})
     with ProgressDisplay() as watch:
         recording = load_recording(source, watch=watch)
@@ -153,7 +153,7 @@ def replay(
 
     checked_robot(robot)
     load_given_plugins(plugins)
-    chosen = validate(ReplayConfig, {"speed": _speed(speed), **parse_settings(settings)}, "replay")
+    chosen = validate(ReplayConfig, {"speed": speed, **parse_settings(settings)}, "replay")
     noise = None if calibration is None else read_calibration(calibration).noise
     with ProgressDisplay() as watch:
         recording = load_recording(dataset, watch=watch)
@@ -294,10 +294,3 @@ def _client(file: Path | None, connect: str | None, profile: Any, purpose: str) 
         yield session, KeySpace(profile or chosen.profile, chosen.domain)
     finally:
         close_session(session)
-
-
-def _speed(text: str) -> float | str:
-    try:
-        return float(text)
-    except ValueError:
-        return text

@@ -103,7 +103,17 @@ def import_(
         if source is not None or output is not None:
             raise ConfigError("--template DIR writes tables to fill in; leave SOURCE and -o out")
         refuse_existing(template, force=force, folders=True)
-        return _write_template(template, robot_type or "diff", references)
+        from omnibench.data.importers.csv_template import write_template
+
+        files = write_template(template, robot_type or "diff", references=references)
+        typer.echo(f"{plural(len(files), 'file')}: {template}")
+        for file in files:
+            typer.echo(f"  {file.name}", err=True)
+        return print_ending(
+            f"{template} holds robot.yaml and {plural(len(files) - 1, 'table')} to fill in",
+            "put your robot and your samples into them, and import them",
+            *("omnibench", "import", "csv", template, "-o", f"data/{template.resolve().name}"),
+        )
     if references:
         raise ConfigError("--references is for --template DIR; a references.csv among the tables is read by itself")
     if robot_type is not None:
@@ -120,7 +130,11 @@ def import_(
         options.setdefault("name", folder)
     dataset = omnibench.import_dataset(importer, source, options)
     read = RecordingSource(dataset, importer, source, given, output)
-    report = None if no_check else _checked(read)
+    report: CheckReport | None = None
+    if not no_check:
+        from omnibench.check.check import check_recording  # slow to import
+
+        report = check_recording(read)
     if not accept_units and report is not None:
         # Units that cannot be right are refused, with what to type.
         wrong = [finding.what for finding in report.findings if finding.severity == "error" and finding.kind in UNITS]
@@ -138,27 +152,6 @@ def import_(
         make_console(error=True).print(f"check: {report.sentence}.", soft_wrap=True)
     holds = f"{output} holds {plural(len(dataset.trajectories), 'run')} of {dataset.robot.name}"
     return print_ending(holds, *_next_step(read, report))
-
-
-def _write_template(folder: Path, robot_type: str, references: bool) -> None:
-    """Write tables and robot.yaml to fill in, and say what to type next."""
-    from omnibench.data.importers.csv_template import write_template
-
-    files = write_template(folder, robot_type, references=references)
-    typer.echo(f"{plural(len(files), 'file')}: {folder}")
-    for file in files:
-        typer.echo(f"  {file.name}", err=True)
-    print_ending(
-        f"{folder} holds robot.yaml and {plural(len(files) - 1, 'table')} to fill in",
-        "put your robot and your samples into them, and import them",
-        *("omnibench", "import", "csv", folder, "-o", f"data/{folder.resolve().name}"),
-    )
-
-
-def _checked(read: "RecordingSource") -> "CheckReport":
-    from omnibench.check.check import check_recording  # slow to import, and left out by --no-check
-
-    return check_recording(read)
 
 
 def _next_step(read: "RecordingSource", report: "CheckReport | None") -> tuple[Any, ...]:

@@ -176,6 +176,7 @@ Per = Literal["run", "second", "metre"]
 _SHAPES = Shapes(lines=(0.5, 1.0), radii=(0.1, 0.2, 0.4, 0.8), turns=(45.0, 90.0, 180.0, 360.0), spins=(360.0, 1080.0))
 # deg, m, deg: more is a slip of the pen.
 _MOST = {"steering_limit": 180.0, "position_noise": 10.0, "heading_noise": 90.0}
+_DECIMAL = r"[0-9]+\.?[0-9]*|\.[0-9]+"
 _SET = "robot"  # name of the candidates' set
 _SAMPLE_PERIOD, _POSE_PERIOD = 0.05, 0.25  # s; commands are constant, so that longer samples tell the same
 # White noise of a motion capture or of scan matching, and per sqrt(s) what a floor and slip add: the order of magnitude
@@ -229,11 +230,8 @@ def design_source(
     if "area" in given:
         # The sides, m, of an area like 3x2.5
         text = given["area"]
-        match = re.fullmatch(r"\s*([0-9.]+)\s*[xX×]\s*([0-9.]+)\s*m?\s*", text)
-        try:
-            sides = (float(match[1]), float(match[2])) if match else (0.0, 0.0)
-        except ValueError:
-            sides = (0.0, 0.0)
+        match = re.fullmatch(rf"\s*({_DECIMAL})\s*[xX×]\s*({_DECIMAL})\s*m?\s*", text)
+        sides = (float(match[1]), float(match[2])) if match else (0.0, 0.0)
         if min(sides) <= 0 or not math.isfinite(max(sides)):
             raise ConfigError(f"--area {text}: give two sides in m, like --area 3x2.5")
         given["area"] = sides

@@ -43,16 +43,7 @@ def simulate_flower(
 
     ConfigError or DataError in one line: an effect of the truth, or a parameter of one, is not known or is missing.
     """
-    truth = true_record(
-        config.truth,
-        config.robot,
-        config.sample_period,
-        tuple(config.sessions),
-        name,
-        integration=config.integration,
-        noise=config.noise,
-        variation=config.commands.variation,
-    )
+    truth = true_record(config, name)
     robot = truth.true_robot()
     trajectories: list[Trajectory] = []
     for split, session in config.sessions.items():
@@ -225,7 +216,7 @@ def simulate_robot(
             times = np.linspace(0.0, session.distance / command.speed, max(2, math.ceil(session.distance / _STEP)))
             path = DrivenPath(times[-1:], plan.start, times[-1] * twist[None], "arc")
             plan.check_path(_places(path.poses(times), mount), times, config.radius, f"command {command.name}")
-    truth = true_record(config.truth, config.robot, config.sample_period, tuple(sessions), name)
+    truth = true_record(config, name)
     simulator = _RobotSimulator(config, truth.true_robot(TRUE_STEP), plan, commands)
     runs: list[_Recorded] = []
     total = len(sessions) * len(commands) * config.repetitions
