@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -172,12 +172,13 @@ class SquaresMethod(TwoWheelMethod):
         """Apply the article's formulas. NotApplicableError: there are no squares, or they were driven one way only."""
         self.needs_matrix(problem)
         squares = squares_both_ways(problem)
-        clockwise, counter = (
-            float(np.mean([square.error[self.coordinate] for square in driven]))
-            for driven in (squares.clockwise, squares.counter)
-        )
+        clockwise, counter = self.mean_error(squares.clockwise), self.mean_error(squares.counter)
         factors = self.factors(clockwise, counter, squares.side, axle_length(problem.robot))
         return squares.solution(problem.robot, *factors)
+
+    def mean_error(self, squares: Sequence[Square]) -> float:
+        """Mean error of squares that were driven one way."""
+        return float(np.mean([square.error[self.coordinate] for square in squares]))
 
     @abstractmethod
     def factors(self, clockwise: float, counter: float, side: float, axle: float) -> tuple[float, float]:
