@@ -16,10 +16,9 @@ from omnibench.fit.geometry import GeometryLimits
 from omnibench.fit.parameterisation import ParameterisationName
 from omnibench.fit.problem import Budget, BudgetSpent, CalibrationProblem, make_parameterisation
 from omnibench.registry import Options
-from omnibench.robot.kinematics import Array, Robot, Wheel, WheelType, class_of, wheel_equations
+from omnibench.robot.kinematics import Array, CarDrive, Robot, Wheel, WheelType, class_of, wheel_equations
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, WheelLog
-from omnibench.simulate.commands import wheels_of
 
 PERIOD = 0.2  # s between wheel samples
 _SAMPLES = 20  # wheel samples of a run
@@ -157,8 +156,14 @@ def synthetic_motions(robot: Robot) -> dict[str, tuple[Leg, ...]]:
 def _commanded(robot: Robot, motion: tuple[float, float, float], samples: int) -> tuple[Array, Array]:
     """Wheel rates (samples + 1, N) and steering angles (samples + 1, S) of a leg, before which the robot steers."""
     twist = np.array(motion) / (samples * PERIOD)
-    rates, steering = wheels_of(robot, twist)
-    return np.vstack([np.zeros_like(rates), np.tile(rates, (samples, 1))]), np.tile(steering, (samples + 1, 1))
+    rates, steering = robot.drive.commands((robot.signal_equations @ twist)[None])
+    if not isinstance(robot.drive, CarDrive):  # a wheel rolls backwards rather than be steered by more than a quarter
+        back = np.abs(steering) > math.pi / 2 + 1e-9
+        steering = np.where(back, steering - np.copysign(math.pi, steering), steering)
+        for wheel, pair in enumerate(robot.drive.pairs):
+            rates[:, wheel] *= -1.0 if pair >= 0 and back[0, pair] else 1.0
+    standing = np.zeros_like(rates)
+    return np.vstack([standing, np.repeat(rates, samples, axis=0)]), np.repeat(steering, samples + 1, axis=0)
 
 
 def synthetic_dataset(wheels: Literal[3, 4] = 3) -> Dataset:
