@@ -568,7 +568,6 @@ def simulate(
 
     The truth stays out of the data set: it is written to another folder with --truth, or else nowhere.
     """
-    from omnibench.cli.terminal.slam_summary import print_slam_accuracy
     from omnibench.simulate.simulation_request import SimulationRequest
 
     hidden = tuple(effects or ())
@@ -589,6 +588,8 @@ def simulate(
         shared.write_asked_report(page, report, figures)
     warn(made.dataset.warnings)
     if made.accuracy is not None:
+        from omnibench.cli.terminal.slam_summary import print_slam_accuracy  # with the report's tables: slow to import
+
         print_slam_accuracy(make_console(), made.accuracy)
     if truth is not None:
         typer.echo(f"truth: {truth / 'truth.yaml'}")

@@ -18,6 +18,7 @@ import numpy as np
 
 from omnibench.jobs.job import Backend, gathered
 from omnibench.progress import Reporter
+from omnibench.robot.compiled import path_sums
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Complex, Integration, OdometryBatch, RunSamples, WheelLog, split_by
 
@@ -228,8 +229,6 @@ def _sums(
     count, size = int(edges[-1]), signals.shape[1]
     moved, driven = np.empty((count, 2)), np.empty((count, size))
     rows = np.empty((2, count if slopes else 1, size), dtype=complex)
-    from omnibench.robot.compiled import path_sums  # numba loads slowly, and few recordings need it
-
     path_sums(
         samples.times, signals, samples.edges, np.concatenate(stamps), edges,
         np.ascontiguousarray(matrix), integration == "arc", slopes, moved, rows[0], rows[1], driven,
