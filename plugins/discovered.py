@@ -33,6 +33,8 @@ class Discovered(Calibrator):
 
         Time is looked at between the steps of the discovery only. When it is spent, the answer is the matrix alone.
         """
+        from omnibench.discover.discover import discover_effects  # loads slowly; every command loads this plug-in
+
         if problem.integration != "arc":
             raise NotApplicableError(
                 "discover integrates arcs, since Euler steps look like slip; set integration to arc"
@@ -41,7 +43,6 @@ class Discovered(Calibrator):
             raise NotApplicableError("effects are found beside a matrix; leave the parameterisation at matrix")
         if not all(run.has_poses for run in problem.trajectories):
             raise NotApplicableError("discover needs reference poses along the path of every run")
-        from omnibench.discover.discover import discover_effects  # a second to import, which most commands do without
 
         plain = closed_form_result(problem)  # from now on the best vector of the problem
         steps = set[str]()

@@ -9,6 +9,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
+from scipy.special import ndtr, stdtrit
 from xxhash import xxh3_64_intdigest
 
 from omnibench.check.evidence import Evidence
@@ -35,8 +36,9 @@ _HARDLY, _BOTH, _ALIKE = 0.005, 0.08, 0.9
 # Steps over which the reference turns that are needed, and spread of the turns, rad, that one angle cannot give: that
 # of circles seven times as wide as the robot is long and of straight lines; chosen.
 _FEWEST, _BENDS = 5, 0.3
-# A clock is reported that is off by at least so many s and so many standard errors (chosen: simulated runs, whose
-# clocks are right, are below); from _SPOILS, s, on it spoils a fit.
+# A clock is reported that is off by at least so many s and by more than chance: Student's t as rare as so many standard
+# errors of a normal distribution (chosen: simulated runs, whose clocks are right, are below). From _SPOILS, s, on it
+# spoils a fit.
 _LEAST_OFF, _ERRORS, _SPOILS = 0.05, 4.0, 0.15
 # Runs up to which so many errors hold; ten times as many runs need as many errors again, as one of them is farther off
 # by chance (chosen: the farthest of 333, 1,665 and 6,660 simulated runs, whose clocks are right, are 4.2, 6.0 and 7.4
@@ -244,10 +246,11 @@ def clocks(evidence: Evidence) -> Iterator[Finding]:
     for run, clock in zip(evidence.runs, evidence.clocks, strict=True):
         if clock is None:
             continue
-        if abs(clock.middle) > max(_LEAST_OFF, errors * clock.middle_error):
+        quantile = float(stdtrit(clock.freedom, ndtr(errors)))
+        if abs(clock.middle) > max(_LEAST_OFF, quantile * clock.middle_error):
             offset[run.id] = clock.middle
         gone = clock.drift * clock.length
-        if abs(gone) > max(_LEAST_OFF, errors * clock.drift_error * clock.length):
+        if abs(gone) > max(_LEAST_OFF, quantile * clock.drift_error * clock.length):
             drift[run.id] = gone
     kinds: tuple[tuple[Kind, dict[str, float]], ...] = (("clock_offset", offset), ("clock_drift", drift))
     for kind, found in kinds:
