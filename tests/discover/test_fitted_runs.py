@@ -514,15 +514,6 @@ def test_what_chance_makes_of_one_family_does_not_hide_another() -> None:
     assert both.groups == (*calm.groups, *rough.groups)
 
 
-def test_the_scale_of_the_tail_is_right_in_the_mean() -> None:
-    rng = np.random.default_rng(3)
-    drawn = np.sort(rng.exponential(size=(2000, 499)), axis=1)
-    told = np.array(
-        [-np.log(by_chance(edge + 20.0, chance).p_value(0) * 499 / 49) for chance in drawn if (edge := chance[-49])]
-    )
-    assert np.mean(20.0 / told) == pytest.approx(1.0, abs=0.01)  # the scale of these exponentials; its error is 0.003
-
-
 def test_evidence_is_of_the_difference_without_the_run_that_adds_most_and_corrected_for_its_tries() -> None:
     given = screening({}, {"heading": FIRST, "place": SECOND}, [0, 6, 0, 0, 0])
     groups = [given.groups.bases[0], Group("covariate", "patch", (1,), tries=5)]

@@ -12,7 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from omnibench.discover.fitting import fit_matrix
-from omnibench.errors import DataError
 from omnibench.fit.gauss_newton import BoxedFit, bounded_step, first_fit
 from omnibench.fit.loss import cost_weightings
 from omnibench.fit.noise import whiteners
@@ -138,12 +137,6 @@ def test_dense_references_are_thinned_and_keep_their_ends() -> None:
     (thinned,) = usable_runs([dense])
     assert len(thinned.pose_times) <= 151
     assert (thinned.pose_times[0], thinned.pose_times[-1]) == (0.0, times[-1])
-
-
-def test_runs_without_poses_after_their_start_cannot_be_used() -> None:
-    run = simulated(()).trajectories[0]
-    with pytest.raises(DataError, match="no trajectory"):
-        usable_runs([replace(run, pose_times=run.pose_times[:1], poses=run.poses[:1])])
 
 
 def test_clocks_that_are_off_run_by_run_are_found_out_and_do_not_move_the_matrix() -> None:

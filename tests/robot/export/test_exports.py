@@ -217,22 +217,6 @@ def test_what_is_said_to_remain_is_what_the_controller_computes_wrongly(name: st
     assert max(remains.straight_position, remains.straight_heading, remains.turn_position) > 1e-4
 
 
-@given(
-    left=st.floats(0.02, 0.3),
-    right=st.floats(0.02, 0.3),
-    separation=st.floats(0.05, 2),
-    wheels=st.sampled_from([DIFF, SKID]),
-)
-def test_multipliers_give_radii_and_track_back(left: float, right: float, separation: float, wheels: Robot) -> None:
-    on_left = np.array([(wheel.y or 0) > 0 for wheel in wheels.wheels])
-    radii = np.where(on_left, left, right) * 2 / len(on_left)
-    matrix = np.array([radii / 2, 0 * radii, radii / separation * np.where(on_left, -1, 1)])
-    found = parameters(export_calibration(calibration(wheels, matrix), "ros2_controllers"), "diff_drive_controller")
-    for side, radius in (("left", left), ("right", right)):
-        assert found["wheel_radius"] * found[f"{side}_wheel_radius_multiplier"] == pytest.approx(radius, rel=1e-9)
-    assert found["wheel_separation"] * found["wheel_separation_multiplier"] == pytest.approx(separation, rel=1e-9)
-
-
 def test_a_steering_offset_is_told_with_the_parameters_that_go_with_it() -> None:
     offset, signals = math.radians(2), driven_signals(TRICYCLE)
     turned = np.array([[math.cos(offset), -math.sin(offset)], [math.sin(offset), math.cos(offset)]])
