@@ -151,7 +151,6 @@ def test_an_equal_design_reaches_its_target_and_respects_the_bound(seed: int, ta
     candidates = d_optimality.Candidates(information(seed), costs(seed))
     optimum = d_optimality.continuous_optimum(candidates)
     counts = d_optimality.equal_design(candidates, optimum, target * optimum.criterion)
-    assert counts is not None
     assert candidates.root(counts) >= target * optimum.criterion
     assert candidates.cost(counts) >= target * optimum.criterion / optimum.bound * (1 - 1e-9)
 

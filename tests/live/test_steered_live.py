@@ -333,13 +333,6 @@ def test_messages_hold_the_steering_angles_whatever_they_hold_of_the_wheels(use:
         assert np.isnan(velocities[4:]).all()
 
 
-def test_joints_are_called_as_a_node_expects_them() -> None:
-    using = calibration(TRICYCLE)
-    drive = concatenate_recording(recording(using=using))
-    robot = RobotTracker("base", using, wheels=WheelSettings(joints=("traction",), steering_joints=("fork",)))
-    assert len(replayed_odometry(robot, played(drive, names=("traction", "fork")))) == len(drive.wheel_times)
-
-
 MOUNTED = mounted(SWERVE)
 
 

@@ -63,7 +63,6 @@ def page(dataset: Dataset, folder: Path, **options: Any) -> Page:
 def played(told: Page) -> dict[str, Any]:
     """What the player reads, by run."""
     found = re.search(r'<script type="application/json" id="[^"]*-runs">(.*?)</script>', told.html, re.DOTALL)
-    assert found is not None
     return json.loads(found[1])
 
 
@@ -189,7 +188,6 @@ def test_long_runs_with_many_scans_stay_below_six_megabytes(tmp_path: Path) -> N
     long = sample(repetitions=1, duration=30.0, rays=1080)
     many = tuple(replace(run, id=f"{run.id}-{number}") for number in range(100) for run in long.dataset.trajectories)
     scans = long.dataset.scans
-    assert scans is not None
     found = ScansInMemory(scans.scanner, {run.id: scans.of(run.id.rsplit("-", 1)[0]) for run in many})
     truth = {run.id: long.truth[run.id.rsplit("-", 1)[0]] for run in many}
     told = page(replace(long.dataset, trajectories=many, scans=found), tmp_path, truth=truth)
@@ -211,7 +209,6 @@ def hostile(run: Trajectory) -> Trajectory:
 
 def test_hostile_names_of_runs_stay_words(made: Sample, tmp_path: Path) -> None:
     scans = made.dataset.scans
-    assert scans is not None
     runs = tuple(map(hostile, made.dataset.trajectories))
     again = ScansInMemory(scans.scanner, {hostile(run).id: scans.of(run.id) for run in made.dataset.trajectories})
     told = page(replace(made.dataset, trajectories=runs, scans=again), tmp_path)
@@ -303,7 +300,6 @@ def test_of_each_kind_the_run_of_median_odometry_error_is_shown() -> None:
 
 def test_runs_without_scans_are_not_shown_where_others_have_them(made: Sample) -> None:
     scans = made.dataset.scans
-    assert scans is not None
     only = ScansInMemory(scans.scanner, {"left-1": scans.of("left-1")})
     assert [run.id for run in representative_runs(replace(made.dataset, scans=only)).values()] == ["left-1"]
 
@@ -343,7 +339,6 @@ def test_points_of_a_wall_lie_on_it_however_the_robot_moves(
 
 def test_rays_that_saw_nothing_make_no_points(made: Sample) -> None:
     scans, run = made.dataset.scans, made.dataset.trajectories[0]
-    assert scans is not None
     found = scans.of(run.id)
     ranges = found.ranges.copy()
     ranges[0, ::2] = np.inf
