@@ -85,5 +85,5 @@ def refusal(name: str, **others: object) -> str:
 
 def certificates(folder: Path) -> tuple[Path, Path, Path]:
     """An authority's certificate, and one of its own with the key, for scheduler, workers and client."""
-    make_keys(folder, ["cluster"])
+    make_keys(folder, ["cluster"], router="cluster")  # which may serve and be a client
     return folder / "ca.pem", folder / "cluster.pem", folder / "cluster.key"

@@ -91,20 +91,9 @@ def test_eq_3_is_the_inverse_and_the_pseudo_inverse_of_the_wheel_equations(wheel
 
 def test_mecanum_wheels_give_the_matrix_of_the_textbooks() -> None:
     r, lx, ly = 0.05, 0.2, 0.15
-    # Front left, front right, rear left, rear right; in textbooks a positive rate drives forward.
+    # Front left, front right, rear left, rear right; a positive rate drives forward.
     textbook = r / 4 * np.array([[1, 1, 1, 1], [-1, 1, 1, -1], np.array([-1, 1, -1, 1]) / (lx + ly)])
-    left, right, rollers = math.pi / 2, -math.pi / 2, math.pi / 4
-    wheels = tuple(
-        Wheel(name=name, radius=r, distance=lx + ly, angle=angle, roller_angle=roller)
-        for name, angle, roller in (
-            ("fl", left, rollers),
-            ("fr", right, -rollers),
-            ("rl", left, -rollers),
-            ("rr", right, rollers),
-        )
-    )
-    # Here a positive rate drives counter-clockwise, which is backward on the left.
-    np.testing.assert_allclose(inverse_kinematic_matrix(wheels), textbook * [-1, 1, -1, 1], atol=1e-16)
+    np.testing.assert_allclose(BY_PLACES.inverse_kinematic_matrix, textbook, atol=1e-15)
 
 
 @pytest.mark.parametrize("rollers", [np.zeros(3), np.zeros(5), np.array([0.7, -0.7, -0.7, 0.7])])

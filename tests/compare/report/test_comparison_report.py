@@ -13,9 +13,6 @@ import numpy as np
 import plotly.graph_objects as go
 import pytest
 from browser import assert_picture_comes_first, opened
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 from recording_samples import sample, with_a_tape
 from report_page import NUMBER, Page
 from report_samples import config, flower, page, run, statistics, usual
@@ -120,13 +117,6 @@ def test_numbers_stand_in_the_units_and_digits_of_the_paper(result: ComparisonRe
         assert repr(float(value)) in report.text
     assert f"numpy {result.environment.versions['numpy']}" in report.text
     assert result.environment.platform in report.text
-
-
-def test_a_run_without_an_answer_is_a_row_with_its_reason(result: ComparisonResult, report: Page) -> None:
-    record = next(run.record for run in result.runs if run.record.label == "hopeless")
-    assert report.row("Every run", "hopeless")[2] == f"failed | {record.reason}"
-    assert f"hopeless gave no answer in 2 of 2 runs (failed: {record.reason})" in report.text
-    assert len(report.tables["Every run"]) == 1 + len(result.runs)
 
 
 def test_recorded_data_notes_and_warnings_are_told(result: ComparisonResult, tmp_path: Path) -> None:
@@ -430,24 +420,11 @@ def test_without_an_exact_optimum_equal_boxes_share_the_lowest_cost() -> None:
     assert drawn["narrow"].best_known == costs["narrow"]
 
 
-@given(
-    hnp.arrays(float, st.integers(1, 3000), elements=st.floats(0.5, 1.0)),
-    st.integers(24, 200),
-)
-def test_thinning_keeps_the_ends_the_order_and_the_limit(shrink: np.ndarray, limit: int) -> None:
-    gaps = np.maximum(np.cumprod(shrink), 1e-10)
-    along = np.arange(1.0, len(gaps) + 1)
-    kept = thinned(along, gaps, limit)
-    assert kept[0] == 0
-    assert kept[-1] == len(gaps) - 1
-    assert kept == sorted(set(kept))
-    assert len(kept) <= limit + 4
-
-
-def test_thinning_does_not_move_a_curve_by_more_than_a_hair() -> None:
+def test_thinning_keeps_both_ends_and_does_not_move_a_curve_by_more_than_a_hair() -> None:
     along = np.arange(1.0, 20_001)
     gaps = np.exp(-along / 2000)
     kept = thinned(along, gaps, 200)
+    assert (kept[0], kept[-1], len(kept) <= 204) == (0, len(gaps) - 1, True)
     drawn = gaps[kept][np.searchsorted(kept, np.arange(len(along)), side="right") - 1]
     assert np.abs(np.log10(drawn) - np.log10(gaps)).max() < 0.1
 
