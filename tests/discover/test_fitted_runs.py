@@ -757,17 +757,6 @@ def odds(information: Array, scores: Array, noise: Array) -> float:
     return float(right - wrong)
 
 
-def test_runs_in_which_effects_differ_raise_the_chance_and_others_do_not() -> None:
-    apart = separation()
-    nothing, alike, different = (
-        float(apart.prospect(information).chance(BOTH))
-        for information in (np.zeros((3, 3)), 50 * run_that_shows(0), 50 * run_that_shows(1))
-    )
-    assert nothing < 0.01
-    assert alike < 0.05
-    assert different > 0.95
-
-
 def test_the_fewest_seconds_that_suffice_are_driven() -> None:
     candidates = np.array([run_that_shows(0), run_that_shows(1, strength=0.5), run_that_shows(1, strength=0.4)])
     seconds = np.array([5.0, 20.0, 10.0])

@@ -427,7 +427,6 @@ def numbered(number: int, publisher: bytes = bytes(16), flow: Flow | None = None
 
 
 class TestMissedMessages:
-
     @pytest.mark.parametrize("flow", [None, (1, 2, 3, False)])
     def test_one_that_comes_late_is_not_missed_and_again_in_a_flow_not_new(self, flow: Flow | None) -> None:
         missed = MissedMessages()
