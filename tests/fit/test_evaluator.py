@@ -380,6 +380,15 @@ def test_a_program_that_cannot_be_solved_says_so() -> None:
         empty.step(np.ones(2))
 
 
+def test_a_step_of_many_errors_stays_in_the_box() -> None:
+    rng = np.random.default_rng(1)
+    jacobian = rng.normal(size=(1200, 3, 3))
+    residuals = -jacobian @ [0.3, -0.2, 0.1] + 0.01 * rng.normal(size=(1200, 3))
+    step = SumOfNormsProgram(residuals, jacobian, np.full(3, -0.25), np.full(3, 0.25)).step(np.ones(1200))
+    assert step[0] == pytest.approx(0.25, abs=1e-6)
+    assert np.abs(step).max() <= 0.25
+
+
 def test_a_long_recording_needs_no_memory_that_grows_with_its_square() -> None:
     stamps = 12_000
     rng = np.random.default_rng(1)
