@@ -114,11 +114,11 @@ def require_type(value: object, kind: type, maker: str) -> None:
     raise ConfigError(f"expected a {kind.__name__}, found {shown(value)}; {way}")
 
 
-def require_choice(what: str, value: object, words: Iterable[str]) -> None:
+def require_choice(what: str, value: object, words: Iterable[str], where: str = "") -> None:
     """UnknownNameError: an argument is none of the words that it may be."""
     known = tuple(words)
     if not isinstance(value, str) or value not in known:
-        raise UnknownNameError(what, str(value), known)
+        raise UnknownNameError(what, str(value), known, where)
 
 
 def require_range(what: str, value: Any, least: float, most: float = math.inf, *, whole: bool = False) -> None:

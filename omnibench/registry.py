@@ -26,7 +26,7 @@ from typing import Any, Generic, TypeVar
 from pydantic import BaseModel, ConfigDict
 
 from omnibench.config import Model, validate
-from omnibench.errors import OmnibenchError, PluginError, UnknownNameError
+from omnibench.errors import OmnibenchError, PluginError, require_choice
 from omnibench.files import check_file
 
 _MOST_BYTES = 1 << 24  # bytes: a larger plug-in file is refused; chosen
@@ -143,8 +143,7 @@ class Registry(Generic[T]):
     def entry(self, name: str, where: str = "") -> Entry[T]:
         """The entry called ``name``; UnknownNameError names the nearest one and lists all."""
         self._load_builtin()
-        if name not in self._entries:
-            raise UnknownNameError(self.kind, name, self._entries, where)
+        require_choice(self.kind, name, self._entries, where)
         return self._entries[name]
 
     def create(self, name: str, options: Mapping[str, Any] | None = None, where: str = "") -> T:

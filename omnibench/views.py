@@ -13,7 +13,7 @@ from importlib import import_module
 from inspect import signature
 from typing import TYPE_CHECKING, Any
 
-from omnibench.errors import UnknownNameError
+from omnibench.errors import require_choice
 
 if TYPE_CHECKING:
     import plotly.graph_objects as go
@@ -89,8 +89,7 @@ class Shown:
         """
         tables = _view(self).tables()
         name = next(iter(tables)) if table is None else table
-        if name not in tables:
-            raise UnknownNameError("table", name, tables)
+        require_choice("table", name, tables)
         return tables[name]()
 
     def plot(self, **options: Any) -> go.Figure:
@@ -104,8 +103,8 @@ class Shown:
         """
         view = _view(self)
         parameters = signature(view.figure).parameters
-        if unknown := options.keys() - parameters.keys():
-            raise UnknownNameError("option of plot", min(unknown), parameters)
+        for option in sorted(options):
+            require_choice("option of plot", option, parameters)
         return view.figure(**options)
 
     def _lines(self) -> list[str]:

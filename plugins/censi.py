@@ -52,10 +52,11 @@ from pydantic import Field
 
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import NotApplicableError
-from omnibench.fit.calibrator import Calibrator, Solution
+from omnibench.fit.calibrator import Solution
+from omnibench.fit.differential import TwoWheelMethod
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
-from omnibench.robot.kinematics import Array, Mount, Robot, class_of, relative
+from omnibench.robot.kinematics import Array, Mount, Robot, relative
 from omnibench.robot.model import OdometryModel
 from omnibench.words import plural
 
@@ -72,18 +73,11 @@ class CensiOptions(Options):
 
 
 @calibrators.register("censi")
-class Censi(Calibrator):
+class Censi(TwoWheelMethod):
     """Censi et al. 2013: radii, axle and the tracked point's mount in closed form, from motions in short intervals."""
 
     Options = CensiOptions
     options: CensiOptions
-    bounded = False
-    as_is = True
-    stochastic = False
-    only_for = "differential drives with two measured wheels"
-
-    def applies(self, robot: Robot) -> bool:
-        return class_of(robot) == "differential" and len(robot.measured) == 2
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """Steps 1 and 2. NotApplicableError: the runs leave some of the six parameters open."""

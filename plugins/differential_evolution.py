@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
+import scipy
 from pydantic import Field, model_validator
-from scipy.optimize import differential_evolution
 
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.problem import CalibrationProblem
@@ -52,7 +52,7 @@ class DifferentialEvolution(Calibrator):
             values = problem.cost(problem.from_unit(points.T))
             return np.where(np.isfinite(values), values, np.inf)
 
-        result = differential_evolution(
+        result = scipy.optimize.differential_evolution(
             cost,
             bounds=[(0.0, 1.0)] * free,
             x0=np.clip(problem.to_unit(problem.start)[0], 0.0, 1.0),

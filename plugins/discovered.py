@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from omnibench.data.dataset import make_dataset
-from omnibench.discover.discover import discover_effects
 from omnibench.errors import NotApplicableError
 from omnibench.fit.calibrator import Calibrator, Outcome, Solution
 from omnibench.fit.parameterisation import MatrixElements
@@ -34,6 +33,8 @@ class Discovered(Calibrator):
 
         Time is looked at between the steps of the discovery only. When it is spent, the answer is the matrix alone.
         """
+        from omnibench.discover.discover import discover_effects  # loads slowly; every command loads this plug-in
+
         if problem.integration != "arc":
             raise NotApplicableError(
                 "discover integrates arcs, since Euler steps look like slip; set integration to arc"
@@ -42,6 +43,7 @@ class Discovered(Calibrator):
             raise NotApplicableError("effects are found beside a matrix; leave the parameterisation at matrix")
         if not all(run.has_poses for run in problem.trajectories):
             raise NotApplicableError("discover needs reference poses along the path of every run")
+
         plain = closed_form_result(problem)  # from now on the best vector of the problem
         steps = set[str]()
 

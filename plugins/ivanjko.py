@@ -36,13 +36,13 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+import scipy
 from pydantic import Field
-from scipy.optimize import least_squares
 
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import NotApplicableError
-from omnibench.fit.calibrator import Calibrator, Solution
-from omnibench.fit.differential import TWO_WHEELS, axle_length, has_two_wheels, with_axle
+from omnibench.fit.calibrator import Solution
+from omnibench.fit.differential import TwoWheelMethod, axle_length, with_axle
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
 from omnibench.robot.kinematics import Array, Robot
@@ -66,19 +66,12 @@ class IvanjkoOptions(Options):
 
 
 @calibrators.register("ivanjko")
-class Ivanjko(Calibrator):
+class Ivanjko(TwoWheelMethod):
     """Ivanjko et al. 2007: radii from straight lines, wheelbase from turns on the spot, in turns."""
 
     Options = IvanjkoOptions
     options: IvanjkoOptions
-    bounded = False
-    as_is = True
-    stochastic = False
     per_session = True
-    only_for = TWO_WHEELS
-
-    def applies(self, robot: Robot) -> bool:
-        return has_two_wheels(robot)
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """Repeat steps 1 and 2. NotApplicableError: no straight line, or no turn on the spot, left or right."""
@@ -136,7 +129,9 @@ def _step_1(robot: Robot, lines: Sequence[Trajectory], integration: Integration)
     def errors(factors: Array) -> Array:
         return (_ends(_changed(robot, factors, 1.0), lines, integration)[:, :2] - truth).ravel()
 
-    found: Array = least_squares(errors, np.ones(2), method="lm", x_scale=_SCALE, xtol=1e-12, ftol=1e-12).x
+    found: Array = scipy.optimize.least_squares(
+        errors, np.ones(2), method="lm", x_scale=_SCALE, xtol=1e-12, ftol=1e-12
+    ).x
     return found
 
 

@@ -10,7 +10,7 @@ four corners, whichever way; unequal wheels turn it by beta along each of four s
 
 Unequal wheels also change the turn at a corner, along the way pi b_0 / 4 of each wheel, b_0 being the design wheelbase:
 
-    gamma = pi b_0 beta / (4 L).                                                                      (2)
+        gamma = pi b_0 beta / (4 L).                                                                      (2)
 
 The true wheelbase b, and the ratio of the right wheel's diameter to the left one's, are
 
@@ -44,47 +44,21 @@ these.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
-import numpy as np
-
-from omnibench.fit.calibrator import Calibrator, Solution
-from omnibench.fit.differential import TWO_WHEELS, Square, axle_length, has_two_wheels, squares_both_ways
-from omnibench.fit.problem import CalibrationProblem
+from omnibench.fit.differential import SquaresMethod
 from omnibench.registry import calibrators
-from omnibench.robot.kinematics import Robot
 
 
 @calibrators.register("jung_chung")
-class JungChung(Calibrator):
+class JungChung(SquaresMethod):
     """Jung and Chung 2012: wheelbase and wheels from the final headings of squares driven both ways."""
 
-    bounded = False
-    as_is = True
-    stochastic = False
-    per_session = True
-    only_for = TWO_WHEELS
+    coordinate = 2
 
-    def applies(self, robot: Robot) -> bool:
-        return has_two_wheels(robot)
-
-    def calibrate(self, problem: CalibrationProblem) -> Solution:
-        """Formulas (1) to (5). NotApplicableError: there are no squares, or they were driven one way only."""
-        self.needs_matrix(problem)
-        squares = squares_both_ways(problem)
-        clockwise, counter = self.mean_error(squares.clockwise), self.mean_error(squares.counter)
-        wheelbase, diameters = errors_of(clockwise, counter, squares.side, axle_length(problem.robot))
-        return squares.solution(problem.robot, wheelbase, diameters)
-
-    def mean_error(self, squares: Sequence[Square]) -> float:
-        """Mean error of the final heading of squares one way, rad."""
-        return float(np.mean([square.error[2] for square in squares]))
-
-
-def errors_of(turn_clockwise: float, turn_counter: float, side: float, axle: float) -> tuple[float, float]:
-    """E_b and E_d of the mean heading errors (rad) of squares of a side (m) and the design wheelbase (m)."""
-    alpha, beta = (turn_clockwise - turn_counter) / 8, (turn_clockwise + turn_counter) / 8  # Eq. (1)
-    gamma = math.pi * axle * beta / (4 * side)  # Eq. (2)
-    wheelbase = (math.pi / 2) / (math.pi / 2 - (alpha + gamma))  # Eq. (3)
-    bend = wheelbase * axle * math.sin(beta / 2) / side  # b/2 over R, which is infinite where beta is 0
-    return wheelbase, (1 + bend) / (1 - bend)  # Eq. (4)
+    def factors(self, clockwise: float, counter: float, side: float, axle: float) -> tuple[float, float]:
+        """Formulas (1) to (4) of the mean heading errors, rad."""
+        alpha, beta = (clockwise - counter) / 8, (clockwise + counter) / 8  # Eq. (1)
+        gamma = math.pi * axle * beta / (4 * side)  # Eq. (2)
+        wheelbase = (math.pi / 2) / (math.pi / 2 - (alpha + gamma))  # Eq. (3)
+        bend = wheelbase * axle * math.sin(beta / 2) / side  # b/2 over R, which is infinite where beta is 0
+        return wheelbase, (1 + bend) / (1 - bend)  # Eq. (4)

@@ -32,13 +32,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from pydantic import Field
 
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import NotApplicableError
-from omnibench.fit.calibrator import Calibrator, Solution
+from omnibench.fit.article_methods import SegmentMethod, SegmentOptions, segment_ends
+from omnibench.fit.calibrator import Solution
 from omnibench.fit.problem import CalibrationProblem
-from omnibench.registry import Options, calibrators
+from omnibench.registry import calibrators
 from omnibench.robot.kinematics import Array, Robot, class_of
 from omnibench.words import plural
 
@@ -48,21 +48,11 @@ _MISSING = 0.01
 _TURNED = 0.1  # rad: paths that turn by less in all segments are straight; chosen
 
 
-class KallasiOptions(Options):
-    """Segments of the paths."""
-
-    segment: float = Field(0.5, gt=0, description="a segment ends after every such length of the path, m")
-
-
 @calibrators.register("kallasi")
-class Kallasi(Calibrator):
+class Kallasi(SegmentMethod):
     """Steering offset and driving scale of a tricycle by linear least squares on headings (Kallasi et al. 2017)."""
 
-    Options = KallasiOptions
-    options: KallasiOptions
-    bounded = False
-    as_is = True
-    stochastic = False
+    options: SegmentOptions
     only_for = "tricycles with one driven and steered wheel"
 
     def applies(self, robot: Robot) -> bool:
@@ -70,11 +60,8 @@ class Kallasi(Calibrator):
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """Solve Eq. (2) over the segments of all runs, and make the matrix of Eq. (3)."""
-        self.needs_matrix(problem)
         design = problem.robot.inverse_kinematic_matrix
-        runs = [run for run in problem.trajectories if run.has_poses and len(run.pose_times) > 1]
-        if not runs:
-            raise NotApplicableError("it fits reference poses along the path, and no run has more than one")
+        runs = self.runs_with_paths(problem)
         segments = [_segments(run, design, self.options.segment) for run in runs]
         driven, turned = (np.concatenate(values) for values in zip(*segments, strict=True))
         strengths = np.linalg.svd(driven, compute_uv=False)
@@ -98,15 +85,6 @@ class Kallasi(Calibrator):
 def _segments(run: Trajectory, design: Array, length: float) -> tuple[Array, Array]:
     """Of each segment of a run the integrals (S, 2) of its signals, rad, and the change (S,) of the heading, rad."""
     driven = np.cumsum(run.signals * np.diff(run.times, prepend=0.0)[:, None], axis=0)
-    path = np.cumsum(np.hypot(*(design[:2] @ np.diff(driven, axis=0, prepend=0.0).T)))
-    knots = np.append(0.0, run.times)
-    at_poses = np.interp(run.pose_times, knots, np.append(0.0, path))
-    ends, begun = [0], 0.0
-    for index, covered in enumerate(at_poses):
-        if covered - begun >= length:
-            ends.append(index)
-            begun = covered
-    if ends[-1] != len(at_poses) - 1:
-        ends.append(len(at_poses) - 1)
+    knots, ends = np.append(0.0, run.times), np.append(0, segment_ends(run, design, length))
     signals = np.stack([np.interp(run.pose_times[ends], knots, np.append(0.0, column)) for column in driven.T], axis=1)
     return np.diff(signals, axis=0), np.diff(run.poses[ends, 2])

@@ -29,13 +29,13 @@ wheel rates that the paths do not drive at all, as those of four wheels without 
 from __future__ import annotations
 
 import numpy as np
-from pydantic import Field
 
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import NotApplicableError
-from omnibench.fit.calibrator import Calibrator, Solution
+from omnibench.fit.article_methods import SegmentMethod, SegmentOptions, segment_ends
+from omnibench.fit.calibrator import Solution
 from omnibench.fit.problem import CalibrationProblem
-from omnibench.registry import Options, calibrators
+from omnibench.registry import calibrators
 from omnibench.robot.kinematics import Array, Robot, class_of
 from omnibench.robot.odometry import Complex, Integration, OdometryBatch
 
@@ -45,21 +45,11 @@ _UNDRIVEN = 1e-6  # of the largest singular value: smaller ones are rounding
 _MISSING = 0.01
 
 
-class LinOptions(Options):
-    """Segments of the paths."""
-
-    segment: float = Field(0.5, gt=0, description="a segment ends after every such length of the path, m")
-
-
 @calibrators.register("lin")
-class Lin(Calibrator):
+class Lin(SegmentMethod):
     """Row 3, then a factor on each wheel's column of rows 1 and 2, each by linear least squares (Lin et al. 2019)."""
 
-    Options = LinOptions
-    options: LinOptions
-    bounded = False
-    as_is = True
-    stochastic = False
+    options: SegmentOptions
     only_for = "omni robots with three wheels and mecanum bases with four"
 
     def applies(self, robot: Robot) -> bool:
@@ -67,12 +57,9 @@ class Lin(Calibrator):
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """Solve Eq. (1) for row 3 and Eq. (2) for the factors."""
-        self.needs_matrix(problem)
-        runs = [run for run in problem.trajectories if run.has_poses and len(run.pose_times) > 1]
-        if not runs:
-            raise NotApplicableError("it fits reference poses along the path, and no run has more than one")
+        runs = self.runs_with_paths(problem)
         design = problem.robot.inverse_kinematic_matrix
-        ends = [_segment_ends(run, design, self.options.segment) for run in runs]
+        ends = [segment_ends(run, design, self.options.segment) for run in runs]
         batch = OdometryBatch([run.log(run.pose_times[end]) for run, end in zip(runs, ends, strict=True)], "arc")
         poses = np.concatenate([run.poses[end] for run, end in zip(runs, ends, strict=True)])
         moved = poses - np.array([run.start for run in runs])[batch.trajectory]
@@ -89,20 +76,6 @@ class Lin(Calibrator):
         vector = matrix.ravel()
         reason = f"on {len(poses)} segments: factors of rows 1 and 2 {_listed(factors, problem.robot)}; "
         return Solution(vector, f"{reason}row 3 {_listed(problem.matrix(vector)[2], problem.robot)}")
-
-
-def _segment_ends(run: Trajectory, design: Array, length: float) -> Array:
-    """Indices (S,) of the reference poses at which the segments of a run end, by the path that the design drives."""
-    durations = np.diff(run.times, prepend=0.0)
-    path = np.cumsum(np.hypot(*(design[:2] @ run.signals.T)) * durations)
-    at_poses = np.interp(run.pose_times, np.append(0.0, run.times), np.append(0.0, path))
-    ends, begun = list[int](), 0.0
-    for index, driven in enumerate(at_poses):
-        if driven - begun >= length:
-            ends.append(index)
-            begun = driven
-    last = len(at_poses) - 1
-    return np.array(ends if ends and ends[-1] == last else [*ends, last])
 
 
 def _headings(run: Trajectory, turning: Array, integration: Integration) -> Array:

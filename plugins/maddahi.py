@@ -22,9 +22,9 @@ other distances than designed, as the APR-02, they leave most of the error in pl
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.optimize import minimize
 
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.problem import CalibrationProblem
@@ -61,7 +61,7 @@ class Maddahi(Calibrator):
         factors = np.ones(len(scaled))
         best = start = _cost(problem, _vector(problem, scaled, factors))
         while np.any(high > low):
-            result = minimize(
+            result = scipy.optimize.minimize(
                 lambda x: _cost(problem, _vector(problem, scaled, x)),
                 factors,
                 method="Nelder-Mead",

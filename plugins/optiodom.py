@@ -49,9 +49,10 @@ from pydantic import Field
 
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import NotApplicableError
-from omnibench.fit.calibrator import Calibrator, Solution
+from omnibench.fit.article_methods import SegmentMethod, SegmentOptions, segment_ends
+from omnibench.fit.calibrator import Solution
 from omnibench.fit.problem import CalibrationProblem
-from omnibench.registry import Options, calibrators
+from omnibench.registry import calibrators
 from omnibench.robot.kinematics import Array, Robot, RobotClass, class_of
 from omnibench.robot.odometry import Integration, chord_shares
 from omnibench.words import plural
@@ -85,22 +86,18 @@ _RULES: dict[RobotClass, Rule] = {
 }
 
 
-class OptiOdomOptions(Options):
+class OptiOdomOptions(SegmentOptions):
     """Segments of the paths, and the limit of the search."""
 
-    segment: float = Field(0.5, gt=0, description="a segment ends after every such length of the path, m")
     steps: int = Field(1000, gt=0, description="most steps")
 
 
 @calibrators.register("optiodom")
-class OptiOdom(Calibrator):
+class OptiOdom(SegmentMethod):
     """A length and the wheels' diameters by resilient propagation on positions (Sousa et al. 2022)."""
 
     Options = OptiOdomOptions
     options: OptiOdomOptions
-    bounded = False
-    as_is = True
-    stochastic = False
     only_for = "differential drives, tricycles, omni robots with three wheels and mecanum bases with four"
 
     def applies(self, robot: Robot) -> bool:
@@ -108,10 +105,7 @@ class OptiOdom(Calibrator):
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """Step until the objective of Eq. (3) rests."""
-        self.needs_matrix(problem)
-        runs = [run for run in problem.trajectories if run.has_poses and len(run.pose_times) > 1]
-        if not runs:
-            raise NotApplicableError("it fits reference positions along the path, and no run has more than one")
+        runs = self.runs_with_paths(problem, "positions")
         if all(np.abs(run.poses[:, 2] - run.start[2]).max() < _TURNED for run in runs):
             raise NotApplicableError("it is for paths that turn, and these are straight")
         geometry, rule = Geometry.of(problem.robot), _RULES[class_of(problem.robot)]
@@ -271,14 +265,7 @@ def _cut(run: Trajectory, design: Array, length: float) -> tuple[Array, NDArray[
     knots = np.append(0.0, run.times)
     driven = np.cumsum(run.signals * np.diff(knots)[:, None], axis=0)
     driven = np.vstack([np.zeros(driven.shape[1]), driven])
-    path = np.append(0.0, np.cumsum(np.hypot(*(design[:2] @ np.diff(driven, axis=0).T))))
-    ends, begun = list[int](), 0.0
-    at_poses = np.interp(run.pose_times, knots, path)
-    for index, covered in enumerate(at_poses):
-        if covered - begun >= length:
-            ends.append(index)
-            begun = covered
-    ends += [] if ends and ends[-1] == len(at_poses) - 1 else [len(at_poses) - 1]
+    ends = segment_ends(run, design, length)
     stamps = run.pose_times[ends]
     grid = np.union1d(run.times[run.times < stamps[-1]], stamps)
     at_grid = np.stack([np.interp(grid, knots, column) for column in driven.T], axis=1)

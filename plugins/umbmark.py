@@ -37,48 +37,21 @@ these. The formulas are of first order: a true E_b of 1.03 with E_d = 0.98 comes
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
-import numpy as np
-
-from omnibench.fit.calibrator import Calibrator, Solution
-from omnibench.fit.differential import TWO_WHEELS, Square, axle_length, has_two_wheels, squares_both_ways
-from omnibench.fit.problem import CalibrationProblem
+from omnibench.fit.differential import SquaresMethod
 from omnibench.registry import calibrators
-from omnibench.robot.kinematics import Robot
 
 
 @calibrators.register("umbmark")
-class Umbmark(Calibrator):
+class Umbmark(SquaresMethod):
     """UMBmark (Borenstein and Feng 1996): wheelbase and wheels from the ends of squares driven both ways."""
 
-    bounded = False
-    as_is = True
-    stochastic = False
-    per_session = True
-    only_for = TWO_WHEELS
+    coordinate = 0
 
-    def applies(self, robot: Robot) -> bool:
-        return has_two_wheels(robot)
-
-    def calibrate(self, problem: CalibrationProblem) -> Solution:
-        """Formulas (1) to (4). NotApplicableError: there are no squares, or they were driven one way only."""
-        self.needs_matrix(problem)
-        squares = squares_both_ways(problem)
-        clockwise, counter = _mean_x(squares.clockwise), _mean_x(squares.counter)
-        wheelbase, diameters = errors_of(clockwise, counter, squares.side, axle_length(problem.robot))
-        return squares.solution(problem.robot, wheelbase, diameters)
-
-
-def errors_of(x_clockwise: float, x_counter: float, side: float, axle: float) -> tuple[float, float]:
-    """E_b and E_d of the mean x errors (m) of squares of a side (m) and the design wheelbase (m)."""
-    alpha = (x_clockwise + x_counter) / (-4 * side)  # Eq. (1)
-    beta = (x_clockwise - x_counter) / (-4 * side)
-    wheelbase = (math.pi / 2) / (math.pi / 2 - alpha)  # Eq. (2)
-    bend = wheelbase * axle * math.sin(beta / 2) / side  # b/2 over R, which is infinite where beta is 0
-    return wheelbase, (1 + bend) / (1 - bend)  # Eq. (3)
-
-
-def _mean_x(squares: Sequence[Square]) -> float:
-    """Mean error of squares one way along their first side, m."""
-    return float(np.mean([square.error[0] for square in squares]))
+    def factors(self, clockwise: float, counter: float, side: float, axle: float) -> tuple[float, float]:
+        """Formulas (1) to (3) of the mean x errors, m."""
+        alpha = (clockwise + counter) / (-4 * side)  # Eq. (1)
+        beta = (clockwise - counter) / (-4 * side)
+        wheelbase = (math.pi / 2) / (math.pi / 2 - alpha)  # Eq. (2)
+        bend = wheelbase * axle * math.sin(beta / 2) / side  # b/2 over R, which is infinite where beta is 0
+        return wheelbase, (1 + bend) / (1 - bend)  # Eq. (3)

@@ -47,7 +47,8 @@ class Evidence:
             times = run.pose_times if clock is None else clock.corrected(run.pose_times)
             used = np.flatnonzero((times >= 0) & (times <= run.times[-1]))
             if clock is not None and len(used) >= max(3, len(times) // 2):
-                run = replace(run, pose_times=times[used], poses=run.poses[used], pose_covariances=None)
+                poses = run.poses if len(used) == len(times) else run.poses[used]
+                run = replace(run, pose_times=times[used], poses=poses, pose_covariances=None)
             aligned.append(run)
         return aligned
 

@@ -9,6 +9,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
+from scipy.special import ndtr, stdtrit
 from xxhash import xxh3_64_intdigest
 
 from omnibench.check.evidence import Evidence
@@ -40,8 +41,9 @@ _BENDS, _FEWEST = 0.3, 5
 # Zeros of a car's steering that are reported, rad and standard errors (chosen: simulated cars without one are below);
 # beyond the most the angle is no small one, and another mistake.
 _LEAST_ZERO, _ZERO_ERRORS, _MOST_ZERO = math.radians(1.0), 5.0, math.radians(15.0)
-# A clock is reported that is off by at least so many s and so many standard errors (chosen: simulated runs, whose
-# clocks are right, are below); from _SPOILS, s, on it spoils a fit.
+# A clock is reported that is off by at least so many s and by more than chance: Student's t as rare as so many standard
+# errors of a normal distribution (chosen: simulated runs, whose clocks are right, are below). From _SPOILS, s, on it
+# spoils a fit.
 _LEAST_OFF, _ERRORS, _SPOILS = 0.05, 4.0, 0.15
 # Runs up to which so many errors hold; ten times as many runs need as many errors again, as one of them is farther off
 # by chance (chosen: the farthest of 333, 1,665 and 6,660 simulated runs, whose clocks are right, are 4.2, 6.0 and 7.4
@@ -235,8 +237,10 @@ def jumps(evidence: Evidence) -> Iterator[Finding]:
     """Poses that jump off the motion that wheels tell and return, and shifts of the reference that last."""
     robot, standing = evidence.dataset.robot, {look.run for look in evidence.looks if look.standing}
     runs = [run for run in evidence.aligned if run.id not in standing]
-    odometry = OdometryModel.of_design(robot, "arc").poses([run.log(run.pose_times) for run in runs])
-    found = {run.id: reference_jumps(robot, driven, run.poses) for run, driven in zip(runs, odometry, strict=True)}
+    model, found = OdometryModel.of_design(robot, "arc"), {}
+    for run in runs:  # of which the odometry of one is in memory
+        (driven,) = model.poses([run.log(run.pose_times)])
+        found[run.id] = reference_jumps(robot, driven, run.poses)
     lone, shifts = ([run for run, each in found.items() if len(getattr(each, kind))] for kind in ("lone", "shifts"))
     poses = sum(len(each.lone) for each in found.values())
     if shifts:
@@ -260,10 +264,11 @@ def clocks(evidence: Evidence) -> Iterator[Finding]:
     for run, clock in zip(evidence.runs, evidence.clocks, strict=True):
         if clock is None:
             continue
-        if abs(clock.middle) > max(_LEAST_OFF, errors * clock.middle_error):
+        quantile = float(stdtrit(clock.freedom, ndtr(errors)))
+        if abs(clock.middle) > max(_LEAST_OFF, quantile * clock.middle_error):
             offset[run.id] = clock.middle
         gone = clock.drift * clock.length
-        if abs(gone) > max(_LEAST_OFF, errors * clock.drift_error * clock.length):
+        if abs(gone) > max(_LEAST_OFF, quantile * clock.drift_error * clock.length):
             drift[run.id] = gone
     kinds: tuple[tuple[Kind, dict[str, float]], ...] = (("clock_offset", offset), ("clock_drift", drift))
     for kind, found in kinds:

@@ -8,9 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+import omnibench
 from omnibench.cli import options as shared
 from omnibench.cli.terminal.console import make_console, print_ending, print_json, print_verdict, warn
+from omnibench.cli.terminal.progress_display import ProgressDisplay
 from omnibench.errors import ConfigError, DataError
+from omnibench.files import refuse_existing, write_text
+from omnibench.progress import Progress
 
 if TYPE_CHECKING:
     from omnibench.compare.config import CompareConfig
@@ -62,10 +66,7 @@ def compare(
     where it was stopped.
     """
     from omnibench.cli.terminal.comparison_tables import print_comparison_ending, print_result
-    from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.compare.report.comparison_report import comparison_document
-    from omnibench.compare.run import run_comparison
-    from omnibench.progress import Progress
     from omnibench.study.study import is_study, read_study_config
 
     shared.refuse_figures_without_browser(figures)
@@ -81,7 +82,7 @@ def compare(
     folders = [*comparison.plugins, *(folder.resolve() for folder in asked)]
     comparison = comparison.model_copy(update={"plugins": tuple(dict.fromkeys(folders))} | given)
     with ProgressDisplay() as watch:
-        result = run_comparison(comparison, output, watch, force=force)
+        result = omnibench.run_comparison(comparison, output, watch, force=force)
         if figures is not None:
             watch(Progress("drawing the figures"))
             shared.write_asked_figures(comparison_document(result), figures)
@@ -101,8 +102,6 @@ def compare(
 def _run_study(config: "StudyConfig", output: Path | None, figures: Path | None, force: bool) -> None:
     """Run a study and print its answer. The exit code is 1 if a recording cannot be read, or no method answered."""
     from omnibench.cli.terminal.comparison_tables import print_study, print_study_ending
-    from omnibench.cli.terminal.progress_display import ProgressDisplay
-    from omnibench.progress import Progress
     from omnibench.study.report import study_document
     from omnibench.study.study import run_study
 
@@ -120,7 +119,6 @@ def _run_study(config: "StudyConfig", output: Path | None, figures: Path | None,
 
 def _asked_comparison(given: Sequence[Path], data: list[str] | None, plugins: Sequence[Path]) -> "CompareConfig":
     """The config that is given, or one for the data set that is: its folders, or a glob."""
-    from omnibench.compare.config import read_compare_config
     from omnibench.compare.recording_config import config_in_words, recording_config
     from omnibench.data.storage import is_glob
 
@@ -135,7 +133,7 @@ def _asked_comparison(given: Sequence[Path], data: list[str] | None, plugins: Se
             "(see omnibench compare --help)"
         )
     if not of_recordings:
-        return read_compare_config(first, _named_paths(data))
+        return omnibench.read_compare_config(first, _named_paths(data))
     if first.is_dir() and not (any(first.glob("dataset.yaml")) or any(first.glob("*/dataset.yaml"))):
         raise ConfigError(f"{first}: is a folder without dataset.yaml; name a config, or the folder of a data set")
     if data:
@@ -180,11 +178,7 @@ def calibrate(
     The fit uses the training split of the data set, and never its validation split.
     """
     from omnibench.cli.terminal.calibration_tables import print_calibration, print_verdict_ending
-    from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.config import parse_settings, to_yaml
-    from omnibench.data.storage import load_dataset
-    from omnibench.files import refuse_existing, write_text
-    from omnibench.fit.calibrate import calibrate as fit
 
     shared.load_given_plugins(plugins)
     chosen = shared.chosen_settings(context, parse_settings(settings))
@@ -195,8 +189,8 @@ def calibrate(
         ProgressDisplay() as watch,
         shared.asked_backend(backend, workers, tls, preload, watch) as jobs,
     ):
-        recordings = load_dataset(dataset)
-        run = fit(recordings, chosen, watch=watch, backend=jobs)
+        recordings = omnibench.load_dataset(dataset)
+        run = omnibench.calibrate(recordings, chosen, watch=watch, backend=jobs)
     calibration, result = run.calibration, run.result
     if output is not None:
         write_text(output, to_yaml(calibration))
@@ -240,17 +234,13 @@ def evaluate(
     On each split: the cost, and the errors of the final pose, beside those of the robot's design values.
     """
     from omnibench.cli.terminal.calibration_tables import print_evaluation, print_verdict_ending
-    from omnibench.cli.terminal.progress_display import ProgressDisplay
-    from omnibench.data.storage import load_dataset
-    from omnibench.fit.evaluate import evaluate as evaluate_calibration
-    from omnibench.robot.calibration import read_calibration
 
     shared.load_given_plugins(plugins)
     tls = shared.tls_files(tls_ca, tls_cert, tls_key)
     with ProgressDisplay() as watch, shared.asked_backend(backend, workers, tls, (), watch):
-        recordings = load_dataset(dataset)
-        evaluated = read_calibration(calibration)
-        evaluation = evaluate_calibration(evaluated, recordings)
+        recordings = omnibench.load_dataset(dataset)
+        evaluated = omnibench.read_calibration(calibration)
+        evaluation = omnibench.evaluate(evaluated, recordings)
     warnings = [*recordings.warnings, *evaluation.warnings]
     warn(warnings)
     if as_json:
@@ -290,17 +280,13 @@ def certify(
     Gives a lower bound on the cost of every matrix in the box, on the training split, whatever the optimiser.
     """
     from omnibench.cli.terminal.calibration_tables import print_certificate, print_certificate_ending
-    from omnibench.cli.terminal.progress_display import ProgressDisplay
-    from omnibench.data.storage import load_dataset
-    from omnibench.fit.certify import certify_optimum
-    from omnibench.robot.calibration import read_calibration
 
     shared.load_given_plugins(plugins)
     tls, preload = shared.tls_files(tls_ca, tls_cert, tls_key), ("omnibench.fit.certify",)
     with ProgressDisplay() as watch, shared.asked_backend(backend, workers, tls, preload, watch) as jobs:
-        recordings = load_dataset(dataset)
-        certified = certify_optimum(
-            read_calibration(calibration),
+        recordings = omnibench.load_dataset(dataset)
+        certified = omnibench.certify_optimum(
+            omnibench.read_calibration(calibration),
             recordings,
             box=box,
             gap=gap,
@@ -335,12 +321,9 @@ def export(
     ros2_controllers takes the controller of the robot's kind, and says what it cannot hold of the calibration.
     """
     from omnibench.errors import visible
-    from omnibench.files import refuse_existing, write_text
-    from omnibench.robot.calibration import read_calibration
-    from omnibench.robot.export.formats import export_calibration
 
     shared.load_given_plugins(plugins)
-    exported = export_calibration(read_calibration(calibration), to)
+    exported = omnibench.export_calibration(omnibench.read_calibration(calibration), to)
     file = output / exported.file_name if output is not None and output.is_dir() else output
     refuse_existing(file, force=force)
     warn(exported.warnings)
@@ -379,16 +362,11 @@ def discover(
     tells how much smaller the error becomes on runs that were held out.
     """
     from omnibench.cli.terminal.discovery_summary import print_discovery
-    from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.config import to_yaml
-    from omnibench.data.storage import load_dataset as load_whole
-    from omnibench.discover.discover import discover_effects
     from omnibench.discover.output import DiscoverOptions, check_output, write_discovery
     from omnibench.discover.report.discovery_report import discovery_report
     from omnibench.discover.result import discovery_document
-    from omnibench.progress import Progress
     from omnibench.registry import effects
-    from omnibench.robot.calibration import read_calibration
 
     shared.refuse_figures_without_browser(figures)
     shared.load_given_plugins(plugins)
@@ -403,10 +381,10 @@ def discover(
         plugins=tuple(map(str, plugins or ())),
     )
     check_output(output, options, force=force)
-    start = None if model is None else read_calibration(model)
-    recordings = load_whole(dataset)
+    start = None if model is None else omnibench.read_calibration(model)
+    recordings = omnibench.load_dataset(dataset)
     with redirect_stdout(sys.stderr), ProgressDisplay() as watch:
-        discovery = discover_effects(
+        discovery = omnibench.discover_effects(
             recordings,
             without=tuple(without or ()),
             unknown_term=unknown_term,

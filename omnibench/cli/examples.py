@@ -10,7 +10,7 @@ from pathlib import Path
 
 from omnibench.cli.handbook_topics import HANDBOOK
 from omnibench.config import Model, read_model
-from omnibench.errors import ConfigError, UnknownNameError
+from omnibench.errors import ConfigError, require_choice
 from omnibench.files import refuse_existing, write_files
 
 
@@ -42,8 +42,7 @@ EXAMPLES = read_model(_Catalogue, Path(__file__).with_name("examples.yaml")).exa
 def find_example(name: str) -> Example:
     """The example called ``name``. UnknownNameError names the nearest one and lists all."""
     known = {example.name: example for example in EXAMPLES}
-    if name not in known:
-        raise UnknownNameError("example", name, known)
+    require_choice("example", name, known)
     return known[name]
 
 

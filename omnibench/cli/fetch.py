@@ -99,18 +99,16 @@ def find_recording(name: str) -> Asked:
     ConfigError names the nearest known name and lists all.
     """
     known: dict[str, Asked] = {}
+    by_repository: dict[str, Asked] = {}
     for recording in RECORDINGS:
-        whole = Asked(recording.repository, recording, recording.datasets)
         for dataset in recording.datasets:
             one = Asked(recording.repository, recording, (dataset,))
             known |= {dataset.name: one, f"{recording.name}/{dataset.name}": one}
-        known[recording.name] = whole
-    if name in known:
-        return known[name]
+        whole = Asked(recording.repository, recording, recording.datasets)
+        known[recording.name] = by_repository[recording.repository.lower()] = whole
     repository = _ADDRESS.sub("", name)
-    for recording in RECORDINGS:
-        if repository.lower() == recording.repository.lower():
-            return known[recording.name]
+    if (asked := known.get(name) or by_repository.get(repository.lower())) is not None:
+        return asked
     owner = repository.partition("/")[0]
     if _REPOSITORY.fullmatch(repository) and owner not in {recording.name for recording in RECORDINGS}:
         return Asked(repository)

@@ -15,6 +15,7 @@ import typer
 from omnibench.cli.options import Force, Json, Plugins, load_given_plugins, output_option
 from omnibench.cli.terminal.console import make_console, print_ending, print_json, say
 from omnibench.errors import ConfigError
+from omnibench.files import resolved
 from omnibench.words import plural
 
 if TYPE_CHECKING:
@@ -69,7 +70,6 @@ def example(
     An example is a config with all that it needs, or a small recording.
     """
     from omnibench.cli.examples import EXAMPLES, find_example, write_example
-    from omnibench.files import resolved
 
     if name is None:
         _print_names({each.name: each.summary for each in EXAMPLES})

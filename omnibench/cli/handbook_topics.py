@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from omnibench.errors import UnknownNameError
+from omnibench.errors import require_choice
 
 HANDBOOK = Path(__file__).with_name("handbook")
 
@@ -29,8 +29,13 @@ class Topic:
 
     @property
     def text(self) -> str:
-        """The page's Markdown, in which a link to another topic reads as the command that shows it."""
-        return _LINK.sub(r"`omnibench guide \2`", self.file.read_text(encoding="utf-8"))
+        """The page's Markdown, in which a link to another topic reads as its words and the command that shows it."""
+
+        def with_command(link: re.Match[str]) -> str:
+            words = "" if link[1].strip("`") == link[2] else f"{link[1]} → "
+            return f"{words}`omnibench guide {link[2]}`"
+
+        return _LINK.sub(with_command, self.file.read_text(encoding="utf-8"))
 
 
 def topics() -> list[Topic]:
@@ -47,6 +52,5 @@ def topics() -> list[Topic]:
 def find_topic(name: str) -> Topic:
     """The topic called ``name``. UnknownNameError names the nearest one and lists all."""
     known = {topic.name: topic for topic in topics()}
-    if name not in known:
-        raise UnknownNameError("topic", name, known, "guide")
+    require_choice("topic", name, known, "guide")
     return known[name]

@@ -10,7 +10,9 @@ import typer
 
 from omnibench.cli.options import Force, Plugins, load_given_plugins, output_option, plugin_folders
 from omnibench.cli.terminal.console import make_console, print_ending, warn
+from omnibench.cli.terminal.progress_display import ProgressDisplay
 from omnibench.errors import ConfigError
+from omnibench.files import refuse_existing, remove
 
 if TYPE_CHECKING:
     from omnibench.live.config import LiveConfig
@@ -93,7 +95,6 @@ def _replay_to_node(
 ) -> None:
     """Play a recording to a node of this process, and show the errors of its odometry."""
     from omnibench.cli.terminal.live_tables import node_log, print_demonstration
-    from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.config import validate
     from omnibench.live.replay.concatenated_drive import ReplayConfig, load_recording
     from omnibench.live.replay.demonstration import demonstrate
@@ -103,7 +104,7 @@ def _replay_to_node(
     if source is None:
         raise ConfigError(f"{file}: replay.dataset names no recording; say --replay DATASET")
     if speed is not None:
-        checked = validate(ReplayConfig, {"speed": _speed(speed)}, "--speed")
+        checked = validate(ReplayConfig, {"speed": speed}, "--speed")
         config = config.model_copy(update={"replay": config.replay.model_copy(update={"speed": checked.speed})})
     with ProgressDisplay() as watch:
         recording = load_recording(source, watch=watch)
@@ -142,7 +143,6 @@ def replay(
     An omnibench node acknowledges what it takes, and is waited for; other programs do not, which is said.
     """
     from omnibench.cli.terminal.live_tables import print_counted, print_played
-    from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.config import parse_settings, validate
     from omnibench.live.network.presence import checked_robot
     from omnibench.live.replay.concatenated_drive import ReplayConfig, concatenate_recording, load_recording
@@ -153,7 +153,7 @@ def replay(
 
     checked_robot(robot)
     load_given_plugins(plugins)
-    chosen = validate(ReplayConfig, {"speed": _speed(speed), **parse_settings(settings)}, "replay")
+    chosen = validate(ReplayConfig, {"speed": speed, **parse_settings(settings)}, "replay")
     noise = None if calibration is None else read_calibration(calibration).noise
     with ProgressDisplay() as watch:
         recording = load_recording(dataset, watch=watch)
@@ -231,7 +231,6 @@ def record(
 ) -> None:
     """Record live topics into MCAP, for Foxglove and rosbags."""
     from omnibench.cli.terminal.live_tables import record as write
-    from omnibench.files import refuse_existing, remove
     from omnibench.live.config import read_live_config
     from omnibench.live.stopping import stop_on_signals
     from omnibench.live.wire.topics import TOPICS
@@ -295,10 +294,3 @@ def _client(file: Path | None, connect: str | None, profile: Any, purpose: str) 
         yield session, KeySpace(profile or chosen.profile, chosen.domain)
     finally:
         close_session(session)
-
-
-def _speed(text: str) -> float | str:
-    try:
-        return float(text)
-    except ValueError:
-        return text

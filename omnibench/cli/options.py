@@ -9,7 +9,7 @@ from __future__ import annotations
 import inspect
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -19,6 +19,7 @@ from typer.core import TyperCommand
 
 from omnibench.cli.terminal.console import warn
 from omnibench.errors import ConfigError, PluginError
+from omnibench.files import refuse_existing
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -128,6 +129,31 @@ def asked_backend(
     choice = BackendChoice(name=name, workers=workers or os.cpu_count() or 1, tls=tls)
     with open_backend(choice, (*_READING, *preload), report) as backend, read_by(backend), reading_told_to(report):
         yield backend
+
+
+def refuse_report(report: Path | None, figures: Path | None, *, force: bool) -> None:
+    """Before the work begins: ConfigError if the page of ``--report`` is there, DataError if no figure can be drawn."""
+    refuse_existing(report, force=force)
+    refuse_figures_without_browser(figures)
+
+
+def write_asked_report(
+    page: Callable[[], Document], report: Path | None, figures: Path | None, *, announced: bool = False
+) -> None:
+    """Write the page of ``--report`` and the figures of ``--figures``; it is made only where either is asked for.
+
+    announced: say on standard error where the page is.
+    """
+    if report is None and figures is None:
+        return
+    from omnibench.report.render import write_document
+
+    document = page()
+    if report is not None:
+        write_document(document, report)
+        if announced:
+            typer.echo(f"report: {report}", err=True)
+    write_asked_figures(document, figures)
 
 
 def refuse_figures_without_browser(folder: Path | None) -> None:

@@ -9,9 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from typer.core import TyperCommand
 
+import omnibench
 from omnibench.cli import options as shared
 from omnibench.cli.terminal.console import make_console, print_ending, print_json, say, warn
+from omnibench.cli.terminal.progress_display import ProgressDisplay
 from omnibench.errors import ConfigError, DataError
+from omnibench.files import refuse_existing, resolved, write_text
+from omnibench.progress import Progress
 from omnibench.words import plural
 
 if TYPE_CHECKING:
@@ -19,6 +23,7 @@ if TYPE_CHECKING:
 
     from omnibench.check.check import CheckReport
     from omnibench.check.source import RecordingSource
+    from omnibench.report.blocks import Document
 
 
 recording_app = typer.Typer()
@@ -88,9 +93,8 @@ def import_(
     from omnibench.data.finding import UNITS
     from omnibench.data.splits import division_in_words
     from omnibench.data.storage import check_dataset_folder, save_dataset
-    from omnibench.files import refuse_existing, resolved
+    from omnibench.progress import reading_told_to
     from omnibench.registry import importers
-    from omnibench.slam.import_dataset import import_dataset
 
     shared.load_given_plugins(plugins, plugin_files)
     entry, given = importers.entry(importer, "import"), parse_settings(settings)
@@ -100,7 +104,17 @@ def import_(
         if source is not None or output is not None:
             raise ConfigError("--template DIR writes tables to fill in; leave SOURCE and -o out")
         refuse_existing(template, force=force, folders=True)
-        return _write_template(template, robot_type or "diff", references)
+        from omnibench.data.importers.csv_template import write_template
+
+        files = write_template(template, robot_type or "diff", references=references)
+        typer.echo(f"{plural(len(files), 'file')}: {template}")
+        for file in files:
+            typer.echo(f"  {file.name}", err=True)
+        return print_ending(
+            f"{template} holds robot.yaml and {plural(len(files) - 1, 'table')} to fill in",
+            "put your robot and your samples into them, and import them",
+            *("omnibench", "import", "csv", template, "-o", f"data/{template.resolve().name}"),
+        )
     if references:
         raise ConfigError("--references is for --template DIR; a references.csv among the tables is read by itself")
     if robot_type is not None:
@@ -115,9 +129,14 @@ def import_(
     options, folder = dict(given), output.resolve().name
     if "name" in entry.cls.Options.model_fields and folder.isprintable() and folder:
         options.setdefault("name", folder)
-    dataset = import_dataset(importer, source, options)
-    read = RecordingSource(dataset, importer, source, given, output)
-    report = None if no_check else _checked(read)
+    with ProgressDisplay() as watch, reading_told_to(watch):
+        dataset = omnibench.import_dataset(importer, source, options)
+        read = RecordingSource(dataset, importer, source, given, output)
+        report: CheckReport | None = None
+        if not no_check:
+            from omnibench.check.check import check_recording  # slow to import
+
+            report = check_recording(read)
     if not accept_units and report is not None:
         # Units that cannot be right are refused, with what to type.
         wrong = [finding.what for finding in report.findings if finding.severity == "error" and finding.kind in UNITS]
@@ -135,27 +154,6 @@ def import_(
         make_console(error=True).print(f"check: {report.sentence}.", soft_wrap=True)
     holds = f"{output} holds {plural(len(dataset.trajectories), 'run')} of {dataset.robot.name}"
     return print_ending(holds, *_next_step(read, report))
-
-
-def _write_template(folder: Path, robot_type: str, references: bool) -> None:
-    """Write tables and robot.yaml to fill in, and say what to type next."""
-    from omnibench.data.importers.csv_template import write_template
-
-    files = write_template(folder, robot_type, references=references)
-    typer.echo(f"{plural(len(files), 'file')}: {folder}")
-    for file in files:
-        typer.echo(f"  {file.name}", err=True)
-    print_ending(
-        f"{folder} holds robot.yaml and {plural(len(files) - 1, 'table')} to fill in",
-        "put your robot and your samples into them, and import them",
-        *("omnibench", "import", "csv", folder, "-o", f"data/{folder.resolve().name}"),
-    )
-
-
-def _checked(read: "RecordingSource") -> "CheckReport":
-    from omnibench.check.check import check_recording  # slow to import, and left out by --no-check
-
-    return check_recording(read)
 
 
 def _next_step(read: "RecordingSource", report: "CheckReport | None") -> tuple[Any, ...]:
@@ -195,7 +193,6 @@ def fetch(
     Your git clones it into ./clones; a clone that is there is used again. Without NAME: the list of known recordings.
     """
     from omnibench.cli.fetch import RECORDINGS, fetch_recording
-    from omnibench.cli.terminal.progress_display import ProgressDisplay
 
     if name is None:
         width = make_console().width
@@ -267,35 +264,25 @@ def check(
 ) -> None:
     """Say what is wrong with a recording, and what to type.
 
-    Nothing is changed. Exit 0: ready; 1: fix, or record more; 2: the source cannot be read.
+    Nothing is changed. Exit 0: ready; 1: fix or record more; 2: the source cannot be read.
     """
     from omnibench.check.check import check_recording
     from omnibench.check.source import next_command, read_source
-    from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.config import parse_settings
-    from omnibench.errors import PluginError
-    from omnibench.files import refuse_existing
-    from omnibench.registry import load_plugin_file, load_plugins
 
-    refuse_existing(report, force=force)
-    shared.refuse_figures_without_browser(figures)
-    load_plugins()
-    for file in plugin or ():
-        if (failure := load_plugin_file(file)) is not None:
-            raise PluginError(f"plug-in {failure.origin} cannot be imported: {failure.error}")
+    shared.refuse_report(report, figures, force=force)
+    shared.load_given_plugins([Path("none")], plugin)
     tls = shared.tls_files(tls_ca, tls_cert, tls_key)
     with ProgressDisplay() as watch, shared.asked_backend(backend, workers, tls, (), watch):
         read = read_source(source, importer, parse_settings(settings), robot)
         checked = check_recording(read)
-    if report is not None or figures is not None:
-        from omnibench.report.recording.inspection_report import check_document
-        from omnibench.report.render import write_document
 
-        document = check_document(read.dataset, checked)
-        if report is not None:
-            write_document(document, report)
-            typer.echo(f"report: {report}", err=True)
-        shared.write_asked_figures(document, figures)
+    def page() -> "Document":
+        from omnibench.report.recording.inspection_report import check_document
+
+        return check_document(read.dataset, checked)
+
+    shared.write_asked_report(page, report, figures, announced=True)
     if as_json:
         print_json(checked.model_dump(mode="json", include={"verdict", "needed", "findings", "command"}))
     else:
@@ -359,25 +346,14 @@ def inspect(
 ) -> None:
     """Show what a data set holds, and what can be identified from it."""
     from omnibench.cli.terminal.inspection_summary import print_inspection
-    from omnibench.cli.terminal.progress_display import ProgressDisplay
-    from omnibench.data.storage import load_dataset
-    from omnibench.files import refuse_existing
-    from omnibench.fit.inspect import inspect_dataset
     from omnibench.report.recording.inspection_report import inspection_document
-    from omnibench.report.render import write_document
 
-    refuse_existing(report, force=force)
-    shared.refuse_figures_without_browser(figures)
+    shared.refuse_report(report, figures, force=force)
     tls = shared.tls_files(tls_ca, tls_cert, tls_key)
     with ProgressDisplay() as watch, shared.asked_backend(backend, workers, tls, (), watch):
-        recordings = load_dataset(dataset)
-        inspection = inspect_dataset(recordings)
-    if report is not None or figures is not None:
-        document = inspection_document(recordings, inspection)
-        if report is not None:
-            write_document(document, report)
-            typer.echo(f"report: {report}", err=True)
-        shared.write_asked_figures(document, figures)
+        recordings = omnibench.load_dataset(dataset)
+        inspection = omnibench.inspect_dataset(recordings)
+    shared.write_asked_report(lambda: inspection_document(recordings, inspection), report, figures, announced=True)
     if as_json:
         return print_json(inspection)
     print_inspection(make_console(), inspection)
@@ -457,9 +433,7 @@ def design(
     from omnibench.cli.terminal.design_summary import print_design
     from omnibench.config import to_json
     from omnibench.design.candidates import RobotOptions, design_source
-    from omnibench.design.design import design_experiment
     from omnibench.design.report import design_document
-    from omnibench.files import refuse_existing, write_text
     from omnibench.report.render import write_document
 
     shared.refuse_figures_without_browser(figures)
@@ -467,7 +441,7 @@ def design(
         refuse_existing(output / "design.json", output / "report.html", force=force)
     shared.load_given_plugins(plugins)
     limits = RobotOptions(max_speed, max_turn_rate, max_wheel_rate, steering_limit, area, position_noise, heading_noise)
-    chosen = design_experiment(
+    chosen = omnibench.design_experiment(
         design_source(source, robot, limits, dataset=dataset, integration=integration),
         use=use,
         per=per,
@@ -523,13 +497,8 @@ def slam(
 
     Each scan is matched against a map that grows from scan to scan.
     """
-    from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.cli.terminal.slam_summary import print_slam
     from omnibench.config import parse_settings, validate
-    from omnibench.files import refuse_existing
-    from omnibench.progress import Progress
-    from omnibench.report.recording.section import recording_document
-    from omnibench.report.render import write_document
     from omnibench.slam.slam_options import SlamOptions
     from omnibench.slam.slam_request import SlamRequest
 
@@ -539,18 +508,19 @@ def slam(
     request = SlamRequest(
         dataset, output, validate(SlamOptions, parse_settings(settings) | given, "slam --set"), model, truth, force
     )
-    refuse_existing(report, force=force)
-    shared.refuse_figures_without_browser(figures)
+    shared.refuse_report(report, figures, force=force)
     if output is None and report is None and figures is None and not as_json:
         raise ConfigError("say where the poses go: -o DATASET; or ask for figures alone: --json, --report FILE.html")
     with ProgressDisplay() as watch:
         result = request.run(watch, table_format)
-        if report is not None or figures is not None:
+
+        def page() -> "Document":
+            from omnibench.report.recording.section import recording_document
+
             watch(Progress("writing the report"))
-            document = recording_document(result.dataset, truth=result.truth, accuracy=result.summary.accuracy)
-            if report is not None:
-                write_document(document, report)
-            shared.write_asked_figures(document, figures)
+            return recording_document(result.dataset, truth=result.truth, accuracy=result.summary.accuracy)
+
+        shared.write_asked_report(page, report, figures)
     warn(result.summary.warnings)
     if as_json:
         return print_json(result.summary)
@@ -600,31 +570,28 @@ def simulate(
 
     The truth stays out of the data set: it is written to another folder with --truth, or else nowhere.
     """
-    from omnibench.cli.terminal.progress_display import ProgressDisplay
-    from omnibench.cli.terminal.slam_summary import print_slam_accuracy
-    from omnibench.files import refuse_existing
-    from omnibench.progress import Progress
-    from omnibench.report.recording.section import recording_document
-    from omnibench.report.render import write_document
     from omnibench.simulate.simulation_request import SimulationRequest
 
     hidden = tuple(effects or ())
     request = SimulationRequest(output, config, truth, dataset, hidden, like, model, noise, seed, force)
-    refuse_existing(report, force=force)
-    shared.refuse_figures_without_browser(figures)
+    shared.refuse_report(report, figures, force=force)
     shared.load_given_plugins([*(plugins or []), *request.plugins] or None)
     with ProgressDisplay() as watch:
         made = request.write(table_format, watch)
-        if report is not None or figures is not None:
+
+        def page() -> "Document":
+            from omnibench.report.recording.section import recording_document
+
             watch(Progress("writing the report"))
             shown = made.simulation
             known: dict[str, Any] = {"truth": shown.paths, "plan": shown.plan, "starts": shown.starts} if shown else {}
-            document = recording_document(made.dataset, accuracy=made.accuracy, **known)
-            if report is not None:
-                write_document(document, report)
-            shared.write_asked_figures(document, figures)
+            return recording_document(made.dataset, accuracy=made.accuracy, **known)
+
+        shared.write_asked_report(page, report, figures)
     warn(made.dataset.warnings)
     if made.accuracy is not None:
+        from omnibench.cli.terminal.slam_summary import print_slam_accuracy  # with the report's tables: slow to import
+
         print_slam_accuracy(make_console(), made.accuracy)
     if truth is not None:
         typer.echo(f"truth: {truth / 'truth.yaml'}")

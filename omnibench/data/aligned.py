@@ -12,29 +12,21 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from omnibench.data.clock_matching import Streams, match_clocks, usual_period
-from omnibench.data.counters import (
-    POWERS_OF_TWO,
-    about_zero,
-    counted_on,
-    counter_range,
-    held_readings,
-    jumping_readings,
-    lost_register,
-    repeated_readings,
-    turns_restored,
-)
+from omnibench.data import counters
+from omnibench.data.clock_matching import SEARCH, Streams, match_clocks, usual_period
 from omnibench.data.finding import FindingWarning
-from omnibench.data.recording import SECONDS, TURNS, Recording, ReferenceOptions, WheelReadings, quantity_of
+from omnibench.data.recording import SECONDS, TURNS, PoseReadings, Recording, ReferenceOptions, quantity_of
 from omnibench.data.references import KINDS, UNITS, References
 from omnibench.errors import DataError
-from omnibench.robot.kinematics import Array, Robot, in_the_middle, interpolated
+from omnibench.progress import tell_reading
+from omnibench.robot.kinematics import Array, Robot, fastest_rates, in_the_middle, interpolated
 from omnibench.robot.odometry import WheelLog
 from omnibench.words import plural, some
 
 _UNKNOWN = 5.0  # s, by which an offset is looked for where wheels and poses are of different epochs; chosen
 _MOST_TOO_FAST = 0.05  # share of samples faster than any wheel turns; more mean a wrong unit
 _WHOLE = 1e-6  # largest distance of whole numbers, which went through rad, from such
+_SAME_SPAN = 1 + 1e-9  # times the range: a span within it, but for rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,25 +67,25 @@ class WheelSamples:
 
 
 @dataclass(frozen=True, eq=False)
-class ReferenceStream:
-    """Reference poses (K, 3), m, m, rad, at times (K,), s, by the wheels' clock; covariances (K, 3, 3) or None.
+class AlignedRecording:
+    """A recording in SI units and the robot's senses, with its reference by the wheels' clock.
 
-    measured: distances, turns, positions and the like, by the same clock, which may be there in the place of poses.
+    recording: as it was read. poses: m, m, rad, s; none of a recording without. measured: references of other kinds.
     """
 
-    times: Array
-    poses: Array
-    covariances: Array | None = None
+    recording: Recording
+    samples: WheelSamples
+    poses: PoseReadings
     measured: References | None = None
 
-    def later(self, offset: float, drift: float) -> ReferenceStream:
-        """The stream with times that are later by offset (s) and by drift (s per s since its first finite time)."""
+    def later(self, offset: float, drift: float) -> AlignedRecording:
+        """With a reference that is later by offset (s) and by drift (s per s since its first finite time)."""
         if not offset and not drift:
             return self
-        measured, known = self.measured, self.times[:1]
-        if measured is not None and not len(known):
-            known = np.append(measured.t0, measured.t1)
-        first = min(known[np.isfinite(known)], default=0.0)
+        measured, stamps = self.measured, self.poses.times[:1]
+        if measured is not None and not len(stamps):
+            stamps = np.append(measured.t0, measured.t1)
+        first = min(stamps[np.isfinite(stamps)], default=0.0)
 
         def moved(times: Array) -> Array:
             moved: Array = times + (offset + drift * (np.where(np.isfinite(times), times, first) - first))
@@ -101,72 +93,55 @@ class ReferenceStream:
 
         if measured is not None:
             measured = replace(measured, t0=moved(measured.t0), t1=moved(measured.t1))
-        return replace(self, times=moved(self.times), measured=measured)
-
-    def only(self, kept: NDArray[np.bool_]) -> ReferenceStream:
-        """The stream with some of its poses."""
-        covariances = None if self.covariances is None else self.covariances[kept]
-        return replace(self, times=self.times[kept], poses=self.poses[kept], covariances=covariances)
-
-
-@dataclass(frozen=True, eq=False)
-class AlignedRecording:
-    """A recording in SI units and the robot's senses, with its reference by the wheels' clock."""
-
-    recording: Recording
-    samples: WheelSamples
-    reference: ReferenceStream
+        return replace(self, poses=replace(self.poses, times=moved(self.poses.times)), measured=measured)
 
 
 def aligned_recordings(
     recordings: Sequence[Recording], options: ReferenceOptions, notes: list[str]
-) -> list[AlignedRecording]:
+) -> Iterator[AlignedRecording]:
     """The recordings in SI units, by one clock, which is matched if the options say so. DataError in one line.
 
-    notes: what was left out, mended or decided is added.
+    notes: what was left out, mended or decided is added, at the end.
     """
-    positions = [each.wheels for each in recordings if quantity_of(each.wheels.unit) == "positions"]
-    ranges: Sequence[float | None] = [None] * len(options.robot.wheel_names)
-    if positions and options.wraps_at != "never":
-        ranges = _ranges(positions, options, notes)
-    counted = [_counted(recording, ranges, options, notes) for recording in recordings]
-    samples = [
-        _wheel_samples(recording, *pair, options, notes) for recording, pair in zip(recordings, counted, strict=True)
-    ]
-    aligned = [
-        AlignedRecording(*pair, _reference_stream(pair[0], options)) for pair in zip(recordings, samples, strict=True)
-    ]
-    return aligned if options.clocks == "same" else _by_matched_clocks(aligned, options, notes)
+    ranges = _ranges(recordings, options, notes)
+
+    def in_si(recording: Recording) -> AlignedRecording:
+        tell_reading(1, "run")
+        values, used = _readings(recording, ranges, options, notes)
+        samples = _wheel_samples(recording, values, used, options, notes)
+        return _with_reference(recording, samples, options)
+
+    aligned = map(in_si, recordings)
+    yield from aligned if options.clocks == "same" else _by_matched_clocks(list(aligned), options, notes)
 
 
-def _ranges(wheels: Sequence[WheelReadings], options: ReferenceOptions, notes: list[str]) -> list[float | None]:
-    """The range of each wheel's counter, by all recordings, or the one that is given."""
-    unit, count = wheels[0].unit, len(options.robot.wheel_names)
+def _ranges(recordings: Sequence[Recording], options: ReferenceOptions, notes: list[str]) -> list[float | None]:
+    """The range of each wheel's counter, by all recordings, or the one that the options say; None if it has none."""
+    count, unit = len(options.robot.wheel_names), ""
+    by_wheel: list[list[Array]] = [[] for _ in range(count)]  # counts of every recording, without lone readings
+    for wheels in (each.wheels for each in recordings if options.wraps_at == "auto"):
+        if quantity_of(wheels.unit) == "positions":
+            unit = wheels.unit
+            lone = counters.jumping_readings(wheels.values, wheels.times)
+            for counts, column, jumping in zip(by_wheel, wheels.values.T, lone.T, strict=True):
+                counts.append(column[~jumping])
     if isinstance(options.wraps_at, float):
         return [options.wraps_at] * count
+    if not unit:
+        return [None] * count
     turns = np.broadcast_to(options.ticks_per_turn or TURNS.get(unit, np.inf), count).tolist()
-    lone = [jumping_readings(readings.values, readings.times) for readings in wheels]  # which no counter's end explains
-    ranges = [
-        counter_range(
-            [each.values[~jumps[:, index], index] for each, jumps in zip(wheels, lone, strict=True)],
-            turn,
-            unit == "ticks",
-        )
-        for index, turn in enumerate(turns)
-    ]
-    # Wheels that never reach the end of their range have that of the others, if they keep within it.
-    recognised = {wrap for wrap in ranges if wrap is not None}
+    ranges = [counters.counter_range(*pair, unit == "ticks") for pair in zip(by_wheel, turns, strict=True)]
+    recognised = sorted({wrap for wrap in ranges if wrap is not None})
     if len(recognised) == 1:
-        (wrap,) = recognised
-        spans = [max(float(np.ptp(each.values[:, index])) for each in wheels) for index in range(count)]
-        ranges = [wrap if span <= wrap else None for span in spans]
-    for wrap in sorted(recognised):
+        # Wheels that never reach the end of their range have that of the others, if they keep within it.
+        ranges = [recognised[0] if max(map(np.ptp, counts)) <= recognised[0] else None for counts in by_wheel]
+    for wrap in recognised:
         again = f"wheel positions begin again after {wrap:.10g} {unit}"
         notes.append(f"{again} and were counted on (wraps_at={wrap:.10g} says so)")
     return ranges
 
 
-def _counted(
+def _readings(
     recording: Recording, ranges: Sequence[float | None], options: ReferenceOptions, notes: list[str]
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Angles (F, N), rad, that count on, or rates, rad/s, in the robot's sense; and the readings that are used (F,).
@@ -179,20 +154,20 @@ def _counted(
         values = np.cumsum(values, axis=0)
     elif quantity == "positions":
         values = _counted_on(recording, ranges, options, notes)
-    values = _at_the_rows(values, readings, slice(values.shape[1]))
+    values = readings.at_the_rows(values, slice(values.shape[1]))
     if quantity != "rates":
-        used = ~repeated_readings(readings.times, values, readings.steering)
+        used = ~counters.repeated_readings(readings.times, values, readings.steering)
         if count := int((~used).sum()):
             repeats = "that repeats the one before" if count == 1 else "that repeat the ones before"
             notes.append(f"{place}: {plural(count, 'reading')} {repeats} while the wheels turn left out")
     if quantity == "positions" and options.wraps_at != "never":
         rows = np.flatnonzero(used)
-        jumping = jumping_readings(values[rows], readings.times[rows])
+        jumping = counters.jumping_readings(values[rows], readings.times[rows])
         used[rows[jumping.any(axis=1)]] = False
         if count := int(jumping.sum()):
             jump = f"{plural(count, 'single reading')} of wheel positions that jump and return left out"
             notes.append(FindingWarning.of_restart(f"{place}: {jump}"))
-    if not recording.a_run and (held := held_readings(values[used])).any():
+    if not recording.a_run and (held := counters.held_readings(values[used])).any():
         used[np.flatnonzero(used)[held]] = False
         holding = f"rows in which the wheels hold their last value left out: {1 - held.mean():.0%} are read"
         notes += [holding] if holding not in notes else []
@@ -203,45 +178,36 @@ def _counted_on(
     recording: Recording, ranges: Sequence[float | None], options: ReferenceOptions, notes: list[str]
 ) -> Array:
     """Positions (F, N) that count on where their counters begin again, with the turns that a register lost."""
-    readings, lost, register = recording.wheels, 0, 0.0
-    on, seconds = readings.values.astype(float), readings.times * SECONDS[options.wheel_time_unit]
-    given = options.wraps_at if isinstance(options.wraps_at, float) else None
-    possible = (given,) if given else POWERS_OF_TWO if readings.unit == "ticks" and options.wraps_at != "never" else ()
-    for index, wrap in enumerate(ranges):
-        spread = float(np.ptp(on[:, index]))
-        if wrap is not None and spread <= wrap * (1 + 1e-9):
-            on[:, index] = counted_on(on[:, index], wrap)
-        short = lost_register(on[:, index], seconds, possible)
-        if given and spread > given * (1 + 1e-9) and short is None:
+    readings, lost, longest = recording.wheels, 0, 0.0
+    seconds, columns = readings.times * SECONDS[options.wheel_time_unit], []
+    stated = options.wraps_at if isinstance(options.wraps_at, float) else None
+    ticks = readings.unit == "ticks" and options.wraps_at != "never"
+    possible = (stated,) if stated else counters.POWERS_OF_TWO if ticks else ()
+    for counts, wrap in zip(readings.values.astype(float).T, ranges, strict=True):
+        spread = float(np.ptp(counts))
+        on = counters.counted_on(counts, wrap) if wrap is not None and spread <= wrap * _SAME_SPAN else counts
+        register = counters.lost_register(on, seconds, possible)
+        if register is None and stated and spread > stated * _SAME_SPAN:
             span = f"positions span {spread:.10g} {readings.unit}"
-            raise DataError(f"{recording.place}: wraps_at is {given:.10g}, but {span}; correct it")
-        if short is not None:
-            before, register = on[:, index].copy(), max(register, short)
-            while not np.array_equal(again := turns_restored(on[:, index], seconds, short), on[:, index]):
-                on[:, index] = again
-            lost += int((np.round((np.diff(on[:, index]) - np.diff(before)) / short) != 0).sum())
+            raise DataError(f"{recording.place}: wraps_at is {stated:.10g}, but {span}; correct it")
+        restored = on if register is None else counters.turns_restored(on, seconds, register)
+        if register is not None:
+            longest = max(longest, register)
+            lost += int((np.round((np.diff(restored) - np.diff(on)) / register) != 0).sum())
+        columns.append(restored)
     if lost:
         back = (
             f"{plural(lost, 'step')} of wheel positions ran back while the wheel turned on, as in a register of "
-            f"{register:.10g} ticks that was read late; they got a turn of it back (wraps_at=2^32 or never keeps them)"
+            f"{longest:.10g} ticks that was read late; they got a turn of it back (wraps_at=2^32 or never keeps them)"
         )
         notes.append(FindingWarning.of_restart(f"{recording.place}: {back}"))
-    return on
-
-
-def _at_the_rows(values: Array, readings: WheelReadings, columns: slice) -> Array:
-    """Values (F, n) at the times of the readings, where they were read at times of their own."""
-    if readings.read_at is None:
-        return values
-    read_at = readings.read_at[:, columns]
-    shown = [np.interp(readings.times, *pair) for pair in zip(read_at.T, values.T, strict=True)]
-    return np.column_stack(shown)
+    return np.column_stack(columns)
 
 
 def _wheel_samples(
     recording: Recording, values: Array, used: NDArray[np.bool_], options: ReferenceOptions, notes: list[str]
 ) -> WheelSamples:
-    """The wheel samples of a recording, in stretches without gaps and restarts. values, used: see ``_counted``.
+    """The wheel samples of a recording, in stretches without gaps and restarts. values, used: see ``_readings``.
 
     A gap is longer than ``longest_gap``, with wheels that turn in it, since a constant twist does not describe it. A
     position that changes faster than ``fastest`` has started again. DataError: so many samples are faster that the unit
@@ -255,19 +221,19 @@ def _wheel_samples(
     if len(times) < 2 and not options.sample_period and readings.begin is None:
         raise DataError(f"{place}: wheels: has one row; two are needed, or --set sample_period=S")
     period = options.sample_period or (usual_period([times]) if len(times) > 1 else float(times[0]))
+    angles: Array | None = None
     if quantity == "rates":
         begin = times[0] - period if readings.begin is None else readings.begin * second
-        begins, ends, rates, angles = np.append(begin, times[:-1]), times, values, None
-        moved: NDArray[np.bool_] = np.ones(len(times), dtype=bool)
+        begins, ends, rates, turning = np.append(begin, times[:-1]), times, values, True
     else:
         begins, ends, rows = times[:-1], times[1:], rows[1:]
         driven = np.diff(values, axis=0)
         rates, angles = driven / (ends - begins)[:, None], values[1:] if quantity == "positions" else None
-        moved = np.any(np.abs(driven) >= (options.still if recording.numbered else 0.0), axis=1)
+        turning = np.any(np.abs(driven) >= (options.still if recording.numbered else 0.0), axis=1)
     lengths = ends - begins
-    gap = (lengths > (options.longest_gap or readings.longest_gap * second)) & moved
+    gap = (lengths > (options.longest_gap or readings.longest_gap * second)) & turning
     rushed = np.abs(rates) * np.minimum(lengths / period, 1.0)[:, None]  # stamps may bunch
-    too_fast = (rushed > options.fastest_rates).any(axis=1) & ~gap
+    too_fast = (rushed > (options.fastest or fastest_rates(options.robot.radii))).any(axis=1) & ~gap
     if too_fast.mean() > _MOST_TOO_FAST:
         raise _misread(recording, rates, lengths, options)
     restart = too_fast & (quantity == "positions")
@@ -280,20 +246,22 @@ def _wheel_samples(
         anew = f"the positions begin anew {plural(count, 'time')}, faster than any wheel turns"
         way = "if that is a counter that wraps, --set wraps_at=N"
         notes.append(FindingWarning.of_restart(f"{place}: {anew} ({way}); runs end there"))
-    steering, kept = None, ~(gap | restart)
+    steering: Array | None = None
     if readings.steering is not None:
         steering = _steering_angles(readings.steering, recording, options)
-        steering = _at_the_rows(steering, readings, slice(readings.values.shape[1], None))
+        steering = readings.at_the_rows(steering, slice(values.shape[1], None))
         late = options.steering_lag
         steering = interpolated(ends - late, readings.times * second, steering) if late else steering[rows]
-    stretch = np.cumsum(~kept, dtype=np.intp)
-    angles, steering = (None if array is None else array[kept] for array in (angles, steering))
-    return WheelSamples(begins[kept], ends[kept], rates[kept], angles, steering, stretch[kept], rows[kept])
+    whole = ~(gap | restart)
+    angles, steering = (None if array is None else array[whole] for array in (angles, steering))
+    stretch = np.cumsum(~whole, dtype=np.intp)[whole]
+    return WheelSamples(begins[whole], ends[whole], rates[whole], angles, steering, stretch, rows[whole])
 
 
 def _steering_angles(shown: Array, recording: Recording, options: ReferenceOptions) -> Array:
     """Steering angles (F, S), rad, of the readings. DataError: they are whole numbers beyond a turn, as ticks are."""
-    as_they_are = recording.a_run and options.steering_as_read
+    stated = any(name.startswith("steering_") for name in options.model_fields_set - {"steering_columns"})
+    as_they_are = recording.a_run and not stated
     unit, count = "rad" if as_they_are else options.steering_unit, len(options.robot.drive.steered)
     beyond = np.ptp(shown, axis=0) > TURNS.get(unit, np.inf)
     if (beyond & (shown == np.round(shown)).all(axis=0)).any():
@@ -303,14 +271,10 @@ def _steering_angles(shown: Array, recording: Recording, options: ReferenceOptio
         )
     if as_they_are:
         return shown
-
-    def per_axle(values: Sequence[float], default: float) -> Array:
-        return np.broadcast_to(np.array(values or default), count)
-
-    turns = per_axle(options.steering_ticks_per_turn, TURNS.get(unit, 1.0))
-    angles = np.column_stack([about_zero(*pair) for pair in zip(shown.T, turns, strict=True)])
-    angles *= 2 * np.pi / turns * per_axle(options.steering_scale, 1.0) * per_axle(options.steering_signs, 1.0)
-    return angles + np.radians(per_axle(options.steering_offsets_deg, 0.0))
+    turns = np.broadcast_to(options.steering_ticks_per_turn or TURNS.get(unit, 1.0), count)
+    angles = np.column_stack([counters.about_zero(*pair) for pair in zip(shown.T, turns, strict=True)])
+    angles *= 2 * np.pi / turns * np.array(options.steering_scale or 1.0) * np.array(options.steering_signs or 1.0)
+    return angles + np.radians(options.steering_offsets_deg or 0.0)
 
 
 def _misread(recording: Recording, rates: Array, durations: Array, options: ReferenceOptions) -> DataError:
@@ -326,28 +290,28 @@ def _misread(recording: Recording, rates: Array, durations: Array, options: Refe
     return DataError(f"{what}; --set {first}, gear_ratio=N (turns of the motor for one of the wheel), {others}")
 
 
-def _reference_stream(recording: Recording, options: ReferenceOptions) -> ReferenceStream:
-    """The reference of a recording in SI units and the robot's senses, by its clock with the options' offset."""
-    factors, poses = options.pose_factors, recording.poses
+def _with_reference(recording: Recording, samples: WheelSamples, options: ReferenceOptions) -> AlignedRecording:
+    """The recording with its reference in SI units and the robot's senses, by its clock with the options' offset."""
     second = SECONDS[options.pose_time_unit or (options.wheel_time_unit if recording.one_table else "s")]
     if not recording.referenced:  # poses are to be made of its scans, at their times
         times = np.empty(0) if recording.scans is None else recording.scans.times
-        return ReferenceStream(times, np.zeros((len(times), 3)))
+        return AlignedRecording(recording, samples, PoseReadings(times, np.zeros((len(times), 3))))
     measured = None if recording.measured is None else measured_as(recording.measured, options, second)
-    stream = ReferenceStream(np.empty(0), np.empty((0, 3)), measured=measured)
-    if poses is not None:
-        if poses.radians:
-            factors = factors * np.array([1.0, 1.0, 1.0 if options.heading_unit == "rad" else np.degrees(1.0)])
-        shown, covariances = poses.poses, poses.covariances
+    poses = PoseReadings(np.empty(0), np.empty((0, 3)))
+    if (shown := recording.poses) is not None:
+        factors = options.pose_factors
+        if shown.radians and options.heading_unit == "deg":
+            factors = factors * np.array([1.0, 1.0, np.degrees(1.0)])
+        poses = replace(shown, times=shown.times * second)
         if (factors != 1.0).any():
-            shown = shown * factors
-            covariances = None if covariances is None else covariances * np.outer(factors, factors)
+            turned = None if shown.covariances is None else shown.covariances * np.outer(factors, factors)
+            poses = replace(poses, poses=shown.poses * factors, covariances=turned)
         if options.heading_offset_deg:
-            shown = shown + np.array([0.0, 0.0, np.radians(options.heading_offset_deg)])
-        stream = ReferenceStream(poses.times * second, shown, covariances, measured)
-        if not recording.a_run and len(shown) > 1 and (held := held_readings(shown)).any():
-            stream = stream.only(~held)
-    return stream.later(options.pose_time_offset, options.pose_time_drift)
+            poses = replace(poses, poses=poses.poses + np.array([0.0, 0.0, np.radians(options.heading_offset_deg)]))
+        if not recording.a_run and len(shown.times) > 1:
+            poses = poses.only(~counters.held_readings(poses.poses))
+    aligned = AlignedRecording(recording, samples, poses, measured)
+    return aligned.later(options.pose_time_offset, options.pose_time_drift)
 
 
 def measured_as(measured: References, options: ReferenceOptions, second: float = 1.0) -> References:
@@ -370,35 +334,30 @@ def _by_matched_clocks(
     aligned: Sequence[AlignedRecording], options: ReferenceOptions, notes: list[str]
 ) -> list[AlignedRecording]:
     """The recordings with poses by the wheels' clock, as matched, which ``notes`` tells."""
-    posed = [
-        index
-        for index, each in enumerate(aligned)
-        if each.recording.poses and len(each.reference.times) > 1 and len(each.samples.ends)
-    ]
-    begun, streams, apart = [], [], False
-    for index in posed:
-        samples, reference = aligned[index].samples, aligned[index].reference
+    matched, begun, streams, search = list(aligned), dict[int, AlignedRecording](), [], SEARCH
+    for index, each in enumerate(aligned):
+        samples, stamps = each.samples, each.poses.times
+        if each.recording.poses is None or len(stamps) < 2 or not len(samples.ends):
+            continue
         zero = float(samples.begins[0])
-        if reference.times[0] >= samples.ends[-1] or reference.times[-1] <= samples.begins[0]:
+        if stamps[0] >= samples.ends[-1] or stamps[-1] <= zero:
             # Where wheels and poses share no time, the poses begin with the wheels.
-            reference, apart = reference.later(zero - float(reference.times[0]), 0.0), True
-        begun.append(reference)
+            each, search = each.later(zero - float(stamps[0]), 0.0), _UNKNOWN
+        begun[index] = each
         # From the begin of the wheels on; samples that are missing count as standing.
         steering = None if samples.steering is None else in_the_middle(samples.steering)
         driven = options.robot.drive.signals(samples.rates, steering) * (samples.ends - samples.begins)[:, None]
         counted = np.vstack([np.zeros(driven.shape[1]), np.cumsum(driven, axis=0)])
-        poses = reference.poses.copy()
-        poses[:, 2] = np.unwrap(poses[:, 2])
-        streams.append(Streams(np.append(zero, samples.ends) - zero, counted, reference.times - zero, poses))
-    matches = match_clocks(options.robot, streams, **({"search": _UNKNOWN} if apart else {}))
-    moved, said, unknown = list(aligned), [], []
-    for index, reference, match in zip(posed, begun, matches, strict=True):
-        name = aligned[index].recording.name
+        poses = np.column_stack([each.poses.poses[:, :2], np.unwrap(each.poses.poses[:, 2])])
+        streams.append(Streams(np.append(zero, samples.ends) - zero, counted, each.poses.times - zero, poses))
+    said, unknown = [], []
+    for (index, each), match in zip(begun.items(), match_clocks(options.robot, streams, search), strict=True):
+        name = each.recording.name
         if match is None:
             unknown.append(name)
             continue
-        moved[index] = replace(aligned[index], reference=reference.later(match.offset, match.drift))
-        offset = moved[index].reference.times[0] - aligned[index].reference.times[0]
+        matched[index] = each.later(match.offset, match.drift)
+        offset = matched[index].poses.times[0] - aligned[index].poses.times[0]
         said.append(f"{name} {offset:+.3f} s" + (f" and {60e3 * match.drift:+.1f} ms a minute" if match.drift else ""))
     if said:
         notes.append(f"clocks matched, added to the times of the poses: {some(said)}")
@@ -407,4 +366,4 @@ def _by_matched_clocks(
             f"clocks not matched, as the motion is too short or too even: {some(unknown)}; give "
             "--set pose_time_offset=SECONDS, or drive with more turns"
         )
-    return moved
+    return matched

@@ -19,12 +19,14 @@ values. They are common to all runs that are given: a run that drives one comman
 
 Eq. (2) and (3) are solved by Gauss-Newton with Huber's weights; a step that does not lower Huber's loss is halved, as
 without that clocks that hardly show step to and fro for ever. Standard errors are of the sandwich kind, of scores
-that are summed over blocks, as slip lasts.
+that are summed over blocks, as slip lasts; or of independent residuals where those are larger, since few blocks scatter
+too little by chance (Angrist and Pischke 2009, section 8.2.3, take the larger of the two as well).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from array import array
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -86,7 +88,8 @@ class ClockMatch:
     """The clock of a run's reference against its wheels', Eq. (1), with standard errors.
 
     middle, middle_error: s to add to the poses' times in the run's middle, where it shows best. drift, drift_error: s
-    per s; 0 and infinite where the run is too short to tell. length: of the reference, s.
+    per s; 0 and infinite where the run is too short to tell. length: of the reference, s. freedom: degrees of freedom
+    of Student's t that the errors have, by the windows that share nothing.
     """
 
     middle: float
@@ -94,6 +97,7 @@ class ClockMatch:
     drift: float
     drift_error: float
     length: float
+    freedom: float
 
     @property
     def offset(self) -> float:
@@ -349,12 +353,17 @@ class Windows:
         scores = derivatives * (weights * residuals)
         sums = np.add.reduceat(scores, np.flatnonzero(np.diff(blocks, prepend=-1.0)), axis=2).reshape(len(design), -1)
         inverse = np.linalg.pinv((design * weights.ravel()) @ design.T)
+        free = max(float(weights.sum()) - len(design), 1.0)
+        alike = inverse * float((weights * residuals**2).sum()) / free  # as if the residuals were independent
         # Chords, and the ticks of coarse counters, which scatter less than they are long, but in a pattern.
         least = _CHORDS * np.array([1, np.sqrt(12.0) / self.length]) + self.tick * np.array([0.25, 1 / self.length])
-        errors = np.sqrt(np.diag(inverse @ (sums @ sums.T) @ inverse)[2:] + least[: len(design) - 2] ** 2)
+        variances = np.maximum(np.diag(inverse @ (sums @ sums.T) @ inverse), np.diag(alike))[2:]
+        errors = np.sqrt(variances + least[: len(design) - 2] ** 2)
         told = len(errors) > 1 and abs(clock[1]) < _LARGEST_DRIFT
         drift_error = float(errors[1]) if told else np.inf
-        return ClockMatch(clock[0], float(errors[0]), clock[1], drift_error, self.length)
+        apart = min(len(weights[0]), self.length / _WINDOW)
+        freedom = max((2 - self.steers) * apart - len(design), 1.0)
+        return ClockMatch(clock[0], float(errors[0]), clock[1], drift_error, self.length, freedom)
 
 
 def _tick_time(driven: Array, durations: Array) -> float:
@@ -445,66 +454,24 @@ def _means(values: Array, starts: NDArray[np.intp]) -> Array:
     return means
 
 
-TURN = 2 * np.pi  # rad
-_SAME_TIME = 1e-6  # s; unix time in a double has steps of 0.2 us
-
-
-@dataclass(frozen=True, eq=False)
-class Alignment:
-    """Wheel samples and poses from a common t = 0 on.
-
-    zero: time of the recording that becomes t = 0, s. after_start (F,): True for wheel samples that end after it.
-    pose_times (K,) and poses (K, 3) start with the pose at t = 0 and end with the wheels.
-    """
-
-    zero: float
-    after_start: NDArray[np.bool_]
-    pose_times: Array
-    poses: Array
-
-
-def align(begin: float, wheel_times: Array, pose_times: Array, poses: Array) -> Alignment | None:
-    """Set t = 0 of a recording to the first instant with both wheels and poses; None when they do not overlap.
-
-    begin: when the first wheel sample began, s. wheel_times (F,): when each ended, s. All times by one clock, in any
-    epoch. t = 0 is the first pose after ``begin``, or ``begin`` itself where poses reach back before it: the start
-    pose is then interpolated (heading the shortest way). The sample during which t = 0 falls keeps its mean rate.
-    Poses after the last wheel sample are left out, since no odometry predicts them.
-    """
-    zero = float(pose_times[0])
-    if zero < begin - _SAME_TIME:
-        zero = begin
-    if zero >= min(wheel_times[-1], pose_times[-1]):
-        return None
-    shown = (pose_times > zero + _SAME_TIME) & (pose_times <= wheel_times[-1] + _SAME_TIME)
-    after_start = wheel_times > zero + _SAME_TIME
-    if not shown.any() or not after_start.any():
-        return None
-    after = int(np.searchsorted(pose_times, zero))
-    if after < len(pose_times) and abs(pose_times[after] - zero) <= _SAME_TIME:
-        start = poses[after]
-    else:
-        step = poses[after] - poses[after - 1]
-        step[2] -= TURN * np.round(step[2] / TURN)
-        share = (zero - pose_times[after - 1]) / (pose_times[after] - pose_times[after - 1])
-        start = poses[after - 1] + share * step
-    times = np.concatenate([[0.0], pose_times[shown] - zero])
-    return Alignment(zero, after_start, times, np.vstack([start, poses[shown]]))
-
-
 _BUNCHED, _TOGETHER = 1.2, 10  # factor of the mean period from the median, and samples that it is taken over; chosen
 
 
-def usual_period(times: Sequence[Array]) -> float:
+def usual_period(times: Iterable[Array]) -> float:
     """The usual time between samples of recordings, to the microsecond, s: the median, or the mean where stamps bunch.
 
     Messages that are stamped on arrival come in bunches: 47 ms, 3 ms, 47 ms ... at a period of 25 ms.
     """
-    steps = [np.diff(recording) for recording in times if len(recording) > 1]
-    typical = float(np.median(np.concatenate(steps))) if steps else float(times[0][0])
-    spans = [(each[_TOGETHER:] - each[:-_TOGETHER]) / _TOGETHER for each in times if len(each) > 2 * _TOGETHER]
-    if spans and not 1 / _BUNCHED < (mean := float(np.median(np.concatenate(spans)))) / typical < _BUNCHED:
-        typical = mean
+    steps, spans, firsts = array("d"), array("d"), list[float]()  # of which there may be very many
+    for stamps in times:
+        firsts += stamps[:1].tolist()
+        steps.frombytes(np.diff(stamps).tobytes())
+        if len(stamps) > 2 * _TOGETHER:
+            spans.frombytes(((stamps[_TOGETHER:] - stamps[:-_TOGETHER]) / _TOGETHER).tobytes())
+    typical = float(np.median(np.frombuffer(steps), overwrite_input=True)) if steps else firsts[0]
+    if spans:
+        mean = float(np.median(np.frombuffer(spans), overwrite_input=True))
+        typical = typical if 1 / _BUNCHED < mean / typical < _BUNCHED else mean
     return round(typical, 6) or typical
 
 

@@ -23,7 +23,7 @@ _FEWEST_CROSSINGS = 3  # at one place, of a range that is no power of two and no
 _AROUND = 1.0  # s before and after
 _KEPT, _LOST = 0.4, 0.6  # of the register's range: that other steps may be off, and that a lost turn is at least
 _RARE, _NEARLY_ALL = 0.01, 0.95  # shares of the steps
-_ROUNDS = 3  # a lost turn beside another hides it at first
+_ROUNDS = 20  # at most: a lost turn beside another hides it at first
 # A reading that jumps and returns is off the line between its neighbours by more than the longest usual step, and by
 # so many standard deviations of usual readings, and ticks, at least (chosen).
 _DEVIATIONS, _TICKS = 8.0, 3.0
@@ -37,13 +37,12 @@ def counter_range(runs: Sequence[Array], turn: float, whole: bool) -> float | No
     runs: its counts (F,) in every run of the recording. turn: counts of a turn. whole: they are ticks, of which other
     ranges than a turn are possible: powers of two, and any that three crossings or more agree on.
     """
-    least, most = min(counts.min() for counts in runs), max(counts.max() for counts in runs)
-    longest = max(float(np.abs(np.diff(counts)).max(initial=0.0)) for counts in runs)
+    spread = max(counts.max() for counts in runs) - min(counts.min() for counts in runs)
     for wrap in sorted((turn, *(POWERS_OF_TWO if whole else ()))):
-        within = most - least <= wrap * (1 + _ROUNDING) and longest > wrap / 2
+        within = wrap / 2 < spread <= wrap * (1 + _ROUNDING)
         if within and any(begins_again(counts, wrap) for counts in runs):
             return wrap
-    return _agreed_range(runs, most - least, turn) if whole and most > least else None
+    return _agreed_range(runs, spread, turn) if whole and spread > 0 else None
 
 
 def begins_again(counts: Array, wrap: float) -> bool:
@@ -59,24 +58,20 @@ def begins_again(counts: Array, wrap: float) -> bool:
 
 def _agreed_range(runs: Sequence[Array], spread: float, turn: float) -> float | None:
     """The range that crossings of its end agree on: the multiple of a turn next to it, if one is near enough."""
-    across, local = [], []
+    across, local = np.empty(0), np.empty(0)
     for counts in runs:
-        steps = np.diff(counts)
-        crossing = np.abs(steps) > spread / 2
-        usual = np.abs(steps[~crossing])
-        if usual.size and usual.max() > _LONGEST_STEP * spread:
+        steps = np.pad(np.diff(counts), 1, constant_values=np.nan)
+        crossing = np.flatnonzero(np.abs(steps) > spread / 2)
+        around = steps[crossing[:, None] + np.array([-1, 1])]  # the steps before and after
+        jumps = np.isnan(around).all(axis=1) | (np.abs(around) > spread / 2).any(axis=1)  # and returns
+        if np.nan_to_num(np.abs(np.delete(steps, crossing))).max() > _LONGEST_STEP * spread or jumps.any():
             return None
-        for index in np.flatnonzero(crossing):
-            around = np.concatenate([steps[max(index - 1, 0) : index], steps[index + 1 : index + 2]])
-            if (np.abs(around) > spread / 2).any() or not len(around):
-                return None  # a reading that jumps and returns
-            across.append(abs(float(steps[index])))
-            local.append(abs(float(around.mean())))
+        across = np.append(across, np.abs(steps[crossing]))
+        local = np.append(local, np.abs(np.nanmean(around, axis=1)))
     if len(across) < _FEWEST_CROSSINGS:
         return None
-    ranges = np.array(across) + np.array(local)
-    wrap, step = float(np.median(ranges)), max(max(local), 1.0)
-    if np.abs(ranges - wrap).max() > _LONGER * step or wrap < spread:
+    wrap, step = float(np.median(across + local)), max(float(local.max()), 1.0)
+    if np.abs(across + local - wrap).max() > _LONGER * step or wrap < spread:
         return None
     likely = [each for each in (turn * round(wrap / turn), spread + 1) if spread < each and abs(each - wrap) <= step]
     return float([*likely, round(wrap)][0])
@@ -130,41 +125,39 @@ def lost_register(counts: Array, times: Array, ranges: Sequence[float]) -> float
     So does a driver that takes the difference of two readings in a register of 16 bits, and now and then reads too
     late. The steps go backwards while the wheel turns on, and not to 0, where a counter stands that was set anew.
     """
-    possible = [wrap for wrap in sorted(ranges) if wrap <= np.ptp(counts)]
+    spread = np.ptp(counts)
+    possible = [wrap for wrap in sorted(ranges) if wrap <= spread]
     if not possible:
         return None
-    off, certain = _surprises(counts, times)
-    steps = np.abs(np.diff(counts))
-    farthest, usual = np.abs(off[certain]).max(initial=0.0), np.median(steps)
-    anew = np.abs(counts[1:]) <= _LONGER * np.quantile(steps, _NEARLY_ALL)
+    steps, (off, certain) = np.diff(counts), _surprises(counts, times)
+    farthest = np.abs(off[certain]).max(initial=0.0)
+    anew = np.abs(counts[1:]) <= _LONGER * np.quantile(np.abs(steps), _NEARLY_ALL)
     for wrap in possible:
         if farthest <= _LOST * wrap:  # no step lost a turn of this register, or of a longer one
             return None
-        if usual > _LONGEST_STEP * wrap:
+        if np.median(np.abs(steps)) > _LONGEST_STEP * wrap:
             continue
-        restored = counts
-        for _ in range(_ROUNDS):
-            restored = turns_restored(restored, times, wrap)
-        turns = np.abs(np.round((np.diff(restored) - np.diff(counts)) / wrap))
-        if turns.max() > 1:  # a shorter register loses several
-            continue
+        restored = turns_restored(counts, times, wrap)
+        turned = np.diff(restored)
+        turns = np.abs(np.round((turned - steps) / wrap))
         lost = turns > 0
-        left, certain = _surprises(restored, times)
-        backwards = np.diff(counts) * np.diff(restored) < 0
-        others = float(np.abs(left[certain & ~lost]).max(initial=0.0))
-        if (lost & anew).any() or not backwards[lost].all():
-            continue
-        if lost.any() and lost.mean() < _RARE and others < _KEPT * wrap:
+        surprises, certain = _surprises(restored, times)
+        others = np.abs(surprises[certain & ~lost]).max(initial=0.0)
+        single = turns.max() == 1 and lost.mean() < _RARE  # a shorter register loses several turns
+        if single and others < _KEPT * wrap and not (lost & (anew | (steps * turned >= 0))).any():
             return wrap
     return None
 
 
 def turns_restored(counts: Array, times: Array, wrap: float) -> Array:
     """Counts (F,) with the whole turns of ``wrap`` that single steps lost, by what the wheel does before and after."""
-    off, certain = _surprises(counts, times)
-    turns = np.where(certain & (np.abs(off) > _LOST * wrap), np.round(off / wrap), 0.0)
-    restored: Array = counts + wrap * np.concatenate([[0.0], np.cumsum(turns)])
-    return restored
+    for _ in range(_ROUNDS):
+        off, certain = _surprises(counts, times)
+        turns = np.where(certain & (np.abs(off) > _LOST * wrap), np.round(off / wrap), 0.0)
+        if not turns.any():
+            break
+        counts = counts + wrap * np.concatenate([[0.0], np.cumsum(turns)])
+    return counts
 
 
 def _surprises(counts: Array, times: Array) -> tuple[Array, NDArray[np.bool_]]:

@@ -7,7 +7,9 @@ from collections import Counter
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import groupby
 from numbers import Real
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,25 +19,18 @@ from pydantic import Field
 from pydantic_core import to_jsonable_python
 
 from omnibench.config import Model
-from omnibench.data.references import NUMBERS, References, reference_flaw, references_of, with_whole_turns
-from omnibench.data.scans import Scans
-from omnibench.data.stored import (
-    COVARIANCES,
-    POSES,
-    REQUIRED,
-    SENT,
-    Flaw,
-    Table,
-    arrays_of_runs,
-    median_period,
-    pose_times_flaw,
-    present_groups,
-    required_columns,
-    samples_in_memory,
-    times_flaw,
-    values_flaw,
-    wheel_times_flaw,
+from omnibench.data import stored
+from omnibench.data.references import (
+    NUMBERS,
+    TURN,
+    References,
+    nearest_turns,
+    reference_flaw,
+    references_of,
+    with_whole_turns,
 )
+from omnibench.data.scans import Scans
+from omnibench.data.stored import Flaw, Table
 from omnibench.errors import DataError, nearest, require_type
 from omnibench.robot.calibration import SAMPLE_PERIODS
 from omnibench.robot.kinematics import Array, Drive, Robot, interpolated
@@ -45,7 +40,6 @@ from omnibench.robot.samples import Samples, digest_of, with_samples
 from omnibench.views import Shown
 from omnibench.words import plural, some
 
-TURN = 2 * np.pi  # rad
 Split = Literal["train", "validation"]
 SPLITS: tuple[Split, ...] = ("train", "validation")
 
@@ -72,6 +66,7 @@ _MOST_PERIODS = 1001.0
 # Share of the runs whose headings are neither wrapped nor those of the wheels, from which on none is unwrapped (chosen:
 # in degrees most are such, in radians none); turns within which wrapped headings lie, with what rounding adds.
 _CONTRADICTED, _WITHIN = 0.25, 1.001
+_POSES_AT_ONCE = 200_000  # whose odometry is in memory when headings are unwrapped: 40 MB; chosen
 _SHOWN = 5  # ids in a warning, at most
 _ONLY_RUN = "run"  # id of the run of tables without a column "trajectory"
 _PERIOD_DECIMALS = 9  # of a sample period in s that is taken from stamps: ns
@@ -234,13 +229,12 @@ class Dataset(Shown):
         for run in self.trajectories:
             for name in _HASHED:
                 value = getattr(run, name)
-                if value is None and name in ("steering", "references"):
-                    continue  # runs without them keep the hash of earlier versions
-                if value is not None and name in _ARRAYS:
+                if name in _ARRAYS and value is not None:
                     digest.update(np.ascontiguousarray(value, dtype=float).tobytes())
                 elif isinstance(value, References):
                     digest.update(repr(value.content).encode())
-                else:  # 6, 6.0 and a NumPy 6.0 are the same number
+                elif value is not None or name not in ("steering", "references"):  # as of earlier versions
+                    # 6, 6.0 and a NumPy 6.0 are the same number
                     digest.update(repr(float(value) if isinstance(value, (int, float)) else value).encode())
         return digest.hexdigest()
 
@@ -299,9 +293,22 @@ def make_dataset(
     if wheels is None:
         runs = [_checked(f"data set {name}", robot, run) for run in trajectories]
     else:
-        runs = _runs_of_frames(robot, trajectories, wheels, poses, references)
+        required = stored.REQUIRED | {"wheels": stored.required_columns(robot)}
+        given = {"wheels": wheels, "poses": poses, "references": references}
+        frames = {key: _frame(key, content) for key, content in given.items() if content is not None}
+        if all("trajectory" not in frame.columns for frame in frames.values()):
+            frames = {key: frame.with_columns(pl.lit(_ONLY_RUN).alias("trajectory")) for key, frame in frames.items()}
+        tables = {key: Table(Path(key), frame, required[key]) for key, frame in frames.items()}
+        named = tables["wheels"].frame["trajectory"].unique(maintain_order=True)
+        listed = _frame("trajectories", {"trajectory": named} if trajectories is None else trajectories)
+        if "split" not in listed.columns:
+            commands = listed["command"].to_list() if "command" in listed.columns else [None] * len(listed)
+            listed = listed.with_columns(pl.Series("split", every_second(commands), dtype=pl.String))
+        of_runs = check_runs(Table(Path("trajectories"), listed, required["trajectories"]))
+        samples = stored.samples_in_memory(tables["wheels"], of_runs, robot)
+        runs = runs_of_tables(of_runs, samples, tables.get("poses"), tables.get("references"))
     if sample_period is None:  # the median; that there is no run is said next
-        sample_period = round(median_period(runs), _PERIOD_DECIMALS) if runs else 1.0
+        sample_period = round(stored.median_period(runs), _PERIOD_DECIMALS) if runs else 1.0
     made = Dataset(name, robot, sample_period, tuple(runs), description, source, licence, simulated, scans=scans)
     return checked(made)
 
@@ -329,45 +336,26 @@ def _checked(place: str, robot: Robot, run: Any) -> Trajectory:
                 raise DataError(f"{where}: {name}: expected numbers, in rows of one length") from None
             if arrays[name] is not value:
                 changed[name] = arrays[name]
-    samples, poses = arrays["times"].shape, arrays["pose_times"].shape
     if run.steering is None and robot.drive.steered:
         raise DataError(f"{where}: it has no steering angles; wheels {', '.join(robot.drive.steered)} steer")
-    rates, sent = (*samples, len(robot.wheel_names)), (len(arrays.get("sent", ())), 5)
-    expected = {"rates": rates, "poses": (*poses, 3), "angles": rates, "targets": rates, "sent": sent}
-    expected |= {"steering": (*samples, len(robot.drive.steered)), "odometry": (*samples, 3)}
-    for name, shape in {**expected, "pose_covariances": (*poses, 3, 3)}.items():
-        found = arrays[name].shape if name in arrays else shape
-        if len(samples) != 1 or len(poses) != 1 or found != shape:
-            raise DataError(f"{where}: {name} has shape {found}, expected {shape}")
+    samples, poses, sent = (np.atleast_1d(arrays.get(name, 0.0)).shape[:1] for name in ("times", "pose_times", "sent"))
+    shapes = {"times": samples, "pose_times": poses, "poses": (*poses, 3), "pose_covariances": (*poses, 3, 3)}
+    shapes |= dict.fromkeys(("rates", "angles", "targets"), (*samples, len(robot.wheel_names)))
+    shapes |= {"steering": (*samples, len(robot.drive.steered)), "odometry": (*samples, 3), "sent": (*sent, 5)}
+    for name, array in arrays.items():
+        if array.shape != shapes[name]:
+            raise DataError(f"{where}: {name} has shape {array.shape}, expected {shapes[name]}")
     if not samples[0] or not poses[0]:
         raise DataError(f"{where}: it has no {'reference poses' if samples[0] else 'wheel samples'}")
-    flaws = [(name, values_flaw(array)) for name, array in arrays.items()]
-    flaws += [("times", wheel_times_flaw(arrays["times"], run.id))]
-    flaws += [("pose_times", pose_times_flaw(arrays["pose_times"], run.id))]
+    flaws = {name: stored.values_flaw(array) for name, array in arrays.items()}
+    flaws["times"] = flaws["times"] or stored.wheel_times_flaw(arrays["times"], run.id)
+    flaws["pose_times"] = flaws["pose_times"] or stored.pose_times_flaw(arrays["pose_times"], run.id)
     if run.references is not None:
-        flaws += [("references", reference_flaw(run.references, float(arrays["times"][-1])))]
-    for name, flaw in flaws:
+        flaws["references"] = reference_flaw(run.references, float(arrays["times"][-1]))
+    for name, flaw in flaws.items():
         if flaw is not None:
             raise DataError(f"{where}: {name}, row {flaw[0] + 1}: {flaw[1]}")
     return replace(run, **changed) if changed else run
-
-
-def _runs_of_frames(robot: Robot, trajectories: Any, wheels: Any, poses: Any, references: Any) -> list[Trajectory]:
-    """The runs of the tables that a user gave."""
-    required = REQUIRED | {"wheels": required_columns(robot)}
-    given = {"wheels": wheels, "poses": poses, "references": references}
-    frames = {name: _frame(name, content) for name, content in given.items() if content is not None}
-    if all("trajectory" not in frame.columns for frame in frames.values()):
-        frames = {name: frame.with_columns(pl.lit(_ONLY_RUN).alias("trajectory")) for name, frame in frames.items()}
-    tables = {name: Table(Path(name), frame, required[name]) for name, frame in frames.items()}
-    named = tables["wheels"].frame["trajectory"].unique(maintain_order=True)
-    runs = pl.DataFrame({"trajectory": named}) if trajectories is None else _frame("trajectories", trajectories)
-    if "split" not in runs.columns:
-        commands = runs["command"].to_list() if "command" in runs.columns else [None] * len(runs)
-        runs = runs.with_columns(pl.Series("split", every_second(commands), dtype=pl.String))
-    of_runs = check_runs(Table(Path("trajectories"), runs, REQUIRED["trajectories"]))
-    samples = samples_in_memory(tables["wheels"], of_runs, robot)
-    return runs_of_tables(of_runs, samples, tables.get("poses"), tables.get("references"))
 
 
 def _frame(name: str, content: Any) -> pl.DataFrame:
@@ -416,18 +404,39 @@ def runs_of_tables(
 ) -> list[Trajectory]:
     """The runs of a data set's tables. DataError names the table, the row and what is wrong.
 
-    runs: see ``check_runs``. samples: of each run. poses: None where all runs have references. commands: the motion
-    commands that were sent in runs, if they were recorded.
+    runs: see ``check_runs``. samples: of each run. poses: None where all runs have references. references: a row for
+    each measurement of a run's motion, with columns trajectory, kind, value and sigma of kinds of one number, value_x,
+    value_y, sigma_x and sigma_y of those of two (sigma stands for both where these are empty), t0 and t1, which may be
+    missing or empty: the run's start and end; sigma_rate (rad/s) of a gyro's offset, which the turns of a session
+    share. commands: the motion commands that were sent in runs, if they were recorded.
     """
     started = set() if poses is None else set(poses.ids)
-    measured = {} if references is None else _references(references, runs, [of_run.end for of_run in samples], started)
+    measured: dict[str, References] = {}
+    if references is not None:
+        numbers = {name: np.full(len(references.frame), np.nan) for name in NUMBERS}
+        for name in [name for name in NUMBERS if name in references.frame.columns]:
+            numbers[name] = references.floats(name).fill_null(np.nan).to_numpy()
+            if name in ("t0", "t1"):
+                infinite = np.isinf(numbers[name])
+                references.refuse(infinite, f"{name} is {{}}; remove or repair the row", numbers[name].tolist())
+        kinds = np.array(["" if kind is None else str(kind).strip() for kind in references.frame["kind"]], dtype=str)
+        for index, rows in references.rows_by_run(runs.ids, runs.file.name):
+            run, of_rows, end = (
+                runs.ids[index],
+                {name: values[rows] for name, values in numbers.items()},
+                samples[index].end,
+            )
+            of_run = references_of(kinds[rows], of_rows, start_known=run in started).of_run(0.0, end)
+            if (wrong := reference_flaw(of_run, end)) is not None:
+                raise references.fail(int(rows[wrong[0]]), wrong[1])
+            measured[run] = of_run.by_time()
 
     def flaw(times: Array, run: str) -> Flaw | None:
-        return pose_times_flaw(times, run, fewest=1 if run in measured else 2)
+        return stored.pose_times_flaw(times, run, fewest=1 if run in measured else 2)
 
-    groups = POSES if poses is None else POSES | present_groups(poses.file, COVARIANCES, poses.frame.columns)
-    posed = arrays_of_runs(poses, runs, groups, flaw, measured)
-    sent = arrays_of_runs(commands, runs, SENT, lambda times, _: times_flaw(times), runs.ids)
+    covariances = stored.present_groups(poses.file, stored.COVARIANCES, poses.frame.columns) if poses else {}
+    posed = stored.arrays_of_runs(poses, runs, stored.POSES | covariances, flaw, measured)
+    sent = stored.arrays_of_runs(commands, runs, stored.SENT, lambda times, _: stored.times_flaw(times), runs.ids)
     trajectories = []
     for index, row in enumerate(runs.frame.iter_rows(named=True)):
         known = {name: row[name] for name in RUN_NUMBERS if row.get(name) is not None}
@@ -441,32 +450,6 @@ def runs_of_tables(
         known |= {"references": measured.get(row["trajectory"]), "sent": sent[index].get("sent")}
         trajectories.append(Trajectory(row["trajectory"], row["split"], samples=samples[index], **known))
     return trajectories
-
-
-def _references(table: Table, runs: Table, ends: Sequence[float], started: set[str]) -> dict[str, References]:
-    """The references of each run that has some.
-
-    The table has a row for each measurement of a run's motion. Columns: trajectory, kind, value and sigma of kinds of
-    one number, value_x, value_y, sigma_x and sigma_y of those of two (sigma stands for both where these are empty), t0
-    and t1, which may be missing or empty: the run's start and end; sigma_rate (rad/s) of a gyro's offset, which the
-    turns of a session share.
-
-    ends: of the wheel samples of each run, s. started: ids of the runs whose start pose is known.
-    """
-    numbers = {name: np.full(len(table.frame), np.nan) for name in NUMBERS}
-    for name in numbers.keys() & {*table.frame.columns}:
-        numbers[name] = table.floats(name).fill_null(np.nan).to_numpy()
-        if name in ("t0", "t1"):
-            table.refuse(np.isinf(numbers[name]), f"{name} is {{}}; remove or repair the row", numbers[name].tolist())
-    kinds = np.array(["" if kind is None else str(kind).strip() for kind in table.frame["kind"]], dtype=str)
-    measured: dict[str, References] = {}
-    for index, rows in table.rows_by_run(runs.ids, runs.file.name):
-        run, of_run = runs.ids[index], {name: values[rows] for name, values in numbers.items()}
-        references = references_of(kinds[rows], of_run, start_known=run in started).of_run(0.0, ends[index])
-        if (flaw := reference_flaw(references, ends[index])) is not None:
-            raise table.fail(int(rows[flaw[0]]), flaw[1])
-        measured[run] = references.by_time()
-    return measured
 
 
 def checked(dataset: Dataset) -> Dataset:
@@ -501,7 +484,7 @@ def checked(dataset: Dataset) -> Dataset:
             moving += 1
             standing += [each.id] if driven.sum(axis=0).max() < _HARDLY * moved[far].max() else []
         each.samples.summarise()  # while they are at hand
-    period, (shortest, longest) = median_period(runs), SAMPLE_PERIODS
+    period, (shortest, longest) = stored.median_period(runs), SAMPLE_PERIODS
     if not period / _MOST_PERIODS < sample_period < period * _MOST_PERIODS:
         raise DataError(
             f"{place}: sample_period is {sample_period:g} s, but the wheel samples come every {period:g} s (the "
@@ -512,7 +495,6 @@ def checked(dataset: Dataset) -> Dataset:
             f"{place}: sample_period is {sample_period:g} s, expected {shortest:g} to {longest:g} s; "
             "check the units of the times"
         )
-    warnings = []
     recorded = [run.poses[:, 2] for run in runs]
     headings, ambiguous = unwrap(robot, [run.log(run.pose_times) for run in runs], recorded)
     # Wrapped headings lie within a turn, and continuous ones need no turns: others are in degrees, say.
@@ -521,18 +503,19 @@ def checked(dataset: Dataset) -> Dataset:
         for run, before, after in zip(runs, recorded, headings, strict=True)
         if np.ptp(before) > _WITHIN * TURN and not np.array_equal(before, after)
     ]
+    warnings = []
     if len(contradicted) > _CONTRADICTED * sum(run.has_poses for run in runs):
-        headings = recorded
+        headings, ambiguous, standing = recorded, [], []  # in other units runs seem to move too far
         warnings.append(
             f"headings of {plural(len(contradicted), 'trajectory')} turn otherwise than the wheels, so that all stay "
             f"as they were recorded: {some(contradicted, _SHOWN)}"
         )
-    elif ambiguous:
+    if ambiguous:
         warnings.append(
             f"headings of {plural(len(ambiguous), 'trajectory')} may be unwrapped wrongly (reference too sparse): "
             f"{some([runs[index].id for index in ambiguous], _SHOWN)}"
         )
-    if 0 < len(standing) < moving and headings is not recorded:  # in other units runs seem to move too far
+    if 0 < len(standing) < moving:
         warnings.append(
             f"the reference moves in {plural(len(standing), 'trajectory')} though no wheel turns, which spoils every "
             f"fit; leave {'it' if len(standing) == 1 else 'them'} out: {some(standing, _SHOWN)}"
@@ -545,9 +528,11 @@ def checked(dataset: Dataset) -> Dataset:
         warnings.append(
             f"sample_period is {sample_period:g} s, but the wheel samples come every {period:g} s (the median)"
         )
-    for index, (run, heading) in enumerate(zip(runs, headings, strict=True)):
+    for index, (run, before, heading) in enumerate(zip(runs, recorded, headings, strict=True)):
+        if heading is not before:  # poses that stay need no memory for a copy
+            run = replace(run, poses=np.column_stack([run.poses[:, :2], heading]))
         references = None if run.references is None else with_whole_turns(robot, run.log([0.0]), run.references)
-        runs[index] = replace(run, poses=np.column_stack([run.poses[:, :2], heading]), references=references)
+        runs[index] = replace(run, references=references)
     return with_warnings(replace(dataset, trajectories=tuple(runs)), warnings)
 
 
@@ -561,21 +546,22 @@ def with_warnings(dataset: Dataset, warnings: Iterable[str]) -> Dataset:
 
 
 def unwrap(robot: Robot, logs: Sequence[WheelLog], headings: Sequence[Array]) -> tuple[list[Array], list[int]]:
-    """Continuous headings (rad) and the indices of trajectories in which they are ambiguous.
+    """Continuous headings (rad), as given where they are, and the indices of trajectories in which they are ambiguous.
 
     Every increment gets the whole turns that bring it closest to the design model's odometry. Where the reference is
     dense this is the nearest turn; where it is sparse, the odometry tells how often the robot turned in between. A
     trajectory is ambiguous if the two still differ by more than a quarter turn between two reference poses.
     """
     model = OdometryModel.of_design(robot, "arc")
-    unwrapped: list[Array] = []
-    ambiguous: list[int] = []
-    for index, (odometry, heading) in enumerate(zip(model.poses(logs), headings, strict=True)):
-        steps, expected = np.diff(heading), np.diff(odometry[:, 2])
-        turns = np.round((expected - steps) / TURN)
-        # Added to the headings as recorded, so that continuous ones stay as they are to the bit.
-        unwrapped.append(heading + TURN * np.concatenate([[0.0], np.cumsum(turns)]))
-        if np.abs(steps + TURN * turns - expected).max(initial=0.0) > TURN / 4:
+    blocks = (np.cumsum([len(heading) for heading in headings]) // _POSES_AT_ONCE).tolist()
+    parts = groupby(zip(blocks, logs, strict=True), key=itemgetter(0))
+    odometries = (odometry for _, part in parts for odometry in model.poses([log for _, log in part]))
+    unwrapped, ambiguous = list[Array](), list[int]()
+    for index, (odometry, heading) in enumerate(zip(odometries, headings, strict=True)):
+        driven = odometry[:, 2]
+        continuous = nearest_turns(heading, driven)
+        unwrapped.append(heading if continuous.tobytes() == heading.tobytes() else continuous)
+        if np.abs(np.diff(continuous) - np.diff(driven)).max(initial=0.0) > TURN / 4:
             ambiguous.append(index)
     return unwrapped, ambiguous
 

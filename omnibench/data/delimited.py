@@ -1,18 +1,29 @@
-"""Tables of numbers from delimited text, read by polars, or from Parquet; a flaw is told with its file and row."""
+"""Tables of numbers from delimited text or Parquet, whose rows polars reads; a flaw is told with its file and row.
+
+Opening a table reads its header. A text with more than ``LARGE`` bytes goes through a temporary Parquet file, of which
+the columns and rows that are asked for are read.
+"""
 
 from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Iterable, Sequence
+from array import array
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from io import BytesIO
+from functools import cached_property, partial
+from io import BytesIO, TextIOWrapper
+from itertools import islice, pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
+import polars.selectors as cs
 from numpy.typing import NDArray
 
+from omnibench.data.parquet import readable, scan_table, seconds
+from omnibench.data.scratch import temporary_file
 from omnibench.errors import DataError, nearest
 from omnibench.files import check_file, read_text
 from omnibench.robot.kinematics import Array
@@ -20,10 +31,14 @@ from omnibench.robot.kinematics import Array
 AUTO = "auto"  # as a separator: the one that the header holds
 BLANK = ("", "nan", "na", "n/a", "null", "none", "-")  # cells without a value, in any case
 DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+")
+LARGE = 1 << 26  # bytes of a text whose numbers are not held in memory together, where they take six times as much
 _COMMAS = " (decimal commas? --set decimal=comma with --set separator)"
 _HEAD = 1 << 16  # characters in which the header and the first rows stand; chosen
 _FIRST = 30  # rows among which those of numbers begin; chosen
+_HEADED = 1000  # lines that tell the types of the columns; chosen
 _MOST_BYTES = 1 << 34  # of a table; chosen
+_AT_ONCE = 1_000_000  # rows of which several columns are read at a time; chosen
+_ROW_GROUP = 1 << 16  # rows of a temporary Parquet file that are read together; chosen
 # Not with leading zeros, as in names of runs.
 _NUMBER = re.compile(r"\s*[-+]?(?:(?:0|[1-9]\d*)(?:\.\d*)?|\.\d+)(?:e[-+]?\d+)?\s*", re.IGNORECASE)
 _UNIT = re.compile(r"[\[(<].*[\])>]|-|[a-zµ°%][a-zµ°%/^0-9·*. -]*", re.IGNORECASE)
@@ -41,6 +56,10 @@ Lines = Sequence[int] | NDArray[np.intp]
 """Numbers of lines of a file, from 1."""
 
 
+Source = Path | BytesIO | Any
+"""What polars reads: a file, a text in memory, or a temporary file."""
+
+
 class ColumnError(DataError):
     """A table has not the columns that are expected of it."""
 
@@ -53,19 +72,30 @@ class NoRowsError(DataError):
 class Table:
     """A table as it stands in its file: columns of numbers, and of texts where not all cells are numbers or blank.
 
-    names: of the columns, numbers from 1 where there is no header. frame: the columns in their order. lines (rows,): of
-    the file that a row came from. units: those of a row below the header. headed: the names come from a header.
+    names: of the columns, numbers from 1 where there is no header. read: gives the columns in their order, when rows
+    are asked for. lines (rows,): of the file that a row came from, and perhaps further ones. units: those of a row
+    below the header. headed: the names come from a header.
     """
 
     file: Path
     names: tuple[str, ...]
-    frame: pl.DataFrame
+    read: Callable[[], pl.LazyFrame]
     lines: Lines
     units: tuple[str, ...] = ()
     headed: bool = True
 
+    @cached_property
+    def frame(self) -> pl.LazyFrame:
+        """The columns in their order. DataError: they cannot be read, or a row has too many fields."""
+        return self.read()
+
+    @cached_property
+    def height(self) -> int:
+        """Number of rows."""
+        return int(self._selected(pl.len()).item())
+
     def __len__(self) -> int:
-        return len(self.frame)
+        return self.height
 
     def __contains__(self, name: str) -> bool:
         """True if a column has the name, or that number, from 1."""
@@ -75,22 +105,40 @@ class Table:
         """The table with the names of its columns in lower case, for tables whose names are given."""
         return replace(self, names=tuple(name.lower() for name in self.names))
 
+    def by_text(self, name: str) -> dict[str, Table]:
+        """The rows that have the same text in a column, in their order, by that text, the first first."""
+        column = pl.nth(self._place(name))
+        begins = column.ne_missing(column.shift()) | (pl.int_range(pl.len()) == 0)
+        stretches = self._selected(
+            pl.int_range(pl.len()).filter(begins).alias("first"), column.filter(begins).alias("text")
+        )
+        edges = [*stretches["first"].to_list(), len(self)]
+        parts: dict[str, list[NDArray[np.intp]]] = {}
+        for text, (first, end) in zip(_texts(stretches["text"]), pairwise(edges), strict=True):
+            parts.setdefault(text, []).append(np.arange(first, end))
+        return {text: self.only(np.concatenate(rows)) for text, rows in parts.items()}
+
     def only(self, rows: NDArray[np.intp]) -> Table:
-        """The table of some of the rows, by their indices."""
-        lines = self.lines[0] + rows if isinstance(self.lines, range) else np.asarray(self.lines)[rows]
-        at_once = len(rows) == 1 + rows[-1] - rows[0] if len(rows) else False
-        return replace(self, frame=self.frame[rows[0] : rows[-1] + 1] if at_once else self.frame[rows], lines=lines)
+        """The table of some of the rows, by their indices, which increase."""
+        first, count = int(rows[0]), len(rows)
+        together = int(rows[-1]) - first + 1 == count
+        lines = self.lines[first : first + count] if together else np.asarray(self.lines[: rows[-1] + 1])[rows]
+
+        def chosen() -> pl.LazyFrame:
+            return self.frame.slice(first, count) if together else self.frame.select(pl.all().gather(rows))
+
+        return replace(self, read=chosen, lines=lines)
 
     def lines_above(self) -> int:
         """Number of the file's lines above its first row of numbers, where texts stand between it and the header."""
-        for row, cells in enumerate(self.frame.head(_FIRST).iter_rows()):
+        for row, cells in enumerate(self._selected(pl.all().head(_FIRST)).iter_rows()):
             if 2 * sum(cell is not None and _is_float(str(cell)) for cell in cells) >= len(cells):
                 return int(self.lines[row]) - 1 if row else 0
         return 0
 
     def unit_of(self, name: str) -> str:
         """The unit that stands below a column's name; empty without one."""
-        return self.units[_place(self.file, name, self.names)] if self.units else ""
+        return self.units[self._place(name)] if self.units else ""
 
     def fail(self, row: int, what: str) -> DataError:
         """The error of one row (0 is the first)."""
@@ -98,26 +146,35 @@ class Table:
 
     def texts(self, name: str) -> list[str]:
         """One column as texts; whole numbers without a decimal point."""
-        column = self._column(name)
-        if column.dtype != pl.String:
-            return [f"{value:.15g}" if value is not None and np.isfinite(value) else "" for value in column.to_list()]
-        return column.fill_null("").str.strip_chars().to_list()
+        return _texts(self._selected(pl.nth(self._place(name))).to_series())
 
     def numbers(self, names: Sequence[str]) -> Array:
         """Columns as numbers (rows, n), NaN where a cell is blank. DataError: a cell holds something else."""
         numbers = np.empty((len(self), len(names)))
-        for place, name in enumerate(names):
-            column = self._column(name)
-            numbers[:, place] = self._parsed(name, column) if column.dtype == pl.String else _floats(column)
+        step = len(names) if len(self) <= _AT_ONCE else 1
+        for first in range(0, len(names), step):
+            chosen = enumerate(names[first : first + step], first)
+            columns = self._selected(
+                *(pl.nth(self._place(name)).alias(str(index)) for index, name in chosen),
+                then=(cs.string(), (~cs.string()).cast(pl.Float64).fill_null(np.nan)),
+            )
+            for column in columns.iter_columns():
+                index = int(column.name)
+                numbers[:, index] = self._parsed(names[index], column) if column.dtype == pl.String else column
         return numbers
+
+    def check_finite(self, numbers: Array, names: Sequence[str], rows: NDArray[np.intp] | None = None) -> None:
+        """DataError names the first cell among numbers (n, columns) that is none. rows (n,): of the table; or all."""
+        for index, place in np.argwhere(~np.isfinite(numbers))[:1].tolist():
+            row = index if rows is None else int(rows[index])
+            cell = self._selected(pl.nth(self._place(names[place])).slice(row, 1)).item()
+            flaw = f"is {str(cell).strip()}; remove or repair the row" if cell not in (None, "") else "is missing"
+            raise self.fail(row, f"{names[place]} {flaw}")
 
     def columns(self, names: Sequence[str]) -> Array:
         """Columns of finite numbers (rows, n). DataError names the first cell that is not one."""
         numbers = self.numbers(names)
-        for row, place in np.argwhere(~np.isfinite(numbers))[:1].tolist():
-            cell = self._column(names[place])[row]
-            flaw = f"is {str(cell).strip()}; remove or repair the row" if cell not in (None, "") else "is missing"
-            raise self.fail(row, f"{names[place]} {flaw}")
+        self.check_finite(numbers, names)
         return numbers
 
     def column(self, name: str) -> Array:
@@ -137,21 +194,28 @@ class Table:
         cells = column.fill_null("").str.strip_chars()
         numbers = cells.cast(pl.Float64, strict=False)
         wrong = numbers.is_null() & ~cells.str.to_lowercase().is_in(BLANK)
-        if not wrong.any():
-            return _floats(numbers)
         for form in _DATES if wrong.sum() * 2 > len(wrong) else ():
             zone = "UTC" if "z" in form else None
             with_zone = cells.str.replace("Z$", "+00:00")
             dates = with_zone.str.to_datetime(form, time_unit="ns", time_zone=zone, strict=False)
             if not (dates.is_null() & wrong).any():
-                return _floats(_seconds(dates))
-        row = int(wrong.arg_true()[0])
-        text = cells[row]
-        hint = "; of decimal commas say --set decimal=comma" if DECIMAL_COMMA.fullmatch(text) else ""
-        raise self.fail(row, f"{name} is {text!r}, expected a number{hint}")
+                numbers, wrong = dates.dt.epoch("ns") / 1e9, wrong.clear()
+                break
+        if wrong.any():
+            row = int(wrong.arg_true()[0])
+            text = cells[row]
+            hint = "; of decimal commas say --set decimal=comma" if DECIMAL_COMMA.fullmatch(text) else ""
+            raise self.fail(row, f"{name} is {text!r}, expected a number{hint}")
+        floats: Array = numbers.fill_null(np.nan).to_numpy()
+        return floats
 
-    def _column(self, name: str) -> pl.Series:
-        return self.frame.to_series(_place(self.file, name, self.names))
+    def _place(self, name: str) -> int:
+        return _place(self.file, name, self.names)
+
+    def _selected(self, *columns: pl.Expr, then: Sequence[pl.Expr | cs.Selector] = ()) -> pl.DataFrame:
+        with readable(self.file):
+            chosen = self.frame.select(columns)
+            return (chosen.select(*then) if then else chosen).collect()
 
 
 def read_cells(
@@ -170,13 +234,13 @@ def read_cells(
     is missing or named twice (ColumnError), it has no rows (NoRowsError), a row has more fields than columns.
     """
     if file.suffix == ".parquet":
-        from omnibench.data.parquet import read_parquet
-
-        frame = read_parquet(file)
-        if frame.is_empty():
+        rows, frame = scan_table(file)
+        if not rows:
             raise NoRowsError(f"{file}: it has no rows")
-        frame = frame.select(_seconds(column) for column in frame.iter_columns())
-        return Table(file, tuple(frame.columns), frame, range(1, len(frame) + 1))
+        frame = frame.select(map(seconds, range(1 << 16), frame.collect_schema().dtypes()))
+        large = file.stat().st_size > LARGE
+        names = tuple(frame.collect_schema())
+        return Table(file, names, lambda: frame if large else frame.collect().lazy(), range(1, rows + 1))
     str(file).encode()  # polars takes no other names: UnicodeEncodeError, which is told in one line
     source, head, lines = _source_of(file, separator)
     # Blank lines within the header, which are left out, count as its lines.
@@ -184,34 +248,38 @@ def read_cells(
     if separator == AUTO:
         separator = next((sign for sign in ";\t," if head and sign in head[: max(header_lines, 1)][-1]), ",")
     separator = separator or "\t"
-    rows = list(csv.reader(head, delimiter=separator, skipinitialspace=True))
+    first = list(csv.reader(head, delimiter=separator, skipinitialspace=True))
     if header_lines:
-        if len(rows) < header_lines:
+        if len(first) < header_lines:
             raise DataError(f"{file}: it has no header with the names of its columns; repair it, or take it out")
-        names = [name.strip() for name in rows[header_lines - 1]]
-        names[0] = names[0].lstrip("# ")  # as numpy.savetxt writes it
+        names = tuple(name.strip() for name in first[header_lines - 1])
+        names = (names[0].lstrip("# "), *names[1:])  # as numpy.savetxt writes it
     else:
-        names = [str(number) for number in range(1, len(rows[0]) + 1)] if rows else []
+        names = tuple(str(number) for number in range(1, len(first[0]) + 1)) if first else ()
     for name in required:
         _place(file, name, names)
-    body = rows[header_lines:]
+    body = first[header_lines:]
     units = tuple(cell.strip() for cell in body[0]) if header_lines and len(body) > 1 and _are_units(*body[:2]) else ()
     skipped = header_lines + bool(units)
-    if len(rows) <= skipped:
+    if len(first) <= skipped:
         raise NoRowsError(f"{file}: it has no rows")
-    if len(rows[skipped]) != len(names):
-        begun = next((row for row, cells in enumerate(rows) if 2 * sum(map(_is_float, cells)) >= len(cells) > 1), 0)
+    if len(first[skipped]) != len(names):
+        begun = next((row for row, cells in enumerate(first) if 2 * sum(map(_is_float, cells)) >= len(cells) > 1), 0)
         above = int(lines[begun]) - 1
         way = f"; are there {above} lines above the rows? --set header_lines={above}"
-        error = _ragged(file, rows[skipped], names, 0, int(lines[skipped]))
+        error = _ragged(file, first[skipped], names, 0, int(lines[skipped]))
         raise DataError(f"{error}{way if begun > skipped else ''}")
-    frame = _frame(file, source, separator, skipped, rows, names, lines)
-    if decimal_comma:
-        frame = frame.with_columns(pl.col(pl.String).str.replace(",", ".", literal=True))
-    return Table(file, tuple(names), frame, lines[skipped : skipped + len(frame)], units, bool(header_lines))
+    # Columns that hold numbers in the first rows are read as numbers.
+    whole = [row for row in first[skipped:] if len(row) == len(names)]
+    numbers = [
+        any(cells) and all(not cell or _NUMBER.fullmatch(cell) for cell in cells) for cells in zip(*whole, strict=True)
+    ]
+    scratch = temporary_file(".parquet") if file.stat().st_size > LARGE else None
+    read = partial(_rows, file, source, separator, skipped, numbers, lines[skipped:], decimal_comma, scratch)
+    return Table(file, names, read, lines[skipped:], units, bool(header_lines))
 
 
-def _source_of(file: Path, separator: str | None) -> tuple[Path | bytes, list[str], Lines]:
+def _source_of(file: Path, separator: str | None) -> tuple[Source, list[str], Lines]:
     """What polars reads of a file, its first lines, and the numbers of its lines, of which some may be left out."""
     check_file(file, _MOST_BYTES, text=True)
     try:
@@ -223,52 +291,71 @@ def _source_of(file: Path, separator: str | None) -> tuple[Path | bytes, list[st
     if separator is not None and not blank and ', "' not in head and "\r" not in head.replace("\r\n", ""):
         shown = head.splitlines()
         return file, shown if len(head) < _HEAD else shown[:-1], range(1, _MOST_BYTES)
-    kept: list[tuple[int, str]] = []
-    for number, line in enumerate(read_text(file).replace(', "', ',"').splitlines(), 1):
-        fields = "\t".join(line.split("#", 1)[0].split()) if separator is None else line
-        if fields.strip(" \t,;"):
-            kept.append((number, fields))
-    text = [line for _, line in kept]
-    return "\n".join(text).encode(), text[:1000], np.array([number for number, _ in kept])
+    large = file.stat().st_size > LARGE
+    cleaned, numbers, first = temporary_file(".csv") if large else BytesIO(), array("q"), list[str]()
+    try:
+        with file.open(encoding="utf-8-sig") as opened:
+            for number, line in enumerate(opened, 1):
+                line = line.rstrip("\n").replace(', "', ',"')
+                fields = "\t".join(line.split("#", 1)[0].split()) if separator is None else line
+                if fields.strip(" \t,;"):
+                    cleaned.write(f"{fields}\n".encode())
+                    numbers.append(number)
+                    first += [fields] if len(first) < _HEADED else []
+    except UnicodeDecodeError:
+        read_text(file)  # which says that it is no text
+        raise
+    cleaned.flush()
+    return cleaned, first, np.array(numbers)
 
 
-def _frame(
+def _rows(
     file: Path,
-    source: Path | bytes,
+    source: Source,
     separator: str,
     skipped: int,
-    first: Sequence[Sequence[str]],
-    names: Sequence[str],
+    numbers: Sequence[bool],
     lines: Lines,
-) -> pl.DataFrame:
-    """The rows of a text below the header. DataError: it cannot be read, or a row has too many fields.
+    decimal_comma: bool,
+    scratch: Any,
+) -> pl.LazyFrame:
+    """The rows of a text below its header, in memory or in the file ``scratch``.
 
-    first: the first rows, the header among them. Columns that hold numbers there are read as numbers, or, where they
-    hold a text further down, all as texts.
+    numbers: which columns hold numbers; where they hold a text further down, all are read as texts. DataError: the text
+    cannot be read, or a row has too many fields.
     """
+    text = source if isinstance(source, Path | BytesIO) else Path(source.name)
     reason: Exception | None = None
-    texts: list[type[pl.DataType]] = [pl.String] * len(names)
-    numbers = [
-        pl.Float64 if any(cells) and all(not cell or _NUMBER.fullmatch(cell) for cell in cells) else pl.String
-        for cells in zip(*(row for row in first[skipped:] if len(row) == len(names)), strict=True)
-    ]
-    for types in (numbers, texts):
+    for numeric in (numbers, [False] * len(numbers)):
+        schema = {str(place): pl.Float64 if number else pl.String for place, number in enumerate(numeric)}
         try:
-            return pl.read_csv(
-                BytesIO(source) if isinstance(source, bytes) else source,
-                has_header=False, separator=separator, skip_lines=skipped, glob=False,
-                schema={str(place): kind for place, kind in enumerate(types)},
-            )  # fmt: skip
+            if isinstance(text, BytesIO):
+                text.seek(0)
+            frame = pl.scan_csv(
+                text, has_header=False, separator=separator, skip_lines=skipped, schema=schema, glob=False
+            )
+            if decimal_comma:
+                frame = frame.with_columns(pl.col(pl.String).str.replace(",", ".", literal=True))
+            if scratch is None:
+                return frame.collect().lazy()
+            frame.sink_parquet(scratch.name, compression="lz4", row_group_size=_ROW_GROUP)
+            return pl.scan_parquet(scratch.name, glob=False)
         except (pl.exceptions.PolarsError, OSError) as error:
             reason = error
-    text = source.decode() if isinstance(source, bytes) else read_text(file)
-    for row, fields in enumerate(csv.reader(text.splitlines()[skipped:], delimiter=separator)):
-        if fields and len(fields) != len(names):
-            raise _ragged(file, fields, names, row, int(lines[skipped + row]))
+    opened = TextIOWrapper(text, encoding="utf-8") if isinstance(text, BytesIO) else text.open(encoding="utf-8-sig")
+    try:
+        with opened:
+            opened.seek(0)
+            rows = csv.reader(islice(opened, skipped, None), delimiter=separator)
+            for row, fields in enumerate(rows):
+                if fields and len(fields) != len(numbers):
+                    raise _ragged(file, fields, numbers, row, int(lines[row]))
+    except UnicodeDecodeError:
+        read_text(file)  # which says that it is no text
     raise DataError(f"{file}: cannot be read: {reason}")
 
 
-def _ragged(file: Path, fields: Sequence[str], names: Sequence[str], row: int, line: int) -> DataError:
+def _ragged(file: Path, fields: Sequence[str], names: Sequence[object], row: int, line: int) -> DataError:
     what = f"it has {len(fields)} fields, expected {len(names)}; repair the row"
     return row_error(file, row, line, what + (_COMMAS if len(fields) > len(names) else ""))
 
@@ -333,19 +420,11 @@ def row_error(file: Path, row: int, line: int, what: str) -> DataError:
     return DataError(f"{file}, {place}: {what}")
 
 
-def _seconds(column: pl.Series) -> pl.Series:
-    """A column of dates or durations in seconds; another as it is."""
-    if column.dtype == pl.Date:
-        column = column.cast(pl.Datetime("ns"))
-    if column.dtype == pl.Datetime:
-        return column.dt.epoch("ns") / 1e9
-    return column.dt.total_nanoseconds() / 1e9 if column.dtype == pl.Duration else column
-
-
-def _floats(column: pl.Series) -> Array:
-    """A column of numbers (rows,), NaN where it has none."""
-    floats: Array = column.cast(pl.Float64).fill_null(np.nan).to_numpy()
-    return floats
+def _texts(column: pl.Series) -> list[str]:
+    """A column as texts; whole numbers without a decimal point."""
+    if column.dtype != pl.String:
+        return [f"{value:.15g}" if value is not None and np.isfinite(value) else "" for value in column.to_list()]
+    return column.fill_null("").str.strip_chars().to_list()
 
 
 def _place(file: Path, name: str, names: Sequence[str]) -> int:

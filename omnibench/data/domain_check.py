@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-
-import numpy as np
-from numpy.typing import NDArray
+from collections.abc import Sequence
 
 from omnibench.data.dataset import Trajectory
 from omnibench.robot.calibration import Calibration
@@ -25,12 +22,13 @@ def extrapolation_warning(calibration: Calibration, runs: Sequence[Trajectory]) 
         return None
     domain, count = TrainingDomain(calibration.robot, calibration.driven), 0
     worst = dict[str, tuple[float, Array]]()  # by command: share of the worst run that is outside, and these motions
-    for run, motions, outside in _motions(calibration, domain, runs):
-        if outside.any():
-            count += 1
-            command, share = run.command or run.id, float(outside.mean())
-            if command not in worst or share > worst[command][0]:
-                worst[command] = share, motions[outside]
+    for run in runs:
+        motions = motions_of(calibration.matrix_array, run.times, run.signals)
+        outside = domain.outside_in_run(motions)
+        command, share = run.command or run.id, float(outside.mean())
+        count += share > 0
+        if share > (worst[command][0] if command in worst else 0.0):
+            worst[command] = share, motions[outside]
     if not count:
         return None
     commands = sorted(worst, key=lambda command: -worst[command][0])
@@ -46,15 +44,8 @@ def share_outside(calibration: Calibration, runs: Sequence[Trajectory]) -> float
     """Share of the runs' time in motions that a calibration was not fitted to; None where these are not known."""
     if not calibration.driven or not runs:
         return None
-    domain = TrainingDomain(calibration.robot, calibration.driven)
-    outside = [outside.mean() * run.samples.end for run, _, outside in _motions(calibration, domain, runs)]
-    return float(sum(outside) / sum(run.samples.end for run in runs))
-
-
-def _motions(
-    calibration: Calibration, domain: TrainingDomain, runs: Sequence[Trajectory]
-) -> Iterator[tuple[Trajectory, Array, NDArray[np.bool_]]]:
-    """Each run with its motions, and which of these are outside the training domain."""
+    domain, outside = TrainingDomain(calibration.robot, calibration.driven), 0.0
     for run in runs:
         motions = motions_of(calibration.matrix_array, run.times, run.signals)
-        yield run, motions, domain.outside_in_run(motions)
+        outside += float(domain.outside_in_run(motions).mean()) * run.samples.end
+    return outside / sum(run.samples.end for run in runs)

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import errno
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import polars as pl
+from polars.io.plugins import register_io_source
 
 from omnibench.errors import DataError
-from omnibench.files import check_file
+from omnibench.files import TableFormat, check_file, quoted_formulas
 
 _LARGE = 1 << 27  # bytes in memory up to which a file may be packed as tightly as it likes; chosen
 _PACKED = 100  # times smaller than in memory: stamps, which increase, do not pack so tightly; chosen
@@ -52,15 +57,63 @@ def parquet_shape(file: Path) -> tuple[int, pl.Schema]:
     return rows, schema
 
 
-def read_parquet(file: Path) -> pl.DataFrame:
-    """A whole Parquet file. DataError as for parquet_shape; a column holds lists, or a text that is no name."""
-    for column, kind in parquet_shape(file)[1].items():
+def scan_table(file: Path) -> tuple[int, pl.LazyFrame]:
+    """Number of rows of a Parquet file, and its columns, unread.
+
+    DataError as for parquet_shape; a column holds lists, or a text that is no name.
+    """
+    rows, types = parquet_shape(file)
+    for column, kind in types.items():
         if kind.is_nested():
             raise DataError(f"{file}: column {column!r} holds {kind}, expected names or numbers")
     with readable(file):
-        frame = pl.read_parquet(file, glob=False)
-    for longest in frame.select(pl.col(pl.String).str.len_chars().max()).iter_columns():
+        frame = pl.scan_parquet(file, glob=False)
+        lengths = frame.select(pl.col(pl.String).str.len_chars().max()).collect()
+    for longest in lengths.iter_columns():
         if (longest[0] or 0) > _LONGEST_CELL:
             text = f"a text of {longest[0]:,} characters"
             raise DataError(f"{file}: column {longest.name!r} has {text}, expected names or numbers")
-    return frame
+    return rows, frame
+
+
+def read_parquet(file: Path) -> pl.DataFrame:
+    """A whole Parquet file. DataError as for scan_table."""
+    _, frame = scan_table(file)
+    with readable(file):
+        return frame.collect()
+
+
+def seconds(place: int, kind: pl.DataType) -> pl.Expr:
+    """A column by its index; one of dates or durations in seconds."""
+    column = pl.nth(place)
+    if kind == pl.Date:
+        column = column.cast(pl.Datetime("ns"))
+    if kind in (pl.Date, pl.Datetime):
+        return column.dt.epoch("ns") / 1e9
+    return column.dt.total_nanoseconds() / 1e9 if kind == pl.Duration else column
+
+
+def sink_frames(
+    frames: Iterable[pl.DataFrame], types: Mapping[str, pl.DataType], table_format: TableFormat, rows: int, file: Path
+) -> None:
+    """Write frames one after another to a table's file, of which ``rows`` rows are in memory at a time.
+
+    types: of the columns, by name. DataError as the frames raise. OSError: the disk refuses.
+    """
+
+    def formatted(*_: Any) -> Iterator[pl.DataFrame]:
+        for frame in frames:
+            for part in frame.iter_slices(rows):
+                yield quoted_formulas(part) if table_format == "csv" else part
+
+    table = register_io_source(formatted, schema=types)
+    try:
+        with file.open("wb") as opened:  # polars would open it at any time, even after a break has removed it
+            if table_format == "csv":
+                table.sink_csv(opened, maintain_order=True)
+            else:
+                table.sink_parquet(opened, row_group_size=rows, maintain_order=True)
+    except pl.exceptions.PolarsError as error:
+        if number := re.search(r"\(os error (\d+)\)", str(error)):
+            raise OSError(int(number[1]), os.strerror(int(number[1]))) from None
+        raise OSError(errno.EIO, str(error)) from None

@@ -9,11 +9,12 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Protocol, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, FiniteFloat, model_validator
 
 from omnibench.config import NonNegative, Positive, read_yaml, validate
@@ -23,7 +24,7 @@ from omnibench.data.scans import Ranges, Scanner
 from omnibench.data.splits import Names
 from omnibench.errors import ConfigError, nearest
 from omnibench.registry import Options
-from omnibench.robot.kinematics import Array, Robot, fastest_rates
+from omnibench.robot.kinematics import Array, Robot
 from omnibench.words import plural
 
 PositionUnit = Literal["m", "cm", "mm", "inch"]
@@ -84,6 +85,13 @@ class WheelReadings:
     read_at: Array | None = None
     others: Mapping[str, Array] = field(default_factory=dict)
 
+    def at_the_rows(self, values: Array, columns: slice) -> Array:
+        """Values (F, n) of some columns at the times of the readings, where they were read at times of their own."""
+        if self.read_at is None:
+            return values
+        read = zip(self.read_at[:, columns].T, values.T, strict=True)
+        return np.column_stack([np.interp(self.times, *pair) for pair in read])
+
 
 @dataclass(frozen=True, eq=False)
 class PoseReadings:
@@ -97,6 +105,11 @@ class PoseReadings:
     covariances: Array | None = None
     radians: bool = False
     doubtful: str = ""
+
+    def only(self, chosen: NDArray[Any]) -> PoseReadings:
+        """Some of the poses, by their indices, or by True (K,)."""
+        covariances = None if self.covariances is None else self.covariances[chosen]
+        return replace(self, times=self.times[chosen], poses=self.poses[chosen], covariances=covariances)
 
 
 @dataclass(frozen=True)
@@ -254,39 +267,25 @@ class RunsOptions(Options):
     source: str = Field("", description="origin of the recording")
     licence: str = Field("", description="licence of the recording")
 
-    @model_validator(mode="before")
-    @classmethod
-    def _robot_is_corrected(cls, content: Any) -> Any:
-        """The robot with the values of ``wheels`` and ``mount`` in the place of its own."""
-        if not isinstance(content, dict) or not (content.get("wheels") or content.get("mount")):
-            return content
-        if content.get("robot") is None:
-            content = {**content, "robot": getattr(cls.model_fields["robot"], "default", None)}
-        robot = _load_robot(content["robot"])
-        return {**content, "robot": corrected_robot(robot, content.get("wheels") or {}, content.get("mount"))}
+    @model_validator(mode="after")
+    def _robot_is_corrected(self) -> RunsOptions:
+        if self.wheels or self.mount:
+            self.__dict__["robot"] = corrected_robot(self.robot, self.wheels, self.mount)
+        return self
 
 
-def corrected_robot(
-    robot: Robot | Mapping[str, Any], wheels: Mapping[str, Mapping[str, Any]], mount: Mapping[str, float] | None
-) -> Robot:
+def corrected_robot(robot: Robot, wheels: Mapping[str, Mapping[str, Any]], mount: Mapping[str, float] | None) -> Robot:
     """A robot with other values of some wheels, by their names, and another tracked point. ConfigError: it is none."""
-    written = robot.model_dump(mode="json", by_alias=True) if isinstance(robot, Robot) else dict(robot)
-    names = [wheel["name"] for wheel in written["wheels"]]
-    for name in wheels:
-        if name not in names:
-            raise ConfigError(f"wheels: no wheel {name!r}; {nearest(str(name), names)}known: {', '.join(names)}")
-    written["wheels"] = [_corrected(wheel, wheels.get(wheel["name"]) or {}) for wheel in written["wheels"]]
-    return validate(
-        Robot, written | ({"mount": dict(mount)} if mount else {}), "the robot with the values of wheels and mount"
-    )
-
-
-def _corrected(wheel: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """A wheel as in a file with other values; an angle in degrees takes the place of one in rad, and the other way."""
-    gone = {key.removesuffix("_deg") for key in values} | {f"{key}_deg" for key in values}
-    if {"x", "y"} & values.keys():
-        gone.add("distance")
-    return {key: value for key, value in wheel.items() if key not in gone} | dict(values)
+    written = robot.model_dump(mode="json", by_alias=True) | ({"mount": dict(mount)} if mount else {})
+    by_name = {wheel["name"]: wheel for wheel in written["wheels"]}
+    for name, values in wheels.items():
+        if name not in by_name:
+            raise ConfigError(f"wheels: no wheel {name!r}; {nearest(str(name), by_name)}known: {', '.join(by_name)}")
+        # An angle in degrees takes the place of one in rad, and the other way; x and y that of a distance.
+        gone = {key.removesuffix("_deg") for key in values} | {f"{key}_deg" for key in values}
+        gone |= {"distance"} if {"x", "y"} & values.keys() else set()
+        by_name[name] = {key: value for key, value in by_name[name].items() if key not in gone} | dict(values)
+    return validate(Robot, written | {"wheels": [*by_name.values()]}, "the robot with the values of wheels and mount")
 
 
 class RecordingOptions(RunsOptions):
@@ -403,25 +402,9 @@ class ReferenceOptions(RecordingOptions):
         return np.broadcast_to(factors * np.array(self.wheel_signs or 1), len(self.robot.wheel_names))
 
     @property
-    def steering_as_read(self) -> bool:
-        """True if no option says how steering angles are to be read."""
-        return not any(name.startswith("steering_") for name in self.model_fields_set - {"steering_columns"})
-
-    @property
-    def fastest_rates(self) -> Array:
-        """Rates (N,), rad/s, that no wheel exceeds."""
-        radii = self.robot.radii
-        return fastest_rates(radii) if self.fastest is None else np.full(len(radii), self.fastest)
-
-    @property
     def still(self) -> float:
         """Largest angle, rad, by which a resting wheel moves within ``least_rest`` s."""
         return self.rest_rate * self.least_rest
-
-    @property
-    def cuts(self) -> bool:
-        """True if runs are cut at anything but what every recording is cut at."""
-        return self.longest_gap is not None or self.jumps != "keep" or self.start_at_rest or self.cutting != "none"
 
     @property
     def cutting(self) -> str:

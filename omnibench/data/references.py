@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Mapping
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
@@ -21,6 +21,7 @@ from omnibench.views import Brief
 ReferenceKind = Literal["distance", "turn", "displacement", "position", "heading"]
 KINDS: tuple[ReferenceKind, ...] = get_args(ReferenceKind)
 PLANAR: frozenset[str] = frozenset({"displacement", "position"})  # kinds of two numbers, x and y
+TURN = 2 * np.pi  # rad
 AT_ONE_TIME: frozenset[str] = frozenset({"position", "heading"})  # kinds of an instant, t1, where t0 is not given
 UNITS: Mapping[str, Literal["m", "rad"]] = MappingProxyType(
     {kind: "rad" if kind in ("turn", "heading") else "m" for kind in KINDS}
@@ -77,23 +78,17 @@ class References(Brief):
         given = list(references)
         for each in given:
             require_type(each, Reference, "Reference(kind, value, sigma)")
-        t1 = np.array([end if each.t1 is None else each.t1 for each in given], dtype=float)
-        t0 = np.array(
-            [
-                each.t0 if each.t0 is not None else until if each.kind in AT_ONE_TIME else 0.0
-                for each, until in zip(given, t1, strict=True)
-            ],
-            dtype=float,
-        )
         kinds = np.array([each.kind for each in given], dtype=str)
-        # One number stands for both, and the second of kinds of one number is NaN.
-        values, sigmas = (
-            np.array([np.resize(pair, 2) for pair in pairs], dtype=float).reshape(-1, 2)
-            for pairs in ([each.value for each in given], [each.sigma for each in given])
-        )
-        measured = cls(kinds, t0, t1, values, sigmas, start_known, rate_sigma)
+        # As of a run to come: -inf is its start, inf its end, and in the place of t0 the same time as t1.
+        starts = [np.inf if each.kind in AT_ONE_TIME else -np.inf for each in given]
+        t0 = [start if each.t0 is None else each.t0 for each, start in zip(given, starts, strict=True)]
+        t1 = [np.inf if each.t1 is None else each.t1 for each in given]
+        pairs = [(np.resize(each.value, 2), np.resize(each.sigma, 2)) for each in given]  # one number stands for both
+        values, sigmas = np.array(pairs, dtype=float).reshape(-1, 2, 2).swapaxes(0, 1)
+        times = np.array([t0, t1], dtype=float)
+        measured = cls(kinds, times[0], times[1], values, sigmas, start_known, rate_sigma)
         values[~measured.planar, 1] = sigmas[~measured.planar, 1] = np.nan
-        return measured.by_time()
+        return measured.of_run(0.0, end).by_time()
 
     def __len__(self) -> int:
         return len(self.kinds)
@@ -159,15 +154,14 @@ def references_of(kinds: NDArray[np.str_], numbers: Mapping[str, Array], *, star
     t1 = np.where(np.isnan(numbers["t1"]), np.inf, numbers["t1"])
     t0 = np.where(np.isnan(numbers["t0"]), np.where(instant, t1, -np.inf), numbers["t0"])
     values = np.column_stack([np.where(planar, numbers["value_x"], numbers["value"]), numbers["value_y"]])
-    both = np.column_stack([numbers["sigma"], numbers["sigma"]])
     sigmas = np.column_stack([numbers["sigma_x"], numbers["sigma_y"]])
-    sigmas = np.where(np.isnan(sigmas) | ~planar[:, None], both, sigmas)
+    sigmas = np.where(np.isnan(sigmas) | ~planar[:, None], numbers["sigma"][:, None], sigmas)
     values[~planar, 1] = sigmas[~planar, 1] = np.nan
     rates = np.append(np.nan_to_num(numbers["sigma_rate"]), 0.0)
     return References(kinds, t0, t1, values, sigmas, start_known, float(rates[np.abs(rates).argmax()]))
 
 
-_LATE = 0.5  # s after the last wheel sample: a later reference is not of this run
+LATE = 0.5  # s after the last wheel sample: a later reference is not of this run
 
 
 def reference_flaw(references: References, end: float | None) -> Flaw | None:
@@ -175,55 +169,49 @@ def reference_flaw(references: References, end: float | None) -> Flaw | None:
 
     end: of its wheel samples, s; None: whatever the times of the references are.
     """
-    for row, kind in enumerate(references.kinds.tolist()):
-        if kind not in KINDS:
-            return row, f"kind is {kind!r}; {nearest(kind, KINDS)}it must be one of {', '.join(KINDS)}"
-        t0, t1 = float(references.t0[row]), float(references.t1[row])
-        what = "" if end is None else _times_flaw(kind, t0, t1, end)
-        if what := what or _numbers_flaw(kind, references.values[row], references.sigmas[row]):
+    columns = (references.kinds, references.t0, references.t1, references.values, references.sigmas)
+    for row, (kind, t0, t1, values, sigmas) in enumerate(zip(*(column.tolist() for column in columns), strict=True)):
+        if what := _flaw_of_row(kind, t0, t1, values, sigmas, end):
             return row, what
-    if np.isfinite(references.rate_sigma) and 0 <= references.rate_sigma <= LARGEST:
+    if 0 <= references.rate_sigma <= LARGEST:
         return None
     return 0, f"sigma_rate is {references.rate_sigma:g}; the standard deviation of a gyro's offset is >= 0, rad/s"
 
 
-def _times_flaw(kind: str, t0: float, t1: float, end: float) -> str:
-    """What is wrong with the times of a reference to a run of ``end`` s; empty if nothing is."""
-    for name, value in (("t0", t0), ("t1", t1)):
-        if not np.isfinite(value):
-            return f"{name} is {value}; remove or repair the row"
-        if value < 0:
-            return f"{name} is {value:g}; it must not be negative (s since the run's start)"
-    if t1 > end + _LATE:
-        return f"t1 is {t1:g}, after the run's last wheel sample at {end:g} s; check the clocks, or leave the row out"
-    if kind == "position" and t0 != t1:
-        return f"t0 is {t0:g} and t1 {t1:g}; a position is that at t1, leave t0 empty"
-    if kind == "heading" and t0 not in (0.0, t1):
-        return f"t0 is {t0:g}; leave it empty for a heading in a fixed frame, or take kind turn for one since t0"
-    if kind not in AT_ONE_TIME and t0 >= t1:
-        return f"t0 is {t0:g} and t1 {t1:g}; a {kind} needs t0 < t1"
-    return ""
-
-
-def _numbers_flaw(kind: str, values: Array, sigmas: Array) -> str:
-    """What is wrong with the values and standard deviations (2,) of a reference; empty if nothing is."""
+def _flaw_of_row(
+    kind: str, t0: float, t1: float, values: Sequence[float], sigmas: Sequence[float], end: float | None
+) -> str:
+    """What is wrong with a reference, its values and standard deviations (2,); empty if nothing is."""
+    if kind not in KINDS:
+        return f"kind is {kind!r}; {nearest(kind, KINDS)}it must be one of {', '.join(KINDS)}"
+    if end is not None:
+        for name, value in (("t0", t0), ("t1", t1)):
+            if not np.isfinite(value):
+                return f"{name} is {value}; remove or repair the row"
+            if value < 0:
+                return f"{name} is {value:g}; it must not be negative (s since the run's start)"
+        if t1 > end + LATE:
+            late = f"t1 is {t1:g}, after the run's last wheel sample at {end:g} s"
+            return f"{late}; check the clocks, or leave the row out"
+        if kind == "position" and t0 != t1:
+            return f"t0 is {t0:g} and t1 {t1:g}; a position is that at t1, leave t0 empty"
+        if kind == "heading" and t0 not in (0.0, t1):
+            return f"t0 is {t0:g}; leave it empty for a heading in a fixed frame, or take kind turn for one since t0"
+        if kind not in AT_ONE_TIME and t0 >= t1:
+            return f"t0 is {t0:g} and t1 {t1:g}; a {kind} needs t0 < t1"
     axes = ("_x", "_y") if kind in PLANAR else ("",)
-    for axis, name in enumerate(axes):
-        value, sigma = f"value{name}", f"sigma{name}"
-        if np.isnan(values[axis]):
-            return f"{value} is missing; a {kind} needs {' and '.join(f'value{name}' for name in axes)}"
-        if np.isnan(sigmas[axis]):
-            return f"{sigma} is missing: how exactly the {kind} is known, a standard deviation"
-        if not np.isfinite(values[axis]) or abs(values[axis]) > LARGEST:
-            return f"{value} is {values[axis]:g}, which no robot can reach; check the units"
-        if not 0 < sigmas[axis] <= LARGEST:
-            return f"{sigma} is {sigmas[axis]:g}; a standard deviation is > 0 (how exactly the {kind} is known)"
+    for axis, value, sigma in zip(axes, values, sigmas, strict=False):
+        if np.isnan(value):
+            return f"value{axis} is missing; a {kind} needs {' and '.join(f'value{name}' for name in axes)}"
+        if np.isnan(sigma):
+            return f"sigma{axis} is missing: how exactly the {kind} is known, a standard deviation"
+        if not abs(value) <= LARGEST:
+            return f"value{axis} is {value:g}, which no robot can reach; check the units"
+        if not 0 < sigma <= LARGEST:
+            return f"sigma{axis} is {sigma:g}; a standard deviation is > 0 (how exactly the {kind} is known)"
     if kind == "distance" and values[0] < 0:
         return f"value is {values[0]:g}; a distance driven is not negative, backwards or not"
     return ""
-
-
-TURN = 2 * np.pi  # rad
 
 
 def with_whole_turns(robot: Robot, log: WheelLog, references: References) -> References:
@@ -236,13 +224,20 @@ def with_whole_turns(robot: Robot, log: WheelLog, references: References) -> Ref
     counted = (references.kinds == "heading") & ~absolute
     for chosen, known, first in ((absolute, references.start_known, log.start[2]), (counted, True, 0.0)):
         if chosen.any():
-            stamps, headings = references.t1[chosen], values[chosen, 0]
-            # Angles (S,) that the design robot has turned by at the stamps, rad.
-            wanted = WheelLog(log.times, log.rates, np.zeros(3), stamps, steering=log.steering, drive=log.drive)
+            wanted = WheelLog(
+                log.times, log.rates, np.zeros(3), references.t1[chosen], steering=log.steering, drive=log.drive
+            )
             (poses,) = OdometryModel.of_design(robot, "arc").poses([wanted])
-            driven: Array = poses[:, 2]
-            before = (first, 0.0) if known else (headings[0], driven[0])
-            steps = np.diff(headings, prepend=before[0])
-            turns = np.round((np.diff(driven, prepend=before[1]) - steps) / TURN)
-            values[chosen, 0] = headings + TURN * np.cumsum(turns)
+            headings, driven = values[chosen, 0], poses[:, 2]  # rad, the latter since the start
+            start = (first, 0.0) if known else (headings[0], driven[0])
+            values[chosen, 0] = nearest_turns(np.append(start[0], headings), np.append(start[1], driven))[1:]
     return replace(references, values=values)
+
+
+def nearest_turns(headings: Array, driven: Array) -> Array:
+    """Headings (S,), rad, with the whole turns that bring each step closest to that of an odometry's headings (S,).
+
+    Continuous headings stay as they are to the bit.
+    """
+    turns = np.round((np.diff(driven) - np.diff(headings)) / TURN)
+    return headings + TURN * np.append(0.0, np.cumsum(turns))

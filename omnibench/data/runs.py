@@ -1,33 +1,79 @@
 """Runs of recordings: wheels in SI units and the robot's senses, references by the wheels' clock, cut where asked.
 
-Everything is decided for all recordings together: ranges of counters, the clocks' coefficients, commands and splits.
+Everything is decided for all recordings together: ranges of counters, the clocks' coefficients, commands and splits. A
+recording is cut at gaps, rests, events, windows and jumps of its reference.
 """
 
 from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from omnibench.data.aligned import aligned_recordings
+from omnibench.data.aligned import AlignedRecording, WheelSamples, aligned_recordings
 from omnibench.data.clock_matching import usual_period
-from omnibench.data.cutting import MadeRun, cut_into_runs
 from omnibench.data.dataset import SPLITS, Dataset, Trajectory, make_dataset
-from omnibench.data.recording import Recording, ReferenceOptions, scan_difference
+from omnibench.data.jumps import reference_jumps
+from omnibench.data.recording import (
+    Event,
+    PoseReadings,
+    Recording,
+    ReferenceOptions,
+    WheelReadings,
+    scan_difference,
+)
+from omnibench.data.references import LATE, TURN
 from omnibench.data.scans import Scans
+from omnibench.data.scratch import Scratch, StoredSequence
 from omnibench.data.splits import complete, divided, every_second, remaining
 from omnibench.errors import DataError
-from omnibench.robot.kinematics import Robot
+from omnibench.robot.kinematics import Array, Robot, interpolated
 from omnibench.robot.model import OdometryModel
-from omnibench.words import some
+from omnibench.robot.samples import Samples
+from omnibench.words import plural, some
 
 _NUMBER = re.compile(
     r"(?:run|trial|exp|experiment|test|take|rep|repetition|drive|log|bag|recording|traj|trajectory)?\d*"
 )
+_KEPT = 0.5  # s of rest that are kept before and after a run (chosen)
+# A robot rests while no wheel leaves a range of this angle (chosen, as that of the importer of bags) for this time
+# (chosen; shorter than there, as no run is cut in two by it).
+_LEAST_REST, _STILL = 0.3, 0.025  # s, rad
+_SAME_TIME = 1e-6  # s; unix time in a double has steps of 0.2 us
+_FAR = 100.0  # times; wheels' and poses' times that last so differently are in other units; chosen
+Span = tuple[float, float]
+"""Begin and end, s."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A span of an unbroken part of the samples. moving: how long the robot drives or may drive, s.
+
+    broken: a gap or a jump ended it, or the piece before. None as the span: it never rests.
+    """
+
+    part: slice
+    span: Span | None
+    moving: float
+    command: str | None = None
+    broken: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class MadeRun:
+    """A run, the time of the recording that became its t = 0, s, and the indices of its scans (S,)."""
+
+    trajectory: Trajectory
+    zero: float
+    recording: Recording
+    scans: NDArray[np.intp]
 
 
 def dataset_of(
@@ -37,27 +83,407 @@ def dataset_of(
 
     notes: what was left out, mended or decided is added; the data set's warnings hold it.
     """
-    aligned = aligned_recordings(recordings, options, notes)
-    runs = [run for each in aligned for run in cut_into_runs(each, options, notes, alone=len(aligned) == 1)]
+    scratch = Scratch() if isinstance(recordings, StoredSequence) else None
+    runs, cuts, referenced = list[MadeRun](), list[str](), True
+    for aligned in aligned_recordings(recordings, options, notes):
+        referenced &= aligned.recording.referenced
+        made = cut_into_runs(aligned, options, cuts, alone=len(recordings) == 1)
+        runs += made if scratch is None else [_in_file(run, scratch) for run in made]
+    notes += cuts
     if not runs:
         raise DataError(f"{notes[-1] if notes else recordings[0].place}; nothing is left")
     trajectories = complete([run.trajectory for run in runs])
     trajectories = divided_runs(with_commands(trajectories, options, notes), runs, options, notes)
-    kept = {run.id for run in trajectories}
-    scans = _scans_of([run for run in runs if run.trajectory.id in kept])
-    period = options.sample_period or usual_period([run.times for run in trajectories])
+    scans = _scans_of(runs, {run.id for run in trajectories})
+    period = options.sample_period or usual_period(run.times for run in trajectories)
     dataset = make_dataset(
         options.name, options.robot, period, trajectories,
         description=options.description, source=options.source, licence=options.licence,
         simulated=simulated, scans=scans,
     )  # fmt: skip
-    if all(recording.referenced for recording in recordings):
+    if referenced:
         return replace(dataset, warnings=(*notes, *dataset.warnings))
     # In the place of poses that are yet to be made stands the design's odometry, from (0, 0, 0) on.
     logs = [run.log(run.pose_times) for run in dataset.trajectories]
     poses = OdometryModel.of_design(options.robot, "arc").poses(logs)
     placed = [replace(run, poses=driven) for run, driven in zip(dataset.trajectories, poses, strict=True)]
     return replace(dataset, trajectories=tuple(placed), referenced=False, warnings=tuple(notes))
+
+
+def _in_file(run: MadeRun, scratch: Scratch) -> MadeRun:
+    """The run with its wheel samples in a temporary file, and without the readings that it was made of."""
+    held, recording = run.trajectory.samples, run.recording
+    arrays = {name: None if array is None else scratch.stored(array) for name, array in held.contents().items()}
+    trajectory = replace(run.trajectory, samples=Samples(arrays, (held.count, held.end)))
+    none = WheelReadings(np.empty(0), np.empty((0, 0)), recording.wheels.unit)
+    return replace(run, trajectory=trajectory, recording=replace(recording, wheels=none, poses=None, measured=None))
+
+
+def cut_into_runs(
+    aligned: AlignedRecording, options: ReferenceOptions, notes: list[str], *, alone: bool = True
+) -> list[MadeRun]:
+    """The runs of a recording, cut as the options say; what is left out is added to ``notes``.
+
+    alone: the recording is the only one. DataError: its wheels and poses share no time.
+    """
+    recording, samples = aligned.recording, aligned.samples
+    if (sensors := recording.sensors) is not None:
+        sensors = sensors.without_bias(samples, options.least_rest, options.still, recording.place)
+        aligned = replace(aligned, recording=replace(recording, sensors=sensors))
+    unmoved = recording.poses is not None and np.array_equal(aligned.poses.times, recording.poses.times)
+    cut = options.longest_gap or options.jumps != "keep" or options.start_at_rest or options.cutting != "none"
+    if recording.a_run and unmoved and not cut:
+        return [_as_it_is(aligned)]
+    uncut = [piece for part in samples.stretches() for piece in _pieces(aligned, part, options)]
+    aligned, breaks = _without_lone_jumps(aligned, options, notes)
+    pieces = [piece for each in uncut for piece in _unbroken(each, aligned, breaks, options)]
+    several, runs, left_out = len(pieces) > 1, list[MadeRun](), Counter[str]()
+    bare = f"with fewer than two {'poses' if recording.poses else 'references' if sensors else 'scans'}"
+    for number, piece in enumerate(pieces, 1):
+        if piece.span is None:
+            left_out["that never rest (start_at_rest)"] += 1
+        elif piece.moving < options.least_run and (piece.broken or options.cutting == "rests"):
+            left_out[f"shorter than {options.least_run:g} s (least_run)"] += 1
+        elif (run := _run(aligned, piece, piece.span, whole=not several and not piece.broken)) is None:
+            left_out[bare] += 1
+        else:
+            runs.append(_called(run, samples, piece, number if several else None, len(runs) + 1, alone=alone))
+    if len(pieces) > len(uncut) and runs:
+        notes.append(
+            f"{recording.place}: cut into {plural(len(pieces), 'run')} where wheels or poses are missing or jump"
+        )
+    if left_out:
+        said = ", ".join(f"{count} {reason}" for reason, count in sorted(left_out.items()))
+        notes.append(f"{recording.place}: {left_out.total()} of {plural(len(pieces), 'run')} left out: {said}")
+    if not pieces:
+        what = "nothing of cut_topic was recorded while the wheels were"
+        if options.cutting == "rests":
+            what = f"the wheels rest all the time (less than {options.rest_rate:g} rad/s, rest_rate)"
+        notes.append(f"{recording.place}: {what}")
+    if not runs and {*left_out} == {bare} and not recording.numbered:
+        raise _apart(aligned, options.pose_time_offset)
+    if alone and options.cutting == "rests" and runs and len(uncut) == len(list(samples.stretches())):
+        advice = f"no rest of {options.least_rest:g} s cuts it; --set cut=topic or cut=windows for more runs"
+        notes.append(f"{recording.place}: {advice}")
+    referenced = _with_references(runs, aligned, notes, whole=not several)
+    if runs and not referenced and alone and sensors is None:
+        raise _apart(aligned, options.pose_time_offset)
+    return referenced
+
+
+def _as_it_is(aligned: AlignedRecording) -> MadeRun:
+    """The run of a recording that is one, with its wheels and references as they were read."""
+    recording, samples, measured = aligned.recording, aligned.samples, aligned.measured
+    made = _made(aligned, np.arange(len(samples.ends)), 0.0, aligned.poses)
+    measured = None if measured is None else measured.of_run(0.0, float(samples.ends[-1]))
+    duration, distance = (recording.attributes.numbers.get(name) for name in ("duration", "distance"))
+    run = replace(made.trajectory, references=measured, duration=duration, distance=distance)
+    return replace(made, trajectory=run, scans=np.arange(0 if recording.scans is None else len(recording.scans.times)))
+
+
+def _pieces(aligned: AlignedRecording, part: slice, options: ReferenceOptions) -> list[Piece]:
+    """The pieces of an unbroken stretch: between rests, events or windows, or all of it."""
+    times, angles = aligned.samples.edges(part)
+    span, stamps = (float(times[0]), float(times[-1])), aligned.poses.times
+    if options.cutting == "rests":
+        rests = find_rests(times, angles, options.least_rest, options.still)
+        return between_rests(part, span, rests, stamps)
+    if options.cutting == "topic":
+        return from_events(part, times, angles, aligned.recording.events, stamps, options.still)
+    count = max(1, round((span[1] - span[0]) / options.window)) if options.window else 1
+    edges = np.linspace(*span, count + 1).tolist()
+    command = aligned.recording.attributes.command
+    return [Piece(part, window, window[1] - window[0], command) for window in pairwise(edges)]
+
+
+def find_rests(times: Array, angles: Array, least: float, turned: float) -> list[Span]:
+    """Rests as (begin, end), s: no wheel's angle leaves a range of ``turned`` rad for at least ``least`` s.
+
+    times (F + 1,): s. angles (F + 1, N): rad, at these times. The range is used and not the rate from sample to sample,
+    because one encoder tick within a short sample is a high rate.
+    """
+    # (first, last) indices of the shortest spans of that length from each time on, and up to each time.
+    every, enough = np.arange(len(times)), least * (1 - 1e-9)
+    on = np.column_stack([every, np.searchsorted(times, times + enough)])
+    back = np.column_stack([np.searchsorted(times, times - enough, side="right") - 1, every])
+    spans = np.vstack([on[on[:, 1] < len(times)], back[back[:, 0] >= 0]])
+    if not len(spans):
+        return []
+    # reduceat takes pairs (first, behind the last); every second result is that between two pairs.
+    pairs = (spans + np.array([0, 1])).ravel()
+    padded = np.vstack([angles, angles[-1:]])
+    ranges = np.maximum.reduceat(padded, pairs)[::2] - np.minimum.reduceat(padded, pairs)[::2]
+    quiet = spans[(ranges <= turned).all(axis=1)]
+    balance = np.zeros(len(times) + 1, dtype=int)
+    np.add.at(balance, quiet[:, 0], 1)
+    np.add.at(balance, quiet[:, 1], -1)
+    resting = np.cumsum(balance)[:-1] > 0  # (T,): the sample that begins at each time is at rest
+    steps = np.flatnonzero(np.diff(resting.astype(int), prepend=0, append=0))
+    return [(float(times[begin]), float(times[end])) for begin, end in zip(steps[::2], steps[1::2], strict=True)]
+
+
+def departure(rest: Span, shared: bool, stamps: Array) -> float:
+    """Begin of the run after a rest, s: at a reference pose of the rest, if it has one."""
+    begin, end = rest
+    target = max(end - _KEPT, (begin + end) / 2 if shared else begin)
+    inside = stamps[(stamps >= begin) & (stamps <= end)]
+    if not len(inside):
+        return target
+    return float(inside[min(int(np.searchsorted(inside, target)), len(inside) - 1)])
+
+
+def between_rests(part: slice, span: Span, rests: Sequence[Span], stamps: Array) -> list[Piece]:
+    """The drives between rests, each with a little rest at both ends, from a reference pose to another.
+
+    stamps (K,): stamps of the reference poses, s. Drives on either side of a rest share at most an instant of it.
+    """
+    begin, end = span
+    edges = [*rests]
+    if not rests or rests[0][0] > begin:
+        edges = [(begin, begin), *edges]
+    if not rests or rests[-1][1] < end:
+        edges = [*edges, (end, end)]
+    pieces = []
+    for before, after in pairwise(edges):
+        first = departure(before, before[0] > begin, stamps)
+        # The end at a reference pose of the rest, if it has one: a departure with the time reversed.
+        last = -departure((-after[1], -after[0]), after[1] < end, -stamps[::-1])
+        pieces.append(Piece(part, (first, last), after[0] - before[1]))
+    return pieces
+
+
+def from_events(
+    part: slice, times: Array, angles: Array, events: Sequence[Event], stamps: Array, turned: float
+) -> list[Piece]:
+    """The pieces of a stretch (times and angles as for ``find_rests``) from each event to the next.
+
+    A piece begins at the last reference pose (``stamps``, s) before its event if the wheels stood since then, so that
+    nothing of the drive is lost. It has the command's name only if the stretch holds the command from its begin.
+    """
+    pieces = []
+    for event, following in pairwise([*events, Event(np.inf)]):
+        begin, end = max(event.time, times[0]), min(following.time, times[-1])
+        if end <= begin:
+            continue
+        whole = begin == event.time and (end == following.time or following.time == np.inf)
+        start = max(stamps[(stamps <= begin) & (stamps >= times[0])], default=begin)
+        inside = interpolated(np.array([start, begin]), times, angles)
+        between = angles[(times >= start) & (times <= begin)]
+        if (np.ptp(np.vstack([inside, between]), axis=0) > turned).any():
+            start = begin
+        pieces.append(Piece(part, (float(start), float(end)), float(end - begin), event.command if whole else None))
+    return pieces
+
+
+def _without_lone_jumps(
+    aligned: AlignedRecording, options: ReferenceOptions, notes: list[str]
+) -> tuple[AlignedRecording, Array]:
+    """The recording without lone poses that jump, and the times (B, 2), s, of the poses before and after each break."""
+    samples, poses = aligned.samples, aligned.poses
+    lone, broken = np.zeros((2, len(poses.times)), dtype=bool)  # broken: after each pose
+    if options.jumps != "keep" and aligned.recording.poses is not None:
+        for part in samples.stretches():
+            inside = (poses.times >= samples.begins[part][0]) & (poses.times <= samples.ends[part][-1])
+            if (seen := np.flatnonzero(inside)).size:
+                log = samples.log(options.robot, part, poses.times[seen])
+                (driven,) = OdometryModel.of_design(options.robot, "arc").poses([log])
+                jumps = reference_jumps(options.robot, driven, poses.poses[seen])
+                lone[seen[jumps.lone]] = True
+                broken[seen[jumps.shifts]] = options.jumps == "cut"
+        if lone.any():
+            jump = f"{plural(int(lone.sum()), 'pose')} that jump and return left out (jumps={options.jumps})"
+            notes.append(f"{aligned.recording.place}: {jump}")
+            poses, broken = poses.only(~lone), broken[~lone]
+    between = np.column_stack([poses.times[:-1], poses.times[1:]])
+    gap = np.diff(poses.times) > (options.longest_gap or np.inf)
+    return replace(aligned, poses=poses), between[broken[:-1] | gap]
+
+
+def _unbroken(piece: Piece, aligned: AlignedRecording, breaks: Array, options: ReferenceOptions) -> Iterator[Piece]:
+    """The parts of a piece without gaps and jumps, from rest on if wanted."""
+    assert piece.span is not None  # it is not cut yet
+    begin, end = piece.span
+    spans = []
+    for before, after in breaks.tolist():
+        if begin - _SAME_TIME < before and after < end + _SAME_TIME:
+            spans.append((begin, before))
+            begin = after
+    spans.append((begin, end))
+    broken = len(spans) > 1
+    for span in spans:
+        begun: Span | None = span
+        if options.start_at_rest:  # from the rest before its first drive on, at a pose
+            times, angles = aligned.samples.edges(piece.part)
+            within = (times > span[0] - _SAME_TIME) & (times < span[1] + _SAME_TIME)
+            rests = find_rests(times[within], angles[within], _LEAST_REST, _STILL)
+            rests = [rest for rest in rests if rest[1] < times[within][-1]]
+            begun = (departure(rests[0], False, aligned.poses.times), span[1]) if rests else None
+        moving = min(piece.moving, span[1] - span[0])
+        yield Piece(piece.part, begun, moving, None if broken else piece.command, broken)
+
+
+def _run(aligned: AlignedRecording, piece: Piece, span: Span, *, whole: bool) -> MadeRun | None:
+    """The run of a piece; None if there are no samples, or not two poses.
+
+    A recording that has references of other kinds, and a start pose at most, begins with its wheels.
+    """
+    samples, poses, (begin, end) = aligned.samples, aligned.poses, span
+    within = (samples.begins[piece.part] < end - _SAME_TIME) & (samples.ends[piece.part] > begin + _SAME_TIME)
+    rows = piece.part.start + np.flatnonzero(within)
+    if not len(rows):
+        return None
+    first = float(samples.begins[rows[0]])
+    measured = aligned.measured is not None or aligned.recording.sensors is not None
+    if not len(poses.times) or (len(poses.times) == 1 and measured):
+        start = poses.poses if len(poses.poses) else np.zeros((1, 3))
+        return _made(aligned, rows, first, PoseReadings(np.zeros(1), start))
+    if not whole:
+        # From pose to pose where it was cut: one interpolated within a drive would be wrong by the path's bend.
+        poses = poses.only((poses.times >= begin - _SAME_TIME) & (poses.times <= end + _SAME_TIME))
+    placed = align(first, float(samples.ends[rows[-1]]), poses) if len(poses.times) > 1 else None
+    if placed is None:
+        return None
+    zero, seen = placed
+    return _made(aligned, rows[samples.ends[rows] > zero + _SAME_TIME], zero, seen)
+
+
+def align(begin: float, end: float, poses: PoseReadings) -> tuple[float, PoseReadings] | None:
+    """The time, s, that becomes t = 0, and the poses from then on, the first at t = 0; None: they lie apart.
+
+    begin, end: of the wheel samples, s. All times are by one clock, in any epoch. t = 0 is the first pose after
+    ``begin``, or ``begin`` itself where poses reach back before it: the start pose is then interpolated (heading the
+    shortest way). Poses after the last wheel sample are left out, since no odometry predicts them.
+    """
+    zero, times = float(poses.times[0]), poses.times
+    if zero < begin - _SAME_TIME:
+        zero = begin
+    shown = np.flatnonzero((times > zero + _SAME_TIME) & (times <= end + _SAME_TIME))
+    if not len(shown) or end <= zero + _SAME_TIME:
+        return None
+    first = int(np.searchsorted(times, zero))
+    start = poses.poses[first]
+    if times[first] > zero + _SAME_TIME:
+        before = poses.poses[first - 1]
+        step = start - before
+        step[2] -= TURN * np.round(step[2] / TURN)
+        start = before + (zero - times[first - 1]) / (times[first] - times[first - 1]) * step
+    seen = poses.only(np.append(first, shown))
+    return zero, replace(seen, times=np.append(0.0, times[shown] - zero), poses=np.vstack([start, poses.poses[shown]]))
+
+
+def _made(aligned: AlignedRecording, rows: NDArray[np.intp], zero: float, poses: PoseReadings) -> MadeRun:
+    """A run of some of the samples, from the time ``zero`` of the recording, s, with its poses and its scans."""
+    recording, samples, said = aligned.recording, aligned.samples, aligned.recording.attributes
+    ends, sent = samples.ends[rows] - zero, said.sent
+    if sent is not None:
+        sent = sent - np.array([zero, 0, 0, 0, 0])
+        if zero or len(rows) < len(samples.ends):  # those that hold at some time of the run
+            sent = sent[(sent[:, 0] > -sent[:, 4]) & (sent[:, 0] < ends[-1])]
+    known: dict[str, Any] = {name: getattr(said, name) for name in ("command", "repetition", "session", "started_at")}
+    known |= {name: value for name, value in said.numbers.items() if name not in ("duration", "distance")}
+    for name, values in (("angles", samples.angles), ("steering", samples.steering)):
+        known[name] = None if values is None else values[rows]
+    known |= {name: np.asarray(values)[samples.rows[rows]] for name, values in recording.wheels.others.items()}
+    run = Trajectory(
+        recording.name, said.split or "train", ends, samples.rates[rows], poses.times, poses.poses,
+        duration=float(ends[-1]), pose_covariances=poses.covariances, sent=sent, **known,
+    )  # fmt: skip
+    scans = np.empty(0, dtype=np.intp)
+    if recording.scans is not None:
+        times = recording.scans.times - zero
+        scans = np.flatnonzero((times >= -5e-10) & (times <= ends[-1] + 5e-10))
+    return MadeRun(run, zero, recording, scans)
+
+
+def _called(
+    run: MadeRun, samples: WheelSamples, piece: Piece, number: int | None, count: int, *, alone: bool
+) -> MadeRun:
+    """A run with its name, session, start and command. number: of the piece, if there are several; count: of runs."""
+    recording, trajectory, first = run.recording, run.trajectory, float(samples.begins[0])
+    changes: dict[str, Any] = {}
+    if recording.numbered:
+        stretch = 0
+        if samples.angles is not None:  # which begin anew in each stretch
+            stretch, first = int(samples.stretch[piece.part.start]), float(samples.begins[piece.part.start])
+        name = f"{count:03d}" + (f"-{piece.command}" if piece.command else "")
+        changes = {"id": name if alone else f"{recording.name}/{name}", "command": piece.command}
+        changes |= {"session": f"{recording.name}#{stretch + 1}" if stretch else recording.name, "started_at": 0.0}
+    elif number is None:
+        changes = {"distance": recording.attributes.numbers.get("distance")}
+    else:
+        changes = {"id": f"{recording.name}#{number}", "command": None if piece.broken else trajectory.command}
+        if trajectory.session is None:
+            changes |= {"session": recording.name, "started_at": 0.0}
+    begun = changes.get("started_at", trajectory.started_at)
+    if begun is not None:
+        changes["started_at"] = begun + (run.zero - first)
+    return replace(run, trajectory=replace(trajectory, **changes))
+
+
+def _with_references(
+    runs: Sequence[MadeRun], aligned: AlignedRecording, notes: list[str], *, whole: bool
+) -> list[MadeRun]:
+    """The runs of a recording with those of its references that lie within them; the others are added to ``notes``.
+
+    whole: the recording is one run, of whose start and end a reference without times tells. Runs without poses and
+    references are left out.
+    """
+    measured, sensors, place = aligned.measured, aligned.recording.sensors, aligned.recording.place
+    if measured is None and sensors is None:
+        return list(runs)
+    referenced, count = [], 0
+    for run in runs:
+        trajectory, references = run.trajectory, measured
+        end = float(trajectory.times[-1])
+        if references is not None:
+            period = end / len(trajectory.times)
+            begun, ended = references.t0 >= run.zero - period, references.t1 <= run.zero + end + LATE
+            if whole:
+                begun, ended = begun | np.isneginf(references.t0), ended | np.isposinf(references.t1)
+            known = trajectory.has_poses or (references.start_known and whole)
+            references = references.only(begun & ended).of_run(run.zero, end)
+            instant = references.t0 == references.t1
+            near = np.abs(references.t0) <= period  # a stamp or two beside the first sample's begin is the start
+            t0 = np.where(near & ~instant, 0.0, np.maximum(references.t0, 0.0))
+            t1 = np.maximum(references.t1, t0)
+            references = replace(references, t0=np.where(instant, t1, t0), t1=t1, start_known=known).by_time()
+        elif sensors is not None:
+            references = sensors.of_run(run.zero, end, start_known=trajectory.has_poses)
+        if references or trajectory.has_poses:
+            trajectory = replace(trajectory, references=references or None)
+            poses = trajectory.poses if trajectory.start_known else np.zeros((1, 3))
+            referenced.append(replace(run, trajectory=replace(trajectory, poses=poses)))
+            count += len(references or ())
+    if sensors is not None and len(referenced) < len(runs):
+        notes.append(f"{place}: {plural(len(runs) - len(referenced), 'run')} without references left out")
+    if measured is not None and count < len(measured):
+        notes.append(
+            f"{place}: {len(measured) - count} of {plural(len(measured), 'reference')} left out, outside of the "
+            "wheels' samples or across a cut; if the clocks differ, set pose_time_unit or pose_time_offset"
+        )
+    return referenced
+
+
+def _apart(aligned: AlignedRecording, offset: float) -> DataError:
+    """The error of wheels and poses that share no time. offset: that was added to the poses' times, s."""
+    samples, times, place = aligned.samples, aligned.poses.times, aligned.recording.place
+    if len(times) < 2 and aligned.measured is not None:
+        return DataError(
+            f"{place}: none of its references lies within its wheels' samples, {samples.begins[0]:.10g} to "
+            f"{samples.ends[-1]:.10g} s; times count by the wheels' clock (--set pose_time_unit=ms, pose_time_offset=S)"
+        )
+    for what, count in (("poses", len(times)), ("wheels", len(samples.ends))):
+        if count < 2:
+            return DataError(f"{place}: {what}: has one row; two are needed, or the run is no run")
+    spans = f"poses {times[0]:.10g} to {times[-1]:.10g} s, wheels {samples.begins[0]:.10g} to {samples.ends[-1]:.10g} s"
+    share = (times[-1] - times[0]) / (samples.ends[-1] - samples.begins[0])
+    later = offset + samples.begins[0] - times[0]
+    way = f"of clocks apart that begin together: --set pose_time_offset={later:.10g} --set clocks=match"
+    if share > _FAR:
+        way = "the poses' times look like ms: --set pose_time_unit=ms (or us, ns)"
+    elif share < 1 / _FAR:
+        way = "the wheels' times look like ms: --set wheel_time_unit=ms (or us, ns)"
+    return DataError(f"{place}: no two poses while the wheels were recorded ({spans}); {way}")
 
 
 def with_commands(runs: Sequence[Trajectory], options: ReferenceOptions, notes: list[str]) -> list[Trajectory]:
@@ -113,11 +539,13 @@ def divided_runs(
     motions = {run.id: motion_of(options.robot, run) for run in runs}
     splits = [run.split for run in runs]
     if not any(source[run.id].recording.attributes.split for run in runs):
-        # Commands by sent twists or names that were driven once leave no repetition to validate on.
         counts = Counter(run.command for run in runs)
-        stated = {run.id for run in runs if source[run.id].trajectory.command}
-        alike = [run.command and (counts[run.command] > 1 or run.id in stated) for run in runs]
-        splits = every_second([run.command if by else motions[run.id] for run, by in zip(runs, alike, strict=True)])
+        groups: list[str | None] = []
+        for run in runs:
+            # A command by sent twists or names that was driven once leaves no repetition to validate on.
+            stated = run.command and (counts[run.command] > 1 or source[run.id].trajectory.command)
+            groups.append(run.command if stated else motions[run.id])
+        splits = every_second(groups)
     parted = divided(runs, options.train, options.validation, otherwise=splits)
     train, validation = ({motions[run.id] for run in parted if run.split == side} for side in SPLITS)
     if train and (missing := sorted(validation - train)):
@@ -146,11 +574,11 @@ def motion_of(robot: Robot, run: Trajectory) -> str:
     return ", ".join(words) or "nowhere"
 
 
-def _scans_of(runs: Sequence[MadeRun]) -> Scans | None:
-    """The scans of runs, still in their recordings; None without any. DataError: they are of different scanners."""
+def _scans_of(runs: Sequence[MadeRun], ids: Collection[str]) -> Scans | None:
+    """The scans of some runs, still in their recordings; None without any. DataError: of different scanners."""
     scans, read = [], {}
     for run in runs:
-        if (recorded := run.recording.scans) is not None and len(run.scans):
+        if (recorded := run.recording.scans) is not None and len(run.scans) and run.trajectory.id in ids:
             scans.append(recorded)
             times = np.maximum(recorded.times[run.scans] - run.zero, 0.0)
             read[run.trajectory.id] = times, partial(recorded.read, run.scans)

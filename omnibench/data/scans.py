@@ -11,7 +11,6 @@ lies along the floor, and from the height h it meets the floor after h/(cos a si
 
 from __future__ import annotations
 
-import errno
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -22,14 +21,13 @@ from typing import Any
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
-from polars.io.plugins import register_io_source
 from pydantic import Field, FiniteFloat, model_validator
 
 from omnibench.config import Model, NonNegative, Positive
-from omnibench.data.parquet import check_unchanged, file_state, parquet_shape, readable
+from omnibench.data.parquet import check_unchanged, file_state, parquet_shape, readable, sink_frames
 from omnibench.data.stored import Rows, Table, check_columns, times_flaw
 from omnibench.errors import DataError
-from omnibench.files import TableFormat, check_file, quoted_formulas, unquoted_formulas
+from omnibench.files import TableFormat, check_file, unquoted_formulas
 from omnibench.robot.kinematics import Array
 
 Ranges = NDArray[np.float32]
@@ -203,18 +201,8 @@ class ScansOnDisk(Scans):
             of_run = times[rows]
             if (flaw := times_flaw(of_run, of_run < 0, "it must not be negative")) is not None:
                 raise table.fail(int(rows[flaw[0]]), flaw[1])
-            recorded[ids[index]] = of_run, partial(self._ranges, rows, f"trajectory {ids[index]}", of_run)
+            recorded[ids[index]] = of_run, partial(self._ranges, rows, ids[index], of_run)
         super().__init__(scanner, recorded)
-
-    def _ranges(self, rows: Rows, whose: str, times: Array) -> Ranges:
-        """The ranges (S, R) of some rows, which are read in parts."""
-        check_unchanged(self.file, self._state)
-        ranges, begin = np.empty((len(rows), self.scanner.rays), np.float32), 0
-        while begin < len(rows):
-            end = int(np.searchsorted(rows, rows[begin] + (_MOST_ROWS if self._in_parquet else _ROWS_OF_CSV)))
-            ranges[begin:end] = self._read(rows[begin:end], whose, times[begin:end])
-            begin = end
-        return ranges
 
     def _lazy(self) -> pl.LazyFrame:
         if self._in_parquet:
@@ -222,19 +210,34 @@ class ScansOnDisk(Scans):
         # Cells are read as text, so that one that is no number is reported with its row.
         return pl.scan_csv(self.file, infer_schema=False, glob=False)
 
-    def _read(self, rows: Rows, whose: str, times: Array) -> Ranges:
-        """The checked ranges (n, R) of some rows."""
+    def _ranges(self, rows: Rows, trajectory: str, times: Array) -> Ranges:
+        """The ranges (S, R) of a trajectory's rows, which are read in parts. DataError names the row of a flaw."""
+        check_unchanged(self.file, self._state)
+        ranges = np.empty((len(rows), self.scanner.rays), np.float32)
+        parts = np.flatnonzero(np.diff(rows // (_MOST_ROWS if self._in_parquet else _ROWS_OF_CSV))) + 1
+        for part in np.split(np.arange(len(rows)), parts):
+            ranges[part] = self._read(rows[part])
+        empty = ~self.scanner.valid(ranges).any(axis=1)
+        for row in np.flatnonzero(empty)[:1].tolist():
+            seen = ranges[row][np.isfinite(ranges[row])]
+            in_millimetres = len(seen) > 0 and self.scanner.valid(seen / 1000).mean() > 0.5
+            limits = f"from {self.scanner.range_min:g} to {self.scanner.range_max:g} m"
+            way = "they look like mm, give m" if in_millimetres else "remove the row"
+            what = f"the scan of trajectory {trajectory} at {times[row]:g} s is empty: no range {limits}; {way}"
+            raise DataError(f"{self.file}, row {rows[row] + 1}: {what}")
+        return ranges
 
-        def refuse(faulty: Any, words: str) -> None:
+    def _read(self, rows: Rows) -> Ranges:
+        """The ranges (n, R) of some rows; DataError: they are not as many numbers as the scanner has rays."""
+
+        def refuse(faulty: Any, what: str, values: Any = ()) -> None:
             for index in np.flatnonzero(faulty)[:1].tolist():
-                what = words.format(length=lengths[index], time=times[index])
-                raise DataError(f"{self.file}, row {rows[index] + 1}: {what}")
+                shown = what.format(values[index]) if len(values) else what
+                raise DataError(f"{self.file}, row {rows[index] + 1}: {shown}")
 
-        first, last, scanner = int(rows[0]), int(rows[-1]), self.scanner
+        first, last, rays = int(rows[0]), int(rows[-1]), self.scanner.rays
         with readable(self.file):
-            column = self._lazy().select("ranges").slice(first, last - first + 1).collect()["ranges"]
-        column = column[rows - first] if len(rows) < len(column) else column
-        lengths = np.zeros(len(rows), dtype=int)
+            column = self._lazy().select("ranges").slice(first, last - first + 1).collect()["ranges"][rows - first]
         if isinstance(column.dtype, pl.Array):
             column = column.arr.to_list()
         if column.dtype == pl.String:  # in CSV a cell is text with blanks between the numbers
@@ -245,16 +248,9 @@ class ScansOnDisk(Scans):
         if not isinstance(column.dtype, pl.List) or not column.dtype.inner.is_numeric():
             raise DataError(f"{self.file}: column 'ranges' holds {column.dtype}, expected lists of numbers")
         lengths = column.list.len().fill_null(0).to_numpy()
-        refuse(lengths != scanner.rays, f"the scan has {{length}} ranges, but scanner.rays is {scanner.rays}")
+        refuse(lengths != rays, f"the scan has {{}} ranges, but scanner.rays is {rays}", lengths)
         ranges: Ranges = column.explode().cast(pl.Float32).fill_null(np.nan).to_numpy().reshape(len(rows), -1)
         refuse(np.isnan(ranges).any(axis=1), "a range is missing or NaN; write inf where nothing was seen")
-        empty = ~scanner.valid(ranges).any(axis=1)
-        if empty.any():
-            seen = ranges[empty][0][np.isfinite(ranges[empty][0])]
-            in_millimetres = len(seen) > 0 and scanner.valid(seen / 1000).mean() > 0.5
-            way = "they look like mm, give m" if in_millimetres else "remove the row"
-            limits = f"from {scanner.range_min:g} to {scanner.range_max:g} m"
-            refuse(empty, f"the scan of {whose} at {{time:g}} s is empty: no range {limits}; {way}")
         return ranges
 
 
@@ -267,20 +263,10 @@ def write_scans(scans: Scans, table_format: TableFormat, trajectories: Iterable[
     chosen = [trajectory for trajectory in trajectories if trajectory in recorded]
     as_text = table_format == "csv"
 
-    def frames(*_: Any) -> Iterator[pl.DataFrame]:
-        for trajectory in chosen:
-            yield from _frames(trajectory, scans.of(trajectory), as_text)
-
     ranges = pl.String() if as_text else pl.List(pl.Float32)
-    table = register_io_source(frames, schema={"trajectory": pl.String(), "t": pl.Float64(), "ranges": ranges})
-    try:
-        with file.open("wb") as opened:  # polars would open it at any time, even after a break has removed it
-            if as_text:
-                table.sink_csv(opened, maintain_order=True)
-            else:
-                table.sink_parquet(opened, row_group_size=_ROW_GROUP, maintain_order=True)
-    except pl.exceptions.PolarsError as error:
-        raise OSError(errno.EIO, str(error)) from None
+    types = {"trajectory": pl.String(), "t": pl.Float64(), "ranges": ranges}
+    frames = (frame for trajectory in chosen for frame in _frames(trajectory, scans.of(trajectory), as_text))
+    sink_frames(frames, types, table_format, _ROW_GROUP, file)
 
 
 def _frames(trajectory: str, scans: TrajectoryScans, as_text: bool) -> Iterator[pl.DataFrame]:
@@ -290,5 +276,5 @@ def _frames(trajectory: str, scans: TrajectoryScans, as_text: bool) -> Iterator[
         columns = {"trajectory": [trajectory] * len(times), "t": times, "ranges": ranges}
         frame = pl.DataFrame(columns).with_columns(pl.col("ranges").arr.to_list(), pl.col("t").cast(pl.Float64))
         if as_text:
-            frame = quoted_formulas(frame.with_columns(pl.col("ranges").cast(pl.List(pl.String)).list.join(" ")))
+            frame = frame.with_columns(pl.col("ranges").cast(pl.List(pl.String)).list.join(" "))
         yield frame

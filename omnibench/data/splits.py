@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from fnmatch import fnmatchcase
 from typing import Annotated, Any
@@ -13,7 +13,7 @@ from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory, with_warn
 from omnibench.data.dataset import every_second as every_second
 from omnibench.data.dataset import repetitions as repetitions
 from omnibench.errors import ConfigError, DataError, nearest
-from omnibench.words import plural
+from omnibench.words import plural, some
 
 _OPTIONAL = ("angles", "targets", "pose_covariances")  # fields of a run that all runs of a data set have, or none
 
@@ -36,18 +36,16 @@ def divided(
     *,
     names: Sequence[str] | None = None,
     otherwise: Sequence[Split] | None = None,
-    alike: Sequence[Hashable] | None = None,
 ) -> list[Trajectory]:
     """The runs with their splits and the number of each repetition; runs that belong to no split are left out.
 
     train, validation: patterns as for ``split_by_name``, of ``names`` (default: the runs' ids). Without patterns the
-    splits are ``otherwise``; by default every second run of a command validates. alike: equal for repetitions of one
-    motion (default: the command). ConfigError as for ``split_by_name``.
+    splits are ``otherwise``; by default every second run of a command validates. ConfigError as for ``split_by_name``.
     """
     splits: Sequence[Split | None] = otherwise or every_second([run.command for run in runs])
     if train or validation:
         splits = split_by_name(names or [run.id for run in runs], train, validation, kind)
-    numbers = repetitions(alike or [run.command or run.id for run in runs])
+    numbers = repetitions([run.command or run.id for run in runs])
     return [
         replace(run, split=split, repetition=number if run.command else None)
         for run, split, number in zip(runs, splits, numbers, strict=True)
@@ -73,19 +71,6 @@ def remaining(names: Sequence[str], patterns: Sequence[str], kind: str) -> set[s
     return others
 
 
-def _matching(option: str, names: Sequence[str], patterns: Sequence[str], kind: str, parts: str = "") -> set[str]:
-    """The names that match one of the patterns, by themselves or followed by ``parts``."""
-    matched = set[str]()
-    for pattern in patterns:
-        matching = {name for name in names if fnmatchcase(name, pattern) or fnmatchcase(name, pattern + parts)}
-        if not matching:
-            known = sorted(set(names))
-            shown = ", ".join(known[:12]) + (", ..." if len(known) > 12 else "")
-            raise ConfigError(f"{option}: no {kind} matches {pattern!r}; {nearest(pattern, known)}found: {shown}")
-        matched |= matching
-    return matched
-
-
 def split_by_name(
     names: Sequence[str], train: Sequence[str], validation: Sequence[str], kind: str
 ) -> list[Split | None]:
@@ -94,14 +79,23 @@ def split_by_name(
     When only one side has patterns, everything else goes to the other; with both, names that match neither get None.
     ConfigError: a pattern matches nothing, or a name matches both sides. ``kind`` is what the names are, for messages.
     """
-    trains, validates = (
-        _matching(side, names, patterns, kind) for side, patterns in zip(SPLITS, (train, validation), strict=True)
-    )
-    for name in names:
-        if name in trains & validates:
-            raise ConfigError(f"{kind} {name!r} is in both train and validation; name it once")
+    trains, validates = (_matching("train", names, train, kind), _matching("validation", names, validation, kind))
+    if both := [name for name in names if name in trains & validates]:
+        raise ConfigError(f"{kind} {both[0]!r} is in both train and validation; name it once")
     rest: Split | None = "validation" if not validation else "train" if not train else None
     return ["train" if name in trains else "validation" if name in validates else rest for name in names]
+
+
+def _matching(option: str, names: Sequence[str], patterns: Sequence[str], kind: str, parts: str = "") -> set[str]:
+    """The names that match one of the patterns, by themselves or followed by ``parts``."""
+    matched = set[str]()
+    for pattern in patterns:
+        matching = {name for name in names if fnmatchcase(name, pattern) or fnmatchcase(name, pattern + parts)}
+        if not matching:
+            known = sorted(set(names))
+            raise ConfigError(f"{option}: no {kind} matches {pattern!r}; {nearest(pattern, known)}found: {some(known)}")
+        matched |= matching
+    return matched
 
 
 def training_split(dataset: Dataset) -> tuple[Trajectory, ...]:

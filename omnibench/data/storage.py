@@ -5,8 +5,8 @@ from __future__ import annotations
 import glob
 import os
 import shlex
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -25,7 +25,7 @@ from omnibench.data.dataset import (
     checked,
     runs_of_tables,
 )
-from omnibench.data.parquet import parquet_shape
+from omnibench.data.parquet import parquet_shape, sink_frames
 from omnibench.data.references import AT_ONE_TIME, References
 from omnibench.data.scans import Scanner, ScansOnDisk, write_scans
 from omnibench.data.splits import put_together
@@ -53,10 +53,11 @@ from omnibench.files import (
     write_files,
 )
 from omnibench.progress import expect_reading
-from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.kinematics import Robot
 from omnibench.words import plural, some
 
 FORMAT: Final = "omnibench-dataset/1"
+_ROW_GROUP = 1 << 17  # rows of samples or poses that are written together; chosen
 _TABLES = ("trajectories", "wheels", "poses", "references", "commands", "scans")
 
 
@@ -238,11 +239,12 @@ def save_dataset(
     header = Header(wheels=dataset.robot.wheel_names, scanner=None if scans is None else scans.scanner, **described)
     text = to_yaml(header.model_dump(mode="json", by_alias=True, exclude=None if header.imported else {"imported"}))
     contents: dict[Path, FileContent] = {folder / "dataset.yaml": text.encode()}
-    for name, frame in tables_of(dataset).items():
-        # A column that only some trajectories have is left out of the sample tables, which may have no gaps.
-        allowed = len(frame) - 1 if name in ("trajectories", "references") else 0
-        filled = frame.select(column for column in frame.iter_columns() if column.null_count() <= allowed)
-        contents[folder / f"{name}.{table_format}"] = encode_table(filled, table_format)
+    for name, table in _tables(dataset, whole=True).items():
+        file = folder / f"{name}.{table_format}"
+        if isinstance(table, pl.DataFrame):
+            contents[file] = encode_table(table, table_format)
+        else:
+            contents[file] = partial(sink_frames, table.frames(), table.types, table_format, _ROW_GROUP)
     if scans is not None:
         contents[folder / f"scans.{table_format}"] = partial(write_scans, scans, table_format, ids)
     with results_locked(folder):
@@ -262,16 +264,53 @@ def check_dataset_folder(folder: Path) -> None:
     check_place(folder)
 
 
-def tables_of(dataset: Dataset) -> dict[str, pl.DataFrame]:
-    """The tables of a data set by name: trajectories, wheels, and poses, references and commands, if there are some."""
+@dataclass(frozen=True)
+class _SampleTable:
+    """A table with rows of every run. columns: of the arrays of a run, by their names in Trajectory."""
+
+    runs: Sequence[Trajectory]
+    times: str
+    columns: Mapping[str, list[str]]
+
+    @property
+    def types(self) -> dict[str, pl.DataType]:
+        """The types of the columns, by name."""
+        numbers = ["t", *(column for group in self.columns.values() for column in group)]
+        return {"trajectory": pl.String()} | dict.fromkeys(numbers, pl.Float64())
+
+    def frames(self) -> Iterator[pl.DataFrame]:
+        """The rows of each run; null where it does not have an array."""
+        for run in self.runs:
+            times = getattr(run, self.times)
+            columns: dict[str, Any] = {"trajectory": pl.repeat(run.id, len(times), eager=True), "t": times}
+            for name, group in self.columns.items():
+                values = getattr(run, name)
+                if name == "pose_covariances" and values is not None:
+                    values = values[:, *np.triu_indices(3)]
+                columns |= {column: None if values is None else values[:, i] for i, column in enumerate(group)}
+            yield pl.DataFrame(columns, schema=self.types)
+
+
+def _tables(dataset: Dataset, *, whole: bool) -> dict[str, pl.DataFrame | _SampleTable]:
+    """The tables of a data set by name: trajectories, wheels, and poses, references and commands, if there are some.
+
+    whole: without the columns of samples and poses that only some runs have, as files have no gaps.
+    """
     runs, names = dataset.trajectories, ("command", "repetition", "split", "session", *RUN_NUMBERS)
     rows = [{"trajectory": run.id} | {name: getattr(run, name) for name in names} for run in runs]
-    tables = {
-        "trajectories": pl.DataFrame(rows, infer_schema_length=None),
-        "wheels": pl.concat([_frame_of(run, run.times, wheel_columns(dataset.robot)) for run in runs]),
+    present = all if whole else any
+    groups = {
+        name: columns
+        for name, columns in wheel_columns(dataset.robot).items()
+        if present(run.samples.has(name) for run in runs)
+    }
+    tables: dict[str, pl.DataFrame | _SampleTable] = {
+        "trajectories": _without_empty(pl.DataFrame(rows, infer_schema_length=None)),
+        "wheels": _SampleTable(runs, "times", groups),
     }
     if placed := [run for run in runs if run.start_known]:
-        tables["poses"] = pl.concat([_frame_of(run, run.pose_times, POSES | COVARIANCES) for run in placed])
+        covered = present(run.pose_covariances is not None for run in placed)
+        tables["poses"] = _SampleTable(placed, "pose_times", POSES | (COVARIANCES if covered else {}))
     if measured := [(run.id, run.references) for run in runs if run.references is not None]:
         tables["references"] = reference_frame(measured)
     if sent := [(run.id, *row) for run in runs if run.sent is not None for row in run.sent.tolist()]:
@@ -279,16 +318,15 @@ def tables_of(dataset: Dataset) -> dict[str, pl.DataFrame]:
     return tables
 
 
-def _frame_of(run: Trajectory, times: Array, groups: Mapping[str, list[str]]) -> pl.DataFrame:
-    """A table of arrays of a run, null where it does not have one. groups: the columns of each."""
-    columns: dict[str, Any] = {"trajectory": [run.id] * len(times), "t": times}
-    for name, group in groups.items():
-        values = getattr(run, name)
-        if name == "pose_covariances" and values is not None:
-            values = values[:, *np.triu_indices(3)]
-        for index, column in enumerate(group):
-            columns[column] = [None] * len(times) if values is None else values[:, index]
-    return pl.DataFrame(columns, schema_overrides={name: pl.Float64 for name in columns if name != "trajectory"})
+def tables_of(dataset: Dataset) -> dict[str, pl.DataFrame]:
+    """The tables of a data set by name: trajectories, wheels, and poses, references and commands, if there are some."""
+    tables = _tables(dataset, whole=False).items()
+    return {name: table if isinstance(table, pl.DataFrame) else pl.concat(table.frames()) for name, table in tables}
+
+
+def _without_empty(frame: pl.DataFrame) -> pl.DataFrame:
+    """The columns of a table that have a value."""
+    return frame.select(column for column in frame.iter_columns() if column.null_count() < len(frame))
 
 
 def reference_frame(references: Sequence[tuple[str, References]]) -> pl.DataFrame:
@@ -303,5 +341,4 @@ def reference_frame(references: Sequence[tuple[str, References]]) -> pl.DataFram
             columns[f"{name}_y"] = numbers[:, 1]
         columns["sigma_rate"] = np.where(of_run.gyro & (of_run.rate_sigma > 0), of_run.rate_sigma, np.nan)
         frames.append(pl.DataFrame({"trajectory": [run] * len(of_run)} | columns).fill_nan(None))
-    frame = pl.concat(frames)
-    return frame.select(column for column in frame.iter_columns() if column.null_count() < len(frame))
+    return _without_empty(pl.concat(frames))

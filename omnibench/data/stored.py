@@ -39,6 +39,7 @@ MOST_DRAWN = 3_000_000  # wheel samples by which a recording is judged: 500 runs
 _ROWS = 1_000_000  # rows that are checked at a time, of which the names take 16 MB (chosen)
 _BLOCK_ROWS = 500_000  # rows of a block, of whole runs: 16 MB of four columns (chosen)
 _BLOCKS_HELD = 3  # blocks in memory, those of all files together, beside one that is being read (chosen)
+_POSE = 4  # samples as which a reference pose counts when runs are drawn, by the memory that a fit takes (chosen)
 _FEWEST = 20  # runs that are drawn at least (chosen)
 _OF_EACH = 2  # runs of every command and session that are drawn before others (chosen): a rare one is not missed
 
@@ -431,8 +432,8 @@ def drawn_runs(runs: Sequence[Run], most: int = MOST_DRAWN) -> list[Run]:
 
 def count_drawn(runs: Sequence[Sampled], most: int = MOST_DRAWN) -> int:
     """How many runs ``drawn_runs`` draws."""
-    samples = sum(run.samples.count for run in runs)
-    return min(max(_FEWEST, len(runs) * most // max(samples, 1)), len(runs))
+    rows = sum(max(run.samples.count, _POSE * len(getattr(run, "pose_times", ()))) for run in runs)
+    return min(max(_FEWEST, len(runs) * most // max(rows, 1)), len(runs))
 
 
 def in_memory(run: Run) -> Run:

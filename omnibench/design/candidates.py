@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -45,7 +46,7 @@ from omnibench.simulate.commands import (
 )
 from omnibench.simulate.config import SteeringLimit
 from omnibench.simulate.robot_config import RobotConfig
-from omnibench.simulate.robot_simulator import planned_commands, run_as_designed
+from omnibench.simulate.robot_simulator import run_as_designed
 from omnibench.simulate.source import ComparedData
 from omnibench.words import noun_for, plural
 
@@ -175,6 +176,7 @@ Per = Literal["run", "second", "metre"]
 _SHAPES = Shapes(lines=(0.5, 1.0), radii=(0.1, 0.2, 0.4, 0.8), turns=(45.0, 90.0, 180.0, 360.0), spins=(360.0, 1080.0))
 # deg, m, deg: more is a slip of the pen.
 _MOST = {"steering_limit": 180.0, "position_noise": 10.0, "heading_noise": 90.0}
+_DECIMAL = r"[0-9]+\.?[0-9]*|\.[0-9]+"
 _SET = "robot"  # name of the candidates' set
 _SAMPLE_PERIOD, _POSE_PERIOD = 0.05, 0.25  # s; commands are constant, so that longer samples tell the same
 # White noise of a motion capture or of scan matching, and per sqrt(s) what a floor and slip add: the order of magnitude
@@ -228,11 +230,8 @@ def design_source(
     if "area" in given:
         # The sides, m, of an area like 3x2.5
         text = given["area"]
-        match = re.fullmatch(r"\s*([0-9.]+)\s*[xX×]\s*([0-9.]+)\s*m?\s*", text)
-        try:
-            sides = (float(match[1]), float(match[2])) if match else (0.0, 0.0)
-        except ValueError:
-            sides = (0.0, 0.0)
+        match = re.fullmatch(rf"\s*({_DECIMAL})\s*[xX×]\s*({_DECIMAL})\s*m?\s*", text)
+        sides = (float(match[1]), float(match[2])) if match else (0.0, 0.0)
         if min(sides) <= 0 or not math.isfinite(max(sides)):
             raise ConfigError(f"--area {text}: give two sides in m, like --area 3x2.5")
         given["area"] = sides
@@ -288,37 +287,32 @@ class RobotCommands(Model):
                 f"{source}: no curve that it can drive within {LONGEST:g} s fits an area of {self.area[0]:g} x "
                 f"{self.area[1]:g} m; give a larger --area, or a greater --steering-limit or --max-speed"
             )
-        _, candidates = driven_as_designed(robot, integration, (_SAMPLE_PERIOD, _POSE_PERIOD), {_SET: commands})
         noise = self.noise
         # The limits in words
         words = [f"{self.max_speed:g} m/s", f"{self.max_turn_rate:g} rad/s", f"wheels {self._wheel_rate:.3g} rad/s"]
         if not self.robot.drive.direct:
             words.append(f"steering angles {math.degrees(self._steering_limit):g} deg")
-        return checked_pool(
-            CandidatePool(
-                source=source,
-                name=robot.name or "robot",
-                description="What to drive before anything was recorded.",
-                robot=robot,
-                integration=integration,
-                candidates=candidates,
-                sets={_SET: tuple(range(len(candidates)))},
-                baseline=np.ones(len(candidates), dtype=np.intp),
-                baseline_name=f"all {plural(len(candidates), 'command')} once",
-                noise=noise,
-                noise_source=(
-                    f"assumed: {1000 * noise.pose_position:.3g} mm and {math.degrees(noise.pose_heading):.2g} deg of "
-                    f"each reference pose, {1000 * noise.walk_position:.3g} mm and "
-                    f"{math.degrees(noise.walk_heading):.2g} deg per √s of floor and slip"
-                ),
-                simulated=True,
-                recorded=False,
-                notes=(
-                    f"Commands were made for at most {', '.join(words)}, and a free floor of {self.area[0]:g} x "
-                    f"{self.area[1]:g} m, of which the robot's wheels need {self._half_width:.2g} m about its centre.",
-                    "Left is counter-clockwise as seen from above, backward too. Begin where a run stays on the floor.",
-                ),
-            )
+        return commanded_pool(
+            source,
+            robot.name or "robot",
+            robot,
+            integration,
+            (_SAMPLE_PERIOD, _POSE_PERIOD),
+            {_SET: commands},
+            driven=dict.fromkeys(commands, 1),
+            baseline_name=f"all {plural(len(commands), 'command')} once",
+            noise=noise,
+            noise_source=(
+                f"assumed: {1000 * noise.pose_position:.3g} mm and {math.degrees(noise.pose_heading):.2g} deg of "
+                f"each reference pose, {1000 * noise.walk_position:.3g} mm and "
+                f"{math.degrees(noise.walk_heading):.2g} deg per √s of floor and slip"
+            ),
+            description="What to drive before anything was recorded.",
+            notes=(
+                f"Commands were made for at most {', '.join(words)}, and a free floor of {self.area[0]:g} x "
+                f"{self.area[1]:g} m, of which the robot's wheels need {self._half_width:.2g} m about its centre.",
+                "Left is counter-clockwise as seen from above, backward too. Begin where a run stays on the floor.",
+            ),
         )
 
     @property
@@ -390,10 +384,6 @@ class CandidatePool:
     simulated: bool
     recorded: bool
     notes: tuple[str, ...]
-
-    def runs(self, name: str) -> tuple[Trajectory, ...]:
-        """Runs of the candidates in a set."""
-        return tuple(run for index in self.sets[name] for run in self.candidates[index].runs)
 
 
 def read_candidates(
@@ -476,33 +466,21 @@ def candidates_of_config(config: DesignConfig, source: str = "") -> CandidatePoo
 
     ConfigError: a set leaves part of the matrix undetermined, or has one command; the noise is zero.
     """
-    place = source or f"config {config.name}"
-    periods = (config.sample_period, config.pose_period)
     commands = {name: config.commands(name) for name in config.sets}
-    pool, candidates = driven_as_designed(config.robot, config.integration, periods, commands)
-    sets = {name: tuple(pool[command] for command in of_set) for name, of_set in commands.items()}
-    baseline = np.zeros(len(candidates), dtype=np.intp)
-    baseline[list(sets[config.baseline.set])] = config.baseline.repetitions
-    count = len(sets[config.baseline.set])
-    return checked_pool(
-        CandidatePool(
-            source=place,
-            name=config.name,
-            description=config.description,
-            robot=config.robot,
-            integration=config.integration,
-            candidates=candidates,
-            sets=sets,
-            baseline=baseline,
-            baseline_name=(
-                f"{count} {noun_for(count, 'command')} of {config.baseline.set} x {config.baseline.repetitions}"
-            ),
-            noise=config.noise,
-            noise_source="assumed: as the config says",
-            simulated=True,
-            recorded=False,
-            notes=config.notes,
-        )
+    baseline, count = config.baseline, len(commands[config.baseline.set])
+    return commanded_pool(
+        source or f"config {config.name}",
+        config.name,
+        config.robot,
+        config.integration,
+        (config.sample_period, config.pose_period),
+        commands,
+        driven=dict.fromkeys(commands[baseline.set], baseline.repetitions),
+        baseline_name=f"{count} {noun_for(count, 'command')} of {baseline.set} x {baseline.repetitions}",
+        noise=config.noise,
+        noise_source="assumed: as the config says",
+        description=config.description,
+        notes=config.notes,
     )
 
 
@@ -525,64 +503,82 @@ def _candidates_of_comparison(
         return candidates_of_dataset(source.load(name), chosen, f"{place}: data set {name}")
     # The commands that the training session of a simulated data set drives, with the noise that is simulated
     flower = source.simulate
-    planned = planned_commands(flower, flower.train)
-    periods = (flower.sample_period, flower.pose_period)
-    pool, candidates = driven_as_designed(flower.robot, chosen, periods, {name: [each.timed for each in planned]})
-    baseline = np.zeros(len(candidates), dtype=np.intp)
-    for each in planned:
-        baseline[pool[each.timed]] += each.repetitions
-    often = f" x {baseline[0]}" if len(set(baseline)) == 1 else f", {plural(int(baseline.sum()), 'run')}"
+    driven = Counter[TimedCommand]()
+    for each in flower.planned(flower.train):
+        driven[each.timed] += each.repetitions
+    often = (
+        f" x {driven.total() // len(driven)}"
+        if len(set(driven.values())) == 1
+        else f", {plural(driven.total(), 'run')}"
+    )
     scale = flower.train.noise_scale
-    noise = Noise(**{kind: scale * getattr(flower.noise, kind) for kind in Noise.model_fields})
-    return checked_pool(
-        CandidatePool(
-            source=place,
-            name=name,
-            description="",
-            robot=flower.robot,
-            integration=chosen,
-            candidates=candidates,
-            sets={name: tuple(range(len(candidates)))},
-            baseline=baseline,
-            baseline_name=f"{len(candidates)} {noun_for(len(candidates), 'command')} of {name}{often}",
-            noise=noise,
-            noise_source="assumed: what the config simulates for training",
-            simulated=True,
-            recorded=False,
-            notes=config.notes,
-        )
+    return commanded_pool(
+        place,
+        name,
+        flower.robot,
+        chosen,
+        (flower.sample_period, flower.pose_period),
+        {name: tuple(driven)},
+        driven=driven,
+        baseline_name=f"{len(driven)} {noun_for(len(driven), 'command')} of {name}{often}",
+        noise=Noise(**{kind: scale * getattr(flower.noise, kind) for kind in Noise.model_fields}),
+        noise_source="assumed: what the config simulates for training",
+        notes=config.notes,
     )
 
 
-def driven_as_designed(
+def commanded_pool(
+    source: str,
+    name: str,
     robot: Robot,
     integration: Integration,
     periods: tuple[float, float],
-    sets: Mapping[str, Iterable[TimedCommand]],
-) -> tuple[dict[TimedCommand, int], tuple[CandidateRun, ...]]:
-    """Index of each distinct command, and its run: wheel rates and poses of a robot that is exactly as designed."""
-    commands = list(dict.fromkeys(timed for of_set in sets.values() for timed in of_set))
+    sets: Mapping[str, Sequence[TimedCommand]],
+    *,
+    driven: Mapping[TimedCommand, int],
+    baseline_name: str,
+    noise: Noise,
+    noise_source: str,
+    description: str = "",
+    notes: tuple[str, ...] = (),
+) -> CandidatePool:
+    """The candidates of sets of commands, each with the one run of a robot that is exactly as designed.
+
+    periods: of the wheel samples and of the reference poses, s. driven: how often the baseline drives each command.
+    ConfigError: a set leaves part of the matrix undetermined, or has one command; the noise is zero.
+    """
+    if _noiseless(noise):
+        raise ConfigError(f"{source}: noise: give position and heading some noise; without it, runs cannot be weighed")
+    commands = dict.fromkeys(timed for of_set in sets.values() for timed in of_set)
+    places = {timed: index for index, timed in enumerate(commands)}
     model = OdometryModel.of_design(robot, integration)
-    names = [timed.command.name for timed in commands]
-    candidates = []
-    for timed, name in zip(commands, names, strict=True):
-        title = name if names.count(name) == 1 else f"{name}_t{timed.duration:.4g}"
-        candidates.append(CandidateRun(title, (run_as_designed(model, timed, periods, title),)))
-    return {timed: index for index, timed in enumerate(commands)}, tuple(candidates)
-
-
-def checked_pool(pool: CandidatePool) -> CandidatePool:
-    """The pool. ConfigError: a set leaves part of the matrix undetermined, or has one command; the noise is zero."""
-    if _noiseless(pool.noise):
-        raise ConfigError(
-            f"{pool.source}: noise: give position and heading some noise; without it, runs cannot be weighed"
-        )
-    for name, indices in pool.sets.items():
-        place = f"{pool.source}: {name}"
-        if len(indices) == 1:
-            raise ConfigError(f"{place}: it has one command only; a design needs several to choose from")
-        require_every_motion(pool.robot, pool.runs(name), place, ConfigError)
-    return pool
+    names = Counter(timed.command.name for timed in commands)
+    candidates = {}
+    for timed in commands:
+        title = timed.command.name
+        title = title if names[title] == 1 else f"{title}_t{timed.duration:.4g}"
+        candidates[timed] = CandidateRun(title, (run_as_designed(model, timed, periods, title),))
+    for of_set, listed in sets.items():
+        if len(listed) == 1:
+            raise ConfigError(f"{source}: {of_set}: it has one command only; a design needs several to choose from")
+        runs = [run for timed in listed for run in candidates[timed].runs]
+        require_every_motion(robot, runs, f"{source}: {of_set}", ConfigError)
+    return CandidatePool(
+        source=source,
+        name=name,
+        description=description,
+        robot=robot,
+        integration=integration,
+        candidates=tuple(candidates.values()),
+        sets={of_set: tuple(places[timed] for timed in listed) for of_set, listed in sets.items()},
+        baseline=np.array([driven.get(timed, 0) for timed in commands], dtype=np.intp),
+        baseline_name=baseline_name,
+        noise=noise,
+        noise_source=noise_source,
+        simulated=True,
+        recorded=False,
+        notes=notes,
+    )
 
 
 def _noiseless(noise: Noise) -> bool:

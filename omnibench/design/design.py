@@ -132,6 +132,10 @@ class SetDesign(Model):
     steps: tuple[Step, ...] = Field(description="the best runs found, more and more of them")
     equivalents: tuple[Equivalent, ...]
 
+    def equivalent(self, use: Use) -> Equivalent:
+        """The smallest design for a use that equals the baseline."""
+        return next(equal for equal in self.equivalents if equal.use == use)
+
 
 class Baseline(Model):
     """The experiment that designs are compared with."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from itertools import cycle
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -110,7 +111,7 @@ def choice_in_words(design: Design, of_set: SetDesign) -> str:
 
 def equal_in_words(design: Design, of_set: SetDesign, use: Use) -> str:
     """Number of runs of a set that give as much information as the baseline, in words."""
-    equal = next(equal for equal in of_set.equivalents if equal.use == use)
+    equal = of_set.equivalent(use)
     if equal.least is None:
         return "none: they leave part of the matrix undetermined"
     least = f"{least_in_words(equal.least)} {UNIT_OF_COST[design.per]}"
@@ -121,28 +122,21 @@ def equal_in_words(design: Design, of_set: SetDesign, use: Use) -> str:
 
 def headline(design: Design) -> str:
     """The answer, a sentence for each set."""
-    return " ".join(_verdict(design, of_set) for of_set in design.sets)
-
-
-def _verdict(design: Design, of_set: SetDesign) -> str:
-    equal = next(equal for equal in of_set.equivalents if equal.use == design.use)
-    runs, chosen = plural(of_set.step.effort.runs, "run"), plural(len(of_set.chosen), "command")
-    words = f"{drive(design, of_set)} {runs} of {chosen}; together they give "
-    if of_set.reached:
-        commands = f"{len(of_set.commands)} {noun_for(len(of_set.commands), 'command')}"
-        words += f"as much information per {design.per} as the best design from {commands}, within 1 %"
-    else:
-        words += f"{percent(of_set.step.efficiency)} of the best design's information per {design.per}"
-    if equal.effort is not None:
-        give = "gives" if equal.effort.runs == 1 else "give"
-        runs = count(equal.effort.runs)
-        words += f"; {runs} of the best runs {give} as much as the baseline's {baseline_runs(design)}"
-    return words + "."
-
-
-def drive(design: Design, of_set: SetDesign) -> str:
-    """``Drive``, with the name of the set where there are several."""
-    return f"{of_set.name}: drive" if len(design.sets) > 1 else "Drive"
+    sentences = []
+    for of_set in design.sets:
+        drive = f"{of_set.name}: drive" if len(design.sets) > 1 else "Drive"
+        runs, chosen = plural(of_set.step.effort.runs, "run"), plural(len(of_set.chosen), "command")
+        words = f"{drive} {runs} of {chosen}; together they give "
+        if of_set.reached:
+            commands = f"{len(of_set.commands)} {noun_for(len(of_set.commands), 'command')}"
+            words += f"as much information per {design.per} as the best design from {commands}, within 1 %"
+        else:
+            words += f"{percent(of_set.step.efficiency)} of the best design's information per {design.per}"
+        if (effort := of_set.equivalent(design.use).effort) is not None:
+            give = "gives" if effort.runs == 1 else "give"
+            words += f"; {count(effort.runs)} of the best runs {give} as much as the baseline's {baseline_runs(design)}"
+        sentences.append(f"{words}.")
+    return " ".join(sentences)
 
 
 def least_in_words(least: float) -> str:
@@ -160,13 +154,26 @@ _STRAIGHT = page.LegendItem("straight", "straight", "#5b6772")
 # Left and right turns may run along the same circle: dashes over a line show both.
 _RIGHT = page.LegendItem("right", "turning right", PALETTE[1], "dash")
 _UNUSED = page.LegendItem("unused", "candidates not chosen", "#d4d9df")
+_ASSUMED = page.Badge("ASSUMED NOISE, NO RECORDINGS", "warning")
 _BASELINE = page.LegendItem("", "baseline", QUIET, symbol="diamond")
 # rad: a run that turns by less is drawn as straight; nothing else hangs on it. Before calibration the simulated APR-02
 # seems to turn by 0.1 to 2.7 degrees in six straight runs: five are drawn as straight, three with half of it and six
 # with twice (tests/studies/constants_fit.py).
 _STRAIGHT_BELOW = math.radians(2)
+_Curve = tuple[Callable[[Precision], float], page.Dash]
 _HEIGHT = 380  # px: the paths end within the first 900 of the page
-_ROW_DASHES: tuple[page.Dash, ...] = ("solid", "dash", "dot")
+# What curves show of a step, and how they are drawn.
+_RUNS, _SECONDS = attrgetter("effort.runs"), attrgetter("effort.seconds")
+_RELATIVE: _Curve = (attrgetter("relative"), "solid")
+_ROWS_OF_MATRIX: tuple[_Curve, ...] = (
+    (lambda step: step.row_percent[0], "solid"),
+    (lambda step: step.row_percent[1], "dash"),
+    (lambda step: step.row_percent[2], "dot"),
+)
+_OF_WHEELS: tuple[_Curve, ...] = (
+    (attrgetter("physical.radius_percent"), "solid"),
+    (attrgetter("physical.distance_percent"), "dash"),
+)
 
 
 def path_figures(design: Design) -> page.FigureGrid:
@@ -200,29 +207,17 @@ def precision_figures(design: Design) -> page.FigureGrid:
     figures = [
         page.Figure(
             f"All elements together, as a multiple of the baseline's ({baseline})",
-            _curves(design, _runs, "runs", [(lambda step: step.relative, "solid")], "standard deviation / baseline's"),
+            _curves(design, _RUNS, "runs", [_RELATIVE], "standard deviation / baseline's"),
             "Geometric mean of the standard deviations against the number of runs, on logarithmic scales",
         ),
         page.Figure(
             "All elements together, against the time of driving",
-            _curves(
-                design,
-                lambda step: step.effort.seconds,
-                "time of driving (s)",
-                [(lambda step: step.relative, "solid")],
-                "standard deviation / baseline's",
-            ),
+            _curves(design, _SECONDS, "time of driving (s)", [_RELATIVE], "standard deviation / baseline's"),
             "Geometric mean of the standard deviations against the time of driving, on logarithmic scales",
         ),
         page.Figure(
             "Rows of the matrix: x solid, y dashed, heading dotted",
-            _curves(
-                design,
-                _runs,
-                "runs",
-                [(_of_row(row), dash) for row, dash in enumerate(_ROW_DASHES)],
-                "% of the row's largest element",
-            ),
+            _curves(design, _RUNS, "runs", _ROWS_OF_MATRIX, "% of the row's largest element"),
             "Largest standard deviation of each row's elements against the number of runs, on logarithmic scales",
         ),
     ]
@@ -230,7 +225,7 @@ def precision_figures(design: Design) -> page.FigureGrid:
         figures.append(
             page.Figure(
                 "Wheels: radius solid, distance dashed",
-                _curves(design, _runs, "runs", [(_radius, "solid"), (_distance, "dash")], "% of the design value"),
+                _curves(design, _RUNS, "runs", _OF_WHEELS, "% of the design value"),
                 "Largest standard deviation of the wheels' radii and distances against the number of runs",
             )
         )
@@ -248,7 +243,7 @@ def efficiency_figure(design: Design) -> page.FigureGrid:
     traces = []
     lowest = min(step.efficiency for of_set in design.sets for step in of_set.steps)
     for of_set, item in zip(design.sets, _legend(design), strict=True):
-        traces += _curve(item, of_set, _runs, lambda step: 100 * step.efficiency)
+        traces += _curve(item, of_set, _RUNS, lambda step: 100 * step.efficiency)
     most = max(of_set.steps[-1].effort.runs for of_set in design.sets)
     figure = plot(*traces, x_title="runs", y_title="efficiency (% of the bound)")
     few = min(of_set.steps[0].effort.runs for of_set in design.sets)
@@ -277,7 +272,7 @@ def _curves(
     design: Design,
     across: Callable[[Precision], float],
     x_title: str,
-    upwards: Sequence[tuple[Callable[[Precision], float], page.Dash]],
+    upwards: Sequence[_Curve],
     y_title: str,
 ) -> go.Figure:
     baseline = design.baseline.precision
@@ -296,24 +291,6 @@ def _curves(
     heights = [value(step) for value, _ in upwards for step in shown]
     logarithmic(figure, "y", min(heights), max(heights))
     return figure
-
-
-def _runs(step: Precision) -> float:
-    return step.effort.runs
-
-
-def _of_row(row: int) -> Callable[[Precision], float]:
-    return lambda step: step.row_percent[row]
-
-
-def _radius(step: Precision) -> float:
-    assert step.physical is not None
-    return step.physical.radius_percent
-
-
-def _distance(step: Precision) -> float:
-    assert step.physical is not None
-    return step.physical.distance_percent
 
 
 def _curve(
@@ -569,22 +546,15 @@ def design_document(design: Design) -> page.Document:
                 folded=True,
             ),
         ),
-        badges=_badges(design),
+        badges=page.simulated_badge(design.simulated) if design.recorded else (_ASSUMED,),
     )
-
-
-def _badges(design: Design) -> tuple[page.Badge, ...]:
-    if not design.recorded:
-        return (page.Badge("ASSUMED NOISE, NO RECORDINGS", "warning"),)
-    return page.simulated_badge(design.simulated)
 
 
 def _answer(design: Design) -> page.Section:
     """The section with the answer: what to drive, in words and as a picture of the paths."""
     tiles = []
     for of_set in design.sets:
-        equal = next(equal for equal in of_set.equivalents if equal.use == design.use)
-        effort, name = equal.effort, f"{of_set.name}: " * (len(design.sets) > 1)
+        effort, name = of_set.equivalent(design.use).effort, f"{of_set.name}: " * (len(design.sets) > 1)
         tiles += [
             page.Fact(
                 f"{name}chosen" if name else "Chosen",

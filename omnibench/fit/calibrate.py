@@ -21,7 +21,7 @@ from itertools import count
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize
+import scipy
 
 from omnibench.config import validate
 from omnibench.data.dataset import Dataset, Trajectory
@@ -153,7 +153,9 @@ class SteeringFit:
 
     def _least(self, start: Array, bounds: Array) -> tuple[Array, float]:
         """The vector (n,) of least cost between bounds (n, 2), and that cost."""
-        found = minimize(self._told, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxfun": _MOST})
+        found = scipy.optimize.minimize(
+            self._told, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxfun": _MOST}
+        )
         return found.x, float(found.fun)
 
     def _told(self, vector: Array) -> tuple[float, Array]:

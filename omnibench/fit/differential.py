@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import NotApplicableError
+from omnibench.fit.article_methods import ArticleMethod
 from omnibench.fit.calibrator import Solution
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.robot.kinematics import Array, Mount, Robot, class_of, compose, interpolated, relative, rotated
@@ -24,6 +27,16 @@ _OFF_TURN = 0.5  # rad by which the odometry's whole turn may be off one (chosen
 def has_two_wheels(robot: Robot) -> bool:
     """True for a differential drive with two measured wheels."""
     return class_of(robot) == "differential" and len(robot.measured) == 2
+
+
+class TwoWheelMethod(ArticleMethod):
+    """An article's method for a differential drive with two measured wheels."""
+
+    only_for = TWO_WHEELS
+
+    def applies(self, robot: Robot) -> bool:
+        """True for a differential drive with two measured wheels."""
+        return has_two_wheels(robot)
 
 
 def middle_of_axle(robot: Robot) -> Array:
@@ -144,3 +157,29 @@ def _square(robot: Robot, run: Trajectory, path: Array) -> Square | None:
         return None
     truth = poses_of_axle(robot, run.poses[[0, -1]])
     return Square(float(side), way, relative(truth[0], truth[1]) - odometry[-1])
+
+
+class SquaresMethod(TwoWheelMethod):
+    """A method that finds wheelbase and wheels from the mean errors of squares driven both ways, within one session.
+
+    coordinate: of a square's error that it reads: 0 along the first side, m, 2 the final heading, rad.
+    """
+
+    per_session = True
+    coordinate: ClassVar[int]
+
+    def calibrate(self, problem: CalibrationProblem) -> Solution:
+        """Apply the article's formulas. NotApplicableError: there are no squares, or they were driven one way only."""
+        self.needs_matrix(problem)
+        squares = squares_both_ways(problem)
+        clockwise, counter = self.mean_error(squares.clockwise), self.mean_error(squares.counter)
+        factors = self.factors(clockwise, counter, squares.side, axle_length(problem.robot))
+        return squares.solution(problem.robot, *factors)
+
+    def mean_error(self, squares: Sequence[Square]) -> float:
+        """Mean error of squares that were driven one way."""
+        return float(np.mean([square.error[self.coordinate] for square in squares]))
+
+    @abstractmethod
+    def factors(self, clockwise: float, counter: float, side: float, axle: float) -> tuple[float, float]:
+        """E_b and E_d of the mean errors each way, for squares of a side (m) and the design wheelbase (m)."""

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import lsq_linear
+import scipy
 
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
@@ -216,7 +216,7 @@ def bounded_step(problem: CalibrationProblem, vector: Array, information: Array,
     low, high = ((bound - vector)[free] / unit for bound in (problem.lower, problem.upper))
     if ((inner < low) | (inner > high)).any() and roots.size:
         bounds = (np.minimum(low, 0.0) - _ROOM, np.maximum(high, 0.0) + _ROOM)
-        inner = lsq_linear(roots.T @ information, target, bounds=bounds, tol=1e-12).x
+        inner = scipy.optimize.lsq_linear(roots.T @ information, target, bounds=bounds, tol=1e-12).x
     step[free] = inner * unit
     return step
 

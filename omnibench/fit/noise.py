@@ -17,9 +17,9 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dpbtrf, dtbtrs
-from scipy.optimize import minimize
 
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
@@ -499,7 +499,7 @@ def _most_likely(groups: list[tuple[Array, Array]], near: Array | None) -> tuple
     else:  # the likelihood may have a local maximum for each component that could dominate
         starts = np.log(0.1 + 0.6 * np.eye(3))
     tries = [
-        minimize(
+        scipy.optimize.minimize(
             lambda logarithms: negative_log_likelihood(units * np.exp(logarithms)),
             start,
             method="L-BFGS-B",

@@ -40,9 +40,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
-from scipy.optimize import minimize
 
 from omnibench.data.dataset import Trajectory
 from omnibench.fit.noise import GIVEN, ROUNDING, NoiseEstimate, grouped, roots_of
@@ -180,7 +180,9 @@ class ReferenceFit:
 
         bounds = [(0.0, _MOST if unit > 0 else 0.0) for unit in size]
         tries = [
-            minimize(value, np.where(driven, start, 0.0), method="L-BFGS-B", bounds=bounds, options={"eps": 1e-4})
+            scipy.optimize.minimize(
+                value, np.where(driven, start, 0.0), method="L-BFGS-B", bounds=bounds, options={"eps": 1e-4}
+            )
             for start in _STARTS
         ]
         return replace(self, walk=walk_of(min(tries, key=lambda answer: float(answer.fun)).x))

@@ -44,8 +44,8 @@ from functools import cached_property
 from typing import Any, Literal, Self
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import minimize, minimize_scalar
 from scipy.special import chdtri, stdtrit
 
 from omnibench.data.dataset import Trajectory
@@ -771,7 +771,9 @@ def _along(differences: noises.Differences, now: SeparateNoise, kind: int) -> Se
         products = _products(differences, noise_with(deviation), used) if held is None else held
         return sum(of_group.minus_log_likelihood(deviations_with(deviation)[used]) for of_group in products)
 
-    answer = minimize_scalar(minus_log_likelihood, bounds=(0.0, reach), method="bounded", options={"xatol": 1e-6})
+    answer = scipy.optimize.minimize_scalar(
+        minus_log_likelihood, bounds=(0.0, reach), method="bounded", options={"xatol": 1e-6}
+    )
     deviation = float(answer.x)
     return SeparateNoise.of(differences, noise_with(deviation), deviations_with(deviation))
 
@@ -798,5 +800,7 @@ def _polished(differences: noises.Differences, near: SeparateNoise) -> SeparateN
 
     count = sum(difference.values.size for difference in differences.each)
     bounds = [(-5.0, 5.0)] * len(start)
-    answer = minimize(cost, np.zeros(len(start)), jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-10})
+    answer = scipy.optimize.minimize(
+        cost, np.zeros(len(start)), jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-10}
+    )
     return described(answer.x)

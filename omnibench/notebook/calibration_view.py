@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
@@ -179,27 +180,18 @@ class EvaluationView(View):
         return {"splits": self._splits, **({"references": self._references} if told else {})}
 
     def _splits(self) -> pl.DataFrame:
-        models = {"calibration": self.shown.splits, "design": self.shown.design}
-        return pl.DataFrame(
-            [
-                {"split": split, "model": model, **{name: vars(errors)[name] for name in _FINAL}}
-                for model, splits in models.items()
-                for split, errors in splits.items()
-            ],
-            infer_schema_length=None,
-        )
+        rows = [labels | {name: vars(errors)[name] for name in _FINAL} for labels, errors in self._of_models()]
+        return pl.DataFrame(rows, infer_schema_length=None)
 
     def _references(self) -> pl.DataFrame:
         """Errors at the references, by split, model and kind."""
-        models = {"calibration": self.shown.splits, "design": self.shown.design}
-        return pl.DataFrame(
-            [
-                {"split": split, "model": model, **dict(at)}
-                for model, splits in models.items()
-                for split, errors in splits.items()
-                for at in errors.references
-            ]
-        )
+        return pl.DataFrame([labels | dict(at) for labels, errors in self._of_models() for at in errors.references])
+
+    def _of_models(self) -> Iterator[tuple[dict[str, Any], SplitErrors]]:
+        """The errors on every split with its name and the model's."""
+        for model, splits in (("calibration", self.shown.splits), ("design", self.shown.design)):
+            for split, errors in splits.items():
+                yield {"split": split, "model": model}, errors
 
     def figure(self) -> go.Figure:
         """Mean position errors on every split, before and after."""

@@ -12,7 +12,7 @@ from omnibench.compare.output import result_table
 from omnibench.compare.report.headline import entry_chart
 from omnibench.compare.report.view import views
 from omnibench.compare.result import ComparisonResult
-from omnibench.errors import DataError, UnknownNameError
+from omnibench.errors import DataError, require_choice
 from omnibench.report.figures import drawn
 from omnibench.views import View
 from omnibench.words import plural
@@ -45,8 +45,7 @@ class ComparisonView(View):
         """The cost of every entry with its 95 % interval. dataset: the name of one, if there are several."""
         of_sets = {view.name: view for view in views(self.shown)}
         name = next(iter(of_sets)) if dataset is None else dataset
-        if name not in of_sets:
-            raise UnknownNameError("data set", name, of_sets)
+        require_choice("data set", name, of_sets)
         grid = entry_chart(of_sets[name])
         if grid is None:
             raise DataError(f"{name}: no entry was calibrated, so that there is nothing to draw")

@@ -8,21 +8,43 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, TypeVar
+from functools import wraps
+from typing import Any, TypeVar, cast
 
-import numba
 import numpy as np
 
 F = TypeVar("F", bound=Callable[..., Any])
+
+_WAITING: dict[str, list[Callable[..., Any]]] = {}  # functions that are not compiled yet, by their modules
 
 # h, rad, below which sin(h)/h and its derivative are summed by their series: the first term left out is 1e-17 there.
 _SMALL = 0.03
 
 
 def compiled(function: F) -> F:
-    """Decorator: compile a function of numbers and arrays at its first call, for the types of its arguments."""
-    machine_code: F = numba.njit(cache=True)(function)
-    return machine_code
+    """Decorator: compile a function of numbers and arrays at its first call, for the types of its arguments.
+
+    Numba, which loads slowly, is imported then; it takes the place of all functions of the module, as one may call
+    another. ``recompile`` is that of numba, for constants that were changed.
+    """
+    waiting = _WAITING.setdefault(function.__module__, [])
+    waiting.append(function)
+    names = function.__globals__
+
+    def machine_code() -> Any:
+        import numba
+
+        for python in waiting:
+            names[python.__name__] = numba.njit(cache=True)(python)
+        waiting.clear()
+        return names[function.__name__]
+
+    @wraps(function)
+    def call(*arguments: Any) -> Any:
+        return machine_code()(*arguments)
+
+    call.recompile = lambda: machine_code().recompile()  # type: ignore[attr-defined]
+    return cast(F, call)
 
 
 @compiled

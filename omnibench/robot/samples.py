@@ -37,6 +37,10 @@ class Samples:
         value = self._arrays.get(name)
         return value() if callable(value) else value
 
+    def has(self, name: str) -> bool:
+        """True if there is an array called ``name``."""
+        return self._arrays.get(name) is not None
+
     def contents(self) -> dict[str, Any]:
         """All arrays by their names, which are read where they stand in a file."""
         return {name: self.array(name) for name in sorted(self._arrays)}

@@ -18,7 +18,6 @@ import numpy as np
 
 from omnibench.jobs.job import Backend, gathered
 from omnibench.progress import Reporter
-from omnibench.robot.compiled import path_sums
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Complex, Integration, OdometryBatch, RunSamples, WheelLog, split_by
 
@@ -229,6 +228,8 @@ def _sums(
     count, size = int(edges[-1]), signals.shape[1]
     moved, driven = np.empty((count, 2)), np.empty((count, size))
     rows = np.empty((2, count if slopes else 1, size), dtype=complex)
+    from omnibench.robot.compiled import path_sums  # numba, which only very many samples need
+
     path_sums(
         samples.times, signals, samples.edges, np.concatenate(stamps), edges,
         np.ascontiguousarray(matrix), integration == "arc", slopes, moved, rows[0], rows[1], driven,

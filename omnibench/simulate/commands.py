@@ -350,30 +350,20 @@ class DrivableCommands:
         pivot = (0.0, 0.0) if rolls is None else rolls[1]
         for pace in self.shapes.paces:
             for direction in map(math.radians, default_directions(self.robot)):
-                yield from self._lines(direction, pivot, pace)
-                yield from self._arcs(direction, pivot, pace)
-            yield from self._spins(pivot, pace)
-
-    def _lines(self, direction: float, pivot: tuple[float, float], pace: float) -> Iterator[TimedCommand]:
-        if line := self._drivable(direction, 0.0, pivot, pace):
-            longest = min(max(self.free), LONGEST * line.speed)
-            for share in self.shapes.lines:
-                yield TimedCommand(line, tidy(share * longest) / line.speed)
-
-    def _arcs(self, direction: float, pivot: tuple[float, float], pace: float) -> Iterator[TimedCommand]:
-        for radius in self._radii(direction, pivot):
-            for side in (1.0, -1.0):
-                if arc := self._drivable(direction, side / radius, pivot, pace):
-                    durations = [math.radians(turn) * radius / arc.speed for turn in self.shapes.turns]
-                    yield from self._of_length(arc, durations)
-
-    def _spins(self, pivot: tuple[float, float], pace: float) -> Iterator[TimedCommand]:
-        """Turns on the spot."""
-        for side in (1.0, -1.0):
-            turn_rate = side * pace * self._slower(Command(0.0, 0.0, side, pivot))
-            spin = Command(0.0, 0.0, turn_rate, pivot)
-            if is_within(self.robot, spin, self.steering_limit):
-                yield from self._of_length(spin, [math.radians(turn) / abs(turn_rate) for turn in self.shapes.spins])
+                if line := self._drivable(direction, 0.0, pivot, pace):
+                    longest = min(max(self.free), LONGEST * line.speed)
+                    for share in self.shapes.lines:
+                        yield TimedCommand(line, tidy(share * longest) / line.speed)
+                for radius, side in product(self._radii(direction, pivot), (1.0, -1.0)):
+                    if arc := self._drivable(direction, side / radius, pivot, pace):
+                        durations = [math.radians(turn) * radius / arc.speed for turn in self.shapes.turns]
+                        yield from self._of_length(arc, durations)
+            for side in (1.0, -1.0):  # turns on the spot
+                turn_rate = side * pace * self._slower(Command(0.0, 0.0, side, pivot))
+                spin = Command(0.0, 0.0, turn_rate, pivot)
+                if is_within(self.robot, spin, self.steering_limit):
+                    durations = [math.radians(turn) / abs(turn_rate) for turn in self.shapes.spins]
+                    yield from self._of_length(spin, durations)
 
     def _radii(self, direction: float, pivot: tuple[float, float]) -> list[float]:
         """Radii of arcs, m: shares of the area, and a little more than the smallest that a robot steers."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Annotated, Generic, Literal, Self, TypeVar
 
 from pydantic import AfterValidator, Field, FiniteFloat, model_validator
@@ -14,7 +15,7 @@ from omnibench.errors import UnknownNameError
 from omnibench.robot.calibration import EffectTerm, Noise
 from omnibench.robot.kinematics import PUBLISHED, Robot
 from omnibench.robot.odometry import Integration
-from omnibench.simulate.commands import Command, Commands, MotionGrid, beyond_steering, unsteerable
+from omnibench.simulate.commands import Command, Commands, MotionGrid, TimedCommand, beyond_steering, unsteerable
 from omnibench.words import plural
 
 _MOST_NOISE = 1e4  # rad/s, or a factor; chosen: a hundred thousand turns a minute
@@ -180,6 +181,16 @@ class Experiment(Model, Generic[S]):
         return sessions
 
 
+@dataclass(frozen=True)
+class PlannedCommand:
+    """A command of a session. heading: at the start, rad; None: as for all runs."""
+
+    name: str
+    timed: TimedCommand
+    repetitions: int
+    heading: float | None = None
+
+
 class FlowerConfig(Experiment[Session]):
     """A simulated flower-shaped experiment: constant commands or ramps, wheel rates and reference poses with noise."""
 
@@ -193,15 +204,20 @@ class FlowerConfig(Experiment[Session]):
 
     @model_validator(mode="after")
     def _can_be_driven(self) -> FlowerConfig:
-        shortest = self._shortest()
-        if self.commands.ramp > shortest:
+        planned, chosen = self._all_planned, self.commands
+        shortest = min(each.timed.duration for each in planned) - chosen.ramp
+        if not chosen.listed and shortest < self.sample_period:
+            raise ValueError("runs are shorter than one sample; raise distance or lower sample_period")
+        if chosen.ramp > shortest:
             raise ValueError(
-                f"commands.ramp: {self.commands.ramp:g} s; the shortest run would have to slow down before it has its "
+                f"commands.ramp: {chosen.ramp:g} s; the shortest run would have to slow down before it has its "
                 f"speed, give it less than {shortest:g} s"
             )
-        if self._rows() > _MOST_ROWS:
+        seconds = sum(each.repetitions * each.timed.duration for each in planned)
+        rows = seconds / self.sample_period + seconds / self.pose_period
+        if rows > _MOST_ROWS:
             raise ValueError(
-                f"this is {self._rows():.1g} wheel samples and poses, more than {_MOST_ROWS:.0e}; "
+                f"this is {rows:.1g} wheel samples and poses, more than {_MOST_ROWS:.0e}; "
                 "check the periods, distances, speeds and repetitions"
             )
         if self.runs > _MOST_RUNS:
@@ -211,34 +227,39 @@ class FlowerConfig(Experiment[Session]):
             )
         return self
 
-    def _shortest(self) -> float:
-        """Duration of the shortest run without its ramps, s."""
-        chosen = self.commands
-        if chosen.listed:
-            return min(each.duration for each in chosen.listed) - chosen.ramp
-        shortest = min(session.distance for session in self.sessions.values()) / max(*chosen.speeds, 1e-9)
-        if math.isfinite(shortest) and shortest < self.sample_period:
-            raise ValueError("runs are shorter than one sample; raise distance or lower sample_period")
-        return min(shortest, chosen.turn_duration) if 0.0 in chosen.speeds else shortest
-
     @property
     def runs(self) -> int:
-        """Number of runs of all sessions, at most."""
-        chosen = self.commands
-        if chosen.listed:
-            return sum(each.repetitions for each in chosen.listed) * len(self.sessions)
-        commands = len(chosen.speeds) * len(chosen.directions(self.robot)) * len(chosen.turn_rates)
-        return commands * self.repetitions * len(self.sessions)
+        """Number of runs of all sessions."""
+        return sum(each.repetitions for each in self._all_planned)
 
-    def _rows(self) -> float:
-        """Number of wheel samples and poses of the experiment."""
-        chosen = self.commands
-        if chosen.listed:
-            seconds = len(self.sessions) * sum(each.repetitions * each.duration for each in chosen.listed)
-            return seconds / self.sample_period + seconds / self.pose_period
-        ways = [session.distance for session in self.sessions.values()]
-        driven = [way / speed + chosen.ramp for way in ways for speed in chosen.speeds if speed]
-        turns = (chosen.turn_duration + chosen.ramp) * len(ways) * (0.0 in chosen.speeds)
-        runs = len(chosen.turn_rates) * self.repetitions
-        seconds = runs * (len(chosen.directions(self.robot)) * sum(driven) + turns)
-        return seconds / self.sample_period + seconds / self.pose_period
+    @property
+    def _all_planned(self) -> list[PlannedCommand]:
+        return [each for session in self.sessions.values() for each in self.planned(session)]
+
+    def planned(self, session: Session) -> list[PlannedCommand]:
+        """The commands within the steering limit; ramps lengthen runs of a grid, so that their length in m stays."""
+        chosen, driven = self.commands, self.driven
+        if not chosen.listed:
+            seconds = [session.distance / each.speed if each.speed else chosen.turn_duration for each in driven]
+            return [
+                PlannedCommand(
+                    each.name,
+                    TimedCommand(each, driving + chosen.ramp, chosen.ramp, chosen.variation),
+                    self.repetitions,
+                )
+                for each, driving in zip(driven, seconds, strict=True)
+            ]
+        planned = []
+        lengths: dict[Command, set[float]] = {}
+        for listed in chosen.listed:
+            lengths.setdefault(listed.command(self.robot), set()).add(listed.duration)
+        for listed in chosen.listed:
+            command = listed.command(self.robot)
+            name = command.name if len(lengths[command]) == 1 else f"{command.name}_t{listed.duration:g}"
+            heading = None
+            if listed.heading_deg is not None:
+                name, heading = f"{name}_h{listed.heading_deg:g}", math.radians(listed.heading_deg)
+            if command in driven:
+                timed = TimedCommand(command, listed.duration, chosen.ramp, chosen.variation)
+                planned.append(PlannedCommand(name, timed, listed.repetitions, heading))
+        return planned

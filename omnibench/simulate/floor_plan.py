@@ -26,7 +26,7 @@ from pydantic import Field, FiniteFloat, model_validator
 from shapely.geometry import LineString, MultiLineString, MultiPolygon, Point, Polygon
 
 from omnibench.config import Model
-from omnibench.errors import ConfigError, UnknownNameError
+from omnibench.errors import ConfigError, require_choice
 from omnibench.robot.kinematics import Array
 
 Corners = tuple[tuple[float, float], ...]
@@ -246,8 +246,7 @@ def _drawing(room: RoomPlan, where: str) -> tuple[Drawing, str]:
     if room.plan is None:
         obstacles = {f"obstacles[{index}]": corners for index, corners in enumerate(room.obstacles)}
         return Drawing(room.boundary or (), room.start or (0.0, 0.0, 0.0), obstacles), "drawn in the config"
-    if room.plan not in PLANS:
-        raise UnknownNameError("plan", room.plan, PLANS, where)
+    require_choice("plan", room.plan, PLANS, where)
     ready = PLANS[room.plan]
     return replace(ready, start=room.start or ready.start), room.plan
 

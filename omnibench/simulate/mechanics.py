@@ -32,7 +32,7 @@ theta), positions as complex numbers, a robot is after a time s at
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
@@ -175,20 +175,16 @@ _SIDE = 1e-6  # rad off the exactly reversed direction, in which a caster would 
 
 def steering_truth(name: str, values: Values, ends: Array, durations: Array) -> Array:
     """True steering angles (F, S) at the samples' ends from the measured ones, rad; durations (F,): s."""
-    return _OF_STEERING[name](values, ends, durations)
+    if name == "steering_gain":
+        return ends + values["g"] * ends
+    if name == "steering_offset":
+        return ends + values["c"]
+    return _with_play(values["b"], ends) if name == "steering_play" else _with_lag(values["tau"], ends, durations)
 
 
-def _with_gain(values: Values, ends: Array, durations: Array) -> Array:  # noqa: ARG001
-    return ends + values["g"] * ends
-
-
-def _with_offset(values: Values, ends: Array, durations: Array) -> Array:  # noqa: ARG001
-    return ends + values["c"]
-
-
-def _with_play(values: Values, ends: Array, durations: Array) -> Array:  # noqa: ARG001
+def _with_play(width: float, ends: Array) -> Array:
     """The wheel is pushed by one flank of the gear or by the other; at first it stands in the middle between them."""
-    half, wheel, path = abs(values["b"]), ends[0].copy(), np.empty_like(ends)
+    half, wheel, path = abs(width), ends[0].copy(), np.empty_like(ends)
     for sample, motor in enumerate(ends):
         pushed_left, pushed_right = motor - half > wheel, motor + half < wheel
         wheel = np.where(pushed_left, motor - half, np.where(pushed_right, motor + half, wheel))
@@ -196,9 +192,8 @@ def _with_play(values: Values, ends: Array, durations: Array) -> Array:  # noqa:
     return path
 
 
-def _with_lag(values: Values, ends: Array, durations: Array) -> Array:
+def _with_lag(tau: float, ends: Array, durations: Array) -> Array:
     """A first-order lag, exact for angles that change linearly within samples; below 0 they are reported late."""
-    tau = values["tau"]
     if tau == 0:
         return ends.copy()
     times = np.cumsum(durations)
@@ -249,18 +244,11 @@ def lost_by_light_wheels(
 
 def body_truth(name: str, values: Values, robot: Robot, twists: Array, durations: Array) -> Array:
     """Twists (F, 3) that are added to those of the robot's centre."""
-    return _OF_BODY[name](values, robot, twists, durations)
-
-
-def _about_a_point_ahead(values: Values, robot: Robot, twists: Array, durations: Array) -> Array:  # noqa: ARG001
-    """A robot that turns at w about a point x abs(w) ahead of its centre carries the centre round that point."""
-    ahead = values["x"] * np.abs(twists[:, 2])
-    carried = 1j * twists[:, 2] * (0.0 - ahead)
-    return np.column_stack([carried.real, carried.imag, np.zeros(len(twists))])
-
-
-def _by_a_caster(values: Values, robot: Robot, twists: Array, durations: Array) -> Array:
-    """Friction in the swivel hands a share of the caster's swing on to the robot, Eq. (1)."""
+    if name == "icr_shift":
+        # A robot that turns at w about a point x abs(w) ahead of its centre carries the centre round that point.
+        carried = 1j * twists[:, 2] * (0.0 - values["x"] * np.abs(twists[:, 2]))
+        return np.column_stack([carried.real, carried.imag, np.zeros(len(twists))])
+    # Friction in the swivel hands a share of the caster's swing on to the robot, Eq. (1).
     added, beta = np.zeros(twists.shape), None
     for sample, ((vx, vy, turn), duration) in enumerate(zip(twists.tolist(), durations.tolist(), strict=True)):
         along, aside = vx, vy - robot.reach * turn
@@ -278,18 +266,8 @@ def _by_a_caster(values: Values, robot: Robot, twists: Array, durations: Array) 
     return added
 
 
-_Steered = Callable[[Values, Array, Array], Array]
-_OF_STEERING: Mapping[str, _Steered] = {
-    "steering_gain": _with_gain,
-    "steering_offset": _with_offset,
-    "steering_play": _with_play,
-    "steering_lag": _with_lag,
-}
-_OF_BODY: Mapping[str, Callable[[Values, Robot, Array, Array], Array]] = {
-    "icr_shift": _about_a_point_ahead,
-    "caster_pull": _by_a_caster,
-}
-STEERING, BODY = frozenset(_OF_STEERING), frozenset(_OF_BODY)
+STEERING = frozenset({"steering_gain", "steering_offset", "steering_play", "steering_lag"})
+BODY = frozenset({"icr_shift", "caster_pull"})
 COUPLING, LIGHT_WHEEL = "steering_coupling", "light_wheel"
 MECHANICS = STEERING | BODY | {COUPLING, LIGHT_WHEEL}
 

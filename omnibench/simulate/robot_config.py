@@ -107,17 +107,12 @@ class RobotConfig(Experiment[RobotSession]):
 
     def _angles(self) -> float:
         """Approximate number of true wheel angles that are simulated."""
-        chosen, profile = self.commands, self.profile
-        sessions = self.sessions.values()
-        seconds = 0.0
-        for speed in chosen.speeds:
-            directions = len(chosen.directions(self.robot)) if speed else 1
-            for turn_rate in chosen.turn_rates:
-                ramps = 2 * max(speed / profile.acceleration, abs(turn_rate) / profile.turn_acceleration)
-                if profile.shape == "jerk_limited":
-                    ramps += 4 * max(math.sqrt(speed / profile.jerk), math.sqrt(abs(turn_rate) / profile.turn_jerk))
-                driven = sum(session.distance / speed if speed else chosen.turn_duration for session in sessions)
-                seconds += directions * (driven + len(sessions) * (ramps + self.settle))
-        if not self.robot.drive.direct:  # half a turn of the steering, at most, before each run
-            seconds += len(self.driven) * len(sessions) * 180 / self.steering.rate_deg
+        sessions, seconds = self.sessions.values(), 0.0
+        for command in self.driven:
+            limits = self.profile.limits(command)
+            rest = 2 / limits.slope + 4 / math.sqrt(limits.jerk) + self.settle
+            if not self.robot.drive.direct:  # half a turn of the steering, at most, before each run
+                rest += 180 / self.steering.rate_deg
+            for session in sessions:
+                seconds += rest + (session.distance / command.speed if command.speed else self.commands.turn_duration)
         return seconds * self.repetitions * len(self.robot.wheels) / TRUE_STEP

@@ -43,16 +43,7 @@ def simulate_flower(
 
     ConfigError or DataError in one line: an effect of the truth, or a parameter of one, is not known or is missing.
     """
-    truth = true_record(
-        config.truth,
-        config.robot,
-        config.sample_period,
-        tuple(config.sessions),
-        name,
-        integration=config.integration,
-        noise=config.noise,
-        variation=config.commands.variation,
-    )
+    truth = true_record(config, name)
     robot = truth.true_robot()
     trajectories: list[Trajectory] = []
     for split, session in config.sessions.items():
@@ -80,43 +71,6 @@ def runs_of(
     """Every command, given with its repetitions, with the number of each, in the order in which they are driven."""
     runs = [(command, repetition) for command, count in commands for repetition in range(1, count + 1)]
     return [runs[index] for index in rng.permutation(len(runs))] if order == "shuffled" else runs
-
-
-@dataclass(frozen=True)
-class PlannedCommand:
-    """A command of a session. heading: at the start, rad; None: as for all runs."""
-
-    name: str
-    timed: TimedCommand
-    repetitions: int
-    heading: float | None = None
-
-
-def planned_commands(config: FlowerConfig, session: Session) -> list[PlannedCommand]:
-    """The commands within the steering limit; ramps lengthen the runs of a grid, so that their length in m stays."""
-    chosen, driven = config.commands, config.driven
-    if not chosen.listed:
-        seconds = [session.distance / each.speed if each.speed else chosen.turn_duration for each in driven]
-        return [
-            PlannedCommand(
-                each.name, TimedCommand(each, driving + chosen.ramp, chosen.ramp, chosen.variation), config.repetitions
-            )
-            for each, driving in zip(driven, seconds, strict=True)
-        ]
-    planned = []
-    lengths: dict[Command, set[float]] = {}
-    for listed in chosen.listed:
-        lengths.setdefault(listed.command(config.robot), set()).add(listed.duration)
-    for listed in chosen.listed:
-        command = listed.command(config.robot)
-        name = command.name if len(lengths[command]) == 1 else f"{command.name}_t{listed.duration:g}"
-        heading = None
-        if listed.heading_deg is not None:
-            name, heading = f"{name}_h{listed.heading_deg:g}", math.radians(listed.heading_deg)
-        if command in driven:
-            timed = TimedCommand(command, listed.duration, chosen.ramp, chosen.variation)
-            planned.append(PlannedCommand(name, timed, listed.repetitions, heading))
-    return planned
 
 
 def commanded_rates(robot: Robot, command: Command, times: Array, ramp: float, variation: Variation = STEADY) -> Array:
@@ -165,7 +119,7 @@ def _session(config: FlowerConfig, robot: TrueRobot, split: Split, session: Sess
     run's end are those at which the next one begins.
     """
     rng = np.random.default_rng(session.seed)
-    commands = [(each, each.repetitions) for each in planned_commands(config, session)]
+    commands = [(each, each.repetitions) for each in config.planned(session)]
     runs = runs_of(commands, config.order, rng)
     half, started_at = config.start_area / 2, 0.0
     before: Array = np.zeros(len(config.robot.wheel_names))
@@ -183,26 +137,21 @@ def _session(config: FlowerConfig, robot: TrueRobot, split: Split, session: Sess
             steering = steering + config.noise.steering * rng.standard_normal(steering.shape)
         poses = robot.reported(log)
         angles = before + np.cumsum(rates * config.sample_period, axis=0)
-        yield Trajectory(
-            id=f"{split}-{number:03d}",
-            split=split,
-            command=planned.name,
+        run = Trajectory(
+            f"{split}-{number:03d}",
+            split,
+            times,
+            rates,
+            pose_times,
+            poses + session.noise_scale * reference_noise(config.noise, pose_times, rng),
             repetition=repetition,
             session=split,
             started_at=started_at,
-            v=command.speed,
-            alpha=command.direction,
-            omega=command.turn_rate,
-            duration=float(times[-1]),
-            distance=command.speed * (float(times[-1]) - ramp),
-            times=times,
-            rates=rates,
-            pose_times=pose_times,
-            poses=poses + session.noise_scale * reference_noise(config.noise, pose_times, rng),
             angles=angles,
             targets=targets,
             steering=steering,
         )
+        yield _commanded(run, command, command.speed * (float(times[-1]) - ramp), planned.name)
         started_at, before = started_at + (float(times[-1]) + PAUSE), angles[-1]
 
 
@@ -232,16 +181,14 @@ def run_as_designed(model: OdometryModel, timed: TimedCommand, periods: tuple[fl
         drive=None if robot.drive.direct else robot.drive,
     )
     (poses,) = model.poses([still.log(pose_times)])
-    return replace(
-        still,
-        poses=poses,
-        command=name,
-        v=command.speed,
-        alpha=command.direction,
-        omega=command.turn_rate,
-        duration=float(times[-1]),
-        distance=command.speed * (float(times[-1]) - timed.ramp),
-    )
+    return _commanded(replace(still, poses=poses), command, command.speed * (float(times[-1]) - timed.ramp), name)
+
+
+def _commanded(run: Trajectory, command: Command, distance: float, name: str) -> Trajectory:
+    """The run with what was commanded: the command and its name, its length in m, and its duration."""
+    speed, direction, turn_rate = command.speed, command.direction, command.turn_rate
+    duration = float(run.times[-1])
+    return replace(run, command=name, v=speed, alpha=direction, omega=turn_rate, duration=duration, distance=distance)
 
 
 _FOLLOWED = 0.1  # relative difference of wheel angle from target above which a warning is given (chosen)
@@ -269,7 +216,7 @@ def simulate_robot(
             times = np.linspace(0.0, session.distance / command.speed, max(2, math.ceil(session.distance / _STEP)))
             path = DrivenPath(times[-1:], plan.start, times[-1] * twist[None], "arc")
             plan.check_path(_places(path.poses(times), mount), times, config.radius, f"command {command.name}")
-    truth = true_record(config.truth, config.robot, config.sample_period, tuple(sessions), name)
+    truth = true_record(config, name)
     simulator = _RobotSimulator(config, truth.true_robot(TRUE_STEP), plan, commands)
     runs: list[_Recorded] = []
     total = len(sessions) * len(commands) * config.repetitions
@@ -353,26 +300,21 @@ class _RobotSimulator:
                 wheels = self._behind_differential(wheels, steering, angles)
                 angles = wheels.wheel_angles[-1]
             run = Trajectory(
-                id=f"{split}-{number:03d}",
-                split=split,
-                command=command.name,
+                f"{split}-{number:03d}",
+                split,
+                motion.times,
+                wheels.rates,
+                np.zeros(1),
+                np.zeros((1, 3)),
                 repetition=repetition,
                 session=split,
                 started_at=started_at,
-                v=command.speed,
-                alpha=command.direction,
-                omega=command.turn_rate,
-                duration=float(motion.times[-1]),
-                distance=session.distance if command.speed else 0.0,
-                times=motion.times,
-                rates=wheels.rates,
-                pose_times=np.zeros(1),
-                poses=np.zeros((1, 3)),
                 angles=wheels.angles,
                 targets=target,
                 steering=None if direct else config.steering.measured(steering[self._steps :: self._steps], rng),
                 drive=None if direct else config.robot.drive,
             )
+            run = _commanded(run, command, session.distance if command.speed else 0.0, command.name)
             yield self._scanned(run, wheels, steering, motion, rng)
             started_at += float(motion.times[-1]) + PAUSE
 

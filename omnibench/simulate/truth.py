@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from pydantic import Field
@@ -12,7 +13,7 @@ from pydantic import Field
 from omnibench.config import Model
 from omnibench.data.dataset import Dataset
 from omnibench.data.true_poses import TruePath
-from omnibench.errors import UnknownNameError
+from omnibench.errors import require_choice
 from omnibench.registry import effects
 from omnibench.robot import kinematics
 from omnibench.robot.calibration import EffectTerm, Noise, Row, matrix_rows
@@ -23,7 +24,7 @@ from omnibench.robot.odometry import Integration, WheelLog
 from omnibench.robot.signals import of_centre, signals_of
 from omnibench.simulate import mechanics as physics
 from omnibench.simulate.commands import Variation
-from omnibench.simulate.config import EncoderNoise, Truth
+from omnibench.simulate.config import EncoderNoise, Experiment, FlowerConfig, Truth
 from omnibench.simulate.floor_plan import FloorPlan
 from omnibench.views import Brief
 
@@ -182,8 +183,8 @@ class TruthRecord(Model):
     robot: kinematics.Robot
     sample_period: float
     matrix: tuple[Row, Row, Row]
-    integration: Integration
-    noise: EncoderNoise
+    integration: Integration = "arc"
+    noise: EncoderNoise = EncoderNoise()
     effects: tuple[EffectTerm, ...] = ()
     wheels: tuple[kinematics.Wheel, ...] | None = Field(
         None, description="the true wheels, if they were drawn about the design"
@@ -209,37 +210,28 @@ class TruthRecord(Model):
         return TrueRobot(model, contacts)
 
 
-def true_record(
-    truth: Truth,
-    robot: kinematics.Robot,
-    sample_period: float,
-    sessions: tuple[str, ...],
-    dataset: str,
-    *,
-    integration: Integration = "arc",
-    noise: EncoderNoise | None = None,
-    variation: Variation | None = None,
-) -> TruthRecord:
-    """The record of a data set's truth.
+def true_record(config: Experiment[Any], dataset: str) -> TruthRecord:
+    """The record of the truth behind a config's data set.
 
-    sessions: names of those that are driven. UnknownNameError: no such effect, or no such parameter for this robot and
-    these sessions.
+    UnknownNameError: no such effect, or no such parameter for this robot and these sessions.
     """
+    truth, robot = config.truth, config.robot
     drawn = _drawn(truth, robot)
-    return TruthRecord(
+    record = TruthRecord(
         dataset=dataset,
         robot=robot,
-        sample_period=sample_period,
+        sample_period=config.sample_period,
         matrix=matrix_rows(true_matrix(truth, robot)),
-        integration=integration,
-        noise=noise or EncoderNoise(),
-        effects=tuple(_complete(term, robot, sessions, _place(dataset)) for term in truth.effects),
+        effects=tuple(_complete(term, robot, tuple(config.sessions), _place(dataset)) for term in truth.effects),
         wheels=drawn and drawn.wheels,
         steering_offsets={} if drawn is None else drawn.steering_offsets,
         mount=robot.mount if drawn is None else drawn.mount,
         lateral_friction=truth.lateral_friction,
-        variation=variation or Variation(),
     )
+    if not isinstance(config, FlowerConfig):
+        return record
+    of_flower = {"integration": config.integration, "noise": config.noise, "variation": config.commands.variation}
+    return record.model_copy(update=of_flower)
 
 
 def true_matrix(truth: Truth, robot: kinematics.Robot) -> kinematics.Array:
@@ -312,10 +304,9 @@ def _complete(term: EffectTerm, robot: kinematics.Robot, sessions: tuple[str, ..
     effect = effects.create(term.name, where=where)
     check_applies(effect, robot, f"{where}: effect {term.name!r}")
     parameters = effect.parameters(robot, sessions)
-    known = {parameter.name for parameter in parameters}
     for given in term.parameters:
-        if given not in known:
-            raise UnknownNameError("parameter", given, known, f"{where}: effect {term.name!r}")
+        names = {parameter.name for parameter in parameters}
+        require_choice("parameter", given, names, f"{where}: effect {term.name!r}")
     unchanged = {parameter.name: 0.0 for parameter in parameters if not parameter.choices}
     if unchanged.keys().isdisjoint(term.parameters):
         return term  # whoever uses it refuses it for its missing parameters

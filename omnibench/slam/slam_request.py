@@ -21,7 +21,6 @@ from omnibench.jobs.job import ResultStore
 from omnibench.progress import Reporter, no_progress
 from omnibench.robot.calibration import read_calibration
 from omnibench.robot.kinematics import Array, interpolated, moved_to, rotated
-from omnibench.robot.model import OdometryModel
 from omnibench.slam.slam_dataset import SlamPath, slam_paths, with_paths
 from omnibench.slam.slam_options import SlamOptions
 
@@ -72,13 +71,14 @@ def slam_accuracy(poses: Dataset, truth: Mapping[str, TruePath]) -> SlamAccuracy
         if len(trajectory.pose_times) < 2:
             raise DataError(f"data set {poses.name}: trajectory {trajectory.id} has no pose after its start")
         runs.append(run_errors(trajectory, truth[trajectory.id]))
+    driven = np.concatenate([run.driven for run in runs])
     return SlamAccuracy(
         runs=len(runs),
         distance_m=sum(float(run.driven[-1]) for run in runs),
         final=_summary([run.of(slice(-1, None)) for run in runs]),
         every=_summary(runs),
-        drift_position=_growth(runs, [run.position for run in runs]),
-        drift_heading=_growth(runs, [run.heading for run in runs]),
+        drift_position=_growth(driven, np.concatenate([run.position for run in runs])),
+        drift_heading=_growth(driven, np.concatenate([run.heading for run in runs])),
     )
 
 
@@ -136,32 +136,28 @@ def _nees(errors: Array, covariances: Array) -> Array:
 
 def _summary(runs: list[RunErrors]) -> ErrorSummary:
     errors = np.concatenate([run.in_robot for run in runs])
-    position, heading = np.hypot(errors[:, 0], errors[:, 1]), np.abs(errors[:, 2])
     nees = np.concatenate([run.nees for run in runs if run.nees is not None] or [np.zeros(0)])
     nees = nees[np.isfinite(nees)]
     forward, left, turned = errors.mean(axis=0).tolist()
-    return ErrorSummary(
-        poses=len(errors),
-        position_mean_m=float(position.mean()),
-        position_p95_m=float(np.quantile(position, 0.95)),
-        position_max_m=float(position.max()),
-        heading_mean_rad=float(heading.mean()),
-        heading_p95_rad=float(np.quantile(heading, 0.95)),
-        heading_max_rad=float(heading.max()),
-        bias_forward_m=forward,
-        bias_left_m=left,
-        bias_heading_rad=turned,
-        nees_mean=float(nees.mean()) if len(nees) else None,
-    )
+    bias = {"bias_forward_m": forward, "bias_left_m": left, "bias_heading_rad": turned}
+    return ErrorSummary(**_spread(errors), **bias, nees_mean=float(nees.mean()) if len(nees) else None)
 
 
-def _growth(runs: list[RunErrors], sizes: list[Array]) -> float:
+def _spread(errors: Array) -> dict[str, float]:
+    """Number of errors (K, 3), and mean, 95 % quantile and maximum of their positions and headings."""
+    sizes = {"position_{}_m": np.hypot(errors[:, 0], errors[:, 1]), "heading_{}_rad": np.abs(errors[:, 2])}
+    spread: dict[str, float] = {"poses": len(errors)}
+    for name, size in sizes.items():
+        spread |= {name.format("mean"): float(size.mean()), name.format("p95"): float(np.quantile(size, 0.95))}
+        spread[name.format("max")] = float(size.max())
+    return spread
+
+
+def _growth(driven: Array, sizes: Array) -> float:
     """Slope k of error^2 = noise^2 + (k distance)^2 by least squares; 0 where errors do not grow."""
-    squares = np.concatenate(sizes) ** 2
-    ways = np.concatenate([run.driven for run in runs]) ** 2
-    ways -= ways.mean()
+    ways = driven**2 - (driven**2).mean()
     spread = float(ways @ ways)
-    return float(np.sqrt(max(0.0, ways @ squares / spread))) if spread > 0 else 0.0
+    return float(np.sqrt(max(0.0, ways @ sizes**2 / spread))) if spread > 0 else 0.0
 
 
 _SAME_TIME = 1e-6  # s: rounding of stamps; poses that are nearer in time are of the same time
@@ -227,30 +223,21 @@ def distances(one: Dataset, other: Dataset) -> Distances | None:
 
     Compared at the stamps of the data set with fewer poses; the other's poses are interpolated by straight lines.
     """
-    differences = [
-        _apart((mine.pose_times, mine.poses), (theirs.pose_times, theirs.poses))
-        for mine, theirs in zip(one.trajectories, other.trajectories, strict=True)
-    ]
-    errors = np.concatenate(differences)
+    pairs = zip(one.trajectories, other.trajectories, strict=True)
+    errors = np.concatenate([_apart(mine, theirs) for mine, theirs in pairs])
     if not len(errors):
         return None
-    position = np.hypot(errors[:, 0], errors[:, 1])
-    heading = np.abs(errors[:, 2])
-    return Distances(
-        poses=len(errors),
-        position_mean_m=float(position.mean()),
-        position_p95_m=float(np.quantile(position, 0.95)),
-        heading_mean_rad=float(heading.mean()),
-        heading_p95_rad=float(np.quantile(heading, 0.95)),
-    )
+    return Distances(**{name: value for name, value in _spread(errors).items() if name in Distances.model_fields})
 
 
-def _apart(one: tuple[Array, Array], other: tuple[Array, Array]) -> Array:
+def _apart(one: Trajectory, other: Trajectory) -> Array:
     """Differences (K, 3) at the common times after the start; only whole turns at the start are taken away."""
-    (times, poses), (dense_times, dense) = sorted((one, other), key=lambda path: len(path[0]))
-    common = (times > _SAME_TIME) & (times >= dense_times[0] - _SAME_TIME) & (times <= dense_times[-1] + _SAME_TIME)
-    turns = np.round((poses[0, 2] - dense[0, 2]) / (2 * np.pi))
-    return poses[common] - interpolated(times[common], dense_times, dense) - [0.0, 0.0, 2 * np.pi * turns]
+    sparse, dense = sorted((one, other), key=lambda run: len(run.pose_times))
+    times, within = sparse.pose_times, dense.pose_times[[0, -1]] + [-_SAME_TIME, _SAME_TIME]
+    common = (times > _SAME_TIME) & (times >= within[0]) & (times <= within[1])
+    turns = np.round((sparse.poses[0, 2] - dense.poses[0, 2]) / (2 * np.pi))
+    there = interpolated(times[common], dense.pose_times, dense.poses)
+    return sparse.poses[common] - there - [0.0, 0.0, 2 * np.pi * turns]
 
 
 _WORKERS = 2  # processes at a time: results do not depend on their number
@@ -294,8 +281,11 @@ class SlamRequest:
         goes on when it is run again. Interrupted: Ctrl-C; the message names that folder, as a note of any error does.
         """
         recorded = load_dataset(self.dataset)
-        truth = self._truth_of(recorded)
-        model = self._model_of(recorded)
+        truth, model = self._truth_of(recorded), None
+        if self.model is not None:
+            calibration = read_calibration(self.model)
+            calibration.check_wheels(recorded.robot, f"the data set {recorded.name}", place=f"--model {self.model}: ")
+            model = calibration.model
         if self.output is not None:
             check_dataset_folder(self.output)
             going_on = any(_paths_beside(self.output).glob("*.json"))  # stopped before the data set was complete
@@ -325,13 +315,6 @@ class SlamRequest:
                     f"--truth {self.truth}: trajectory {trajectory.id} is not in it; name the truth of this data set"
                 )
         return truth
-
-    def _model_of(self, recorded: Dataset) -> OdometryModel | None:
-        if self.model is None:
-            return None
-        calibration = read_calibration(self.model)
-        calibration.check_wheels(recorded.robot, f"the data set {recorded.name}", place=f"--model {self.model}: ")
-        return calibration.model
 
 
 def _paths_beside(output: Path) -> Path:

@@ -16,7 +16,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, Literal, get_args
 
 from omnibench.config import validate
-from omnibench.errors import ConfigError, OmnibenchError, PluginError, UnknownNameError
+from omnibench.errors import ConfigError, OmnibenchError, PluginError, require_choice
 from omnibench.files import refuse_existing, write_text
 from omnibench.jobs.job import Failure, Job, JobWatch, ResultStore, run_jobs
 from omnibench.jobs.job_process import Processes
@@ -64,8 +64,7 @@ def new_plugin(
     force: replace files that exist. ConfigError: ``kind`` is unknown, ``name`` is no identifier in lower case or is
     taken, or a file exists already. DataError: a file cannot be written.
     """
-    if kind not in PLUGIN_KINDS:
-        raise UnknownNameError("kind of plug-in", kind, PLUGIN_KINDS)
+    require_choice("kind of plug-in", kind, PLUGIN_KINDS)
     if not name.isidentifier() or not name.isascii() or keyword.iskeyword(name) or name != name.lower():
         raise ConfigError(f"{name!r} cannot name a plug-in; use lower-case letters, digits and _, as in my_search")
     if name.startswith(("_", "test_", "conftest")):

@@ -254,19 +254,6 @@ def test_a_data_set_has_the_name_of_its_folder_unless_another_is_given(command: 
     assert (load_dataset("data/day1").name, load_dataset("day2").name) == ("day1", "lab")
 
 
-@pytest.mark.slow
-def test_a_new_plugin_is_checked_and_compared(command: Command, tmp_path: Path) -> None:
-    new = command("plugin", "new", "my_search")
-    assert new.stdout.splitlines() == ["written: plugins/my_search.py", "written: plugins/test_my_search.py"]
-    check = command("plugin", "check", "plugins/my_search.py")
-    assert check.returncode == 0, check.stdout
-    assert " passed" in check.stdout.splitlines()[-1]
-    assert "failed" not in check.stdout
-    config = write_config(tmp_path / "c", calibrators=["closed_form", "my_search"])
-    compared = succeeded(command("compare", config, "--plugins", "plugins", "--output", tmp_path / "out"))
-    assert "flower my_search seed 1: budget, cost 0.0" in compared.stderr
-
-
 def test_a_plugin_that_breaks_the_contract_fails_its_check_with_exit_code_1(command: Command, tmp_path: Path) -> None:
     text = "@calibrators.register('outside')\nclass Outside(Calibrator):\n    'Outside.'\n"
     text += "    def calibrate(self, problem):\n        return Solution(problem.upper + 1, 'x')\n"

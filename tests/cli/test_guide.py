@@ -12,6 +12,7 @@ import polars as pl
 import pytest
 import yaml
 from commands import CONFIGS, ROOT, Command, Prepared, assert_refused, run_here, succeeded
+from markdown_it import MarkdownIt
 from newcomer import ELSEWHERE, lines_of, typed_here
 from newcomer import PAGES as TYPED_PAGES
 from pydantic import TypeAdapter
@@ -66,6 +67,19 @@ def test_a_topic_is_plain_markdown_when_piped_and_its_code_fits_a_narrow_termina
     assert printed.stdout.startswith("# ")
     assert ".md" not in printed.stdout  # links to topics are commands there
     assert [line for block in blocks(BY_NAME[name].file) for line in block.splitlines() if len(line) > 76] == []
+
+
+@pytest.mark.parametrize("name", BY_NAME)
+def test_a_topic_has_no_words_that_markdown_takes_for_html(name: str) -> None:
+    tokens = [token for block in MarkdownIt().parse(BY_NAME[name].text) for token in (block, *(block.children or ()))]
+    assert [token.content for token in tokens if token.type.startswith("html")] == []
+
+
+def test_a_link_to_a_topic_keeps_its_words_beside_the_command(command: Command) -> None:
+    assert (
+        "what was measured without motion capture → `omnibench guide references`"
+        in command("guide", "importing").stdout
+    )
 
 
 def test_a_topic_is_set_for_reading_on_a_terminal(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -120,12 +120,6 @@ def test_a_file_too_large_for_the_disk_is_not_there(arguments: str, command: Com
     assert [file for file in Path().rglob("*") if file.is_file()] == []
 
 
-def test_a_calibration_that_cannot_be_written_in_the_end_is_one_line(command: Command, prepared: Prepared) -> None:
-    too_long = "x" * 245 + ".yaml"  # with what is added while it is written
-    run = command("calibrate", prepared.data, "-o", too_long)
-    assert_refused(run, f"{too_long}: cannot be written: File name too long")
-
-
 @pytest.mark.parametrize("name", ["robot", "data set", "session"])
 def test_a_very_long_name_is_one_short_line(name: str, command: Command, prepared: Prepared, tmp_path: Path) -> None:
     long, data, file = "x" * 100_000, tmp_path / "data", tmp_path / "calibration.yaml"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -33,6 +34,24 @@ def packages(statements: str) -> set[str]:
 def test_the_help_imports_typer_and_nothing_else() -> None:
     shown = "sys.argv = ['omnibench', '--help']; from omnibench.__main__ import main; main()"
     assert packages(shown) - packages("import typer, rich") == {"omnibench"}
+
+
+def test_loading_the_plug_ins_imports_neither_discover_nor_numba_nor_the_optimisers() -> None:
+    plugins = Path(__file__).parents[2] / "plugins"
+    loaded = python(
+        "import sys; from omnibench.registry import load_plugins; load_plugins(sys.argv[1])\nprint(*sys.modules)",
+        plugins,
+    ).stdout.split()
+    assert "omnibench.fit.calibrators.closed_form" in loaded
+    assert {"numba", "scipy.optimize", "scipy.stats", "omnibench.discover.discover"}.isdisjoint(loaded)
+
+
+def test_a_plugin_that_prints_does_not_spoil_what_check_prints(tmp_path: Path) -> None:
+    (tmp_path / "chatty.py").write_text("print('hello')\n")
+    program = "import sys; sys.argv = ['omnibench', 'check', 'nowhere', '--plugin', sys.argv[1]]\n"
+    shown = python(program + "from omnibench.__main__ import main; main()", tmp_path / "chatty.py")
+    assert (shown.returncode, shown.stdout) == (2, "")
+    assert shown.stderr.startswith("hello\n")
 
 
 # Stands for a library that is still being imported when Ctrl-C comes, and turns it into an error of its own.

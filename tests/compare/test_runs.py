@@ -208,7 +208,6 @@ def test_a_result_comes_back_to_the_last_bit(
     with tempfile.TemporaryDirectory() as folder:
         ResultStore(Path(folder), RunResult).put("key", put)
         got = ResultStore(Path(folder), RunResult).get("key")
-    assert got is not None
     for name in ("outcome", "reason", "cost", "evaluations", "seconds", "history", "at_bounds", "held"):
         assert getattr(got, name) == getattr(put, name)
     for name in ("vector", "matrix"):
@@ -230,7 +229,6 @@ def test_results_are_read_whether_they_hold_one_number_of_degrees_of_freedom_sev
         fields["degrees_of_freedom"] = json.loads(freedom)
     store.file("key").write_text(json.dumps(fields))
     result = store.get("key")
-    assert result is not None
     assert (None if result.degrees_of_freedom is None else result.degrees_of_freedom.tolist()) == stored
 
 
@@ -348,7 +346,6 @@ def started(folder: Path, ended: int = 1, **changes: Any) -> subprocess.Popen[st
         text=True,
         start_new_session=True,
     )
-    assert process.stderr is not None
     assert process.stderr.readline() == "comparing: 4 runs\n"
     if ended:
         assert next(line for line in process.stderr if line.startswith(f"[{ended}/4] flower "))
@@ -778,9 +775,7 @@ class TestFits:
         alone, *others = (
             calibrate(flower, intervals=True, backend=backend).intervals for backend in (None, Processes(2), dask)
         )
-        assert alone is not None
         for each in others:
-            assert each is not None
             np.testing.assert_array_equal(each.low, alone.low)
             np.testing.assert_array_equal(each.high, alone.high)
 

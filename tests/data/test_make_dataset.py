@@ -20,6 +20,7 @@ from wheeled_samples import DIFF, TRICYCLE, driven
 import omnibench
 from omnibench.config import validate
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
+from omnibench.data.recording import ReferenceOptions
 from omnibench.data.splits import divided, division_in_words
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import ConfigError, DataError, OmnibenchError
@@ -130,6 +131,11 @@ def test_a_flaw_is_refused_with_its_table_row_and_column(given: dict[str, Any], 
     tables: dict[str, Any] = {"wheels": wheels(), "poses": poses()} | given
     with refused(DataError, match=message):
         omnibench.make_dataset("day1", DIFF, **tables)
+
+
+def test_values_of_wheels_without_their_robot_are_refused_as_it_is_missing() -> None:
+    with pytest.raises(ConfigError, match="options: key 'robot' is missing"):
+        validate(ReferenceOptions, {"wheels": {"left": {"y": 0.12}}}, "options")
 
 
 def test_a_table_in_the_place_of_runs_is_named() -> None:

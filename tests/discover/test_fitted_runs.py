@@ -341,7 +341,6 @@ def test_motors_are_drawn_less_what_their_effects_explain() -> None:
     found = lagging()
     assert [effect.name for effect in found.effects] == ["motor_lag"]
     drawn = motor_grid(found, Residuals(found).runs)
-    assert drawn is not None
     before, after = (
         np.array([value for value in trace.y if value is not None], dtype=float)
         for trace in drawn.figures[-1].plot.data
@@ -514,15 +513,6 @@ def test_what_chance_makes_of_one_family_does_not_hide_another() -> None:
     assert both.groups == (*calm.groups, *rough.groups)
 
 
-def test_the_scale_of_the_tail_is_right_in_the_mean() -> None:
-    rng = np.random.default_rng(3)
-    drawn = np.sort(rng.exponential(size=(2000, 499)), axis=1)
-    told = np.array(
-        [-np.log(by_chance(edge + 20.0, chance).p_value(0) * 499 / 49) for chance in drawn if (edge := chance[-49])]
-    )
-    assert np.mean(20.0 / told) == pytest.approx(1.0, abs=0.01)  # the scale of these exponentials; its error is 0.003
-
-
 def test_evidence_is_of_the_difference_without_the_run_that_adds_most_and_corrected_for_its_tries() -> None:
     given = screening({}, {"heading": FIRST, "place": SECOND}, [0, 6, 0, 0, 0])
     groups = [given.groups.bases[0], Group("covariate", "patch", (1,), tries=5)]
@@ -555,9 +545,7 @@ CHANCE = 0.002
 
 
 def found_in(fit: Fit) -> Significance:
-    found = fine_structure(fit, np.random.default_rng(0))
-    assert found is not None
-    return found
+    return fine_structure(fit, np.random.default_rng(0))
 
 
 def found_beside(kind: str, seed: int) -> Significance:
@@ -577,7 +565,6 @@ def found_beside(kind: str, seed: int) -> Significance:
 def test_what_happens_within_a_turn_a_run_or_a_session_is_seen_over_it(kind: str, covariate: str, term: str) -> None:
     found = found_beside(kind, 1031)
     basis = found.groups[found.best].basis
-    assert basis is not None
     assert (basis.covariate, basis.term) == (covariate, term)
     assert found.p_value(found.best) < CHANCE
 
@@ -588,7 +575,6 @@ def test_joints_that_knock_the_robot_round_are_seen_in_the_direction_in_which_th
     joints = [index for index, group in enumerate(found.groups) if group.basis and group.basis.term == "smooth_joint"]
     best = max(joints, key=lambda index: found.evidence[index])
     basis = found.groups[best].basis
-    assert basis is not None
     assert found.p_value(best) < CHANCE
     assert np.degrees(basis.shapes["normal"]) == pytest.approx(84.7, abs=4)
     assert "turn the robot" in basis.detail
@@ -598,7 +584,6 @@ def test_joints_that_knock_the_robot_round_are_seen_in_the_direction_in_which_th
 def test_a_belt_is_seen_at_the_number_of_times_that_it_turns_with_its_wheel() -> None:
     found = found_beside("belt", 1030)  # which turns half as often
     basis = found.groups[found.best].basis
-    assert basis is not None
     assert basis.term == "smooth_wheel_angle"
     assert basis.shapes["harmonic"] == pytest.approx(0.5, abs=0.01)
     assert found.p_value(found.best) < CHANCE
@@ -650,9 +635,7 @@ def proposed(folder: Path) -> FlowerConfig:
     """The config of the experiment that is proposed for the look-alikes."""
     (experiment,) = look_alike().experiments
     (folder / "experiment.yaml").write_text(experiment.config)
-    source = read_simulation(folder / "experiment.yaml").config
-    assert isinstance(source, FlowerConfig)
-    return source
+    return read_simulation(folder / "experiment.yaml").config
 
 
 def test_a_proposal_says_what_to_drive_how_long_and_what_it_tells() -> None:
@@ -715,8 +698,6 @@ def test_steering_is_turned_within_a_run_where_its_play_is_in_doubt() -> None:
     steady, weaving = (
         candidate_runs(fit, [effects.create(name)])[0].run.steering for name in ("heading_drift", "steering_play")
     )
-    assert steady is not None
-    assert weaving is not None
     assert np.ptp(steady) == 0 < np.ptp(weaving)
 
 
@@ -774,17 +755,6 @@ def odds(information: Array, scores: Array, noise: Array) -> float:
     tempered = 1 + DISCREPANCY**2 * (explained(scores).max() - 1)
     right, wrong = log_evidence(explained(scores + math.sqrt(tempered) * noise) / tempered, np.ones(2), 0.0)
     return float(right - wrong)
-
-
-def test_runs_in_which_effects_differ_raise_the_chance_and_others_do_not() -> None:
-    apart = separation()
-    nothing, alike, different = (
-        float(apart.prospect(information).chance(BOTH))
-        for information in (np.zeros((3, 3)), 50 * run_that_shows(0), 50 * run_that_shows(1))
-    )
-    assert nothing < 0.01
-    assert alike < 0.05
-    assert different > 0.95
 
 
 def test_the_fewest_seconds_that_suffice_are_driven() -> None:

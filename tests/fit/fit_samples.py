@@ -8,14 +8,16 @@ from typing import Any, Literal
 
 import numpy as np
 
-from omnibench.data.dataset import Trajectory
+from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.fit.calibrator import Calibrator, Solution
+from omnibench.fit.cost import Cost
 from omnibench.fit.geometry import GeometryLimits
 from omnibench.fit.loss import LossName, with_loss
 from omnibench.fit.parameterisation import Box, ExplicitBox, ParameterisationName
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
 from omnibench.progress import Reporter, no_progress
 from omnibench.registry import Options, costs
+from omnibench.robot.calibration import Calibration, matrix_rows
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import Integration
 from omnibench.testing.synthetic import synthetic_robot, synthetic_trajectories
@@ -88,3 +90,23 @@ class Scripted(Calibrator):
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         answer: Solution = self._script(problem)
         return answer
+
+
+class Worst(Cost):
+    """The largest pose error, a cost that is no sum of norms."""
+
+    name = "worst"
+
+    def combine(self, errors: Array, trajectory: Any) -> Array:  # noqa: ARG002
+        return np.asarray(np.linalg.norm(errors, axis=-1).max(axis=-1))
+
+
+def design_of(dataset: Dataset, integration: Integration = "euler") -> Calibration:
+    """The design values of a data set's robot, as a calibration."""
+    return Calibration(
+        name="design",
+        robot=dataset.robot,
+        sample_period=dataset.sample_period,
+        matrix=matrix_rows(dataset.robot.inverse_kinematic_matrix),
+        integration=integration,
+    )

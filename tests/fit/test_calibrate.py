@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,13 +13,12 @@ import pytest
 import yaml
 from commands import Command, refused
 from corelli import corelli_dataset, half
-from fit_samples import noisy_trajectories
+from fit_samples import Worst, design_of, noisy_trajectories
 from hidden.session_sets import session_set
 from lanes import slow
 from motions import FLOWER, RING, TURNS, driven
-from numpy.typing import NDArray
 from real_recordings import mean_errors
-from rich.console import Console
+from report_page import on_terminal
 from sample_robots import APR_02, CAR, DIFFERENTIAL, MECANUM, SKID, TRICYCLE, WHEELED
 from shrink_coverage import ANSWERS, covered
 from wheeled_recordings import PERIOD, path, recorded
@@ -33,7 +31,6 @@ from omnibench.errors import ConfigError, DataError, UnknownNameError
 from omnibench.fit.calibrate import CalibrationRun, SteeringFit, calibrate
 from omnibench.fit.calibrator import Outcome, calibration_of_fit
 from omnibench.fit.certify import certify_optimum
-from omnibench.fit.cost import Cost
 from omnibench.fit.evaluate import evaluate
 from omnibench.fit.geometry import GeometryLimits, WheelGeometry
 from omnibench.fit.prior import TOLERANCES, default_mount, default_unidentified, prior_root, tolerance_of
@@ -42,7 +39,7 @@ from omnibench.fit.sessions import SessionComparison, compare_sessions
 from omnibench.fit.settings import CompleteSettings
 from omnibench.progress import Progress
 from omnibench.registry import costs
-from omnibench.robot.calibration import Calibration, matrix_rows, read_calibration, write_calibration
+from omnibench.robot.calibration import read_calibration, write_calibration
 from omnibench.robot.kinematics import Array, Mount, Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.testing.synthetic import synthetic_robot
@@ -224,25 +221,20 @@ def test_an_empty_training_split_is_refused() -> None:
         calibrate(make_dataset("held out", ROBOT, 0.2, held_out))
 
 
-def printed(run: CalibrationRun) -> str:
-    """What ``calibrate`` prints of a run."""
-    stream = io.StringIO()
-    print_calibration(Console(file=stream, width=160), run)
-    return stream.getvalue()
-
-
 def test_intervals_that_hold_only_if_kept_values_are_right_are_marked_on_their_row() -> None:
-    told = printed(calibrate(straight()))
+    told = on_terminal(print_calibration, calibrate(straight()), width=160)
     row = next(line for line in told.splitlines() if line.startswith("  95 %"))
     assert row.count("*") == 3
     assert "* only if the design values are right along a + b + c" in told
-    assert "*" not in printed(calibrate(straight(), unidentified="fit"))
+    assert "*" not in on_terminal(print_calibration, calibrate(straight(), unidentified="fit"))
 
 
 def test_an_angle_deviates_in_degrees(dataset: Dataset) -> None:
     run = calibrate(dataset)
     angle = next(each for each in run.uncertainty.parameters if each.name == "angle_a")
-    row = next(line for line in printed(run).splitlines() if line.startswith("angle_a"))
+    row = next(
+        line for line in on_terminal(print_calibration, run, width=160).splitlines() if line.startswith("angle_a")
+    )
     assert f" {math.degrees(angle.value - ROBOT.wheels[0].angle):+.3f} deg " in row
     assert "%" not in row
 
@@ -348,16 +340,6 @@ def weaving(coupling: float) -> Dataset:
 
 # What the search for a steering fits.
 MATRIX = {"calibrator": "closed_form", "parameterisation": "matrix", "unidentified": "keep"}
-
-
-class Worst(Cost):
-    """The largest pose error."""
-
-    name = "worst"
-
-    def combine(self, errors: Array, trajectory: NDArray[np.intp]) -> Array:  # noqa: ARG002
-        worst: Array = np.abs(errors).max(axis=(1, 2))
-        return worst
 
 
 def fitted(run: CalibrationRun) -> dict[str, float]:
@@ -581,14 +563,7 @@ def data(tmp_path: Path) -> Path:
     dataset = session_set("small", 3, change=0.02)
     runs = [run for run in dataset.trajectories if run.repetition is not None and run.repetition < 4]
     save_dataset(replace(dataset, trajectories=tuple(runs)), tmp_path / "data")
-    design = Calibration(
-        name="design",
-        robot=dataset.robot,
-        sample_period=dataset.sample_period,
-        matrix=matrix_rows(dataset.robot.inverse_kinematic_matrix),
-        integration="arc",
-    )
-    write_calibration(design, tmp_path / "design.yaml")
+    write_calibration(design_of(dataset, "arc"), tmp_path / "design.yaml")
     return tmp_path / "data"
 
 

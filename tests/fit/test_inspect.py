@@ -23,7 +23,6 @@ from omnibench.fit.span import (
     directions_kept,
     driven_span,
     motion_in_words,
-    unidentified_directions,
 )
 from omnibench.robot.kinematics import Array, Robot, wheel_equations
 from omnibench.testing.synthetic import synthetic_robot
@@ -165,13 +164,6 @@ def test_mecanum_wheels_leave_the_direction_that_would_make_them_slip_and_three_
     assert noisy.shares[3] > 1e-4 > 1e-12 > mecanum.shares[3]
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_the_direction_that_mecanum_wheels_leave_has_the_same_name_on_any_data(seed: int) -> None:
-    # Positive rates drive counter-clockwise, so forward is negative on the left.
-    (null,) = driven_span(noisy_trajectories(4, seed=seed)).null
-    assert direction_in_words(null, synthetic_robot(4).wheel_names) == "fl - fr - rl + rr"
-
-
 def test_a_direction_is_named_with_its_shares() -> None:
     assert direction_in_words(np.array([-0.25, 0.001, 0.5]), ("a", "b", "c")) == "- 0.5 a + c"
 
@@ -261,14 +253,3 @@ def test_a_span_that_holds_motions_is_named_by_them() -> None:
 def test_a_direction_is_told_by_what_the_designed_robot_does(twist: tuple[float, float, float], words: str) -> None:
     rates = wheel_equations(ROBOT.wheels) @ np.array(twist)
     assert motion_in_words(rates / np.linalg.norm(rates), ROBOT) == words
-
-
-def test_what_is_not_identified_is_named_the_same_on_any_slip() -> None:
-    names = {
-        tuple(
-            direction_in_words(direction, ROBOT.wheel_names)
-            for direction in unidentified_directions(ROBOT, driven_span(driven(RING, slip=0.02, seed=seed)))
-        )
-        for seed in range(5)
-    }
-    assert names == {("a + b + c",)}

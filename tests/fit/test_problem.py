@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,14 +18,12 @@ from omnibench.config import validate
 from omnibench.data.dataset import make_dataset
 from omnibench.errors import ConfigError, DataError
 from omnibench.fit.calibrate import calibrate
-from omnibench.fit.calibrator import Calibrator, Outcome, RunResult, Solution, run_calibrator, unloadable
+from omnibench.fit.calibrator import Outcome, RunResult, Solution, run_calibrator
 from omnibench.fit.cost import Cost
 from omnibench.fit.geometry import GeometryLimits, WheelGeometry
-from omnibench.fit.identifiability import identified_parameters
 from omnibench.fit.parameterisation import Box, MatrixElements, make_bounds
 from omnibench.fit.problem import BudgetSpent, CalibrationProblem
-from omnibench.progress import Progress
-from omnibench.registry import PluginFailure, calibrators, costs
+from omnibench.registry import costs
 from omnibench.robot.kinematics import Array, Mount, Robot, inverse_kinematic_matrix, published_matrix
 from omnibench.testing.synthetic import synthetic_robot
 
@@ -116,14 +113,6 @@ def test_the_seed_decides_the_random_numbers() -> None:
     assert draws[0] == draws[1] != draws[2]
 
 
-def test_progress_is_shown_while_candidates_are_evaluated() -> None:
-    shown: list[Progress] = []
-    problem = make_problem(evaluations=50_000, watch=shown.append)
-    while not shown:
-        problem.cost(problem.start)
-    assert shown[0] == Progress("search", problem.evaluations, 50_000, "evaluation", problem.best_cost)
-
-
 @pytest.mark.parametrize("name", ["start", "lower", "upper", "free", "reference", "best_vector"])
 @pytest.mark.parametrize("evaluated", [0, 4])
 def test_what_a_calibrator_is_given_cannot_be_overwritten(name: str, evaluated: int) -> None:
@@ -155,19 +144,6 @@ class TestUnitCube:
         vectors = problem.from_unit(np.array(points))
         assert ((vectors >= problem.lower) & (vectors <= problem.upper)).all()
 
-    def test_frozen_elements_keep_their_start(self) -> None:
-        problem = make_problem(box="paper")
-        frozen = np.flatnonzero(~problem.free)
-        assert problem.names[frozen[0]] == "m12"
-        assert len(frozen) == 1
-        vectors = problem.from_unit(np.random.default_rng(0).uniform(size=(4, 8)))
-        np.testing.assert_array_equal(vectors[:, frozen], np.tile(problem.start[frozen], (4, 1)))
-
-    def test_a_box_without_any_width_has_one_point(self) -> None:
-        design = synthetic_robot().inverse_kinematic_matrix
-        problem = make_problem(box=box_between(design, design))
-        np.testing.assert_array_equal(problem.from_unit(np.zeros((2, 0))), [problem.start, problem.start])
-
 
 class TestBox:
     """Inside, and on the surface."""
@@ -190,31 +166,9 @@ class TestBox:
         assert frozen.at_bounds(frozen.start) == ()
 
 
-def test_limits_of_the_geometry_are_its_box() -> None:
-    problem = make_problem(RUNS, parameterisation="geometry", limits=GeometryLimits(angle_deg=0.0))
-    frozen = [name for name, free in zip(problem.names, problem.free, strict=True) if not free]
-    assert (problem.box, frozen) == ("limits", ["angle_a", "angle_b", "angle_c"])
-
-
 def test_no_trajectories_are_refused() -> None:
     with pytest.raises(DataError, match="no trajectories"):
         make_problem(())
-
-
-def test_a_calibrator_is_given_the_runs_to_train_and_no_others() -> None:
-    problems: list[CalibrationProblem] = []
-
-    @calibrators.register("spy")
-    class Spy(Calibrator):
-        """Keeps its problem; tests/compare/test_runs.py follows all that a problem leads to."""
-
-        def calibrate(self, problem: CalibrationProblem) -> Solution:
-            problems.append(problem)
-            return Solution(problem.start, "seen enough")
-
-    held_out = [replace(run, id=f"v{run.id}", split="validation") for run in noisy_trajectories(seed=2)]
-    calibrate(make_dataset("both", synthetic_robot(), 0.2, [*RUNS, *held_out]), "spy")
-    assert [run.id for run in problems[0].trajectories] == [run.id for run in RUNS]
 
 
 def test_elements_that_the_cost_does_not_see_keep_their_start_values() -> None:
@@ -359,19 +313,6 @@ class TestGeometry:
             validate(GeometryLimits, limits, "limits")
 
 
-def test_the_derivatives_of_a_geometry_are_those_of_the_wheel_equations_inverse() -> None:
-    """With E the wheel equations, rows (-sin d, cos d, R) / r, the matrix is M = E^-1 and dM = -M dE M."""
-    geometry = WheelGeometry(APR_02)
-    slopes = geometry.slopes(geometry.start).reshape(3, 3, 9)
-    for index, wheel in enumerate(APR_02.wheels):
-        column = DESIGN[:, index]
-        of_distance = -np.outer(column, DESIGN[2]) / wheel.radius
-        of_angle = np.outer(column, np.cos(wheel.angle) * DESIGN[0] + np.sin(wheel.angle) * DESIGN[1]) / wheel.radius
-        np.testing.assert_allclose(slopes[:, index, index], column / wheel.radius, rtol=1e-8, atol=1e-11)
-        np.testing.assert_allclose(slopes[:, :, 3 + index], of_distance, rtol=1e-7, atol=1e-9)
-        np.testing.assert_allclose(slopes[:, :, 6 + index], of_angle, rtol=1e-7, atol=1e-9)
-
-
 def test_the_derivatives_of_matrix_elements_are_zero_along_directions_that_are_kept() -> None:
     slopes = MatrixElements(APR_02, "row", np.array([[0.6, 0.8, 0.0]])).slopes(DESIGN.ravel())
     kept = np.array([[0.64, -0.48, 0.0], [-0.48, 0.36, 0.0], [0.0, 0.0, 1.0]])  # 1 - n n'
@@ -443,13 +384,6 @@ def test_a_longer_wheelbase_turns_a_car_less() -> None:
     geometry = WheelGeometry(CAR)
     longer = geometry.matrices((geometry.start * [1.0, 1.25])[None])[0]
     np.testing.assert_allclose(longer, CAR.inverse_kinematic_matrix * [[1.0], [1.0], [0.8]], rtol=0, atol=1e-15)
-
-
-def test_the_side_of_a_tracked_point_is_not_told_apart_from_that_of_the_wheels() -> None:
-    geometry = WheelGeometry(TRICYCLE, fitted_mount=True)
-    none_kept = np.zeros((0, len(TRICYCLE.drive.names)))
-    told = dict(zip(geometry.names, identified_parameters(geometry, none_kept), strict=True))
-    assert [name for name, known in told.items() if not known] == ["y_front", "mount_y"]
 
 
 def test_the_limits_of_a_mecanum_geometry_hold_its_design() -> None:
@@ -559,11 +493,6 @@ def test_whatever_a_calibrator_raises_its_run_has_failed_with_the_reason(error: 
     assert result.evaluations == 1
 
 
-def test_ctrl_c_is_not_taken_for_a_failure() -> None:
-    with pytest.raises(KeyboardInterrupt):
-        run(raising(KeyboardInterrupt()))
-
-
 INVALID: dict[str, tuple[Callable[[CalibrationProblem], Any], str]] = {
     "infinity": (lambda _: np.full(9, np.inf), "NaN or infinity"),
     "one NaN": (lambda problem: np.append(problem.start[:8], np.nan), "NaN or infinity"),
@@ -653,11 +582,3 @@ def test_the_answer_is_a_copy() -> None:
 
 def test_a_reason_of_several_lines_becomes_one() -> None:
     assert run(lambda problem: Solution(problem.start, "first\nsecond")).reason == "first second"
-
-
-def test_a_plugin_that_cannot_be_imported_fails_with_its_error() -> None:
-    stand_in: type[Calibrator] = unloadable(PluginFailure("plugins/mine.py", "SyntaxError: invalid syntax"))
-    result = run_calibrator(stand_in(stand_in.Options(anything=1)), make_problem(RUNS))
-    assert result.outcome is Outcome.FAILED
-    assert "plugins/mine.py" in result.reason
-    assert "SyntaxError" in result.reason

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 import os
 import re
 import subprocess
@@ -12,15 +11,12 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from cryptography import x509
-from cryptography.hazmat.primitives import hashes, serialization
-from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.x509.oid import NameOID
 from job_samples import IMPORTING_THIS
 from timing import until
 
 from omnibench.errors import OmnibenchError
 from omnibench.jobs.backend_choice import BackendChoice, open_backend
+from omnibench.live.network.keys import make_keys
 
 
 @contextmanager
@@ -89,28 +85,5 @@ def refusal(name: str, **others: object) -> str:
 
 def certificates(folder: Path) -> tuple[Path, Path, Path]:
     """An authority's certificate, and one of its own with the key, for scheduler, workers and client."""
-    folder.mkdir(exist_ok=True)
-    authority_key, key = (ec.generate_private_key(ec.SECP256R1()) for _ in range(2))
-    authority = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "test authority")])
-    now = datetime.datetime.now(datetime.UTC)
-
-    def certificate(subject: x509.Name, of_key: ec.EllipticCurvePrivateKey, *, is_ca: bool) -> x509.Certificate:
-        builder = x509.CertificateBuilder().subject_name(subject).issuer_name(authority).public_key(of_key.public_key())
-        builder = builder.serial_number(x509.random_serial_number())
-        builder = builder.not_valid_before(now - datetime.timedelta(days=1))
-        builder = builder.not_valid_after(now + datetime.timedelta(days=1))
-        builder = builder.add_extension(x509.BasicConstraints(ca=is_ca, path_length=None), critical=True)
-        return builder.sign(authority_key, hashes.SHA256())
-
-    contents = {
-        "ca.pem": certificate(authority, authority_key, is_ca=True).public_bytes(serialization.Encoding.PEM),
-        "cert.pem": certificate(
-            x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "cluster")]), key, is_ca=False
-        ).public_bytes(serialization.Encoding.PEM),
-        "key.pem": key.private_bytes(
-            serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-        ),
-    }
-    for name, content in contents.items():
-        (folder / name).write_bytes(content)
-    return folder / "ca.pem", folder / "cert.pem", folder / "key.pem"
+    make_keys(folder, ["cluster"], router="cluster")  # which may serve and be a client
+    return folder / "ca.pem", folder / "cluster.pem", folder / "cluster.key"

@@ -52,7 +52,6 @@ class Notes(JobWatch[Answer]):
 
     def reason(self, number: int = 0) -> str:
         failure = self.endings[number]
-        assert isinstance(failure, Failure)
         return failure.reason
 
 

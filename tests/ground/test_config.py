@@ -20,7 +20,7 @@ from pydantic import Field, model_validator
 from omnibench.config import Model, parse_settings, parse_yaml, read_model, read_yaml, to_yaml, validate
 from omnibench.errors import ConfigError, DataError, PluginError, UnknownNameError, nearest, one_line, visible
 from omnibench.files import check_results_folder, link_latest, new_results_folder, replacing, results_locked, write_text
-from omnibench.fit.calibrator import Calibrator, run_calibrator
+from omnibench.fit.calibrator import run_calibrator
 from omnibench.registry import calibrators, load_plugin_file, load_plugins, registered_from
 from omnibench.testing import synthetic_problem
 
@@ -303,14 +303,6 @@ def test_an_unknown_option_and_one_of_the_wrong_size_are_named() -> None:
         calibrators.create("random_search", {"candidate": 3})
     with pytest.raises(ConfigError, match=r"'random_search': candidates: .*greater than 0 \(given: 0\)"):
         calibrators.create("random_search", {"candidates": 0})
-
-
-def test_a_name_that_is_taken_is_refused() -> None:
-    with pytest.raises(PluginError, match="calibrator 'theoretical' is registered already, by built in"):
-
-        @calibrators.register("theoretical")
-        class Another(Calibrator):
-            """Would take the name."""
 
 
 def test_a_file_is_loaded_with_its_options_summary_and_origin(folder: Path) -> None:

@@ -29,7 +29,7 @@ SKID: Final = make_robot("skid", *(fixed(name, *place) for name, place in _CORNE
 DIFFERENTIAL: Final = make_robot("differential", fixed("left", 0.0, 0.1), fixed("right", 0.0, -0.1))
 
 
-def calibration(robot: Robot = SWERVE, **changes: Any) -> Calibration:
+def steered_calibration(robot: Robot = SWERVE, **changes: Any) -> Calibration:
     """A calibration of a robot whose matrix is some percent off the design."""
     design = robot.inverse_kinematic_matrix
     off = 1 + 0.03 * np.sin(np.arange(design.size)).reshape(design.shape)
@@ -45,9 +45,9 @@ def calibration(robot: Robot = SWERVE, **changes: Any) -> Calibration:
     return plain.model_copy(update=changes)
 
 
-def drive(seconds: float = 1.0, *, seed: int = 1, using: Calibration | None = None) -> Drive:
+def steered_drive(seconds: float = 1.0, *, seed: int = 1, using: Calibration | None = None) -> Drive:
     """A lively drive: wheel rates that wander by some rad/s, and steering that swings within half a right angle."""
-    chosen = using or calibration()
+    chosen = using or steered_calibration()
     rng = np.random.default_rng(seed)
     count = round(seconds / PERIOD) + 1
     wheels, steered = len(chosen.robot.wheel_names), len(chosen.robot.drive.steered)
@@ -68,10 +68,10 @@ def only(sample: JointState, *names: str) -> JointState:
 
 def recording(seed: int = 1, runs: int = 3, *, using: Calibration | None = None, pose_every: int = 10) -> Recording:
     """Runs of 0.4 s with poses that are those of a calibration, exactly."""
-    chosen = using or calibration()
+    chosen = using or steered_calibration()
     made = []
     for number in range(runs):
-        path, start = drive(0.4, seed=seed + number, using=chosen), np.array([0.3 * number, 1.0, 0.7 - number])
+        path, start = steered_drive(0.4, seed=seed + number, using=chosen), np.array([0.3 * number, 1.0, 0.7 - number])
         log = replace(path.log, start=start, stamps=np.append(0.0, path.times[pose_every - 1 :: pose_every]))
         rates, (poses,) = log.rates, chosen.model.poses([log])
         made.append(

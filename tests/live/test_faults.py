@@ -20,8 +20,10 @@ from chaos.run import run
 from drives import SECOND, calibration, drive, slam
 from nodes import Command, asked, config_of, connected, running, sent, sent_one_by_one, wheels_of, write_node
 from sessions import free_port, until
+from timing import PATIENCE
 
 from omnibench.config import to_yaml
+from omnibench.live.node import LiveNode
 from omnibench.live.wire.messages import JOINT_STATE, ODOMETRY, JointState, Odometry
 
 pytestmark = pytest.mark.slow  # processes that are killed, stopped or frozen
@@ -109,7 +111,8 @@ def test_a_killed_node_goes_on_with_its_pose_and_calibration(tmp_path: Path) -> 
         heard = heard_odometry(session)
         wheels = wheels_of(session)
         poses = wheels_of(session, topic="slam_pose")
-        assert asked(session, "omnibench/apr/swap", to_yaml(other))["accepted"]
+        swapped = {"robot": "apr", "accepted": True, "calibration": "synthetic 1.1", "kept": True}
+        assert asked(session, "omnibench/apr/swap", to_yaml(other)) == swapped
         sent_one_by_one(wheels, path.samples()[:150], heard)
         poses.put(slam(path.stamps[140], [7.0, 8.0, 0.5]))
         until(lambda: asked(session, "omnibench/apr/health")["counts"]["poses"] == 1, "the pose")
@@ -135,6 +138,27 @@ def test_a_killed_node_goes_on_with_its_pose_and_calibration(tmp_path: Path) -> 
         after = asked(session, f"omnibench/apr/pose?at={path.stamps[200]}")["map"]
         assert np.hypot(after["x"] - mapped["x"], after["y"] - mapped["y"]) < 0.03
         session.close()
+
+
+def test_a_node_goes_on_once_its_router_that_was_killed_is_back(tmp_path: Path) -> None:
+    port, payloads = free_port(), iter(drive(100.0).payloads())
+    for name in ("router", "node"):
+        (tmp_path / name).mkdir()
+    router = write_node(tmp_path / "router", port=port)
+    to_router = {"mode": "client", "connect": [f"tcp/127.0.0.1:{port}"], "wait": PATIENCE}
+    with (
+        Command("live", router) as killed,
+        LiveNode(config_of(tmp_path / "node", zenoh=to_router)) as node,
+        connected(port) as robot,
+    ):
+        wheels, heard = wheels_of(robot), heard_odometry(robot)
+        until(lambda: wheels.put(next(payloads)) or heard, "the first odometry")
+        killed.kill()
+        taken = node.health("apr").counts["samples"]
+        heard.clear()
+        with Command("live", router):
+            until(lambda: wheels.put(next(payloads)) or heard, "odometry by way of the router that is back")
+            assert asked(robot, "omnibench/apr/health")["counts"]["samples"] > taken
 
 
 def test_memory_stays_flat_over_many_samples(tmp_path: Path) -> None:

@@ -34,6 +34,7 @@ from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, OdometryBatch
 from omnibench.testing import (
     CalibratorConformance,
+    run_cases,
     synthetic_problem,
     synthetic_robot,
     synthetic_trajectories,
@@ -61,6 +62,24 @@ class TestOptiOdomOnMecanumWheels(TestOptiOdom):
 
     def problem(self, *arguments: Any, **changes: Any) -> Any:
         return super().problem(*arguments, **{"wheels": 4} | changes)
+
+
+@pytest.mark.parametrize(
+    ("name", "solved"),
+    [
+        ("kallasi", 0.5),  # the wheel's true distance from the axle is not the designed one, which it cannot see
+        ("lin", 0.02),
+        ("maddahi", 0.6),
+        *((name, 1e-9) for name in ("censi", "ivanjko")),
+        ("jung_chung", 0.4),
+        ("umbmark", 0.2),
+        pytest.param("cmaes", 1e-7, marks=pytest.mark.slow),
+        ("differential_evolution", 1e-7),
+    ],
+)
+def test_a_plugin_keeps_the_contract_of_calibrators(name: str, solved: float) -> None:
+    results = run_cases(type("Suite", (CalibratorConformance,), {"name": name, "solved": solved})())
+    assert [result for result in results if not result.passed] == []
 
 
 def module() -> Any:
@@ -202,13 +221,6 @@ def test_straight_lines_are_refused(calibrator: str, name: str, named: str) -> N
     assert (result.outcome, named in result.reason) == (Outcome.NOT_APPLICABLE, True)
 
 
-class TestKallasi(CalibratorConformance):
-    """The cases of every calibrator."""
-
-    name = "kallasi"
-    solved = 0.5  # the wheel's true distance from the axle is not the designed one, which the method cannot see
-
-
 def tricycle(mount: Mount | None = None) -> Robot:
     return ROBOTS["tricycle"].model_copy(update={"mount": mount})
 
@@ -233,13 +245,6 @@ def test_they_are_reported() -> None:
     reason = fit("kallasi", tricycle(), runs).reason
     assert "+2.000 deg" in reason
     assert "0.08400 m per rad (1.0500 of the design)" in reason
-
-
-class TestLin(CalibratorConformance):
-    """The cases of every calibrator."""
-
-    name = "lin"
-    solved = 0.02
 
 
 @settings(max_examples=10, deadline=None)
@@ -272,16 +277,12 @@ def test_the_geometry_is_refused() -> None:
     assert (result.outcome, "parameterisation: matrix" in result.reason) == (Outcome.FAILED, True)
 
 
-class TestMaddahi(CalibratorConformance):
-    """The cases of every calibrator."""
-
-    name = "maddahi"
-    solved = 0.6
-
-
 def with_radii(shares: list[float]) -> tuple[Trajectory, ...]:
     """Recordings of the synthetic robot when nothing but its wheel radii are not as designed."""
     return driven(synthetic_robot(), synthetic_robot().inverse_kinematic_matrix * shares)
+
+
+PARAMETERISATIONS: tuple[ParameterisationName, ...] = ("matrix", "geometry")
 
 
 def maddahi(
@@ -298,11 +299,9 @@ def test_wheel_radii_that_differ_from_the_design_are_found(shares: list[float]) 
     assert result.matrix == pytest.approx(synthetic_robot().inverse_kinematic_matrix * shares, rel=1e-6)
 
 
-@pytest.mark.parametrize("parameterisation", ["matrix", "geometry"])
-def test_both_parameterisations_give_the_same_matrix(parameterisation: ParameterisationName) -> None:
-    result = maddahi(synthetic_trajectories(synthetic_robot()), parameterisation)
-    reference = maddahi(synthetic_trajectories(synthetic_robot()), "matrix")
-    assert result.matrix == pytest.approx(reference.matrix, rel=1e-6, abs=1e-9)
+def test_both_parameterisations_give_the_same_matrix() -> None:
+    of_matrix, of_geometry = (maddahi(synthetic_trajectories(synthetic_robot()), each) for each in PARAMETERISATIONS)
+    assert of_geometry.matrix == pytest.approx(of_matrix.matrix, rel=1e-6, abs=1e-9)
 
 
 def test_the_indices_are_reported_with_a_lateral_mean_of_one() -> None:
@@ -386,34 +385,6 @@ def ratios(matrix: Array, design: Robot = ROBOT) -> tuple[float, float]:
 ARTICLES = ("ivanjko", "jung_chung", "umbmark")  # which calibrate from the runs of one session
 METHODS = ("censi", *ARTICLES)
 factors = st.floats(0.95, 1.05)
-
-
-class TestCensi(CalibratorConformance):
-    """The cases of every calibrator."""
-
-    name = "censi"
-    solved = 1e-09
-
-
-class TestIvanjko(CalibratorConformance):
-    """The same."""
-
-    name = "ivanjko"
-    solved = 1e-09
-
-
-class TestJungChung(CalibratorConformance):
-    """The same."""
-
-    name = "jung_chung"
-    solved = 0.4
-
-
-class TestUmbmark(CalibratorConformance):
-    """The same."""
-
-    name = "umbmark"
-    solved = 0.2
 
 
 def assert_not_for(result: RunResult, *named: str) -> None:
@@ -586,14 +557,6 @@ def test_figures_of_real_recordings_come_out(label: str, tolerance: float, monke
 # The calibrators cmaes and differential_evolution of ``plugins/``.
 
 
-@pytest.mark.slow
-class TestCmaes(CalibratorConformance):
-    """The cases of every calibrator."""
-
-    name = "cmaes"
-    solved = 1e-7
-
-
 def test_cmaes_says_which_package_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "cma", None)  # what Python itself does for a module that cannot be imported
     result = run_calibrator(calibrators.create("cmaes"), synthetic_problem())
@@ -618,13 +581,6 @@ def test_cmaes_says_which_criterion_stopped_it() -> None:
     result = run_calibrator(calibrators.create("cmaes", {"tolx": 1e-3}), synthetic_problem(evaluations=20_000))
     assert result.outcome is Outcome.CONVERGED
     assert result.reason == "pycma: tolx 0.001"
-
-
-class TestDifferentialEvolution(CalibratorConformance):
-    """The cases of every calibrator."""
-
-    name = "differential_evolution"
-    solved = 1e-7
 
 
 def test_differential_evolution_evaluates_whole_generations(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -123,7 +123,6 @@ class TestCommonOptions:
         (run,) = data.trajectories
         np.testing.assert_allclose(run.rates, plain.rates[:, [1, 0, 2]] * [-1, 1, 1])
         assert (run.id, run.split, run.command, run.session) == (plain.id, plain.split, plain.command, plain.session)
-        assert data.imported is not None
         assert data.imported.options == {"wheel_signs": [-1, 1, 1], "wheel_columns": ["2", "1", "3"]}
         cut = import_dataset("robotino", tmp_path, {"window": 0.5, "name": "halves"})
         assert (cut.name, len(cut.trajectories)) == ("halves", 2)

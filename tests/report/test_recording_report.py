@@ -17,13 +17,15 @@ from hypothesis import strategies as st
 from recording_samples import COMMANDS, NOISE, PERIOD, TICK, Sample, sample
 from report_page import Page
 from syrupy.assertion import SnapshotAssertion
-from wheeled_samples import ROBOTS, driven
+from wheeled_samples import DIFF, ROBOTS, driven
 
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.scans import Mount, Scanner, ScansInMemory, TrajectoryScans
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import DataError
+from omnibench.fit.inspect import inspect_dataset
 from omnibench.report.figures import is_placed
+from omnibench.report.recording import inspection_report
 from omnibench.report.recording.recording_figures import (
     ODOMETRY_ITEM,
     all_runs,
@@ -63,7 +65,6 @@ def page(dataset: Dataset, folder: Path, **options: Any) -> Page:
 def played(told: Page) -> dict[str, Any]:
     """What the player reads, by run."""
     found = re.search(r'<script type="application/json" id="[^"]*-runs">(.*?)</script>', told.html, re.DOTALL)
-    assert found is not None
     return json.loads(found[1])
 
 
@@ -189,7 +190,6 @@ def test_long_runs_with_many_scans_stay_below_six_megabytes(tmp_path: Path) -> N
     long = sample(repetitions=1, duration=30.0, rays=1080)
     many = tuple(replace(run, id=f"{run.id}-{number}") for number in range(100) for run in long.dataset.trajectories)
     scans = long.dataset.scans
-    assert scans is not None
     found = ScansInMemory(scans.scanner, {run.id: scans.of(run.id.rsplit("-", 1)[0]) for run in many})
     truth = {run.id: long.truth[run.id.rsplit("-", 1)[0]] for run in many}
     told = page(replace(long.dataset, trajectories=many, scans=found), tmp_path, truth=truth)
@@ -211,7 +211,6 @@ def hostile(run: Trajectory) -> Trajectory:
 
 def test_hostile_names_of_runs_stay_words(made: Sample, tmp_path: Path) -> None:
     scans = made.dataset.scans
-    assert scans is not None
     runs = tuple(map(hostile, made.dataset.trajectories))
     again = ScansInMemory(scans.scanner, {hostile(run).id: scans.of(run.id) for run in made.dataset.trajectories})
     told = page(replace(made.dataset, trajectories=runs, scans=again), tmp_path)
@@ -303,7 +302,6 @@ def test_of_each_kind_the_run_of_median_odometry_error_is_shown() -> None:
 
 def test_runs_without_scans_are_not_shown_where_others_have_them(made: Sample) -> None:
     scans = made.dataset.scans
-    assert scans is not None
     only = ScansInMemory(scans.scanner, {"left-1": scans.of("left-1")})
     assert [run.id for run in representative_runs(replace(made.dataset, scans=only)).values()] == ["left-1"]
 
@@ -343,7 +341,6 @@ def test_points_of_a_wall_lie_on_it_however_the_robot_moves(
 
 def test_rays_that_saw_nothing_make_no_points(made: Sample) -> None:
     scans, run = made.dataset.scans, made.dataset.trajectories[0]
-    assert scans is not None
     found = scans.of(run.id)
     ranges = found.ranges.copy()
     ranges[0, ::2] = np.inf
@@ -427,3 +424,100 @@ def test_without_reference_poses_the_overview_shows_the_odometry(made: Sample) -
     drawn = all_runs(replace(made.dataset, trajectories=runs, scans=None), runs[0], ())
     assert drawn.legend[0] == ODOMETRY_ITEM
     assert np.ptp([x for x in drawn.figures[0].plot.data[0].x if x is not None]) > 0.5
+
+
+# The report of an inspection: motions that were driven, what can be identified, and that the answer comes first.
+
+
+def driving(robot: Robot, *twists: tuple[float, float, float]) -> list[Trajectory]:
+    """Runs of four seconds, each at one twist by the design values."""
+    times = np.arange(1, 81) * 0.05
+    return [
+        Trajectory(
+            id=f"run-{number}",
+            split="train",
+            times=times,
+            rates=np.tile(np.array(twist) @ robot.signal_equations.T, (len(times), 1)),
+            pose_times=np.zeros(1),
+            poses=np.zeros((1, 3)),
+        )
+        for number, twist in enumerate(twists)
+    ]
+
+
+OMNI = sample().dataset.robot
+
+
+@pytest.mark.parametrize(
+    ("twist", "kinds"),
+    [
+        ((0.2, 0.0, 0.0), {"straight", "forward"}),
+        ((-0.2, 0.0, 0.0), {"straight", "backward"}),
+        ((0.1, 0.0, 0.02), {"straight", "forward"}),  # what a straight line of uneven wheels turns by
+        ((0.2, 0.0, 0.5), {"curves to the left", "forward"}),
+        ((0.0, 0.2, -0.5), {"curves to the right", "sideways to the left"}),
+        ((0.0, -0.2, 0.0), {"straight", "sideways to the right"}),
+        ((0.0, 0.0, 0.5), {"on the spot to the left"}),
+        ((0.0, 0.0, -0.5), {"on the spot to the right"}),
+    ],
+)
+def test_a_motion_is_known_by_its_direction_and_turn(twist: tuple[float, float, float], kinds: set[str]) -> None:
+    found = inspection_report.driven_motions(driving(OMNI, twist), OMNI)
+    assert {motion.name for motion in found if motion.driven} == kinds
+    assert all(motion.share in (0.0, 1.0) for motion in found)
+
+
+def test_time_at_rest_is_no_motion() -> None:
+    found = inspection_report.driven_motions(driving(OMNI, (0.2, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.5)), OMNI)
+    shares = {motion.name: motion.share for motion in found}
+    assert shares["straight"] == pytest.approx(0.5) == shares["on the spot to the left"]
+    assert "×" not in repr(inspection_report.motion_table(found).rows)  # a speed that is rounding is zero
+    on_two_wheels = inspection_report.driven_motions(driving(DIFF, (0.2, 0.0, 0.0)), DIFF)
+    assert not [motion for motion in on_two_wheels if motion.name.startswith("sideways")]
+
+
+def test_motions_that_are_missing_on_both_sides_are_named_once() -> None:
+    missing = inspection_report.missing_in_words(inspection_report.driven_motions(driving(OMNI, (0.2, 0.0, 0.0)), OMNI))
+    assert missing == "in curves to the left, in curves to the right, on the spot, backward or sideways"
+
+
+@pytest.fixture(scope="module")
+def recorded() -> Dataset:
+    return sample().dataset
+
+
+@pytest.fixture(scope="module")
+def inspection_file(recorded: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    inspection_file = tmp_path_factory.mktemp("inspection") / "report.html"
+    write_document(inspection_report.inspection_document(recorded, inspect_dataset(recorded)), inspection_file)
+    return inspection_file
+
+
+@pytest.fixture(scope="module")
+def inspection(inspection_file: Path) -> Page:
+    return Page(inspection_file.read_text(encoding="utf-8"))
+
+
+def test_the_report_of_an_inspection_reads_as_before(inspection: Page, snapshot: SnapshotAssertion) -> None:
+    assert inspection.words() == snapshot
+
+
+def test_every_parameter_has_its_precision(recorded: Dataset, inspection: Page) -> None:
+    found = inspect_dataset(recorded).identifiability.parameters
+    rows = inspection.tables["Wheels, as these runs determine them"][1:]
+    assert [row[3] == "determined" for row in rows] == [parameter.told for parameter in found]
+    assert {row[1][-1] for row in rows} == {"m", "°"}
+
+
+@pytest.mark.slow
+def test_the_paths_stand_in_the_first_900_pixels(inspection_file: Path) -> None:
+    assert_picture_comes_first(inspection_file)
+
+
+def test_runs_that_are_all_alike_leave_motions_open(recorded: Dataset, tmp_path: Path) -> None:
+    only = [replace(run, split="train") for run in recorded.trajectories if run.command == "straight"]
+    few = replace(recorded, trajectories=tuple(only), scans=None)
+    write_document(inspection_report.inspection_document(few, inspect_dataset(few)), tmp_path / "report.html")
+    told = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
+    assert "To train, it was never driven in curves to the left" in told.text
+    assert "Part of the matrix stays open" in told.text

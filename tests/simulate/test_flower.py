@@ -97,13 +97,6 @@ def test_the_last_reference_pose_is_never_doubled(distance: float, stamps: list[
         np.testing.assert_allclose(run.pose_times, stamps, atol=1e-12)
 
 
-def test_wheel_angles_are_the_sum_of_the_rates_through_the_whole_session() -> None:
-    before = np.zeros(3)
-    for run in benchmark().dataset.split("train"):
-        np.testing.assert_allclose(run.angles, before + np.cumsum(run.rates * 0.01, axis=0), atol=1e-9)
-        before = run.angles[-1]
-
-
 def test_the_order_of_the_runs_is_shuffled_unless_sorted_is_asked_for() -> None:
     given = [command.name for command in small().driven for _ in range(2)]
     orders = {
@@ -133,15 +126,6 @@ def test_the_same_config_gives_the_same_bits_on_disk_too(tmp_path: Path) -> None
     assert simulate_dataset(small()).dataset.hash == dataset.hash
     save_dataset(dataset, tmp_path / "flower")
     assert load_dataset(tmp_path / "flower").hash == dataset.hash
-
-
-def test_another_seed_gives_other_noise_and_the_same_commands_and_validation_has_its_own() -> None:
-    session = {"seed": 1, "distance": 0.3}
-    dataset = simulate_dataset(small(order="sorted", train=session, validation={**session, "seed": 2})).dataset
-    for one, other in zip(dataset.split("train"), dataset.split("validation"), strict=True):
-        assert one.command == other.command
-        assert (one.rates != other.rates).all()
-        assert (one.poses[1:] != other.poses[1:]).all()
 
 
 def test_the_truth_record_holds_eq_8_and_how_it_was_driven() -> None:
@@ -250,12 +234,6 @@ def test_tolerances_draw_a_robot_about_its_design() -> None:
     assert not np.array_equal(true_matrix(other.truth, other.robot), truth)
 
 
-def test_a_matrix_may_be_the_truth() -> None:
-    rows = [[-0.09, 0.0, 0.09], [0.05, -0.1, 0.05], [0.25, 0.25, 0.25]]
-    given = apr02(truth={"matrix": rows})
-    np.testing.assert_array_equal(true_matrix(given.truth, given.robot), rows)
-
-
 def commands_with(**changes: Any) -> dict[str, Any]:
     return {"commands": {**apr02_settings()["commands"], **changes}}
 
@@ -358,13 +336,6 @@ def test_steering_angles_are_those_of_the_commands_within_a_quarter_turn_and_noi
         np.testing.assert_array_equal(true_steering(robot(name), measured), plain.steering)
     errors = np.concatenate([m.steering - p.steering for m, p in zip(noisy, quiet, strict=True)])  # type: ignore[operator]
     assert errors.std() == pytest.approx(0.002, rel=0.05)
-
-
-def test_a_cars_rear_wheels_turn_at_different_rates_in_a_curve() -> None:
-    made = simulate_dataset(experiment("car", truth={"tolerances": {}}))
-    for run in made.dataset.trajectories:
-        turn = (run.rates[:, 1] - run.rates[:, 0]) * 0.1 / 0.4
-        np.testing.assert_allclose(turn, run.omega, atol=1e-9)
 
 
 def test_an_effect_on_the_steering_angle_hides_in_the_motion_and_not_in_what_is_measured(misread_steering: str) -> None:

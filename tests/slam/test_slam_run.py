@@ -29,10 +29,9 @@ from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import advance
 from omnibench.simulate.commands import Command
 from omnibench.simulate.floor_plan import FloorPlan, RoomPlan, make_plan
-from omnibench.simulate.lidar import Lidar, LidarMount, measure_scans
+from omnibench.simulate.lidar import Lidar, LidarMount
 from omnibench.slam.import_dataset import import_dataset
-from omnibench.slam.motion_prior import LastPosePrior, MotionWithinScan, OdometryPrior, smoothed
-from omnibench.slam.scan_matching import Correspondences, ScanMap, ScanPoints, scan_points
+from omnibench.slam.motion_prior import LastPosePrior, OdometryPrior, smoothed
 from omnibench.slam.slam_dataset import FLOOR, SlamPath, run_slam, slam_dataset
 from omnibench.slam.slam_options import SlamOptions
 from omnibench.slam.slam_request import distances, run_errors, slam_accuracy
@@ -466,39 +465,6 @@ class TestNearlyRoundRoom:
             assert np.abs(path.poses - run.true)[-1, 2] < 0.2 * DEGREE
             assert path.covariances[-1, 2, 2] < (0.2 * DEGREE) ** 2
             assert path.warnings == ()
-
-
-def scan_of(plan: FloorPlan, seed: int) -> ScanPoints:
-    """A noisy scan from the room's start."""
-    track = TruePath(np.linspace(0.0, 0.025, 2), np.tile(plan.start, (2, 1)))
-    ranges = measure_scans(plan, LIDAR, track, np.zeros(1), np.random.default_rng(seed)).ranges[0]
-    return scan_points(ranges, LIDAR.scanner, 1.0, MotionWithinScan.steady(np.zeros(3), 0.025))
-
-
-@cache
-def pairs_at_start(plan: FloorPlan) -> Correspondences:
-    """A scan on the map of another."""
-    surroundings = ScanMap(SlamOptions().spacing)
-    surroundings.add(scan_of(plan, 0).lines, np.zeros(3), keyframe=0)
-    return Correspondences(surroundings, scan_of(plan, 1), np.zeros(3))
-
-
-class TestRise:
-    """What slopes promise, tried out some way along a direction."""
-
-    @given(st.floats(0, 2 * np.pi), st.floats(0.03, 0.1), st.floats(0.02, 0.05), st.integers(100, 1000))
-    def test_a_room_with_corners_keeps_the_promise(self, way: float, far: float, turned: float, most: int) -> None:
-        step = np.array([far * np.cos(way), far * np.sin(way), turned])
-        assert 0.9 < pairs_at_start(room("furnished_room")).rise(step, most) < 1.1
-
-    @given(st.floats(0.03, 0.06), st.integers(150, 1000))
-    def test_a_round_room_breaks_it_for_turns(self, turned: float, most: int) -> None:
-        assert abs(pairs_at_start(polygon(400)).rise(np.array([0.0, 0.0, turned]), most)) < 0.5
-
-    @given(st.floats(0, 2 * np.pi), st.floats(0.03, 0.1))
-    def test_a_round_room_keeps_it_for_ways(self, way: float, far: float) -> None:
-        step = np.array([far * np.cos(way), far * np.sin(way), 0.0])
-        assert pairs_at_start(polygon(400)).rise(step, 200) > 0.9
 
 
 class TestDisagreementWithTheOdometry:

@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "discover")]
 
 from real_recordings import OPTIODOM  # noqa: E402
-from test_discovering_wheeled import HIDDEN, recordings  # noqa: E402
+from test_discovering import HIDDEN, recordings  # noqa: E402
 
 from omnibench.data.dataset import Dataset  # noqa: E402
 from omnibench.discover.discover import discover_effects  # noqa: E402

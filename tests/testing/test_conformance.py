@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-from commands import ENVIRONMENT, Command, assert_refused, python, refused, succeeded, write_effect
+from commands import ENVIRONMENT, Command, assert_refused, python, refused, succeeded
 from lanes import slow
 from timing import PATIENCE, until
 
@@ -285,31 +285,6 @@ def test_a_claim_of_convergence_is_measured_by_the_share_that_the_author_sets() 
     suite(CalibratorConformance, ClaimsTooMuch).test_synthetic_problem_is_solved_or_honestly_reported()
     with pytest.raises(Nonconformance, match=r"at 1 of the start's cost, where 0\.001 was expected"):
         suite(CalibratorConformance, ClaimsTooMuch, solved=1e-3).test_synthetic_problem_is_solved_or_honestly_reported()
-
-
-def test_an_answer_that_does_not_depend_on_the_box_need_not_keep_it() -> None:
-    class Published(AnswersOutside):
-        """A fixed answer."""
-
-        bounded = False
-        fitted = False
-
-    assert failures(CalibratorConformance, Published) == {}
-
-
-@pytest.mark.slow
-def test_the_calibrators_own_parameterisation_is_used() -> None:
-    class Geometric(Honest):
-        """Searches the wheels."""
-
-        parameterisation = "geometry"
-
-        def calibrate(self, problem: CalibrationProblem) -> Solution:
-            if problem.parameterisation.name != "geometry":
-                raise ConfigError("geometric searches the geometry parameterisation only")
-            return super().calibrate(problem)
-
-    assert failures(CalibratorConformance, Geometric) == {}
 
 
 @pytest.mark.parametrize("parameterisation", ["matrix", "geometry"])
@@ -729,15 +704,6 @@ def test_an_effect_is_made_checked_and_listed_on_the_command_line(command: Comma
     assert "The faster the robot drives" in row
     assert "second_slip.py" in "".join(listed.split())  # a long path is broken
     assert "built in" in next(line for line in listed.splitlines() if "heading_drift" in line)
-
-
-@pytest.mark.slow
-def test_a_broken_effect_ends_in_exit_code_1(command: Command) -> None:
-    three_wheels_only = 'values["k"] * signals.rates[:, :3]'
-    write_effect(Path("broken_one.py"), "wheel", '"k", "1", -0.1, 0.1, "growth"', three_wheels_only)
-    checked = command("plugin", "check", "broken_one.py")
-    assert checked.returncode == 1
-    assert f"failed  effect broken_one: {SHAPES}: " in checked.stdout
 
 
 # Writing the first version of a plug-in, and checking one.

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 import time
-from typing import Final
-
-from rich.console import Console
-from rich.progress import BarColumn, TaskID, TextColumn, TimeElapsedColumn
-from rich.progress import Progress as Bars
-from rich.table import Column
+from typing import TYPE_CHECKING, Final
 
 from omnibench.cli.terminal.console import make_console
-from omnibench.progress import Progress
 from omnibench.words import plural
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import TaskID
+
+    from omnibench.progress import Progress
 
 _PERIOD: Final = 10.0  # s between two lines of tasks that go on, in a pipe; chosen
 _BAR: Final = 24  # columns of a bar at most, and a sixth of a narrow terminal; chosen
@@ -27,6 +27,10 @@ class ProgressDisplay:
     """
 
     def __init__(self, console: Console | None = None, period: float = _PERIOD) -> None:
+        from rich.progress import BarColumn, TextColumn, TimeElapsedColumn  # slow to import
+        from rich.progress import Progress as Bars
+        from rich.table import Column
+
         self.console = console or make_console(error=True)
         self._bars = Bars(
             TextColumn("{task.description}", markup=False, table_column=Column()),

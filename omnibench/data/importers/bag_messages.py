@@ -6,7 +6,7 @@ Every fault of a file is one line. Messages that cannot be used are left out and
 from __future__ import annotations
 
 import re
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.config import read_yaml
-from omnibench.errors import ConfigError, DataError, UnknownNameError, nearest
+from omnibench.data.importers.tum import planar_headings
+from omnibench.errors import ConfigError, DataError, OmnibenchError, UnknownNameError, nearest
 from omnibench.files import check_file, read_text
 from omnibench.robot.kinematics import Array
 from omnibench.words import plural
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
 
 Stamps = NDArray[np.int64]
+Reader = Callable[[Any], Any]  # of a message
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 FIX, IMU, SCAN = (f"sensor_msgs/msg/{name}" for name in ("NavSatFix", "Imu", "LaserScan"))
 SECOND = 1_000_000_000  # ns
@@ -59,30 +61,30 @@ class Topic:
         """The part of the name before the last slash."""
         return self.name.strip("/").rpartition("/")[0]
 
+    def stamp(self, message: Any, otherwise: int) -> int:
+        """The stamp of a message's header, ns; ``otherwise`` without one, or where the times of recording count."""
+        header = None if self.recorded else getattr(message, "header", None)
+        return otherwise if header is None else int(header.stamp.sec) * SECOND + int(header.stamp.nanosec)
 
-@dataclass(frozen=True)
-class Record:
-    """A recorded message. number: in its topic, from 1. logged: time of recording, ns. message: None if undecodable."""
 
-    number: int
-    logged: int
-    message: Any
+Clock = Callable[[Topic, Stamps], Array]
+"""Gives times, s by the clock of the wheels, to the stamps of a topic's messages."""
+Record = tuple[int, int, Any]
+"""A recorded message: its number in its topic, from 1, the time of recording, ns, and itself, None if undecodable."""
 
 
 class Bag:
     """An open bag; see :func:`open_bag`. recorded: names of topics of which the times of recording count."""
 
     def __init__(self, path: Path, reader: AnyReader, recorded: Sequence[str], definitions: Sequence[Path]) -> None:
-        self.path, self.definitions = path, definitions
-        self._reader = reader
+        self.path, self.definitions, self._reader = path, definitions, reader
         self._connections: dict[tuple[str, str], list[Any]] = defaultdict(list)
         for connection in reader.connections:
-            package, _, rest = connection.msgtype.partition("/")
-            kind = f"{package}/msg/{rest}" if rest and "/" not in rest else connection.msgtype
+            kind = connection.msgtype
+            kind = kind.replace("/", "/msg/") if kind.count("/") == 1 else kind
             self._connections[connection.topic, kind].append(connection)
-        self.topics = [
-            Topic(*key, sum(each.msgcount for each in self._connections[key])) for key in sorted(self._connections)
-        ]
+        counts = {key: sum(each.msgcount for each in of_topic) for key, of_topic in self._connections.items()}
+        self.topics = [Topic(*key, count) for key, count in sorted(counts.items())]
         unstamped = {self.topic(name, "recorded_stamps").name for name in recorded}
         self.topics = [replace(topic, recorded=topic.name in unstamped) for topic in self.topics]
 
@@ -113,7 +115,7 @@ class Bag:
                     message = self._reader.deserialize(data, topic.type)
                 except Exception:  # garbage fails in many ways
                     message = None
-                yield Record(number, logged, message)
+                yield number, logged, message
         if first is None and number < topic.messages:  # an MCAP without its message indexes
             raise DataError(
                 f"{self.path}: only {number} of {plural(topic.messages, 'message')} on {topic.name} can be found; "
@@ -140,7 +142,7 @@ class Bag:
     def require_fields(self, topic: Topic, paths: Sequence[str], key: str) -> None:
         """ConfigError: the messages of a topic do not have the fields that the option ``key`` names."""
         fields, place = self.fields(topic.type), f"{self.path}: {key}: {topic.name} ({topic.type})"
-        if not fields:
+        if topic.type not in self._reader.typestore.fielddefs:
             way = "say what is in them by .msg files, or the folder of their package: --set message_definitions=FOLDER"
             raise ConfigError(f"{place}: the bag does not define its messages; {way}")
         for path in paths:
@@ -159,27 +161,20 @@ def open_bag(path: Path, recorded: Sequence[str] = (), definitions: Sequence[Pat
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
-    files = sorted(path.iterdir()) if path.is_dir() else [path]
-    for file in files:
-        if file.name == _METADATA:
-            try:
-                read_yaml(file)  # within limits, which rosbags has not
-            except ConfigError as error:
-                raise DataError(str(error)) from None
-        elif not file.is_dir():
-            check_file(file)
     # Bags before ROS 2 Iron do not hold the definitions of their types; those of ROS itself hardly ever changed.
     store = get_typestore(Stores.ROS2_HUMBLE)
-    types = store.fielddefs | _defined_types(definitions)
+    store.fielddefs |= _defined_types(definitions)
     with _damage_as_error(path):
-        if definitions:
-            store = get_typestore(Stores.EMPTY)
-            store.register(types)
+        for file in sorted(path.iterdir()) if path.is_dir() else [path]:
+            if file.name == _METADATA:
+                read_yaml(file)  # within limits, which rosbags has not
+            elif not file.is_dir():
+                check_file(file)
         reader = AnyReader([path], default_typestore=store)
         reader.open()
         if definitions:
-            types = {name: fields for name, fields in types.items() if name not in reader.typestore.fielddefs}
-            reader.typestore.register(types)
+            read = reader.typestore.fielddefs
+            reader.typestore.register({name: fields for name, fields in store.fielddefs.items() if name not in read})
     try:
         yield Bag(path, reader, recorded, definitions)
     finally:
@@ -224,6 +219,8 @@ def _damage_as_error(path: Path) -> Iterator[None]:
     """Turn any error of rosbags on a file that is no bag, or a damaged one, into a DataError."""
     try:
         yield
+    except OmnibenchError as error:
+        raise DataError(str(error)) from None
     except PermissionError:
         raise DataError(f"{path}: cannot be read: permission denied") from None
     except Exception as error:  # struct.error, TypeError, KeyError, ...: rosbags trusts what it reads
@@ -238,49 +235,32 @@ def reader_of(paths: Sequence[str]) -> Callable[[Any], list[float]]:
     return lambda message: [float(reduce(lambda value, step: step(value), path, message)) for path in steps]
 
 
-def header_stamp(message: Any) -> int | None:
-    """The stamp of a message's header, ns; None without a header."""
-    header = getattr(message, "header", None)
-    return None if header is None else int(header.stamp.sec) * SECOND + int(header.stamp.nanosec)
-
-
-def stamp_of(topic: Topic, record: Record, part: Any) -> int:
-    """The stamp, ns, of (a part of) a message: that of its header, or the time of recording where this counts."""
-    stamp = None if topic.recorded else header_stamp(part)
-    return record.logged if stamp is None else stamp
-
-
 class TopicMessages:
     """The messages of a topic. Useless ones are left out and counted by reason, the others sorted by their stamps.
 
-    contents: what ``read`` gives of each, or of a ``part`` of it; where either gives None, it is of something else.
-    numbers, stamps, logged (K,): from 1, and ns. rows: indices of the messages that remain. Messages without a header,
-    and those of topics for which it is asked, have the times of recording as stamps.
+    contents: what ``read`` gives of each part of a message, by default the whole; None is of something else. numbers,
+    stamps, logged (K,): from 1, and ns. rows: indices of the messages that remain. Messages without a header, and those
+    of topics for which it is asked, have the times of recording as stamps.
     """
 
-    def __init__(
-        self, bag: Bag, topic: Topic, read: Callable[[Any], Any], part: Callable[[Any], Any] = lambda message: message
-    ) -> None:
+    def __init__(self, bag: Bag, topic: Topic, read: Reader, parts: Reader = lambda message: [message]) -> None:
         self.place = f"{bag.path}: topic {topic.name}"
         self.contents: list[Any] = []
         self._bag, self._topic, self._headless = bag, topic, False
-        self._left_out: list[tuple[int, str]] = []  # numbers of messages, and why
+        self._left_out: dict[str, list[int]] = defaultdict(list)  # numbers of messages, by why
         stamped = []
-        for record in bag.records(topic):
+        for number, logged, message in bag.records(topic):
             try:
-                message = part(record.message)
-                if message is None and record.message is not None:
-                    continue
-                content, stamp = read(message), stamp_of(topic, record, message)
+                for part in parts(message):
+                    content, stamp = read(part), topic.stamp(part, logged)
+                    if content is not None and stamp > 0:
+                        self.contents.append(content)
+                        stamped.append((number, stamp, logged))
+                        self._headless |= not hasattr(part, "header")
+                    elif content is not None:
+                        self._left_out[_NO_STAMP].append(number)
             except (AttributeError, IndexError, TypeError, ValueError):  # garbage, or a type that is defined otherwise
-                self._left_out.append((record.number, "that cannot be decoded"))
-                continue
-            if content is not None and stamp > 0:
-                self.contents.append(content)
-                stamped.append((record.number, stamp, record.logged))
-                self._headless |= not hasattr(message, "header")
-            elif content is not None:
-                self._left_out.append((record.number, _NO_STAMP))
+                self._left_out["that cannot be decoded"].append(number)
         self.numbers, self.stamps, self.logged = np.array(stamped, dtype=np.int64).reshape(-1, 3).T
         self.rows = np.arange(len(stamped))
 
@@ -290,8 +270,17 @@ class TopicMessages:
 
     def keep(self, good: NDArray[np.bool_], reason: str) -> None:
         """Drop the messages that are not good (K,) for ``reason``."""
-        self._left_out += [(number, reason) for number in self.numbers[self.rows[~good[self.rows]]].tolist()]
+        if len(dropped := self.numbers[self.rows[~good[self.rows]]]):
+            self._left_out[reason] += dropped.tolist()
         self.rows = self.rows[good[self.rows]]
+
+    def keep_planar(self, quaternions: Array) -> Array:
+        """Headings (K,), rad, of the quaternions (K, 4) of all messages, of which those that are flawed are dropped."""
+        orientations = planar_headings(quaternions)
+        flawed = self.rows[orientations.flawed[self.rows]]
+        flaw = f", as {orientations.flaw(int(flawed[0]))}" if len(flawed) else ""
+        self.keep(~orientations.flawed, f"with a wrong orientation{flaw}")
+        return orientations.headings
 
     def in_order(self, notes: list[str], way_out: str = "") -> NDArray[np.intp]:
         """Indices of the messages that remain, sorted by stamp, without repeated stamps.
@@ -312,20 +301,18 @@ class TopicMessages:
         fresh = np.zeros(len(self.contents), dtype=bool)
         fresh[self.rows] = np.diff(self.stamps[self.rows], prepend=-1) > 0
         self.keep(fresh, "with a repeated stamp")
-        firsts, total = {reason: number for number, reason in self._left_out[::-1]}, self._topic.messages
-        counts = Counter(reason for _, reason in self._left_out)
-        reasons = [f"{count} {reason} (first: message {firsts[reason]})" for reason, count in counts.items()]
-        left_out = f"{counts.total()} of {plural(total, 'message')} left out: {', '.join(reasons)}"
-        if len(self.rows) < max(2, counts.total()):
-            if _NO_STAMP in counts:
+        total, count = plural(self._topic.messages, "message"), sum(map(len, self._left_out.values()))
+        reasons = [f"{len(each)} {reason} (first: message {each[0]})" for reason, each in self._left_out.items()]
+        words = [f"{count} of {total} left out: {', '.join(reasons)}"] if count else []
+        if len(self.rows) < max(2, count):
+            if _NO_STAMP in self._left_out:
                 topics = [topic.name for topic in self._bag.topics if topic.recorded or topic == self._topic]
                 way_out = (
                     f"set recorded_stamps=[{','.join(topics)}] to take the times of recording, or record it anew: the "
                     "publisher must fill header.stamp"
                 )
-            problem = left_out if counts else f"it has {plural(total, 'message')}, too few"
+            problem = words[0] if count else f"it has {total}, too few"
             raise DataError(f"{self.place}: {problem}{'; ' if way_out else ''}{way_out}")
-        words = [left_out] if counts else []
         if self._headless:
             words.append("its messages have no stamps; they have the times of recording")
         if late := int(np.count_nonzero(behind)):

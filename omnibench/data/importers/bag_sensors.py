@@ -30,22 +30,20 @@ from pydantic import Field
 
 from omnibench.config import Positive, validate
 from omnibench.data.aligned import WheelSamples, measured_as
-from omnibench.data.cutting import find_rests
 from omnibench.data.importers.bag_messages import (
     FIX,
     TRANSFORMS,
     Bag,
-    Stamps,
+    Clock,
     Topic,
     TopicMessages,
     open_bag,
     possible,
     reader_of,
-    stamp_of,
 )
-from omnibench.data.importers.tum import planar_headings
 from omnibench.data.recording import ReferenceOptions, ScanReadings, ScanShape, scan_difference
 from omnibench.data.references import Reference, ReferenceKind, References
+from omnibench.data.runs import find_rests
 from omnibench.data.scans import Mount, Ranges, Scanner
 from omnibench.data.splits import Names
 from omnibench.errors import ConfigError, DataError, nearest
@@ -85,20 +83,19 @@ def east_north(latitudes: Array, longitudes: Array, origin: tuple[float, float],
 
     height: m above the ellipsoid, of all points: the robot is on the floor.
     """
+
+    def geocentric(phi: Array, lam: Array) -> Array:  # Eq. (1)
+        normal = _SEMI_MAJOR / np.sqrt(1 - _ECCENTRICITY_SQUARED * np.sin(phi) ** 2)
+        out = (normal + height) * np.cos(phi)
+        up = (normal * (1 - _ECCENTRICITY_SQUARED) + height) * np.sin(phi)
+        return np.array([out * np.cos(lam), out * np.sin(lam), up])
+
     phi, lam = np.radians(origin)
-    start = _geocentric(np.array([phi]), np.array([lam]), height)
-    dx, dy, dz = (_geocentric(np.radians(latitudes), np.radians(longitudes), height) - start).T
+    start = geocentric(np.array([phi]), np.array([lam]))
+    dx, dy, dz = geocentric(np.radians(latitudes), np.radians(longitudes)) - start
     east = -np.sin(lam) * dx + np.cos(lam) * dy  # Eq. (2)
     north = -np.sin(phi) * (np.cos(lam) * dx + np.sin(lam) * dy) + np.cos(phi) * dz  # Eq. (3)
     return np.column_stack([east, north])
-
-
-def _geocentric(phi: Array, lam: Array, height: float) -> Array:
-    """Geocentric coordinates (K, 3), m, Eq. (1)."""
-    normal = _SEMI_MAJOR / np.sqrt(1 - _ECCENTRICITY_SQUARED * np.sin(phi) ** 2)
-    out = (normal + height) * np.cos(phi)
-    up = (normal * (1 - _ECCENTRICITY_SQUARED) + height) * np.sin(phi)
-    return np.column_stack([out * np.cos(lam), out * np.sin(lam), up])
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,13 +111,8 @@ class SensorReadings:
     sigmas: Array
 
 
-def read_sensor(
-    bag: Bag, topic: Topic, options: SensorOptions, seconds: Callable[[Topic, Stamps], Array], notes: list[str]
-) -> SensorReadings:
-    """The readings of a topic; what is left out is added to ``notes``. DataError: how exact they are is not known.
-
-    seconds: gives times by the clock of the wheels, s, to the stamps of the topic's messages.
-    """
+def read_sensor(bag: Bag, topic: Topic, options: SensorOptions, seconds: Clock, notes: list[str]) -> SensorReadings:
+    """The readings of a topic; what is left out is added to ``notes``. DataError: how exact they are is not known."""
     fields = _FIX if topic.type == FIX else _IMU
     messages = TopicMessages(bag, topic, reader_of(fields))
     table = messages.table(len(fields))
@@ -136,9 +128,7 @@ def read_sensor(
     else:
         option, sigma = "heading_sigma_deg", options.heading_sigma_deg and math.radians(options.heading_sigma_deg)
         way = "degrees: --set heading_sigma_deg=2, or take its rates of turn: --set imu=gyro"
-        orientations = planar_headings(table[:, :4])
-        messages.keep(~orientations.flawed, "with a wrong orientation, or tilted by over 20 degrees")
-        values, variances = orientations.headings[:, None], table[:, 6:]
+        values, variances = messages.keep_planar(table[:, :4])[:, None], table[:, 6:]
     variances = np.full_like(variances, sigma**2) if sigma else variances
     exact: NDArray[np.bool_] = np.asarray((np.isfinite(variances) & (variances > 0)).all(axis=1))
     if len(messages.rows) and not exact[messages.rows].any():
@@ -171,15 +161,14 @@ class BagSensors:
         no rest, and ``gyro_offset_deg`` is not given.
         """
         rests = [rest for part in samples.stretches() for rest in find_rests(*samples.edges(part), least_rest, still)]
-        readings, sigma = [], 0.0
+        readings, offsets = [], [0.0]
         for sensor in self.readings:
             if sensor.kind == "turn":
-                resting = np.zeros(len(sensor.times), dtype=bool)
-                for begin, end in rests:
-                    resting |= (sensor.times >= begin) & (sensor.times <= end)
+                within = [(sensor.times >= begin) & (sensor.times <= end) for begin, end in rests]
+                resting = np.any(within, axis=0) if rests else np.zeros(len(sensor.times), dtype=bool)
                 if resting.any():
                     rested = float(resting.sum() * np.median(np.diff(sensor.times)))
-                    offset = math.radians(self.options.gyro_noise_deg) / math.sqrt(rested)
+                    offsets.append(math.radians(self.options.gyro_noise_deg) / math.sqrt(rested))
                     sensor = replace(sensor, values=sensor.values - sensor.values[resting].mean())
                 elif self.options.gyro_offset_deg is None:
                     raise DataError(
@@ -188,10 +177,9 @@ class BagSensors:
                         "--set gyro_offset_deg=0.5"
                     )
                 else:
-                    offset = math.radians(self.options.gyro_offset_deg)
-                sigma = max(sigma, offset)
+                    offsets.append(math.radians(self.options.gyro_offset_deg))
             readings.append(sensor)
-        return replace(self, readings=readings, rate_sigma=sigma)
+        return replace(self, readings=readings, rate_sigma=max(offsets))
 
     def of_run(self, zero: float, end: float, *, start_known: bool) -> References | None:
         """The references of a run from the time ``zero`` on, for ``end`` s; None if there are none.
@@ -218,49 +206,47 @@ class BagSensors:
 
     def _turns(self, times: Array, rates: Array, end: float) -> list[Reference]:
         """Angles turned in each period; beside the offset's, their errors are independent: a rate's white noise."""
-        angles = np.concatenate([[0.0], np.cumsum((rates[1:] + rates[:-1]) / 2 * np.diff(times))])
         begin, last = max(0.0, float(times[0])), min(end, float(times[-1]))
         if last - begin < _LEAST_SPAN:
             return []
-        count = max(1, round((last - begin) / self.options.reference_period))
-        edges = np.linspace(begin, last, count + 1)
+        edges = np.linspace(begin, last, max(1, round((last - begin) / self.options.reference_period)) + 1)
+        angles = np.concatenate([[0.0], np.cumsum((rates[1:] + rates[:-1]) / 2 * np.diff(times))])
         turned = np.diff(np.interp(edges, times, angles))
-        sigma = math.radians(self.options.gyro_noise_deg) * math.sqrt((last - begin) / count)
+        sigma = math.radians(self.options.gyro_noise_deg) * math.sqrt((last - begin) / len(turned))
         gaps = np.flatnonzero(np.diff(times) > _LONGEST_GAP)
-        seen = [not ((times[gaps] < edges[row + 1]) & (times[gaps + 1] > edges[row])).any() for row in range(count)]
         return [
-            Reference("turn", float(turned[row]), sigma, float(edges[row + 1]), float(edges[row]))
-            for row in np.flatnonzero(seen).tolist()
+            Reference("turn", angle, sigma, t1, t0)
+            for angle, t0, t1 in zip(turned.tolist(), edges[:-1].tolist(), edges[1:].tolist(), strict=True)
+            if not ((times[gaps] < t1) & (times[gaps + 1] > t0)).any()
         ]
 
 
 _BASES = ("base_link", "base_footprint", "base")  # REP-105; with or without the robot's namespace
 _LARGEST_TILT = math.radians(20)  # rad; a scanner with a larger tilt does not scan parallel to the floor (chosen)
 _SAME_INCREMENT = 0.1  # relative difference of the time between rays, which some drivers measure anew for every scan
-_WAY_OUT = "scans=false leaves the scans out"
 Parents = dict[str, tuple[str, Array]]
 
 
 def _transforms(bag: Bag, topic: Topic) -> Iterator[tuple[str, str, Any]]:
     """Frame, parent and transform from the frame to its parent, of all messages of a topic."""
-    for record in bag.records(topic):
-        for each in getattr(record.message, "transforms", ()):
+    for _, _, message in bag.records(topic):
+        for each in getattr(message, "transforms", ()):
             yield each.child_frame_id.strip("/"), each.header.frame_id.strip("/"), each.transform
 
 
 def fixed_transforms(bag: Bag) -> Parents:
     """Parent of every frame of /tf_static, and the transform (4, 4) from the frame to its parent."""
-    from scipy.spatial.transform import Rotation  # slow to import, and needed by bags with transforms alone
+    from scipy.spatial.transform import RigidTransform, Rotation  # slow, and needed by bags with transforms alone
 
     parents: Parents = {}
     for topic in bag.of_type(TRANSFORMS):
         for child, parent, transform in _transforms(bag, topic) if topic.name.endswith("tf_static") else ():
-            turn, place, matrix = transform.rotation, transform.translation, np.eye(4)
+            turn, place = transform.rotation, transform.translation
             try:
-                matrix[:3, :3] = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
+                rotation = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w])
             except ValueError:  # all zeros: no rotation, and so no transform
                 continue
-            matrix[:3, 3] = place.x, place.y, place.z
+            matrix = RigidTransform.from_components([place.x, place.y, place.z], rotation).as_matrix()
             if np.isfinite(matrix).all():
                 parents[child] = parent, matrix
     return parents
@@ -300,13 +286,10 @@ def frames_between(bag: Bag, topic: Topic, frames: Sequence[str]) -> tuple[list[
     return links, fixed
 
 
-def read_scans(
-    bag: Bag, topic: Topic, mount: Mount | None, seconds: Callable[[Topic, Stamps], Array], notes: list[str]
-) -> ScanReadings:
-    """Check every scan of a topic; what is left out is added to ``notes``. DataError.
+def read_scans(bag: Bag, topic: Topic, mount: Mount | None, seconds: Clock, notes: list[str]) -> ScanReadings:
+    """Check every scan of a topic; what is left out is added to ``notes``. DataError, or ConfigError: it is no scanner.
 
-    mount: of the scanner; None: by /tf_static. seconds: gives times by the clock of the wheels, s, to the stamps of the
-    first rays.
+    mount: of the scanner; None: by /tf_static. The stamp of a scan is that of its first ray.
     """
     messages = TopicMessages(bag, topic, _laser_scan)
     place, scans = messages.place, messages.contents
@@ -315,14 +298,11 @@ def read_scans(
         if difference := scan_difference(shape, other):
             raise DataError(
                 f"{place}, message {number}: {difference} as in the messages before; all scans must be of one scanner, "
-                f"of one number of rays; {_WAY_OUT}"
+                "of one number of rays"
             )
     empty = f"without a range from {shape.range_min:g} to {shape.range_max:g} m"
     messages.keep(np.array([seen for _, seen, *_ in scans], dtype=bool), empty)
-    try:
-        rows = messages.in_order(notes)
-    except DataError as error:
-        raise DataError(f"{error}; {_WAY_OUT}") from None
+    rows = messages.in_order(notes)
     _, _, frame, _, scan_time = scans[0]
     # The scanner's time between rays, s: the median of its scans.
     increments = np.array([increment for _, _, _, increment, _ in scans])
@@ -336,10 +316,7 @@ def read_scans(
     mount, sense = (mount, 1) if mount else _mounting(bag, frame, place, notes)
     angles = {"angle_min": sense * shape.angle_min, "angle_increment": sense * shape.angle_increment}
     content = {"name": topic.name, "time_increment": increment, "mount": mount, **shape._asdict(), **angles}
-    try:
-        scanner = validate(Scanner, content, place)
-    except ConfigError as error:
-        raise DataError(f"{error}; {_WAY_OUT}") from None
+    scanner = validate(Scanner, content, place)
     stamps, logged = messages.stamps[rows], messages.logged[rows]
 
     def read(chosen: NDArray[np.intp]) -> Ranges:
@@ -349,10 +326,10 @@ def read_scans(
         ranges = np.empty((len(chosen), scanner.rays), np.float32)
         with open_bag(bag.path, [topic.name] if topic.recorded else [], bag.definitions) as again:
             first, last = int(logged[chosen].min()), int(logged[chosen].max())
-            for record in again.records(again.topic(topic.name, "scan_topic"), first, last):
-                index = places.pop((record.logged, stamp_of(topic, record, record.message)), None)
-                if index is not None and len(record.message.ranges) == scanner.rays:
-                    ranges[index] = _measured(record.message)
+            for _, when, message in again.records(again.topic(topic.name, "scan_topic"), first, last):
+                index = places.pop((when, topic.stamp(message, when)), None)
+                if index is not None and len(message.ranges) == scanner.rays:
+                    ranges[index] = _measured(message)
         if places:
             raise DataError(f"{place}: the bag has changed since it was opened; import it again")
         return ranges
@@ -398,7 +375,7 @@ def _mounting(bag: Bag, frame: str, place: str, notes: list[str]) -> tuple[Mount
     if min(tilt, math.pi - tilt) > _LARGEST_TILT:
         raise DataError(
             f"{bag.path}: the scanner's frame {frame} is tilted by {math.degrees(tilt):.0f} degrees, so that it does "
-            f"not scan the plane of the floor; if it does, set scanner_mount; {_WAY_OUT}"
+            "not scan the plane of the floor; if it does, set scanner_mount"
         )
     yaw = math.atan2(whole[1, 0], whole[0, 0])
     return Mount(x=float(whole[0, 3]), y=float(whole[1, 3]), yaw=yaw), -1 if tilt > math.pi / 2 else 1

@@ -7,8 +7,8 @@ value and standard deviation.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from itertools import pairwise
 from pathlib import Path
@@ -16,7 +16,7 @@ from shlex import quote
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-import polars as pl
+from numpy.typing import NDArray
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from omnibench.config import as_yaml
@@ -24,10 +24,12 @@ from omnibench.data.dataset import SPLITS, Dataset
 from omnibench.data.delimited import (
     AUTO,
     DECIMAL_COMMA,
+    LARGE,
     ColumnError,
     NoRowsError,
     Table,
     missing_column,
+    not_increasing,
     read_cells,
 )
 from omnibench.data.importer import Importer
@@ -35,8 +37,10 @@ from omnibench.data.importers.tum import planar_headings, read_tum
 from omnibench.data.recording import PoseReadings, Recording, ReferenceOptions, RunAttributes, WheelReadings, words_of
 from omnibench.data.references import KINDS, NUMBERS, References, reference_flaw, references_of
 from omnibench.data.runs import dataset_of
+from omnibench.data.scratch import Scratch
 from omnibench.data.splits import Names
 from omnibench.errors import DataError, nearest
+from omnibench.progress import expect_reading, tell_reading
 from omnibench.registry import importers
 from omnibench.robot.kinematics import Array
 from omnibench.words import plural, some
@@ -398,15 +402,13 @@ def _likely(column: StreamColumn, names: Sequence[str], options: CsvOptions, bes
 class TableFiles:
     """The files of wheels and of poses of a recording; one file where they stand in the same rows.
 
-    references: that of distances, turns and the like, of this recording or of all; without poses there is one. loaded:
-    the table of the wheels, where it is the only one and was read already.
+    references: that of distances, turns and the like, of this recording or of all; without poses there is one.
     """
 
     name: str
     wheels: Path
     poses: Path | None
     references: Path | None = None
-    loaded: Table | None = field(default=None, repr=False)
 
 
 def find_tables(source: Path, options: CsvOptions, notes: list[str]) -> list[TableFiles]:
@@ -522,8 +524,7 @@ def _by_headers(
         if missing:
             without[file] = table, list(dict.fromkeys(missing))
         else:
-            alone = table if len(tables) == 1 else None
-            fitting.append(TableFiles(name, file, file if posed else None, references, alone))
+            fitting.append(TableFiles(name, file, file if posed else None, references))
     if not fitting and not without:
         raise DataError(f"{source}: none of its tables has rows ({_TEMPLATE})")
     if not fitting:
@@ -552,12 +553,10 @@ def by_run(table: Table, options: CsvOptions) -> Tables:
     column = run_column(options, table)
     if column is None:
         return {None: table}
-    names = pl.Series(table.texts(column))
-    rows = pl.DataFrame({"row": np.arange(len(names))}).group_by(names.alias("run"), maintain_order=True).agg("row")
-    of_runs = {run: of_run.to_numpy() for run, of_run in zip(rows["run"], rows["row"], strict=True)}
+    of_runs: Tables = dict(table.by_text(column).items())
     if "" in of_runs:
-        raise table.fail(int(of_runs[""][0]), f"{column} is missing; name the run of every row")
-    return {run: table.only(of_run) for run, of_run in of_runs.items()}
+        raise of_runs[""].fail(0, f"{column} is missing; name the run of every row")
+    return of_runs
 
 
 def read_measured(table: Table) -> References:
@@ -585,37 +584,40 @@ def read_measured(table: Table) -> References:
 
 def _stream(
     table: Table, columns: Sequence[StreamColumn], what: str, notes: list[str], *, shared: bool
-) -> tuple[Array, Array, list[str], Table]:
-    """Times (rows,) and values (rows, n) of a stream, the names of its values, and the rows of the table that hold it.
+) -> tuple[Array, Array, list[str], NDArray[np.intp]]:
+    """Times (F,) and values (F, n) of a stream, the names of its values, and the rows (F,) of the table that hold it.
 
     what: wheels or poses. Rows without any value of the stream are left out, and so are rows that repeat a time.
     DataError names the row of what is wrong.
     """
     time, *names = [column.place(table) or column.names[0] for column in columns]
-    blank = np.isnan(table.numbers(names)).all(axis=1)
-    if blank.all():
-        raise DataError(f"{table.file}: no row has values of the {what} ({', '.join(names)})")
-    rows = table.only(np.flatnonzero(~blank)) if blank.any() else table
+    numbers = table.numbers([time, *names])
+    filled = ~np.isnan(numbers[:, 1:]).all(axis=1)
+    rows, blank = np.flatnonzero(filled), len(numbers) - int(np.sum(filled))
     beside = shared and what == "poses"  # poses in the rows of the wheels
-    for row in np.flatnonzero(np.isnan(rows.numbers([time])[:, 0]))[:1].tolist() if beside else ():
+    if blank == len(numbers):
+        raise DataError(f"{table.file}: no row has values of the {what} ({', '.join(names)})")
+    if blank:
+        numbers = numbers[rows]
+        if not shared:
+            notes.append(f"{table.file}: {plural(blank, 'row')} without values of the {what} left out")
+    for row in np.flatnonzero(np.isnan(numbers[:, 0]))[:1].tolist() if beside else ():
         way = 'where poses have a column of times of their own, --set "columns={pose_t: NAME}"'
-        raise rows.fail(row, f"{time} is missing; {way}")
-    values = rows.columns([time, *names])
-    if blank.any() and not shared:
-        left_out = plural(int(blank.sum()), "row")
-        notes.append(f"{table.file}: {left_out} without values of the {what} left out")
-    fresh = np.diff(values[:, 0], prepend=-np.inf) != 0
-    repeated = int((~fresh).sum())
+        raise table.fail(int(rows[row]), f"{time} is missing; {way}")
+    table.check_finite(numbers, [time, *names], rows)
+    again = np.diff(numbers[:, 0], prepend=np.nan) == 0
     # Of a sensor that is slower than the rows all values are held.
-    held = np.append(False, (np.diff(values, axis=0) == 0).all(axis=1))
-    if repeated and (repeated < _MOST_REPEATED * len(fresh) or held[~fresh].all()):
-        rows = rows.only(np.flatnonzero(fresh))
+    held = np.append(False, (np.diff(numbers[:, 1:], axis=0) == 0).all(axis=1))
+    if again.any() and (np.mean(again) < _MOST_REPEATED or held[again].all()):
+        numbers, rows = numbers[~again], rows[~again]
         if not beside:  # of the same rows it was said
-            notes.append(f"{table.file}: {plural(repeated, 'row')} that repeat the {time} of the one before left out")
-    try:
-        return rows.increasing(time), rows.columns(names), names, rows
-    except DataError as error:
-        raise DataError(f"{error}{_of_runs(rows, time)}") from None
+            repeated = plural(int(again.sum()), "row")
+            notes.append(f"{table.file}: {repeated} that repeat the {time} of the one before left out")
+    times = numbers[:, 0].copy()
+    if (flaw := not_increasing(times)) is not None:
+        row, why = flaw
+        raise DataError(f"{table.fail(int(rows[row]), f'{time} {why}')}{_of_runs(table.only(rows), time)}")
+    return times, numbers[:, 1:].copy(), names, rows
 
 
 def _of_runs(table: Table, time: str) -> str:
@@ -630,8 +632,11 @@ def _of_runs(table: Table, time: str) -> str:
     return "; repair the row, or, in a table of several runs, name the column of runs: --set run_column=NAME"
 
 
-def read_recordings(source: Path, options: CsvOptions, notes: list[str]) -> list[Recording]:
-    """The recordings of all tables, of each run by itself. DataError names the file and the row of what is wrong."""
+def read_recordings(source: Path, options: CsvOptions, notes: list[str]) -> Sequence[Recording]:
+    """The recordings of all tables, of each run by itself; of large tables in a temporary file, whence one is read.
+
+    DataError names the file and the row of what is wrong.
+    """
     files = find_tables(source, options, notes)
     as_tables = options.model_copy(update={"header_lines": 1, "separator": None})
     measured = {
@@ -640,11 +645,20 @@ def read_recordings(source: Path, options: CsvOptions, notes: list[str]) -> list
         if file
     }
     attributes = read_run_attributes(source, options, notes)
-    recordings = []
-    for each in files:
-        of_runs = measured[each.references] if each.references else {}
-        recordings += _recordings(each, of_runs, attributes, options, notes, several=len(files) > 1)
-    names = [recording.name for recording in recordings]
+    names = list[str]()
+
+    def read() -> Iterator[Recording]:
+        if size > LARGE:
+            expect_reading(len(files), "run")
+        for each in files:
+            of_runs = measured[each.references] if each.references else {}
+            for recording in _recordings(each, of_runs, attributes, options, notes, several=len(files) > 1):
+                tell_reading(1, "run")
+                names.append(recording.name)
+                yield recording
+
+    size = sum(file.stat().st_size for file in {file for each in files for file in (each.wheels, each.poses) if file})
+    recordings = Scratch().sequence(read()) if size > LARGE else list(read())
     for file, of_runs in measured.items():
         if len(names) > 1 and None in of_runs and sum(each.references == file for each in files) != 1:
             raise _unnamed(of_runs[None])
@@ -679,13 +693,13 @@ def _recordings(
     notes: list[str],
     *,
     several: bool,
-) -> list[Recording]:
+) -> Iterator[Recording]:
     """The recording of every run that a column of the tables names, or of all of their rows.
 
     measured: the references by their runs. ColumnError: columns of wheels or of poses are missing, all of which it
     names, or say another unit.
     """
-    shared, table = files.wheels == files.poses, files.loaded or load(files.wheels, options)
+    shared, table = files.wheels == files.poses, load(files.wheels, options)
     reference = files.poses or files.references or files.wheels
     tables = [(table, wheel_columns(options))]
     if files.poses is not None and files.poses.suffix != ".tum":
@@ -704,7 +718,8 @@ def _recordings(
     runs = list(dict.fromkeys([*wheels, *poses]))
     if len(runs) > 1:
         runs = [run for run in runs if run is not None]
-    recordings = []
+        if files.wheels.stat().st_size > LARGE:
+            expect_reading(len(runs), "run")
     for run in runs:
         name = files.name if run is None or (several and len(runs) == 1) else f"{files.name}/{run}" if several else run
         if run not in wheels and None not in wheels:
@@ -730,8 +745,7 @@ def _recordings(
             references = replace(references, start_known=seen is not None and len(seen.times) > 0)
         place = str(reference) if None in wheels else f"{reference}, run {run}"
         said = attributes.get(name, RunAttributes())
-        recordings.append(Recording(name, place, readings, seen, references, attributes=said, one_table=shared))
-    return recordings
+        yield Recording(name, place, readings, seen, references, attributes=said, one_table=shared)
 
 
 def _wheels(table: Table, options: CsvOptions, notes: list[str], *, shared: bool) -> WheelReadings:
@@ -755,7 +769,7 @@ def _poses(table: Table, options: CsvOptions, notes: list[str], *, shared: bool)
     axes = ["xyz".index(axis) for axis in (*options.floor, options.up)]
     orientations = planar_headings(turns[:, [*axes, 3]] * [*side, 1.0, 1.0])
     for row in np.flatnonzero(orientations.flawed)[:1].tolist():
-        raise rows.fail(row, orientations.flaw(row))
+        raise table.fail(int(rows[row]), orientations.flaw(row))
     return PoseReadings(times, np.column_stack([places, orientations.headings]), radians=True)
 
 
@@ -838,6 +852,6 @@ class Csv(Importer):
         notes: list[str] = []
         return dataset_of(self.recordings(source, notes), self.options, notes)
 
-    def recordings(self, source: Path, notes: list[str]) -> list[Recording]:
+    def recordings(self, source: Path, notes: list[str]) -> Sequence[Recording]:
         """The recordings under ``source`` as they stand in their tables."""
         return read_recordings(source, self.options, notes)

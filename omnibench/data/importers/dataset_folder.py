@@ -80,7 +80,7 @@ class DatasetFolder(Importer):
         """The data set as the options say. DataError as for ``load_dataset``."""
         recorded, options = read_recorded(source), self.options
         said = {key: getattr(options, key) or getattr(recorded, key) for key in ("description", "source", "licence")}
-        return _reread(recorded.trajectories, recorded, recorded.scans, options.model_copy(update=said), [])
+        return _reread(recorded, options.model_copy(update=said), [])
 
     def recordings(self, source: Path, notes: list[str]) -> list[Recording]:  # noqa: ARG002 (as of other importers)
         """The runs of the data set as recordings, as they stand in its tables."""
@@ -96,8 +96,7 @@ def read_again(dataset: Dataset, settings: Mapping[str, Any], place: str) -> Dat
     known = {key: getattr(dataset, key) for key in ("robot", "name", "description", "source", "licence")}
 
     def by(settings: Mapping[str, Any], notes: list[str]) -> Dataset:
-        options = validate(DatasetOptions, {**known, **settings}, place)
-        return _reread(dataset.trajectories, dataset, dataset.scans, options, notes)
+        return _reread(dataset, validate(DatasetOptions, {**known, **settings}, place), notes)
 
     before = by({}, []).warnings
     notes = [warning for warning in dataset.warnings if warning not in before]
@@ -105,17 +104,12 @@ def read_again(dataset: Dataset, settings: Mapping[str, Any], place: str) -> Dat
     return again if dataset.referenced else replace(again, referenced=False, warnings=tuple(notes))
 
 
-def _reread(
-    runs: Sequence[Trajectory], header: Dataset, scans: Scans | None, options: DatasetOptions, notes: list[str]
-) -> Dataset:
-    """The data set of runs by the options; its sample period stays unless these say another, or another unit of times.
-
-    header: says the robot by which the runs were recorded, their sample period, and whether they were simulated.
-    """
-    recordings = recordings_of(runs, header.robot, scans, options)
-    dataset = dataset_of(recordings, options, notes, simulated=header.simulated)
+def _reread(recorded: Dataset, options: DatasetOptions, notes: list[str]) -> Dataset:
+    """A data set by the options; its sample period stays unless these say another, or another unit of times."""
+    recordings = recordings_of(recorded.trajectories, recorded.robot, recorded.scans, options)
+    dataset = dataset_of(recordings, options, notes, simulated=recorded.simulated)
     if not options.sample_period and options.wheel_time_unit == "s":
-        dataset = replace(dataset, sample_period=header.sample_period)
+        dataset = replace(dataset, sample_period=recorded.sample_period)
     return joined(dataset, [load_dataset(folder) for folder in options.join])
 
 
@@ -123,49 +117,34 @@ def recordings_of(
     runs: Sequence[Trajectory], robot: Robot, scans: Scans | None, options: DatasetOptions
 ) -> list[Recording]:
     """The runs of a robot's data set as recordings. ConfigError: it has no wheel of a name that the options give."""
-    wheels = _indices(options.wheel_columns or options.robot.wheel_names, robot.wheel_names, "omega_", "wheel_columns")
+    wheels = _chosen(options.wheel_columns or options.robot.wheel_names, robot.wheel_names, "omega_", "wheel_columns")
     axles = options.steering_columns or options.robot.drive.steered
-    steering = _indices(axles, robot.drive.steered, "steer_", "steering_columns")
-    names = tuple(robot.wheel_names[index] for index in wheels), tuple(robot.drive.steered[index] for index in steering)
+    steering = _chosen(axles, robot.drive.steered, "steer_", "steering_columns")
+    names, turning, steered = (tuple(wheels.values()), tuple(steering.values())), list(wheels), list(steering)
     poses = [_POSE.index(column) for column in options.pose_columns]
     factors, second = options.wheel_factors(options.wheel_unit), SECONDS[options.wheel_time_unit]
     scanned = set() if scans is None else set(scans.trajectories)
     recordings = []
     for run in runs:
-        covariances = run.pose_covariances
-        if covariances is not None and poses != [0, 1, 2]:
-            covariances = covariances[:, poses][:, :, poses]
-        others = {
-            "angles": None if run.angles is None else run.angles[:, wheels] * factors,
-            "targets": None if run.targets is None else run.targets[:, wheels] * (options.wheel_signs or 1),
-            "odometry": run.odometry,
-        }
-        numbers = {key: getattr(run, key) for key in ("v", "alpha", "omega", "duration", "distance")}
-        angles = None if run.steering is None or not steering else run.steering[:, steering]
-        attributes = RunAttributes(
-            run.command,
-            run.repetition,
-            run.split,
-            run.session,
-            run.started_at,
-            {key: value for key, value in numbers.items() if value is not None},
-            None if run.sent is None else run.sent * (second, 1, 1, 1, second),
-        )
-        readings = WheelReadings(
-            run.times,
-            run.rates[:, wheels],
-            options.wheel_unit,
-            angles,
-            *names,
-            begin=0.0,
-            others={key: value for key, value in others.items() if value is not None},
-        )
+        others = {} if run.odometry is None else {"odometry": run.odometry}
+        if run.angles is not None:
+            others["angles"] = run.angles[:, turning] * factors
+        if run.targets is not None:
+            others["targets"] = run.targets[:, turning] * (options.wheel_signs or 1)
+        rates, unit = run.rates[:, turning], options.wheel_unit
+        angles = None if run.steering is None or not steered else run.steering[:, steered]
+        readings = WheelReadings(run.times, rates, unit, angles, *names, begin=0.0, others=others)
+        covariances = None if run.pose_covariances is None else run.pose_covariances[:, poses][:, :, poses]
         seen = PoseReadings(run.pose_times, run.poses[:, poses], covariances) if run.start_known else None
         measured = None if run.references is None else run.references.open_ended(float(run.times[-1]))
+        said = {key: getattr(run, key) for key in ("command", "repetition", "split", "session", "started_at")}
+        numbers = {key: getattr(run, key) for key in ("v", "alpha", "omega", "duration", "distance")}
+        numbers = {key: value for key, value in numbers.items() if value is not None}
+        sent = None if run.sent is None else run.sent * (second, 1, 1, 1, second)
+        attributes = RunAttributes(**said, numbers=numbers, sent=sent)
         seeing = None
         if scans is not None and run.id in scanned:
-            ranges = partial(_ranges, scans, run.id)
-            seeing = ScanReadings(scans.scanner, run.id, scans.times(run.id), ranges)
+            seeing = ScanReadings(scans.scanner, run.id, scans.times(run.id), partial(_ranges, scans, run.id))
         place = f"trajectory {run.id}"
         recordings.append(
             Recording(run.id, place, readings, seen, measured, attributes=attributes, scans=seeing, a_run=True)
@@ -177,7 +156,8 @@ def _ranges(scans: Scans, run: str, rows: Any) -> Ranges:
     return scans.of(run).ranges[rows]
 
 
-def _indices(names: Sequence[str], known: Sequence[str], prefix: str, option: str) -> list[int]:
+def _chosen(names: Sequence[str], known: Sequence[str], prefix: str, option: str) -> dict[int, str]:
+    """The wheels that an option names, with or without a prefix, by their indices among those that are known."""
     bare = [name.removeprefix(prefix) for name in names]
     for name in bare:
         if name not in known:
@@ -185,4 +165,4 @@ def _indices(names: Sequence[str], known: Sequence[str], prefix: str, option: st
             raise ConfigError(f"the data set has no wheel {name!r}; {nearest(name, known)}found: {shown}; set {option}")
     if len(set(bare)) < len(bare):
         raise ConfigError(f"{option} names one wheel twice: {', '.join(names)}; name each once")
-    return [known.index(name) for name in bare]
+    return {known.index(name): name for name in bare}

@@ -11,13 +11,14 @@ import csv
 import math
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import cycle
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+import polars as pl
 from numpy.typing import NDArray
 from pydantic import Field
 
@@ -29,7 +30,7 @@ from omnibench.data.splits import Names, complete, divided
 from omnibench.errors import DataError, nearest
 from omnibench.files import read_text
 from omnibench.registry import Options, importers
-from omnibench.robot.kinematics import Array, Robot, Wheel, in_the_middle
+from omnibench.robot.kinematics import Array, Robot, in_the_middle
 from omnibench.words import plural
 
 
@@ -37,16 +38,16 @@ from omnibench.words import plural
 class Kind:
     """A robot, and the columns of its files, counted from 0.
 
-    lengths: how many the metadata state, L, or L1 and L2. wheels: name, type, and x and y in these lengths, or of omni
-    wheels the angle of the axle, deg. columns: of its run files after t, x, y, theta; ticks first. signs: of these, to
-    the wheels' sense in omnibench. log_fields: of a row of its log, whose first is the time. log_ticks, log_signs: as
-    in the run files. log_commands: v, vn (if any) and omega; in ticks and rad a cycle, not in m/s and rad/s, where
-    there is no vn. Empty: they are not logged.
+    lengths: how many the metadata state, L, or L1 and L2. wheels: as in dataset.yaml, without radii, with x, y and
+    distances in these lengths. columns: of its run files after t, x, y, theta; ticks first. signs: of these, to the
+    wheels' sense in omnibench. log_fields: of a row of its log, whose first is the time. log_ticks, log_signs: as in
+    the run files. log_commands: v, vn (if any) and omega; in ticks and rad a cycle, not in m/s and rad/s, where there
+    is no vn. Empty: they are not logged.
     """
 
     title: str
     lengths: int
-    wheels: tuple[tuple[str, str, float, float], ...]
+    wheels: tuple[Mapping[str, Any], ...]
     columns: tuple[str, ...]
     signs: tuple[int, ...]
     log_fields: int
@@ -57,56 +58,56 @@ class Kind:
 
 KINDS = {
     "diff": Kind(
-        "differential drive, encoders at 20 Hz", 1, (("right", "fixed", 0, -0.5), ("left", "fixed", 0, 0.5)),
+        "differential drive, encoders at 20 Hz", 1,
+        ({"name": "right", "type": "fixed", "x": 0, "y": -0.5}, {"name": "left", "type": "fixed", "x": 0, "y": 0.5}),
         ("ticks_right", "ticks_left"), (1, 1), 8, (2, 1), (1, 1), (6, 7),
     ),
     "omni3": Kind(
         "three-wheeled omnidirectional robot, encoders at 25 Hz", 1,
-        (("0", "omni", 300, 0), ("1", "omni", 60, 0), ("2", "omni", 180, 0)),
+        tuple({"name": name, "distance": 1, "angle_deg": angle, "roller_angle": 0}
+              for name, angle in (("0", 300), ("1", 60), ("2", 180))),
         ("ticks_0", "ticks_1", "ticks_2"), (-1, -1, -1), 10, (1, 2, 3), (1, 1, 1), (7, 8, 9),
     ),
     "omni4": Kind(
         "mecanum base, encoders at 100 Hz", 2,
-        (("front_left", "mecanum", 0.5, 0.5), ("front_right", "mecanum", 0.5, -0.5),
-         ("rear_left", "mecanum", -0.5, 0.5), ("rear_right", "mecanum", -0.5, -0.5)),
+        ({"name": "front_left", "type": "mecanum", "x": 0.5, "y": 0.5, "roller_angle_deg": 45},
+         {"name": "front_right", "type": "mecanum", "x": 0.5, "y": -0.5, "roller_angle_deg": -45},
+         {"name": "rear_left", "type": "mecanum", "x": -0.5, "y": 0.5, "roller_angle_deg": -45},
+         {"name": "rear_right", "type": "mecanum", "x": -0.5, "y": -0.5, "roller_angle_deg": 45}),
         ("turns_0", "turns_1", "turns_2", "turns_3"), (1, -1, 1, -1), 11, (1, 2, 3, 4), (-1, 1, -1, 1), (8, 9, 10),
     ),
-    "tricyc": Kind(
+    "tricyc": Kind(  # neither the radius of its rear wheels nor their distance apart counts
         "tricycle with a driven and steered front wheel, encoders at 20 Hz", 1,
-        (("front", "steered", 1, 0), ("rear_left", "fixed", 0, 0.5), ("rear_right", "fixed", 0, -0.5)),
+        ({"name": "front", "type": "steered", "x": 1, "y": 0},
+         {"name": "rear_left", "type": "fixed", "x": 0, "y": 0.5, "measured": False},
+         {"name": "rear_right", "type": "fixed", "x": 0, "y": -0.5, "measured": False}),
         ("ticks", "steering"), (1,), 3, (1,), (1,),
     ),
 }  # fmt: skip
 """The robots by their type in the metadata."""
 
 
-@dataclass(frozen=True)
-class Geometry:
+class Geometry(NamedTuple):
     """Design values by a session's metadata, m. lengths: L, or L1 and L2. diameters: of the wheels."""
 
     lengths: tuple[float, ...]
     diameters: tuple[float, ...]
 
     def __str__(self) -> str:
-        shown = [
-            f"{values[0]:g}" if len(set(values)) == 1 else ", ".join(f"{value:g}" for value in values)
-            for values in (self.lengths, self.diameters)
-        ]
-        return f"L {shown[0]} m, D {shown[1]} m"
+        lengths, diameters = (
+            ", ".join(f"{value:g}" for value in (values[:1] if len(set(values)) == 1 else values)) for values in self
+        )
+        return f"L {lengths} m, D {diameters} m"
 
     def robot(self, kind: str, name: str) -> Robot:
-        """The robot of some type. The radius of a tricycle's rear wheels, and their distance apart, do not count."""
-        wheels = []
-        for (wheel, sort, x, y), diameter in zip(KINDS[kind].wheels, cycle(self.diameters), strict=False):
-            place: dict[str, Any] = {"type": sort, "x": x * self.lengths[0], "y": y * self.lengths[-1]}
-            if sort == "omni":
-                place = {"distance": self.lengths[0], "angle": math.radians(x), "roller_angle": 0.0}
-            elif sort == "mecanum":
-                place["roller_angle"] = math.copysign(math.pi / 4, x * y)
-            elif kind == "tricyc" and sort == "fixed":
-                place["measured"] = False
-            wheels.append(Wheel(name=wheel, radius=diameter / 2, **place))
-        return Robot(name=name, wheels=tuple(wheels))
+        """The robot of some type. Of a tricycle, whose metadata state one diameter, all wheels have this."""
+        scales = {"x": self.lengths[0], "y": self.lengths[-1], "distance": self.lengths[0]}
+        wheels = [
+            {key: value * scales[key] if key in scales else value for key, value in wheel.items()}
+            | {"radius": diameter / 2}
+            for wheel, diameter in zip(KINDS[kind].wheels, cycle(self.diameters), strict=False)
+        ]
+        return Robot.model_validate({"name": name, "wheels": wheels})
 
 
 _RUN = re.compile(r"_run-(\d+)\.csv$")
@@ -132,35 +133,36 @@ class Session:
 
 def read_metadata(file: Path) -> Session:
     """Read a session's metadata and find its runs. DataError names the file and the key that is wrong."""
-    values = {fields[0].strip(): fields[1:] for fields in csv.reader(read_text(file).splitlines()) if fields}
-    robot = "".join(values.get("type", [])[:1]).strip()
+    rows = csv.reader(read_text(file).splitlines())
+    values = {key.strip(): [text.strip() for text in texts if text.strip()] for key, *texts in filter(None, rows)}
+    robot = "".join(values.get("type", [])[:1])
     if robot not in KINDS:
         raise DataError(f"{file}: type is {robot!r}; {nearest(robot, KINDS)}it must be one of {', '.join(KINDS)}")
     numbers: dict[str, tuple[float, ...]] = {"odo_ti": ()}
     counts = {"Di": len(KINDS[robot].signs), "Li": KINDS[robot].lengths, "ngear": 1, "encRes": 1}
-    for key, count in (counts | ({"odo_ti": 0} if "odo_ti" in values else {})).items():
+    optional = {"odo_ti": len(values["odo_ti"])} if "odo_ti" in values else {}
+    for key, count in (counts | optional).items():
         if key not in values:
             raise DataError(f"{file}: key {key!r} is missing; {nearest(key, values)}found: {', '.join(values)}")
-        texts = [text.strip() for text in values[key] if text.strip()]
-        numbers[key] = _numbers(texts)
-        if len(numbers[key]) != (count or len(texts)):
-            raise DataError(f"{file}: {key} is {', '.join(texts)!r}, expected {count or 'finite'} numbers")
-        if count and min(numbers[key]) <= 0:
+        numbers[key] = _numbers(values[key])
+        if len(numbers[key]) != count:
+            raise DataError(f"{file}: {key} is {', '.join(values[key])!r}, expected {count} numbers")
+        if key in counts and min(numbers[key]) <= 0:
             raise DataError(f"{file}: {key} is {min(numbers[key]):g}, it must be above 0")
     name = file.name.removesuffix("_metadata.csv")
     files = sorted(file.parent.glob(f"{name}_run-*.csv"))
     runs = {int(match[1]): path for path in files if (match := _RUN.search(path.name))}
     if not runs:
         raise DataError(f"{file.parent}: no {name}_run-NN.csv beside {file.name}")
-    geometry = Geometry(numbers["Li"], numbers["Di"])
     tick = 2 * math.pi / (numbers["ngear"][0] * numbers["encRes"][0])
+    geometry = Geometry(numbers["Li"], numbers["Di"])
     return Session(file, file.parent.parent.name, name, robot, geometry, tick, numbers["odo_ti"], runs)
 
 
 def _numbers(texts: Sequence[str]) -> tuple[float, ...]:
     """Texts as numbers; empty if one is not a finite number."""
     try:
-        numbers = tuple(float(text) for text in texts)
+        numbers = tuple(map(float, texts))
     except ValueError:
         return ()
     return numbers if all(map(math.isfinite, numbers)) else ()
@@ -188,26 +190,26 @@ def read_log(session: Session) -> SessionLog | None:
     file, kind = session.file.with_name(f"{session.name}.csv"), KINDS[session.robot]
     if not file.is_file():
         return None
-    header: list[list[str]] = []
-    run, rows = None, []
-    for line, text in enumerate(read_text(file).splitlines(), 1):
-        fields = text.split(",")
-        if fields[0] == "Run:":
-            if len(fields) < 2 or not fields[1].strip().isdigit():
-                raise DataError(f"{file}, line {line}: expected the number of a run after 'Run:'")
-            run = int(fields[1])
-        elif fields[0] in ("RUNFINISHED", "METHODFINISHED") or fields[0].startswith("+++"):
-            run = None
-        elif run is not None:
-            numbers = _numbers(fields[: kind.log_fields])
-            if len(numbers) < kind.log_fields:
-                raise DataError(f"{file}, line {line}: expected {kind.log_fields} finite numbers; repair the row")
-            rows.append((run, *numbers))
-        elif not rows:
-            header.append(fields)
-    if not rows:
+    text, line, run = pl.col("text"), pl.col("line"), pl.col("run")
+    first = text.str.extract("^([^,]*)")
+    number = text.str.extract(r"^Run:,\s*(\d+)\s*(?:,|$)").cast(pl.Int64, strict=False)
+    ends = first.is_in(["RUNFINISHED", "METHODFINISHED"]) | first.str.starts_with("+++")
+    lines = pl.DataFrame({"text": read_text(file).splitlines()}, {"text": pl.String}).with_row_index("line", 1)
+    for row in lines.filter((first == "Run:") & number.is_null())["line"].head(1):
+        raise DataError(f"{file}, line {row}: expected the number of a run after 'Run:'")
+    # The run that each line stands in, -1 outside of runs; markers are left out.
+    lines = lines.with_columns(pl.when(ends).then(-1).otherwise(number).forward_fill().fill_null(-1).alias("run"))
+    lines = lines.filter((first != "Run:") & ~ends)
+    rows = lines.filter(run >= 0)
+    if rows.is_empty():
         raise DataError(f"{file}: it holds no run")
-    runs, table = np.array(rows)[:, 0].astype(np.intp), np.array(rows)[:, 1:]
+    fields, count = text.str.split(",").list, kind.log_fields
+    columns = [fields.get(place, null_on_oob=True).str.strip_chars().alias(f"{place}") for place in range(count)]
+    table = rows.select(columns).cast(pl.Float64, strict=False).to_numpy()
+    for row in rows["line"].filter(~np.isfinite(table).all(axis=1)).head(1):
+        raise DataError(f"{file}, line {row}: expected {count} finite numbers; repair the row")
+    header = [row.split(",") for row in lines.filter((run < 0) & (line < rows["line"][0]))["text"]]
+    runs = rows["run"].to_numpy().astype(np.intp)
     times, ticks, commands = table[:, 0], table[:, kind.log_ticks] * kind.log_signs, None
     if len(kind.log_commands) == 3:
         commands = table[:, kind.log_commands]
@@ -301,14 +303,14 @@ class Optiodom(Importer):
         if not sessions:
             raise DataError(f"{source}: no *_metadata.csv below it; name a folder with OptiOdom sessions (data/omni3)")
         kinds = sorted({session.robot for session in sessions})
+        kind = options.robot or kinds[0]
         if options.robot is None and len(kinds) > 1:
             raise DataError(
                 f"{source}: it holds recordings of {plural(len(kinds), 'robot')}, {', '.join(kinds)}; import one at a "
-                f"time: name its folder, or --set robot={kinds[0]}"
+                f"time: name its folder, or --set robot={kind}"
             )
-        if options.robot not in (None, *kinds):
-            raise DataError(f"{source}: it holds no recordings of robot {options.robot}; found: {', '.join(kinds)}")
-        kind = options.robot or kinds[0]
+        if kind not in kinds:
+            raise DataError(f"{source}: it holds no recordings of robot {kind}; found: {', '.join(kinds)}")
         sessions = [session for session in sessions if session.robot == kind]
         # The commonest geometry, of equally common ones the first session's; and a note if there are others.
         (geometry, most), *others = Counter(session.geometry for session in sessions).most_common()
@@ -319,19 +321,17 @@ class Optiodom(Importer):
                 f"sessions state different dimensions of the robot: those of {most} of {len(sessions)} are taken, "
                 f"{geometry} (others: {rest})"
             )
-        logs = [read_log(session) if options.log else None for session in sessions]
-        unlogged = [session.name for session, log in zip(sessions, logs, strict=True) if log is None]
-        if options.log and unlogged:
+        runs, groups, unlogged = list[Trajectory](), list[str](), list[str]()
+        for session in sessions:
+            log = read_log(session) if options.log else None
+            unlogged += [session.name] if log is None and options.log else []
+            runs += [_read_run(session, number, log, options.log) for number in session.runs]
+            groups += [session.group] * len(session.runs)
+        if unlogged:
             notes.append(
                 f"{len(unlogged)} of {plural(len(sessions), 'session')} have no log ({', '.join(unlogged)}): commands "
                 "are named after the motion by the wheels there, and absolute wheel angles are left out of all runs"
             )
-        runs = [
-            _read_run(session, number, log, options.log)
-            for session, log in zip(sessions, logs, strict=True)
-            for number in session.runs
-        ]
-        groups = [session.group for session in sessions for _ in session.runs]
         train = options.train
         if not train and not options.validation and len(set(groups)) > 1:
             train = (min(groups),)
@@ -348,25 +348,16 @@ class Optiodom(Importer):
         return replace(dataset, warnings=(*notes, *dataset.warnings))
 
 
-class _Motion(NamedTuple):
-    """A run's motion: medians of speed, m/s, direction, rad, and rate of turn, rad/s, while it moves; the greatest
-    speed, m/s; length, m, and turn, rad, in all."""
+def _motion(twists: Array, durations: Array) -> dict[str, Any]:
+    """The motion of twists (rows, 3) in m/s, m/s, rad/s for durations (rows,), s, as fields of a trajectory.
 
-    v: float
-    alpha: float
-    omega: float
-    fastest: float
-    distance: float
-    turned: float
-
-
-def _motion(twists: Array, durations: Array) -> _Motion:
-    """The motion of twists (rows, 3) in m/s, m/s, rad/s for durations (rows,), s."""
+    v (m/s), alpha (rad) and omega (rad/s) are medians while it moves, distance (m) is the length of it all.
+    """
     speeds = np.hypot(twists[:, 0], twists[:, 1])
     moving = (speeds > _SAME_SPEED) | (np.abs(twists[:, 2]) > _SAME_SPEED)
     vx, vy, omega = np.median(twists[moving], axis=0) if moving.any() else np.zeros(3)
-    v, alpha, turned = float(np.hypot(vx, vy)), math.atan2(vy, vx), float(twists[:, 2] @ durations)
-    return _Motion(v, alpha, float(omega), float(speeds.max()), float(speeds @ durations), turned)
+    direction = {"v": float(np.hypot(vx, vy)), "alpha": math.atan2(vy, vx), "omega": float(omega)}
+    return direction | {"distance": float(speeds @ durations)}
 
 
 def _read_run(session: Session, number: int, log: SessionLog | None, with_log: bool) -> Trajectory:
@@ -378,28 +369,24 @@ def _read_run(session: Session, number: int, log: SessionLog | None, with_log: b
         raise DataError(f"{table.file}: a run needs two rows or more")
     times = table.increasing("t")
     times = times - times[0]
+    steps, end = np.diff(times), float(times[-1])
     ticks = table.columns(kind.columns[: len(kind.signs)]) * kind.signs
-    rates = ticks[1:] * session.angle_per_tick / np.diff(times)[:, None]
+    rates, poses = ticks[1:] * session.angle_per_tick / steps[:, None], table.columns(_POSE[1:])
+    steering = table.columns(("steering",))[1:] if "steering" in table else None
+    name = f"{session.group}_{table.file.stem}"
     run = Trajectory(
-        id=f"{session.group}_{table.file.stem}",
-        split="train",
-        times=times[1:],
-        rates=rates,
-        pose_times=times,
-        poses=table.columns(_POSE[1:]),
-        session=session.name,
-        duration=float(times[-1]),
-        steering=table.columns(("steering",))[1:] if "steering" in table else None,
+        name, "train", times[1:], rates, times, poses, session=session.name, duration=end, steering=steering
     )
     if not with_log:
         return run
     robot = session.geometry.robot(session.robot, session.robot)
-    middle = None if run.steering is None else in_the_middle(run.steering)
-    driven = _motion(robot.drive.signals(rates, middle) @ robot.inverse_kinematic_matrix.T, np.diff(times))
-    alpha, speed, path = driven.alpha, "", f"_{driven.distance:.1f}m"
+    middle = None if steering is None else in_the_middle(steering)
+    driven = robot.drive.signals(rates, middle) @ robot.inverse_kinematic_matrix.T
+    motion, turned, speed = _motion(driven, steps), math.degrees(float(driven[:, 2] @ steps)), ""
+    alpha, path = motion["alpha"], f"_{motion['distance']:.1f}m"
     if log is not None:
         path, start = log.path, session.starts[number - 1] if number <= len(session.starts) else 0.0
-        first = round(start / float(np.median(np.diff(times))))
+        first = round(start / float(np.median(steps)))
         rows = np.flatnonzero(log.runs == number)[first : first + len(ticks)]
         if len(rows) < len(ticks) or not np.allclose(log.ticks[rows], ticks, rtol=0, atol=_SAME_TICKS):
             raise DataError(
@@ -408,8 +395,8 @@ def _read_run(session: Session, number: int, log: SessionLog | None, with_log: b
         logged = log.times[rows]
         run = replace(run, angles=log.angles[rows[1:]], started_at=float(logged[0] - log.times[0]))
         if log.commands is not None:
-            sent = _motion(log.commands[rows], np.diff(logged, prepend=logged[0]))
-            run = replace(run, v=sent.v, alpha=sent.alpha, omega=sent.omega, distance=sent.distance)
-            alpha, speed = sent.alpha, f"_v{sent.fastest:.2g}"
-    direction, turn = round(math.degrees(alpha) / 5) * 5, round(math.degrees(driven.turned) / 90) * 90
+            sent = log.commands[rows]
+            motion, speed = _motion(sent, np.diff(logged, prepend=logged[0])), f"_v{np.hypot(*sent[:, :2].T).max():.2g}"
+            run, alpha = replace(run, **motion), motion["alpha"]
+    direction, turn = round(math.degrees(alpha) / 5) * 5, round(turned / 90) * 90
     return replace(run, command=f"{session.group}_a{direction}_turn{turn:+d}{speed}{path}")

@@ -23,19 +23,16 @@ from omnibench.data.importers.bag_messages import (
     SECOND,
     TRANSFORMS,
     Bag,
-    Record,
     Stamps,
     Topic,
     TopicMessages,
     find_bags,
-    header_stamp,
     open_bag,
     possible,
     reader_of,
 )
 from omnibench.data.importers.bag_sensors import BagSensors, SensorOptions, frames_between, read_scans, read_sensor
 from omnibench.data.importers.copied_reference import follows_the_wheels
-from omnibench.data.importers.tum import planar_headings
 from omnibench.data.recording import (
     Event,
     PoseReadings,
@@ -149,7 +146,7 @@ def wheel_topics(bag: Bag, options: RosbagOptions) -> list[Topic]:
     """
     if options.wheel_topic:
         return [bag.topic(name, "wheel_topic") for name in options.wheel_topic]
-    if topics := _chosen(bag, "wheel_topic", (), (JOINT_STATE,), "joint_states"):
+    if topics := _only(bag, "wheel_topic", bag.of_type(JOINT_STATE), "joint_states"):
         return topics
     others = [topic for topic in bag.topics if topic.messages and topic.type.split("/")[0] not in _NO_WHEELS]
     way = wheels_typed(bag, options.robot.wheel_names, others)
@@ -193,9 +190,9 @@ def pose_topics(bag: Bag, options: RosbagOptions, wheels: Topic, *, others: bool
         bag.require_fields(topic, options.pose_columns, "pose_columns")
         return [topic]
     if options.pose_topic is not None:
-        return _chosen(bag, "pose_topic", options.pose_topic, types)
-    odometry = [topic for topic in bag.of_type(*POSE_TYPES) if _OWN_POSES.search(topic.name.lower())]
-    topics = _chosen(bag, "pose_topic", (), POSE_TYPES, "slam_pose", wheels, odometry)
+        return _named(bag, "pose_topic", [options.pose_topic], types)
+    independent = [topic for topic in bag.of_type(*POSE_TYPES) if not _OWN_POSES.search(topic.name.lower())]
+    topics = _only(bag, "pose_topic", independent, "slam_pose", wheels)
     if topics or others:
         return topics
     if doubtful := [topic for topic in bag.of_type(*types) if not topic.name.endswith("tf_static")]:
@@ -210,22 +207,10 @@ def pose_topics(bag: Bag, options: RosbagOptions, wheels: Topic, *, others: bool
     )
 
 
-def _chosen(
-    bag: Bag,
-    key: str,
-    names: str | Sequence[str] | None,
-    types: Sequence[str],
-    ending: str = "",
-    wheels: Topic | None = None,
-    without: Sequence[Topic] = (),
-) -> list[Topic]:
-    """The topics that an option names, or the only one of some types, or the only one of these with an ending.
-
-    Among several that end so the one in the wheels' namespace. Empty: there is none of these types with messages.
-    ConfigError: one that is named is of another type, or there are several.
-    """
-    named = [bag.topic(name, key) for name in ([names] if isinstance(names, str) else names or ())]
-    for topic in named:
+def _named(bag: Bag, key: str, names: Sequence[str], types: Sequence[str]) -> list[Topic]:
+    """The topics that an option names. ConfigError: one of them is not of these types."""
+    topics = [bag.topic(name, key) for name in names]
+    for topic in topics:
         if topic.type not in types:
             fields = ", ".join(bag.fields(topic.type)) or "what .msg files define (message_definitions)"
             way = f", or --set pose_columns=[X,Y,HEADING] or [POSE] of {fields}" if key == "pose_topic" else ""
@@ -233,15 +218,20 @@ def _chosen(
                 f"{bag.path}: {key}: {topic.name} is {topic.type}, expected {' or '.join(types)}{way}; found: "
                 f"{_listed(bag.of_type(*types))}"
             )
-    candidates = [topic for topic in bag.of_type(*types) if topic not in without]
-    if named or not candidates:
-        return named
-    ended = [topic for topic in candidates if topic.name.endswith(ending)]
+    return topics
+
+
+def _only(bag: Bag, key: str, topics: Sequence[Topic], ending: str = "", wheels: Topic | None = None) -> list[Topic]:
+    """The only one of some topics, or the only one with an ending, among these the one in the wheels' namespace.
+
+    Empty: there are none. ConfigError: there are several, one of which the option ``key`` is to name.
+    """
+    ended = [topic for topic in topics if topic.name.endswith(ending)]
     beside = [topic for topic in ended if wheels is not None and topic.namespace == wheels.namespace]
-    for choice in (beside, candidates, ended):
-        if len(choice) == 1:
-            return choice
-    raise ConfigError(f"{bag.path}: several topics could be the {key}; --set {key}=NAME, one of: {_listed(candidates)}")
+    choice = next((choice for choice in (beside, topics, ended) if len(choice) == 1), ())
+    if topics and not choice:
+        raise ConfigError(f"{bag.path}: several topics could be the {key}; --set {key}=NAME, one of: {_listed(topics)}")
+    return list(choice)
 
 
 def _listed(topics: Sequence[Topic]) -> str:
@@ -265,11 +255,10 @@ class _Joints:
 
     def covers(self, stamps: Stamps) -> NDArray[np.bool_]:
         """True for stamps (F,) at which there is a message, or one before and one after without a gap."""
-        after = np.searchsorted(self.stamps, stamps)
-        inside = np.clip(after, 1, len(self.stamps) - 1)
-        apart = self.stamps[inside] - self.stamps[inside - 1] > self.longest_gap * SECOND
-        within = (stamps >= self.stamps[0]) & (stamps <= self.stamps[-1])
-        return within & (~apart | np.isin(stamps, self.stamps))
+        after, last = np.searchsorted(self.stamps, stamps), len(self.stamps) - 1
+        before = np.searchsorted(self.stamps, stamps, side="right") - 1
+        spans = self.stamps[np.minimum(after, last)] - self.stamps[before]
+        return np.asarray((before >= 0) & (after <= last) & (spans <= self.longest_gap * SECOND))
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,43 +285,57 @@ class _WheelClock:
             )
         return self.seconds(stamps)
 
-    def of_record(self, topic: Topic, record: Record) -> float:
-        """The time of a message, s: by its header, or by when it was recorded, as the wheels' messages have both."""
-        stamp = None if topic.recorded else header_stamp(record.message)
-        if stamp:
-            return float(self.seconds(np.array(stamp)))
+    def messages(self, bag: Bag, topic: Topic) -> list[tuple[float, Any]]:
+        """Times, s, and messages of a topic, in this order.
+
+        A time is that of a header, or by when the message was recorded, as the wheels' messages have both.
+        """
         order = np.argsort(self.logged, kind="stable")
-        logged, stamps = self.logged[order], np.maximum.accumulate(self.stamps[order])
-        return float(np.interp(record.logged - logged[0], logged - logged[0], self.seconds(stamps)))
+        logged, wheels = self.logged[order], self.seconds(np.maximum.accumulate(self.stamps[order]))
+        records = list(bag.records(topic))
+        stamps = np.array([topic.stamp(message, 0) for _, _, message in records], dtype=np.int64)
+        recorded = np.array([when for _, when, _ in records], dtype=np.int64)
+        by_recording = np.interp(recorded - logged[0], logged - logged[0], wheels)
+        times = np.where(stamps != 0, self.seconds(stamps), by_recording)
+        return [(float(times[row]), records[row][2]) for row in np.argsort(times, kind="stable")]
 
 
 def read_bag(path: Path, name: str, options: RosbagOptions, notes: list[str]) -> Recording:
     """The recording of a bag; what is left out is added to ``notes``. DataError, ConfigError."""
     with open_bag(path, options.recorded_stamps, options.message_definitions) as bag:
         topics = wheel_topics(bag, options)
-        if options.robot.drive.steered and not options.steering_topic and len(topics) > 1:
-            raise ConfigError(f"{path}: every wheel has its own topic; --set steering_topic=[...], too")
-        steering = [bag.topic(name, "steering_topic") for name in options.steering_topic] or topics
-        scans = _chosen(bag, "scan_topic", options.scan_topic, (SCAN,), "/scan", topics[0]) if options.scans else []
+        steering: list[Topic] = []
+        if options.robot.drive.steered:
+            steering = [bag.topic(name, "steering_topic") for name in options.steering_topic] or topics
+            if len(topics) > 1 and not options.steering_topic:
+                raise ConfigError(f"{path}: every wheel has its own topic; --set steering_topic=[...], too")
+        scans: list[Topic] = []
+        if options.scans:
+            scans = _named(bag, "scan_topic", [options.scan_topic] if options.scan_topic else [], (SCAN,))
+            scans = scans or _only(bag, "scan_topic", bag.of_type(SCAN), "/scan", topics[0])
         others = bool(scans or options.references or bag.of_type(FIX, IMU))
         references = pose_topics(bag, options, topics[0], others=others)
         # Sensors count where they are named, or where nothing else tells how the robot moved.
-        sensors = _chosen(bag, "references", options.references, (FIX, IMU)) if options.references else []
+        sensors = _named(bag, "references", options.references, (FIX, IMU))
         if not (references or scans or sensors):
-            sensors = [topic for kind in (FIX, IMU) for topic in _chosen(bag, "references", (), (kind,))]
+            sensors = [topic for kind in (FIX, IMU) for topic in _only(bag, "references", bag.of_type(kind))]
         twists = [topic for topic in bag.of_type(*_TWISTS) if topic.name.endswith("cmd_vel")]
         beside = [topic for topic in twists if topic.namespace == topics[0].namespace]
         sent = next((each[0] for each in (twists, beside) if len(each) == 1), None)
-        wheels, clock = read_wheels(bag, topics, steering if options.robot.drive.steered else [], options, notes)
+        wheels, clock = read_wheels(bag, topics, steering, options, notes)
         readings = [read_sensor(bag, topic, options, clock.seconds_of, notes) for topic in sensors]
+        try:
+            seen = read_scans(bag, scans[0], options.scanner_mount, clock.seconds_of, notes) if scans else None
+        except (ConfigError, DataError) as error:
+            raise DataError(f"{error}; scans=false leaves the scans out") from None
         return Recording(
             name,
             f"{path}: topic {topics[0].name}",
             wheels,
             read_poses(bag, references[0], options, clock, notes) if references else None,
-            events=_events(bag, options.cut_topic, clock) if options.cut_topic else (),
+            events=_events(bag, bag.topic(options.cut_topic, "cut_topic"), clock) if options.cut_topic else (),
             attributes=RunAttributes(sent=_sent_twists(bag, sent, clock) if sent else None),
-            scans=read_scans(bag, scans[0], options.scanner_mount, clock.seconds_of, notes) if scans else None,
+            scans=seen,
             sensors=BagSensors(readings, options) if readings else None,
             numbered=True,
         )
@@ -346,20 +349,20 @@ def read_wheels(
     Where they come by several topics, the messages of the others that are nearest to those of the first count, with the
     times that they have; where the others have gaps, messages of the first are left out. DataError, ConfigError.
     """
-    robot, apart = options.robot, set(wheels).isdisjoint(steering)
-    streams: list[_Joints] = []
+    streams: list[list[_Joints]] = []
     for steers, topics, names, asked in (
-        (False, wheels, robot.wheel_names, options.joints),
-        (True, steering, robot.drive.steered, options.steering_joints),
+        (False, wheels, options.robot.wheel_names, options.joints),
+        (True, steering, options.robot.drive.steered, options.steering_joints),
     ):
         choices = [JointChoice((wheel,), asked[row : row + 1], steers, True) for row, wheel in enumerate(names)]
         if len(topics) == 1:
-            choices = [JointChoice(names, asked, steers, apart)]
-        streams += [read_joints(bag, *pair, options, notes) for pair in zip(topics, choices, strict=False)]
-    first, count, several = streams[0], len(wheels), len(streams) > 1
-    if len({stream.unit for stream in streams[:count]}) > 1:
+            choices = [JointChoice(names, asked, steers, only=set(wheels).isdisjoint(steering))]
+        streams.append([read_joints(bag, *pair, options, notes) for pair in zip(topics, choices, strict=True)])
+    turning, steered = streams
+    first, several = turning[0], len(turning + steered) > 1
+    if len({stream.unit for stream in turning}) > 1:
         raise DataError(f"{bag.path}: some wheel topics hold positions and some velocities; --set use=velocities")
-    covered = np.logical_and.reduce([stream.covers(first.stamps) for stream in streams])
+    covered = np.logical_and.reduce([stream.covers(first.stamps) for stream in turning + steered])
     if covered.sum() < 2:
         shown = ", ".join(topic.name for topic in dict.fromkeys((*wheels, *steering)))
         raise DataError(
@@ -368,23 +371,18 @@ def read_wheels(
         )
     clock = _WheelClock(bag.path, wheels[0], first.stamps[covered], first.logged[covered])
     times, values, read_at = clock.seconds(clock.stamps), [], []
-    for stream in streams:
+    for stream in turning + steered:
         stamps, numbers = clock.seconds(stream.stamps), stream.values
         if several and stream.unit.endswith("/sample"):  # there may be several between two messages of the first
             numbers = np.cumsum(numbers, axis=0)
         nearest = np.searchsorted((stamps[1:] + stamps[:-1]) / 2, times)
         values.append(numbers[nearest])
         read_at.append(np.tile(stamps[nearest][:, None], len(stream.names)))
-    return WheelReadings(
-        times,
-        np.hstack(values[:count]),
-        first.unit.removesuffix("/sample") if several else first.unit,
-        np.hstack(values[count:]) if steering else None,
-        tuple(chain.from_iterable(stream.names for stream in streams[:count])),
-        tuple(chain.from_iterable(stream.names for stream in streams[count:])),
-        longest_gap=first.longest_gap,
-        read_at=np.hstack(read_at) if several else None,
-    ), clock
+    unit = first.unit.removesuffix("/sample") if several else first.unit
+    counted, angles = np.hstack(values[: len(turning)]), np.hstack(values[len(turning) :]) if steered else None
+    columns, axles = (tuple(chain(*(stream.names for stream in part))) for part in streams)
+    gap, read = first.longest_gap, np.hstack(read_at) if several else None
+    return WheelReadings(times, counted, unit, angles, columns, axles, longest_gap=gap, read_at=read), clock
 
 
 def read_joints(bag: Bag, topic: Topic, choice: JointChoice, options: RosbagOptions, notes: list[str]) -> _Joints:
@@ -490,12 +488,7 @@ def _pose_parts(kind: str, path: str) -> list[str]:
 def _planar(messages: TopicMessages, table: Array, notes: list[str]) -> tuple[NDArray[np.intp], Array]:
     """Rows of x, y and heading (K, 3), or of x, y and a quaternion (K, 6), on the floor, and their poses (n, 3)."""
     messages.keep(possible(table[:, :2]), "without a finite position")
-    headings = table[:, 2]
-    if table.shape[1] > 3:
-        orientations = planar_headings(table[:, 2:])
-        headings, flawed = orientations.headings, messages.rows[orientations.flawed[messages.rows]]
-        flaw = f", as {orientations.flaw(int(flawed[0]))}" if len(flawed) else ""
-        messages.keep(~orientations.flawed, f"with a wrong orientation{flaw}")
+    headings = messages.keep_planar(table[:, 2:]) if table.shape[1] > 3 else table[:, 2]
     messages.keep(possible(headings[:, None]), "without a finite heading")
     rows = messages.in_order(notes)
     return rows, np.column_stack([table[:, :2], headings])[rows]
@@ -510,8 +503,8 @@ def _by_transforms(bag: Bag, topic: Topic, frames: Sequence[str], notes: list[st
     read, streams = reader_of(_pose_parts("geometry_msgs/msg/Transform", "transform")), {}
     for link in [link for link in links if link not in fixed]:
 
-        def placed(message: Any, link: str = link) -> Any:
-            return next((part for part in message.transforms if part.child_frame_id.strip("/") == link), None)
+        def placed(message: Any, link: str = link) -> list[Any]:
+            return [part for part in message.transforms if part.child_frame_id.strip("/") == link]
 
         messages = TopicMessages(bag, topic, read, placed)
         rows, poses = _planar(messages, messages.table(6), notes)
@@ -531,21 +524,21 @@ def _by_transforms(bag: Bag, topic: Topic, frames: Sequence[str], notes: list[st
     return stamps, whole
 
 
-def _events(bag: Bag, name: str, clock: _WheelClock) -> tuple[Event, ...]:
+def _events(bag: Bag, topic: Topic, clock: _WheelClock) -> tuple[Event, ...]:
     """The messages of a topic as events, with the text of a String as the command."""
-    topic, events = bag.topic(name, "cut_topic"), []
-    for record in bag.records(topic):
-        text = record.message.data if topic.type == "std_msgs/msg/String" and record.message else ""
-        events.append(Event(clock.of_record(topic, record), one_line(str(text)) or None))
-    return tuple(sorted(events, key=lambda event: event.time))
+    texts = topic.type == "std_msgs/msg/String"
+    return tuple(
+        Event(time, one_line(str(message.data if texts and message else "")) or None)
+        for time, message in clock.messages(bag, topic)
+    )
 
 
 def _sent_twists(bag: Bag, topic: Topic, clock: _WheelClock) -> Array | None:
     """The twists that were sent (C, 5), each valid until another one came; None without any."""
     read = reader_of(("linear.x", "linear.y", "angular.z"))
-    messages = ((clock.of_record(topic, record), record.message) for record in bag.records(topic) if record.message)
-    rows = sorted((time, *read(getattr(message, "twist", message))) for time, message in messages)
-    times, x, y, turn = np.array([row for row in rows if np.isfinite(row).all()]).reshape(-1, 4).T
+    messages = [(time, message) for time, message in clock.messages(bag, topic) if message]
+    table = np.array([(time, *read(getattr(message, "twist", message))) for time, message in messages]).reshape(-1, 4)
+    times, x, y, turn = table[np.isfinite(table).all(axis=1)].T
     twists = np.column_stack([times, np.hypot(x, y), np.arctan2(y, x), turn])
     twists = twists[np.diff(twists[:, 1:], axis=0, prepend=np.inf).any(axis=1)]  # of equal ones the first
     if not len(twists):

@@ -151,20 +151,19 @@ def _recording(folder: Path, source: Path, options: Table1Options) -> Recording:
         others["odometry"] = odometry * (metre, metre, RADIANS[options.heading_unit])
     sent = scans = None
     if (file := folder / "commands.csv").exists():
-        sent = np.column_stack(_timed(file, _SENT)) * (1, 1, math.radians(1), 1, 1)
+        sent = np.column_stack(_timed(file, _SENT)) * (1, 1, RADIANS["deg"], 1, 1)
     if (file := folder / "lidar.csv").exists():
         scans = _scans(file, options.scanner, float(pose_times[0]), float(times[-1]))
-    split = next((split for split in SPLITS if split in name.split("/")), None)
-    numbers = {"v": v, "alpha": math.radians(alpha), "omega": omega, "distance": distance}
-    command, session = f"v{v:g}_a{alpha:g}_w{omega:g}_d{distance:g}", name.rpartition("/")[0] or None
-    return Recording(
-        name,
-        str(folder / "slam.csv"),
-        WheelReadings(times, rates, options.wheel_unit, begin=0.0, others=others),
-        PoseReadings(pose_times, poses),
-        attributes=RunAttributes(command, split=split, session=session, numbers=numbers, sent=sent),
-        scans=scans,
+    attributes = RunAttributes(
+        f"v{v:g}_a{alpha:g}_w{omega:g}_d{distance:g}",
+        split=next((split for split in SPLITS if split in name.split("/")), None),
+        session=name.rpartition("/")[0] or None,
+        numbers={"v": v, "alpha": math.radians(alpha), "omega": omega, "distance": distance},
+        sent=sent,
     )
+    readings = WheelReadings(times, rates, options.wheel_unit, begin=0.0, others=others)
+    place = str(folder / "slam.csv")
+    return Recording(name, place, readings, PoseReadings(pose_times, poses), attributes=attributes, scans=scans)
 
 
 def _timed(file: Path, columns: Sequence[str]) -> tuple[Array, Array]:

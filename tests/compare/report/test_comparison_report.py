@@ -13,9 +13,6 @@ import numpy as np
 import plotly.graph_objects as go
 import pytest
 from browser import assert_picture_comes_first, opened
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 from recording_samples import sample, with_a_tape
 from report_page import NUMBER, Page
 from report_samples import config, flower, page, run, statistics, usual
@@ -44,7 +41,7 @@ from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.fit.identifiability import geometry_of
 from omnibench.fit.problem import Improvement
 from omnibench.fit.ratio_intervals import Interval
-from omnibench.report.blocks import Callout, Facts, Figure, FigureGrid, Row, Table
+from omnibench.report.blocks import Callout, Figure, FigureGrid, Row, Table
 from omnibench.report.figures import motion_system, parameters
 from omnibench.report.numbers import fixed
 from omnibench.report.recording.recording_figures import describe
@@ -120,13 +117,6 @@ def test_numbers_stand_in_the_units_and_digits_of_the_paper(result: ComparisonRe
         assert repr(float(value)) in report.text
     assert f"numpy {result.environment.versions['numpy']}" in report.text
     assert result.environment.platform in report.text
-
-
-def test_a_run_without_an_answer_is_a_row_with_its_reason(result: ComparisonResult, report: Page) -> None:
-    record = next(run.record for run in result.runs if run.record.label == "hopeless")
-    assert report.row("Every run", "hopeless")[2] == f"failed | {record.reason}"
-    assert f"hopeless gave no answer in 2 of 2 runs (failed: {record.reason})" in report.text
-    assert len(report.tables["Every run"]) == 1 + len(result.runs)
 
 
 def test_recorded_data_notes_and_warnings_are_told(result: ComparisonResult, tmp_path: Path) -> None:
@@ -430,24 +420,11 @@ def test_without_an_exact_optimum_equal_boxes_share_the_lowest_cost() -> None:
     assert drawn["narrow"].best_known == costs["narrow"]
 
 
-@given(
-    hnp.arrays(float, st.integers(1, 3000), elements=st.floats(0.5, 1.0)),
-    st.integers(24, 200),
-)
-def test_thinning_keeps_the_ends_the_order_and_the_limit(shrink: np.ndarray, limit: int) -> None:
-    gaps = np.maximum(np.cumprod(shrink), 1e-10)
-    along = np.arange(1.0, len(gaps) + 1)
-    kept = thinned(along, gaps, limit)
-    assert kept[0] == 0
-    assert kept[-1] == len(gaps) - 1
-    assert kept == sorted(set(kept))
-    assert len(kept) <= limit + 4
-
-
-def test_thinning_does_not_move_a_curve_by_more_than_a_hair() -> None:
+def test_thinning_keeps_both_ends_and_does_not_move_a_curve_by_more_than_a_hair() -> None:
     along = np.arange(1.0, 20_001)
     gaps = np.exp(-along / 2000)
     kept = thinned(along, gaps, 200)
+    assert (kept[0], kept[-1], len(kept) <= 204) == (0, len(gaps) - 1, True)
     drawn = gaps[kept][np.searchsorted(kept, np.arange(len(along)), side="right") - 1]
     assert np.abs(np.log10(drawn) - np.log10(gaps)).max() < 0.1
 
@@ -506,7 +483,6 @@ def test_the_section_on_the_data_says_where_wheels_stand_and_which_are_not_drive
 ) -> None:
     view = usual_view()
     facts = data_section(replace(view, dataset=replace(view.dataset, robot=robot))).blocks[0]
-    assert isinstance(facts, Facts)
     (fact,) = (fact for fact in facts.items if fact.name == "Robot")
     assert fact.note.startswith(first)
     assert fact.note.endswith(last)
@@ -524,9 +500,6 @@ def test_the_arrow_at_a_wheel_points_where_a_positive_rate_drives_it() -> None:
 
 def test_the_best_entrys_geometry_is_drawn_over_the_design() -> None:
     view = usual_view()
-    assert view.best is not None
-    assert view.best.typical is not None
-    assert view.best.typical.matrix is not None
     _, figure = grids(view)[0].figures
     (fitted,) = (trace for trace in figure.plot.data if trace.legendgroup == "fitted")
     radii, distances, angles = geometry_of(view.best.typical.matrix, view.dataset.robot).reshape(3, 3)
@@ -553,7 +526,6 @@ def test_wheels_whose_position_is_not_known_are_not_drawn() -> None:
 
 def test_the_diagram_of_the_search_names_the_cost_the_budget_and_the_runs() -> None:
     *_, diagram = search_section(usual_view()).blocks
-    assert isinstance(diagram, FigureGrid)
     told = " ".join(labels(diagram.figures[0]))
     assert all(
         words in told for words in ("final_pose", "Eq. (6)", "2,000 evaluations", "16 training runs", "exact arcs")
@@ -601,7 +573,6 @@ def figures(view: DatasetView, alike: bool) -> dict[str, ComparedFigure]:
 def circumstances(view: DatasetView) -> dict[str, Row]:
     """The rows on circumstances, by the circumstance."""
     _, table = published_blocks(view)
-    assert isinstance(table, Table)
     return {row.cells[0].text: row for row in table.rows}
 
 
@@ -620,8 +591,6 @@ def test_figures_equal_to_ours_are_alike(two_entries: ComparisonResult) -> None:
     assert not figures(view, alike=False)
     assert len(compared_figures(view)) == 8
     table, _, remarks = published_blocks(recorded(view))
-    assert isinstance(table, Table)
-    assert isinstance(remarks, Callout)
     assert remarks.items == ("A misprint.",)
     assert [row.cells[-1].text for row in table.rows] == ["as published"] * 8
     assert table.rows[0].cells[3].text == "0.0 %"
@@ -629,7 +598,6 @@ def test_figures_equal_to_ours_are_alike(two_entries: ComparisonResult) -> None:
 
 def test_simulated_recordings_are_given_no_verdict_as_they_were_chosen(two_entries: ComparisonResult) -> None:
     table, _ = published_blocks(with_published(two_entries, scaled(two_entries, 1.0, 1.0)))
-    assert isinstance(table, Table)
     assert [column.title for column in table.columns] == ["Figure", "Here", "Published", "From the nearest"]
     assert {len(row.cells) for row in table.rows} == {4}
     assert "agrees with them by construction" in table.note
@@ -652,7 +620,6 @@ def test_published_times_stand_beside_evaluations_of_the_same_methods() -> None:
         {**scaled(two_entries, 1, 1), "label": "fast", "seconds": 637, "entry": "closed_form"},
     ]
     _, _, table = published_blocks(with_published(two_entries, *both))
-    assert isinstance(table, Table)
     slow, fast, change = ([cell.text for cell in row.cells] for row in table.rows)
     evaluations = statistics(two_entries, "closed_form").evaluations_median
     assert slow[:3] == ["slow", "903 s", "1,001"]
@@ -708,7 +675,6 @@ def test_published_figures_without_validation_are_compared_on_training_only(two_
 
 def test_costs_of_another_kind_are_not_set_beside_the_published_ones(two_entries: ComparisonResult) -> None:
     (block,) = published_blocks(with_published(two_entries, scaled(two_entries, 1, 1), cost="trajectory"))
-    assert isinstance(block, Callout)
     assert block.items == ("They are of the cost final_pose, Eq. (6); this comparison's is trajectory.",)
 
 

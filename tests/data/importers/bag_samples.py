@@ -270,11 +270,16 @@ def odometry_error(data: Dataset, model: OdometryModel | None = None) -> float:
     return max(float(np.abs(chosen.poses([run.reference_log])[0] - run.poses[1:]).max()) for run in data.trajectories)
 
 
-def odometry(poses: Array, stamps: Array, topic: str = "/tracker") -> list[Sent]:
+def stamped(topic: str, kind: str, stamps: Array, contents: Sequence[dict[str, Any]], late: int = 0) -> list[Sent]:
+    """Messages with headers, which are recorded ``late`` ns after their stamps."""
     return [
-        Sent(topic, "nav_msgs/msg/Odometry", {"header": header(stamp), "pose": {"pose": pose(place)}}, int(stamp))
-        for stamp, place in zip(stamps, poses, strict=True)
+        Sent(topic, kind, {"header": header(stamp)} | content, int(stamp) + late)
+        for stamp, content in zip(stamps, contents, strict=True)
     ]
+
+
+def odometry(poses: Array, stamps: Array, topic: str = "/tracker") -> list[Sent]:
+    return stamped(topic, "nav_msgs/msg/Odometry", stamps, [{"pose": {"pose": pose(place)}} for place in poses])
 
 
 def edited(sent: Sequence[Sent], topic: str, edit: Callable[[Sent], Sent | None], every: int = 1) -> list[Sent]:

@@ -156,6 +156,9 @@ def test_without_a_log_angles_are_left_out_and_a_command_is_named_after_the_moti
         ("_metadata", "ngear,12", "ngear,0", r"ngear is 0"),
         ("_metadata", "encRes,1024", "encRes,many", r"encRes is 'many'"),
         ("", "10.08,100,", "10.08,x,", "line 7: expected 10 finite numbers"),
+        ("", "10.08,100,", "10.08,nan,", "line 7: expected 10 finite numbers"),
+        ("", "Run:,2", "Run:,two", "line 12: expected the number of a run after 'Run:'"),
+        ("", "Run:", "Walk:", "it holds no run"),
         ("", "10.08,100,", "10.08,99,", r"does not hold the ticks of s1_run-01\.csv; .* log: false"),
     ],
 )

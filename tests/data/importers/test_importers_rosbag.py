@@ -36,6 +36,7 @@ from bag_samples import (
     pose,
     read,
     slam_pose,
+    stamped,
     text,
     transform,
     write_mcap,
@@ -47,7 +48,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from timing import PATIENCE
 
-from omnibench.data.cutting import between_rests, find_rests
+from omnibench.data.runs import between_rests, find_rests
 from omnibench.data.storage import load_dataset
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrate import calibrate
@@ -143,11 +144,11 @@ def test_poses_of_unknown_covariance_are_read_and_pose_sigma_counts_for_them(tmp
 
 @pytest.mark.parametrize("kind", ["PoseStamped", "TransformStamped"])
 def test_other_types_of_poses_are_read(tmp_path: Path, kind: str) -> None:
-    poses = []
-    for stamp, place in zip(DRIVE.pose_stamps, DRIVE.poses, strict=True):
-        body = {"pose": pose(place)} if kind == "PoseStamped" else {"transform": transform(place)}
-        content = {"header": header(stamp)} | body
-        poses.append(Sent("/tracker/robot", f"geometry_msgs/msg/{kind}", content, int(stamp)))
+    if kind == "PoseStamped":
+        contents = [{"pose": pose(place)} for place in DRIVE.poses]
+    else:
+        contents = [{"transform": transform(place)} for place in DRIVE.poses]
+    poses = stamped("/tracker/robot", f"geometry_msgs/msg/{kind}", DRIVE.pose_stamps, contents)
     wheels = [each for each in messages(DRIVE) if each.topic == WHEELS]
     assert odometry_error(read(write_rosbag2(tmp_path / "drive", [*wheels, *poses]))) < 1e-9
 

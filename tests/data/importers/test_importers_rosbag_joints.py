@@ -36,6 +36,7 @@ from bag_samples import (
     read,
     slam_pose,
     stamp_of,
+    stamped,
     text,
     transform,
     write_mcap,
@@ -429,15 +430,10 @@ OWN = "is the robot's own odometry: .* --set pose_topic=NAME"
 
 
 def transforms(parent: str, child: str, stamps: Array, poses: Array, topic: str = "/tf") -> list[Sent]:
-    return [
-        Sent(
-            topic,
-            "tf2_msgs/msg/TFMessage",
-            {"transforms": [{"header": header(stamp, parent), "child_frame_id": child, "transform": transform(place)}]},
-            int(stamp),
-        )
-        for stamp, place in zip(stamps, poses, strict=True)
-    ]
+    placed = [{"child_frame_id": child, "transform": transform(place)} for place in poses]
+    stamps_of = [{"header": header(stamp, parent)} for stamp in stamps]
+    contents = [{"transforms": [one | other]} for one, other in zip(placed, stamps_of, strict=True)]
+    return stamped(topic, "tf2_msgs/msg/TFMessage", stamps, contents)
 
 
 def test_odometry_is_no_reference_unless_named(tmp_path: Path) -> None:
@@ -512,56 +508,35 @@ BY_PATH = ["motors.2.angle", "motors.0.angle", "motors.1.angle"]
 
 def status() -> list[Sent]:
     """The wheels c, a, b as parts of a message of the base."""
-    order = [1, 2, 0]
-    return [
-        Sent(
-            "/status",
-            "base_msgs/msg/Status",
-            {
-                "header": header(stamp, ""),
-                "battery": 24.0,
-                "motors": [{"ticks": 0, "angle": float(angles[wheel])} for wheel in order],
-                "wheel": np.degrees(angles).tolist(),
-            },
-            int(stamp),
-        )
-        for stamp, angles in zip(DRIVE.stamps, DRIVE.angles, strict=True)
+    contents = [
+        {
+            "battery": 24.0,
+            "motors": [{"ticks": 0, "angle": float(angles[wheel])} for wheel in (1, 2, 0)],
+            "wheel": np.degrees(angles).tolist(),
+        }
+        for angles in DRIVE.angles
     ]
+    return stamped("/status", "base_msgs/msg/Status", DRIVE.stamps, contents)
 
 
 def tick_messages(late: int = 3_000_000, bits: int = 31) -> list[Sent]:
     """A message a wheel, of 4096 ticks a turn, whose counters begin again."""
     counted = np.floor(DRIVE.angles * 4096 / (2 * math.pi)).astype(int)
     shown = (counted + 2 ** (bits - 1)) % 2**bits - 2 ** (bits - 1)
-    return [
-        Sent(
-            f"/motor_{wheel}/tick",
-            "base_msgs/msg/Tick",
-            {"header": header(stamp + late * index), "data": int(count), "resolution": 4096},
-            int(stamp) + late * index,
-        )
-        for index, wheel in enumerate("abc")
-        for stamp, count in zip(DRIVE.stamps, shown[:, index], strict=True)
-    ]
+    sent: list[Sent] = []
+    for index, wheel in enumerate("abc"):
+        contents = [{"data": int(count), "resolution": 4096} for count in shown[:, index]]
+        sent += stamped(f"/motor_{wheel}/tick", "base_msgs/msg/Tick", DRIVE.stamps + late * index, contents)
+    return sent
 
 
 def located() -> list[Sent]:
     """The reference as a pose within a message, and as three numbers, m and deg."""
-    return [
-        Sent(
-            "/camera",
-            "base_msgs/msg/Located",
-            {
-                "header": header(stamp),
-                "place": pose(place),
-                "x": place[0],
-                "y": place[1],
-                "yaw": math.degrees(place[2]),
-            },
-            int(stamp),
-        )
-        for stamp, place in zip(DRIVE.pose_stamps, noisy(DRIVE.poses).tolist(), strict=True)
+    contents = [
+        {"place": pose(place), "x": place[0], "y": place[1], "yaw": math.degrees(place[2])}
+        for place in noisy(DRIVE.poses).tolist()
     ]
+    return stamped("/camera", "base_msgs/msg/Located", DRIVE.pose_stamps, contents)
 
 
 @pytest.mark.parametrize("write", [write_mcap, write_rosbag1])
@@ -576,7 +551,7 @@ def test_wheels_are_read_from_fields_of_any_message(tmp_path: Path, write: Calla
 
 
 def test_poses_are_read_from_fields_of_any_message(tmp_path: Path) -> None:
-    source = write_mcap(tmp_path / "drive", [*WHEELS_ONLY, *located()])
+    source = write_mcap(tmp_path / "drive", [*WHEELS_ONLY, *located(), text("go", EPOCH, "/word")])
     for options in (
         {"pose_columns": ["place"]},
         {"pose_columns": ["x", "y", "yaw"], "heading_unit": "deg"},
@@ -586,6 +561,8 @@ def test_poses_are_read_from_fields_of_any_message(tmp_path: Path) -> None:
         read(source)
     with refused(ConfigError, match=r"pose_topic: /camera is .*or --set pose_columns=.*place,.*x, y, yaw"):
         read(source, pose_topic="/camera")
+    with refused(ConfigError, match=r"pose_columns: /word .* has no field 'data'; its numbers: none"):
+        read(source, pose_topic="/word", pose_columns="data")
     with refused(ConfigError, match=r"pose_columns: .* has no field 'plac'; did you mean 'place'\?"):
         read(source, pose_topic="/camera", pose_columns="plac")
     with refused(ConfigError, match="pose_columns: yaw of /camera .* is no geometry pose"):

@@ -26,6 +26,7 @@ from bag_samples import (
     pose,
     read,
     stamp_of,
+    stamped,
     write_mcap,
     write_rosbag2,
 )
@@ -339,51 +340,41 @@ def degrees_at(places: Array) -> tuple[Array, Array]:
     return LATITUDE + np.degrees(places[:, 1] / (meridian + HEIGHT)), LONGITUDE + np.degrees(places[:, 0] / east)
 
 
-def fix(stamp: int, latitude: float, longitude: float, **content: Any) -> Sent:
+def fixes(**content: Any) -> list[Sent]:
+    """A fix at each reference pose of the drive."""
     said = {
-        "header": header(stamp, "gps"),
         "status": {"status": 0, "service": 1},
-        "latitude": float(latitude),
-        "longitude": float(longitude),
         "altitude": HEIGHT,
         "position_covariance": np.diag([4e-4, 9e-4, 1e-2]).ravel().tolist(),
         "position_covariance_type": 2,
     }
-    return Sent(FIX, NAVSAT, said | content, int(stamp) + 50_000_000)
+    places = zip(*degrees_at(DRIVE.poses[:, :2]), strict=True)
+    contents = [said | {"latitude": float(north), "longitude": float(east)} | content for north, east in places]
+    return stamped(FIX, NAVSAT, DRIVE.pose_stamps, contents, late=50_000_000)
 
 
-def fixes(**content: Any) -> list[Sent]:
-    """A fix at each reference pose of the drive."""
-    latitudes, longitudes = degrees_at(DRIVE.poses[:, :2])
-    triples = zip(DRIVE.pose_stamps, latitudes, longitudes, strict=True)
-    return [fix(stamp, latitude, longitude, **content) for stamp, latitude, longitude in triples]
-
-
-def imu(stamp: int, rate: float, heading: float | None = None, variance: float = 1e-4) -> Sent:
-    """A message of an inertial sensor; without a heading it tells no orientation."""
-    turn = pose((0.0, 0.0, heading or 0.0))["orientation"]
-    content = {
-        "header": header(stamp, "imu"),
-        "orientation": turn,
+def inertial(rate: float, heading: float | None = None, variance: float = 1e-4) -> dict[str, Any]:
+    """The content of a message of an inertial sensor; without a heading it tells no orientation."""
+    return {
+        "orientation": pose((0.0, 0.0, heading or 0.0))["orientation"],
         "orientation_covariance": [-1.0, *[0.0] * 8] if heading is None else np.diag([1e-4, 1e-4, variance]).ravel(),
         "angular_velocity": {"x": 0.0, "y": 0.0, "z": float(rate)},
         "angular_velocity_covariance": [0.0] * 9,
         "linear_acceleration": {"x": 0.0, "y": 0.0, "z": 9.81},
         "linear_acceleration_covariance": [0.0] * 9,
     }
-    return Sent(IMU, INERTIAL, content, int(stamp) + 2_000_000)
 
 
 def gyro(offset: float) -> list[Sent]:
     """A gyro's messages with the wheels', whose rates of turn have an offset, rad/s."""
-    turning = DRIVE.rates @ TRUTH[2] + offset
     middle = (DRIVE.stamps[:-1] + DRIVE.stamps[1:]) // 2
-    return [imu(stamp, rate) for stamp, rate in zip(middle, turning, strict=True)]
+    contents = [inertial(rate) for rate in DRIVE.rates @ TRUTH[2] + offset]
+    return stamped(IMU, INERTIAL, middle, contents, late=2_000_000)
 
 
 def compass(**content: Any) -> list[Sent]:
-    pairs = zip(DRIVE.pose_stamps, DRIVE.poses[:, 2], strict=True)
-    return [imu(stamp, 0.0, heading, **content) for stamp, heading in pairs]
+    contents = [inertial(0.0, heading, **content) for heading in DRIVE.poses[:, 2]]
+    return stamped(IMU, INERTIAL, DRIVE.pose_stamps, contents, late=2_000_000)
 
 
 def at(run: Trajectory) -> Array:

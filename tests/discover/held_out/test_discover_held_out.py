@@ -164,7 +164,6 @@ def test_a_run_is_predicted_by_the_runs_of_the_other_folds_alone() -> None:
 
 def test_the_floor_is_the_scatter_between_repetitions_as_one_prediction_errs_by_it() -> None:
     floor = floor_of(extended_of(RUNS, left(1, 3, 2, 2)).fit)
-    assert floor is not None
     assert sorted(floor.eq6.tolist()) == pytest.approx([0.0, np.sqrt(2)])  # 2 apart, over the root of 2
     assert floor_of(extended_of(RUNS[::2], left(1, 2)).fit) is None  # no command is repeated
 

@@ -57,7 +57,7 @@ from omnibench.discover.selection.unknown_term import add_smooth_terms
 from omnibench.fit.noise import Whitener
 from omnibench.registry import effects
 from omnibench.robot.calibration import Calibration, read_calibration, write_calibration
-from omnibench.robot.effects.effect import ActuatorEffect, Parameter
+from omnibench.robot.effects.effect import Parameter
 from omnibench.robot.kinematics import Robot
 
 DRIFT, BIAS, SLIP = "heading_drift", "body_velocity_bias", "rotation_translation_coupling"
@@ -573,8 +573,6 @@ def test_most_of_the_gap_closes_on_a_held_out_session_by_a_step_without_a_name(
     assert {term.name for term in found.extended.effects} <= {"smooth_heading", "smooth_course", "smooth_heading_wave"}
     assert [step.name for step in found.steps] == ["plain matrix", "+ unnamed, over heading"]
     first, last = (step.held_out for step in found.steps)
-    assert first is not None
-    assert last is not None
     assert last < first
     assert len([note for note in found.notes if "unnamed term" in note]) == 1
 
@@ -776,7 +774,6 @@ def runs(name: str = "motor_gain", count: int = 12, **values: float) -> list[Tra
     rng = np.random.default_rng(1)
     times = np.arange(1, 81) / 20
     effect = effects.create(name)
-    assert isinstance(effect, ActuatorEffect)
     made = []
     for number in range(count):
         speeds = (0.5 + number % 3) * np.array([1.0, -0.6, 0.3])
@@ -802,7 +799,6 @@ def test_an_effect_is_named_and_its_parameter_is_exact_to_its_standard_error(
     name: str, values: dict[str, float]
 ) -> None:
     motors = found(runs(name, **values))
-    assert motors is not None
     assert [group.name for group in motors.selection.chosen] == [name]
     error = motors.covariance.standard_deviations[0]
     assert motors.values[0] == pytest.approx(*values.values(), abs=4 * error)
@@ -812,21 +808,18 @@ def test_an_effect_is_named_and_its_parameter_is_exact_to_its_standard_error(
 def test_the_standard_error_of_a_gain_is_that_of_a_regression_on_the_targets() -> None:
     recorded = runs(g=-0.03, count=60)
     motors = found(recorded)
-    assert motors is not None
     squares = sum(float(np.square(run.targets).sum()) for run in recorded if run.targets is not None)
     assert motors.covariance.standard_deviations[0] == pytest.approx(NOISE / np.sqrt(squares), rel=0.5)
 
 
 def test_of_motors_that_only_scatter_nothing_is_named() -> None:
     motors = found(runs(g=0.0))
-    assert motors is not None
     assert motors.selection.chosen == ()
     assert motors.values.shape == (0,)
 
 
 def test_an_effect_that_is_left_out_is_not_named() -> None:
     motors = found(runs(g=-0.03), "motor_gain")
-    assert motors is not None
     assert "motor_gain" not in motors.selection.weights
 
 

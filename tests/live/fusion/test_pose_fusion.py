@@ -145,14 +145,6 @@ def test_a_pose_that_comes_before_its_wheel_sample_waits_for_it() -> None:
     assert robot.counts.poses == before + 1
 
 
-def test_the_same_pose_twice_counts_once() -> None:
-    robot = Robot().drive(50)
-    robot.see(0.2)
-    robot.see(0.3)
-    assert robot.see(0.3) == "duplicate"
-    assert robot.counts.poses == 2
-
-
 def test_the_gate_rejects_true_poses_as_seldom_as_it_says() -> None:
     rng = np.random.default_rng(4)
     rejected, count = 0, 3000

@@ -48,8 +48,6 @@ def same(one: JointState | PoseEstimate, other: JointState | PoseEstimate) -> bo
             and np.array_equal(np.asarray(one.positions), np.asarray(other.positions))
             and np.array_equal(np.asarray(one.velocities), np.asarray(other.velocities))
         )
-    assert isinstance(one, PoseEstimate)
-    assert isinstance(other, PoseEstimate)
     turn = (one.pose[2] - other.pose[2]) / (2 * math.pi)
     return (
         (one.stamp, one.frame) == (other.stamp, other.frame)

@@ -271,14 +271,6 @@ def test_without_noise_the_reference_is_the_truth(hidden: tuple[EffectTerm, ...]
     np.testing.assert_allclose(true_start_poses(recording), drive.start_poses, atol=1e-9)
 
 
-def test_with_true_start_poses_the_truth_goes_on_without_a_jump() -> None:
-    recording = simulated_recording(EncoderNoise(bias_position=0.1, bias_heading=0.1, encoder=0.1))
-    drive = concatenate_recording(recording)
-    steps = np.diff(concatenated_truth(drive, recording), axis=0)
-    assert np.hypot(steps[:, 0], steps[:, 1]).max() < 1.1 * 0.3 * 0.01
-    assert (steps[drive.rates[1:].any(axis=1) == 0] == 0).all()
-
-
 def test_with_true_start_poses_the_truth_is_what_the_robots_own_matrix_drives() -> None:
     recording = simulated_recording(EncoderNoise(bias_position=0.1, bias_heading=0.1))
     drive = concatenate_recording(recording)  # without noise of the encoders their rates are the targets
@@ -392,14 +384,6 @@ def test_a_simulated_data_set_of_a_config_comes_with_its_truth(tmp_path: Path) -
     assert recording.dataset.hash == expected.dataset.hash
     assert (recording.dataset.name, recording.dataset.description) == ("flower", "Two runs.")
     assert recording.truth == expected.truth
-
-
-def test_one_of_several_can_be_chosen(tmp_path: Path) -> None:
-    path = config_with(
-        tmp_path, short=simulated(), long=simulated(train={"seed": 1, "distance": 0.2}), other={"path": "x"}
-    )
-    longest = [load_recording(path, name).dataset.trajectories[0].times[-1] for name in ("short", "long")]
-    np.testing.assert_allclose(longest, [0.5, 1.0])
 
 
 @pytest.mark.parametrize(

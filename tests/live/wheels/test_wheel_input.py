@@ -11,8 +11,7 @@ import pytest
 from drives import ORIGIN, PERIOD, SECOND, Drive, drive
 from hypothesis import given
 from hypothesis import strategies as st
-from steered import CAR, SWERVE, TRICYCLE, calibration, only
-from steered import drive as steered_drive
+from steered import CAR, SWERVE, TRICYCLE, only, steered_calibration, steered_drive
 
 from omnibench.errors import ConfigError
 from omnibench.live.estimation.health import Counts
@@ -374,7 +373,7 @@ class SteeringReceiver:
     """The wheel input of a robot, fed with messages as soon as they are stamped."""
 
     def __init__(self, robot: Robot = TRICYCLE, **settings: object) -> None:
-        state = new_state("robot", calibration(robot), WheelSettings.model_validate(settings), None)
+        state = new_state("robot", steered_calibration(robot), WheelSettings.model_validate(settings), None)
         self.counts, self.input = state.counts, state.wheel_input
 
     def take(self, *messages: JointState) -> list[WheelStep]:

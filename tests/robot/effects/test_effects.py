@@ -16,7 +16,6 @@ from effect_samples import (
     EVERY_MOTION,
     MOTION,
     PERIOD,
-    REFERENCE,
     ROBOTS,
     SESSIONS,
     a_drive,
@@ -129,21 +128,6 @@ def test_an_effect_that_another_matrix_absorbs_says_how_it_is_measured(name: str
     assert effect.run_nuisance == (name == "reference_clock_drift")
 
 
-@pytest.mark.parametrize("name", EVERY_MOTION)
-@given(data=st.data(), seed=st.integers(0, 2**32 - 1), factor=st.floats(-3, 3))
-def test_corrections_are_linear_and_vanish_at_zero(name: str, data: st.DataObject, seed: int, factor: float) -> None:
-    chosen = EVERY[data.draw(st.sampled_from([robot for applied, robot in APPLIED if applied == name]))]
-    effect, log = effects.create(name), a_drive(seed, 12, chosen)
-    given_signals = signals_of(log, chosen, chosen.inverse_kinematic_matrix, 0.02, effect.needs)
-    shapes = {each.name: each.choices[0] for each in effect.parameters(chosen, SESSIONS) if each.choices}
-    one, other = (dict(a_term(name, chosen, seed + step).values) | shapes for step in (1, 2))
-    mixed = {key: one[key] + factor * other[key] for key in one} | shapes
-    found, first, second = (effect.correction(given_signals, values) for values in (mixed, one, other))
-    size = max(1.0, float(np.abs(first).max()), float(np.abs(second).max()))
-    np.testing.assert_allclose(found, first + factor * second, rtol=0, atol=1e-13 * size)
-    assert not effect.correction(given_signals, dict.fromkeys(one, 0.0) | shapes).any()
-
-
 @pytest.mark.parametrize("name", ["heading_drift", "body_velocity_bias"])
 def test_a_drift_acts_only_while_a_wheel_turns(name: str) -> None:
     term = a_term(name, APR_02)
@@ -202,15 +186,6 @@ def test_what_the_reference_reports_is_the_formula_of_the_catalogue(name: str) -
     found = effect.reported(POSES, POSES[0], own)
     np.testing.assert_allclose(found[0], POSES[0], rtol=0, atol=1e-15)  # the start is where it is said to be
     np.testing.assert_allclose(found[1], expected(POSES[1]), rtol=0, atol=1e-15)
-
-
-@pytest.mark.parametrize("name", REFERENCE)
-@given(seed=st.integers(0, 2**32 - 1))
-def test_what_the_reference_reports_can_be_corrected(name: str, seed: int) -> None:
-    poses = np.random.default_rng(seed).normal(0, 3, (5, 3))
-    term = a_term(name, APR_02, seed)
-    reported = term.effect.reported(poses, poses[0], term.values)
-    np.testing.assert_allclose(term.effect.corrected(reported, poses[0], term.values), poses, rtol=0, atol=1e-13)
 
 
 def actuated(name: str, durations: Array, targets: Array, **values: float) -> Array:
@@ -441,14 +416,6 @@ def test_a_stream_takes_steering_angles_that_take_no_time(seed: int) -> None:
 def test_any_real_number_is_a_parameter(value: float) -> None:
     found = make_term("heading_drift", {"b": value}, APR_02).values["b"]
     assert (found, type(found)) == (1.0, float)
-
-
-@pytest.mark.parametrize("name", built_in(Effect))
-def test_every_effect_takes_its_own_parameters(name: str) -> None:
-    for robot in filter(effects.create(name).applies, EVERY.values()):
-        known = effects.create(name).parameters(robot, ("x", "y"))
-        given = {each.name: each.choices[-1] if each.choices else each.high for each in known}
-        assert dict(make_term(name, given, robot, sessions=("x", "y")).values) == given
 
 
 REFUSED: dict[str, tuple[str, Mapping[str, Any], str]] = {  # wrong types among them

@@ -35,8 +35,6 @@ from export_samples import (
     parameters,
     steered,
 )
-from hypothesis import given
-from hypothesis import strategies as st
 from sample_robots import APR_02
 from scipy.optimize import minimize
 from syrupy.assertion import SnapshotAssertion
@@ -217,22 +215,6 @@ def test_what_is_said_to_remain_is_what_the_controller_computes_wrongly(name: st
     assert max(remains.straight_position, remains.straight_heading, remains.turn_position) > 1e-4
 
 
-@given(
-    left=st.floats(0.02, 0.3),
-    right=st.floats(0.02, 0.3),
-    separation=st.floats(0.05, 2),
-    wheels=st.sampled_from([DIFF, SKID]),
-)
-def test_multipliers_give_radii_and_track_back(left: float, right: float, separation: float, wheels: Robot) -> None:
-    on_left = np.array([(wheel.y or 0) > 0 for wheel in wheels.wheels])
-    radii = np.where(on_left, left, right) * 2 / len(on_left)
-    matrix = np.array([radii / 2, 0 * radii, radii / separation * np.where(on_left, -1, 1)])
-    found = parameters(export_calibration(calibration(wheels, matrix), "ros2_controllers"), "diff_drive_controller")
-    for side, radius in (("left", left), ("right", right)):
-        assert found["wheel_radius"] * found[f"{side}_wheel_radius_multiplier"] == pytest.approx(radius, rel=1e-9)
-    assert found["wheel_separation"] * found["wheel_separation_multiplier"] == pytest.approx(separation, rel=1e-9)
-
-
 def test_a_steering_offset_is_told_with_the_parameters_that_go_with_it() -> None:
     offset, signals = math.radians(2), driven_signals(TRICYCLE)
     turned = np.array([[math.cos(offset), -math.sin(offset)], [math.sin(offset), math.cos(offset)]])
@@ -368,11 +350,6 @@ def test_omni_wheels_of_unequal_spacing_are_refused() -> None:
         exported(robot(30, 150, 270, 330))
 
 
-def test_a_few_degrees_off_are_fitted() -> None:
-    values = parameters(exported(robot(62, 180, 300)), NODE)
-    assert math.degrees(values["wheel_offset"]) == pytest.approx(60.7, abs=0.3)
-
-
 def test_a_wheel_that_turns_the_robot_clockwise_keeps_its_sign() -> None:
     inward = [wheel.model_copy(update={"angle": wheel.axle + math.pi}) for wheel in APR_02.wheels]
     places = [wheel.position for wheel in APR_02.wheels]
@@ -383,16 +360,6 @@ def test_a_wheel_that_turns_the_robot_clockwise_keeps_its_sign() -> None:
     assert "reverse the joints' axes, but not of b" in " | ".join(export.warnings)
     matrix = machine.inverse_kinematic_matrix
     np.testing.assert_allclose(closest_omni_wheel_drive(machine, matrix).matrix, matrix, atol=1e-12)
-
-
-@given(offset=st.floats(-3.1, 3.1), radius=st.floats(0.01, 0.5), distance=st.floats(0.05, 1), count=st.integers(3, 8))
-def test_omni_wheels_give_their_parameters_back(offset: float, radius: float, distance: float, count: int) -> None:
-    angles = math.degrees(offset) + 360 * np.arange(count) / count
-    machine = robot(*angles, radius=radius, distance=distance)
-    fitted = closest_omni_wheel_drive(machine, machine.inverse_kinematic_matrix)
-    assert fitted.order == tuple(range(count))
-    assert (fitted.robot_radius, fitted.wheel_radius) == pytest.approx((distance, radius), rel=1e-9)
-    assert math.remainder(fitted.wheel_offset - offset, 2 * math.pi) == pytest.approx(0, abs=1e-9)
 
 
 def test_an_unknown_format_is_refused_with_the_nearest_and_all() -> None:
@@ -548,12 +515,6 @@ def run_header(export: Export, folder: Path, stem: str, samples: Array, wheels: 
     return np.array([[float(value) for value in line.split()] for line in done.stdout.splitlines()])
 
 
-def by_lever_arm(index: int) -> Wheel:
-    """A mecanum wheel as in the paper: distance and angle of the axle."""
-    angle, roller = math.copysign(math.pi / 2, 1.5 - index), math.pi / 4 * (-1) ** index
-    return Wheel(name="abcd"[index], radius=0.148, distance=0.195, angle=angle, roller_angle=roller)
-
-
 @needs_compiler
 @pytest.mark.parametrize("integration", ["euler", "arc"])
 def test_the_compiled_step_equals_the_stream(tmp_path: Path, integration: Integration) -> None:
@@ -608,13 +569,12 @@ def test_a_header_says_where_its_matrix_comes_from_and_what_it_leaves_out(snapsh
 
 @needs_compiler
 def test_any_number_of_wheels_and_any_name_compiles(tmp_path: Path) -> None:
-    mecanum = Robot(name="m", wheels=tuple(map(by_lever_arm, range(4))))
     origin = Provenance(**ORIGIN | {"dataset": "a */ b"})
-    document = calibration(mecanum, name="4-wheeler: *Größe* */ #1", sample_period=1.0, provenance=origin)
+    document = calibration(MECANUM, name="4-wheeler: *Größe* */ #1", sample_period=1.0, provenance=origin)
     export = export_calibration(document, "c_header")
     assert export.file_name == "robot_4_wheeler_gr_e_1_odometry.h"
     poses = run_header(export, tmp_path, "robot_4_wheeler_gr_e_1", np.array([[1.0, 2, 3, 4, 0.5]]), 4)
-    stream = OdometryStream(mecanum.inverse_kinematic_matrix, "arc", START)
+    stream = OdometryStream(MECANUM.inverse_kinematic_matrix, "arc", START)
     np.testing.assert_allclose(poses[0], stream.drive(np.array([0.5, 1, 1.5, 2])), rtol=0, atol=1e-12)
 
 

@@ -451,14 +451,6 @@ def test_a_run_ends_with_the_rest_that_was_asked_for() -> None:
     assert not driven.twists[resting].any()
 
 
-def test_the_same_seed_gives_the_same_motion() -> None:
-    link = CommandLink(lost=0.4)
-    one, other, third = (motion(link=link, seed=seed) for seed in (5, 5, 6))
-    assert one.commands == other.commands
-    assert np.array_equal(one.twists, other.twists)
-    assert one.commands != third.commands
-
-
 def test_a_command_that_moves_nothing_is_refused() -> None:
     with pytest.raises(ConfigError, match="v0_a0_w0"):
         motion(Command(0.0, 0.0, 0.0))
