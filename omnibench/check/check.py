@@ -6,7 +6,7 @@ runs that were not fitted, by the verdict of ``calibrate``.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Set
 from dataclasses import replace
 from pathlib import Path
 from textwrap import wrap
@@ -53,9 +53,9 @@ class CheckReport(Model):
     """The check of one recording.
 
     needed: True if a calibration gains more than chance on runs that it was not fitted to, False if it does not; None
-    if that cannot be told. sentence: the verdict in words. gain: what cross-validation says. command: the import with
-    all fixes that can be typed; empty if there is none. clocks: of the runs that have poses, in their order; None where
-    one does not show.
+    if that cannot be told. sentence: the verdict in words. gain: what cross-validation says. command: the import that
+    mends all errors or, of a recording that is ready, all warnings, as far as options do; else empty. clocks: of the
+    runs that have poses, in their order; None where one does not show.
     """
 
     verdict: Verdict
@@ -83,13 +83,13 @@ def misreadings(evidence: Evidence) -> Iterator[Finding]:
     if explained.far and not explained.mistakes and explained.unexplained < UNRELATED:
         said, fit, design = "", explained.fit, evidence.dataset.robot.inverse_kinematic_matrix
         if fit is not None:
-            rows = zip(("ahead", "sideways", "turning"), fit.matrix, design, strict=True)
+            rows = zip(("goes ahead", "goes sideways", "turns"), fit.matrix, design, strict=True)
             shares = [
-                f"{name} {float(row @ fit.gram @ meant) / size:.2g} times"
+                f"{name} {float(row @ fit.gram @ meant) / size:.2f} times as far"
                 for name, row, meant in rows
                 if (size := float(meant @ fit.gram @ meant)) > 0
             ]
-            said = f" (it moves {', '.join(shares)} as much as its wheels say)"
+            said = f" (it {', '.join(shares)} as its wheels say)"
         what = f"the robot does not move as robot.yaml says{said}, and no single mistake explains it"
         fix = "measure its wheels anew (radius, x, y, distance, angle; m), see their order and signs, and correct "
         fix += "robot.yaml; a calibration would end at its bounds"
@@ -154,17 +154,20 @@ def check_recording(read: RecordingSource) -> CheckReport:
     if not read.findings and (mended := _mended(evidence)) is not None:
         return check_recording(mended).model_copy(update={"clocks": tuple(evidence.clocks)})
     as_read = findings_in(evidence)
-    misread = any(finding.kind in MISREAD and finding not in read.findings for finding in as_read)
     findings = with_fixes(read, as_read)
     errors = [finding for finding in findings if finding.severity == "error"]
     kinds = {finding.kind for finding in errors}
+    misread = MISREAD & {
+        finding.kind for finding in as_read if finding.severity == "error" and finding not in read.findings
+    }
     unknown = misread or kinds & (SPOILED | {"reference_foreign", "wheel_unsigned"})
-    needed, gain = (None, "") if unknown else expected_gain(read.dataset, clocks_agree=not kinds & CLOCKS)
+    needed, gain = (None, "") if unknown else expected_gain(read.dataset, kinds)
     typed = [finding for finding in errors if finding.changes]
     missing = [finding for finding in findings if finding.kind in LACKING]
     to_mend = typed or any(kind.startswith("design") for kind in kinds)
     verdict: Verdict = "fix" if to_mend else "record more" if errors or missing else "ready"
     if verdict == "ready":
+        typed = [finding for finding in findings if finding.severity == "warning" and finding.changes]
         sentence = f"{read.dataset.name} is ready for calibration"
         sentence += f"; {plural(len(findings), 'remark')} below" if findings else ""
         sentence += ", and hardly needs one: it would gain no more than chance" if needed is False else ""
@@ -216,10 +219,10 @@ def _mended(evidence: Evidence) -> RecordingSource | None:
     return None if mended is None else replace(read, dataset=mended, findings=tuple(mistakes))
 
 
-def expected_gain(dataset: Dataset, *, clocks_agree: bool = True) -> tuple[bool | None, str]:
+def expected_gain(dataset: Dataset, errors: Set[str] = frozenset()) -> tuple[bool | None, str]:
     """The verdict on a quick fit to the training runs, as ``calibrate`` judges its own: is it needed, and in words.
 
-    clocks_agree: False where the reference's clock is so far off that a gain which is not significant says nothing.
+    errors: kinds of the errors that were found; clocks that are off, and jumps, hide whether there is a gain.
     """
     robot, held_out = dataset.robot, dataset.split("validation")
     training = looked_at(dataset.split("train") or held_out)
@@ -229,8 +232,9 @@ def expected_gain(dataset: Dataset, *, clocks_agree: bool = True) -> tuple[bool 
     small = verdict.improvement is not None and abs(verdict.improvement) < _SMALL
     if verdict.verdict == "undecided" and small and verdict.units >= _ENOUGH:
         needed = False
-    if needed is None and not clocks_agree:
-        return None, "whether a calibration is needed can be told once the clocks are matched"
+    for hiding, mended in ((CLOCKS, "the clocks are matched"), ({"reference_jump"}, "the jumps are out")):
+        if needed is None and hiding & errors:
+            return None, f"whether a calibration is needed can be told once {mended}"
     if verdict.verdict == "unknown":
         runs = plural(len(dataset.trajectories), "run")
         return None, f"whether a calibration is needed cannot be told from {runs}; record four, of three commands"

@@ -160,7 +160,7 @@ def _read(name: str, source: Path, given: Mapping[str, Any]) -> Dataset:
     """The data set of a source, also if its rates are too fast for any wheel, which is what a check tells then."""
     options = dict(given)
     if "name" in importers.entry(name, "--format").options.model_fields:
-        options.setdefault("name", source.resolve().stem)
+        options.setdefault("name", _title(source.resolve()))
     try:
         importer, again = importer_of(name, source, options)
         dataset = read_dataset(importer, source, again)
@@ -174,6 +174,11 @@ def _read(name: str, source: Path, given: Mapping[str, Any]) -> Dataset:
     if dataset.referenced:
         return dataset
     raise DataError(f"{source}: it has no reference poses; import it, which makes them from its scans, and check that")
+
+
+def _title(source: Path) -> str:
+    """What a source is called: the name of a folder, or of a file without its ending."""
+    return source.name if source.is_dir() else source.stem
 
 
 def sensible(dataset: Dataset) -> bool:
@@ -256,7 +261,7 @@ def next_command(read: RecordingSource) -> str:
 def import_command(read: RecordingSource, options: Mapping[str, Any]) -> str:
     """The command line that imports a source by some options."""
     if read.folder is None:
-        target = Path("data") / (read.source.stem or "recording")
+        target = Path("data") / (_title(read.source) or "recording")
     else:
         target = read.folder.with_name(f"{read.folder.name}_mended") if read.importer == "dataset" else read.folder
     words = ["omnibench", "import", read.importer, str(read.source), "-o", str(target), "--force"]

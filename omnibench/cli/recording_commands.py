@@ -91,7 +91,7 @@ def import_(
     from omnibench.config import parse_settings
     from omnibench.data.dataset import Imported
     from omnibench.data.finding import UNITS
-    from omnibench.data.splits import division_in_words
+    from omnibench.data.runs import division_in_words
     from omnibench.data.storage import check_dataset_folder, save_dataset
     from omnibench.progress import reading_told_to
     from omnibench.registry import importers
@@ -148,7 +148,7 @@ def import_(
     warn(dataset.warnings)
     typer.echo(f"{plural(len(dataset.trajectories), 'trajectory')}: {output}")
     way = " (other: --set validation=PATTERN)" if "validation" in entry.cls.Options.model_fields else ""
-    divided = f"{division_in_words(dataset.trajectories, options)}{way}"
+    divided = f"{division_in_words(dataset.robot, dataset.trajectories, options)}{way}"
     make_console(error=True).print(divided, soft_wrap=True)
     if report is not None:
         make_console(error=True).print(f"check: {report.sentence}.", soft_wrap=True)
@@ -317,7 +317,9 @@ def _print_check(console: "Console", checked: "CheckReport", next_step: str) -> 
         console.print()
         console.print(f"{needed}: {checked.gain}" if needed else checked.gain, soft_wrap=True)
     console.print()
-    if checked.command:
+    if checked.command and checked.verdict == "ready":
+        print_ending("nothing stands in the way", "mend what it warns of", *shlex.split(checked.command))
+    elif checked.command:
         print_ending("what can be mended is mended by one import", "type", *shlex.split(checked.command))
     elif checked.verdict == "record more":
         print_ending("nothing of this can be typed", "record what is missing, and check again")

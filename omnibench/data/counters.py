@@ -28,6 +28,7 @@ _ROUNDS = 20  # at most: a lost turn beside another hides it at first
 # so many standard deviations of usual readings, and ticks, at least (chosen).
 _DEVIATIONS, _TICKS = 8.0, 3.0
 _FEWEST = 5  # readings, of fewer it is not told what is usual
+_MOST_HELD = 100  # rows in which a sensor that is read less often holds a value; chosen: more are an even motion
 _FEWEST_TICKS, _USUAL = 10, 2.0  # ticks of a step that is not slow; periods, a longer one without a step is a rest
 
 
@@ -229,7 +230,7 @@ def held_readings(values: Array) -> NDArray[np.bool_]:
     if len(lengths) < _FEWEST:
         return held
     period = int(np.median(lengths[1:-1]))
-    if period < 2 or np.mean(np.abs(lengths[1:-1] - period) <= 1) < 1 - 5 * _RARE:
+    if not 2 <= period <= _MOST_HELD or np.mean(np.abs(lengths[1:-1] - period) <= 1) < 1 - 5 * _RARE:
         return held
     since = np.arange(len(values)) - np.repeat(changes, lengths)
     return since % period != 0

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -557,6 +557,31 @@ def divided_runs(
         if recording.a_run or recording.attributes.repetition is not None:
             parted[index] = replace(run, repetition=recording.attributes.repetition)
     return parted
+
+
+def division_in_words(robot: Robot, runs: Sequence[Trajectory], options: Mapping[str, Any]) -> str:
+    """How imported runs of a robot are divided, and by what: ``training 8 runs of 4 commands, validation ...``.
+
+    options: the importer's, with patterns under ``train`` and ``validation`` where these were given.
+    """
+    parts, splits, commands = [], [run.split for run in runs], [run.command for run in runs]
+    for split, name in zip(SPLITS, ("training", "validation"), strict=True):
+        members = [run for run in runs if run.split == split]
+        driven = {run.command for run in members if run.command is not None}
+        of_commands = f" of {plural(len(driven), 'command')}" if driven else ""
+        parts.append(f"{name} {plural(len(members), 'run')}{of_commands}")
+    given = {side: options[side] for side in SPLITS if options.get(side)}
+    if given:
+        rule = f"by {', '.join(f'{side}={value}' for side, value in given.items())}"
+    elif splits == every_second(commands):
+        rule = "every second run of a command validates"
+    elif splits == every_second(
+        [run.command if commands.count(run.command) > 1 else motion_of(robot, run) for run in runs]
+    ):
+        rule = "every second run of a command, or of those that move alike by their wheels, validates"
+    else:
+        rule = "as the source or its importer says"
+    return f"{', '.join(parts)}, {rule}"
 
 
 def motion_of(robot: Robot, run: Trajectory) -> str:

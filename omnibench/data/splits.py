@@ -9,11 +9,11 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator
 
-from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory, with_warnings
+from omnibench.data.dataset import Dataset, Split, Trajectory, with_warnings
 from omnibench.data.dataset import every_second as every_second
 from omnibench.data.dataset import repetitions as repetitions
 from omnibench.errors import ConfigError, DataError, nearest
-from omnibench.words import plural, some
+from omnibench.words import some
 
 _OPTIONAL = ("angles", "targets", "pose_covariances")  # fields of a run that all runs of a data set have, or none
 
@@ -103,27 +103,6 @@ def training_split(dataset: Dataset) -> tuple[Trajectory, ...]:
     if trajectories := dataset.split("train"):
         return trajectories
     raise DataError(f"data set {dataset.name}: the training split is empty; set split to train for some trajectories")
-
-
-def division_in_words(runs: Sequence[Trajectory], options: Mapping[str, Any]) -> str:
-    """How imported runs are divided, and by what: ``training 8 runs of 4 commands, validation 4 runs of ...``.
-
-    options: the importer's, with patterns under ``train`` and ``validation`` where these were given.
-    """
-    parts = []
-    for split, name in zip(SPLITS, ("training", "validation"), strict=True):
-        members = [run for run in runs if run.split == split]
-        commands = {run.command for run in members if run.command is not None}
-        of_commands = f" of {plural(len(commands), 'command')}" if commands else ""
-        parts.append(f"{name} {plural(len(members), 'run')}{of_commands}")
-    given = {side: options[side] for side in SPLITS if options.get(side)}
-    if given:
-        rule = f"by {', '.join(f'{side}={value}' for side, value in given.items())}"
-    elif [run.split for run in runs] == every_second([run.command for run in runs]):
-        rule = "every second run of a command validates"
-    else:
-        rule = "by the importer's own rule"
-    return f"{', '.join(parts)}, {rule}"
 
 
 _SAME_PERIOD = 0.1  # share by which sample periods may differ: as between drives of one robot (chosen)

@@ -14,6 +14,7 @@ import pytest
 import yaml
 from commands import flower, refused
 from lanes import slow
+from sample_robots import APR_02
 from storage_samples import a_trajectory
 from wheeled_samples import DIFF, TRICYCLE, driven
 
@@ -21,7 +22,8 @@ import omnibench
 from omnibench.config import validate
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.recording import ReferenceOptions
-from omnibench.data.splits import divided, division_in_words
+from omnibench.data.runs import division_in_words
+from omnibench.data.splits import divided
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import ConfigError, DataError, OmnibenchError
 from omnibench.fit.calibrate import calibrate
@@ -175,12 +177,12 @@ def test_patterns_may_be_of_other_names_and_go_before_the_splits_given() -> None
 
 
 def test_a_division_says_how_many_runs_and_commands_each_side_has_and_by_what() -> None:
-    words = division_in_words(divided(RUNS, (), ()), {})
+    words = division_in_words(APR_02, divided(RUNS, (), ()), {})
     assert words.startswith("training 3 runs of 2 commands, validation 1 run of 1 command, every second run")
-    named = division_in_words(divided(RUNS, (), ("b",)), {"validation": "b"})
+    named = division_in_words(APR_02, divided(RUNS, (), ("b",)), {"validation": "b"})
     assert named == "training 3 runs of 2 commands, validation 1 run of 1 command, by validation=b"
-    own = division_in_words(divided(RUNS, (), (), otherwise=["validation"] * 4), {})
-    assert own == "training 0 runs, validation 4 runs of 2 commands, by the importer's own rule"
+    own = division_in_words(APR_02, divided(RUNS, (), (), otherwise=["validation"] * 4), {})
+    assert own == "training 0 runs, validation 4 runs of 2 commands, as the source or its importer says"
 
 
 RUN = a_trajectory("1", 0.5, session="morning", started_at=60.0, angles=np.ones((4, 3)))

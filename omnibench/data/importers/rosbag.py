@@ -462,7 +462,7 @@ def read_poses(bag: Bag, topic: Topic, options: RosbagOptions, clock: _WheelCloc
             covariances[~usable] = pose_covariance(metres, degrees)
         elif not usable.all():
             covariances = None
-            notes += [f"{unknown}, so that none counts; set pose_sigma=[m,deg] to have them"] if stated else []
+            notes += [f"{unknown}, so that poses have none; set pose_sigma=[m,deg] to give them"] if stated else []
     apart = options.clocks == "match" or options.pose_time_offset
     times = clock.seconds(stamps) if apart else clock.seconds_of(topic, stamps)
     return PoseReadings(times, poses, covariances, len(columns) < 3, "" if topic.type in POSE_TYPES else topic.name)

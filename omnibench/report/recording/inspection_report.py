@@ -16,7 +16,7 @@ from omnibench.check.check import CheckReport
 from omnibench.check.motions import SHARE, motion_kinds, turning
 from omnibench.data.clock_matching import ClockMatch
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.data.finding import Finding
+from omnibench.data.finding import CLOCKS
 from omnibench.fit.identifiability import ROWS, UNTOLD
 from omnibench.fit.inspect import Inspection
 from omnibench.report import blocks as page
@@ -331,7 +331,8 @@ _WORDS = {"error": "Errors", "warning": "Warnings", "note": "Notes"}
 def check_document(dataset: Dataset, checked: CheckReport) -> page.Document:
     """The report on a data set as blocks."""
     runs = [run for run in dataset.trajectories if run.has_poses]
-    picture = _clock_picture(dataset.robot, runs, checked.clocks) or path_overview(dataset)
+    clocks_are_off = any(finding.kind in CLOCKS for finding in checked.findings)
+    picture = _clock_picture(dataset.robot, runs, checked.clocks) if clocks_are_off else None
     counts = {severity: sum(each.severity == severity for each in checked.findings) for severity in _WORDS}
     tiles = [page.Fact(_WORDS[severity], str(count)) for severity, count in counts.items()]
     tiles.append(page.Fact("Runs", str(len(dataset.trajectories))))
@@ -340,11 +341,11 @@ def check_document(dataset: Dataset, checked: CheckReport) -> page.Document:
         page.answer_section(
             f"{checked.sentence}.",
             tiles,
-            picture,
+            picture or path_overview(dataset),
             *([page.Paragraph(gain, "note")] if checked.gain else []),
             title="Verdict",
         ),
-        page.Section("findings", "Findings, each with what to type", tuple(_blocks(checked.findings))),
+        page.Section("findings", "Findings, each with what to type", tuple(_blocks(checked))),
     ]
     return page.Document(
         title=f"Check: {dataset.name}",
@@ -354,16 +355,21 @@ def check_document(dataset: Dataset, checked: CheckReport) -> page.Document:
     )
 
 
-def _blocks(findings: Sequence[Finding]) -> list[page.Block]:
-    if not findings:
+def _blocks(checked: CheckReport) -> list[page.Block]:
+    if not checked.findings:
         return [page.Paragraph("Nothing was found that spoils a calibration.")]
     blocks: list[page.Block] = []
-    for finding in findings:
-        blocks.append(page.Paragraph(f"{finding.severity.capitalize()}, {finding.where}: {finding.what}."))
-        if finding.fix.startswith("omnibench "):
+    for finding in checked.findings:
+        end = "" if finding.what.endswith("?") else "."
+        blocks.append(page.Paragraph(f"{finding.severity.capitalize()}, {finding.where}: {finding.what}{end}"))
+        if finding.changes and finding.fix:
+            blocks.append(page.Code(f"--set {finding.fix}"))
+        elif finding.fix.startswith("omnibench "):
             blocks.append(page.Code(finding.fix))
         elif finding.fix:
             blocks.append(page.Paragraph(finding.fix, "note"))
+    if checked.command:
+        blocks += [page.Paragraph("One import mends what options mend:"), page.Code(checked.command)]
     return blocks
 
 
