@@ -54,7 +54,6 @@ _ZERO_STEP, _LEAST_ZERO, _LEAST_GEAR, _ALIKE = 2.0, 4.0, 1.6, 1.25
 _LAGS = tuple(np.arange(0.0, 0.41, 0.05).tolist())  # s by which wheels may follow a commanded steering angle
 _LAGGING = 0.9  # share of the cost without a lag, below which a lag is a mistake of its own; chosen
 _STEERING_WINDOW = 0.4  # s: short beside the changes of a steering angle; chosen
-_GENTLE = 1.0  # m/s2 of lateral acceleration, up to which tyres hardly slip; chosen
 _STEERING_SAMPLES = 5_000  # wheel samples, of evenly chosen runs, that scale, zero and lag are fitted to; chosen
 _GEARS_OF_STEERING = tuple(1.25**power for power in (*range(-34, -1), *range(2, 15)))
 DEGREE = math.pi / 180
@@ -363,11 +362,8 @@ def _fitted_steering(robot: Robot, logs: Sequence[WheelLog], poses: Sequence[Arr
         windows = Windows.of([meant.of(log) for log in logs], poses, _STEERING_WINDOW)
         if windows is None:
             return np.zeros(0), np.zeros(0)
-        # Tyres slip the less, the smaller the lateral acceleration is.
-        seconds = windows.times[:, 1] - windows.times[:, 0]
-        gentle = np.abs(windows.moved) * np.abs(windows.turned) < _GENTLE * seconds**2
-        chosen = gentle if 5 * gentle.sum() > len(gentle) else slice(None)
-        return windows.turned[chosen], windows.driven[chosen] @ row_3
+        gentle = windows.gentle()
+        return gentle.turned, gentle.driven @ row_3
 
     wanted, _ = turned(np.array([1.0, 0.0]), 0.0)
     if len(wanted) < 8 or not np.abs(wanted).max():

@@ -34,7 +34,7 @@ from omnibench.check.hypotheses import (
 )
 from omnibench.check.motion_fit import DesignDistance, FreeFit, Windows, continuous, transformed
 from omnibench.data.finding import Finding
-from omnibench.robot.kinematics import Array, Robot, wrapped
+from omnibench.robot.kinematics import Array, CarDrive, Robot, wrapped
 from omnibench.robot.odometry import OdometryBatch, WheelLog
 
 # d^2 from which on a recording is suspicious, share of it that may remain, and score by which an explanation must be
@@ -86,6 +86,8 @@ class Recorded:
     def fit(self) -> FreeFit | None:
         """The matrix that fits freely; None where poses are too sparse."""
         windows = Windows.of(self.logs, self.poses)
+        if windows is not None and isinstance(self.robot.drive, CarDrive):
+            windows = windows.gentle()  # its matrix holds no slip of the tyres
         return None if windows is None else windows.fit(self.robot.reach)
 
     def meant(self, hypothesis: Hypothesis) -> Recorded:

@@ -34,6 +34,7 @@ _WINDOW = 1.0  # s between two poses: long beside their noise, short beside the 
 _LONGEST = 3.0  # s: a longer window turns too far for straight lines between its poses; chosen
 _DENSE = 0.6  # s between poses, in which no robot of this kind turns by half a turn; chosen
 _STEP = 0.1  # s: samples are taken together up to here, which windows of a second hardly show; chosen
+_GENTLE = 1.0  # m/s2 of lateral acceleration, up to which tyres hardly slip; chosen
 _HUBER = 1.5  # standard deviations from which on a residual counts less
 _REWEIGHTED = 5  # rounds of reweighted least squares; outliers are found in three
 # Slip of the strongest motion that may pass for motion along a weakly driven direction, as a share; of mecanum and
@@ -88,6 +89,14 @@ class Windows:
         if not parts:
             return None
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
+
+    def gentle(self) -> Windows:
+        """Those in which tyres hardly slip, as the lateral acceleration is small; all where these are few."""
+        seconds = self.times[:, 1] - self.times[:, 0]
+        chosen = np.abs(self.moved) * np.abs(self.turned) < _GENTLE * seconds**2
+        if 5 * chosen.sum() <= len(chosen):
+            return self
+        return Windows(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
 
     def fit(self, reach: float) -> FreeFit | None:
         """The free fit; None if there are too few windows. reach: size of the robot, m."""

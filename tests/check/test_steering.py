@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
-from commands import CONFIGS
+from commands import CONFIGS, RECORDINGS
 
 from omnibench import check
 from omnibench.check.misreadings import search
@@ -143,3 +145,22 @@ def test_a_small_zero_of_a_cars_steering_is_warned_of_with_its_option(degrees: f
         assert "calibrate --steering fit" in finding.what
         (offset,) = set(finding.changes["steering_offsets_deg"])
         assert offset == pytest.approx(-degrees, abs=0.4)
+
+
+@pytest.mark.skipif(not (RECORDINGS / "dart").is_dir(), reason="the recordings of the car DART are not at hand")
+def test_a_command_that_a_real_car_steers_by_is_told_with_its_scale_and_lag_and_no_other_design(tmp_path: Path) -> None:
+    wheels = [
+        {"name": "rear", "type": "fixed", "radius": 0.0325, "x": 0, "y": 0},
+        {"name": "front", "type": "steered", "driven": False, "radius": 0.0325, "x": 0.175, "y": 0},
+    ]
+    robot = tmp_path / "robot.yaml"
+    robot.write_text(yaml.safe_dump({"name": "dart", "wheels": wheels}))
+    columns = {
+        "t": "vicon time", "rear": "vel encoder", "steer_front": "steering",
+        "x": "vicon x", "y": "vicon y", "theta": "vicon yaw",
+    }  # fmt: skip
+    report = check(RECORDINGS / "dart", options={"columns": columns, "wheel_unit": "m/s"}, robot=robot)
+    typed = dict(word.split("=", 1) for word in shlex.split(report.command) if word.startswith("steering_"))
+    assert 0.36 <= float(typed["steering_scale"]) <= 0.44
+    assert 0.06 <= float(typed["steering_lag"]) <= 0.14
+    assert "design_unknown" not in {finding.kind for finding in report.findings}
