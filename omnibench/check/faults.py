@@ -24,7 +24,7 @@ from omnibench.robot.kinematics import CarDrive
 from omnibench.robot.model import OdometryModel
 from omnibench.words import plural, some
 
-_MOST_NOTES = 12  # notes on restarts of counters that are shown one by one; chosen
+_MOST_NOTES = 3  # notes on restarts of counters that are shown one by one; chosen
 _MOSTLY = 0.25  # share of a run for which a reference stands, from which on it counts as frozen; chosen
 _RARE = 0.02  # share of the samples: more that are too fast are another unit
 # Share of the angle of the wheel that turns most, up to which one is dead; angle, rad, and share of the largest, that
@@ -68,7 +68,7 @@ def notes(evidence: Evidence) -> Iterator[Finding]:
     restarts = [each.what for each in findings_of(evidence.dataset.warnings) if each.kind == "counter_restart"]
     if restarts:
         what = "; ".join(restarts[:_MOST_NOTES])
-        what += f" and {len(restarts) - _MOST_NOTES} more" if len(restarts) > _MOST_NOTES else ""
+        what += f"; and {len(restarts) - _MOST_NOTES} more such notes" if len(restarts) > _MOST_NOTES else ""
         fix = "nothing: the import has mended it"
         yield Finding(kind="counter_restart", what=what, where="all wheels", severity="note", fix=fix)
     runs = evidence.dataset.trajectories

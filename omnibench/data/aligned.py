@@ -187,6 +187,9 @@ def _counted_on(
         spread = float(np.ptp(counts))
         on = counters.counted_on(counts, wrap) if wrap is not None and spread <= wrap * _SAME_SPAN else counts
         register = counters.lost_register(on, seconds, possible)
+        if register is not None:  # lone readings that jump may have feigned it
+            usual = ~counters.jumping_readings(on[:, None], seconds)[:, 0]
+            register = counters.lost_register(on[usual], seconds[usual], possible)
         if register is None and stated and spread > stated * _SAME_SPAN:
             span = f"positions span {spread:.10g} {readings.unit}"
             raise DataError(f"{recording.place}: wraps_at is {stated:.10g}, but {span}; correct it")

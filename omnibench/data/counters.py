@@ -24,9 +24,9 @@ _AROUND = 1.0  # s before and after
 _KEPT, _LOST = 0.4, 0.6  # of the register's range: that other steps may be off, and that a lost turn is at least
 _RARE, _NEARLY_ALL = 0.01, 0.95  # shares of the steps
 _ROUNDS = 20  # at most: a lost turn beside another hides it at first
-# A reading that jumps and returns is off the line between its neighbours by more than the longest usual step, and by
-# so many standard deviations of usual readings, and ticks, at least (chosen).
-_DEVIATIONS, _TICKS = 8.0, 3.0
+# A reading that jumps and returns is beyond its neighbours by more than the longest usual step, and by so many standard
+# deviations of usual readings from the line between theirs, and ticks, at least; it returns as near as that (chosen).
+_DEVIATIONS, _NEAR, _TICKS = 8.0, 4.0, 3.0
 _FEWEST = 5  # readings, of fewer it is not told what is usual
 _MOST_HELD = 100  # rows in which a sensor that is read less often holds a value; chosen: more are an even motion
 _FEWEST_TICKS, _USUAL = 10, 2.0  # ticks of a step that is not slow; periods, a longer one without a step is a rest
@@ -94,29 +94,34 @@ def counted_on(counts: Array, wrap: float) -> Array:
 
 
 def jumping_readings(counts: Array, times: Array) -> NDArray[np.bool_]:
-    """True (F, N) for lone readings of counts (F, N), one or two in a row, that jump off the line about them.
+    """True (F, N) for lone readings of counts (F, N), one or two in a row, that jump beyond those about them.
 
-    The line between the readings before and after is as steep as the wheel's usual steps, so that a counter which was
-    set anew, and stays there, does not count. A wheel that stands has the ticks of the others.
+    Readings with a late stamp are off the line between their neighbours, too, but between these. The line is as steep
+    as the steps beside it, so that a counter which was set anew, and stays there, does not count. A wheel that stands
+    has the ticks of the others.
     """
-    jumping, steps = np.zeros(counts.shape, dtype=bool), np.abs(np.diff(counts, axis=0))
+    jumping, steps = np.zeros(counts.shape, dtype=bool), np.diff(counts, axis=0)
     if len(counts) < _FEWEST or not steps.any():
         return jumping
-    tick = min(float(np.median(moved[moved <= 2 * moved.min()])) for wheel in steps.T if len(moved := wheel[wheel > 0]))
-    longest = np.quantile(steps, _NEARLY_ALL, axis=0)  # (N,)
+    sizes = np.abs(steps)
+    tick = min(float(np.median(moved[moved <= 2 * moved.min()])) for wheel in sizes.T if len(moved := wheel[wheel > 0]))
+    longest = np.quantile(sizes, _NEARLY_ALL, axis=0)  # (N,)
+    share = (times[1:-1] - times[:-2]) / (times[2:] - times[:-2])
+    off = counts[1:-1] - counts[:-2] - share[:, None] * (counts[2:] - counts[:-2])
+    deviation = 1.4826 * np.median(np.abs(off), axis=0)
+    near, usual = (np.maximum(size * deviation, _TICKS * tick) for size in (_NEAR, _DEVIATIONS))
+    least = np.maximum(usual, longest)
+    around = np.pad(steps, ((1, 1), (0, 0)), mode="edge")  # steps before and after each reading
     for lone in (1, 2):
-        spans = times[lone + 1 :] - times[: -lone - 1]
-        across = counts[lone + 1 :] - counts[: -lone - 1]  # (F - lone - 1, N)
-        off = []
-        for row in range(1, lone + 1):
-            share = (times[row : row + len(spans)] - times[: len(spans)]) / spans
-            off.append(np.abs(counts[row : row + len(spans)] - counts[: len(spans)] - share[:, None] * across))
-        usual = _DEVIATIONS * 1.4826 * np.median(off[0], axis=0)
-        least = np.maximum(np.maximum(usual, longest), _TICKS * tick)
-        even = np.abs(across) <= (lone + 1) * (_LONGER * longest + tick)
-        apart = even & (np.min(off, axis=0) > least)
-        for row in range(1, lone + 1):
-            jumping[row : row + len(spans)] |= apart
+        before, after = counts[: -lone - 1], counts[lone + 1 :]  # (F - lone - 1, N)
+        slow, fast = np.sort([around[: -lone - 2], around[lone + 2 :]], axis=0) * (lone + 1)
+        jumps = (after - before >= slow - near) & (after - before <= fast + near)
+        lowest, highest = np.minimum(before, after) - least, np.maximum(before, after) + least
+        rows = [slice(row, row + len(before)) for row in range(1, lone + 1)]
+        for row in rows:
+            jumps &= (counts[row] < lowest) | (counts[row] > highest)
+        for row in rows:
+            jumping[row] |= jumps
     return jumping
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 import sys
 from collections.abc import Iterable, Iterator, Mapping
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 
     from omnibench.robot.calibration import HeldOutVerdict
 
+_MOST_ALIKE = 3  # warnings that differ by places and numbers alone and are shown one by one
 _PIPED_WIDTH = 160  # columns of a table in a pipe or a file, where nobody's window is too narrow
 
 
@@ -49,9 +51,15 @@ def make_console(error: bool = False) -> Console:
 
 
 def warn(messages: Iterable[str]) -> None:
-    """A line on standard error for each message."""
+    """A line on standard error for each message; for the first of many that differ by places and numbers alone."""
+    alike: dict[str, list[str]] = {}
     for message in messages:
-        make_console(error=True).print(f"warning: {message}", soft_wrap=True)
+        alike.setdefault(re.sub(r"\d[\d.,]*", "#", message.partition(": ")[2] or message), []).append(message)
+    for several in alike.values():
+        if len(several) > _MOST_ALIKE:
+            several = [f"{several[0]} (and {len(several) - 1} more such warnings)"]
+        for message in several:
+            make_console(error=True).print(f"warning: {message}", soft_wrap=True)
 
 
 def say(text: str) -> None:
