@@ -722,7 +722,7 @@ def test_a_calibration_that_is_put_runs(tmp_path: Path) -> None:
 def test_refused_swaps_stand_in_health(tmp_path: Path, caplog: pytest.LogCaptureFixture, put: str, named: str) -> None:
     with running(config_of(tmp_path)) as (node, session):
         for _ in range(10):
-            session.put("omnibench/apr/calibration", put)
+            session.put("omnibench/apr/calibration", put, congestion_control=zenoh.CongestionControl.BLOCK)
         until(lambda: node.health("apr").counts["swaps_refused"] == 10, "the refusals")
         swap = asked(session, "omnibench/apr/health")["last_swap"]
         assert not swap["accepted"]
