@@ -55,7 +55,8 @@ class Evidence:
     @cached_property
     def seen(self) -> Recorded:
         """The runs that have poses, by the wheels' clock; without any, those that have positions."""
-        return recorded(replace(self.dataset, trajectories=tuple(self.aligned)) if self.aligned else self.dataset)
+        seen = recorded(replace(self.dataset, trajectories=tuple(self.aligned)) if self.aligned else self.dataset)
+        return replace(seen, counted=bool(self.read.options.get("ticks_per_turn")))
 
     @cached_property
     def explained(self) -> Explained:

@@ -34,6 +34,10 @@ FEWEST_TICKS = 100  # ticks of a turn of the wheel: a factor from there on is na
 # wheel that is changed, a reference that is wrong, a factor that is fitted, a zero beyond a right angle, which is
 # nearly the same as its wheel counted the other way round.
 _WHEEL, _REFERENCE, _FITTED, _REVERSED = 4.0, 4.5, 6.0, 9.0
+# A radius of the robot's file is the same as a factor of the rates, of all drives. It is named up to a diameter given
+# as the radius and a few hundredths more, in steps that a calibration takes over; the likelier of both readings is
+# cheaper by so much: the diameter where rates are recorded, the count where ticks are (chosen).
+_RADII, _DIAMETER, _LIKELIER = 1.03 ** np.array([power for power in range(-25, 26) if abs(power) > 4]), 2.0, 0.4
 # Factors of coordinates in the robot's file that are tried, the steps about the best one, and usual causes; chosen.
 _FACTORS = tuple(1.15**power for power in range(-18, 19) if abs(power) > 1)
 _FINER = tuple(1.03**power for power in range(-5, 6))
@@ -138,10 +142,13 @@ def plain_hypothesis(robot: Robot) -> Hypothesis:
     return Hypothesis(np.eye(3), np.eye(len(robot.drive.names)))
 
 
-def wheel_hypotheses(robot: Robot) -> Iterator[Hypothesis]:
-    """Rates and steering angles that are exchanged, negated, scaled or from another zero; the first is no mistake."""
+def wheel_hypotheses(robot: Robot, *, counted: bool = False) -> Iterator[Hypothesis]:
+    """Rates and steering angles that are exchanged, negated, scaled or from another zero; the first is no mistake.
+
+    Radii of the robot's file are among them, which scale the rates. counted: True if rates were made of ticks.
+    """
     yield (plain := plain_hypothesis(robot))
-    for reading, cost, mistake in _misread_wheels(robot):
+    for reading, cost, mistake in (*_misread_wheels(robot), *_other_radii(robot, counted)):
         if (columns := reading.columns(robot.drive)) is not None:
             yield replace(plain, columns=columns, cost=cost, mistakes=(mistake,))
         elif cost <= _WHEEL:  # each is a fit
@@ -180,6 +187,15 @@ def _misread_wheels(robot: Robot) -> Iterator[tuple[Reading, float, Finding]]:
             words = f"wheels {names[first]} and {names[second]} look swapped, rates and steering angles"
             both = error("wheels_swapped", words, rates.where, {**rates.changes, **angles.changes})
             yield replace(reading, rate_order=order), _WHEEL, both
+
+
+def _other_radii(robot: Robot, counted: bool) -> Iterator[tuple[Reading, float, Finding]]:
+    """Radii of the robot's file that are off by a factor: a diameter given as the radius, of all wheels and of each."""
+    every, *single = _groups(len(robot.measured))
+    yield Reading((), 1 / _DIAMETER), _WHEEL + (_LIKELIER if counted else -_LIKELIER), _radius(robot, every, _DIAMETER)
+    for group in (every, *single):
+        for factor in _RADII.tolist():
+            yield Reading((), np.where(group > 0, 1 / factor, 1.0)), _FITTED, _radius(robot, group, factor)
 
 
 def _arrangements(count: int, *, orders: bool) -> list[tuple[Sequence[int], Sequence[int]]]:
@@ -275,14 +291,22 @@ def design_hypotheses(robot: Robot, fit: FreeFit) -> Iterator[Hypothesis]:
     if (exchanged_rollers := _corrected(robot, rollers)) is not None:
         words = "the rollers of the wheels in robot.yaml look exchanged: those of left and right wheels"
         yield wrong("design_rollers", words, {"wheels": rollers}, exchanged_rollers, _WHEEL)
-    if (offset := _tracked_point(robot, fit)) is not None:
-        mount = {"x": round(float(offset[0]), 3), "y": round(float(offset[1]), 3)}
-        if (present := robot.mount) is not None:
-            mount = {key: round(value + getattr(present, key), 3) for key, value in mount.items()}
-            mount["yaw"] = present.yaw
-        words = f"the tracked point looks {abs(offset[0]):.2f} m {'ahead of' if offset[0] > 0 else 'behind'} and "
-        words += f"{abs(offset[1]):.2f} m to the {'left' if offset[1] > 0 else 'right'} of where robot.yaml has it"
-        yield wrong("design_mount", words, {"mount": mount}, corrected_robot(robot, {}, mount), _FITTED)
+    if (mistake := another_mount(robot, _tracked_point(robot, fit))) is not None:
+        other = corrected_robot(robot, {}, mistake.changes["mount"])
+        yield replace(plain, cost=_FITTED, mistakes=(mistake,), robot=other)
+
+
+def another_mount(robot: Robot, offset: Array) -> Finding | None:
+    """The tracked point (2,), m, beside where the robot's file has it; None if it is near, or no point of the robot."""
+    if not _NEAREST_MOUNT * robot.reach < np.hypot(*offset) < _FARTHEST_MOUNT * robot.reach:
+        return None
+    mount = {"x": round(float(offset[0]), 3), "y": round(float(offset[1]), 3)}
+    if (present := robot.mount) is not None:
+        mount = {key: round(value + getattr(present, key), 3) for key, value in mount.items()}
+        mount["yaw"] = present.yaw
+    words = f"the tracked point looks {abs(offset[0]):.2f} m {'ahead of' if offset[0] > 0 else 'behind'} and "
+    words += f"{abs(offset[1]):.2f} m to the {'left' if offset[1] > 0 else 'right'} of where robot.yaml has it"
+    return error("design_mount", words, "robot.yaml", {"mount": mount})
 
 
 def _placed(robot: Robot, keys: Sequence[str], factor: float) -> dict[str, dict[str, float]]:
@@ -305,8 +329,8 @@ def _corrected(robot: Robot, wheels: Mapping[str, Mapping[str, Any]]) -> Robot |
         return None
 
 
-def _tracked_point(robot: Robot, fit: FreeFit) -> Array | None:
-    """Where the tracked point is (2,), m, beside where the design has it, by the matrix; None if it is near.
+def _tracked_point(robot: Robot, fit: FreeFit) -> Array:
+    """Where the tracked point is (2,), m, beside where the design has it, by the matrix; NaN if nothing turns.
 
     A point at (x, y) of the robot has rows k1 - y k3 and k2 + x k3.
     """
@@ -314,10 +338,7 @@ def _tracked_point(robot: Robot, fit: FreeFit) -> Array | None:
     weights = 1 / np.maximum(np.diag(fit.covariance[0]), 1e-300)
     whole = float(weights @ turn**2)
     off = np.array([weights @ ((fit.matrix[1] - design[1]) * turn), -(weights @ ((fit.matrix[0] - design[0]) * turn))])
-    if not whole or not np.isfinite(whole):
-        return None
-    off = off / whole
-    return off if _NEAREST_MOUNT * robot.reach < np.hypot(*off) < _FARTHEST_MOUNT * robot.reach else None
+    return off / whole if whole and np.isfinite(whole) else np.full(2, np.nan)
 
 
 def steering_readings(robot: Robot, logs: Sequence[WheelLog], poses: Sequence[Array]) -> Iterator[Hypothesis]:
@@ -456,11 +477,22 @@ def _scaled(names: Sequence[str], group: Array, factor: float) -> Finding:
     ticks = 2 * math.pi * factor
     if factor in _COUNTS:
         words += f", as where counts are {'not ' if factor < 1 else ''}multiplied by {shown:g}, or by a gear of "
-        words += f"{shown:g}" + (", or a diameter is given as the radius" if factor == 2 else "")
+        words += f"{shown:g}"
     else:
         words += _as_ticks(ticks) if ticks > FEWEST_TICKS else "; is there a gear between the encoder and the wheel?"
     factors = [float(f"{factor:.3g}") if member else 1.0 for member in group]
     return error("wheel_scale", words, where, {"rate_factors": factors})
+
+
+def _radius(robot: Robot, group: Array, factor: float) -> Finding:
+    """The wheels of a group (N,) of 0 and 1 whose radius in the robot's file is a factor too large."""
+    members = [wheel for wheel, member in zip(robot.measured, group.tolist(), strict=True) if member]
+    size, shown = ("large", factor) if factor > 1 else ("small", 1 / factor)
+    of_what = "all wheels" if group.all() else wheels_in_words([wheel.name for wheel in members])
+    words = f"the radius of {of_what} in robot.yaml looks about {_rounded(shown)} times too {size}"
+    words += ", as where a diameter is given as the radius" if factor == _DIAMETER else ""
+    radii = {wheel.name: {"radius": float(f"{wheel.radius / factor:.4g}")} for wheel in members}
+    return error("design_radius", words, "robot.yaml", {"wheels": radii})
 
 
 def _clockwise(steered: Sequence[str], group: Array) -> Finding:

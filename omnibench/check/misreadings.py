@@ -22,6 +22,7 @@ from omnibench.check.hypotheses import (
     IN_DEGREES,
     Hypothesis,
     Reading,
+    another_mount,
     design_hypotheses,
     mirrored_positions,
     plain_hypothesis,
@@ -32,10 +33,10 @@ from omnibench.check.hypotheses import (
     turned_reference,
     wheel_hypotheses,
 )
-from omnibench.check.motion_fit import DesignDistance, FreeFit, Windows, continuous, transformed
+from omnibench.check.motion_fit import DesignDistance, FreeFit, Windows, continuous, transformed, usual_changes
 from omnibench.data.finding import Finding
 from omnibench.robot.kinematics import Array, CarDrive, Robot, wrapped
-from omnibench.robot.odometry import OdometryBatch, WheelLog
+from omnibench.robot.odometry import Complex, OdometryBatch, WheelLog
 
 # d^2 from which on a recording is suspicious, share of it that may remain, and score by which an explanation must be
 # better (chosen: untouched recordings have 3.6 at most, a wheel counted 1.5 times too much adds 16 or more).
@@ -56,7 +57,11 @@ _MOST_SAMPLES = 60_000  # wheel samples of the runs that hypotheses are fitted t
 # explanation may leave, and misfits that are as good as the best (chosen: errors of calibration, slip and noise are
 # below).
 _MISFIT, _LEAST_MISFIT, _EXPLAINED, _AS_GOOD = 0.15, 0.05, 0.35, 1.1
+_SCALES = ("wheel_scale", "design_radius")
 _LEAST_FACTOR = 1.8  # of rates beside sparse poses: a smaller one may be another design; chosen
+# Score by which positions without headings must fit better with a tracked point off the centre, what it costs and is
+# to be better by beside poses; and their least deviation, as a share of the robot's size; chosen.
+_FITTED_POINT, _EXACT = 10.0, 0.01
 # Runs that are compared at most, and poses of each: with headings, and without; chosen.
 _MOST_RUNS, _MOST_STAMPS, _MOST_POSITIONS = 24, 300, 30
 
@@ -66,7 +71,7 @@ class Recorded:
     """Runs of a robot: logs, and reference poses (K, 3) at their stamps.
 
     as_read: these poses before their headings were made continuous. without_headings: True if they are positions, in a
-    frame that each run may have turned.
+    frame that each run may have turned. counted: True if the rates were made of ticks.
     """
 
     robot: Robot
@@ -74,6 +79,7 @@ class Recorded:
     poses: Sequence[Array]
     as_read: Sequence[Array] = ()
     without_headings: bool = False
+    counted: bool = False
 
     def some(self) -> Recorded:
         """Runs from first to last that are looked at, all if they are few or short; with continuous headings."""
@@ -81,7 +87,7 @@ class Recorded:
         every = max(1, math.ceil(samples / _MOST_SAMPLES)) if len(self.logs) > 3 else 1
         logs, as_read = self.logs[::every], self.poses[::every]
         poses = [continuous(log.stamps, of_run) for log, of_run in zip(logs, as_read, strict=True)]
-        return Recorded(self.robot, logs, poses, as_read)
+        return replace(self, logs=logs, poses=poses, as_read=as_read)
 
     def fit(self) -> FreeFit | None:
         """The matrix that fits freely; None where poses are too sparse."""
@@ -147,6 +153,22 @@ class _Scored:
     remaining: float
     mistakes: tuple[Finding, ...]
 
+    @property
+    def usual(self) -> bool:
+        """True if the motion is as near the design as sound recordings are, and the wheels explain it."""
+        agrees = self.distance < _SUSPICIOUS and self.contradiction < _CONTRADICTING
+        return agrees and self.remaining < UNRELATED
+
+    def explains(self, present: _Scored) -> bool:
+        """True if it is likelier than no mistake, and leaves hardly anything of what made the recording suspicious."""
+        return (
+            bool(self.mistakes)
+            and self.score <= present.score - _BETTER
+            and self.remaining < UNRELATED
+            and self.distance <= max(_REMAINS * present.distance, _SUSPICIOUS)
+            and self.contradiction <= max(_REMAINS * present.contradiction, _CONTRADICTING)
+        )
+
 
 def search(recording: Recorded) -> Explained:
     """The mistakes that explain a recording best; none if its matrix is near enough to the design."""
@@ -161,21 +183,20 @@ def search(recording: Recorded) -> Explained:
     contradiction = float(far.contradictions(fit.gram, np.eye(len(fit.gram))[None])[0])
     if distance < _SUSPICIOUS and contradiction < _CONTRADICTING and fit.share < _BADLY:
         return Explained(_contradicting(some), fit=fit)
+    suspicious = distance >= _SUSPICIOUS or contradiction >= _CONTRADICTING
     scored = sorted(_scores(some, fit), key=lambda each: each.score)
-    best, present = scored[0], next(each for each in scored if not each.mistakes)
-    # Hardly anything remains of what made the recording suspicious.
-    likely = (
-        best.score <= present.score - _BETTER
-        and best.remaining < UNRELATED
-        and best.distance <= max(_REMAINS * present.distance, _SUSPICIOUS)
-        and best.contradiction <= max(_REMAINS * present.contradiction, _CONTRADICTING)
-    )
-    if not best.mistakes or not likely:
-        suspicious = distance >= _SUSPICIOUS or contradiction >= _CONTRADICTING
+    present = next(each for each in scored if not each.mistakes)
+    best = scored[0] if scored[0].explains(present) else None
+    if best is None and suspicious:
+        # Something is wrong anyway: a single mistake that leaves nothing of it need only pay for itself.
+        single = [each for each in scored[: scored.index(present)] if len(each.mistakes) == 1]
+        best = next((each for each in single if each.usual), None)
+    if best is None:
         return Explained(unexplained=present.remaining, far=suspicious, fit=fit)
     near = [
         other.mistakes
-        for other in scored[1:]
+        for other in scored
+        if other is not best and other.mistakes
         if other.score < best.score + _ALIKE or other.score - other.cost < best.score - best.cost + _SAME
     ]
     return Explained(best.mistakes, _other_kinds(best.mistakes, near), unexplained=best.remaining, fit=fit)
@@ -194,7 +215,7 @@ def _other_kinds(best: Sequence[Finding], others: Sequence[tuple[Finding, ...]])
 def _scores(recording: Recorded, fit: FreeFit) -> Iterator[_Scored]:
     """The scores of all hypotheses, without those of fits whose residual alone is beyond any explanation."""
     weight, best = min(fit.windows / _CORRELATED, _MOST_WEIGHED), math.inf
-    every = list(wheel_hypotheses(recording.robot))
+    every = list(wheel_hypotheses(recording.robot, counted=recording.counted))
     transforming = [hypothesis for hypothesis in every if hypothesis.reading is None]
     for base in _bases(recording, fit, [hypothesis for hypothesis in every if hypothesis.reading is not None]):
         residual, remaining = weight * math.log(max(base.fit.share, 1e-9)), float(base.fit.unexplained.min())
@@ -267,8 +288,8 @@ def _search_sparse(recording: Recorded) -> Explained:
     plain = plain_hypothesis(robot)
     present = float(moments.misfits([plain])[0])
     if not present > _LEAST_MISFIT:  # nan: it hardly moved
-        return Explained(_contradicting(recording))
-    hypotheses = list(_sparse_hypotheses(robot))
+        return Explained(_contradicting(recording) or (moments.off_centre() if positions else ()))
+    hypotheses = list(_sparse_hypotheses(recording))
     if positions:
         hypotheses.append(plain.with_reference(mirrored_positions()))
     scored = []
@@ -285,7 +306,7 @@ def _search_sparse(recording: Recorded) -> Explained:
     near = [each for each in scored if each[0] <= _AS_GOOD * least + (present / 10 if positions else _MISFIT / 4)]
     misfit, _, mistakes = min(near, key=lambda each: (len(each[2]), each[1], each[0]))
     if not mistakes or misfit >= _EXPLAINED * present or (positions and len(mistakes) > 1):
-        return Explained(far=present > _MISFIT and not positions)
+        return Explained(moments.off_centre() if positions else (), far=present > _MISFIT and not positions)
     alike = [each[2] for each in near if len(each[2]) == len(mistakes)] if positions else []
     return Explained(mistakes, _other_kinds(mistakes, alike))
 
@@ -311,15 +332,16 @@ def _contradicting(recording: Recorded) -> tuple[Finding, ...]:
     return steering[best].mistakes if shares[best] < _EXPLAINED * present else ()
 
 
-def _sparse_hypotheses(robot: Robot) -> Iterator[Hypothesis]:
+def _sparse_hypotheses(recording: Recorded) -> Iterator[Hypothesis]:
     """Mistakes of the wheels, one of them or none, each with every unit of the positions.
 
-    Factors of rates that a calibration is for are left out: sparse poses do not tell them from another design.
+    Factors of rates and radii that a calibration is for are left out: sparse poses do not tell them from another
+    design.
     """
     wheels = []
-    for wheel in wheel_hypotheses(robot):
-        factors = [factor for mistake in wheel.mistakes for factor in mistake.changes.get("rate_factors", ())]
-        small = factors and all(1 / _LEAST_FACTOR < factor < _LEAST_FACTOR for factor in factors)
+    for wheel in wheel_hypotheses(recording.robot, counted=recording.counted):
+        scaled, factors = any(mistake.kind in _SCALES for mistake in wheel.mistakes), np.diag(wheel.columns)
+        small = scaled and bool((factors > 1 / _LEAST_FACTOR).all() and (factors < _LEAST_FACTOR).all())
         if wheel.reading is None and not small:
             wheels.append(wheel)
     yield from wheels
@@ -397,6 +419,69 @@ class _Moments:
         if self.without_headings:
             return np.where(lengths < runs * size, np.nan, position)
         return np.where((lengths < runs * size) & (angles < runs), np.nan, np.maximum(position, heading))
+
+    def off_centre(self) -> tuple[Finding, ...]:
+        """The mistake of a tracked point off the centre, by positions in frames that each run may have turned.
+
+        Empty where the point is near, or where the design fits about as well without it.
+        """
+        exact, count = _EXACT * self.robot.reach, len(usual_changes(self.robot))
+        nothing = np.zeros(count + 2)
+        at_first, _ = self._fitted(nothing, max(self._missed(nothing), exact), count + 2)
+        deviation = max(self._missed(at_first), exact)
+        values, cost = self._fitted(at_first, deviation, count + 2)
+        without, dearer = self._fitted(nothing, deviation, count)
+        if dearer - cost < _FITTED_POINT or max(self._missed(values), exact) >= _REMAINS * self._missed(without):
+            return ()
+        mistake = another_mount(self.robot, values[count:])
+        return () if mistake is None else (mistake,)
+
+    def _fitted(self, start: Array, deviation: float, free: int) -> tuple[Array, float]:
+        """Values as in _misses by maximum a posteriori, of which the first so many are free, and -2 log(density).
+
+        deviation: of the positions, m.
+        """
+        from scipy.optimize import least_squares  # slow to import
+
+        count = len(start) - 2
+        steps = 1e-4 * np.append(np.ones(count), [self.robot.reach] * 2)[:free]
+
+        def residuals(values: Array) -> Array:
+            """Residuals (P, 2 S + J) of values (P, free), in standard deviations."""
+            whole = np.pad(values, ((0, 0), (0, len(start) - free)))
+            off = self._misses(whole) / (deviation * math.sqrt(_CORRELATED))
+            return np.hstack([off.real, off.imag, whole[:, :count]])
+
+        def slopes(values: Array) -> Array:
+            moved = residuals(np.vstack([values, values + np.diag(steps)]))
+            return ((moved[1:] - moved[0]) / steps[:, None]).T
+
+        solution = least_squares(
+            lambda values: residuals(values[None])[0], start[:free], slopes,
+            loss="soft_l1", x_scale=100 * steps, max_nfev=15,
+        )  # fmt: skip
+        return np.pad(solution.x, (0, len(start) - free)), 2 * float(solution.cost)
+
+    def _missed(self, values: Array) -> float:
+        """The median distance of the positions from the odometry of values (J + 2,), m."""
+        return float(np.median(np.abs(self._misses(values[None]))))
+
+    def _misses(self, values: Array) -> Complex:
+        """What the positions lie beside the odometry (P, S), m, each run moved and turned to fit.
+
+        values (P, J + 2): changes of the design in standard deviations, and x and y of the tracked point, m.
+        """
+        changes = np.tensordot(values[:, :-2], usual_changes(self.robot), 1)
+        poses = self.odometry.poses(self.robot.inverse_kinematic_matrix + changes)
+        point = (values[:, -2] + 1j * values[:, -1])[:, None]
+        firsts, run = np.flatnonzero(self.first), np.cumsum(self.first) - 1
+        places = [poses[..., 0] + 1j * poses[..., 1] + point * np.exp(1j * poses[..., 2])]
+        places.append((self.poses[:, 0] + 1j * self.poses[:, 1])[None])
+        counts = np.bincount(run)
+        driven, seen = (place - (np.add.reduceat(place, firsts, axis=1) / counts)[:, run] for place in places)
+        angles = np.angle(np.add.reduceat(driven * seen.conj(), firsts, axis=1))
+        off: Complex = driven - seen * np.exp(1j * angles)[:, run]
+        return off
 
     def _turns(self, headings: Array) -> Array:
         """Turns (..., S) since the moment before from headings since the start."""

@@ -224,6 +224,21 @@ _YAW = 0.035  # rad of the tracked point's heading; chosen, 2 degrees
 _PLACE = 0.1  # of the robot's reach: standard deviation of x and y of the tracked point; chosen
 
 
+def usual_changes(robot: Robot) -> Array:
+    """What a standard deviation of each radius, of each row's gain and of the tracked point's yaw adds to the design.
+
+    (J, 3, M).
+    """
+    design = robot.inverse_kinematic_matrix
+    columns = design.shape[1]
+    lateral = _LATERAL if any(wheel.kind == "mecanum" for wheel in robot.wheels) else _GAINS[1]
+    gains = (_GAINS[0], lateral, _SKID if robot.skid else _GAINS[2])
+    changes = [_RADIUS * design * (np.arange(columns) == column) for column in range(columns)]
+    changes += [gain * design * (np.arange(3) == row)[:, None] for row, gain in enumerate(gains)]
+    x, y, turn = design
+    return np.array([*changes, _YAW * np.array([-y, x, 0 * turn])])
+
+
 class DesignDistance:
     """Distances of fits from the design of one robot, Eq. (3)."""
 
@@ -233,15 +248,11 @@ class DesignDistance:
         self._outside = _beyond_twists(robot)
         self._units = np.repeat(1 / scales, columns)
         # S (3M, 3M) in units of the rows: what radii, gains, and yaw and place of the tracked point may change.
-        lateral = _LATERAL if any(wheel.kind == "mecanum" for wheel in robot.wheels) else _GAINS[1]
-        gains = (_GAINS[0], lateral, _SKID if robot.skid else _GAINS[2])
-        changes = [_RADIUS * self.design * (np.arange(columns) == column) for column in range(columns)]
-        changes += [gain * self.design * (np.arange(3) == row)[:, None] for row, gain in enumerate(gains)]
-        x, y, turn = self.design
-        changes.append(_YAW * np.array([-y, x, 0 * turn]))
-        changes += [
+        turn = self.design[2]
+        places = [
             _PLACE * robot.reach * np.array(rows) for rows in ([turn, 0 * turn, 0 * turn], [0 * turn, turn, 0 * turn])
         ]
+        changes = [*usual_changes(robot), *places]
         flat = np.array(changes).reshape(len(changes), -1)
         allowed = flat.T @ flat + np.diag(np.repeat((_ELEMENT * scales) ** 2, columns))
         self._allowed = allowed * np.outer(self._units, self._units)

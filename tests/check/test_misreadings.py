@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from omnibench.check.misreadings import Explained, Recorded, search
 from omnibench.check.source import recorded as read_as_recorded
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
+from omnibench.data.recording import corrected_robot
 from omnibench.data.references import Reference, References
 from omnibench.robot.kinematics import Array
 from omnibench.simulate.source import simulate_dataset
@@ -101,6 +102,48 @@ def test_exchanged_wheels_come_with_the_way_back(robot: str) -> None:
     assert {"wheel_order": order} in changes
 
 
+def misdesigned(key: str, factor: float, *wheels: str) -> Dataset:
+    """The recording of a robot, in whose file a value of some wheels is a factor too large."""
+    robot = recorded("diff").robot
+    values = {wheel.name: {key: factor * getattr(wheel, key)} for wheel in robot.wheels if wheel.name in wheels}
+    return replace(recorded("diff"), robot=corrected_robot(robot, values, None))
+
+
+@pytest.mark.parametrize("factor", [0.6, 1.66, 2.0, 6.9])
+def test_a_track_that_is_off_is_named_however_little_it_is_beyond_a_calibration(factor: float) -> None:
+    dataset = misdesigned("y", factor, *recorded("diff").robot.wheel_names)
+    found = explained(dataset)
+    (mistake,) = found.mistakes
+    assert (mistake.kind, found.alike) == ("design_distance", ())
+    for wheel in recorded("diff").robot.wheels:
+        assert mistake.changes["wheels"][wheel.name]["y"] == pytest.approx(wheel.y, rel=0.05)
+
+
+@pytest.mark.parametrize("factor", [0.75, 1.3])
+@pytest.mark.parametrize("every", [False, True])
+def test_a_radius_that_is_off_is_named_of_one_wheel_and_of_all(every: bool, factor: float) -> None:
+    robot = recorded("diff").robot
+    wrong = robot.wheels if every else robot.wheels[:1]
+    (mistake,) = explained(misdesigned("radius", factor, *(wheel.name for wheel in wrong))).mistakes
+    assert mistake.kind == "design_radius"
+    assert mistake.changes["wheels"] == {
+        wheel.name: {"radius": pytest.approx(wheel.radius, rel=0.1)} for wheel in wrong
+    }
+
+
+@pytest.mark.parametrize(("counted", "first"), [(False, "design_radius"), (True, "wheel_scale")])
+def test_a_diameter_given_as_the_radius_comes_first_but_where_ticks_may_be_counted_twice(
+    counted: bool, first: str
+) -> None:
+    robot = recorded("diff").robot
+    recording = replace(read_as_recorded(misdesigned("radius", 2.0, *robot.wheel_names)), counted=counted)
+    found = search(recording)
+    by_kind = {mistake.kind: mistake.changes for mistake in (*found.mistakes, *(each[0] for each in found.alike))}
+    assert [mistake.kind for mistake in found.mistakes] == [first]
+    assert by_kind["design_radius"]["wheels"] == {wheel.name: {"radius": wheel.radius} for wheel in robot.wheels}
+    assert by_kind["wheel_scale"] == {"rate_factors": [2.0, 2.0]}
+
+
 def positions_alone(run: Trajectory) -> Trajectory:
     """A run of which only the positions of every second are known, to 5 mm, in a frame of their own."""
     rng, rows = np.random.default_rng(len(run.times)), np.searchsorted(run.pose_times, np.arange(0, run.times[-1], 1.0))
@@ -110,6 +153,12 @@ def positions_alone(run: Trajectory) -> Trajectory:
     ]
     references = References.of(fixes, end=float(run.times[-1]))
     return replace(run, pose_times=np.zeros(1), poses=np.zeros((1, 3)), references=references)
+
+
+def seen_at(run: Trajectory, x: float, y: float) -> Trajectory:
+    """A run whose poses are of a point of the robot, m."""
+    place = (x + 1j * y) * np.exp(1j * run.poses[:, 2])
+    return replace(run, poses=run.poses + np.column_stack([place.real, place.imag, 0 * place.real]))
 
 
 @pytest.mark.parametrize(
@@ -131,6 +180,17 @@ def test_positions_without_headings_tell_a_misread_recording(change: str, robot:
     else:
         # One wheel that drives is every wheel.
         assert {kind, kind.replace("wheel_", "wheels_")} & kinds
+
+
+@pytest.mark.parametrize("robot", [name for name in NAMES if name != "skid"])
+def test_a_tracked_point_off_the_centre_is_told_by_positions_without_headings(robot: str) -> None:
+    reach = recorded(robot).robot.reach
+    x, y = 1.2 * reach, -0.6 * reach
+    runs = [positions_alone(seen_at(run, x, y)) for run in recorded(robot).trajectories]
+    (mistake,) = search(read_as_recorded(replace(recorded(robot), trajectories=tuple(runs)))).mistakes
+    assert mistake.kind == "design_mount"
+    mount = mistake.changes["mount"]
+    assert (mount["x"], mount["y"]) == pytest.approx((x, y), abs=0.1 * reach)
 
 
 @settings(max_examples=8, deadline=None)
