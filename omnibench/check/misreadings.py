@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,9 +60,11 @@ _MOST_SAMPLES = 60_000  # wheel samples of the runs that hypotheses are fitted t
 _MISFIT, _LEAST_MISFIT, _EXPLAINED, _AS_GOOD = 0.15, 0.05, 0.35, 1.1
 _SCALES = ("wheel_scale", "design_radius")
 _LEAST_FACTOR = 1.8  # of rates beside sparse poses: a smaller one may be another design; chosen
-# Score by which positions without headings must fit better with a tracked point off the centre, what it costs and is
-# to be better by beside poses; and their least deviation, as a share of the robot's size; chosen.
+# Score by which positions without headings must fit better with a tracked point off the centre than with none, or
+# another: what it costs and is to be better by beside poses. And their least deviation, as a share of the robot's size;
+# chosen.
 _FITTED_POINT, _EXACT = 10.0, 0.01
+_APART = 0.15  # of the robot's size: points that are nearer to each other are one; chosen
 # Runs that are compared at most, and poses of each: with headings, and without; chosen.
 _MOST_RUNS, _MOST_STAMPS, _MOST_POSITIONS = 24, 300, 30
 
@@ -288,7 +291,8 @@ def _search_sparse(recording: Recorded) -> Explained:
     plain = plain_hypothesis(robot)
     present = float(moments.misfits([plain])[0])
     if not present > _LEAST_MISFIT:  # nan: it hardly moved
-        return Explained(_contradicting(recording) or (moments.off_centre() if positions else ()))
+        contradicting = _contradicting(recording)
+        return moments.off_centre() if positions and not contradicting else Explained(contradicting)
     hypotheses = list(_sparse_hypotheses(recording))
     if positions:
         hypotheses.append(plain.with_reference(mirrored_positions()))
@@ -306,7 +310,7 @@ def _search_sparse(recording: Recorded) -> Explained:
     near = [each for each in scored if each[0] <= _AS_GOOD * least + (present / 10 if positions else _MISFIT / 4)]
     misfit, _, mistakes = min(near, key=lambda each: (len(each[2]), each[1], each[0]))
     if not mistakes or misfit >= _EXPLAINED * present or (positions and len(mistakes) > 1):
-        return Explained(moments.off_centre() if positions else (), far=present > _MISFIT and not positions)
+        return moments.off_centre() if positions else Explained(far=present > _MISFIT)
     alike = [each[2] for each in near if len(each[2]) == len(mistakes)] if positions else []
     return Explained(mistakes, _other_kinds(mistakes, alike))
 
@@ -420,36 +424,50 @@ class _Moments:
             return np.where(lengths < runs * size, np.nan, position)
         return np.where((lengths < runs * size) & (angles < runs), np.nan, np.maximum(position, heading))
 
-    def off_centre(self) -> tuple[Finding, ...]:
+    def off_centre(self) -> Explained:
         """The mistake of a tracked point off the centre, by positions in frames that each run may have turned.
 
-        Empty where the point is near, or where the design fits about as well without it.
+        Runs of one motion tell how far the point is ahead, or behind, but not which: such points are named alike. None
+        is where the point is near or not known, or where the design fits about as well without it.
         """
-        exact, count = _EXACT * self.robot.reach, len(usual_changes(self.robot))
-        nothing = np.zeros(count + 2)
-        at_first, _ = self._fitted(nothing, max(self._missed(nothing), exact), count + 2)
-        deviation = max(self._missed(at_first), exact)
-        values, cost = self._fitted(at_first, deviation, count + 2)
-        without, dearer = self._fitted(nothing, deviation, count)
-        if dearer - cost < _FITTED_POINT or max(self._missed(values), exact) >= _REMAINS * self._missed(without):
-            return ()
+        reach, count = self.robot.reach, len(usual_changes(self.robot))
+        exact, nothing = _EXACT * reach, np.zeros(count + 2)
+        starts = [np.append(nothing[:count], np.multiply(signs, reach / 2)) for signs in product((1, -1), repeat=2)]
+        deviation = max(self._missed(nothing), exact)
+        at_first = [self._fitted(start, deviation, count + 2)[0] for start in starts]
+        deviation = max(min(map(self._missed, at_first)), exact)
+        points = [self._fitted(start, deviation, count + 2) for start in at_first]
+        least = min(cost for _, cost, _ in points)
+        likely = [point for point in points if point[1] < least + _FITTED_POINT]
+        values, cost, error = max(likely, key=lambda point: float(point[0][count]))  # trackers mostly stand ahead
+        without, dearer, _ = self._fitted(nothing, deviation, count)
+        close = max(self._missed(values), exact) < _REMAINS * self._missed(without)
         mistake = another_mount(self.robot, values[count:])
-        return () if mistake is None else (mistake,)
+        if mistake is None or not close or dearer - cost < _FITTED_POINT or error > np.hypot(*values[count:]) / 2:
+            return Explained()
+        distinct, alike = [values[count:]], list[tuple[Finding, ...]]()
+        for point in (other[count:] for other, _, _ in likely):
+            if min(np.hypot(*(point - other)) for other in distinct) > _APART * reach:
+                distinct.append(point)
+                if (other := another_mount(self.robot, point)) is not None:
+                    words = f"{other.what}, which runs that drive ahead and then turn on the spot would tell"
+                    alike.append((other.model_copy(update={"what": words}),))
+        return Explained((mistake,), tuple(alike))
 
-    def _fitted(self, start: Array, deviation: float, free: int) -> tuple[Array, float]:
-        """Values as in _misses by maximum a posteriori, of which the first so many are free, and -2 log(density).
+    def _fitted(self, start: Array, deviation: float, free: int) -> tuple[Array, float, float]:
+        """Values as in _misses by maximum a posteriori, -2 log(density), and the standard error of the tracked point.
 
-        deviation: of the positions, m.
+        free: number of the first values that are fitted, the others stay 0. deviation: of the positions, m.
         """
         from scipy.optimize import least_squares  # slow to import
 
-        count = len(start) - 2
+        count, as_one = len(start) - 2, max(_CORRELATED, len(self.poses) / _MOST_WEIGHED)
         steps = 1e-4 * np.append(np.ones(count), [self.robot.reach] * 2)[:free]
 
         def residuals(values: Array) -> Array:
             """Residuals (P, 2 S + J) of values (P, free), in standard deviations."""
             whole = np.pad(values, ((0, 0), (0, len(start) - free)))
-            off = self._misses(whole) / (deviation * math.sqrt(_CORRELATED))
+            off = self._misses(whole) / (deviation * math.sqrt(as_one))
             return np.hstack([off.real, off.imag, whole[:, :count]])
 
         def slopes(values: Array) -> Array:
@@ -460,7 +478,9 @@ class _Moments:
             lambda values: residuals(values[None])[0], start[:free], slopes,
             loss="soft_l1", x_scale=100 * steps, max_nfev=15,
         )  # fmt: skip
-        return np.pad(solution.x, (0, len(start) - free)), 2 * float(solution.cost)
+        covariance = np.linalg.pinv(solution.jac.T @ solution.jac + 1e-9 * np.eye(free))[count:, count:]
+        error = math.sqrt(float(np.linalg.eigvalsh(covariance)[-1])) if free > count else 0.0
+        return np.pad(solution.x, (0, len(start) - free)), 2 * float(solution.cost), error
 
     def _missed(self, values: Array) -> float:
         """The median distance of the positions from the odometry of values (J + 2,), m."""
