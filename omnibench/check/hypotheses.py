@@ -443,7 +443,8 @@ def _named_steering(robot: Robot, group: Array, reading: Reading) -> Iterator[Hy
     if abs(zero) >= _LEAST_ZERO or (wrong and abs(zero) >= 0.5):
         wrong, cost = [*wrong, another_zero(robot, group, round(zero, 1))], cost or _FITTED
     if reading.lag:
-        words = f"the wheels of {where} follow the column {reading.lag:.2g} s late, as a servo follows its command"
+        follow = "follows" if group.sum() == 1 else "follow"
+        words = f"{names} {follow} the steering column {reading.lag:.2g} s late, as a servo follows its command"
         wrong, cost = [*wrong, error("steering_lag", words, where, {"steering_lag": reading.lag})], cost or _FITTED
     if wrong:
         yield replace(plain_hypothesis(robot), cost=cost, mistakes=tuple(wrong), reading=reading)
