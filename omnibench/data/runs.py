@@ -576,7 +576,7 @@ def division_in_words(robot: Robot, runs: Sequence[Trajectory], options: Mapping
     elif splits == every_second(commands):
         rule = "every second run of a command validates"
     elif splits == every_second(
-        [run.command if commands.count(run.command) > 1 else motion_of(robot, run) for run in runs]
+        [c if c and commands.count(c) > 1 else motion_of(robot, run) for c, run in zip(commands, runs, strict=True)]
     ):
         rule = "every second run of a command, or of those that move alike by their wheels, validates"
     else:
