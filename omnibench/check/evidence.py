@@ -41,7 +41,7 @@ class Evidence:
 
     @cached_property
     def aligned(self) -> Sequence[Trajectory]:
-        """The same runs with poses by the wheels' clock, as far as it shows."""
+        """The runs that have poses, with these by the wheels' clock where the reference's clock shows."""
         aligned = []
         for run, clock in zip(self.runs, self.clocks, strict=True):
             times = run.pose_times if clock is None else clock.corrected(run.pose_times)

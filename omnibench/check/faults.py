@@ -238,7 +238,7 @@ def jumps(evidence: Evidence) -> Iterator[Finding]:
     robot, standing = evidence.dataset.robot, {look.run for look in evidence.looks if look.standing}
     runs = [run for run in evidence.aligned if run.id not in standing]
     model, found = OdometryModel.of_design(robot, "arc"), {}
-    for run in runs:  # of which the odometry of one is in memory
+    for run in runs:  # one by one, so that the odometry of a single run is in memory
         (driven,) = model.poses([run.log(run.pose_times)])
         found[run.id] = reference_jumps(robot, driven, run.poses)
     lone, shifts = ([run for run, each in found.items() if len(getattr(each, kind))] for kind in ("lone", "shifts"))

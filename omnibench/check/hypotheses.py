@@ -34,9 +34,9 @@ FEWEST_TICKS = 100  # ticks of a turn of the wheel: a factor from there on is na
 # wheel that is changed, a reference that is wrong, a factor that is fitted, a zero beyond a right angle, which is
 # nearly the same as its wheel counted the other way round.
 _WHEEL, _REFERENCE, _FITTED, _REVERSED = 4.0, 4.5, 6.0, 9.0
-# A radius of the robot's file is the same as a factor of the rates, of all drives. It is named up to a diameter given
-# as the radius and a few hundredths more, in steps that a calibration takes over; the likelier of both readings is
-# cheaper by so much: the diameter where rates are recorded, the count where ticks are (chosen).
+# Factors of radii in the robot's file that are tried: half to double in steps of 3 %, without those that a calibration
+# is for; a diameter given as the radius. The same factor of all rates explains as much: where rates are recorded the
+# radius is likelier, where ticks are their count, and the likelier one costs less by _LIKELIER. Chosen.
 _RADII, _DIAMETER, _LIKELIER = 1.03 ** np.array([power for power in range(-25, 26) if abs(power) > 4]), 2.0, 0.4
 # Factors of coordinates in the robot's file that are tried, the steps about the best one, and usual causes; chosen.
 _FACTORS = tuple(1.15**power for power in range(-18, 19) if abs(power) > 1)
@@ -156,7 +156,7 @@ def wheel_hypotheses(robot: Robot, *, counted: bool = False) -> Iterator[Hypothe
 
 
 def _misread_wheels(robot: Robot) -> Iterator[tuple[Reading, float, Finding]]:
-    """What was meant, the cost of the mistake, and the finding that mends it."""
+    """Each mistake of wheels: the reading that was meant, the cost of the mistake, and the finding that mends it."""
     drive, names = robot.drive, robot.wheel_names
     for order, signs in _arrangements(len(names), orders=drive.direct):
         moved, negative = sum(wheel != column for wheel, column in enumerate(order)), sum(sign < 0 for sign in signs)

@@ -59,12 +59,12 @@ _MOST_SAMPLES = 60_000  # wheel samples of the runs that hypotheses are fitted t
 # below).
 _MISFIT, _LEAST_MISFIT, _EXPLAINED, _AS_GOOD = 0.15, 0.05, 0.35, 1.1
 _SCALES = ("wheel_scale", "design_radius")
-_LEAST_FACTOR = 1.8  # of rates beside sparse poses: a smaller one may be another design; chosen
+_LEAST_FACTOR = 1.8  # factor of rates, below which sparse poses do not tell it from another design; chosen
 # Score by which positions without headings must fit better with a tracked point off the centre than with none, or
 # another: what it costs and is to be better by beside poses. And their least deviation, as a share of the robot's size;
 # chosen.
 _FITTED_POINT, _EXACT = 10.0, 0.01
-_APART = 0.15  # of the robot's size: points that are nearer to each other are one; chosen
+_APART = 0.15  # share of the robot's size, within which two tracked points that fit are one; chosen
 # Runs that are compared at most, and poses of each: with headings, and without; chosen.
 _MOST_RUNS, _MOST_STAMPS, _MOST_POSITIONS = 24, 300, 30
 
@@ -303,7 +303,7 @@ def _search_sparse(recording: Recorded) -> Explained:
     for hypothesis in steering_scales(robot):
         misfits = _Moments.of(recording.meant(hypothesis)).misfits([plain])
         scored.append((float(misfits[0]), hypothesis.cost, hypothesis.mistakes))
-    if present <= _MISFIT and not positions:  # as far as another design goes, but for steering
+    if present <= _MISFIT and not positions:  # another design misses by as much: only steering is judged
         scored = [each for each in scored if all(mistake.kind.startswith("steering") for mistake in each[2])]
     # The simplest of those that fit about as well as the best one.
     least = np.nanmin([misfit for misfit, _, _ in scored])
@@ -487,7 +487,7 @@ class _Moments:
         return float(np.median(np.abs(self._misses(values[None]))))
 
     def _misses(self, values: Array) -> Complex:
-        """What the positions lie beside the odometry (P, S), m, each run moved and turned to fit.
+        """Differences (P, S) of the positions from the odometry, m, with each run moved and turned to fit.
 
         values (P, J + 2): changes of the design in standard deviations, and x and y of the tracked point, m.
         """

@@ -91,7 +91,7 @@ class Windows:
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
 
     def gentle(self) -> Windows:
-        """Those in which tyres hardly slip, as the lateral acceleration is small; all where these are few."""
+        """The windows of little lateral acceleration, in which tyres hardly slip; all windows where these are few."""
         seconds = self.times[:, 1] - self.times[:, 0]
         chosen = np.abs(self.moved) * np.abs(self.turned) < _GENTLE * seconds**2
         if 5 * chosen.sum() <= len(chosen):
@@ -221,7 +221,7 @@ _RADIUS, _GAINS, _ELEMENT = 0.06, (0.05, 0.05, 0.12), 0.02
 _LATERAL = 0.2  # the gain of row y of mecanum wheels, which slip sideways; chosen
 _SKID = 0.5  # the gain of row 3 of a skid-steered robot, which turns 20 to 50 % less than its design
 _YAW = 0.035  # rad of the tracked point's heading; chosen, 2 degrees
-_PLACE = 0.1  # of the robot's reach: standard deviation of x and y of the tracked point; chosen
+_PLACE = 0.1  # standard deviation of the tracked point's x and y, as a share of the robot's reach; chosen
 
 
 def usual_changes(robot: Robot) -> Array:

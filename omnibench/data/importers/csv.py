@@ -346,7 +346,9 @@ def _way_out(table: Table, missing: Sequence[StreamColumn], options: CsvOptions)
     ]
     shown = ", ".join(f"{key}: {_typed(taken.get(key, 'NAME'))}" for key in keys)
     if any(key not in taken for key in keys):
-        return f'name {"it" if len(keys) == 1 else "them"}: --set "columns={{{shown}}}"{typed}'
+        way = f'name {"it" if len(keys) == 1 else "them"}: --set "columns={{{shown}}}"{typed}'
+        without = ", or put positions without headings into a table RUN_references.csv (omnibench guide references)"
+        return way + (without if keys == ["theta"] else "")
     return f'did you mean --set "columns={{{shown}}}"{typed}?'
 
 

@@ -403,6 +403,13 @@ def test_dates_in_parquet_files_are_seconds(tmp_path: Path) -> None:
     assert odometry_error(data) < FITS
 
 
+def test_positions_without_headings_are_shown_the_table_that_takes_them(tmp_path: Path) -> None:
+    write_exact(tmp_path)
+    file = tmp_path / "run1_poses.csv"
+    pl.read_csv(file).drop("theta").write_csv(file)
+    assert "put positions without headings into a table RUN_references.csv" in refusal(tmp_path)
+
+
 @pytest.mark.parametrize("table", ["wheels", "poses"])
 def test_a_table_of_one_row_is_said_to_be_one(tmp_path: Path, table: str) -> None:
     write_exact(tmp_path)
