@@ -239,8 +239,3 @@ def expected_gain(dataset: Dataset, errors: Set[str] = frozenset()) -> tuple[boo
         runs = plural(len(dataset.trajectories), "run")
         return None, f"whether a calibration is needed cannot be told from {runs}; record four, of three commands"
     return needed, verdict.sentence
-
-
-def mending(read: RecordingSource, report: CheckReport) -> str:
-    """Command that reads a recording again without the errors of its report, also once a data set is written."""
-    return command(read, [finding for finding in report.findings if finding.severity == "error"])

@@ -160,10 +160,8 @@ def _next_step(read: "RecordingSource", report: "CheckReport | None") -> tuple[A
     """The next step after an import in words, then the words to type."""
     if report is None:
         return "see what they tell", "omnibench", "inspect", read.folder
-    from omnibench.check.check import mending
-
-    if command := mending(read, report):
-        return "mend it", *shlex.split(command)
+    if report.command:
+        return "mend what it warns of" if report.verdict == "ready" else "mend it", *shlex.split(report.command)
     if report.verdict == "ready":
         return "calibrate it", "omnibench", "calibrate", read.folder, "-o", "calibration.yaml"
     return "see what is missing", "omnibench", "check", read.folder
