@@ -8,5 +8,6 @@ import pytest
 
 
 def slow(*values: Any) -> list[Any]:
-    """The values as parameters that only ``pytest -m slow`` tries."""
-    return [pytest.param(value, marks=pytest.mark.slow) for value in values]
+    """The values, tuples of them where a case has several, as parameters that only ``pytest -m slow`` tries."""
+    cases = (value if isinstance(value, tuple) else (value,) for value in values)
+    return [pytest.param(*case, marks=pytest.mark.slow) for case in cases]

@@ -7,14 +7,14 @@ import re
 import shlex
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import polars as pl
 import pytest
-from commands import omnibench as command
+from commands import run_here
 from config_robots import experiment
 from hypothesis import example, given
 from hypothesis import strategies as st
@@ -31,6 +31,7 @@ from omnibench.robot.odometry import DrivenPath, WheelLog
 from omnibench.simulate.source import simulate_dataset
 
 Change = Callable[[Trajectory], Trajectory]
+command = partial(run_here, cwd=Path())
 
 
 @pytest.fixture(autouse=True)

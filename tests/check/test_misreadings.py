@@ -6,12 +6,14 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from itertools import cycle, product
 
 import numpy as np
 import pytest
 from config_robots import NAMES, experiment
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from lanes import slow
 
 from omnibench.check.misreadings import Explained, Recorded, search
 from omnibench.check.source import recorded as read_as_recorded
@@ -68,7 +70,7 @@ CHANGES: dict[str, tuple[Change, str]] = {
     "x and y exchanged": (poses(lambda values: values[:, [1, 0, 2]]), "reference_mirrored"),
     "turned": (turned(40.0), "reference_turned"),
 }
-EVERY_WHEEL = ("diff", "skid", "mecanum")
+EVERY_WHEEL, STEERED = ("diff", "skid", "mecanum"), ("tricycle", "car", "swerve")
 
 
 @pytest.mark.parametrize("robot", NAMES)
@@ -77,7 +79,8 @@ def test_a_sound_recording_is_misread_in_nothing(robot: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "robot"), [(change, NAMES[index % len(NAMES)]) for index, change in enumerate(CHANGES)]
+    ("change", "robot"),
+    [*zip(CHANGES, cycle(EVERY_WHEEL), strict=False), *slow(*zip(CHANGES, cycle(STEERED), strict=False))],
 )
 def test_a_mistake_is_named(change: str, robot: str) -> None:
     made, kind = CHANGES[change]
@@ -161,15 +164,12 @@ def seen_at(run: Trajectory, x: float, y: float) -> Trajectory:
     return replace(run, poses=run.poses + np.column_stack([place.real, place.imag, 0 * place.real]))
 
 
-@pytest.mark.parametrize(
-    ("change", "robot"),
-    [
-        (change, robot)
-        for change in ("none", "one negated", "all times 4", "y mirrored")
-        for robot in NAMES
-        if (change, robot) != ("one negated", "car")  # the rates of both rear wheels make one signal
-    ],
-)
+SPARSE = ("none", "one negated", "all times 4", "y mirrored")
+OTHERS = [*product(SPARSE, ("skid", *STEERED))]
+OTHERS.remove(("one negated", "car"))  # the rates of both rear wheels make one signal
+
+
+@pytest.mark.parametrize(("change", "robot"), [*product(SPARSE, ("diff", "mecanum")), *slow(*OTHERS)])
 def test_positions_without_headings_tell_a_misread_recording(change: str, robot: str) -> None:
     made, kind = CHANGES.get(change, (lambda run: one(run, -1.0) if change == "one negated" else run, "wheel_negated"))
     runs = [positions_alone(made(run)) for run in recorded(robot).trajectories]
@@ -182,7 +182,7 @@ def test_positions_without_headings_tell_a_misread_recording(change: str, robot:
         assert {kind, kind.replace("wheel_", "wheels_")} & kinds
 
 
-@pytest.mark.parametrize("robot", [name for name in NAMES if name != "skid"])
+@pytest.mark.parametrize("robot", ["diff", "mecanum", *slow(*STEERED)])
 def test_a_tracked_point_off_the_centre_is_told_by_positions_without_headings(robot: str) -> None:
     reach = recorded(robot).robot.reach
     x, y = 1.2 * reach, -0.6 * reach

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from commands import CONFIGS
+from lanes import slow
 
 from omnibench.check.misreadings import search
 from omnibench.check.source import recorded as recorded_of
@@ -101,10 +102,7 @@ IN_MM, IN_CM = positions(1000.0), positions(100.0)
 _HEADING = "theta looks like degrees; it must be rad"
 MISTAKES = {
     "rpm": (IN_RPM, "wheel rates look like rpm; omega_* must be rad/s"),
-    "degrees per second": (
-        IN_DEGREES_PER_SECOND,
-        "wheel rates look like deg/s; omega_* must be rad/s",
-    ),
+    "degrees per second": (IN_DEGREES_PER_SECOND, "wheel rates look like deg/s; omega_* must be rad/s"),
     "degrees": (IN_DEGREES, _HEADING),
     "degrees within 180": (IN_DEGREES_WITHIN_180, _HEADING),
     "degrees within 360": (IN_DEGREES_WITHIN_360, _HEADING),
@@ -115,8 +113,7 @@ ANGLES = ("degrees", "degrees within 180", "degrees within 360")
 RATES_AND_POSITIONS = ("rpm", "degrees per second", "mm", "cm")
 
 
-@pytest.mark.parametrize("sparse", [False, True])
-@pytest.mark.parametrize("robot", ["apr02", "mecanum"])
+@pytest.mark.parametrize(("robot", "sparse"), [("apr02", True), ("mecanum", False), *slow(("mecanum", True))])
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_a_wrong_unit_is_named(mistake: str, robot: str, sparse: bool) -> None:
     change, warning = MISTAKES[mistake]
@@ -242,10 +239,3 @@ def test_a_robot_that_hardly_moved_gives_nothing() -> None:
         return replace(run, rates=run.rates * 1e-3, poses=run.poses * 1e-3)
 
     assert warnings_of(recorded(), hardly) == ""
-
-
-@pytest.mark.parametrize("recorded", ["omni3", "robotino"])
-def test_real_recordings_give_no_warning(recorded: str, request: pytest.FixtureRequest) -> None:
-    dataset = request.getfixturevalue(recorded)
-    few = replace(dataset, trajectories=dataset.trajectories[::4])
-    assert warnings_of(few) == ""
