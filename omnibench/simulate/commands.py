@@ -113,6 +113,8 @@ def sharpest_turn(robot: Robot, command: Command, limit: float) -> float:
 
 def unsteerable(robot: Robot, commands: Sequence[Command], degrees: float | None) -> list[Command]:
     """The commands that are beyond a robot's steering limit, deg, or need it to turn on the spot."""
+    if robot.drive.direct:
+        return []
     limit = steering_limit(robot, degrees)
     return [command for command in commands if not is_within(robot, command, limit)]
 

@@ -220,9 +220,10 @@ class FlowerConfig(Experiment[Session]):
                 f"this is {rows:.1g} wheel samples and poses, more than {_MOST_ROWS:.0e}; "
                 "check the periods, distances, speeds and repetitions"
             )
-        if self.runs > _MOST_RUNS:
+        runs = sum(each.repetitions for each in planned)
+        if runs > _MOST_RUNS:
             raise ValueError(
-                f"this is {self.runs} runs, more than {_MOST_RUNS}; give fewer speeds, directions, rates of turn or "
+                f"this is {runs} runs, more than {_MOST_RUNS}; give fewer speeds, directions, rates of turn or "
                 "repetitions"
             )
         return self

@@ -224,12 +224,8 @@ def test_what_is_not_known_of_a_trajectory_is_not_in_its_log() -> None:
         ({"train": {"seed": 1, "distance": 1.0, "noise_scale": 1e300}}, "noise_scale: .* less than or equal to"),
         ({"noise": {"pose_position": 1e300}}, "pose_position: .* less than or equal to"),
         (
-            {
-                "commands": {"speeds": [0.2], "directions_deg": list(range(100_001)), "turn_rates": [0.0]},
-                "train": {"seed": 1, "distance": 0.1},
-                "validation": None,
-            },
-            "100001 runs, more than 100000",
+            {"repetitions": 16_667, "train": {"seed": 1, "distance": 0.1}, "validation": None},
+            "100002 runs, more than 100000",
         ),
     ],
 )
