@@ -33,10 +33,17 @@ from commands import (
 )
 from config_robots import NAMES, experiment
 
-from omnibench.compare.config import CompareConfig, effective_config, load_calibrators, read_compare_config
+from omnibench.compare.config import (
+    CertificateChoice,
+    CompareConfig,
+    effective_config,
+    load_calibrators,
+    read_compare_config,
+)
 from omnibench.compare.output import prepare_output
 from omnibench.compare.plan import PlannedRun, load_datasets, make_plan
 from omnibench.compare.recording_config import recording_config, suitable_calibrators
+from omnibench.compare.run import certify
 from omnibench.config import to_yaml
 from omnibench.errors import DataError, OmnibenchError
 from omnibench.fit.evaluate import evaluate
@@ -210,6 +217,8 @@ def test_a_data_set_is_compared_by_all_calibrators_that_suit_it(
     command: Command, prepared: Prepared, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("omnibench.compare.recording_config._EVALUATIONS", 300)
+    proof = CertificateChoice(seconds=0.5)
+    monkeypatch.setattr("omnibench.compare.run.certify", lambda _, *runs: certify(proof, *runs))
     printed = command("compare", prepared.data, "-o", "out")
     assert printed.returncode == 0, printed.stderr
     first = printed.stderr.splitlines()[0]

@@ -277,6 +277,12 @@ def test_a_wrong_backend_is_named(name: str, parts: tuple[str, ...]) -> None:
         check_backend(name)
 
 
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("omnibench.jobs.dask_backend._ANSWER", 1.0)
+
+
+@pytest.mark.usefixtures("impatient")
 def test_a_scheduler_that_nobody_started_is_one_line(command: Command, tmp_path: Path) -> None:
     run = command("compare", write_config(tmp_path), "-o", tmp_path / "out", "--backend", "tcp://127.0.0.1:9")
     assert_refused(run, "tcp://127.0.0.1:9", "dask scheduler")
@@ -293,6 +299,7 @@ def test_dask_is_imported_only_where_it_is_asked_for() -> None:
     assert python(program, env=ENVIRONMENT).stdout == "False\n"
 
 
+@pytest.mark.usefixtures("impatient")
 def test_a_web_server_is_no_scheduler() -> None:
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), http.server.SimpleHTTPRequestHandler)
     threading.Thread(target=server.serve_forever, daemon=True).start()
