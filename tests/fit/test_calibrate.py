@@ -298,10 +298,12 @@ def of_group(dataset: Dataset, *groups: str) -> Dataset:
 @pytest.mark.parametrize(
     ("name", "trained", "published"),
     [
-        ("diff", "circular", {"circular": (0.0090, 1.10), "square": (0.028, 1.9), "ivanjko": (0.0055, 0.95)}),
-        pytest.param("diff", "square", {"square": (0.0108, 1.05), "circular": (0.0297, 4.06)}, marks=pytest.mark.slow),
-        pytest.param("tricyc", "circular", {"circular": (0.042, 3.7), "square": (0.084, 3.2)}, marks=pytest.mark.slow),
-        pytest.param("omni4", "circular", {"": (0.031, 3.4)}, marks=pytest.mark.slow),
+        ("tricyc", "circular", {"circular": (0.042, 3.7), "square": (0.084, 3.2)}),
+        *slow(
+            ("diff", "circular", {"circular": (0.0090, 1.10), "square": (0.028, 1.9), "ivanjko": (0.0055, 0.95)}),
+            ("diff", "square", {"square": (0.0108, 1.05), "circular": (0.0297, 4.06)}),
+            ("omni4", "circular", {"": (0.031, 3.4)}),
+        ),
     ],
 )
 def test_a_real_robot_errs_less_than_by_published_methods(
@@ -410,6 +412,7 @@ def mean_distance(run: CalibrationRun, drive: Trajectory) -> float:
     return float(np.hypot(*(poses - drive.poses[1:])[:, :2].T).mean())
 
 
+@pytest.mark.slow
 def test_a_real_tricycle_with_a_steering_gain_far_off_errs_less_than_its_authors_say() -> None:
     dataset = corelli_dataset()
     (drive,) = dataset.trajectories
@@ -547,6 +550,7 @@ def test_repetitions_that_agree_exactly_show_what_differs_and_nothing_else() -> 
     assert compared(replace(dataset, trajectories=none)).differences == ()
 
 
+@pytest.mark.slow
 def test_squares_and_a_single_run_of_a_real_robot_are_not_said_to_be_another_session(omni3: Dataset) -> None:
     found = compared(omni3)
     assert found.differences == ()
