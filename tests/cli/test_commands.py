@@ -16,7 +16,6 @@ from commands import (
     COMMAND,
     CONFIGS,
     ENVIRONMENT,
-    RECORDINGS,
     Command,
     Prepared,
     Printed,
@@ -224,22 +223,6 @@ def test_export_to_ros2_says_what_its_parameters_cannot_hold(command: Command, p
     printed = command("export", prepared.calibration, "--to", "ros2_controllers")
     assert "wheel_radius" in str(yaml.safe_load(printed.stdout))
     assert printed.stderr.startswith("warning: ")
-
-
-@pytest.mark.slow
-def test_import_turns_recordings_into_a_data_set(command: Command, tmp_path: Path) -> None:
-    source = RECORDINGS / "optiodom" / "omni3"
-    if not source.is_dir():
-        pytest.skip(f"the recordings are not there: {source}")
-    split = ("--set", "train=circular", "--set", "validation=square")
-    printed = succeeded(command("import", "optiodom", source, "-o", tmp_path / "data", *split))
-    assert printed.stdout == f"67 trajectories: {tmp_path / 'data'}\n"
-    division = "training 44 runs of 20 commands, validation 23 runs of 5 commands, by train=circular, validation=square"
-    assert division in printed.stderr
-    again = command("import", "optiodom", source, "-o", tmp_path / "again", "--set", "validation=*quare")
-    assert "validation 23 runs of 5 commands, by validation=*quare" in again.stderr
-    dataset = load_dataset(tmp_path / "data")
-    assert (len(dataset.split("train")), len(dataset.split("validation"))) == (44, 23)
 
 
 def test_a_data_set_has_the_name_of_its_folder_unless_another_is_given(command: Command, tmp_path: Path) -> None:

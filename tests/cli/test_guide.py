@@ -242,14 +242,6 @@ def test_an_example_says_what_to_type_next_and_is_as_good_as_written_where_it_is
     assert again.stdout.startswith("nothing is written")
 
 
-def test_a_file_that_differs_is_not_overwritten(command: Command) -> None:
-    Path("configs").mkdir()
-    Path("configs/apr02.yaml").write_text("name: mine\n", encoding="utf-8")
-    assert_refused(command("example", "apr02", "-o", "."), "configs/apr02.yaml is there already")
-    assert Path("configs/apr02.yaml").read_text(encoding="utf-8") == "name: mine\n"
-    assert not Path("plugins").exists()
-
-
 def test_a_recording_that_is_there_is_not_simulated_again(command: Command) -> None:
     assert command("example", "recording", "-o", "demo").returncode == 0
     assert_refused(command("example", "recording", "-o", "demo"), "is there already", "choose another folder")

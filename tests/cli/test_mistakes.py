@@ -12,8 +12,6 @@ import pytest
 import yaml
 from commands import COMMAND, ENVIRONMENT, Command, Prepared, assert_refused, disk_that_takes, omnibench, succeeded
 
-from omnibench.data.storage import load_dataset
-
 
 @pytest.mark.parametrize(
     ("arguments", "parts"),
@@ -148,14 +146,6 @@ def test_a_disk_that_is_full_is_said_before_the_work(prepared: Prepared, tmp_pat
     calibrate = [*COMMAND, "calibrate", prepared.data, "-o", tmp_path / "c.yaml", "--plugins", "none"]
     run = subprocess.run([*mounted, *calibrate], capture_output=True, text=True, env=ENVIRONMENT, check=False)
     assert_refused(run, f"{tmp_path}/c.yaml: cannot be written: No space left on device")
-
-
-def test_a_data_set_too_large_leaves_the_one_before(command: Command, prepared: Prepared, tmp_path: Path) -> None:
-    data = shutil.copytree(prepared.data, tmp_path / "data")
-    with disk_that_takes(600):
-        run = command("simulate", prepared.config, "-o", data, "--format", "csv", "--force")
-    assert_refused(run, FULL)
-    assert load_dataset(data).hash == load_dataset(prepared.data).hash
 
 
 MINE = "written: by hand\n"

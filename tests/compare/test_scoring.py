@@ -117,12 +117,6 @@ def test_no_gap_is_measured_against_an_optimum_that_was_not_reached() -> None:
     assert [row.gap for row in rows.values()] == [None, None]
 
 
-def test_a_run_without_an_answer_has_no_figures_but_the_theoretical_ones() -> None:
-    row = records(["crs"], (None,))["crs"]
-    assert row.theoretical_train_cost > 0
-    assert {row.train_cost, row.validation_cost, row.train_position_m, row.matrix, row.gap} == {None}
-
-
 def test_final_errors_are_mean_distances_and_mean_absolute_headings() -> None:
     errors = np.array([[3.0, 4.0, -0.1], [0.0, 0.0, 0.3]])
     assert position_error(errors) == pytest.approx(2.5)
@@ -188,16 +182,6 @@ def test_what_the_runs_do_not_identify_is_warned_of_for_everything_that_is_fitte
     (warning,) = result.warnings
     assert warning.startswith("data set flower, fit of the matrix:")
     assert "(turning on the spot)" in warning
-
-
-def test_copies_of_training_runs_are_not_held_out(tmp_path: Path) -> None:
-    dataset = load_dataset(prepare().data)
-    train = dataset.split("train")
-    copies = [replace(run, id=f"copy-{run.id}", split="validation") for run in train]
-    save_dataset(make_dataset("copied", dataset.robot, dataset.sample_period, [*train, *copies]), tmp_path / "data")
-    entries = ["theoretical", "closed_form"]
-    result = compared_here(tmp_path / "out", datasets={"copied": {"path": tmp_path / "data"}}, calibrators=entries)
-    assert result.held_out["copied"].verdict.verdict == "unknown"
 
 
 # Answers with effects beside the matrix

@@ -266,8 +266,7 @@ def test_a_warm_up_that_ends_is_not_carried_on_without_a_warning() -> None:
     drift = ({"name": "thermal_radius_drift", "parameters": {"k": 2e-5}},)
     dataset = simulated(drift, repetitions=6)
     late = with_runs(
-        dataset,
-        lambda run: replace(run, started_at=run.started_at + 20_000) if run.split == "validation" else run,
+        dataset, lambda run: replace(run, started_at=run.started_at + 20_000) if run.split == "validation" else run
     )
     found = discover_effects(late)
     assert [effect.name for effect in found.effects] == ["thermal_radius_drift"]

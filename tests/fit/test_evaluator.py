@@ -28,11 +28,7 @@ from omnibench.errors import ConfigError, DataError
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.certify import LowerBounds, certify_optimum, into_unit_ball, prove
 from omnibench.fit.cost import Cost, SumOfNorms
-from omnibench.fit.evaluator import (
-    ElementBox,
-    PoseEvaluator,
-    make_evaluator,
-)
+from omnibench.fit.evaluator import ElementBox, PoseEvaluator, make_evaluator
 from omnibench.fit.geometry import GeometryLimits
 from omnibench.fit.loss import CORNERS, DEGREES_OF_FREEDOM, LEAST_SCALE, Huber, Loss, StudentT, with_ends_from_others
 from omnibench.fit.parameterisation import Box

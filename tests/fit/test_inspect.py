@@ -17,13 +17,7 @@ from syrupy.assertion import SnapshotAssertion
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.errors import DataError
 from omnibench.fit.inspect import Inspection, inspect_dataset
-from omnibench.fit.span import (
-    aligned,
-    direction_in_words,
-    directions_kept,
-    driven_span,
-    motion_in_words,
-)
+from omnibench.fit.span import aligned, direction_in_words, directions_kept, driven_span, motion_in_words
 from omnibench.robot.kinematics import Array, Robot, wheel_equations
 from omnibench.testing.synthetic import synthetic_robot
 

@@ -330,21 +330,6 @@ def test_a_swerve_base_averages_its_modules() -> None:
     assert len(SWERVE.drive.names) == 8
 
 
-@pytest.mark.parametrize("robot", EVERY)
-@given(seed=st.integers(0, 2**32 - 1), integration=st.sampled_from(["euler", "arc"]))
-def test_a_stream_drives_as_a_batch(robot: Robot, seed: int, integration: Integration) -> None:
-    rng = np.random.default_rng(seed)
-    times = np.cumsum(rng.uniform(0.01, 0.1, 40))
-    rates = rng.normal(0.0, 5.0, (40, len(robot.wheel_names)))
-    steering = rng.normal(0.0, 0.4, (40, len(robot.drive.steered))) if robot.drive.steered else None
-    model = OdometryModel.of_design(robot, integration)
-    log = WheelLog(times, rates, np.array([1.0, -2.0, 0.5]), times, steering=steering, drive=robot.drive)
-    stream = model.stream(log.start)
-    for sample, duration in enumerate(np.diff(times, prepend=0.0)):
-        stream.drive(rates[sample] * duration, steering=None if steering is None else steering[sample])
-    np.testing.assert_allclose(stream.pose, model.poses([log])[0][-1], rtol=0, atol=1e-12)
-
-
 def test_a_row_of_zeros_has_the_scale_of_the_other_direction_of_driving() -> None:
     """Of a differential drive, radius r and track 2 b: r / 2 ahead and aside, r / 2b for turning."""
     sideways = DIFFERENTIAL.model_copy(update={"mount": Mount(yaw=math.pi / 2)})  # zeros to rounding in row 1 then
@@ -576,11 +561,6 @@ POSES = arrays(float, 3, elements=st.floats(-10, 10))
 @given(POSES, POSES)
 def test_the_relative_pose_leads_from_the_first_to_the_second(first: np.ndarray, second: np.ndarray) -> None:
     np.testing.assert_allclose(compose(first, relative(first, second)), second, atol=1e-9)
-
-
-@given(POSES, POSES, POSES)
-def test_composing_is_associative(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> None:
-    np.testing.assert_allclose(compose(compose(a, b), c), compose(a, compose(b, c)), atol=1e-9)
 
 
 @given(POSES, POSES)

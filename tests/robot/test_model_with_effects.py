@@ -258,25 +258,9 @@ def test_the_floor_drifts_in_the_references_frame() -> None:
     np.testing.assert_allclose(turned + log.start[:2], in_map[:, :2], rtol=0, atol=1e-12)
 
 
-def test_angles_that_are_not_told_are_counted_from_zero() -> None:
-    chosen, log = model(a_term("wheel_eccentricity", APR_02)), at_every_sample(a_drive(5))
-    counted = replace(log, wheel_angles=np.cumsum(log.rates * np.diff(log.times, prepend=0.0)[:, None], axis=0))
-    stream = stream_of(chosen, log)
-    for rates, duration in zip(log.rates, np.diff(log.times, prepend=0.0), strict=True):
-        stream.drive(rates * duration, duration)
-    np.testing.assert_allclose(stream.pose, chosen.poses([counted])[0][-1], rtol=0, atol=1e-12)
-
-
 def test_without_a_session_it_is_one_that_no_calibration_knows() -> None:
     worn, plain = model(term("tyre_wear", radius_morning=0.01)).stream(), model().stream()
     np.testing.assert_allclose(worn.drive(TENTHS, 0.1), plain.drive(TENTHS, 0.1), rtol=0, atol=1e-15)
-
-
-def test_session_time_begins_where_it_is_told() -> None:
-    warm = model(term("thermal_radius_drift", k=1e-5))
-    late = warm.stream(session_time=1000.0)
-    late.drive(TENTHS, 0.1)
-    np.testing.assert_allclose(late.moved, 1.010_000_5 * (warm.matrix @ np.ones(3)) * 0.1, rtol=0, atol=1e-14)
 
 
 def test_a_motion_that_takes_no_time_is_the_matrix_alone() -> None:
@@ -333,13 +317,6 @@ def test_an_acceleration_is_the_slope_of_the_smoothed_twist() -> None:
     for sample, (rates, duration) in enumerate(zip(log.rates, np.diff(log.times, prepend=0.0), strict=True)):
         before, smoothed = smoothed, smoothed + share * (MATRIX @ rates - smoothed)
         np.testing.assert_allclose(found.accelerations[sample], (smoothed - before) / duration, rtol=0, atol=1e-11)
-
-
-def test_a_steady_acceleration_is_seen_as_it_is() -> None:
-    times = PERIOD * np.arange(1, 101)
-    direction = np.linalg.solve(MATRIX, [0.5, -0.2, 1.0])
-    found = of(WheelLog(times, (times - PERIOD / 2)[:, None] * direction, np.zeros(3), times[-1:]))
-    np.testing.assert_allclose(found.accelerations[-1], [0.5, -0.2, 1.0], rtol=1e-9)
 
 
 def test_the_way_is_counted_from_the_last_rest() -> None:

@@ -18,10 +18,7 @@ from omnibench.data.storage import save_dataset
 from omnibench.robot.kinematics import Array, Robot, wheel_equations
 
 PERIOD, SAMPLES = 0.1, 40
-TWISTS = {
-    "line": ((0.3, 0.0, 0.0), (-0.3, 0.0, 0.0)),
-    "arc": ((0.3, 0.0, 0.5), (0.3, 0.0, -0.5)),
-}
+TWISTS = {"line": ((0.3, 0.0, 0.0), (-0.3, 0.0, 0.0)), "arc": ((0.3, 0.0, 0.5), (0.3, 0.0, -0.5))}
 METHODS: tuple[dict[str, Any], ...] = (
     {"name": "theoretical", "label": "design", "family": "baseline"},
     {"name": "closed_form", "label": "default", "family": "ours"},

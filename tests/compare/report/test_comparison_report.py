@@ -335,11 +335,6 @@ def test_the_paths_before_and_after_stand_in_the_first_900_pixels(result: Compar
 # What the report's plots and differences are made of, and the robot as it draws it.
 
 
-def test_an_element_of_rounding_size_counts_as_zero() -> None:
-    reference = np.array([[1.0, -1.2e-17, 1.0]] * 3)
-    assert np.isnan(relative_deviations(np.ones((3, 3)), reference)[:, 1]).all()
-
-
 def trajectories(**changes: object):
     return simulate_dataset(FlowerConfig.model_validate(flower(**changes))).dataset.split("validation")
 

@@ -552,10 +552,7 @@ def test_wheels_are_read_from_fields_of_any_message(tmp_path: Path, write: Calla
 
 def test_poses_are_read_from_fields_of_any_message(tmp_path: Path) -> None:
     source = write_mcap(tmp_path / "drive", [*WHEELS_ONLY, *located(), text("go", EPOCH, "/word")])
-    for options in (
-        {"pose_columns": ["place"]},
-        {"pose_columns": ["x", "y", "yaw"], "heading_unit": "deg"},
-    ):
+    for options in ({"pose_columns": ["place"]}, {"pose_columns": ["x", "y", "yaw"], "heading_unit": "deg"}):
         assert odometry_error(read(source, pose_topic="/camera", **options)) < 0.05
     with pytest.raises(DataError, match=r"poses in other messages: --set pose_topic=NAME --set pose_columns"):
         read(source)

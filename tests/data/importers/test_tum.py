@@ -177,10 +177,7 @@ def test_a_wheel_that_turns_back_has_lost_no_turns(seed: int, bits: int, longest
 @given(st.integers(0, 10**6), st.integers(300, 10**6))
 def test_a_counter_that_is_set_to_zero_does_not_begin_again(seed: int, before: int) -> None:
     counts = np.abs(drive(seed, 3.0))
-    assert recognised(np.concatenate([before + counts, counts])) in (
-        None,
-        power_near(before),
-    )
+    assert recognised(np.concatenate([before + counts, counts])) in (None, power_near(before))
 
 
 def power_near(number: int) -> float | None:

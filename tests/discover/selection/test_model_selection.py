@@ -731,9 +731,7 @@ def test_a_model_that_predicts_held_out_commands_far_worse_has_no_share(fitted: 
     assert average.note == ""
 
 
-def test_models_that_predict_alike_share_by_the_probabilities_of_their_names(
-    fitted: Fitted,
-) -> None:
+def test_models_that_predict_alike_share_by_the_probabilities_of_their_names(fitted: Fitted) -> None:
     right = model(fitted, RIGHT)
     average = averaged([(0.3, right), (0.1, copy_of(right))])
     assert [weight for weight, _ in average.members] == pytest.approx([0.75, 0.25])

@@ -205,11 +205,7 @@ def batch(path: Drive, using: Calibration) -> Array:
 # Agrees with the batch
 
 
-@given(
-    st.sets(st.sampled_from(sorted(EFFECTS)), max_size=4),
-    st.integers(0, 1000),
-    st.sampled_from(["euler", "arc"]),
-)
+@given(st.sets(st.sampled_from(sorted(EFFECTS)), max_size=4), st.integers(0, 1000), st.sampled_from(["euler", "arc"]))
 def test_odom_with_effects_is_that_of_the_batch(names: set[str], seed: int, integration: Integration) -> None:
     plain = calibration(integration=integration)
     using = with_effects(*(term(name, **EFFECTS[name]) for name in names), plain=plain)
@@ -277,9 +273,7 @@ def driven_for(using: Calibration, seconds: float, twist: tuple[float, float, fl
 
 
 @given(
-    st.sets(st.sampled_from(sorted(EFFECTS.keys() - {"floor_drift"})), max_size=3),
-    st.integers(0, 99),
-    st.booleans(),
+    st.sets(st.sampled_from(sorted(EFFECTS.keys() - {"floor_drift"})), max_size=3), st.integers(0, 99), st.booleans()
 )
 def test_odom_goes_on_after_a_swap_as_with_the_other(names: set[str], place: int, there: bool) -> None:
     path, both = drive(1.0), [calibration(), with_effects(*(term(name, **EFFECTS[name]) for name in names))]

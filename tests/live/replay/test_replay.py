@@ -172,12 +172,7 @@ def test_covariances_of_the_config_come_next() -> None:
 
 def test_covariances_that_the_noise_model_makes_of_the_time_since_the_run_began_come_last() -> None:
     noise = Noise(
-        pose_position=0.03,
-        bias_position=0.04,
-        walk_position=0.02,
-        pose_heading=0.01,
-        bias_heading=0,
-        walk_heading=0.1,
+        pose_position=0.03, bias_position=0.04, walk_position=0.02, pose_heading=0.01, bias_heading=0, walk_heading=0.1
     )
     covariances = covariances_of(noise=noise)
     since = DRIVE.slam_times - DRIVE.start_times[DRIVE.slam_run]

@@ -445,11 +445,6 @@ def test_what_is_wrong_is_told_in_one_line(case: str) -> None:
         make_term(name, parameters, APR_02, "cal.yaml")
 
 
-def test_tyre_wear_takes_the_radius_of_any_session_or_none() -> None:
-    assert dict(make_term("tyre_wear", {"radius_2023-01-12": 0.01}, APR_02).values) == {"radius_2023-01-12": 0.01}
-    assert not make_term("tyre_wear", {}, APR_02).values
-
-
 def signals_in(log: WheelLog, robot: Robot) -> Signals:
     needs = {"poses", "steering_side", "caster_rates"}
     return signals_of(log, robot, robot.inverse_kinematic_matrix, PERIOD, needs)

@@ -317,8 +317,7 @@ def controller_twist(values: dict[str, Any], velocities: Array) -> Array:
 
 
 @pytest.mark.parametrize(
-    "angles",
-    [(60, 180, 300), (300, 60, 180), (60, 300, 180), (-60, 60, 180), (0, 90, 180, 270), (45, 315, 225, 135)],
+    "angles", [(60, 180, 300), (300, 60, 180), (60, 300, 180), (-60, 60, 180), (0, 90, 180, 270), (45, 315, 225, 135)]
 )
 def test_the_controller_drives_a_design_robot_exactly(angles: tuple[float, ...]) -> None:
     machine = robot(*angles)

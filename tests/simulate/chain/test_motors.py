@@ -18,13 +18,7 @@ from omnibench.config import validate
 from omnibench.errors import ConfigError
 from omnibench.robot.kinematics import Array, wheel_equations
 from omnibench.simulate.commands import Command
-from omnibench.simulate.motion_commands import (
-    CommandedMotion,
-    CommandLink,
-    MotionProfile,
-    command_motion,
-    target_rates,
-)
+from omnibench.simulate.motion_commands import CommandedMotion, CommandLink, MotionProfile, command_motion, target_rates
 from omnibench.simulate.motors import Controller, DrivenRun, Encoder, Motor, check_reach, drive_session
 
 PERIOD, STEP = 0.01, 0.001  # s
