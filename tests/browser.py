@@ -1,7 +1,5 @@
 """Chromium, in which reports are opened by the tests."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Helpers that run omnibench as a user does: in processes of its own, with small configs."""
 
-from __future__ import annotations
-
 import io
 import json
 import os
@@ -98,6 +96,14 @@ def compared_here(output: Path, **changes: Any) -> ComparisonResult:
     """Run the small comparison with ``changes``, in this process, which is faster; plug-ins are loaded for it only."""
     with registries_restored():
         return run_comparison(CompareConfig.model_validate(small(**changes)), output)
+
+
+class Printed(NamedTuple):
+    """How a command ended and what it printed."""
+
+    returncode: int
+    stdout: str
+    stderr: str
 
 
 def assert_refused(run: Printed | subprocess.CompletedProcess[str], *parts: str) -> None:
@@ -227,14 +233,6 @@ def files_of(folder: Path, pattern: str = "*") -> dict[str, tuple[int, bytes]]:
 def rows(output: Path) -> dict[str, dict[str, Any]]:
     """The runs of a comparison by label; of several seeds the last one."""
     return {run["label"]: run for run in summary(output)["runs"]}
-
-
-class Printed(NamedTuple):
-    """How a command ended and what it printed."""
-
-    returncode: int
-    stdout: str
-    stderr: str
 
 
 Command = Callable[..., Printed]

@@ -1,7 +1,5 @@
 """The robots of the configs that bring one on fixed, steered or mecanum wheels, and their simulations."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import yaml

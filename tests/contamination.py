@@ -1,7 +1,5 @@
 """Recordings whose reference poses jump, made from others."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The tricycle of tricycle_corelli, imported by options alone."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

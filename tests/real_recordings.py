@@ -1,7 +1,5 @@
 """Recordings of real robots, where they are at hand: read once a run of the suite. Tests take them as fixtures."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A small recording for the tests of its report: a robot of known truth in a room that it really scans."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from functools import cache

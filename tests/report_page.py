@@ -1,7 +1,5 @@
 """A report and a table on a terminal as their readers see them, for the tests."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from html.parser import HTMLParser

@@ -1,7 +1,5 @@
 """The robot of most tests."""
 
-from __future__ import annotations
-
 import math
 
 from omnibench.robot.kinematics import Robot, Wheel

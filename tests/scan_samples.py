@@ -1,7 +1,5 @@
 """What a laser scanner sees from the simulated drive of ``bag_samples``: a room with things in it, as ROS messages."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from typing import Any

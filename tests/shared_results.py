@@ -1,7 +1,5 @@
 """Results that several tests look at, made once a run of the suite by whichever worker needs them first."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import pickle

@@ -1,7 +1,5 @@
 """Processor time of a call, which other processes do not lengthen as they do wall time, waiting, and load."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import time

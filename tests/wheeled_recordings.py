@@ -4,8 +4,6 @@ Arcs are integrated in a few lines of their own: noise on every reference pose, 
 and encoder noise.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from omnibench.data.dataset import Trajectory

@@ -1,7 +1,5 @@
 """Robots on fixed and steered wheels, and their runs as designed."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

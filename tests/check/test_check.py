@@ -1,7 +1,5 @@
 """The check of a recording as a user types it: verdict, findings, and fixes that mend what they are said to mend."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex

@@ -1,7 +1,5 @@
 """Wheels, units and references that are misread are named with what mends them; sound recordings give nothing."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,7 +11,7 @@ import pytest
 from config_robots import NAMES, experiment
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from lanes import slow
+from lanes import slow, slow_cases
 
 from omnibench.check.misreadings import Explained, Recorded, search
 from omnibench.check.source import recorded as read_as_recorded
@@ -80,7 +78,7 @@ def test_a_sound_recording_is_misread_in_nothing(robot: str) -> None:
 
 @pytest.mark.parametrize(
     ("change", "robot"),
-    [*zip(CHANGES, cycle(EVERY_WHEEL), strict=False), *slow(*zip(CHANGES, cycle(STEERED), strict=False))],
+    [*zip(CHANGES, cycle(EVERY_WHEEL), strict=False), *slow_cases(*zip(CHANGES, cycle(STEERED), strict=False))],
 )
 def test_a_mistake_is_named(change: str, robot: str) -> None:
     made, kind = CHANGES[change]
@@ -169,7 +167,7 @@ OTHERS = [*product(SPARSE, ("skid", *STEERED))]
 OTHERS.remove(("one negated", "car"))  # the rates of both rear wheels make one signal
 
 
-@pytest.mark.parametrize(("change", "robot"), [*product(SPARSE, ("diff", "mecanum")), *slow(*OTHERS)])
+@pytest.mark.parametrize(("change", "robot"), [*product(SPARSE, ("diff", "mecanum")), *slow_cases(*OTHERS)])
 def test_positions_without_headings_tell_a_misread_recording(change: str, robot: str) -> None:
     made, kind = CHANGES.get(change, (lambda run: one(run, -1.0) if change == "one negated" else run, "wheel_negated"))
     runs = [positions_alone(made(run)) for run in recorded(robot).trajectories]

@@ -1,7 +1,5 @@
 """Mistakes of robots that steer are named, with the option that mends them; so are wheels that count backward."""
 
-from __future__ import annotations
-
 import math
 import shlex
 from collections.abc import Callable
@@ -14,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from commands import CONFIGS, RECORDINGS
-from lanes import slow
+from lanes import slow, slow_cases
 
 from omnibench import check
 from omnibench.check.misreadings import search
@@ -73,7 +71,7 @@ def test_sound_recordings_of_every_robot_are_misread_in_nothing(robot: str) -> N
     assert mistakes_of(robot) == ()
 
 
-@pytest.mark.parametrize(("robot", "wheel"), [*FIRST_WHEELS, *slow(*OTHER_WHEELS)])
+@pytest.mark.parametrize(("robot", "wheel"), [*FIRST_WHEELS, *slow_cases(*OTHER_WHEELS)])
 def test_a_wheel_that_is_counted_the_wrong_way_is_named_with_its_option(robot: str, wheel: int) -> None:
     names = recorded(robot).robot.wheel_names
     mistake, *_ = mistakes_of(robot, rates=times(-1, wheel))

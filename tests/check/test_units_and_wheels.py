@@ -1,7 +1,5 @@
 """Units and wheels that cannot be right are named by the check; sound recordings give nothing."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -13,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from commands import CONFIGS
-from lanes import slow
+from lanes import slow, slow_cases
 
 from omnibench.check.misreadings import search
 from omnibench.check.source import recorded as recorded_of
@@ -113,7 +111,7 @@ ANGLES = ("degrees", "degrees within 180", "degrees within 360")
 RATES_AND_POSITIONS = ("rpm", "degrees per second", "mm", "cm")
 
 
-@pytest.mark.parametrize(("robot", "sparse"), [("apr02", True), ("mecanum", False), *slow(("mecanum", True))])
+@pytest.mark.parametrize(("robot", "sparse"), [("apr02", True), ("mecanum", False), *slow_cases(("mecanum", True))])
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_a_wrong_unit_is_named(mistake: str, robot: str, sparse: bool) -> None:
     change, warning = MISTAKES[mistake]
@@ -126,7 +124,7 @@ def test_a_wrong_unit_is_named(mistake: str, robot: str, sparse: bool) -> None:
         *(("flower", mistake) for mistake in MISTAKES),
         *(("forward only", mistake) for mistake in RATES_AND_POSITIONS),
         ("turns on the spot only", "degrees"),
-        *slow(
+        *slow_cases(
             *(("straight runs only", mistake) for mistake in RATES_AND_POSITIONS),
             *(("turns on the spot only", mistake) for mistake in ANGLES[1:]),
             *(("one turning run", mistake) for mistake in MISTAKES),
@@ -163,7 +161,7 @@ def arrangements(wheels: int) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
 EXCHANGES = [each for each in arrangements(3) if max(each[1]) > 0]
 
 
-@pytest.mark.parametrize(("order", "signs"), [*EXCHANGES[::4], *slow(*(set(EXCHANGES) - set(EXCHANGES[::4])))])
+@pytest.mark.parametrize(("order", "signs"), [*EXCHANGES[::4], *slow_cases(*sorted({*EXCHANGES} - {*EXCHANGES[::4]}))])
 def test_an_exchange_of_three_wheels_is_told_with_the_way_back(order: tuple[int, ...], signs: tuple[int, ...]) -> None:
     names = "abc"
     # Recorded column i holds signs[i] * wheel order[i]; the warning names the column that each wheel is found in.

@@ -1,7 +1,5 @@
 """A newcomer who types the README and then the pages of the handbook."""
 
-from __future__ import annotations
-
 import shlex
 import shutil
 from collections.abc import Callable

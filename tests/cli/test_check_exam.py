@@ -1,7 +1,5 @@
 """The exam of `omnibench check`: its makers and judge, and a quick selection of its cases."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """What each command prints and leaves behind: documents on standard output, files, plug-ins."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Commands on a terminal: help, endings with what came out and what to do next, and no cut word in 60 columns."""
 
-from __future__ import annotations
-
 import re
 import sys
 from importlib.metadata import version

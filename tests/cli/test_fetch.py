@@ -1,7 +1,5 @@
 """``omnibench fetch``: the user's git clones from bare repositories in a folder that stands for GitHub; no network."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

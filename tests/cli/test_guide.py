@@ -1,7 +1,5 @@
 """The handbook, the README and the examples: every topic is found, and whatever they say to type exists."""
 
-from __future__ import annotations
-
 import ast
 import re
 import sys

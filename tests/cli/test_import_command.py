@@ -1,7 +1,5 @@
 """``omnibench import``: help, templates, units that cannot be right, strange logs, and data sets without poses."""
 
-from __future__ import annotations
-
 import json
 import math
 import shlex

@@ -1,7 +1,5 @@
 """A user's mistake and a disk that refuses: one line on standard error, exit code 2, nothing lost."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -3,8 +3,6 @@
 The 360 runs of the simulated experiment would go through SLAM again and again: an edit of its config leaves 12.
 """
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 from typing import Any

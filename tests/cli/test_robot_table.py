@@ -1,7 +1,5 @@
 """``omnibench listen`` and ``omnibench record``: what they print and how they end, from real sessions."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

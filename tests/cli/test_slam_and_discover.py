@@ -1,7 +1,5 @@
 """``omnibench slam`` and ``discover`` as a user runs them: their results, folders, and what a terminal shows."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

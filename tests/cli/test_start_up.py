@@ -1,7 +1,5 @@
 """What happens before a command begins its work, and equations without a finite solution: one line each."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace

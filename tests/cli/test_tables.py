@@ -1,7 +1,5 @@
 """Tables on a terminal: whole in any width, and what is left out is named; comparisons, calibrations and progress."""
 
-from __future__ import annotations
-
 import os
 import pty
 import re

@@ -1,7 +1,5 @@
 """Commands of the README and the handbook: parsed, and typed one after the other as a reader types them."""
 
-from __future__ import annotations
-
 import os
 import re
 import shlex

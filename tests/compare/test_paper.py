@@ -3,8 +3,6 @@
 Palacin et al., Applied Sciences 13:1053 (2023). Figures in this file are copied from its pages.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """From a config, or a data set without one, to runs, and what a comparison leaves behind."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

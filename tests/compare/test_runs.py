@@ -1,7 +1,5 @@
 """Runs of a comparison: stored, gone on with, failing, in workers and on backends."""
 
-from __future__ import annotations
-
 import ast
 import json
 import multiprocessing

@@ -1,7 +1,5 @@
 """Scores of a comparison: costs, statistics, losses and certificates."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path

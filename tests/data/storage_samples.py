@@ -1,7 +1,5 @@
 """A data set in which everything is known, its tables on disk, and what can be changed in them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Reference and wheels brought together: clocks, a common t = 0, and headings that are unwrapped once."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

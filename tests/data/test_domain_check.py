@@ -1,7 +1,5 @@
 """What is said of runs that drive motions which a calibration's effects were not fitted to."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

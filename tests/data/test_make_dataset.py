@@ -1,7 +1,5 @@
 """make_dataset on arrays and tables, division into training and validation, and the logs of its runs."""
 
-from __future__ import annotations
-
 import re
 from contextlib import suppress
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Scans on disk: what is read comes back, a trajectory at a time, and a broken table is refused in one line."""
 
-from __future__ import annotations
-
 import math
 import random
 import weakref

@@ -1,7 +1,5 @@
 """Data sets on disk: what is read comes back, what cannot be right is refused in one line, others stay."""
 
-from __future__ import annotations
-
 import math
 import os
 import shutil

@@ -1,7 +1,5 @@
 """D-optimal designs: the bound holds against brute force, exchange never loses, and known optima are found."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from itertools import combinations_with_replacement
 

@@ -1,7 +1,5 @@
 """Designs from configs, recordings and robots alone: how good, against what, and what is refused."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

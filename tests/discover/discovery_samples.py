@@ -1,7 +1,5 @@
 """Small flower experiments with hidden effects, and what is discovered in them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any

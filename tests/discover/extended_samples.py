@@ -1,7 +1,5 @@
 """Fits of a few runs that are put together by hand: what they leave, and what they know, is given."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

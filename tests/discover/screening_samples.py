@@ -5,8 +5,6 @@ columns is the Gram matrix of the vectors. The noise of each row is +1 or -1 and
 residuals have exactly the chi-square along each row that they are made for, and chance makes 1 of each column.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

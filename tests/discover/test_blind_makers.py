@@ -1,7 +1,5 @@
 """The makers of recordings with something hidden: what they hide is what they say, and nobody can read it off."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

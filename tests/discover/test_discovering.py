@@ -1,7 +1,5 @@
 """Discovering hidden effects in small simulations, in odd recordings of them, and the missing one of a real robot."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Fitted runs, experiments, and what residuals depend on."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

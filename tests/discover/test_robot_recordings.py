@@ -1,7 +1,5 @@
 """Recordings of a real chain, blind sets, and effects in other forms than the textbook's do not mislead discover."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

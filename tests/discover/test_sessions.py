@@ -1,7 +1,5 @@
 """Sessions that differ, and what a discovery and its report say of them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

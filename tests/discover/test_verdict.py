@@ -1,7 +1,5 @@
 """Verdicts and headlines, from the effects that were named and what the residuals depend on."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

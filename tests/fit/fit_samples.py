@@ -1,7 +1,5 @@
 """Small recordings and problems that several tests of the fit share."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Literal

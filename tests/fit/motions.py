@@ -1,7 +1,5 @@
 """Recordings of chosen motions, for tests of what can be identified from them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Literal

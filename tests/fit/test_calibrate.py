@@ -1,7 +1,5 @@
 """Calibrations of data sets: omnidirectional and wheeled robots, several sessions, and shrinkage."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,7 +13,7 @@ from commands import Command, refused
 from corelli import corelli_dataset, half
 from fit_samples import Worst, design_of, noisy_trajectories
 from hidden.session_sets import session_set
-from lanes import slow
+from lanes import slow, slow_cases
 from motions import FLOWER, RING, TURNS, driven
 from real_recordings import mean_errors
 from report_page import on_terminal
@@ -299,7 +297,7 @@ def of_group(dataset: Dataset, *groups: str) -> Dataset:
     ("name", "trained", "published"),
     [
         ("omni4", "circular", {"": (0.031, 3.4)}),
-        *slow(
+        *slow_cases(
             ("tricyc", "circular", {"circular": (0.042, 3.7), "square": (0.084, 3.2)}),
             ("diff", "circular", {"circular": (0.0090, 1.10), "square": (0.028, 1.9), "ivanjko": (0.0055, 0.95)}),
             ("diff", "square", {"square": (0.0108, 1.05), "circular": (0.0297, 4.06)}),

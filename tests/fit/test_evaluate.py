@@ -1,7 +1,5 @@
 """Observations of references, and evaluations of calibrations on them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The fast evaluator, costs and robust losses, and lower bounds that are proven."""
 
-from __future__ import annotations
-
 import math
 import re
 import tracemalloc

@@ -1,7 +1,5 @@
 """What is in a data set, and the directions of wheel rates that recordings drive."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

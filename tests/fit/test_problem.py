@@ -1,7 +1,5 @@
 """The calibration problem: what it counts, keeps and shows, and what nobody can see through it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """Schedulers and workers of Dask as processes of their own, as on a cluster."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

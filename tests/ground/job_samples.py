@@ -1,7 +1,5 @@
 """Jobs, and a watch that notes what becomes of them."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import sys

@@ -1,7 +1,5 @@
 """Configs, registries and files, and what is refused of them in one line."""
 
-from __future__ import annotations
-
 import errno
 import os
 import stat
@@ -9,7 +7,7 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 import pytest
@@ -47,7 +45,7 @@ class Robot(Model):
     mode: Literal["euler", "arc"] = "arc"
 
     @model_validator(mode="after")
-    def _few_wheels(self) -> Robot:
+    def _few_wheels(self) -> Self:
         if len(self.wheels) > 3:
             raise ValueError(f"{len(self.wheels)} wheels are too many")
         return self

@@ -1,7 +1,5 @@
 """Dask as a backend: a cluster of this machine keeps what every backend promises, and workers may be killed."""
 
-from __future__ import annotations
-
 import gc
 import http.server
 import os

@@ -1,7 +1,5 @@
 """Clusters of Dask that an address joins: machines that differ, faults of scheduler and client, TLS."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

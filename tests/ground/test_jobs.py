@@ -1,7 +1,5 @@
 """Many independent jobs: what every backend promises, limits, workers that die, and clear ends."""
 
-from __future__ import annotations
-
 import importlib
 import multiprocessing
 import os

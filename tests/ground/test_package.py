@@ -1,7 +1,5 @@
 """The package as it is imported and started, and its rooms, whose imports run one way."""
 
-from __future__ import annotations
-
 import ast
 import doctest
 from collections import defaultdict

@@ -1,7 +1,5 @@
 """omnibench installed from a wheel does its main job in an empty folder, where no clone is."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

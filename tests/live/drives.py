@@ -1,7 +1,5 @@
 """A small robot with a calibration, and the messages that it sends while it drives."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

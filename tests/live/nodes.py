@@ -1,7 +1,5 @@
 """Nodes for tests, in this process or as the command that a user runs, and what comes on keys of a session."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
@@ -9,7 +7,7 @@ import subprocess
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import yaml
 import zenoh
@@ -89,7 +87,7 @@ class Command:
         out, _ = self.process.communicate(timeout=PATIENCE)
         return out, self.said()
 
-    def __enter__(self) -> Command:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -1,7 +1,5 @@
 """Small recordings for the tests of replay."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

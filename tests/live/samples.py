@@ -1,7 +1,5 @@
 """Messages with numbers that no default has, robots that publish them, and recordings of them."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

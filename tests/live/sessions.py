@@ -1,7 +1,5 @@
 """Real Zenoh sessions on loopback for tests, and waiting for what they bring about."""
 
-from __future__ import annotations
-
 import json
 import socket
 from collections.abc import Sequence

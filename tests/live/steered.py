@@ -1,7 +1,5 @@
 """Robots that steer, with calibrations, and the messages that they send while they drive."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any, Final
 

@@ -1,7 +1,5 @@
 """What goes wrong on a robot, done to real nodes, routers and subscribers."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal

@@ -1,7 +1,5 @@
 """The node on Zenoh, with real sessions: what it takes, publishes, records and answers, and which orders it obeys."""
 
-from __future__ import annotations
-
 import gc
 import json
 import math

@@ -1,7 +1,5 @@
 """What public objects show at a Python prompt and in a notebook, and the notebooks of the handbook."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace

@@ -1,7 +1,5 @@
 """Recordings of a robot with a slip that no matrix has, made by code that shares no odometry with the package."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The calibrators ``learned`` and ``learned_alone`` of ``plugins/``."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Calibrators of plugins/: published methods, optimisers, and the model that discover finds."""
 
-from __future__ import annotations
-
 import math
 import sys
 import time

@@ -1,7 +1,5 @@
 """The robotino importer: a plug-in in one file, on the recordings where they are at hand."""
 
-from __future__ import annotations
-
 from itertools import permutations, product
 from pathlib import Path
 

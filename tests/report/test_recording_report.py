@@ -1,7 +1,5 @@
 """The report on a recording: what it tells, where it draws things, and that a browser can play it."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

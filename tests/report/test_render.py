@@ -1,7 +1,5 @@
 """Pages of a report: rendered blocks, their style, and figures as files."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

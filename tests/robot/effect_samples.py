@@ -1,7 +1,5 @@
 """Robots, drives and terms that the tests of effects share."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Robots of every kind for tests of exports, their calibrations, and what an export's node says."""
 
-from __future__ import annotations
-
 import math
 import re
 from typing import Any

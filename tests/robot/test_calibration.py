@@ -1,7 +1,5 @@
 """The calibration file, omnibench-calibration/1."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from datetime import UTC, datetime

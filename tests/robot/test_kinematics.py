@@ -1,7 +1,5 @@
 """From wheels of any kind to the inverse kinematic matrix and drive signals, robots that cannot be, and odometry."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

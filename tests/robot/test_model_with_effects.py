@@ -1,7 +1,5 @@
 """A model with effects, ``learned`` among them: in a batch and in a stream, from which signals, and how it fades."""
 
-from __future__ import annotations
-
 import base64
 import math
 import re

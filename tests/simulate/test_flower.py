@@ -1,7 +1,5 @@
 """The flower benchmark and hidden effects: what is simulated, how noisy, and that its truth stays hidden."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Simulated data sets of a YAML: which is meant, what may be asked of it, and robots simulated from command to SLAM."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import fields, replace
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """SLAM of runs and data sets: accurate, unbiased and honest where scans tell the pose, and honest where they do not."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Small data sets of two robots (simulated here), and a study on them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

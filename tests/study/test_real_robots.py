@@ -1,7 +1,5 @@
 """configs/real_robots.yaml on the recordings, and figures of the page on the paper that take minutes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

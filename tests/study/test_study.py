@@ -1,7 +1,5 @@
 """Studies of calibrators on robots: their config, trainings and ranks."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

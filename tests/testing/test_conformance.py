@@ -1,7 +1,5 @@
 """Conformance cases and plug-in files: what keeps the contract passes, and what breaks it fails its case."""
 
-from __future__ import annotations
-
 import random
 import re
 from collections.abc import Callable

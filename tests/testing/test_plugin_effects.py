@@ -1,7 +1,5 @@
 """An effect of one's own, from its scaffold to every command that reads a calibration with it."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

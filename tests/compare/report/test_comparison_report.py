@@ -1,7 +1,5 @@
 """The report of a comparison: its words, tables and figures, and published figures beside them."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Real bags of a simulated drive: twelve runs with rests between them, wheels at 50 Hz, reference poses at 4 Hz."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """A small robot's drives with rests and turns, as a recorder would write them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

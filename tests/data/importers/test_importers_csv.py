@@ -1,7 +1,5 @@
 """The csv importer: rates, angles and ticks in any units and epoch, its layouts, blank cells and names."""
 
-from __future__ import annotations
-
 import math
 import re
 import shlex

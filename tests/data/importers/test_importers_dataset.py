@@ -1,7 +1,5 @@
 """The importer of data sets, which mends what is wrong with them, and joining the data sets of one robot."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The optiodom importer: on the recordings of four robots, and on small files of the same layout."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from pathlib import Path

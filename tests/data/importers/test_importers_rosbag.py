@@ -1,7 +1,5 @@
 """The rosbag importer: wheels and reference poses of every format, the topics and joints it takes, cuts into runs."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Callable, Sequence

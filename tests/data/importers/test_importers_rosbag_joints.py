@@ -1,7 +1,5 @@
 """Wheels and poses of bags by joints and fields of any message; recordings that are not as they should be; odometry."""
 
-from __future__ import annotations
-
 import math
 import random
 import re

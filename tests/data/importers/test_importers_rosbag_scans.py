@@ -1,7 +1,5 @@
 """Bags beside poses: scans with their scanner, and fixes, compasses and gyros as references."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace

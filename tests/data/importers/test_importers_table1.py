@@ -1,7 +1,5 @@
 """The table1 importer: Table 1 of Palacin et al. 2023 as files, in the units that it lists."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

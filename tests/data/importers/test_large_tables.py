@@ -1,7 +1,5 @@
 """Tables that go through a temporary file give what they give in memory, and leave nothing behind."""
 
-from __future__ import annotations
-
 import gc
 import pickle
 import signal

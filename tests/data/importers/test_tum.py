@@ -1,7 +1,5 @@
 """Poses in TUM format, headings from quaternions, counters that begin again, and references that are odometry."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

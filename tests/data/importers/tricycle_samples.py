@@ -1,7 +1,5 @@
 """A simulated tricycle that is driven and steered by its front wheel; it shares nothing with omnibench."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any

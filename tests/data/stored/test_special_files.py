@@ -1,7 +1,5 @@
 """Pipes, devices, bombs and odd names in the place of files: one line at once, by one door."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import socket

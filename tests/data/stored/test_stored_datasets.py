@@ -1,7 +1,5 @@
 """Data sets whose wheel samples stay in their file give what they give in memory, and mend nothing silently."""
 
-from __future__ import annotations
-
 import math
 import os
 import pickle

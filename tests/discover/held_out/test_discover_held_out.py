@@ -1,7 +1,5 @@
 """Cross-validation, and gaps between held-out errors and what repetitions allow, from residuals that are known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What the report of a discovery and its ``discovery.json`` say."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """A discovery's figures as people read them, and the scale on which its panels are drawn."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

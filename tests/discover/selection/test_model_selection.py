@@ -1,7 +1,5 @@
 """Selection of effects, evidence for and against them, competing models, unknown terms and motors."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The calibrators that come with omnibench: least squares, robust fits, searches, and their contract."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace

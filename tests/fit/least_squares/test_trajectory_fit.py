@@ -1,7 +1,5 @@
 """Runs made ready, the steps of a fit (derivatives, nuisances, the box, weights), and the noise of references."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal

@@ -1,7 +1,5 @@
 """How sure a calibration is: covariance of the elements and of the geometry behind them, and resampled intervals."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

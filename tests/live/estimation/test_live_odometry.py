@@ -1,7 +1,5 @@
 """Live odometry, of robots that steer too, with effects and learned ones: the batch's numbers, covariances, swaps."""
 
-from __future__ import annotations
-
 import logging
 import math
 import re

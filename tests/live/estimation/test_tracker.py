@@ -1,7 +1,5 @@
 """One robot, message by message: what is published, what is refused, what is remembered and what its health says."""
 
-from __future__ import annotations
-
 import json
 import re
 import time

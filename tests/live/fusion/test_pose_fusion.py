@@ -1,6 +1,6 @@
 """Fusing SLAM poses at their own time, whenever they arrive, put where and when they were taken."""
 
-from __future__ import annotations
+from typing import Self
 
 import numpy as np
 import pytest
@@ -78,7 +78,7 @@ class Robot:
         self.truth = [np.zeros(3)]
         self._append(motion(ORIGIN, np.zeros(3), 0.0))
 
-    def drive(self, samples: int) -> Robot:
+    def drive(self, samples: int) -> Self:
         for _ in range(samples):
             moved = np.array([0.005, 0.0, 0.005])
             self.truth.append(advance(self.truth[-1], moved, "arc"))

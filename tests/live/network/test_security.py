@@ -1,7 +1,5 @@
 """A router with access rules: who gets in, who may write and read what, and what strangers can take."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -1,7 +1,5 @@
 """Sessions: where they listen and connect, keys and certificates, and what is said of those that cannot be."""
 
-from __future__ import annotations
-
 import ipaddress
 import json
 import os

@@ -1,7 +1,5 @@
 """A short drive, its replay and what the messages of one hold, for tests of replays."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Chained recordings: which can be replayed, composed poses, continuous wheel angles, the truth behind them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Replay: which messages there are, when they arrive, what they hold, and their delivery to nodes that fail."""
 
-from __future__ import annotations
-
 import math
 import os
 import signal

@@ -1,7 +1,5 @@
 """Wheel messages and steering angles of real senders: late, twice, missing, wrapped, by a clock that jumps."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Every message, published by real sessions in every profile, is read by decoders that are not ours."""
 
-from __future__ import annotations
-
 import math
 import threading
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Those who listen to robots: ``subscribe``, recorder, Foxglove server and monitor, with real sessions."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

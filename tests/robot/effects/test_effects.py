@@ -1,7 +1,5 @@
 """Effects: what each does to a robot's motion, its terms in a file, and what is refused."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Parameters of the controllers of ros2_controllers, held against the controllers' own odometry."""
 
-from __future__ import annotations
-
 import math
 import re
 import shutil

@@ -1,7 +1,5 @@
 """The LIDAR and its rooms: exact geometry, motion within a scan, noise, plans, and what does not fit."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Motors and encoders: against closed forms, at rest, at their limits, and what cannot be asked of them."""
 
-from __future__ import annotations
-
 import math
 import re
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Scan matching: lines of walls, small_gicp on a planar map, deskewing, and errors that are carried along."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np
