@@ -106,125 +106,133 @@ def assert_failed(run: Printed, *parts: str) -> None:
         assert part in error
 
 
-class TestKnownRecording:
-    def test_it_is_cloned_at_the_tested_commit_and_imported(self, command: Command, optiodom: str) -> None:
-        ended = succeeded(command("fetch", "diff"))
-        said = ended.stdout.splitlines()
-        source = f"public GitHub repository {OPTIODOM}, commit {optiodom}"
-        assert said[:3] == [
-            "4 trajectories: data/diff",
-            f"source: {source}, in {CLONE}",
-            "licence: MIT (data/diff/LICENSE)",
-        ]
-        assert said[3].startswith("cite: Sousa, Petry, Costa, Moreira: OptiOdom")
-        assert "git clone: sousarbarb/optiodom" in ended.stderr
-        assert ended.stderr.splitlines()[-1] == "  omnibench check data/diff"
-        dataset = load_dataset("data/diff")
-        assert (dataset.name, dataset.source, dataset.licence) == ("diff", source, "MIT")
-        assert dataset.imported.options == {"name": "diff", "source": source}
-        assert Path("data/diff/LICENSE").read_text(encoding="utf-8") == LICENCE
-        assert command("check", "data/diff").returncode < 2
-
-    def test_a_clone_that_is_there_is_used_again(self, command: Command, github: GitHub, optiodom: str) -> None:
-        assert command("fetch", "optiodom/diff").returncode == 0
-        shutil.rmtree(github.folder)  # the network is gone
-        before = (CLONE / ".git" / "HEAD").stat().st_mtime_ns
-        again = succeeded(command("fetch", "diff", "-o", "again"))
-        assert "git" not in again.stderr
-        assert (CLONE / ".git" / "HEAD").stat().st_mtime_ns == before
-        assert optiodom in load_dataset("again").source
-
-    def test_another_commit_is_checked_out_in_it(self, command: Command, github: GitHub, optiodom: str) -> None:
-        newest = succeeded(command("fetch", "diff", "--commit", "HEAD"))
-        assert optiodom not in newest.stdout
-        assert github.git(CLONE, "rev-list", "--count", "HEAD") == "1"  # without its history
-        assert optiodom in command("fetch", "diff", "--force").stdout  # which is then fetched
-        commit = github.publish(OPTIODOM, {"README.md": "newest\n"})
-        assert commit in command("fetch", "diff", "--force", "--commit", commit[:10]).stdout
-
-    def test_a_clone_from_elsewhere_needs_no_network(self, command: Command, github: GitHub, optiodom: str) -> None:
-        CLONE.parent.mkdir(parents=True)
-        github.git(Path(), "clone", "-q", f"https://github.com/{OPTIODOM}", CLONE)
-        shutil.rmtree(github.folder)
-        assert optiodom in command("fetch", "diff").stdout
-
-    def test_a_data_set_that_is_there_is_refused_before_a_clone(self, command: Command, optiodom: str) -> None:
-        assert optiodom
-        Path("data/diff").mkdir(parents=True)
-        Path("data/diff/dataset.yaml").write_text("mine\n", encoding="utf-8")
-        assert_failed(command("fetch", "diff"), "data/diff is there already", "--force")
-        assert not CLONE.exists()
-        assert command("fetch", "diff", "--force").returncode == 0
-        assert load_dataset("data/diff").name == "diff"
-
-    def test_what_the_commit_does_not_hold_is_said(self, command: Command, optiodom: str) -> None:
-        assert_failed(command("fetch", "omni3"), f"{CLONE}/data/omni3 is not in commit {optiodom[:8]}")
-
-    @pytest.mark.slow
-    @pytest.mark.skipif(not OMNI3.is_dir(), reason=f"the OptiOdom recordings are not at {OMNI3}")
-    def test_every_robot_of_a_repository_gets_a_data_set(self, command: Command, github: GitHub) -> None:
-        sessions = ("diff/circular/231220200121", "tricyc/square", "omni3/square", "omni4/circular/231220200453")
-        files: dict[str, str | Path] = {f"data/{each}": RECORDINGS / "optiodom" / each for each in sessions}
-        github.tested(optiodom=github.publish(OPTIODOM, {"LICENSE": LICENCE, **files}))
-        ended = succeeded(command("fetch", "optiodom", "-o", "robots"))
-        listed = [line.split(": ")[1] for line in ended.stdout.splitlines()[:4]]
-        assert listed == [f"robots/{name}" for name in ("diff", "tricyc", "omni3", "omni4")]
-        assert load_dataset("robots/omni3").licence == "MIT"
-
-    @pytest.mark.slow
-    @pytest.mark.skipif(not ROBOTINO.is_dir(), reason=f"the recordings are not at {ROBOTINO}")
-    def test_the_importer_may_be_a_plug_in_that_comes_with_omnibench(self, command: Command, github: GitHub) -> None:
-        (robotino,) = find_recording("robotino").datasets
-        runs = ROBOTINO / "one_surface_type" / "table_surface"
-        files: dict[str, str | Path] = {f"{robotino.path}/exp0{k}.csv": runs / f"exp0{k}.csv" for k in range(4)}
-        commit = github.publish("BrOleg5/research-wheel-slippage", files)
-        github.tested(robotino=commit)
-        ended = succeeded(command("fetch", "https://github.com/BrOleg5/Research-Wheel-Slippage.git"))
-        assert "licence: Apache-2.0\n" in ended.stdout  # the repository here holds no text of it
-        assert "cite: https://github.com/BrOleg5/research-wheel-slippage\n" in ended.stdout
-        assert commit in load_dataset("data/robotino").source
-
-    @pytest.mark.slow
-    @pytest.mark.skipif(not CORELLI.is_file(), reason=f"the recording is not at {CORELLI}")
-    def test_options_of_the_catalogue_are_taken(self, command: Command, github: GitHub) -> None:
-        github.tested(corelli=github.publish(find_recording("corelli").repository, {"dataset.txt": CORELLI}))
-        assert command("fetch", "corelli").returncode == 0
-        dataset = load_dataset("data/corelli")
-        assert (dataset.robot.name, dataset.licence) == ("corelli", "Apache-2.0")
-        assert dataset.imported.options["steering_scale"] == 0.1
+def test_it_is_cloned_at_the_tested_commit_and_imported(command: Command, optiodom: str) -> None:
+    ended = succeeded(command("fetch", "diff"))
+    said = ended.stdout.splitlines()
+    source = f"public GitHub repository {OPTIODOM}, commit {optiodom}"
+    assert said[:3] == [
+        "4 trajectories: data/diff",
+        f"source: {source}, in {CLONE}",
+        "licence: MIT (data/diff/LICENSE)",
+    ]
+    assert said[3].startswith("cite: Sousa, Petry, Costa, Moreira: OptiOdom")
+    assert "git clone: sousarbarb/optiodom" in ended.stderr
+    assert ended.stderr.splitlines()[-1] == "  omnibench check data/diff"
+    dataset = load_dataset("data/diff")
+    assert (dataset.name, dataset.source, dataset.licence) == ("diff", source, "MIT")
+    assert dataset.imported.options == {"name": "diff", "source": source}
+    assert Path("data/diff/LICENSE").read_text(encoding="utf-8") == LICENCE
+    assert command("check", "data/diff").returncode < 2
 
 
-class TestAnyRepository:
-    def test_a_recognised_format_is_imported(self, command: Command, github: GitHub, prepared: Prepared) -> None:
-        files: dict[str, str | Path] = {file.name: file for file in prepared.data.iterdir()}
-        commit = github.publish("somebody/runs", {**files, "LICENCE.txt": "\nCC-BY-4.0\nall of it\n"})
-        ended = succeeded(command("fetch", "somebody/runs"))
-        assert "licence: CC-BY-4.0 (data/runs/LICENCE.txt)\n" in ended.stdout
-        dataset = load_dataset("data/runs")
-        assert dataset.licence == "CC-BY-4.0"
-        assert f"somebody/runs, commit {commit}" in dataset.source
+def test_a_clone_that_is_there_is_used_again(command: Command, github: GitHub, optiodom: str) -> None:
+    assert command("fetch", "optiodom/diff").returncode == 0
+    shutil.rmtree(github.folder)  # the network is gone
+    before = (CLONE / ".git" / "HEAD").stat().st_mtime_ns
+    again = succeeded(command("fetch", "diff", "-o", "again"))
+    assert "git" not in again.stderr
+    assert (CLONE / ".git" / "HEAD").stat().st_mtime_ns == before
+    assert optiodom in load_dataset("again").source
 
-    def test_what_cannot_be_imported_is_cloned_and_the_next_step_said(self, command: Command, github: GitHub) -> None:
-        github.publish("somebody/log", {"log.csv": "t,ticks_left,ticks_right\n0.1,1,2\n"})
-        ended = succeeded(command("fetch", "somebody/log"))
-        assert Path("clones/somebody/log/log.csv").is_file()
-        assert not Path("data").exists()
-        assert "licence: the repository states none; ask its authors" in ended.stdout
-        assert "\nnot imported: " in ended.stderr
-        assert "robot" in ended.stderr
-        assert ended.stderr.splitlines()[-1] == "  omnibench import csv --help"
-        github.publish("somebody/words", {"README.md": "words\n"})
-        ended = succeeded(command("fetch", "somebody/words"))
-        assert "no recording is recognised there" in ended.stderr
 
-    def test_impossible_units_are_not_imported(self, command: Command, github: GitHub, prepared: Prepared) -> None:
-        (table,) = Path(shutil.copytree(prepared.data, "degrees")).glob("poses.parquet")
-        pl.read_parquet(table).with_columns(pl.col("theta").degrees()).write_parquet(table)
-        files: dict[str, str | Path] = {file.name: file for file in Path("degrees").iterdir()}
-        github.publish("somebody/degrees", files)
-        ended = command("fetch", "somebody/degrees")
-        assert "\nnot imported: theta looks like degrees" in ended.stderr
-        assert not Path("data").exists()
+def test_another_commit_is_checked_out_in_it(command: Command, github: GitHub, optiodom: str) -> None:
+    newest = succeeded(command("fetch", "diff", "--commit", "HEAD"))
+    assert optiodom not in newest.stdout
+    assert github.git(CLONE, "rev-list", "--count", "HEAD") == "1"  # without its history
+    assert optiodom in command("fetch", "diff", "--force").stdout  # which is then fetched
+    commit = github.publish(OPTIODOM, {"README.md": "newest\n"})
+    assert commit in command("fetch", "diff", "--force", "--commit", commit[:10]).stdout
+
+
+def test_a_clone_from_elsewhere_needs_no_network(command: Command, github: GitHub, optiodom: str) -> None:
+    CLONE.parent.mkdir(parents=True)
+    github.git(Path(), "clone", "-q", f"https://github.com/{OPTIODOM}", CLONE)
+    shutil.rmtree(github.folder)
+    assert optiodom in command("fetch", "diff").stdout
+
+
+def test_a_data_set_that_is_there_is_refused_before_a_clone(command: Command, optiodom: str) -> None:
+    assert optiodom
+    Path("data/diff").mkdir(parents=True)
+    Path("data/diff/dataset.yaml").write_text("mine\n", encoding="utf-8")
+    assert_failed(command("fetch", "diff"), "data/diff is there already", "--force")
+    assert not CLONE.exists()
+    assert command("fetch", "diff", "--force").returncode == 0
+    assert load_dataset("data/diff").name == "diff"
+
+
+def test_what_the_commit_does_not_hold_is_said(command: Command, optiodom: str) -> None:
+    assert_failed(command("fetch", "omni3"), f"{CLONE}/data/omni3 is not in commit {optiodom[:8]}")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not OMNI3.is_dir(), reason=f"the OptiOdom recordings are not at {OMNI3}")
+def test_every_robot_of_a_repository_gets_a_data_set(command: Command, github: GitHub) -> None:
+    sessions = ("diff/circular/231220200121", "tricyc/square", "omni3/square", "omni4/circular/231220200453")
+    files: dict[str, str | Path] = {f"data/{each}": RECORDINGS / "optiodom" / each for each in sessions}
+    github.tested(optiodom=github.publish(OPTIODOM, {"LICENSE": LICENCE, **files}))
+    ended = succeeded(command("fetch", "optiodom", "-o", "robots"))
+    listed = [line.split(": ")[1] for line in ended.stdout.splitlines()[:4]]
+    assert listed == [f"robots/{name}" for name in ("diff", "tricyc", "omni3", "omni4")]
+    assert load_dataset("robots/omni3").licence == "MIT"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not ROBOTINO.is_dir(), reason=f"the recordings are not at {ROBOTINO}")
+def test_the_importer_may_be_a_plug_in_that_comes_with_omnibench(command: Command, github: GitHub) -> None:
+    (robotino,) = find_recording("robotino").datasets
+    runs = ROBOTINO / "one_surface_type" / "table_surface"
+    files: dict[str, str | Path] = {f"{robotino.path}/exp0{k}.csv": runs / f"exp0{k}.csv" for k in range(4)}
+    commit = github.publish("BrOleg5/research-wheel-slippage", files)
+    github.tested(robotino=commit)
+    ended = succeeded(command("fetch", "https://github.com/BrOleg5/Research-Wheel-Slippage.git"))
+    assert "licence: Apache-2.0\n" in ended.stdout  # the repository here holds no text of it
+    assert "cite: https://github.com/BrOleg5/research-wheel-slippage\n" in ended.stdout
+    assert commit in load_dataset("data/robotino").source
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not CORELLI.is_file(), reason=f"the recording is not at {CORELLI}")
+def test_options_of_the_catalogue_are_taken(command: Command, github: GitHub) -> None:
+    github.tested(corelli=github.publish(find_recording("corelli").repository, {"dataset.txt": CORELLI}))
+    assert command("fetch", "corelli").returncode == 0
+    dataset = load_dataset("data/corelli")
+    assert (dataset.robot.name, dataset.licence) == ("corelli", "Apache-2.0")
+    assert dataset.imported.options["steering_scale"] == 0.1
+
+
+def test_a_recognised_format_is_imported(command: Command, github: GitHub, prepared: Prepared) -> None:
+    files: dict[str, str | Path] = {file.name: file for file in prepared.data.iterdir()}
+    commit = github.publish("somebody/runs", {**files, "LICENCE.txt": "\nCC-BY-4.0\nall of it\n"})
+    ended = succeeded(command("fetch", "somebody/runs"))
+    assert "licence: CC-BY-4.0 (data/runs/LICENCE.txt)\n" in ended.stdout
+    dataset = load_dataset("data/runs")
+    assert dataset.licence == "CC-BY-4.0"
+    assert f"somebody/runs, commit {commit}" in dataset.source
+
+
+def test_what_cannot_be_imported_is_cloned_and_the_next_step_said(command: Command, github: GitHub) -> None:
+    github.publish("somebody/log", {"log.csv": "t,ticks_left,ticks_right\n0.1,1,2\n"})
+    ended = succeeded(command("fetch", "somebody/log"))
+    assert Path("clones/somebody/log/log.csv").is_file()
+    assert not Path("data").exists()
+    assert "licence: the repository states none; ask its authors" in ended.stdout
+    assert "\nnot imported: " in ended.stderr
+    assert "robot" in ended.stderr
+    assert ended.stderr.splitlines()[-1] == "  omnibench import csv --help"
+    github.publish("somebody/words", {"README.md": "words\n"})
+    ended = succeeded(command("fetch", "somebody/words"))
+    assert "no recording is recognised there" in ended.stderr
+
+
+def test_impossible_units_are_not_imported(command: Command, github: GitHub, prepared: Prepared) -> None:
+    (table,) = Path(shutil.copytree(prepared.data, "degrees")).glob("poses.parquet")
+    pl.read_parquet(table).with_columns(pl.col("theta").degrees()).write_parquet(table)
+    files: dict[str, str | Path] = {file.name: file for file in Path("degrees").iterdir()}
+    github.publish("somebody/degrees", files)
+    ended = command("fetch", "somebody/degrees")
+    assert "\nnot imported: theta looks like degrees" in ended.stderr
+    assert not Path("data").exists()
 
 
 class TestMistakes:

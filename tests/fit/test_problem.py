@@ -116,47 +116,50 @@ def test_what_a_calibrator_is_given_cannot_be_overwritten(name: str, evaluated: 
         getattr(problem, name)[0] = 0
 
 
-class TestUnitCube:
-    """Searches work in the unit cube of the elements that are free."""
-
-    def test_its_corners_are_the_box_and_what_is_outside_comes_to_its_surface(self) -> None:
-        problem = make_problem(RUNS)
-        np.testing.assert_allclose(problem.from_unit(np.zeros(9))[0], problem.lower, rtol=1e-15)
-        np.testing.assert_allclose(problem.from_unit(np.ones(9))[0], problem.upper, rtol=1e-15)
-        np.testing.assert_array_equal(problem.to_unit(problem.upper + 1.0)[0], np.ones(9))
-
-    @given(seed=st.integers(0, 2**16), box=st.sampled_from(["row", "paper"]))
-    def test_points_come_back(self, seed: int, box: Any) -> None:
-        problem = make_problem(RUNS, box=box)
-        points = np.random.default_rng(seed).uniform(size=(5, int(problem.free.sum())))
-        np.testing.assert_allclose(problem.to_unit(problem.from_unit(points)), points, atol=1e-13)
-
-    @given(points=st.lists(st.floats(-1e3, 1e3), min_size=9, max_size=9))
-    def test_it_never_leads_outside_the_box(self, points: list[float]) -> None:
-        problem = make_problem(RUNS)
-        vectors = problem.from_unit(np.array(points))
-        assert ((vectors >= problem.lower) & (vectors <= problem.upper)).all()
+# Searches work in the unit cube of the elements that are free.
 
 
-class TestBox:
-    """Inside, and on the surface."""
+def test_corners_of_the_unit_cube_are_the_box_and_what_is_outside_comes_to_its_surface() -> None:
+    problem = make_problem(RUNS)
+    np.testing.assert_allclose(problem.from_unit(np.zeros(9))[0], problem.lower, rtol=1e-15)
+    np.testing.assert_allclose(problem.from_unit(np.ones(9))[0], problem.upper, rtol=1e-15)
+    np.testing.assert_array_equal(problem.to_unit(problem.upper + 1.0)[0], np.ones(9))
 
-    def test_its_corners_are_inside_and_rounding_is_forgiven_and_no_more(self) -> None:
-        problem = make_problem(RUNS)
-        assert problem.inside(np.array([problem.lower, problem.upper, problem.start])).all()
-        assert problem.inside(problem.upper * (1 + 1e-14 * np.sign(problem.upper)))
-        beyond = problem.upper.copy()
-        beyond[4] += 1e-9
-        outside = [beyond, np.full(9, np.nan), np.full(9, np.inf)]
-        assert not problem.inside(np.array(outside)).any()
 
-    def test_elements_on_a_bound_are_named_but_not_frozen_ones(self) -> None:
-        problem = make_problem(RUNS)
-        vector = problem.start.copy()
-        vector[[1, 8]] = problem.upper[1], problem.lower[8]
-        assert problem.at_bounds(vector) == ("m12", "m33")
-        frozen = make_problem(RUNS, box="paper")
-        assert frozen.at_bounds(frozen.start) == ()
+@given(seed=st.integers(0, 2**16), box=st.sampled_from(["row", "paper"]))
+def test_points_of_the_unit_cube_come_back(seed: int, box: Any) -> None:
+    problem = make_problem(RUNS, box=box)
+    points = np.random.default_rng(seed).uniform(size=(5, int(problem.free.sum())))
+    np.testing.assert_allclose(problem.to_unit(problem.from_unit(points)), points, atol=1e-13)
+
+
+@given(points=st.lists(st.floats(-1e3, 1e3), min_size=9, max_size=9))
+def test_the_unit_cube_never_leads_outside_the_box(points: list[float]) -> None:
+    problem = make_problem(RUNS)
+    vectors = problem.from_unit(np.array(points))
+    assert ((vectors >= problem.lower) & (vectors <= problem.upper)).all()
+
+
+# Inside of the box, and on its surface.
+
+
+def test_corners_of_the_box_are_inside_and_rounding_is_forgiven_and_no_more() -> None:
+    problem = make_problem(RUNS)
+    assert problem.inside(np.array([problem.lower, problem.upper, problem.start])).all()
+    assert problem.inside(problem.upper * (1 + 1e-14 * np.sign(problem.upper)))
+    beyond = problem.upper.copy()
+    beyond[4] += 1e-9
+    outside = [beyond, np.full(9, np.nan), np.full(9, np.inf)]
+    assert not problem.inside(np.array(outside)).any()
+
+
+def test_elements_on_a_bound_are_named_but_not_frozen_ones() -> None:
+    problem = make_problem(RUNS)
+    vector = problem.start.copy()
+    vector[[1, 8]] = problem.upper[1], problem.lower[8]
+    assert problem.at_bounds(vector) == ("m12", "m33")
+    frozen = make_problem(RUNS, box="paper")
+    assert frozen.at_bounds(frozen.start) == ()
 
 
 def test_no_trajectories_are_refused() -> None:
@@ -236,56 +239,57 @@ def test_along_undriven_directions_the_design_is_kept(seed: int) -> None:
     np.testing.assert_allclose(matrices @ driven, vectors.reshape(-1, 3, 4) @ driven, atol=1e-14)
 
 
-class TestGeometry:
-    """Radius, distance and angle of every wheel within physical limits."""
+# Radius, distance and angle of every wheel within physical limits.
 
-    @pytest.mark.parametrize(
-        ("limits", "radius", "distance", "angle_deg"),
-        [
-            (GeometryLimits(), (0.9, 1.1), (0.8, 1.2), (-3.0, 3.0)),
-            (
-                GeometryLimits(radius=(-0.02, 0.05), distance=(0.0, 0.3), angle_deg=(-1.0, 0.5)),
-                (0.98, 1.05),
-                (1.0, 1.3),
-                (-1.0, 0.5),
-            ),
-        ],
-    )
-    def test_limits_are_shares_of_radius_and_distance_and_degrees(
-        self, limits: GeometryLimits, radius: Any, distance: Any, angle_deg: Any
-    ) -> None:
-        geometry = WheelGeometry(APR_02, limits)
-        ends = (geometry.bounds.lower, geometry.bounds.upper)
-        for end, of_radius, of_distance, degrees in zip(ends, radius, distance, angle_deg, strict=True):
-            found = end.reshape(3, 3)
-            np.testing.assert_allclose(found[:2], [[of_radius * 0.148] * 3, [of_distance * 0.195] * 3], rtol=1e-12)
-            np.testing.assert_allclose(found[2], np.radians(np.array([60, 180, 300]) + degrees), rtol=1e-12)
 
-    @pytest.mark.parametrize("wheels", [3, 4])
-    def test_vectors_mean_the_matrix_of_a_robot_built_like_that(self, wheels: Any) -> None:
-        robot = synthetic_robot(wheels)
-        rng = np.random.default_rng(2)
-        geometry = WheelGeometry(robot)
-        vectors = rng.uniform(geometry.bounds.lower, geometry.bounds.upper, (6, 3 * wheels))
-        for vector, matrix in zip(vectors, geometry.matrices(vectors), strict=True):
-            built = tuple(
-                wheel.model_copy(update={"radius": r, "distance": d, "angle": a})
-                for wheel, r, d, a in zip(robot.wheels, *vector.reshape(3, -1), strict=True)
-            )
-            np.testing.assert_allclose(matrix, inverse_kinematic_matrix(built), rtol=1e-12, atol=1e-16)
+@pytest.mark.parametrize(
+    ("limits", "radius", "distance", "angle_deg"),
+    [
+        (GeometryLimits(), (0.9, 1.1), (0.8, 1.2), (-3.0, 3.0)),
+        (
+            GeometryLimits(radius=(-0.02, 0.05), distance=(0.0, 0.3), angle_deg=(-1.0, 0.5)),
+            (0.98, 1.05),
+            (1.0, 1.3),
+            (-1.0, 0.5),
+        ),
+    ],
+)
+def test_limits_are_shares_of_radius_and_distance_and_degrees(
+    limits: GeometryLimits, radius: Any, distance: Any, angle_deg: Any
+) -> None:
+    geometry = WheelGeometry(APR_02, limits)
+    ends = (geometry.bounds.lower, geometry.bounds.upper)
+    for end, of_radius, of_distance, degrees in zip(ends, radius, distance, angle_deg, strict=True):
+        found = end.reshape(3, 3)
+        np.testing.assert_allclose(found[:2], [[of_radius * 0.148] * 3, [of_distance * 0.195] * 3], rtol=1e-12)
+        np.testing.assert_allclose(found[2], np.radians(np.array([60, 180, 300]) + degrees), rtol=1e-12)
 
-    @pytest.mark.parametrize("limits", [{"radius": (0.01, 0.1)}, {"distance": (0.1, -0.1)}])
-    def test_limits_that_exclude_the_design_or_are_the_wrong_way_round_are_refused_by_name(self, limits: Any) -> None:
-        (name,) = limits
-        with pytest.raises(ConfigError, match=f"of {name}_a is "):
-            make_problem(parameterisation="geometry", limits=GeometryLimits(**limits))
 
-    @pytest.mark.parametrize(
-        "limits", [{"radius": 1.5}, {"distance": [-1.0, 0.2]}, {"radius": math.nan}, {"radii": 0.1}]
-    )
-    def test_limits_that_cannot_be_are_refused_in_one_line(self, limits: dict[str, Any]) -> None:
-        with refused(ConfigError, match=r"^limits: "):
-            validate(GeometryLimits, limits, "limits")
+@pytest.mark.parametrize("wheels", [3, 4])
+def test_vectors_mean_the_matrix_of_a_robot_built_like_that(wheels: Any) -> None:
+    robot = synthetic_robot(wheels)
+    rng = np.random.default_rng(2)
+    geometry = WheelGeometry(robot)
+    vectors = rng.uniform(geometry.bounds.lower, geometry.bounds.upper, (6, 3 * wheels))
+    for vector, matrix in zip(vectors, geometry.matrices(vectors), strict=True):
+        built = tuple(
+            wheel.model_copy(update={"radius": r, "distance": d, "angle": a})
+            for wheel, r, d, a in zip(robot.wheels, *vector.reshape(3, -1), strict=True)
+        )
+        np.testing.assert_allclose(matrix, inverse_kinematic_matrix(built), rtol=1e-12, atol=1e-16)
+
+
+@pytest.mark.parametrize("limits", [{"radius": (0.01, 0.1)}, {"distance": (0.1, -0.1)}])
+def test_limits_that_exclude_the_design_or_are_the_wrong_way_round_are_refused_by_name(limits: Any) -> None:
+    (name,) = limits
+    with pytest.raises(ConfigError, match=f"of {name}_a is "):
+        make_problem(parameterisation="geometry", limits=GeometryLimits(**limits))
+
+
+@pytest.mark.parametrize("limits", [{"radius": 1.5}, {"distance": [-1.0, 0.2]}, {"radius": math.nan}, {"radii": 0.1}])
+def test_limits_that_cannot_be_are_refused_in_one_line(limits: dict[str, Any]) -> None:
+    with refused(ConfigError, match=r"^limits: "):
+        validate(GeometryLimits, limits, "limits")
 
 
 def test_the_derivatives_of_matrix_elements_are_zero_along_directions_that_are_kept() -> None:

@@ -294,51 +294,53 @@ def test_what_a_job_leaves_ends_its_process(what: str, tmp_path: Path, monkeypat
     assert (processes[0] == processes[-1]) == (what == "nothing")
 
 
-class TestWorkersThatDie:
-    @pytest.mark.parametrize("by", [signal.SIGKILL, *slow(signal.SIGTERM, signal.SIGHUP)])
-    def test_a_job_that_is_killed_is_tried_three_times(self, by: signal.Signals, tmp_path: Path) -> None:
-        jobs = [*jobs_of(killed, [(tmp_path, by)]), Job("other", squared, 3)]
-        notes = run(tmp_path / "results", jobs, Processes(2))
-        # Of other tests' processes some are killed for lack of memory, which the system counts for all.
-        reason = notes.reason().replace(": the system was out of memory", "")
-        assert reason == f"the process died without an answer (killed by {by.name}) in each of 3 tries"
-        assert (tmp_path / "killed").stat().st_size == 3
-        assert notes.endings[1] == ResultStore(tmp_path / "results", Answer).get("other")
-
-    def test_a_job_that_is_killed_once_or_after_writing_has_a_result(self, tmp_path: Path) -> None:
-        assert run(tmp_path / "once", jobs_of(killed_once, [tmp_path]), Processes(1)).answers() == {0: 2}
-        written = tmp_path / "written"
-        assert run(written, jobs_of(killed_after_writing, [written]), Processes(1)).answers() == {0: 7}
-
-    def test_a_job_that_ends_its_process_is_named_with_the_exit_code(self, tmp_path: Path) -> None:
-        notes = run(tmp_path, jobs_of(ended_with, [0, 3]), Processes(1))
-        assert "(exit code 0)" in notes.reason(0)
-        assert "(exit code 3)" in notes.reason(1)
-
-    def test_a_job_that_crashes_is_not_tried_again(self, tmp_path: Path) -> None:
-        notes = run(tmp_path / "results", jobs_of(crashed, [tmp_path]), Processes(1))
-        assert notes.reason() == "the process died without an answer (killed by SIGABRT)"
-        assert (tmp_path / "crashed").stat().st_size == 1
+@pytest.mark.parametrize("by", [signal.SIGKILL, *slow(signal.SIGTERM, signal.SIGHUP)])
+def test_a_job_that_is_killed_is_tried_three_times(by: signal.Signals, tmp_path: Path) -> None:
+    jobs = [*jobs_of(killed, [(tmp_path, by)]), Job("other", squared, 3)]
+    notes = run(tmp_path / "results", jobs, Processes(2))
+    # Of other tests' processes some are killed for lack of memory, which the system counts for all.
+    reason = notes.reason().replace(": the system was out of memory", "")
+    assert reason == f"the process died without an answer (killed by {by.name}) in each of 3 tries"
+    assert (tmp_path / "killed").stat().st_size == 3
+    assert notes.endings[1] == ResultStore(tmp_path / "results", Answer).get("other")
 
 
-class TestLimits:
-    def test_a_job_over_its_memory_is_ended_and_not_tried_again(self, tmp_path: Path) -> None:
-        jobs = [
-            Job("one", one_large_array, tmp_path, memory_mb=400),
-            Job("many", many_small_objects, tmp_path, memory_mb=400),
-            Job("little", little_memory, tmp_path, memory_mb=400),
-        ]
-        notes = run(tmp_path / "results", jobs, Processes(2))
-        assert {notes.reason(0), notes.reason(1)} == {"out of memory (limit 400 MB)"}
-        assert notes.endings[2] == Answer(10**6)
-        assert {(tmp_path / name).stat().st_size for name in ("one_large_array", "many_small_objects")} == {1}
+def test_a_job_that_is_killed_once_or_after_writing_has_a_result(tmp_path: Path) -> None:
+    assert run(tmp_path / "once", jobs_of(killed_once, [tmp_path]), Processes(1)).answers() == {0: 2}
+    written = tmp_path / "written"
+    assert run(written, jobs_of(killed_after_writing, [written]), Processes(1)).answers() == {0: 7}
 
-    def test_a_job_over_its_time_is_ended_and_not_tried_again(self, tmp_path: Path) -> None:
-        jobs = [Job(work.__name__, work, None, seconds=1.0) for work in (asleep, deaf)]
-        notes = run(tmp_path, [*jobs, Job("other", squared, 2)], Processes(3))
-        over_time = Failure("over time (limit 1 s)", over_time=True)
-        assert (notes.endings[0], notes.endings[1]) == (over_time, over_time)
-        assert sorted(notes.began_numbers) == [0, 1, 2]
+
+def test_a_job_that_ends_its_process_is_named_with_the_exit_code(tmp_path: Path) -> None:
+    notes = run(tmp_path, jobs_of(ended_with, [0, 3]), Processes(1))
+    assert "(exit code 0)" in notes.reason(0)
+    assert "(exit code 3)" in notes.reason(1)
+
+
+def test_a_job_that_crashes_is_not_tried_again(tmp_path: Path) -> None:
+    notes = run(tmp_path / "results", jobs_of(crashed, [tmp_path]), Processes(1))
+    assert notes.reason() == "the process died without an answer (killed by SIGABRT)"
+    assert (tmp_path / "crashed").stat().st_size == 1
+
+
+def test_a_job_over_its_memory_is_ended_and_not_tried_again(tmp_path: Path) -> None:
+    jobs = [
+        Job("one", one_large_array, tmp_path, memory_mb=400),
+        Job("many", many_small_objects, tmp_path, memory_mb=400),
+        Job("little", little_memory, tmp_path, memory_mb=400),
+    ]
+    notes = run(tmp_path / "results", jobs, Processes(2))
+    assert {notes.reason(0), notes.reason(1)} == {"out of memory (limit 400 MB)"}
+    assert notes.endings[2] == Answer(10**6)
+    assert {(tmp_path / name).stat().st_size for name in ("one_large_array", "many_small_objects")} == {1}
+
+
+def test_a_job_over_its_time_is_ended_and_not_tried_again(tmp_path: Path) -> None:
+    jobs = [Job(work.__name__, work, None, seconds=1.0) for work in (asleep, deaf)]
+    notes = run(tmp_path, [*jobs, Job("other", squared, 2)], Processes(3))
+    over_time = Failure("over time (limit 1 s)", over_time=True)
+    assert (notes.endings[0], notes.endings[1]) == (over_time, over_time)
+    assert sorted(notes.began_numbers) == [0, 1, 2]
 
 
 def test_within_a_job_there_are_no_further_processes(tmp_path: Path) -> None:
@@ -453,41 +455,43 @@ class Table:
     empty: JsonArray | None = None
 
 
-class TestStore:
-    def test_gives_arrays_back_to_the_last_bit(self, tmp_path: Path) -> None:
-        values = np.random.default_rng(5).normal(size=(4, 3, 3)) * 10.0 ** np.arange(-150, 150, 100)
-        values[0, 0] = [np.nan, np.inf, -0.0]
-        store = ResultStore(tmp_path, Table)
-        store.put("key", Table(values))
-        table = store.get("key")
-        assert table.values.tobytes() == values.tobytes()
-        assert table.empty is None
+def test_a_store_gives_arrays_back_to_the_last_bit(tmp_path: Path) -> None:
+    values = np.random.default_rng(5).normal(size=(4, 3, 3)) * 10.0 ** np.arange(-150, 150, 100)
+    values[0, 0] = [np.nan, np.inf, -0.0]
+    store = ResultStore(tmp_path, Table)
+    store.put("key", Table(values))
+    table = store.get("key")
+    assert table.values.tobytes() == values.tobytes()
+    assert table.empty is None
 
-    def test_refuses_what_it_could_not_give_back(self, tmp_path: Path) -> None:
-        store = ResultStore(tmp_path, Answer)
-        three: Any = "three"  # on purpose not the whole number that an answer takes
-        with pytest.raises(ValueError, match="number"):
-            store.put("key", Answer(three))
-        assert list(tmp_path.iterdir()) == []
 
-    def test_removes_its_files_and_no_others(self, tmp_path: Path) -> None:
-        store = ResultStore(tmp_path / "results", Answer)
-        store.put("key", Answer(1))
-        (tmp_path / "results" / "notes.txt").touch()
-        store.remove()
-        assert [file.name for file in (tmp_path / "results").iterdir()] == ["notes.txt"]
+def test_a_store_refuses_what_it_could_not_give_back(tmp_path: Path) -> None:
+    store = ResultStore(tmp_path, Answer)
+    three: Any = "three"  # on purpose not the whole number that an answer takes
+    with pytest.raises(ValueError, match="number"):
+        store.put("key", Answer(three))
+    assert list(tmp_path.iterdir()) == []
 
-    def test_a_key_changes_with_every_bit_of_what_it_is_made_of(self) -> None:
-        values = np.arange(6.0)
-        keys = [
-            content_key({"table": Table(values), "number": 1}),
-            content_key({"table": Table(np.nextafter(values, 9.0)), "number": 1}),
-            content_key({"table": Table(values.reshape(2, 3)), "number": 1}),
-            content_key({"table": Table(values, values), "number": 1}),
-            content_key({"table": Table(values), "number": 2}),
-        ]
-        assert len(set(keys)) == len(keys)
-        assert keys[0] == content_key({"number": 1, "table": Table(values.copy())})
+
+def test_a_store_removes_its_files_and_no_others(tmp_path: Path) -> None:
+    store = ResultStore(tmp_path / "results", Answer)
+    store.put("key", Answer(1))
+    (tmp_path / "results" / "notes.txt").touch()
+    store.remove()
+    assert [file.name for file in (tmp_path / "results").iterdir()] == ["notes.txt"]
+
+
+def test_a_key_changes_with_every_bit_of_what_it_is_made_of() -> None:
+    values = np.arange(6.0)
+    keys = [
+        content_key({"table": Table(values), "number": 1}),
+        content_key({"table": Table(np.nextafter(values, 9.0)), "number": 1}),
+        content_key({"table": Table(values.reshape(2, 3)), "number": 1}),
+        content_key({"table": Table(values, values), "number": 1}),
+        content_key({"table": Table(values), "number": 2}),
+    ]
+    assert len(set(keys)) == len(keys)
+    assert keys[0] == content_key({"number": 1, "table": Table(values.copy())})
 
 
 def test_ctrl_c_while_the_fork_server_starts_is_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -30,39 +30,41 @@ def test_the_registry_knows_the_plugin_and_its_file() -> None:
     assert entry.summary.startswith("Festo Robotino v2")
 
 
-class TestRecordings:
-    def test_all_72_directions_are_read_and_every_second_validates(self, robotino: Dataset) -> None:
-        assert (len(robotino.split("train")), len(robotino.split("validation"))) == (36, 36)
-        directions = np.degrees([run.alpha or 0.0 for run in robotino.trajectories])
-        np.testing.assert_allclose(directions, 5 * np.arange(72), atol=1e-3)
-        assert [run.split for run in robotino.trajectories[:4]] == ["train", "validation"] * 2
-        assert robotino.warnings == ()
+def test_all_72_directions_are_read_and_every_second_validates(robotino: Dataset) -> None:
+    assert (len(robotino.split("train")), len(robotino.split("validation"))) == (36, 36)
+    directions = np.degrees([run.alpha or 0.0 for run in robotino.trajectories])
+    np.testing.assert_allclose(directions, 5 * np.arange(72), atol=1e-3)
+    assert [run.split for run in robotino.trajectories[:4]] == ["train", "validation"] * 2
+    assert robotino.warnings == ()
 
-    def test_set_speeds_obey_the_wheel_equation_of_the_design(self, robotino: Dataset) -> None:
-        for run in robotino.trajectories:
-            twist = run.v * np.cos(run.alpha), run.v * np.sin(run.alpha), 0.0
-            expected = wheel_equations(robotino.robot.wheels) @ twist
-            np.testing.assert_allclose(np.median(run.targets, axis=0), expected, atol=1e-4)
 
-    def test_no_other_order_or_signs_of_the_wheels_fit_the_camera(self, robotino: Dataset) -> None:
-        batch = OdometryBatch([run.final_log for run in robotino.trajectories], "arc")
-        finals = np.array([run.final_pose for run in robotino.trajectories])
-        design = robotino.robot.inverse_kinematic_matrix
-        arrangements = list(product(permutations(range(3)), product((1, -1), repeat=3)))
-        matrices = np.array([design[:, order] * signs for order, signs in arrangements])
-        errors = np.linalg.norm((batch.poses(matrices) - finals)[..., :2], axis=-1).mean(axis=1)
-        best, second = np.argsort(errors)[:2]
-        assert arrangements[best] == ((0, 1, 2), (1, 1, 1))
-        assert errors[best] < 0.17
-        assert errors[second] > 1.0
+def test_set_speeds_obey_the_wheel_equation_of_the_design(robotino: Dataset) -> None:
+    for run in robotino.trajectories:
+        twist = run.v * np.cos(run.alpha), run.v * np.sin(run.alpha), 0.0
+        expected = wheel_equations(robotino.robot.wheels) @ twist
+        np.testing.assert_allclose(np.median(run.targets, axis=0), expected, atol=1e-4)
 
-    def test_the_design_model_predicts_the_camera_s_headings(self, robotino: Dataset) -> None:
-        batch = OdometryBatch([run.final_log for run in robotino.trajectories], "arc")
-        headings = batch.poses(robotino.robot.inverse_kinematic_matrix[None])[0, :, 2]
-        errors = headings - [run.final_pose[2] for run in robotino.trajectories]
-        turned = [run.final_pose[2] - run.start[2] for run in robotino.trajectories]
-        assert np.degrees(np.abs(errors).mean()) < 2
-        assert np.degrees(np.abs(turned).mean()) > 10
+
+def test_no_other_order_or_signs_of_the_wheels_fit_the_camera(robotino: Dataset) -> None:
+    batch = OdometryBatch([run.final_log for run in robotino.trajectories], "arc")
+    finals = np.array([run.final_pose for run in robotino.trajectories])
+    design = robotino.robot.inverse_kinematic_matrix
+    arrangements = list(product(permutations(range(3)), product((1, -1), repeat=3)))
+    matrices = np.array([design[:, order] * signs for order, signs in arrangements])
+    errors = np.linalg.norm((batch.poses(matrices) - finals)[..., :2], axis=-1).mean(axis=1)
+    best, second = np.argsort(errors)[:2]
+    assert arrangements[best] == ((0, 1, 2), (1, 1, 1))
+    assert errors[best] < 0.17
+    assert errors[second] > 1.0
+
+
+def test_the_design_model_predicts_the_camera_s_headings(robotino: Dataset) -> None:
+    batch = OdometryBatch([run.final_log for run in robotino.trajectories], "arc")
+    headings = batch.poses(robotino.robot.inverse_kinematic_matrix[None])[0, :, 2]
+    errors = headings - [run.final_pose[2] for run in robotino.trajectories]
+    turned = [run.final_pose[2] - run.start[2] for run in robotino.trajectories]
+    assert np.degrees(np.abs(errors).mean()) < 2
+    assert np.degrees(np.abs(turned).mean()) > 10
 
 
 def write_run(folder: Path, name: str = "exp00", vx: float = 0.1) -> Path:
@@ -109,16 +111,16 @@ def test_a_malformed_row_and_a_folder_without_runs_are_named(tmp_path: Path) -> 
         import_dataset("robotino", tmp_path)
 
 
-class TestCommonOptions:
-    """Options of ``import dataset`` hold for an importer that knows none of them."""
+# Options of ``import dataset`` hold for an importer that knows none of them.
 
-    def test_signs_order_and_cuts_are_applied_to_what_it_reads(self, tmp_path: Path) -> None:
-        write_run(tmp_path)
-        (plain,) = import_dataset("robotino", tmp_path).trajectories
-        data = import_dataset("robotino", tmp_path, {"wheel_signs": [-1, 1, 1], "wheel_columns": ["2", "1", "3"]})
-        (run,) = data.trajectories
-        np.testing.assert_allclose(run.rates, plain.rates[:, [1, 0, 2]] * [-1, 1, 1])
-        assert (run.id, run.split, run.command, run.session) == (plain.id, plain.split, plain.command, plain.session)
-        assert data.imported.options == {"wheel_signs": [-1, 1, 1], "wheel_columns": ["2", "1", "3"]}
-        cut = import_dataset("robotino", tmp_path, {"window": 0.5, "name": "halves"})
-        assert (cut.name, len(cut.trajectories)) == ("halves", 2)
+
+def test_signs_order_and_cuts_are_applied_to_what_it_reads(tmp_path: Path) -> None:
+    write_run(tmp_path)
+    (plain,) = import_dataset("robotino", tmp_path).trajectories
+    data = import_dataset("robotino", tmp_path, {"wheel_signs": [-1, 1, 1], "wheel_columns": ["2", "1", "3"]})
+    (run,) = data.trajectories
+    np.testing.assert_allclose(run.rates, plain.rates[:, [1, 0, 2]] * [-1, 1, 1])
+    assert (run.id, run.split, run.command, run.session) == (plain.id, plain.split, plain.command, plain.session)
+    assert data.imported.options == {"wheel_signs": [-1, 1, 1], "wheel_columns": ["2", "1", "3"]}
+    cut = import_dataset("robotino", tmp_path, {"window": 0.5, "name": "halves"})
+    assert (cut.name, len(cut.trajectories)) == ("halves", 2)

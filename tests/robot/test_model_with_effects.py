@@ -108,58 +108,61 @@ def test_a_model_gives_the_poses_of_each_log_by_itself() -> None:
             np.testing.assert_allclose(found, method([log])[0], rtol=0, atol=1e-13)
 
 
-class TestReported:
-    @given(seed=seeds)
-    def test_without_effects_of_the_reference_it_is_the_odometry(self, seed: int) -> None:
-        log = a_drive(seed)
-        late = replace(log, stamps=np.append(log.stamps, log.times[-1] + 1.0))
-        chosen = model(*mixture(seed, APR_02))
-        np.testing.assert_array_equal(chosen.reported([late])[0], chosen.poses([late])[0])
+@given(seed=seeds)
+def test_without_effects_of_the_reference_the_odometry_is_reported(seed: int) -> None:
+    log = a_drive(seed)
+    late = replace(log, stamps=np.append(log.stamps, log.times[-1] + 1.0))
+    chosen = model(*mixture(seed, APR_02))
+    np.testing.assert_array_equal(chosen.reported([late])[0], chosen.poses([late])[0])
 
-    def test_effects_of_the_reference_do_nothing_to_the_odometry_and_before_its_start_the_robot_stood(self) -> None:
-        log = a_drive(1)
-        chosen = model(*(a_term(name, APR_02) for name in REFERENCE))
-        np.testing.assert_array_equal(chosen.poses([log])[0], model().poses([log])[0])
-        early = replace(log, stamps=np.array([0.0, 0.19]))
-        (found,) = model(term("reference_time_offset", tau=0.2)).reported([early])
-        np.testing.assert_array_equal(found, [log.start, log.start])
 
-    @given(seed=seeds, tau=st.floats(-0.2, 0.2), latency=st.floats(-0.1, 0.1))
-    def test_a_pose_is_the_odometrys_when_it_was_taken(self, seed: int, tau: float, latency: float) -> None:
-        log = a_drive(seed, 60)
-        stamps = log.stamps[(log.stamps > 0.35) & (log.stamps < log.times[-1] - 0.35)]
-        chosen = model(*mixture(seed, APR_02))
-        delayed = replace(
-            chosen, terms=(*chosen.terms, term("reference_time_offset", tau=tau), term("heading_latency", tau=latency))
-        )
-        (found,) = delayed.reported([replace(log, stamps=stamps)])
-        (positions,) = chosen.poses([replace(log, stamps=stamps - tau)])
-        (headings,) = chosen.poses([replace(log, stamps=stamps - tau - latency)])
-        np.testing.assert_allclose(found, np.column_stack([positions[:, :2], headings[:, 2]]), rtol=0, atol=1e-12)
+def test_effects_of_the_reference_do_nothing_to_the_odometry_and_before_its_start_the_robot_stood() -> None:
+    log = a_drive(1)
+    chosen = model(*(a_term(name, APR_02) for name in REFERENCE))
+    np.testing.assert_array_equal(chosen.poses([log])[0], model().poses([log])[0])
+    early = replace(log, stamps=np.array([0.0, 0.19]))
+    (found,) = model(term("reference_time_offset", tau=0.2)).reported([early])
+    np.testing.assert_array_equal(found, [log.start, log.start])
 
-    @pytest.mark.parametrize("integration", BOTH)
-    def test_after_the_last_sample_the_robot_goes_on_at_its_last_mean_rate(self, integration: Integration) -> None:
-        log = a_drive(6)
-        eccentric = a_term("wheel_eccentricity", APR_02)
-        chosen = model(term("reference_time_offset", tau=-0.15), eccentric, integration=integration)
-        (found,) = chosen.reported([replace(log, stamps=log.times[-1:])])
-        mean = log.rates[-5:].mean(axis=0)
-        longer = replace(
-            log,
-            times=np.append(log.times, log.times[-1] + 0.15),
-            rates=np.vstack([log.rates, mean]),
-            wheel_angles=np.vstack([log.wheel_angles, log.wheel_angles[-1] + 0.15 * mean]),
-            stamps=log.times[-1:] + 0.15,
-        )
-        np.testing.assert_allclose(found, chosen.poses([longer])[0], rtol=0, atol=1e-12)
 
-    def test_a_later_effect_works_on_what_an_earlier_one_reports(self) -> None:
-        log = a_drive(7)
-        arm, scale = term("lidar_lever_arm", x=0.05, y=0.02), term("reference_scale", s=0.01)
-        (first,) = model(arm).reported([log])
-        (both,) = model(arm, scale).reported([log])
-        expected = log.start[:2] + 1.01 * (first[:, :2] - log.start[:2])
-        np.testing.assert_allclose(both[:, :2], expected, rtol=0, atol=1e-12)
+@given(seed=seeds, tau=st.floats(-0.2, 0.2), latency=st.floats(-0.1, 0.1))
+def test_a_pose_is_the_odometrys_when_it_was_taken(seed: int, tau: float, latency: float) -> None:
+    log = a_drive(seed, 60)
+    stamps = log.stamps[(log.stamps > 0.35) & (log.stamps < log.times[-1] - 0.35)]
+    chosen = model(*mixture(seed, APR_02))
+    delayed = replace(
+        chosen, terms=(*chosen.terms, term("reference_time_offset", tau=tau), term("heading_latency", tau=latency))
+    )
+    (found,) = delayed.reported([replace(log, stamps=stamps)])
+    (positions,) = chosen.poses([replace(log, stamps=stamps - tau)])
+    (headings,) = chosen.poses([replace(log, stamps=stamps - tau - latency)])
+    np.testing.assert_allclose(found, np.column_stack([positions[:, :2], headings[:, 2]]), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("integration", BOTH)
+def test_after_the_last_sample_the_robot_goes_on_at_its_last_mean_rate(integration: Integration) -> None:
+    log = a_drive(6)
+    eccentric = a_term("wheel_eccentricity", APR_02)
+    chosen = model(term("reference_time_offset", tau=-0.15), eccentric, integration=integration)
+    (found,) = chosen.reported([replace(log, stamps=log.times[-1:])])
+    mean = log.rates[-5:].mean(axis=0)
+    longer = replace(
+        log,
+        times=np.append(log.times, log.times[-1] + 0.15),
+        rates=np.vstack([log.rates, mean]),
+        wheel_angles=np.vstack([log.wheel_angles, log.wheel_angles[-1] + 0.15 * mean]),
+        stamps=log.times[-1:] + 0.15,
+    )
+    np.testing.assert_allclose(found, chosen.poses([longer])[0], rtol=0, atol=1e-12)
+
+
+def test_a_later_effect_works_on_what_an_earlier_one_reports() -> None:
+    log = a_drive(7)
+    arm, scale = term("lidar_lever_arm", x=0.05, y=0.02), term("reference_scale", s=0.01)
+    (first,) = model(arm).reported([log])
+    (both,) = model(arm, scale).reported([log])
+    expected = log.start[:2] + 1.01 * (first[:, :2] - log.start[:2])
+    np.testing.assert_allclose(both[:, :2], expected, rtol=0, atol=1e-12)
 
 
 MISSING = {

@@ -36,6 +36,7 @@ from omnibench.slam.slam_request import distances, run_errors, slam_accuracy
 from omnibench.testing.synthetic import synthetic_dataset
 
 LIDAR = Lidar()
+SLOW = Lidar(turn_time=0.2)
 FAST = Command(0.5, 0.6, 1.0)
 DEFAULT = SlamOptions()
 LAST_POSE = SlamOptions(start="last_pose")
@@ -77,77 +78,78 @@ def nees(path: SlamPath, run: Run) -> Array:
     return (found * np.linalg.solve(path.covariances[1:], found)).sum(axis=(1, 2))
 
 
-class TestFurnishedRoom:
-    """The requirement is 1 cm and 0.3 deg in the mean at the end of a run."""
-
-    @pytest.mark.parametrize(
-        "options", [DEFAULT, pytest.param(LAST_POSE, marks=pytest.mark.slow)], ids=["odometry", "last_pose"]
-    )
-    def test_flower_runs_end_within_2_mm_and_0_05_deg_and_covariances_say_so(self, options: SlamOptions) -> None:
-        runs = [driven("furnished_room", number) for number in range(8)]
-        final = np.array([errors(located(run, options), run)[-1] for run in runs])
-        assert np.hypot(final[:, 0], final[:, 1]).mean() < 2 * MM
-        assert np.abs(final[:, 2]).mean() < 0.05 * DEGREE
-        assert 1.5 < np.mean([nees(located(run, options), run).mean() for run in runs]) < 5
-        assert problems(located(runs[2])) == []
-
-    @pytest.mark.slow
-    def test_the_odometry_does_not_pull_at_the_poses(self) -> None:
-        for number in (1, 2, 5):
-            run = driven("furnished_room", number)
-
-            def shorter(times: Array, run: Run = run) -> Array:
-                return 0.9 * run.odometry(times)
-
-            found = run_slam(run.scans, LIDAR.scanner, SlamOptions(), np.zeros(3), shorter)
-            moved = np.abs(found.poses - located(run).poses).max(axis=0)
-            assert moved[:2].max() < 0.3 * MM
-            assert moved[2] < 0.01 * DEGREE
-
-    def test_a_fast_robot_is_found_from_its_last_pose(self) -> None:
-        run = drive(room("furnished_room"), LIDAR, FAST, np.random.default_rng(1), distance=1.1)
-        assert np.abs(np.diff(run.true[:, 2])).max() > 0.2  # rad from scan to scan
-        found = errors(located(run, LAST_POSE), run)
-        assert np.abs(found[:, :2]).max() < 6 * MM
-        assert np.abs(found[:, 2]).max() < 0.2 * DEGREE
-
-    def test_deskewing_takes_the_motion_within_a_scan_out(self) -> None:
-        run = drive(room("furnished_room"), LIDAR, FAST, np.random.default_rng(2), distance=1.1)
-        moving = slice(3, -4)
-        with_it, without = (errors(located(run, SlamOptions(deskew=on)), run)[moving] for on in (True, False))
-        assert np.abs(with_it[:, 2]).mean() < 0.2 * np.abs(without[:, 2]).mean()
-
-    def test_the_poses_are_the_robots_wherever_the_scanner_sits(self) -> None:
-        lidar = Lidar(mount=LidarMount(x=-0.2, y=0.15, yaw_deg=70.0))
-        run = driven("furnished_room", 2, lidar)
-        found = errors(located(run, scanner=lidar.scanner), run)
-        assert np.hypot(found[:, 0], found[:, 1]).max() < 4 * MM
-
-    def test_poses_begin_at_the_start_pose_and_headings_go_on_beyond_a_turn(self) -> None:
-        command = Command(0.05, 0.0, 1.2)
-        run = drive(room("furnished_room"), LIDAR, command, np.random.default_rng(4), distance=0.35)
-        start = np.array([5.0, -3.0, 2.0])
-        path = run_slam(run.scans, LIDAR.scanner, SlamOptions(), start, run.odometry)
-        np.testing.assert_array_equal(path.poses[0], start)
-        assert run.true[-1, 2] > 7
-        assert path.poses[-1, 2] - 2.0 == pytest.approx(run.true[-1, 2], abs=0.2 * DEGREE)
-        way = (run.true[-1, 0] + 1j * run.true[-1, 1]) * np.exp(2j)
-        assert path.poses[-1, :2] == pytest.approx([5.0 + way.real, -3.0 + way.imag], abs=4 * MM)
+# In the furnished room, where 1 cm and 0.3 deg in the mean at the end of a run are required.
 
 
-class TestSlowScanner:
-    """The robot drives on while it scans: 4 cm or more in a scan, and none when it has stopped."""
+@pytest.mark.parametrize(
+    "options", [DEFAULT, pytest.param(LAST_POSE, marks=pytest.mark.slow)], ids=["odometry", "last_pose"]
+)
+def test_flower_runs_end_within_2_mm_and_0_05_deg_and_covariances_say_so(options: SlamOptions) -> None:
+    runs = [driven("furnished_room", number) for number in range(8)]
+    final = np.array([errors(located(run, options), run)[-1] for run in runs])
+    assert np.hypot(final[:, 0], final[:, 1]).mean() < 2 * MM
+    assert np.abs(final[:, 2]).mean() < 0.05 * DEGREE
+    assert 1.5 < np.mean([nees(located(run, options), run).mean() for run in runs]) < 5
+    assert problems(located(runs[2])) == []
 
-    SLOW = Lidar(turn_time=0.2)
 
-    def test_covariances_are_honest_and_poses_as_good_as_a_fast_ones(self) -> None:
-        runs = [driven("furnished_room", number, self.SLOW) for number in range(4)]
-        paths = [located(run, scanner=self.SLOW.scanner) for run in runs]
-        position = np.concatenate(
-            [np.hypot(*errors(path, run)[1:, :2].T) for path, run in zip(paths, runs, strict=True)]
-        )
-        assert position.mean() < 1.5 * MM
-        assert 1 < np.mean([nees(path, run).mean() for path, run in zip(paths, runs, strict=True)]) < 5
+@pytest.mark.slow
+def test_the_odometry_does_not_pull_at_the_poses() -> None:
+    for number in (1, 2, 5):
+        run = driven("furnished_room", number)
+
+        def shorter(times: Array, run: Run = run) -> Array:
+            return 0.9 * run.odometry(times)
+
+        found = run_slam(run.scans, LIDAR.scanner, SlamOptions(), np.zeros(3), shorter)
+        moved = np.abs(found.poses - located(run).poses).max(axis=0)
+        assert moved[:2].max() < 0.3 * MM
+        assert moved[2] < 0.01 * DEGREE
+
+
+def test_a_fast_robot_is_found_from_its_last_pose() -> None:
+    run = drive(room("furnished_room"), LIDAR, FAST, np.random.default_rng(1), distance=1.1)
+    assert np.abs(np.diff(run.true[:, 2])).max() > 0.2  # rad from scan to scan
+    found = errors(located(run, LAST_POSE), run)
+    assert np.abs(found[:, :2]).max() < 6 * MM
+    assert np.abs(found[:, 2]).max() < 0.2 * DEGREE
+
+
+def test_deskewing_takes_the_motion_within_a_scan_out() -> None:
+    run = drive(room("furnished_room"), LIDAR, FAST, np.random.default_rng(2), distance=1.1)
+    moving = slice(3, -4)
+    with_it, without = (errors(located(run, SlamOptions(deskew=on)), run)[moving] for on in (True, False))
+    assert np.abs(with_it[:, 2]).mean() < 0.2 * np.abs(without[:, 2]).mean()
+
+
+def test_the_poses_are_the_robots_wherever_the_scanner_sits() -> None:
+    lidar = Lidar(mount=LidarMount(x=-0.2, y=0.15, yaw_deg=70.0))
+    run = driven("furnished_room", 2, lidar)
+    found = errors(located(run, scanner=lidar.scanner), run)
+    assert np.hypot(found[:, 0], found[:, 1]).max() < 4 * MM
+
+
+def test_poses_begin_at_the_start_pose_and_headings_go_on_beyond_a_turn() -> None:
+    command = Command(0.05, 0.0, 1.2)
+    run = drive(room("furnished_room"), LIDAR, command, np.random.default_rng(4), distance=0.35)
+    start = np.array([5.0, -3.0, 2.0])
+    path = run_slam(run.scans, LIDAR.scanner, SlamOptions(), start, run.odometry)
+    np.testing.assert_array_equal(path.poses[0], start)
+    assert run.true[-1, 2] > 7
+    assert path.poses[-1, 2] - 2.0 == pytest.approx(run.true[-1, 2], abs=0.2 * DEGREE)
+    way = (run.true[-1, 0] + 1j * run.true[-1, 1]) * np.exp(2j)
+    assert path.poses[-1, :2] == pytest.approx([5.0 + way.real, -3.0 + way.imag], abs=4 * MM)
+
+
+# A slow scanner: the robot drives 4 cm or more in a scan, and none when it has stopped.
+
+
+def test_a_slow_scanners_covariances_are_honest_and_its_poses_as_good_as_a_fast_ones() -> None:
+    runs = [driven("furnished_room", number, SLOW) for number in range(4)]
+    paths = [located(run, scanner=SLOW.scanner) for run in runs]
+    position = np.concatenate([np.hypot(*errors(path, run)[1:, :2].T) for path, run in zip(paths, runs, strict=True)])
+    assert position.mean() < 1.5 * MM
+    assert 1 < np.mean([nees(path, run).mean() for path, run in zip(paths, runs, strict=True)]) < 5
 
 
 @pytest.mark.slow
@@ -165,22 +167,22 @@ def test_coarse_encoders_do_not_make_covariances_dishonest(turn_time: float) -> 
     assert 1 < np.mean(found) < 6
 
 
-class TestCorridor:
-    """Nothing there tells how far along it the robot is."""
+# A corridor does not tell how far along it the robot is.
 
-    def test_odometry_is_kept_along_it_the_covariance_grows_with_the_way_and_it_is_said(self) -> None:
-        run = driven("corridor", 3)
-        path = located(run)
-        found, stated = errors(path, run), np.sqrt(np.diagonal(path.covariances, axis1=1, axis2=2))
-        odometry = run.odometry(run.scans.times)
-        assert np.abs(path.poses[:, 0] - odometry[:, 0]).max() < 25 * MM  # its axis is that of the run, within degrees
-        assert np.abs(found[:, 0]).max() > 20 * MM  # which is as wrong as the odometry is
-        assert stated[-1, 0] > 50 * MM
-        assert (np.diff(stated[1:, 0]) > -0.01 * MM).all()
-        assert stated[-1, 1] < stated[-1, 0] / 10
-        assert np.abs(found[:, 2]).max() < 0.05 * DEGREE
-        (problem,) = problems(path)  # the robot stands along it, within some degrees
-        assert re.fullmatch(r"scans tell too little along ([0-6]|17\d) deg of the run's frame", problem)
+
+def test_along_a_corridor_odometry_is_kept_the_covariance_grows_with_the_way_and_it_is_said() -> None:
+    run = driven("corridor", 3)
+    path = located(run)
+    found, stated = errors(path, run), np.sqrt(np.diagonal(path.covariances, axis1=1, axis2=2))
+    odometry = run.odometry(run.scans.times)
+    assert np.abs(path.poses[:, 0] - odometry[:, 0]).max() < 25 * MM  # its axis is that of the run, within degrees
+    assert np.abs(found[:, 0]).max() > 20 * MM  # which is as wrong as the odometry is
+    assert stated[-1, 0] > 50 * MM
+    assert (np.diff(stated[1:, 0]) > -0.01 * MM).all()
+    assert stated[-1, 1] < stated[-1, 0] / 10
+    assert np.abs(found[:, 2]).max() < 0.05 * DEGREE
+    (problem,) = problems(path)  # the robot stands along it, within some degrees
+    assert re.fullmatch(r"scans tell too little along ([0-6]|17\d) deg of the run's frame", problem)
 
 
 @pytest.mark.parametrize(
@@ -190,7 +192,7 @@ class TestCorridor:
         pytest.param("corridor", 6, LAST_POSE, LIDAR, 1, 5, marks=pytest.mark.slow),
         pytest.param("hall", 4, DEFAULT, LIDAR, 1.5, 5, marks=pytest.mark.slow),
         pytest.param("furnished_room", 4, SlamOptions(deskew=False), LIDAR, 0, 5, marks=pytest.mark.slow),
-        pytest.param("furnished_room", 4, LAST_POSE, TestSlowScanner.SLOW, 1, 6, marks=pytest.mark.slow),
+        pytest.param("furnished_room", 4, LAST_POSE, SLOW, 1, 6, marks=pytest.mark.slow),
     ],
     ids=["corridor", "corridor from the last pose", "hall", "not deskewed", "slow scanner from the last pose"],
 )
@@ -229,49 +231,49 @@ def lose(ranges: Ranges) -> None:
     ranges[np.random.default_rng(1).uniform(size=ranges.shape) < 0.3] = np.inf
 
 
-class TestImperfectScans:
-    @pytest.mark.parametrize(("change", "most"), [(walk, 15), (blind_at_first, 20), (lose, 5)])
-    def test_people_lost_returns_and_a_blind_first_scan_cost_little(
-        self, change: Callable[[Ranges], None], most: int
-    ) -> None:
-        run = changed(driven("furnished_room", 4), change)
-        found = errors(located(run), run)
-        assert np.hypot(found[:, 0], found[:, 1]).max() < most * MM
+@pytest.mark.parametrize(("change", "most"), [(walk, 15), (blind_at_first, 20), (lose, 5)])
+def test_people_lost_returns_and_a_blind_first_scan_cost_little(change: Callable[[Ranges], None], most: int) -> None:
+    run = changed(driven("furnished_room", 4), change)
+    found = errors(located(run), run)
+    assert np.hypot(found[:, 0], found[:, 1]).max() < most * MM
 
-    def test_a_scan_with_a_few_returns_keeps_the_start_and_says_so(self) -> None:
-        def nearly_blind(ranges: Ranges) -> None:
-            ranges[6, :] = np.inf
-            ranges[6, 500:503] = 2.0
 
-        run = changed(driven("furnished_room", 4), nearly_blind)
-        path = located(run)
-        assert path.matched[6] == 0
-        assert path.covariances[6, 0, 0] > 4 * path.covariances[7, 0, 0]
-        assert np.hypot(*errors(path, run)[7, :2]) < 4 * MM
-        (problem,) = problems(path)
-        assert "less than a fifth" in problem
+def test_a_scan_with_a_few_returns_keeps_the_start_and_says_so() -> None:
+    def nearly_blind(ranges: Ranges) -> None:
+        ranges[6, :] = np.inf
+        ranges[6, 500:503] = 2.0
 
-    @pytest.mark.slow
-    def test_ranges_noisier_than_the_scanner_says_are_noticed(self) -> None:
-        runs = [driven("furnished_room", number, Lidar(noise=0.03, far_noise=0.06)) for number in range(4)]
-        assert np.mean([nees(located(run), run).mean() for run in runs]) < 5
+    run = changed(driven("furnished_room", 4), nearly_blind)
+    path = located(run)
+    assert path.matched[6] == 0
+    assert path.covariances[6, 0, 0] > 4 * path.covariances[7, 0, 0]
+    assert np.hypot(*errors(path, run)[7, :2]) < 4 * MM
+    (problem,) = problems(path)
+    assert "less than a fifth" in problem
 
-    def test_what_cannot_be_located_is_named(self) -> None:
-        run = driven("furnished_room", 4)
-        none = TrajectoryScans(np.zeros(0), np.zeros((0, 1080), dtype=np.float32))
-        few = TrajectoryScans(run.scans.times, run.scans.ranges[:, :500])
-        blind = run.scans.ranges.copy()
-        blind[3] = np.inf
-        for scans, odometry, named in (
-            (none, run.odometry, "there is no scan"),
-            (few, run.odometry, r"\(\d+, 500\), expected \(\d+, 1080\)"),
-            (TrajectoryScans(run.scans.times, blind), run.odometry, rf"scan at {run.scans.times[3]:g} s is empty"),
-            (run.scans, None, "start: last_pose"),
-        ):
-            with pytest.raises(DataError, match=named):
-                run_slam(scans, LIDAR.scanner, SlamOptions(), np.zeros(3), odometry)
-        with pytest.raises(ConfigError, match=r"search_distance 0\.1 m .*match_distance 0\.5 m"):
-            validate(SlamOptions, {"search_distance": 0.1, "match_distance": 0.5}, "config")
+
+@pytest.mark.slow
+def test_ranges_noisier_than_the_scanner_says_are_noticed() -> None:
+    runs = [driven("furnished_room", number, Lidar(noise=0.03, far_noise=0.06)) for number in range(4)]
+    assert np.mean([nees(located(run), run).mean() for run in runs]) < 5
+
+
+def test_what_cannot_be_located_is_named() -> None:
+    run = driven("furnished_room", 4)
+    none = TrajectoryScans(np.zeros(0), np.zeros((0, 1080), dtype=np.float32))
+    few = TrajectoryScans(run.scans.times, run.scans.ranges[:, :500])
+    blind = run.scans.ranges.copy()
+    blind[3] = np.inf
+    for scans, odometry, named in (
+        (none, run.odometry, "there is no scan"),
+        (few, run.odometry, r"\(\d+, 500\), expected \(\d+, 1080\)"),
+        (TrajectoryScans(run.scans.times, blind), run.odometry, rf"scan at {run.scans.times[3]:g} s is empty"),
+        (run.scans, None, "start: last_pose"),
+    ):
+        with pytest.raises(DataError, match=named):
+            run_slam(scans, LIDAR.scanner, SlamOptions(), np.zeros(3), odometry)
+    with pytest.raises(ConfigError, match=r"search_distance 0\.1 m .*match_distance 0\.5 m"):
+        validate(SlamOptions, {"search_distance": 0.1, "match_distance": 0.5}, "config")
 
 
 def test_a_scanner_that_is_tilted_to_the_floor_is_located_as_well_as_a_horizontal_one() -> None:
@@ -352,39 +354,42 @@ def test_ticks_are_smoothed_out_and_what_they_hide_is_said() -> None:
     assert (np.abs(missed) < 3 * np.array([within.deviations[0] for within in found])).all()
 
 
-class TestCorrected:
-    """What the pose found tells of an odometry that is wrong in scale."""
+# What the pose found tells of an odometry that is wrong in scale.
 
-    LAST = np.array([0.4, -0.3, 1.0])
 
-    def test_odometry_that_is_short_is_put_right_within_the_scan(self) -> None:
-        motion = OdometryPrior(circle(0.27, 0.9), TIMES, 0.1, SlamOptions())  # of 0.3 m/s and 1 rad/s
-        found = compose(self.LAST, advance(np.zeros(3), np.array([0.3, 0.0, 1.0]) * 0.25, "arc"))
-        twist, deviations = motion.correct(1, self.LAST, found, np.array([0.03, 0.0, 0.1]))
-        np.testing.assert_allclose(twist, [0.03, 0.0, 0.1], rtol=0.05, atol=1e-6)
-        assert (deviations < [0.01, 0.01, 0.05]).all()
+LAST = np.array([0.4, -0.3, 1.0])
 
-    def test_of_a_robot_that_only_now_begins_to_move_nothing_is_known_but_the_odometrys_error(self) -> None:
-        def begins(times: Array) -> Array:
-            return np.column_stack([0.5 * np.maximum(times - 1.25, 0.0) ** 2, 0 * times, 0 * times])
 
-        motion = OdometryPrior(begins, TIMES, 0.2, SlamOptions(odometry_error=0.1))
-        twist, deviations = motion.correct(1, self.LAST, compose(self.LAST, np.array([1e-3, 0.0, 0.0])), np.zeros(3))
-        speed = motion.predict(1, self.LAST).within.mean[0]
-        assert 0.05 < speed < 0.15
-        assert np.abs(twist).max() < 1e-3
-        assert deviations[0] > 0.1 * speed
+def test_odometry_that_is_short_is_put_right_within_the_scan() -> None:
+    motion = OdometryPrior(circle(0.27, 0.9), TIMES, 0.1, SlamOptions())  # of 0.3 m/s and 1 rad/s
+    found = compose(LAST, advance(np.zeros(3), np.array([0.3, 0.0, 1.0]) * 0.25, "arc"))
+    twist, deviations = motion.correct(1, LAST, found, np.array([0.03, 0.0, 0.1]))
+    np.testing.assert_allclose(twist, [0.03, 0.0, 0.1], rtol=0.05, atol=1e-6)
+    assert (deviations < [0.01, 0.01, 0.05]).all()
 
-    def test_a_twist_between_scans_is_that_of_the_arc_and_not_of_its_chord(self) -> None:
-        motion = LastPosePrior(TIMES, 0.1, SlamOptions())
-        path = circle(0.3, 1.0)(TIMES)
-        assert motion.predict(1, path[0]).within.mean == pytest.approx(0.0)
-        twist, _ = motion.correct(1, path[0], path[1], np.zeros(3))
-        then = motion.predict(2, path[1]).within.mean
-        np.testing.assert_allclose(then, [0.3, 0.0, 1.0], atol=1e-12)
-        twist, _ = motion.correct(2, path[1], path[2], np.zeros(3))
-        np.testing.assert_allclose(twist, 0.0, atol=1e-12)
-        assert abs(relative(path[0], path[1])[1]) > 0.009  # m, which a chord would take for a motion to the left
+
+def test_of_a_robot_that_only_now_begins_to_move_nothing_is_known_but_the_odometrys_error() -> None:
+    def begins(times: Array) -> Array:
+        return np.column_stack([0.5 * np.maximum(times - 1.25, 0.0) ** 2, 0 * times, 0 * times])
+
+    motion = OdometryPrior(begins, TIMES, 0.2, SlamOptions(odometry_error=0.1))
+    twist, deviations = motion.correct(1, LAST, compose(LAST, np.array([1e-3, 0.0, 0.0])), np.zeros(3))
+    speed = motion.predict(1, LAST).within.mean[0]
+    assert 0.05 < speed < 0.15
+    assert np.abs(twist).max() < 1e-3
+    assert deviations[0] > 0.1 * speed
+
+
+def test_a_twist_between_scans_is_that_of_the_arc_and_not_of_its_chord() -> None:
+    motion = LastPosePrior(TIMES, 0.1, SlamOptions())
+    path = circle(0.3, 1.0)(TIMES)
+    assert motion.predict(1, path[0]).within.mean == pytest.approx(0.0)
+    twist, _ = motion.correct(1, path[0], path[1], np.zeros(3))
+    then = motion.predict(2, path[1]).within.mean
+    np.testing.assert_allclose(then, [0.3, 0.0, 1.0], atol=1e-12)
+    twist, _ = motion.correct(2, path[1], path[2], np.zeros(3))
+    np.testing.assert_allclose(twist, 0.0, atol=1e-12)
+    assert abs(relative(path[0], path[1])[1]) > 0.009  # m, which a chord would take for a motion to the left
 
 
 @cache
@@ -418,98 +423,103 @@ ROUND = [
 ]
 
 
-class TestRoundRoom:
-    """It tells where the robot is, but not how it is turned."""
-
-    @pytest.mark.parametrize(("plan", "lidar"), ROUND)
-    def test_the_heading_stays_that_of_the_odometry_and_is_said_uncertain(self, plan: FloorPlan, lidar: Lidar) -> None:
-        for number in (0, 2):  # whose odometry ends 6 deg off
-            run = driven_in(plan, number, lidar)
-            path = located(run, scanner=lidar.scanner)
-            wrong = since_start(run.odometry(run.scans.times)[:, 2])
-            assert np.abs(wrong - run.true[:, 2])[-1] > 5 * DEGREE
-            assert np.abs(since_start(path.poses[:, 2]) - wrong).max() < 0.6 * DEGREE
-            stated = np.sqrt(path.covariances[1:, 2, 2])
-            assert (np.abs(path.poses - run.true)[1:, 2] < 2 * stated).all()
-            assert stated[-1] > 5 * DEGREE
-            assert problems(path) == ["scans tell too little of the heading"]
-
-    @pytest.mark.slow
-    def test_off_its_centre_the_heading_is_no_worse_than_the_odometrys(self) -> None:
-        for number in range(3):  # its way about the centre tells of the heading, too
-            run = driven_in(polygon(400, start=(1.0, 0.5)), number)
-            path = located(run)
-            wrong = since_start(run.odometry(run.scans.times)[:, 2]) - run.true[:, 2]
-            assert np.abs(path.poses - run.true)[-1, 2] < abs(wrong[-1]) + 0.6 * DEGREE
-            assert np.sqrt(path.covariances[-1, 2, 2]) > 5 * DEGREE
-            assert problems(path) == ["scans tell too little of the heading"]
-
-    def test_where_the_robot_is_in_it_stays_known(self) -> None:
-        run = driven_in(polygon(400), 1)  # straight, and its odometry keeps the heading
-        found = (located(run).poses - run.true)[:, :2]
-        assert np.hypot(*found.T).max() < 5 * MM
+# A round room tells where the robot is, but not how it is turned.
 
 
-class TestNearlyRoundRoom:
-    @pytest.mark.parametrize(
-        "plan",
-        [polygon(8), *(pytest.param(polygon(400, stretch=each), marks=pytest.mark.slow) for each in (1.2, 2.0))],
-        ids=["octagon", "oval", "ellipse"],
-    )
-    def test_the_heading_is_told_by_its_shape(self, plan: FloorPlan) -> None:
-        for number in range(3):
-            run = driven_in(plan, number)
-            path = located(run)
-            assert np.abs(path.poses - run.true)[-1, 2] < 0.2 * DEGREE
-            assert path.covariances[-1, 2, 2] < (0.2 * DEGREE) ** 2
-            assert path.warnings == ()
+@pytest.mark.parametrize(("plan", "lidar"), ROUND)
+def test_in_a_round_room_the_heading_stays_that_of_the_odometry_and_is_said_uncertain(
+    plan: FloorPlan, lidar: Lidar
+) -> None:
+    for number in (0, 2):  # whose odometry ends 6 deg off
+        run = driven_in(plan, number, lidar)
+        path = located(run, scanner=lidar.scanner)
+        wrong = since_start(run.odometry(run.scans.times)[:, 2])
+        assert np.abs(wrong - run.true[:, 2])[-1] > 5 * DEGREE
+        assert np.abs(since_start(path.poses[:, 2]) - wrong).max() < 0.6 * DEGREE
+        stated = np.sqrt(path.covariances[1:, 2, 2])
+        assert (np.abs(path.poses - run.true)[1:, 2] < 2 * stated).all()
+        assert stated[-1] > 5 * DEGREE
+        assert problems(path) == ["scans tell too little of the heading"]
 
 
-class TestDisagreementWithTheOdometry:
-    @pytest.mark.parametrize("options", [SlamOptions(), LAST_POSE], ids=["odometry", "last_pose"])
-    @pytest.mark.parametrize("number", [1, *slow(0, 3)])
-    def test_a_mirrored_or_turned_scanner_and_standing_wheels_are_said(self, number: int, options: SlamOptions) -> None:
-        run, scanner = driven_in(room("furnished_room"), number), LIDAR.scanner
-        turned = scanner.model_copy(update={"mount": scanner.mount.model_copy(update={"yaw": np.pi})})
-        still = run_slam(run.scans, scanner, SlamOptions(), np.zeros(3), lambda times: np.zeros((len(times), 3)))
-        for path in (located(mirrored(run), options), located(run, scanner=turned), still):
-            (problem,) = problems(path)
-            assert re.match(r"poses and odometry disagree by \d+ % of the motion: .*mirrored", problem)
-        assert "by 1000 % of the motion" in problem  # which is the most that is said
+@pytest.mark.slow
+def test_off_the_centre_of_a_round_room_the_heading_is_no_worse_than_the_odometrys() -> None:
+    for number in range(3):  # its way about the centre tells of the heading, too
+        run = driven_in(polygon(400, start=(1.0, 0.5)), number)
+        path = located(run)
+        wrong = since_start(run.odometry(run.scans.times)[:, 2]) - run.true[:, 2]
+        assert np.abs(path.poses - run.true)[-1, 2] < abs(wrong[-1]) + 0.6 * DEGREE
+        assert np.sqrt(path.covariances[-1, 2, 2]) > 5 * DEGREE
+        assert problems(path) == ["scans tell too little of the heading"]
 
-    @pytest.mark.slow
-    @pytest.mark.parametrize("scale", [0.8, 1.25])
-    @pytest.mark.parametrize("options", [SlamOptions(), LAST_POSE], ids=["odometry", "last_pose"])
-    def test_within_what_wheels_may_be_wrong_by_is_not_said(self, options: SlamOptions, scale: float) -> None:
-        for number in range(3):
-            run = driven_in(room("furnished_room"), number)
 
-            def odometry(times: Array, run: Run = run) -> Array:
-                return run.odometry(times) * np.array([scale, scale, 1.0])
+def test_where_the_robot_is_in_a_round_room_stays_known() -> None:
+    run = driven_in(polygon(400), 1)  # straight, and its odometry keeps the heading
+    found = (located(run).poses - run.true)[:, :2]
+    assert np.hypot(*found.T).max() < 5 * MM
 
-            assert run_slam(run.scans, LIDAR.scanner, options, np.zeros(3), odometry).warnings == ()
 
-    def test_along_what_scans_do_not_tell_is_not_said(self) -> None:
-        run = driven_in(room("corridor"), 0)
-        (problem,) = problems(located(run, LAST_POSE))
-        assert problem.startswith("scans tell too little along")
+@pytest.mark.parametrize(
+    "plan",
+    [polygon(8), *(pytest.param(polygon(400, stretch=each), marks=pytest.mark.slow) for each in (1.2, 2.0))],
+    ids=["octagon", "oval", "ellipse"],
+)
+def test_in_a_nearly_round_room_the_heading_is_told_by_its_shape(plan: FloorPlan) -> None:
+    for number in range(3):
+        run = driven_in(plan, number)
+        path = located(run)
+        assert np.abs(path.poses - run.true)[-1, 2] < 0.2 * DEGREE
+        assert path.covariances[-1, 2, 2] < (0.2 * DEGREE) ** 2
+        assert path.warnings == ()
 
-    @pytest.mark.slow
-    def test_of_many_runs_is_one_sentence_with_its_mean(self) -> None:
-        shares, trajectories, scans = [], [], {}
-        for number in (0, 1, 3):
-            run = mirrored(driven_in(room("furnished_room"), number))
-            shares += [warning.share for warning in located(run).warnings if warning.share is not None]
-            ends = np.array([0.0, float(run.log.times[-1])])
-            trajectories.append(
-                Trajectory(f"run-{number}", "train", run.log.times, run.log.rates, ends, np.zeros((2, 3)), command="")
-            )
-            scans[f"run-{number}"] = run.scans
-        held = ScansInMemory(LIDAR.scanner, scans)
-        dataset = make_dataset("mirrored", ROBOT, 0.01, trajectories, simulated=True, scans=held)
-        (warning,) = [each for each in slam_dataset(dataset, SlamOptions(), workers=1).warnings if "SLAM" in each]
-        assert warning.startswith(f"SLAM: poses and odometry disagree by {100 * np.mean(shares):.0f} % of the motion")
-        assert warning.endswith(": 3 of 3 runs, e.g. run-0, run-1, run-3")
+
+@pytest.mark.parametrize("options", [SlamOptions(), LAST_POSE], ids=["odometry", "last_pose"])
+@pytest.mark.parametrize("number", [1, *slow(0, 3)])
+def test_a_mirrored_or_turned_scanner_and_standing_wheels_are_said(number: int, options: SlamOptions) -> None:
+    run, scanner = driven_in(room("furnished_room"), number), LIDAR.scanner
+    turned = scanner.model_copy(update={"mount": scanner.mount.model_copy(update={"yaw": np.pi})})
+    still = run_slam(run.scans, scanner, SlamOptions(), np.zeros(3), lambda times: np.zeros((len(times), 3)))
+    for path in (located(mirrored(run), options), located(run, scanner=turned), still):
+        (problem,) = problems(path)
+        assert re.match(r"poses and odometry disagree by \d+ % of the motion: .*mirrored", problem)
+    assert "by 1000 % of the motion" in problem  # which is the most that is said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", [0.8, 1.25])
+@pytest.mark.parametrize("options", [SlamOptions(), LAST_POSE], ids=["odometry", "last_pose"])
+def test_a_disagreement_within_what_wheels_may_be_wrong_by_is_not_said(options: SlamOptions, scale: float) -> None:
+    for number in range(3):
+        run = driven_in(room("furnished_room"), number)
+
+        def odometry(times: Array, run: Run = run) -> Array:
+            return run.odometry(times) * np.array([scale, scale, 1.0])
+
+        assert run_slam(run.scans, LIDAR.scanner, options, np.zeros(3), odometry).warnings == ()
+
+
+def test_a_disagreement_along_what_scans_do_not_tell_is_not_said() -> None:
+    run = driven_in(room("corridor"), 0)
+    (problem,) = problems(located(run, LAST_POSE))
+    assert problem.startswith("scans tell too little along")
+
+
+@pytest.mark.slow
+def test_a_disagreement_of_many_runs_is_one_sentence_with_its_mean() -> None:
+    shares, trajectories, scans = [], [], {}
+    for number in (0, 1, 3):
+        run = mirrored(driven_in(room("furnished_room"), number))
+        shares += [warning.share for warning in located(run).warnings if warning.share is not None]
+        ends = np.array([0.0, float(run.log.times[-1])])
+        trajectories.append(
+            Trajectory(f"run-{number}", "train", run.log.times, run.log.rates, ends, np.zeros((2, 3)), command="")
+        )
+        scans[f"run-{number}"] = run.scans
+    held = ScansInMemory(LIDAR.scanner, scans)
+    dataset = make_dataset("mirrored", ROBOT, 0.01, trajectories, simulated=True, scans=held)
+    (warning,) = [each for each in slam_dataset(dataset, SlamOptions(), workers=1).warnings if "SLAM" in each]
+    assert warning.startswith(f"SLAM: poses and odometry disagree by {100 * np.mean(shares):.0f} % of the motion")
+    assert warning.endswith(": 3 of 3 runs, e.g. run-0, run-1, run-3")
 
 
 # SLAM of whole data sets: what becomes of them, on import too, and what is said of bad ones.
@@ -551,143 +561,147 @@ def with_scans(dataset: Dataset, **changed: TrajectoryScans | None) -> Dataset:
     return replace(dataset, scans=ScansInMemory(LIDAR.scanner, kept))
 
 
-class TestPoses:
-    def test_are_found_from_the_start_pose_on_at_the_stamps_of_the_scans_and_all_else_stays(self) -> None:
-        dataset, truth = recorded()
-        found = found_alone()
-        for run in found.trajectories:
-            np.testing.assert_array_equal(run.pose_times, truth[run.id].times)
-            np.testing.assert_array_equal(run.poses[0], START)
-            assert np.abs(run.poses - truth[run.id].poses).max() < 0.004
-            assert (np.linalg.eigvalsh(run.pose_covariances) > 0).all()
-        assert (found.name, found.robot, found.simulated, found.scans) == ("rooms", ROBOT, True, dataset.scans)
-        for before, after in zip(dataset.trajectories, found.trajectories, strict=True):
-            assert after.command == before.command
-            np.testing.assert_array_equal(after.rates, before.rates)
-        assert found.warnings == ()
-
-    def test_do_not_depend_on_the_number_of_processes_and_progress_is_told_run_by_run(self) -> None:
-        told: list[Progress] = []
-        found = slam_dataset(recorded()[0], SlamOptions(), workers=2, watch=told.append)
-        assert found.hash == found_alone().hash
-        assert told == [Progress("SLAM", done, 3, "run") for done in range(4)]
-
-    def test_do_not_depend_on_the_odometry_that_the_search_starts_from(self) -> None:
-        dataset, _ = recorded()
-        better = OdometryModel(ROBOT, published_matrix("palacin2023_eq9"), "arc")
-        other = slam_dataset(dataset, SlamOptions(), model=better, workers=1)
-        for one, two in zip(found_alone().trajectories, other.trajectories, strict=True):
-            assert 0 < np.abs(one.poses - two.poses).max() < 0.0002
-
-    def test_begin_at_t_0_when_the_first_scan_comes_later(self) -> None:
-        dataset, truth = recorded()
-        scans = dataset.scans.of("run-1")
-        late = with_scans(dataset, run_1=TrajectoryScans(scans.times[1:], scans.ranges[1:]))
-        run = slam_dataset(late, SlamOptions(), workers=1).trajectories[1]
-        np.testing.assert_array_equal(run.pose_times, [0.0, *scans.times[1:]])
+def test_poses_are_found_from_the_start_pose_on_at_the_stamps_of_the_scans_and_all_else_stays() -> None:
+    dataset, truth = recorded()
+    found = found_alone()
+    for run in found.trajectories:
+        np.testing.assert_array_equal(run.pose_times, truth[run.id].times)
         np.testing.assert_array_equal(run.poses[0], START)
-        assert len(run.pose_covariances) == len(run.poses)
-        assert np.abs(run.poses - truth["run-1"].poses).max() < 0.01  # as the odometry missed until then
-        np.testing.assert_array_equal(run.pose_covariances[0], FLOOR)
-
-    def test_are_as_uncertain_as_the_odometry_until_a_first_scan_that_comes_later(self) -> None:
-        dataset, truth = recorded()
-        late = {name: TrajectoryScans(scans.times[8:], scans.ranges[8:]) for name, scans in dataset.scans}
-        found = slam_dataset(replace(dataset, scans=ScansInMemory(LIDAR.scanner, late)), SlamOptions(), workers=1)
-        for run in found.trajectories:
-            way = np.hypot(*(run.poses[1] - START)[:2])
-            assert way > 0.2
-            stated = np.sqrt(np.linalg.eigvalsh(run.pose_covariances[:, :2, :2])[:, -1])
-            assert stated[0] == pytest.approx(1e-4)
-            assert (stated[1:] > 0.09 * way).all()
-        every = slam_accuracy(found, truth).every
-        assert every.nees_mean < 5
-        (warning,) = found.warnings
-        assert warning.startswith("SLAM: the robot moves before the first scan, whose pose is therefore as uncertain")
-        assert "3 of 3 runs" in warning
-
-    def test_leave_scans_before_t_0_out(self) -> None:
-        dataset, _ = recorded()
-        scans = dataset.scans.of("run-1")
-        early = TrajectoryScans(np.concatenate([[-0.2], scans.times]), np.vstack([scans.ranges[:1], scans.ranges]))
-        run = slam_dataset(with_scans(dataset, run_1=early), SlamOptions(), workers=1).trajectories[1]
-        np.testing.assert_array_equal(run.pose_times, scans.times)
+        assert np.abs(run.poses - truth[run.id].poses).max() < 0.004
+        assert (np.linalg.eigvalsh(run.pose_covariances) > 0).all()
+    assert (found.name, found.robot, found.simulated, found.scans) == ("rooms", ROBOT, True, dataset.scans)
+    for before, after in zip(dataset.trajectories, found.trajectories, strict=True):
+        assert after.command == before.command
+        np.testing.assert_array_equal(after.rates, before.rates)
+    assert found.warnings == ()
 
 
-class TestWhatIsSaid:
-    def test_a_corridor_is_named_with_its_direction_and_runs(self) -> None:
-        dataset, _ = recorded("corridor", 2)
-        (warning,) = slam_dataset(dataset, SlamOptions(), workers=1).warnings
-        # The robot stands along the corridor, within some degrees; its start pose is turned by 0.5 rad, or 29 deg.
-        said = (
-            r"SLAM: scans tell too little along (2[4-9]|3[0-4]) deg of the run's frame: 2 of 2 runs, e.g. run-0, run-1"
-        )
-        assert re.fullmatch(said, warning)
-
-    @pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
-    def test_missing_and_empty_scans_name_the_run_whoever_found_it(self, workers: int) -> None:
-        dataset, _ = recorded()
-        scans = dataset.scans.of("run-1")
-        ranges = scans.ranges.copy()
-        ranges[2] = np.inf
-        for changed, named in (
-            (replace(dataset, scans=None), r"scans\.parquet"),
-            (with_scans(dataset, run_2=None), "run-2 has no scans"),
-            (with_scans(dataset, run_1=TrajectoryScans(scans.times, ranges)), "run-1: SLAM: the scan at .* is empty"),
-        ):
-            with pytest.raises(DataError, match=f"data set rooms: .*{named}"):
-                slam_dataset(changed, SlamOptions(), workers=workers)
+def test_poses_do_not_depend_on_the_number_of_processes_and_progress_is_told_run_by_run() -> None:
+    told: list[Progress] = []
+    found = slam_dataset(recorded()[0], SlamOptions(), workers=2, watch=told.append)
+    assert found.hash == found_alone().hash
+    assert told == [Progress("SLAM", done, 3, "run") for done in range(4)]
 
 
-class TestAccuracy:
-    def test_is_that_of_the_poses(self) -> None:
-        _, truth = recorded()
-        found = slam_accuracy(found_alone(), truth)
-        assert found.runs == 3
-        assert found.distance_m == pytest.approx(3 * 0.4, rel=0.1)
-        assert found.final.poses == 3
-        assert found.every.poses == sum(len(path.times) - 1 for path in truth.values())
-        assert 0 < found.final.position_mean_m <= found.final.position_p95_m <= found.final.position_max_m < 0.004
-        assert 0 < found.every.heading_mean_rad < found.every.heading_max_rad < 0.002
-        assert 1 < found.every.nees_mean < 6
+def test_poses_do_not_depend_on_the_odometry_that_the_search_starts_from() -> None:
+    dataset, _ = recorded()
+    better = OdometryModel(ROBOT, published_matrix("palacin2023_eq9"), "arc")
+    other = slam_dataset(dataset, SlamOptions(), model=better, workers=1)
+    for one, two in zip(found_alone().trajectories, other.trajectories, strict=True):
+        assert 0 < np.abs(one.poses - two.poses).max() < 0.0002
 
-    def test_growing_errors_are_drift_and_bias_in_the_robots_frame(self) -> None:
-        dataset, truth = recorded()
-        runs = []
-        for run in dataset.trajectories:
-            path = truth[run.id]
-            way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path.poses[:, :2], axis=0).T))])
-            left = path.poses[:, 2] + np.pi / 2
-            poses = path.poses + 0.02 * way[:, None] * np.column_stack([np.cos(left), np.sin(left), 0.5 + 0 * left])
-            runs.append(replace(run, pose_times=path.times, poses=poses))
-        found = slam_accuracy(make_dataset("drifting", ROBOT, 0.01, runs), truth)
-        assert found.drift_position == pytest.approx(0.02, rel=1e-6)
-        assert found.drift_heading == pytest.approx(0.01, rel=1e-6)
-        assert found.final.bias_left_m == pytest.approx(found.final.position_mean_m, rel=1e-6)
-        assert found.final.bias_forward_m == pytest.approx(0, abs=1e-9)
-        assert found.final.position_mean_m == pytest.approx(0.02 * found.distance_m / 3, rel=1e-6)
-        assert found.every.nees_mean is None  # covariances are not known
 
-    def test_singular_covariances_of_a_foreign_data_set_are_left_out_of_the_nees(self) -> None:
-        dataset, truth = recorded(runs=1)
-        (run,) = dataset.trajectories
+def test_poses_begin_at_t_0_when_the_first_scan_comes_later() -> None:
+    dataset, truth = recorded()
+    scans = dataset.scans.of("run-1")
+    late = with_scans(dataset, run_1=TrajectoryScans(scans.times[1:], scans.ranges[1:]))
+    run = slam_dataset(late, SlamOptions(), workers=1).trajectories[1]
+    np.testing.assert_array_equal(run.pose_times, [0.0, *scans.times[1:]])
+    np.testing.assert_array_equal(run.poses[0], START)
+    assert len(run.pose_covariances) == len(run.poses)
+    assert np.abs(run.poses - truth["run-1"].poses).max() < 0.01  # as the odometry missed until then
+    np.testing.assert_array_equal(run.pose_covariances[0], FLOOR)
+
+
+def test_poses_are_as_uncertain_as_the_odometry_until_a_first_scan_that_comes_later() -> None:
+    dataset, truth = recorded()
+    late = {name: TrajectoryScans(scans.times[8:], scans.ranges[8:]) for name, scans in dataset.scans}
+    found = slam_dataset(replace(dataset, scans=ScansInMemory(LIDAR.scanner, late)), SlamOptions(), workers=1)
+    for run in found.trajectories:
+        way = np.hypot(*(run.poses[1] - START)[:2])
+        assert way > 0.2
+        stated = np.sqrt(np.linalg.eigvalsh(run.pose_covariances[:, :2, :2])[:, -1])
+        assert stated[0] == pytest.approx(1e-4)
+        assert (stated[1:] > 0.09 * way).all()
+    every = slam_accuracy(found, truth).every
+    assert every.nees_mean < 5
+    (warning,) = found.warnings
+    assert warning.startswith("SLAM: the robot moves before the first scan, whose pose is therefore as uncertain")
+    assert "3 of 3 runs" in warning
+
+
+def test_poses_leave_scans_before_t_0_out() -> None:
+    dataset, _ = recorded()
+    scans = dataset.scans.of("run-1")
+    early = TrajectoryScans(np.concatenate([[-0.2], scans.times]), np.vstack([scans.ranges[:1], scans.ranges]))
+    run = slam_dataset(with_scans(dataset, run_1=early), SlamOptions(), workers=1).trajectories[1]
+    np.testing.assert_array_equal(run.pose_times, scans.times)
+
+
+def test_a_corridor_is_named_with_its_direction_and_runs() -> None:
+    dataset, _ = recorded("corridor", 2)
+    (warning,) = slam_dataset(dataset, SlamOptions(), workers=1).warnings
+    # The robot stands along the corridor, within some degrees; its start pose is turned by 0.5 rad, or 29 deg.
+    said = r"SLAM: scans tell too little along (2[4-9]|3[0-4]) deg of the run's frame: 2 of 2 runs, e.g. run-0, run-1"
+    assert re.fullmatch(said, warning)
+
+
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_missing_and_empty_scans_name_the_run_whoever_found_it(workers: int) -> None:
+    dataset, _ = recorded()
+    scans = dataset.scans.of("run-1")
+    ranges = scans.ranges.copy()
+    ranges[2] = np.inf
+    for changed, named in (
+        (replace(dataset, scans=None), r"scans\.parquet"),
+        (with_scans(dataset, run_2=None), "run-2 has no scans"),
+        (with_scans(dataset, run_1=TrajectoryScans(scans.times, ranges)), "run-1: SLAM: the scan at .* is empty"),
+    ):
+        with pytest.raises(DataError, match=f"data set rooms: .*{named}"):
+            slam_dataset(changed, SlamOptions(), workers=workers)
+
+
+def test_the_accuracy_is_that_of_the_poses() -> None:
+    _, truth = recorded()
+    found = slam_accuracy(found_alone(), truth)
+    assert found.runs == 3
+    assert found.distance_m == pytest.approx(3 * 0.4, rel=0.1)
+    assert found.final.poses == 3
+    assert found.every.poses == sum(len(path.times) - 1 for path in truth.values())
+    assert 0 < found.final.position_mean_m <= found.final.position_p95_m <= found.final.position_max_m < 0.004
+    assert 0 < found.every.heading_mean_rad < found.every.heading_max_rad < 0.002
+    assert 1 < found.every.nees_mean < 6
+
+
+def test_growing_errors_are_drift_and_bias_in_the_robots_frame() -> None:
+    dataset, truth = recorded()
+    runs = []
+    for run in dataset.trajectories:
         path = truth[run.id]
-        poses = path.poses + np.array([0.0, 0.002, 0.0])
-        poses[0] = START
-        flat = np.tile(np.diag([0.001, 0.001, 0.001]) ** 2, (len(poses), 1, 1))
-        none = replace(run, pose_times=path.times, poses=poses, pose_covariances=0 * flat)
-        assert slam_accuracy(replace(dataset, trajectories=(none,)), truth).every.nees_mean is None
-        flat[4, 2, 2] = 0.0
-        some = replace(none, pose_covariances=flat)
-        found = slam_accuracy(replace(dataset, trajectories=(some,)), truth)
-        assert found.every.nees_mean == pytest.approx(4.0)
-        assert np.isnan(run_errors(some, path).nees).sum() == 1
+        way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path.poses[:, :2], axis=0).T))])
+        left = path.poses[:, 2] + np.pi / 2
+        poses = path.poses + 0.02 * way[:, None] * np.column_stack([np.cos(left), np.sin(left), 0.5 + 0 * left])
+        runs.append(replace(run, pose_times=path.times, poses=poses))
+    found = slam_accuracy(make_dataset("drifting", ROBOT, 0.01, runs), truth)
+    assert found.drift_position == pytest.approx(0.02, rel=1e-6)
+    assert found.drift_heading == pytest.approx(0.01, rel=1e-6)
+    assert found.final.bias_left_m == pytest.approx(found.final.position_mean_m, rel=1e-6)
+    assert found.final.bias_forward_m == pytest.approx(0, abs=1e-9)
+    assert found.final.position_mean_m == pytest.approx(0.02 * found.distance_m / 3, rel=1e-6)
+    assert found.every.nees_mean is None  # covariances are not known
 
-    def test_another_truth_is_one_line(self) -> None:
-        dataset, truth = recorded()
-        others = {name: path for name, path in truth.items() if name != "run-1"}
-        with pytest.raises(DataError, match="trajectory run-1 is not in the truth"):
-            slam_accuracy(dataset, others)
+
+def test_singular_covariances_of_a_foreign_data_set_are_left_out_of_the_nees() -> None:
+    dataset, truth = recorded(runs=1)
+    (run,) = dataset.trajectories
+    path = truth[run.id]
+    poses = path.poses + np.array([0.0, 0.002, 0.0])
+    poses[0] = START
+    flat = np.tile(np.diag([0.001, 0.001, 0.001]) ** 2, (len(poses), 1, 1))
+    none = replace(run, pose_times=path.times, poses=poses, pose_covariances=0 * flat)
+    assert slam_accuracy(replace(dataset, trajectories=(none,)), truth).every.nees_mean is None
+    flat[4, 2, 2] = 0.0
+    some = replace(none, pose_covariances=flat)
+    found = slam_accuracy(replace(dataset, trajectories=(some,)), truth)
+    assert found.every.nees_mean == pytest.approx(4.0)
+    assert np.isnan(run_errors(some, path).nees).sum() == 1
+
+
+def test_another_truth_is_one_line() -> None:
+    dataset, truth = recorded()
+    others = {name: path for name, path in truth.items() if name != "run-1"}
+    with pytest.raises(DataError, match="trajectory run-1 is not in the truth"):
+        slam_accuracy(dataset, others)
 
 
 @pytest.fixture(scope="module")

@@ -580,129 +580,138 @@ def test_a_box_with_little_freedom_is_searched_without_complaint(name: str, box:
     np.testing.assert_array_equal(result.vector[:7], design.ravel()[:7])
 
 
-class TestGenetic:
-    """The paper's search."""
-
-    def test_it_stops_when_the_best_has_stalled(self) -> None:
-        result = run("genetic", make_problem(RUNS), stall_generations=5, tolerance=0.05)
-        assert result.outcome is Outcome.CONVERGED
-        assert "0.05 or less on average over 5 generations" in result.reason
-
-    def test_by_default_it_stops_when_50_generations_change_the_best_by_a_millionth_on_average(self) -> None:
-        result = run("genetic", make_problem(RUNS, evaluations=20_000), population=40)
-        last = 40 + 38 * np.arange((result.evaluations - 40) // 38 + 1)  # of each generation; two are the elite
-        costs = np.array([step.cost for step in result.history])
-        best = costs[np.searchsorted([step.evaluations for step in result.history], last, "right") - 1]
-        averages = np.convolve(np.abs(np.diff(best)) / best[1:], np.full(50, 1 / 50), "valid")
-        assert averages[-1] <= 1e-6 < averages[:-1].min()
-        assert averages[0] > 1e-4
-
-    def test_the_population_is_200_above_five_variables_and_50_below_and_the_elite_not_evaluated_again(self) -> None:
-        design = synthetic_robot().inverse_kinematic_matrix
-        width = np.zeros((3, 3))
-        width[2] = 0.02
-        few = box_between(design - width, design + width)
-        assert run("genetic", make_problem(RUNS), generations=1, elite=0.05).evaluations == 200 + 190
-        assert run("genetic", make_problem(RUNS, box=few), generations=1).evaluations == 50 + 47
-        result = run("genetic", make_problem(RUNS), population=20, elite=0.5, generations=4)
-        assert result.evaluations == 20 + 4 * 10
-        assert (result.outcome, result.reason) == (Outcome.BUDGET, "4 generations")
+# The genetic algorithm, which is the paper's search.
 
 
-class TestNlopt:
-    """Controlled random search and ISRES."""
-
-    @pytest.mark.parametrize(
-        ("name", "shorter", "longer"),
-        [
-            ("crs", {"tolerance": 1e-1}, {"tolerance": 1e-3}),
-            pytest.param("isres", {"tolerance": 1e-1}, {"tolerance": 1e-3}, marks=pytest.mark.slow),
-            ("crs", {"tolerance": 1e-3, "population": 20}, {"tolerance": 1e-3, "population": 200}),
-        ],
-    )
-    def test_a_wider_tolerance_or_a_smaller_population_ends_the_search_earlier(
-        self, name: str, shorter: dict[str, Any], longer: dict[str, Any]
-    ) -> None:
-        few, many = (run(name, make_problem(RUNS), **options).evaluations for options in (shorter, longer))
-        assert few < many
-
-    @pytest.mark.parametrize("tolerances", [{"tolerance": 1e-2}, {"tolerance": 0.0, "step": 0.2}])
-    def test_the_tolerance_that_was_met_of_cost_or_step_is_named(self, tolerances: dict[str, float]) -> None:
-        result = run("crs", make_problem(RUNS), **tolerances)
-        assert result.outcome is Outcome.CONVERGED
-        assert f"below {list(tolerances.values())[-1]}" in result.reason
+def test_the_genetic_search_stops_when_the_best_has_stalled() -> None:
+    result = run("genetic", make_problem(RUNS), stall_generations=5, tolerance=0.05)
+    assert result.outcome is Outcome.CONVERGED
+    assert "0.05 or less on average over 5 generations" in result.reason
 
 
-class TestParametric:
-    """Section 4.2: the physical parameters of every wheel."""
-
-    def test_without_noise_it_finds_the_hidden_geometry_and_reports_its_matrix(self) -> None:
-        hidden = true_robot(synthetic_robot())
-        runs = synthetic_trajectories(synthetic_robot())
-        problem = make_problem(runs, parameterisation="geometry", evaluations=25_000)
-        result = run("parametric", problem)
-        radii, distances, angles = result.vector.reshape(3, 3)
-        np.testing.assert_allclose(radii, [wheel.radius for wheel in hidden.wheels], rtol=1e-5)
-        np.testing.assert_allclose(distances, [wheel.distance for wheel in hidden.wheels], rtol=1e-5)
-        np.testing.assert_allclose(angles, [wheel.angle for wheel in hidden.wheels], atol=1e-5)
-        np.testing.assert_array_equal(result.matrix, problem.matrix(result.vector))
-
-    def test_options_reach_the_search_and_its_name_the_reason(self) -> None:
-        problem = make_problem(RUNS, parameterisation="geometry")
-        result = run("parametric", problem, search="random_search", search_options={"candidates": 30})
-        assert result.evaluations == 31
-        assert result.reason == "random_search: 30 candidates tried"
-
-    @pytest.mark.parametrize(
-        ("options", "error", "named"),
-        [
-            ({"search": "parametric"}, ConfigError, "search"),
-            ({"search": "csr"}, UnknownNameError, "'csr'; did you mean 'crs'"),
-            ({"search_options": {"populaton": 5}}, ConfigError, "'populaton'; did you mean 'population'"),
-        ],
-    )
-    def test_a_search_that_is_itself_or_unknown_is_refused(self, options: Any, error: Any, named: str) -> None:
-        with pytest.raises(error, match=named):
-            calibrators.create("parametric", options)
+def test_by_default_the_genetic_search_stops_when_50_generations_change_the_best_by_a_millionth() -> None:
+    result = run("genetic", make_problem(RUNS, evaluations=20_000), population=40)
+    last = 40 + 38 * np.arange((result.evaluations - 40) // 38 + 1)  # of each generation; two are the elite
+    costs = np.array([step.cost for step in result.history])
+    best = costs[np.searchsorted([step.evaluations for step in result.history], last, "right") - 1]
+    averages = np.convolve(np.abs(np.diff(best)) / best[1:], np.full(50, 1 / 50), "valid")
+    assert averages[-1] <= 1e-6 < averages[:-1].min()
+    assert averages[0] > 1e-4
 
 
-class TestBaselines:
-    """What the others are measured against."""
+def test_the_population_is_200_above_five_variables_and_50_below_and_the_elite_not_evaluated_again() -> None:
+    design = synthetic_robot().inverse_kinematic_matrix
+    width = np.zeros((3, 3))
+    width[2] = 0.02
+    few = box_between(design - width, design + width)
+    assert run("genetic", make_problem(RUNS), generations=1, elite=0.05).evaluations == 200 + 190
+    assert run("genetic", make_problem(RUNS, box=few), generations=1).evaluations == 50 + 47
+    result = run("genetic", make_problem(RUNS), population=20, elite=0.5, generations=4)
+    assert result.evaluations == 20 + 4 * 10
+    assert (result.outcome, result.reason) == (Outcome.BUDGET, "4 generations")
 
-    def test_theoretical_is_the_design_and_random_search_tries_as_many_as_it_says(self) -> None:
-        problem = make_problem(RUNS)
-        result = run("theoretical", problem)
-        np.testing.assert_array_equal(result.matrix, synthetic_robot().inverse_kinematic_matrix)
-        assert result.cost == problem.values(problem.start[None])[0]
-        assert result.evaluations == 1
-        result = run("random_search", make_problem(RUNS), candidates=257, batch=50)
-        assert (result.evaluations, result.reason) == (258, "257 candidates tried")
 
-    ROWS = [[-0.09, 0.0, 0.09], [0.05, -0.1, 0.05], [0.24, 0.24, 0.24]]
+# Controlled random search and ISRES.
 
-    @pytest.mark.parametrize("matrix", ["palacin2023_eq8", "palacin2023_eq9", ROWS])
-    def test_published_is_the_matrix_as_printed_even_outside_the_box(self, matrix: Any) -> None:
-        result = run("published", make_problem(RUNS, box="paper"), matrix=matrix)
-        assert (result.outcome, result.at_bounds) == (Outcome.CONVERGED, ())
-        np.testing.assert_array_equal(result.matrix, published_matrix(matrix) if isinstance(matrix, str) else matrix)
 
-    def test_a_published_matrix_for_other_wheels_fails_in_words(self) -> None:
-        result = run("published", make_problem(wheels=4))
-        assert result.outcome is Outcome.FAILED
-        assert "12 values" in result.reason
+@pytest.mark.parametrize(
+    ("name", "shorter", "longer"),
+    [
+        ("crs", {"tolerance": 1e-1}, {"tolerance": 1e-3}),
+        pytest.param("isres", {"tolerance": 1e-1}, {"tolerance": 1e-3}, marks=pytest.mark.slow),
+        ("crs", {"tolerance": 1e-3, "population": 20}, {"tolerance": 1e-3, "population": 200}),
+    ],
+)
+def test_a_wider_tolerance_or_a_smaller_population_ends_the_search_earlier(
+    name: str, shorter: dict[str, Any], longer: dict[str, Any]
+) -> None:
+    few, many = (run(name, make_problem(RUNS), **options).evaluations for options in (shorter, longer))
+    assert few < many
 
-    @pytest.mark.parametrize(
-        ("matrix", "named"),
-        [
-            ([[1.0, 2.0, 3.0]] * 2, r"\[3, 3\]"),
-            ([[1.0, 2.0], [1.0, 2.0, 3.0], [1.0]], r"\[2, 3, 1\]"),
-            ([[1.0] * 9], r"\[9\]"),
-            ("palacin2023_eq7", "palacin2023_eq8, palacin2023_eq9"),
-        ],
-    )
-    def test_rows_that_are_no_matrix_and_unknown_matrices_are_refused(self, matrix: Any, named: str) -> None:
-        with pytest.raises(ConfigError, match=named):
-            calibrators.create("published", {"matrix": matrix})
+
+@pytest.mark.parametrize("tolerances", [{"tolerance": 1e-2}, {"tolerance": 0.0, "step": 0.2}])
+def test_the_tolerance_that_was_met_of_cost_or_step_is_named(tolerances: dict[str, float]) -> None:
+    result = run("crs", make_problem(RUNS), **tolerances)
+    assert result.outcome is Outcome.CONVERGED
+    assert f"below {list(tolerances.values())[-1]}" in result.reason
+
+
+# Section 4.2: the physical parameters of every wheel.
+
+
+def test_without_noise_parametric_finds_the_hidden_geometry_and_reports_its_matrix() -> None:
+    hidden = true_robot(synthetic_robot())
+    runs = synthetic_trajectories(synthetic_robot())
+    problem = make_problem(runs, parameterisation="geometry", evaluations=25_000)
+    result = run("parametric", problem)
+    radii, distances, angles = result.vector.reshape(3, 3)
+    np.testing.assert_allclose(radii, [wheel.radius for wheel in hidden.wheels], rtol=1e-5)
+    np.testing.assert_allclose(distances, [wheel.distance for wheel in hidden.wheels], rtol=1e-5)
+    np.testing.assert_allclose(angles, [wheel.angle for wheel in hidden.wheels], atol=1e-5)
+    np.testing.assert_array_equal(result.matrix, problem.matrix(result.vector))
+
+
+def test_options_reach_the_search_and_its_name_the_reason() -> None:
+    problem = make_problem(RUNS, parameterisation="geometry")
+    result = run("parametric", problem, search="random_search", search_options={"candidates": 30})
+    assert result.evaluations == 31
+    assert result.reason == "random_search: 30 candidates tried"
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "named"),
+    [
+        ({"search": "parametric"}, ConfigError, "search"),
+        ({"search": "csr"}, UnknownNameError, "'csr'; did you mean 'crs'"),
+        ({"search_options": {"populaton": 5}}, ConfigError, "'populaton'; did you mean 'population'"),
+    ],
+)
+def test_a_search_that_is_itself_or_unknown_is_refused(options: Any, error: Any, named: str) -> None:
+    with pytest.raises(error, match=named):
+        calibrators.create("parametric", options)
+
+
+# Baselines, which the others are measured against.
+
+
+def test_theoretical_is_the_design_and_random_search_tries_as_many_as_it_says() -> None:
+    problem = make_problem(RUNS)
+    result = run("theoretical", problem)
+    np.testing.assert_array_equal(result.matrix, synthetic_robot().inverse_kinematic_matrix)
+    assert result.cost == problem.values(problem.start[None])[0]
+    assert result.evaluations == 1
+    result = run("random_search", make_problem(RUNS), candidates=257, batch=50)
+    assert (result.evaluations, result.reason) == (258, "257 candidates tried")
+
+
+ROWS = [[-0.09, 0.0, 0.09], [0.05, -0.1, 0.05], [0.24, 0.24, 0.24]]
+
+
+@pytest.mark.parametrize("matrix", ["palacin2023_eq8", "palacin2023_eq9", ROWS])
+def test_published_is_the_matrix_as_printed_even_outside_the_box(matrix: Any) -> None:
+    result = run("published", make_problem(RUNS, box="paper"), matrix=matrix)
+    assert (result.outcome, result.at_bounds) == (Outcome.CONVERGED, ())
+    np.testing.assert_array_equal(result.matrix, published_matrix(matrix) if isinstance(matrix, str) else matrix)
+
+
+def test_a_published_matrix_for_other_wheels_fails_in_words() -> None:
+    result = run("published", make_problem(wheels=4))
+    assert result.outcome is Outcome.FAILED
+    assert "12 values" in result.reason
+
+
+@pytest.mark.parametrize(
+    ("matrix", "named"),
+    [
+        ([[1.0, 2.0, 3.0]] * 2, r"\[3, 3\]"),
+        ([[1.0, 2.0], [1.0, 2.0, 3.0], [1.0]], r"\[2, 3, 1\]"),
+        ([[1.0] * 9], r"\[9\]"),
+        ("palacin2023_eq7", "palacin2023_eq8, palacin2023_eq9"),
+    ],
+)
+def test_rows_that_are_no_matrix_and_unknown_matrices_are_refused(matrix: Any, named: str) -> None:
+    with pytest.raises(ConfigError, match=named):
+        calibrators.create("published", {"matrix": matrix})
 
 
 def test_a_published_matrix_is_not_kept_to_the_design_where_nothing_was_driven() -> None:

@@ -81,174 +81,187 @@ def shares(uncertainty: Uncertainty) -> Array:
     return uncertainty.standard_deviations / np.abs(ROBOT.inverse_kinematic_matrix).max(axis=1, keepdims=True)
 
 
-class TestInformation:
-    """Fisher information of the elements."""
-
-    @pytest.mark.parametrize("stamps", ["reference", "final"])
-    def test_it_is_that_of_the_residuals_covariance(self, stamps: str) -> None:
-        run = driven(FLOWER[:1], repetitions=1)[0]
-        log = run.final_log if stamps == "final" else run.reference_log
-        jacobian = OdometryBatch([log], "arc").jacobian(TRUTH).reshape(len(log.stamps), 3, 9)
-        steps = np.minimum.outer(log.stamps, log.stamps)
-        position = 0.004**2 * np.eye(len(steps)) + 0.002**2 * steps
-        heading = 0.006**2 * np.eye(len(steps)) + 0.003**2
-        expected = sum(
-            jacobian[:, row].T @ np.linalg.solve(covariance, jacobian[:, row])
-            for row, covariance in enumerate((position, position, heading))
-        )
-        (information,) = information_of_runs([run], TRUTH, "arc", NOISE, stamps=stamps)
-        np.testing.assert_allclose(information, expected, rtol=1e-9, atol=1e-6)
+# Fisher information of the elements.
 
 
-class TestCovariance:
-    """The sandwich of a sum of norms."""
-
-    @pytest.mark.slow
-    def test_it_agrees_with_the_bootstrap_on_the_flower(self) -> None:
-        problem, result = flower_problem()
-        said = uncertainty_of(problem, result).standard_deviations
-        intervals = bootstrap_intervals(problem, result.vector, resamples=150, rng=np.random.default_rng(0))
-        drawn = (intervals.high - intervals.low) / (2 * 1.96)
-        # Of 150 resamples a 95 % range is uncertain by 8 %; of 180 runs each estimate by as much again.
-        np.testing.assert_allclose(said / drawn, 1, atol=0.2)
-        assert np.mean(said / drawn) == pytest.approx(1, abs=0.1)
-
-    @pytest.mark.parametrize("cost", ["final_pose", "final_position", "trajectory"])
-    def test_every_cost_that_is_a_sum_of_norms_has_one(self, cost: str) -> None:
-        deviations = shares(found(driven(FLOWER), cost=cost))
-        assert (deviations > 1e-5).all()
-        assert (deviations < 0.02).all()
-
-    def test_a_cost_of_headings_says_nothing_of_rows_1_and_2(self) -> None:
-        uncertainty = found(driven(FLOWER), cost="final_heading")
-        assert not uncertainty.covariance[:6].any()
-        assert (uncertainty.standard_deviations[2] > 0).all()
-
-    def test_an_element_that_the_box_holds_has_no_variance_and_no_interval(self) -> None:
-        problem = make_problem(driven(FLOWER), box="paper")
-        result = solved(problem)
-        uncertainty = uncertainty_of(problem, result)
-        assert uncertainty.standard_deviations[0, 1] == 0
-        assert np.count_nonzero(uncertainty.standard_deviations) == 8
-        drawn = bootstrap_intervals(problem, result.vector, resamples=60, rng=np.random.default_rng(1))
-        for intervals in (uncertainty.intervals, drawn):
-            assert np.argwhere(np.isnan(intervals.low)).tolist() == [[0, 1]]
-
-    def test_what_depends_on_an_element_on_a_bound_has_no_interval(self) -> None:
-        truth, wide = TRUTH[1, 2], np.abs(ROBOT.inverse_kinematic_matrix)
-        lower, upper = ROBOT.inverse_kinematic_matrix - wide - 0.1, ROBOT.inverse_kinematic_matrix + wide + 0.1
-        design = ROBOT.inverse_kinematic_matrix[1, 2]
-        (upper if truth > design else lower)[1, 2] = (truth + design) / 2
-        box = ExplicitBox(lower=matrix_rows(lower), upper=matrix_rows(upper))
-        problem = make_problem(driven(FLOWER), box=box)
-        result = solved(problem)
-        assert result.at_bounds == ("m23",)
-        drawn = bootstrap_intervals(problem, result.vector, resamples=60, rng=np.random.default_rng(1))
-        uncertainty = uncertainty_of(problem, result)
-        for intervals in (uncertainty.intervals, drawn):
-            assert np.argwhere(np.isnan(intervals.low)).tolist() == [[1, 2]]
-            assert np.argwhere(np.isnan(intervals.high)).tolist() == [[1, 2]]
-        told = {each.untold for each in uncertainty.parameters}
-        assert told == {"no interval"}
-
-    def test_resamples_that_a_bound_stops_have_no_interval(self) -> None:
-        free = solved(make_problem(driven(FLOWER)))
-        wide = np.abs(ROBOT.inverse_kinematic_matrix).max() + np.zeros((3, 3))
-        lower, upper = free.matrix - wide, free.matrix + wide
-        above = free.matrix[0, 0] > ROBOT.inverse_kinematic_matrix[0, 0]
-        (upper if above else lower)[0, 0] = free.matrix[0, 0] + (1e-5 if above else -1e-5)
-        problem = make_problem(driven(FLOWER), box=ExplicitBox(lower=matrix_rows(lower), upper=matrix_rows(upper)))
-        result = solved(problem)
-        assert result.at_bounds == ()
-        drawn = bootstrap_intervals(problem, result.vector, resamples=60, rng=np.random.default_rng(1))
-        assert np.argwhere(np.isnan(drawn.low)).tolist() == [[0, 0]]
-
-    def test_directions_that_are_kept_have_no_variance_and_their_parameters_none_at_all(self) -> None:
-        uncertainty = found(driven(RING, slip=0.02))
-        turn = np.kron(np.eye(3), np.ones(3))
-        np.testing.assert_allclose(turn @ uncertainty.covariance @ turn.T, 0, atol=1e-18)
-        assert (uncertainty.standard_deviations > 0).all()
-        untold = [each.name for each in uncertainty.parameters if each.standard_deviation is None]
-        assert untold == ["distance_a", "distance_b", "distance_c"]
-
-    @pytest.mark.parametrize(("freedom", "quantile"), [(None, 1.960), (np.full(9, 4.0), 2.776)])
-    def test_a_calibrator_s_own_covariance_and_freedom_are_taken(self, freedom: Array | None, quantile: float) -> None:
-        problem, deviations = make_problem(driven(FLOWER)), np.sqrt(np.arange(1.0, 10.0)) * 1e-4
-        own = replace(solved(problem), covariance=np.diag(deviations**2), degrees_of_freedom=freedom, noise=NOISE)
-        uncertainty = uncertainty_of(problem, own)
-        np.testing.assert_allclose(uncertainty.standard_deviations.ravel(), deviations)
-        assert (uncertainty.basis, uncertainty.noise) == ("likelihood", NOISE)
-        half_widths = (uncertainty.intervals.high - uncertainty.intervals.low).ravel() / 2
-        np.testing.assert_allclose(half_widths, quantile * deviations, rtol=2e-4)
-
-
-class TestBasis:
-    """What the covariance rests on, chosen by rule and said in words."""
-
-    def test_repetitions_are_used_where_there_are_some_and_runs_scatter_about_zero_elsewhere(self) -> None:
-        assert "48 runs of 16 commands" in found(driven(FLOWER)).source
-        once = found(driven(FLOWER, repetitions=1))
-        unnamed = found([replace(run, command=None) for run in driven(FLOWER)])
-        assert "16 runs: no command is repeated" in once.source
-        assert "no command is repeated" in unnamed.source
-
-    @pytest.mark.parametrize(
-        ("runs", "cost", "reason"),
-        [
-            (driven(RING[1:3], repetitions=1), "trajectory", "too few"),
-            (driven(FLOWER, noise=0.0), "final_pose", "exactly"),
-            ([replace(run, rates=0 * run.rates) for run in driven(FLOWER)], "final_pose", "free"),
-        ],
+@pytest.mark.parametrize("stamps", ["reference", "final"])
+def test_the_information_is_that_of_the_residuals_covariance(stamps: str) -> None:
+    run = driven(FLOWER[:1], repetitions=1)[0]
+    log = run.final_log if stamps == "final" else run.reference_log
+    jacobian = OdometryBatch([log], "arc").jacobian(TRUTH).reshape(len(log.stamps), 3, 9)
+    steps = np.minimum.outer(log.stamps, log.stamps)
+    position = 0.004**2 * np.eye(len(steps)) + 0.002**2 * steps
+    heading = 0.006**2 * np.eye(len(steps)) + 0.003**2
+    expected = sum(
+        jacobian[:, row].T @ np.linalg.solve(covariance, jacobian[:, row])
+        for row, covariance in enumerate((position, position, heading))
     )
-    def test_few_still_or_exact_runs_have_no_covariance(self, runs: list[Trajectory], cost: str, reason: str) -> None:
-        with pytest.raises(NoCovarianceError, match=reason):
-            found(runs, cost=cost)
-
-    def test_an_answer_that_is_no_minimum_is_told(self) -> None:
-        problem = make_problem(driven(FLOWER))
-        best = solved(problem)
-        off = replace(best, vector=best.vector * 1.02, matrix=problem.matrix(best.vector * 1.02))
-        with pytest.raises(NoCovarianceError, match="standard deviations away"):
-            uncertainty_of(problem, off)
+    (information,) = information_of_runs([run], TRUTH, "arc", NOISE, stamps=stamps)
+    np.testing.assert_allclose(information, expected, rtol=1e-9, atol=1e-6)
 
 
-class TestParameters:
-    """Radius, distance and angle of each wheel."""
+# The sandwich of a sum of norms.
 
-    @given(seed=st.integers(0, 2**16))
-    def test_geometries_near_the_design_survive_the_way_to_the_matrix_and_back(self, seed: int) -> None:
-        design = WheelGeometry(ROBOT).start
-        geometry = design * (1 + 0.05 * np.random.default_rng(seed).standard_normal(9))
-        matrix = inverse_kinematic_matrices(*geometry.reshape(3, 1, 3))[0]
-        np.testing.assert_allclose(geometry_of(matrix, ROBOT), geometry, rtol=1e-9)
 
-    def test_the_slopes_are_those_of_the_way_back(self) -> None:
-        geometry = geometry_of(TRUTH, ROBOT)
-        step = 1e-6 * np.random.default_rng(0).standard_normal((3, 3))
-        moved = geometry_of(TRUTH + step, ROBOT) - geometry_of(TRUTH - step, ROBOT)
-        np.testing.assert_allclose(WheelGeometry(ROBOT).slopes(geometry) @ moved / 2, step.flat, rtol=1e-5, atol=1e-12)
+@pytest.mark.slow
+def test_the_covariance_agrees_with_the_bootstrap_on_the_flower() -> None:
+    problem, result = flower_problem()
+    said = uncertainty_of(problem, result).standard_deviations
+    intervals = bootstrap_intervals(problem, result.vector, resamples=150, rng=np.random.default_rng(0))
+    drawn = (intervals.high - intervals.low) / (2 * 1.96)
+    # Of 150 resamples a 95 % range is uncertain by 8 %; of 180 runs each estimate by as much again.
+    np.testing.assert_allclose(said / drawn, 1, atol=0.2)
+    assert np.mean(said / drawn) == pytest.approx(1, abs=0.1)
 
-    @pytest.mark.parametrize("matrix", [np.zeros((3, 3)), np.ones((3, 3))])
-    def test_a_matrix_that_no_wheels_have_is_refused(self, matrix: Array) -> None:
-        with pytest.raises(DataError, match="no wheels have it"):
-            geometry_of(matrix, ROBOT)
 
-    def test_the_matrix_of_four_wheels_means_no_one_geometry(self) -> None:
-        problem = make_problem(driven(FLOWER, wheels=4), wheels=4)
-        assert uncertainty_of(problem, solved(problem)).parameters is None
-        with pytest.raises(DataError, match="three omni wheels"):
-            geometry_of(np.zeros((3, 4)), synthetic_robot(4))
+@pytest.mark.parametrize("cost", ["final_pose", "final_position", "trajectory"])
+def test_every_cost_that_is_a_sum_of_norms_has_a_covariance(cost: str) -> None:
+    deviations = shares(found(driven(FLOWER), cost=cost))
+    assert (deviations > 1e-5).all()
+    assert (deviations < 0.02).all()
 
-    @pytest.mark.slow
-    def test_both_ways_to_the_geometry_agree(self) -> None:
-        runs = driven(FLOWER, noise=0.01)
-        by_matrix = found(runs).parameters
-        problem = make_problem(runs, parameterisation="geometry")
-        by_geometry = uncertainty_of(problem, solved(problem, "parametric")).parameters
-        for one, other in zip(by_matrix, by_geometry, strict=True):
-            assert one.name == other.name
-            assert one.value == pytest.approx(other.value, rel=1e-4)
-            assert one.standard_deviation == pytest.approx(other.standard_deviation, rel=1e-3)
+
+def test_a_cost_of_headings_says_nothing_of_rows_1_and_2() -> None:
+    uncertainty = found(driven(FLOWER), cost="final_heading")
+    assert not uncertainty.covariance[:6].any()
+    assert (uncertainty.standard_deviations[2] > 0).all()
+
+
+def test_an_element_that_the_box_holds_has_no_variance_and_no_interval() -> None:
+    problem = make_problem(driven(FLOWER), box="paper")
+    result = solved(problem)
+    uncertainty = uncertainty_of(problem, result)
+    assert uncertainty.standard_deviations[0, 1] == 0
+    assert np.count_nonzero(uncertainty.standard_deviations) == 8
+    drawn = bootstrap_intervals(problem, result.vector, resamples=60, rng=np.random.default_rng(1))
+    for intervals in (uncertainty.intervals, drawn):
+        assert np.argwhere(np.isnan(intervals.low)).tolist() == [[0, 1]]
+
+
+def test_what_depends_on_an_element_on_a_bound_has_no_interval() -> None:
+    truth, wide = TRUTH[1, 2], np.abs(ROBOT.inverse_kinematic_matrix)
+    lower, upper = ROBOT.inverse_kinematic_matrix - wide - 0.1, ROBOT.inverse_kinematic_matrix + wide + 0.1
+    design = ROBOT.inverse_kinematic_matrix[1, 2]
+    (upper if truth > design else lower)[1, 2] = (truth + design) / 2
+    box = ExplicitBox(lower=matrix_rows(lower), upper=matrix_rows(upper))
+    problem = make_problem(driven(FLOWER), box=box)
+    result = solved(problem)
+    assert result.at_bounds == ("m23",)
+    drawn = bootstrap_intervals(problem, result.vector, resamples=60, rng=np.random.default_rng(1))
+    uncertainty = uncertainty_of(problem, result)
+    for intervals in (uncertainty.intervals, drawn):
+        assert np.argwhere(np.isnan(intervals.low)).tolist() == [[1, 2]]
+        assert np.argwhere(np.isnan(intervals.high)).tolist() == [[1, 2]]
+    told = {each.untold for each in uncertainty.parameters}
+    assert told == {"no interval"}
+
+
+def test_resamples_that_a_bound_stops_have_no_interval() -> None:
+    free = solved(make_problem(driven(FLOWER)))
+    wide = np.abs(ROBOT.inverse_kinematic_matrix).max() + np.zeros((3, 3))
+    lower, upper = free.matrix - wide, free.matrix + wide
+    above = free.matrix[0, 0] > ROBOT.inverse_kinematic_matrix[0, 0]
+    (upper if above else lower)[0, 0] = free.matrix[0, 0] + (1e-5 if above else -1e-5)
+    problem = make_problem(driven(FLOWER), box=ExplicitBox(lower=matrix_rows(lower), upper=matrix_rows(upper)))
+    result = solved(problem)
+    assert result.at_bounds == ()
+    drawn = bootstrap_intervals(problem, result.vector, resamples=60, rng=np.random.default_rng(1))
+    assert np.argwhere(np.isnan(drawn.low)).tolist() == [[0, 0]]
+
+
+def test_directions_that_are_kept_have_no_variance_and_their_parameters_none_at_all() -> None:
+    uncertainty = found(driven(RING, slip=0.02))
+    turn = np.kron(np.eye(3), np.ones(3))
+    np.testing.assert_allclose(turn @ uncertainty.covariance @ turn.T, 0, atol=1e-18)
+    assert (uncertainty.standard_deviations > 0).all()
+    untold = [each.name for each in uncertainty.parameters if each.standard_deviation is None]
+    assert untold == ["distance_a", "distance_b", "distance_c"]
+
+
+@pytest.mark.parametrize(("freedom", "quantile"), [(None, 1.960), (np.full(9, 4.0), 2.776)])
+def test_a_calibrator_s_own_covariance_and_freedom_are_taken(freedom: Array | None, quantile: float) -> None:
+    problem, deviations = make_problem(driven(FLOWER)), np.sqrt(np.arange(1.0, 10.0)) * 1e-4
+    own = replace(solved(problem), covariance=np.diag(deviations**2), degrees_of_freedom=freedom, noise=NOISE)
+    uncertainty = uncertainty_of(problem, own)
+    np.testing.assert_allclose(uncertainty.standard_deviations.ravel(), deviations)
+    assert (uncertainty.basis, uncertainty.noise) == ("likelihood", NOISE)
+    half_widths = (uncertainty.intervals.high - uncertainty.intervals.low).ravel() / 2
+    np.testing.assert_allclose(half_widths, quantile * deviations, rtol=2e-4)
+
+
+# What the covariance rests on, chosen by rule and said in words.
+
+
+def test_repetitions_are_used_where_there_are_some_and_runs_scatter_about_zero_elsewhere() -> None:
+    assert "48 runs of 16 commands" in found(driven(FLOWER)).source
+    once = found(driven(FLOWER, repetitions=1))
+    unnamed = found([replace(run, command=None) for run in driven(FLOWER)])
+    assert "16 runs: no command is repeated" in once.source
+    assert "no command is repeated" in unnamed.source
+
+
+@pytest.mark.parametrize(
+    ("runs", "cost", "reason"),
+    [
+        (driven(RING[1:3], repetitions=1), "trajectory", "too few"),
+        (driven(FLOWER, noise=0.0), "final_pose", "exactly"),
+        ([replace(run, rates=0 * run.rates) for run in driven(FLOWER)], "final_pose", "free"),
+    ],
+)
+def test_few_still_or_exact_runs_have_no_covariance(runs: list[Trajectory], cost: str, reason: str) -> None:
+    with pytest.raises(NoCovarianceError, match=reason):
+        found(runs, cost=cost)
+
+
+def test_an_answer_that_is_no_minimum_is_told() -> None:
+    problem = make_problem(driven(FLOWER))
+    best = solved(problem)
+    off = replace(best, vector=best.vector * 1.02, matrix=problem.matrix(best.vector * 1.02))
+    with pytest.raises(NoCovarianceError, match="standard deviations away"):
+        uncertainty_of(problem, off)
+
+
+# Radius, distance and angle of each wheel.
+
+
+@given(seed=st.integers(0, 2**16))
+def test_geometries_near_the_design_survive_the_way_to_the_matrix_and_back(seed: int) -> None:
+    design = WheelGeometry(ROBOT).start
+    geometry = design * (1 + 0.05 * np.random.default_rng(seed).standard_normal(9))
+    matrix = inverse_kinematic_matrices(*geometry.reshape(3, 1, 3))[0]
+    np.testing.assert_allclose(geometry_of(matrix, ROBOT), geometry, rtol=1e-9)
+
+
+def test_the_slopes_are_those_of_the_way_back() -> None:
+    geometry = geometry_of(TRUTH, ROBOT)
+    step = 1e-6 * np.random.default_rng(0).standard_normal((3, 3))
+    moved = geometry_of(TRUTH + step, ROBOT) - geometry_of(TRUTH - step, ROBOT)
+    np.testing.assert_allclose(WheelGeometry(ROBOT).slopes(geometry) @ moved / 2, step.flat, rtol=1e-5, atol=1e-12)
+
+
+@pytest.mark.parametrize("matrix", [np.zeros((3, 3)), np.ones((3, 3))])
+def test_a_matrix_that_no_wheels_have_is_refused(matrix: Array) -> None:
+    with pytest.raises(DataError, match="no wheels have it"):
+        geometry_of(matrix, ROBOT)
+
+
+def test_the_matrix_of_four_wheels_means_no_one_geometry() -> None:
+    problem = make_problem(driven(FLOWER, wheels=4), wheels=4)
+    assert uncertainty_of(problem, solved(problem)).parameters is None
+    with pytest.raises(DataError, match="three omni wheels"):
+        geometry_of(np.zeros((3, 4)), synthetic_robot(4))
+
+
+@pytest.mark.slow
+def test_both_ways_to_the_geometry_agree() -> None:
+    runs = driven(FLOWER, noise=0.01)
+    by_matrix = found(runs).parameters
+    problem = make_problem(runs, parameterisation="geometry")
+    by_geometry = uncertainty_of(problem, solved(problem, "parametric")).parameters
+    for one, other in zip(by_matrix, by_geometry, strict=True):
+        assert one.name == other.name
+        assert one.value == pytest.approx(other.value, rel=1e-4)
+        assert one.standard_deviation == pytest.approx(other.standard_deviation, rel=1e-3)
 
 
 def test_a_resampled_optimum_differs_from_a_full_refit_by_far_less_than_the_intervals_width() -> None:
@@ -635,169 +648,179 @@ def untold(found: Identifiability) -> tuple[str, ...]:
     return tuple(each.name for each in found.parameters if not each.told)
 
 
-class TestSmallMatrices:
-    """Information matrices of two or three wheels, whose inverses are known."""
-
-    def test_independent_elements_have_the_inverse_root_of_their_information(self) -> None:
-        information = np.diag([1.0, 4.0, 16.0, 25.0, 100.0, 0.25])
-        np.testing.assert_allclose(
-            deviations_along(information, np.eye(2)), [[1.0, 0.25, 0.1], [0.5, 0.2, 2.0]], rtol=1e-12
-        )
-
-    def test_directions_that_are_fitted_together_share_their_information_and_kept_ones_take_none(self) -> None:
-        correlated = np.kron(np.eye(3), [[2.0, 1.0], [1.0, 2.0]])  # its inverse is [[2, -1], [-1, 2]] / 3
-        together = deviations_along(correlated, np.eye(2))
-        alone = deviations_along(correlated, np.array([[1.0, 0.0]]))
-        turned = deviations_along(correlated, np.array([[1.0, 1.0], [1.0, -1.0]]) / math.sqrt(2))
-        np.testing.assert_allclose(together, math.sqrt(2 / 3) * np.ones((2, 3)), rtol=1e-12)
-        np.testing.assert_allclose(alone, math.sqrt(1 / 2) * np.ones((1, 3)), rtol=1e-12)
-        np.testing.assert_allclose(turned.T, np.tile([math.sqrt(1 / 3), 1.0], (3, 1)), rtol=1e-12)
-
-    def test_a_direction_without_information_is_open_and_leaves_the_others_as_they_are(self) -> None:
-        deviations = deviations_along(np.diag([4.0, 0.0, 4.0, 0.0, 4.0, 0.0]), np.eye(2))
-        np.testing.assert_allclose(deviations[0], 0.5, rtol=1e-12)
-        assert (deviations[1] > 1e6).all()
-        assert np.isfinite(deviations).all()
-
-    def test_each_parameter_needs_the_directions_in_which_it_shows(self) -> None:
-        """Equal steps of all three wheels turn the robot: only the distances change with what it then does."""
-        turn = np.full((1, 3), 1 / math.sqrt(3))
-        assert identified_parameters(WheelGeometry(ROBOT), np.zeros((0, 3))) == (True,) * 9
-        assert identified_parameters(WheelGeometry(ROBOT), turn) == (True,) * 3 + (False,) * 3 + (True,) * 3
-        assert identified_parameters(WheelGeometry(ROBOT), np.eye(3)) == (False,) * 9
+# Information matrices of two or three wheels, whose inverses are known.
 
 
-class TestPrecision:
-    """Predicted standard deviations, against those of linear regressions that are known."""
-
-    def test_headings_alone_give_row_3_the_precision_of_a_regression_on_wheel_angles(self) -> None:
-        """With positions that tell nothing, row 3 is m3 in heading = m3.C + noise at every stamp."""
-        rng = np.random.default_rng(1)
-        blurred = np.array([50.0, 50.0, 0.0])
-        runs = [
-            replace(run, poses=run.poses + blurred * rng.standard_normal(run.poses.shape))
-            for run in driven(FLOWER, repetitions=2)
-        ]
-        found = identifiability(ROBOT, runs)
-        information = 0.0
-        for run in runs:
-            angles, stamps = run.rates[0] * run.pose_times[1:, None], run.pose_times[1:]
-            noise = found.noise
-            covariance = noise.pose_heading**2 * np.eye(len(stamps)) + noise.bias_heading**2
-            covariance += noise.walk_heading**2 * np.minimum.outer(stamps, stamps)
-            information = information + angles.T @ np.linalg.solve(covariance, angles)
-        directions = unidentified_directions(ROBOT, driven_span(runs)), aligned(driven_span(runs).strong, ROBOT)
-        basis = np.concatenate(directions)
-        expected = np.sqrt(np.diag(basis @ np.linalg.inv(information) @ basis.T))
-        largest = np.abs(ROBOT.inverse_kinematic_matrix[2]).max()
-        predicted = [each.deviations[2] for each in found.directions if each.deviations is not None]
-        np.testing.assert_allclose(predicted, expected / largest, rtol=1e-3)
-
-
-class TestDirections:
-    """Every direction of wheel rates, with its motion and how well it is told."""
-
-    def test_runs_that_turn_and_drive_tell_everything_even_if_they_never_reverse(self) -> None:
-        found = told_of(FLOWER)
-        assert states(found) == dict.fromkeys(("turning on the spot", "moving along x", "moving along y"), "driven")
-        assert (found.sentences, untold(found)) == ((), ())
-        assert told_of(((SPEED, 0.0, 0.4), (0.0, SPEED, 0.4), (SPEED, SPEED, 0.4))).sentences == ()
-
-    @pytest.mark.parametrize("slip", [0.0, 0.02])
-    def test_translation_alone_leaves_the_turn_and_the_distances(self, slip: float) -> None:
-        found = told_of(RING, slip)
-        assert states(found)["turning on the spot"] == ("weak" if slip else "undriven")
-        assert untold(found) == DISTANCES
-        assert ", ".join(DISTANCES) in found.sentences[-1]
-
-    @pytest.mark.parametrize(
-        ("twists", "slip", "motion"),
-        [
-            (TURNS, 0.02, "turning on the spot"),
-            (((SPEED, 0.0, 0.0), (-SPEED, 0.0, 0.0)), 0.002, "moving along x"),
-            (((SPEED, 0.0, 0.3),), 0.0, "moving along x while turning"),
-        ],
+def test_independent_elements_have_the_inverse_root_of_their_information() -> None:
+    information = np.diag([1.0, 4.0, 16.0, 25.0, 100.0, 0.25])
+    np.testing.assert_allclose(
+        deviations_along(information, np.eye(2)), [[1.0, 0.25, 0.1], [0.5, 0.2, 2.0]], rtol=1e-12
     )
-    def test_turns_lines_or_one_command_alone_are_one_direction(
-        self, twists: tuple[Twist, ...], slip: float, motion: str
-    ) -> None:
-        found = told_of(twists, slip=slip)
-        assert [each.motion for each in found.directions if each.state == "driven"] == [motion]
-        assert {each.state for each in found.directions} <= {"driven", "weak", "undriven"}
-        assert len(untold(found)) >= 8
-        assert all("record" in sentence for sentence in found.sentences[:2])
-
-    def test_four_wheels_name_the_slipping_direction_apart_from_the_turn_and_slip_is_no_motion(self) -> None:
-        still = identifiability(synthetic_robot(4), driven(RING, wheels=4))
-        assert [(each.direction, each.motion) for each in still.directions[2:]] == [
-            ("fl + fr + rl + rr", "turning on the spot"),
-            ("fl - fr - rl + rr", ""),
-        ]
-        found = identifiability(synthetic_robot(4), driven(FLOWER, wheels=4, slip=0.02))
-        assert [each.state for each in found.directions] == ["driven"] * 3 + ["weak"]
-        (sentence,) = found.sentences
-        assert f"fl - fr - rl + rr, which only slips, with {100 * found.directions[3].share:.1f} %" in sentence
 
 
-class TestPrediction:
-    """The standard deviations that the noise allows."""
-
-    def test_noise_is_estimated_from_the_repetitions(self) -> None:
-        found = told_of(FLOWER)
-        assert found.noise.pose_position == pytest.approx(0.003, rel=0.1)
-        assert "48 runs of 16 commands" in found.noise_source
-
-    def test_a_row_that_is_told_badly_is_named_with_its_deviation(self) -> None:
-        found = told_of(((SPEED, 0.0, 0.4), (0.0, SPEED, 0.4), (SPEED, SPEED, -0.4)), noise=0.2, repetitions=2)
-        rough = next(sentence for sentence in found.sentences if sentence.startswith("of a + b + c"))
-        assert "row 1 (x) to " in rough
-        assert rough.endswith("record more or longer runs")
-
-    def test_runs_without_reference_poses_are_refused(self) -> None:
-        blind = [replace(run, pose_times=run.pose_times[:1], poses=run.poses[:1]) for run in driven(TURNS)]
-        with pytest.raises(DataError, match="no trajectory has a reference pose after its start"):
-            identifiability(ROBOT, blind)
+def test_directions_that_are_fitted_together_share_their_information_and_kept_ones_take_none() -> None:
+    correlated = np.kron(np.eye(3), [[2.0, 1.0], [1.0, 2.0]])  # its inverse is [[2, -1], [-1, 2]] / 3
+    together = deviations_along(correlated, np.eye(2))
+    alone = deviations_along(correlated, np.array([[1.0, 0.0]]))
+    turned = deviations_along(correlated, np.array([[1.0, 1.0], [1.0, -1.0]]) / math.sqrt(2))
+    np.testing.assert_allclose(together, math.sqrt(2 / 3) * np.ones((2, 3)), rtol=1e-12)
+    np.testing.assert_allclose(alone, math.sqrt(1 / 2) * np.ones((1, 3)), rtol=1e-12)
+    np.testing.assert_allclose(turned.T, np.tile([math.sqrt(1 / 3), 1.0], (3, 1)), rtol=1e-12)
 
 
-class TestWarnings:
-    """What a calibration says of the directions it could not tell."""
-
-    @pytest.mark.parametrize("wheels", [3, 4])
-    def test_fine_data_give_none(self, wheels: Any) -> None:
-        runs = driven(FLOWER, wheels=wheels)
-        assert warnings_of_calibration(synthetic_robot(wheels), driven_span(runs), "matrix", "keep") == ()
-
-    @pytest.mark.parametrize(
-        ("parameterisation", "unidentified", "end"),
-        [
-            ("matrix", "keep", "kept at the design values"),
-            ("matrix", "fit", "what was fitted there rests on slip and noise"),
-            ("geometry", "keep", "what was fitted to it rests on slip and noise"),
-        ],
-    )
-    def test_each_way_to_go_on_is_said(self, parameterisation: str, unidentified: str, end: str) -> None:
-        runs = driven(RING, slip=0.02)
-        (warning,) = warnings_of_calibration(ROBOT, driven_span(runs), parameterisation, unidentified)
-        assert "a + b + c (turning on the spot)" in warning
-        assert f"{100 * driven_span(runs).shares[2]:.1f} %" in warning
-        assert warning.endswith(end)
-
-    def test_what_is_not_driven_at_all_is_kept_whatever_is_asked(self) -> None:
-        (warning,) = warnings_of_calibration(ROBOT, driven_span(driven(RING)), "matrix", "fit")
-        assert warning.endswith("do; kept at the design values")
+def test_a_direction_without_information_is_open_and_leaves_the_others_as_they_are() -> None:
+    deviations = deviations_along(np.diag([4.0, 0.0, 4.0, 0.0, 4.0, 0.0]), np.eye(2))
+    np.testing.assert_allclose(deviations[0], 0.5, rtol=1e-12)
+    assert (deviations[1] > 1e6).all()
+    assert np.isfinite(deviations).all()
 
 
-class TestRecordings:
-    """The Robotino's table recordings translate only; omni3 drives everything."""
+def test_each_parameter_needs_the_directions_in_which_it_shows() -> None:
+    """Equal steps of all three wheels turn the robot: only the distances change with what it then does."""
+    turn = np.full((1, 3), 1 / math.sqrt(3))
+    assert identified_parameters(WheelGeometry(ROBOT), np.zeros((0, 3))) == (True,) * 9
+    assert identified_parameters(WheelGeometry(ROBOT), turn) == (True,) * 3 + (False,) * 3 + (True,) * 3
+    assert identified_parameters(WheelGeometry(ROBOT), np.eye(3)) == (False,) * 9
 
-    def test_table_recordings_leave_the_turn_open_and_omni3_nothing(self, robotino: Dataset, omni3: Dataset) -> None:
-        found = inspect_dataset(robotino)
-        turning = found.findings[0]
-        assert turning.startswith("these recordings hardly turn the robot: they drive the wheels along 1 + 2 + 3")
-        assert "what row 3 (heading) says of it cannot be identified" in turning
-        assert states(found.identifiability)["turning on the spot"] == "weak"
-        assert untold(found.identifiability) == ("distance_1", "distance_2", "distance_3")
-        assert warnings_of_calibration(omni3.robot, driven_span(omni3.split("train")), "matrix", "keep") == ()
+
+# Predicted standard deviations, against those of linear regressions that are known.
+
+
+def test_headings_alone_give_row_3_the_precision_of_a_regression_on_wheel_angles() -> None:
+    """With positions that tell nothing, row 3 is m3 in heading = m3.C + noise at every stamp."""
+    rng = np.random.default_rng(1)
+    blurred = np.array([50.0, 50.0, 0.0])
+    runs = [
+        replace(run, poses=run.poses + blurred * rng.standard_normal(run.poses.shape))
+        for run in driven(FLOWER, repetitions=2)
+    ]
+    found = identifiability(ROBOT, runs)
+    information = 0.0
+    for run in runs:
+        angles, stamps = run.rates[0] * run.pose_times[1:, None], run.pose_times[1:]
+        noise = found.noise
+        covariance = noise.pose_heading**2 * np.eye(len(stamps)) + noise.bias_heading**2
+        covariance += noise.walk_heading**2 * np.minimum.outer(stamps, stamps)
+        information = information + angles.T @ np.linalg.solve(covariance, angles)
+    directions = unidentified_directions(ROBOT, driven_span(runs)), aligned(driven_span(runs).strong, ROBOT)
+    basis = np.concatenate(directions)
+    expected = np.sqrt(np.diag(basis @ np.linalg.inv(information) @ basis.T))
+    largest = np.abs(ROBOT.inverse_kinematic_matrix[2]).max()
+    predicted = [each.deviations[2] for each in found.directions if each.deviations is not None]
+    np.testing.assert_allclose(predicted, expected / largest, rtol=1e-3)
+
+
+# Every direction of wheel rates, with its motion and how well it is told.
+
+
+def test_runs_that_turn_and_drive_tell_everything_even_if_they_never_reverse() -> None:
+    found = told_of(FLOWER)
+    assert states(found) == dict.fromkeys(("turning on the spot", "moving along x", "moving along y"), "driven")
+    assert (found.sentences, untold(found)) == ((), ())
+    assert told_of(((SPEED, 0.0, 0.4), (0.0, SPEED, 0.4), (SPEED, SPEED, 0.4))).sentences == ()
+
+
+@pytest.mark.parametrize("slip", [0.0, 0.02])
+def test_translation_alone_leaves_the_turn_and_the_distances(slip: float) -> None:
+    found = told_of(RING, slip)
+    assert states(found)["turning on the spot"] == ("weak" if slip else "undriven")
+    assert untold(found) == DISTANCES
+    assert ", ".join(DISTANCES) in found.sentences[-1]
+
+
+@pytest.mark.parametrize(
+    ("twists", "slip", "motion"),
+    [
+        (TURNS, 0.02, "turning on the spot"),
+        (((SPEED, 0.0, 0.0), (-SPEED, 0.0, 0.0)), 0.002, "moving along x"),
+        (((SPEED, 0.0, 0.3),), 0.0, "moving along x while turning"),
+    ],
+)
+def test_turns_lines_or_one_command_alone_are_one_direction(
+    twists: tuple[Twist, ...], slip: float, motion: str
+) -> None:
+    found = told_of(twists, slip=slip)
+    assert [each.motion for each in found.directions if each.state == "driven"] == [motion]
+    assert {each.state for each in found.directions} <= {"driven", "weak", "undriven"}
+    assert len(untold(found)) >= 8
+    assert all("record" in sentence for sentence in found.sentences[:2])
+
+
+def test_four_wheels_name_the_slipping_direction_apart_from_the_turn_and_slip_is_no_motion() -> None:
+    still = identifiability(synthetic_robot(4), driven(RING, wheels=4))
+    assert [(each.direction, each.motion) for each in still.directions[2:]] == [
+        ("fl + fr + rl + rr", "turning on the spot"),
+        ("fl - fr - rl + rr", ""),
+    ]
+    found = identifiability(synthetic_robot(4), driven(FLOWER, wheels=4, slip=0.02))
+    assert [each.state for each in found.directions] == ["driven"] * 3 + ["weak"]
+    (sentence,) = found.sentences
+    assert f"fl - fr - rl + rr, which only slips, with {100 * found.directions[3].share:.1f} %" in sentence
+
+
+# The standard deviations that the noise allows.
+
+
+def test_noise_is_estimated_from_the_repetitions() -> None:
+    found = told_of(FLOWER)
+    assert found.noise.pose_position == pytest.approx(0.003, rel=0.1)
+    assert "48 runs of 16 commands" in found.noise_source
+
+
+def test_a_row_that_is_told_badly_is_named_with_its_deviation() -> None:
+    found = told_of(((SPEED, 0.0, 0.4), (0.0, SPEED, 0.4), (SPEED, SPEED, -0.4)), noise=0.2, repetitions=2)
+    rough = next(sentence for sentence in found.sentences if sentence.startswith("of a + b + c"))
+    assert "row 1 (x) to " in rough
+    assert rough.endswith("record more or longer runs")
+
+
+def test_runs_without_reference_poses_are_refused() -> None:
+    blind = [replace(run, pose_times=run.pose_times[:1], poses=run.poses[:1]) for run in driven(TURNS)]
+    with pytest.raises(DataError, match="no trajectory has a reference pose after its start"):
+        identifiability(ROBOT, blind)
+
+
+# What a calibration says of the directions it could not tell.
+
+
+@pytest.mark.parametrize("wheels", [3, 4])
+def test_fine_data_give_no_warnings(wheels: Any) -> None:
+    runs = driven(FLOWER, wheels=wheels)
+    assert warnings_of_calibration(synthetic_robot(wheels), driven_span(runs), "matrix", "keep") == ()
+
+
+@pytest.mark.parametrize(
+    ("parameterisation", "unidentified", "end"),
+    [
+        ("matrix", "keep", "kept at the design values"),
+        ("matrix", "fit", "what was fitted there rests on slip and noise"),
+        ("geometry", "keep", "what was fitted to it rests on slip and noise"),
+    ],
+)
+def test_each_way_to_go_on_is_said(parameterisation: str, unidentified: str, end: str) -> None:
+    runs = driven(RING, slip=0.02)
+    (warning,) = warnings_of_calibration(ROBOT, driven_span(runs), parameterisation, unidentified)
+    assert "a + b + c (turning on the spot)" in warning
+    assert f"{100 * driven_span(runs).shares[2]:.1f} %" in warning
+    assert warning.endswith(end)
+
+
+def test_what_is_not_driven_at_all_is_kept_whatever_is_asked() -> None:
+    (warning,) = warnings_of_calibration(ROBOT, driven_span(driven(RING)), "matrix", "fit")
+    assert warning.endswith("do; kept at the design values")
+
+
+# The Robotino's table recordings translate only; omni3 drives everything.
+
+
+def test_table_recordings_leave_the_turn_open_and_omni3_nothing(robotino: Dataset, omni3: Dataset) -> None:
+    found = inspect_dataset(robotino)
+    turning = found.findings[0]
+    assert turning.startswith("these recordings hardly turn the robot: they drive the wheels along 1 + 2 + 3")
+    assert "what row 3 (heading) says of it cannot be identified" in turning
+    assert states(found.identifiability)["turning on the spot"] == "weak"
+    assert untold(found.identifiability) == ("distance_1", "distance_2", "distance_3")
+    assert warnings_of_calibration(omni3.robot, driven_span(omni3.split("train")), "matrix", "keep") == ()
 
 
 KNOWN = np.empty((0, 2))  # no direction of wheel rates is unknown

@@ -499,122 +499,128 @@ def replaying(folder: Path, port: int, *options: object) -> Iterator[Command]:
         yield replay
 
 
-class TestToANode:
-    @pytest.mark.parametrize("busy", [False, pytest.param(True, marks=pytest.mark.slow)])
-    def test_the_tail_is_taken_when_the_session_closes_right_after(self, tmp_path: Path, busy: bool) -> None:
-        chosen = config_of(tmp_path)
-        (endpoint,) = chosen.zenoh.listening
-        with running(chosen) as (node, _):
-            with load(2) if busy else nullcontext(), raw_session("client", connect=[endpoint]) as session:
-                report = long_player(session).play()
-            assert node.health("apr").counts["samples"] == report.sent["joint_states"]
-        assert report.taken == report.total
+@pytest.mark.parametrize("busy", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_the_tail_is_taken_when_the_session_closes_right_after(tmp_path: Path, busy: bool) -> None:
+    chosen = config_of(tmp_path)
+    (endpoint,) = chosen.zenoh.listening
+    with running(chosen) as (node, _):
+        with load(2) if busy else nullcontext(), raw_session("client", connect=[endpoint]) as session:
+            report = long_player(session).play()
+        assert node.health("apr").counts["samples"] == report.sent["joint_states"]
+    assert report.taken == report.total
 
-    def test_a_node_that_starts_again_gets_the_rest(self, node: Command, folder: Path, port: int) -> None:
-        with connected(port) as session, playing(session, wait=600) as replay:
-            until(lambda: counts(session)["samples"] > PART / 2, "a part of the recording")
-            node.kill()
-            replay.go_on()
-            with running(read_live_config(folder / "node.yaml")) as (again, _):
-                report = replay.report()
-                rest = again.health("apr").counts
-        assert (report.taken, report.restarts) == (report.total, 1)
-        assert rest["missing"] == 0
-        assert rest["samples"] < report.sent["joint_states"]
 
-    def test_what_a_killed_node_may_have_published_is_taken_and_not_published_again(self, tmp_path: Path) -> None:
-        path, came = drive(1.0), []
-        with running(config_of(tmp_path)) as (node, session):
-            session.declare_subscriber("apr/odom", lambda sample: came.append(sample.payload.to_bytes()[4:12]))
-            wheels = wheels_of(session)
-            for number, payload in enumerate(path.payloads()[50:60], 50):  # 50 to 52 were on their way to another node
-                wheels.put(payload, attachment=packed(number, bytes(16), (7, number, 50, number < 53)))
-            until(lambda: node.health("apr").counts["samples"] == 10, "all samples")
-            until(lambda: len(came) == 7, "the odometry of the others")
-            wheels.put(path.payloads()[60], attachment=packed(60, bytes(16), (7, 60, 60, True)))  # a gap, to this node
-            until(lambda: len(came) == 8, "its odometry")
-            assert node.health("apr").counts["unpublished"] == 3
-        assert came == [payload[4:12] for payload in path.payloads()[53:61]]
-
-    def test_a_node_counts_the_numbered_samples_of_a_robot_that_never_came(self, tmp_path: Path) -> None:
-        payloads = drive(4.0).payloads()
-        with running(config_of(tmp_path)) as (node, session):
-            wheels = wheels_of(session)
-            for number in [*range(100), *range(150, 400, 2)]:
-                wheels.put(payloads[number], attachment=packed(number, bytes(16)))
-            until(lambda: node.health("apr").counts["samples"] == 225, "all samples")
-            counted = node.health("apr").counts
-        assert (counted["missing"], counted["clock_jumps"]) == (50 + 124, 0)
-
-    @pytest.mark.slow
-    @pytest.mark.parametrize("from_the_beginning", [False, True])
-    def test_a_node_that_stands_still_misses_nothing(self, node: Command, port: int, from_the_beginning: bool) -> None:
-        with connected(port) as session, ThreadPoolExecutor(1) as pool:
-            wheels_of(session).undeclare()
-            if from_the_beginning:
-                os.kill(node.process.pid, signal.SIGSTOP)
-            replay = Replay(session, pool, wait=600)
-            if not from_the_beginning:
-                until(lambda: counts(session)["samples"] > PART / 2, "a part of the recording")
-                os.kill(node.process.pid, signal.SIGSTOP)
-            replay.go_on()
-            time.sleep(2.0)  # longer than the replay waits until it sends again
-            assert not replay.done()
-            os.kill(node.process.pid, signal.SIGCONT)
+def test_a_node_that_starts_again_gets_the_rest(node: Command, folder: Path, port: int) -> None:
+    with connected(port) as session, playing(session, wait=600) as replay:
+        until(lambda: counts(session)["samples"] > PART / 2, "a part of the recording")
+        node.kill()
+        replay.go_on()
+        with running(read_live_config(folder / "node.yaml")) as (again, _):
             report = replay.report()
-            counted = counts(session)
-        assert report.taken == report.total
-        assert (counted["samples"], counted["duplicates"], counted["missing"]) == (report.sent["joint_states"], 0, 0)
+            rest = again.health("apr").counts
+    assert (report.taken, report.restarts) == (report.total, 1)
+    assert rest["missing"] == 0
+    assert rest["samples"] < report.sent["joint_states"]
 
-    @pytest.mark.slow
-    def test_no_more_than_the_window_is_under_way(self, node: Command, port: int) -> None:
-        with connected(port) as session, playing(session, wait=600) as replay:
+
+def test_what_a_killed_node_may_have_published_is_taken_and_not_published_again(tmp_path: Path) -> None:
+    path, came = drive(1.0), []
+    with running(config_of(tmp_path)) as (node, session):
+        session.declare_subscriber("apr/odom", lambda sample: came.append(sample.payload.to_bytes()[4:12]))
+        wheels = wheels_of(session)
+        for number, payload in enumerate(path.payloads()[50:60], 50):  # 50 to 52 were on their way to another node
+            wheels.put(payload, attachment=packed(number, bytes(16), (7, number, 50, number < 53)))
+        until(lambda: node.health("apr").counts["samples"] == 10, "all samples")
+        until(lambda: len(came) == 7, "the odometry of the others")
+        wheels.put(path.payloads()[60], attachment=packed(60, bytes(16), (7, 60, 60, True)))  # a gap, to this node
+        until(lambda: len(came) == 8, "its odometry")
+        assert node.health("apr").counts["unpublished"] == 3
+    assert came == [payload[4:12] for payload in path.payloads()[53:61]]
+
+
+def test_a_node_counts_the_numbered_samples_of_a_robot_that_never_came(tmp_path: Path) -> None:
+    payloads = drive(4.0).payloads()
+    with running(config_of(tmp_path)) as (node, session):
+        wheels = wheels_of(session)
+        for number in [*range(100), *range(150, 400, 2)]:
+            wheels.put(payloads[number], attachment=packed(number, bytes(16)))
+        until(lambda: node.health("apr").counts["samples"] == 225, "all samples")
+        counted = node.health("apr").counts
+    assert (counted["missing"], counted["clock_jumps"]) == (50 + 124, 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("from_the_beginning", [False, True])
+def test_a_node_that_stands_still_misses_nothing(node: Command, port: int, from_the_beginning: bool) -> None:
+    with connected(port) as session, ThreadPoolExecutor(1) as pool:
+        wheels_of(session).undeclare()
+        if from_the_beginning:
+            os.kill(node.process.pid, signal.SIGSTOP)
+        replay = Replay(session, pool, wait=600)
+        if not from_the_beginning:
             until(lambda: counts(session)["samples"] > PART / 2, "a part of the recording")
             os.kill(node.process.pid, signal.SIGSTOP)
-            replay.go_on()
-            time.sleep(2.0)
-            replay.stop.set()
-            report = replay.report()  # although nothing is taken any more
-            os.kill(node.process.pid, signal.SIGCONT)
-        assert 0 < sum(report.sent.values()) - report.taken <= WINDOW
+        replay.go_on()
+        time.sleep(2.0)  # longer than the replay waits until it sends again
+        assert not replay.done()
+        os.kill(node.process.pid, signal.SIGCONT)
+        report = replay.report()
+        counted = counts(session)
+    assert report.taken == report.total
+    assert (counted["samples"], counted["duplicates"], counted["missing"]) == (report.sent["joint_states"], 0, 0)
 
-    @pytest.mark.slow
-    def test_nodes_with_a_state_that_are_killed_integrate_all_of_it_once(self, tmp_path: Path, port: int) -> None:
-        config = write_node(tmp_path, "apr", port=port, state="state", fusion="none")
-        batch = calibration().model.poses([LONG.log()])[0]
-        with ThreadPoolExecutor(1) as pool:
-            node = Command("live", config)
-            session, stop = connected(port, ALIVE), threading.Event()
-            replay = long_player(
-                session, wait=600, wheels={"use": "velocities"}
-            )  # from rates nothing lost can be made good
-            report = pool.submit(replay.play, stop)
-            try:
-                for _ in range(2):
-                    with connected(port, ALIVE) as client:
-                        until(lambda: counts(client)["samples"] > PART, "a part of the recording")
-                        node.kill()
-                    node = Command("live", config)
-                assert report.result().restarts == 2
+
+@pytest.mark.slow
+def test_no_more_than_the_window_is_under_way(node: Command, port: int) -> None:
+    with connected(port) as session, playing(session, wait=600) as replay:
+        until(lambda: counts(session)["samples"] > PART / 2, "a part of the recording")
+        os.kill(node.process.pid, signal.SIGSTOP)
+        replay.go_on()
+        time.sleep(2.0)
+        replay.stop.set()
+        report = replay.report()  # although nothing is taken any more
+        os.kill(node.process.pid, signal.SIGCONT)
+    assert 0 < sum(report.sent.values()) - report.taken <= WINDOW
+
+
+@pytest.mark.slow
+def test_nodes_with_a_state_that_are_killed_integrate_all_of_it_once(tmp_path: Path, port: int) -> None:
+    config = write_node(tmp_path, "apr", port=port, state="state", fusion="none")
+    batch = calibration().model.poses([LONG.log()])[0]
+    with ThreadPoolExecutor(1) as pool:
+        node = Command("live", config)
+        session, stop = connected(port, ALIVE), threading.Event()
+        replay = long_player(
+            session, wait=600, wheels={"use": "velocities"}
+        )  # from rates nothing lost can be made good
+        report = pool.submit(replay.play, stop)
+        try:
+            for _ in range(2):
                 with connected(port, ALIVE) as client:
-                    pose = asked(client, "omnibench/apr/pose")["odom"]
-            finally:
-                stop.set()
-                node.kill()
-                session.close()
-        assert report.result().taken == report.result().total
-        np.testing.assert_allclose([pose["x"], pose["y"]], relative(batch[0], batch[-1])[:2], atol=1e-6)
-
-    @pytest.mark.slow
-    def test_a_node_that_stays_away_is_one_line_with_the_number_that_is_missing(self, node: Command, port: int) -> None:
-        with connected(port) as session, playing(session, wait=1) as replay:
-            until(lambda: counts(session)["samples"] > PART / 2, "a part of the recording")
+                    until(lambda: counts(client)["samples"] > PART, "a part of the recording")
+                    node.kill()
+                node = Command("live", config)
+            assert report.result().restarts == 2
+            with connected(port, ALIVE) as client:
+                pose = asked(client, "omnibench/apr/pose")["odom"]
+        finally:
+            stop.set()
             node.kill()
-            replay.go_on()
-            with pytest.raises(DeliveryError, match="'apr'") as failure:
-                replay.report()
-        words = str(failure.value).replace(",", "").split()
-        assert 0 < int(words[0]) < int(words[2])
+            session.close()
+    assert report.result().taken == report.result().total
+    np.testing.assert_allclose([pose["x"], pose["y"]], relative(batch[0], batch[-1])[:2], atol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_node_that_stays_away_is_one_line_with_the_number_that_is_missing(node: Command, port: int) -> None:
+    with connected(port) as session, playing(session, wait=1) as replay:
+        until(lambda: counts(session)["samples"] > PART / 2, "a part of the recording")
+        node.kill()
+        replay.go_on()
+        with pytest.raises(DeliveryError, match="'apr'") as failure:
+            replay.report()
+    words = str(failure.value).replace(",", "").split()
+    assert 0 < int(words[0]) < int(words[2])
 
 
 @pytest.mark.slow
@@ -665,36 +671,36 @@ class TestTheCommand:
         assert any("meanwhile the node counted" in out and "wheel sample" in out.split("counted")[1] for out in said)
 
 
-class TestToOthers:
-    @pytest.mark.slow
-    def test_that_delivery_is_not_confirmed_is_said(self, tmp_path: Path, port: int) -> None:
-        save_dataset(random_dataset(7), tmp_path / "data")
-        came: list[object] = []
-        with raw_session("router", listen=[f"tcp/127.0.0.1:{port}"]) as router:
-            router.declare_subscriber("apr/joint_states", came.append)
-            to = ("--robot", "apr", "--connect", f"tcp/127.0.0.1:{port}", "--speed", "max")
-            with Command("replay", tmp_path / "data", *to) as replay:
-                out, _ = replay.ended()
-        assert replay.process.returncode == 0
-        assert "delivery not confirmed" in out
-        assert f"{len(came):,} wheel samples" in out
+@pytest.mark.slow
+def test_that_delivery_is_not_confirmed_is_said(tmp_path: Path, port: int) -> None:
+    save_dataset(random_dataset(7), tmp_path / "data")
+    came: list[object] = []
+    with raw_session("router", listen=[f"tcp/127.0.0.1:{port}"]) as router:
+        router.declare_subscriber("apr/joint_states", came.append)
+        to = ("--robot", "apr", "--connect", f"tcp/127.0.0.1:{port}", "--speed", "max")
+        with Command("replay", tmp_path / "data", *to) as replay:
+            out, _ = replay.ended()
+    assert replay.process.returncode == 0
+    assert "delivery not confirmed" in out
+    assert f"{len(came):,} wheel samples" in out
 
-    @pytest.mark.slow
-    def test_a_router_that_takes_nothing_any_more_is_told(self, tmp_path: Path, port: int) -> None:
-        with (
-            Command("live", write_node(tmp_path, port=port)) as router,
-            connected(port) as listener,
-            connected(port) as session,
-        ):
-            came: list[object] = []
-            listener.declare_subscriber("apr/joint_states", came.append)
-            with playing(session, wait=2) as replay:
-                until(lambda: len(came) > PART / 2, "a part of the recording")
-                os.kill(router.process.pid, signal.SIGSTOP)
-                replay.go_on()
-                with pytest.raises(DeliveryError, match=r"'apr': the (router|link)"):
-                    replay.report()
-                os.kill(router.process.pid, signal.SIGCONT)
+
+@pytest.mark.slow
+def test_a_router_that_takes_nothing_any_more_is_told(tmp_path: Path, port: int) -> None:
+    with (
+        Command("live", write_node(tmp_path, port=port)) as router,
+        connected(port) as listener,
+        connected(port) as session,
+    ):
+        came: list[object] = []
+        listener.declare_subscriber("apr/joint_states", came.append)
+        with playing(session, wait=2) as replay:
+            until(lambda: len(came) > PART / 2, "a part of the recording")
+            os.kill(router.process.pid, signal.SIGSTOP)
+            replay.go_on()
+            with pytest.raises(DeliveryError, match=r"'apr': the (router|link)"):
+                replay.report()
+            os.kill(router.process.pid, signal.SIGCONT)
 
 
 @pytest.mark.slow

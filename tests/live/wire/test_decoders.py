@@ -424,35 +424,37 @@ def numbered(number: int, publisher: bytes = bytes(16), flow: Flow | None = None
     return zenoh.ZBytes(packed(number, publisher, flow))
 
 
-class TestMissedMessages:
-    @pytest.mark.parametrize("flow", [None, (1, 2, 3, False)])
-    def test_one_that_comes_late_is_not_missed_and_again_in_a_flow_not_new(self, flow: Flow | None) -> None:
-        missed = MissedMessages()
-        came = [missed.take(numbered(number, flow=flow)) for number in (1, 4, 2, 2, 4, 3)]
-        again = 0 if flow is None else None
-        assert came == [0, 2, 0, again, again, 0]
-        assert missed.count == 0
+@pytest.mark.parametrize("flow", [None, (1, 2, 3, False)])
+def test_a_message_that_comes_late_is_not_missed_and_again_in_a_flow_not_new(flow: Flow | None) -> None:
+    missed = MissedMessages()
+    came = [missed.take(numbered(number, flow=flow)) for number in (1, 4, 2, 2, 4, 3)]
+    again = 0 if flow is None else None
+    assert came == [0, 2, 0, again, again, 0]
+    assert missed.count == 0
 
-    def test_publishers_have_numbers_of_their_own(self) -> None:
-        missed = MissedMessages()
-        for number in (1, 2, 3):
-            missed.take(numbered(number))
-            missed.take(numbered(100 * number, b"another publisher"[:16]))
-        assert missed.count == 2 * 99
 
-    @pytest.mark.parametrize("length", [0, 14, 33, 58, 90])
-    def test_messages_of_other_programs_tell_nothing(self, length: int) -> None:
-        missed = MissedMessages()
-        messages = [None, zenoh.ZBytes(b"x" * length), zenoh.ZBytes(b"x" * length)]
-        assert [missed.take(each) for each in messages] == [0, 0, 0]
-        assert missed.count == 0
-        assert flow_of(b"x" * length) is None
+def test_publishers_have_numbers_of_their_own() -> None:
+    missed = MissedMessages()
+    for number in (1, 2, 3):
+        missed.take(numbered(number))
+        missed.take(numbered(100 * number, b"another publisher"[:16]))
+    assert missed.count == 2 * 99
 
-    def test_many_that_are_missed_are_counted_at_once(self) -> None:
-        missed = MissedMessages()
-        for number in range(1, 500_000, 50_000):
-            missed.take(numbered(number))
-        assert missed.count == 9 * 49_999
+
+@pytest.mark.parametrize("length", [0, 14, 33, 58, 90])
+def test_messages_of_other_programs_tell_nothing(length: int) -> None:
+    missed = MissedMessages()
+    messages = [None, zenoh.ZBytes(b"x" * length), zenoh.ZBytes(b"x" * length)]
+    assert [missed.take(each) for each in messages] == [0, 0, 0]
+    assert missed.count == 0
+    assert flow_of(b"x" * length) is None
+
+
+def test_many_messages_that_are_missed_are_counted_at_once() -> None:
+    missed = MissedMessages()
+    for number in range(1, 500_000, 50_000):
+        missed.take(numbered(number))
+    assert missed.count == 9 * 49_999
 
 
 def test_a_flow_adds_to_an_attachment_what_ros_passes_over() -> None:

@@ -69,74 +69,75 @@ def test_the_noise_of_a_map_of_one_scan_counts_as_much_as_that_of_the_scan_that_
     np.testing.assert_allclose(np.diag(pairs.scatter()), 2 * np.diag(pairs.information()), rtol=0.1)
 
 
-class TestSmallGicp:
-    def test_a_planar_cloud_alone_would_keep_it_where_it_began(self) -> None:
-        """Why the map is made of crosses; when this fails, small_gicp has learnt to do without."""
-        points = points_of(ranges_at(np.zeros(3))).points
-        flat = small_gicp.PointCloud(np.column_stack([points, np.zeros(len(points))]))
-        tree = small_gicp.KdTree(flat)
-        small_gicp.estimate_normals(flat, tree, 10)
-        moved = small_gicp.PointCloud(np.column_stack([points + np.array([0.05, 0.0]), np.zeros(len(points))]))
-        found = small_gicp.align(flat, moved, tree, registration_type="PLANE_ICP")
-        np.testing.assert_allclose(found.T_target_source, np.eye(4), atol=1e-9)
-        assert found.converged
-
-    @given(x=metres, y=metres, heading=radians, seed=st.integers(0, 50), far=st.booleans())
-    def test_any_small_motion_is_found(self, x: float, y: float, heading: float, seed: int, far: bool) -> None:
-        true = np.array([x, y, heading])
-        scan = points_of(ranges_at(true))
-        start = true + np.random.default_rng(seed).uniform(-1, 1, 3) * [0.1, 0.1, 0.05]
-        if far:
-            start = true + np.array([0.3, -0.25, 0.25])
-        found = search(room_map(), scan, start, OPTIONS)
-        np.testing.assert_allclose(found, true, atol=0.015)  # corners pull at small_gicp's pose
-        match = refine(room_map(), scan, found, start, OPTIONS)
-        np.testing.assert_allclose(match.pose, true, atol=1e-3)
-        np.testing.assert_allclose(match.gain, np.eye(3), atol=1e-3)  # of the start nothing remains
+def test_a_planar_cloud_alone_would_keep_it_where_it_began() -> None:
+    """Why the map is made of crosses; when this fails, small_gicp has learnt to do without."""
+    points = points_of(ranges_at(np.zeros(3))).points
+    flat = small_gicp.PointCloud(np.column_stack([points, np.zeros(len(points))]))
+    tree = small_gicp.KdTree(flat)
+    small_gicp.estimate_normals(flat, tree, 10)
+    moved = small_gicp.PointCloud(np.column_stack([points + np.array([0.05, 0.0]), np.zeros(len(points))]))
+    found = small_gicp.align(flat, moved, tree, registration_type="PLANE_ICP")
+    np.testing.assert_allclose(found.T_target_source, np.eye(4), atol=1e-9)
+    assert found.converged
 
 
-class TestMap:
-    def test_what_is_there_is_not_added_again(self) -> None:
-        surroundings = ScanMap(OPTIONS.spacing)
-        lines = points_of(ranges_at(np.zeros(3), lidar=Lidar())).lines
-        assert surroundings.add(lines, np.zeros(3), keyframe=0) > 100
-        again = points_of(ranges_at(np.zeros(3), seed=1, lidar=Lidar())).lines
-        assert surroundings.add(again, np.zeros(3), keyframe=1) < 0.1 * len(surroundings)
-
-    def test_what_a_turned_robot_sees_behind_it_is_new(self) -> None:
-        surroundings = ScanMap(OPTIONS.spacing)
-        surroundings.add(points_of(ranges_at(np.zeros(3))).lines, np.zeros(3), keyframe=0)
-        before, turned = len(surroundings), np.array([0.0, 0.0, np.pi])
-        assert surroundings.add(points_of(ranges_at(turned)).lines, turned, keyframe=1) > 0.2 * before
-        assert set(surroundings.surface.keyframe) == {0, 1}
-
-    def test_both_sides_of_a_thin_wall_are_kept_apart(self) -> None:
-        surroundings = ScanMap(OPTIONS.spacing)
-        scan = points_of(ranges_at(np.zeros(3)))
-        surroundings.add(scan.lines, np.zeros(3), keyframe=0)
-        behind = compose(np.zeros(3), np.array([0.0, 0.0, np.pi]))
-        pairs = Correspondences(surroundings, scan, behind)  # surfaces that face away from the scanner are not matched
-        assert pairs.matched < 0.3
+@given(x=metres, y=metres, heading=radians, seed=st.integers(0, 50), far=st.booleans())
+def test_any_small_motion_is_found(x: float, y: float, heading: float, seed: int, far: bool) -> None:
+    true = np.array([x, y, heading])
+    scan = points_of(ranges_at(true))
+    start = true + np.random.default_rng(seed).uniform(-1, 1, 3) * [0.1, 0.1, 0.05]
+    if far:
+        start = true + np.array([0.3, -0.25, 0.25])
+    found = search(room_map(), scan, start, OPTIONS)
+    np.testing.assert_allclose(found, true, atol=0.015)  # corners pull at small_gicp's pose
+    match = refine(room_map(), scan, found, start, OPTIONS)
+    np.testing.assert_allclose(match.pose, true, atol=1e-3)
+    np.testing.assert_allclose(match.gain, np.eye(3), atol=1e-3)  # of the start nothing remains
 
 
-class TestDeskewing:
-    @given(x=st.floats(-0.5, 0.5), y=st.floats(-0.5, 0.5), turn=st.floats(-1, 1), heading=st.floats(-np.pi, np.pi))
-    def test_a_scan_on_the_way_becomes_one_at_rest(self, x: float, y: float, turn: float, heading: float) -> None:
-        twist, place = np.array([x, y, turn]), np.array([0.1, 0.2, heading])
-        moving = points_of(ranges_at(place, twist), twist)
-        surroundings = ScanMap(OPTIONS.spacing)
-        surroundings.add(points_of(ranges_at(place)).lines, place, keyframe=0)
-        match = refine(surroundings, moving, place, place, OPTIONS)
-        # Corners cost half a millimetre; the motion within the scan, up to 7 mm and 1 deg, is gone.
-        np.testing.assert_allclose(match.pose, place, atol=1e-3)
+def test_what_is_in_the_map_is_not_added_again() -> None:
+    surroundings = ScanMap(OPTIONS.spacing)
+    lines = points_of(ranges_at(np.zeros(3), lidar=Lidar())).lines
+    assert surroundings.add(lines, np.zeros(3), keyframe=0) > 100
+    again = points_of(ranges_at(np.zeros(3), seed=1, lidar=Lidar())).lines
+    assert surroundings.add(again, np.zeros(3), keyframe=1) < 0.1 * len(surroundings)
 
-    def test_a_twist_may_be_put_right_afterwards(self) -> None:
-        twist, less = np.array([0.3, -0.2, 0.8]), np.array([0.25, -0.1, 0.7])
-        ranges = ranges_at(np.zeros(3), twist)
-        once, twice = points_of(ranges, twist), points_of(ranges, less).deskewed(twist - less)
-        second_order = 0.1 * 0.8 * 0.01875**2
-        np.testing.assert_allclose(twice.points, once.points, atol=second_order)
-        np.testing.assert_allclose(twice.rays, once.rays, atol=second_order)
+
+def test_what_a_turned_robot_sees_behind_it_is_new() -> None:
+    surroundings = ScanMap(OPTIONS.spacing)
+    surroundings.add(points_of(ranges_at(np.zeros(3))).lines, np.zeros(3), keyframe=0)
+    before, turned = len(surroundings), np.array([0.0, 0.0, np.pi])
+    assert surroundings.add(points_of(ranges_at(turned)).lines, turned, keyframe=1) > 0.2 * before
+    assert set(surroundings.surface.keyframe) == {0, 1}
+
+
+def test_both_sides_of_a_thin_wall_are_kept_apart() -> None:
+    surroundings = ScanMap(OPTIONS.spacing)
+    scan = points_of(ranges_at(np.zeros(3)))
+    surroundings.add(scan.lines, np.zeros(3), keyframe=0)
+    behind = compose(np.zeros(3), np.array([0.0, 0.0, np.pi]))
+    pairs = Correspondences(surroundings, scan, behind)  # surfaces that face away from the scanner are not matched
+    assert pairs.matched < 0.3
+
+
+@given(x=st.floats(-0.5, 0.5), y=st.floats(-0.5, 0.5), turn=st.floats(-1, 1), heading=st.floats(-np.pi, np.pi))
+def test_a_scan_on_the_way_becomes_one_at_rest(x: float, y: float, turn: float, heading: float) -> None:
+    twist, place = np.array([x, y, turn]), np.array([0.1, 0.2, heading])
+    moving = points_of(ranges_at(place, twist), twist)
+    surroundings = ScanMap(OPTIONS.spacing)
+    surroundings.add(points_of(ranges_at(place)).lines, place, keyframe=0)
+    match = refine(surroundings, moving, place, place, OPTIONS)
+    # Corners cost half a millimetre; the motion within the scan, up to 7 mm and 1 deg, is gone.
+    np.testing.assert_allclose(match.pose, place, atol=1e-3)
+
+
+def test_a_twist_may_be_put_right_afterwards() -> None:
+    twist, less = np.array([0.3, -0.2, 0.8]), np.array([0.25, -0.1, 0.7])
+    ranges = ranges_at(np.zeros(3), twist)
+    once, twice = points_of(ranges, twist), points_of(ranges, less).deskewed(twist - less)
+    second_order = 0.1 * 0.8 * 0.01875**2
+    np.testing.assert_allclose(twice.points, once.points, atol=second_order)
+    np.testing.assert_allclose(twice.rays, once.rays, atol=second_order)
 
 
 def test_noise_beyond_what_the_scanner_says_is_measured() -> None:
