@@ -133,9 +133,7 @@ def test_a_radius_that_is_off_is_named_of_one_wheel_and_of_all(every: bool, fact
 
 
 @pytest.mark.parametrize(("counted", "first"), [(False, "design_radius"), (True, "wheel_scale")])
-def test_a_diameter_given_as_the_radius_comes_first_but_where_ticks_may_be_counted_twice(
-    counted: bool, first: str
-) -> None:
+def test_a_diameter_given_as_radius_comes_first_unless_ticks_may_be_counted_twice(counted: bool, first: str) -> None:
     robot = recorded("diff").robot
     recording = replace(read_as_recorded(misdesigned("radius", 2.0, *robot.wheel_names)), counted=counted)
     found = search(recording)

@@ -272,9 +272,7 @@ def test_ctrl_c_keeps_paths(command: Command, driven: Driven, tmp_path: Path, mo
     assert len(poses) == 1  # of one run, whoever found its path
 
 
-def test_an_error_keeps_paths(
-    command: Command, driven: Driven, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_errors_keep_paths(command: Command, driven: Driven, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scans = first_scans(driven)
     empty = replace(scans, ranges=np.zeros_like(scans.ranges))
     # Two are worked on at a time: others end before the last begins.

@@ -408,7 +408,7 @@ def test_a_reader_that_leaves_early_gets_no_more_and_the_report_is_written(tmp_p
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGKILL"])
-def test_the_runs_end_with_a_comparison_that_is_killed_which_then_goes_on(
+def test_runs_end_with_a_comparison_that_is_killed_which_then_goes_on(
     name: str, command: Command, tmp_path: Path
 ) -> None:
     process = started(tmp_path, workers=4)  # none starts later
@@ -456,9 +456,7 @@ class hangs(Misbehaving):
 
 
 @pytest.mark.slow
-def test_what_was_killed_is_tried_again_when_a_comparison_goes_on_and_what_hung_is_not(
-    command: Command, tmp_path: Path
-) -> None:
+def test_going_on_tries_again_what_was_killed_and_not_what_hung(command: Command, tmp_path: Path) -> None:
     plugins = write_plugin(tmp_path / "plugins", "misbehaving", MISBEHAVING.format(folder=str(tmp_path)))
     entries, budget = ["theoretical", "is_killed", "hangs"], {"evaluations": 500, "seconds": 0.5}
     config = write_config(tmp_path, plugins=[str(plugins)], calibrators=entries, budget=budget)

@@ -453,9 +453,7 @@ def far_ends(result: ComparisonResult) -> list[str]:
     return [warning for warning in result.warnings if "beside it say" in warning]
 
 
-def test_a_robust_loss_is_better_on_runs_without_jumps_and_is_said(
-    squares: ComparisonResult, huber: ComparisonResult
-) -> None:
+def test_a_robust_loss_is_better_without_jumps_and_is_said(squares: ComparisonResult, huber: ComparisonResult) -> None:
     robust, other = (result.runs[1].record.validation_cost for result in (huber, squares))
     assert robust < other
     assert "loss" not in summary(squares.output)

@@ -427,9 +427,7 @@ ROUND = [
 
 
 @pytest.mark.parametrize(("plan", "lidar"), ROUND)
-def test_in_a_round_room_the_heading_stays_that_of_the_odometry_and_is_said_uncertain(
-    plan: FloorPlan, lidar: Lidar
-) -> None:
+def test_in_a_round_room_the_heading_is_the_odometrys_and_said_uncertain(plan: FloorPlan, lidar: Lidar) -> None:
     for number in (0, 2):  # whose odometry ends 6 deg off
         run = driven_in(plan, number, lidar)
         path = located(run, scanner=lidar.scanner)

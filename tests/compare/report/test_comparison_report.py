@@ -279,9 +279,7 @@ def test_data_without_directions_have_boxes_instead_of_a_flower(told: Render) ->
 
 
 @pytest.mark.slow
-def test_long_histories_and_long_runs_make_a_file_below_eight_megabytes(
-    result: ComparisonResult, tmp_path: Path
-) -> None:
+def test_long_histories_and_runs_make_a_file_below_eight_megabytes(result: ComparisonResult, tmp_path: Path) -> None:
     long_runs = flower(sample_period=0.04, pose_period=0.04, train={"seed": 1, "distance": 12}, repetitions=1)
     dataset = simulate_dataset(FlowerConfig.model_validate(long_runs)).dataset
     steps = [Improvement(2 * k, 1e-3 * k, 0.02 + math.exp(-1e-3 * k)) for k in range(1, 20_000)]
@@ -471,7 +469,7 @@ def test_wheels_given_by_x_and_y_stand_there_along_their_rolling(robot: Robot) -
         (TRICYCLE, "front: steered, radius 0.0325 m, x 0.15 m, y 0 m; ", "x 0 m, y −0.08 m, not measured"),
     ],
 )
-def test_the_section_on_the_data_says_where_wheels_stand_and_which_are_not_driven_or_not_measured(
+def test_the_section_on_the_data_says_where_wheels_stand_and_which_are_passive(
     robot: Robot, first: str, last: str
 ) -> None:
     view = usual_view()

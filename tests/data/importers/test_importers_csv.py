@@ -212,9 +212,7 @@ MOTIVE = (
         ("poses", MOTIVE.split("\n", 3)[3], "columns={pose_t: 2, qx: 3, qy: 4, qz: 5, qw: 6, x: 7, z: 9}.* --set up=y"),
     ],
 )
-def test_tables_that_other_programs_write_are_told_how_to_be_read(
-    tmp_path: Path, file: str, text: str, message: str
-) -> None:
+def test_tables_of_other_programs_are_told_how_to_be_read(tmp_path: Path, file: str, text: str, message: str) -> None:
     write_exact(tmp_path)
     (tmp_path / f"run1_{file}.csv").write_text(text)
     with refused(DataError, match=message):
@@ -564,7 +562,7 @@ def test_a_counter_that_is_set_to_zero_ends_a_run(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("left", "right"), [([40], [40]), ([40, 90], [60, 61])])
-def test_single_readings_of_0_are_left_out_and_said_also_of_a_wheel_that_stands(
+def test_single_readings_of_0_are_left_out_and_said_also_at_rest(
     tmp_path: Path, left: list[int], right: list[int]
 ) -> None:
     times = np.arange(0.0, 8.0, 0.05)

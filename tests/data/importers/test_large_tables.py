@@ -114,9 +114,7 @@ def test_a_large_table_is_imported_as_it_is_in_memory(
     assert not list(temporary.iterdir())
 
 
-def test_a_flaw_far_below_is_named_with_its_row(
-    tmp_path: Path, temporary: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_flaw_far_below_is_named_by_its_row(tmp_path: Path, temporary: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     lines = runs().write_csv().splitlines()
     for line, words in (
         (lines[1500].replace(",", ",x", 1), "is 'x"),
@@ -156,7 +154,7 @@ def test_a_break_while_a_large_table_is_read_or_written_leaves_nothing_half_writ
     assert not list(temporary.iterdir())
 
 
-def test_a_data_set_whose_temporary_file_is_gone_says_so(
+def test_a_data_set_whose_file_is_gone_says_so(
     tmp_path: Path, temporary: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one_table(tmp_path)

@@ -109,8 +109,6 @@ def scale_of(values: list[float], half_width: list[float]) -> float:
     [(50.0, 60.0, False), (50.0, 2.0, True), (50.0, 20.0, True), (np.nan, np.nan, False)],
     ids=["within a wide band", "beyond the usual band", "beyond a wide band", "unknown"],
 )
-def test_a_value_sets_the_scale_unless_it_lies_within_a_band_wider_than_usual(
-    last: float, half_width: float, shown: bool
-) -> None:
+def test_a_value_sets_the_scale_unless_in_a_band_wider_than_usual(last: float, half_width: float, shown: bool) -> None:
     scale = scale_of([1.0, -2.0, 1.5, 2.0, -1.0, last], [2.0, 2.0, 2.0, 2.0, 2.0, half_width])
     assert scale == pytest.approx(1.1 * (50.0 if shown else 1.3 * 2.0))

@@ -736,9 +736,7 @@ def test_translation_alone_leaves_the_turn_and_the_distances(slip: float) -> Non
         (((SPEED, 0.0, 0.3),), 0.0, "moving along x while turning"),
     ],
 )
-def test_turns_lines_or_one_command_alone_are_one_direction(
-    twists: tuple[Twist, ...], slip: float, motion: str
-) -> None:
+def test_turns_lines_or_one_command_are_one_direction(twists: tuple[Twist, ...], slip: float, motion: str) -> None:
     found = told_of(twists, slip=slip)
     assert [each.motion for each in found.directions if each.state == "driven"] == [motion]
     assert {each.state for each in found.directions} <= {"driven", "weak", "undriven"}
