@@ -185,7 +185,7 @@ def test_list_takes_the_plugins_of_the_folder_one_is_in(command: Command, tmp_pa
 
 
 @pytest.mark.parametrize("by_variable", [False, True])
-def test_plugins_can_be_left_out(
+def test_unwanted_plugins_are_not_loaded(
     command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, by_variable: bool
 ) -> None:
     write_plugin(tmp_path / "plugins", "unwanted", "raise SystemExit('it ran')\n")

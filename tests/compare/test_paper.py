@@ -119,7 +119,7 @@ def test_published_rows_have_every_figure_of_tables_2_and_3(config: str) -> None
 
 
 @pytest.mark.parametrize(("before", "after", "share"), [row[part] for row in TABLES for part in (1, 2)])
-def test_a_printed_improvement_is_one_that_costs_of_four_decimals_allow(
+def test_a_printed_improvement_is_one_that_costs_rounded_to_four_decimals_allow(
     before: float, after: float, share: str
 ) -> None:
     half = 0.00005

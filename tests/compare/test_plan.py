@@ -138,7 +138,7 @@ def test_the_schema_refuses_what_reading_refuses(mistake: dict[str, Any], schema
 
 
 @pytest.mark.parametrize("config", COMPARISONS, ids=lambda path: path.stem)
-def test_a_shipped_config_keeps_to_the_schema_and_is_read_with_all_calibrators(
+def test_a_config_that_we_ship_keeps_to_the_schema_and_is_read_with_all_its_calibrators(
     config: Path, schema: dict[str, Any]
 ) -> None:
     jsonschema.Draft202012Validator.check_schema(schema)
@@ -203,7 +203,7 @@ def test_labels_tell_boxes_and_parameterisations_apart(tmp_path: Path) -> None:
 SEARCHES = {"crs", "genetic", "isres", "random_search", "parametric"}
 
 
-def test_all_calibrators_that_suit_are_compared(
+def test_a_data_set_is_compared_by_all_calibrators_that_suit_it(
     command: Command, prepared: Prepared, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("omnibench.compare.recording_config._EVALUATIONS", 300)
@@ -242,7 +242,7 @@ calibrators.register("mine")(Mine)
     assert "mine" in [entry.name for entry in config.calibrators]
 
 
-def test_folders_of_a_set_are_compared_as_one(
+def test_folders_of_a_data_set_are_compared_as_one(
     command: Command, prepared: Prepared, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("omnibench.compare.recording_config.suitable_calibrators", lambda _: ["theoretical"])
@@ -389,7 +389,7 @@ def test_the_effective_config_spells_out_every_default_and_gives_the_same_runs(r
         assert {f"{key}.json" for key in keys} == {file.name for file in (results / "runs").iterdir()}
 
 
-def test_results_go_to_their_own_folder_with_a_link_to_the_latest(
+def test_results_go_to_a_folder_of_their_own_with_a_link_to_the_latest(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -408,7 +408,7 @@ def test_a_reader_that_leaves_early_gets_no_more_and_the_report_is_written(tmp_p
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGKILL"])
-def test_runs_end_with_a_comparison_that_is_killed_which_then_goes_on(
+def test_the_runs_end_with_a_comparison_that_is_killed_which_then_goes_on(
     name: str, command: Command, tmp_path: Path
 ) -> None:
     process = started(tmp_path, workers=4)  # none starts later

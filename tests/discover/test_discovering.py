@@ -131,7 +131,7 @@ def test_the_readme_and_the_page_on_discover_print_its_figures_and_its_driving_p
 
 
 @pytest.mark.slow
-def test_proposed_runs_tell_the_class_apart_with_the_recorded_ones(
+def test_the_runs_that_are_proposed_tell_the_class_apart_together_with_the_recorded_ones(
     recorded: Discovery, omni3: Dataset, tmp_path: Path
 ) -> None:
     (experiment,) = recorded.experiments
@@ -145,7 +145,7 @@ def test_proposed_runs_tell_the_class_apart_with_the_recorded_ones(
     assert found.effects[0].weight >= 0.95
 
 
-def test_steps_come_in_order_confirming_only_with_an_effect_and_conclusions_fit_nothing(
+def test_steps_come_in_order_confirming_only_with_an_effect_and_what_concludes_fits_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     conclude = discover.conclude

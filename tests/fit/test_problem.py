@@ -254,7 +254,7 @@ def test_along_undriven_directions_the_design_is_kept(seed: int) -> None:
         ),
     ],
 )
-def test_limits_are_shares_of_lengths_and_degrees(
+def test_limits_are_shares_of_radius_and_distance_and_degrees(
     limits: GeometryLimits, radius: Any, distance: Any, angle_deg: Any
 ) -> None:
     geometry = WheelGeometry(APR_02, limits)
@@ -338,7 +338,7 @@ def test_the_design_values_have_the_design_matrix(robot: Robot, fitted_mount: bo
         (SWERVE, "x", lambda wheel: {"x": wheel.x + 0.1}),
     ],
 )
-def test_a_changed_number_has_a_changed_robots_matrix(
+def test_a_changed_number_has_the_matrix_of_a_robot_that_is_changed_so(
     robot: Robot, kind: str, change: Callable[[Any], dict[str, float]]
 ) -> None:
     changed = with_wheels(robot, change)

@@ -236,7 +236,7 @@ def test_quick_jobs_share_a_process_while_it_is_young(tmp_path: Path, monkeypatc
     assert len(set(processes_of(run(tmp_path, jobs_of(squared, range(9)), Processes(2))))) == 2
 
 
-def test_imports_of_jobs_make_their_process_neither_old_nor_another(
+def test_what_jobs_import_makes_their_process_neither_old_nor_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(job_process, "_YOUNG", 3.0)
@@ -249,7 +249,7 @@ def test_imports_of_jobs_make_their_process_neither_old_nor_another(
     assert len(set(processes_of(notes))) == 1
 
 
-def test_a_process_moved_to_another_folder_by_imports_does_no_further_job(
+def test_a_process_that_imports_have_moved_to_another_folder_does_no_further_job(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.syspath_prepend(tmp_path)

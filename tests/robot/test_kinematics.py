@@ -414,7 +414,7 @@ def test_one_stamp_within_the_last_sample_equals_a_stream(integration: Integrati
     seed=st.integers(0, 2**32 - 1),
     samples=st.integers(1, 30),
 )
-def test_arcs_lie_on_the_circle_however_sampled(
+def test_arcs_lie_on_the_circle_whatever_the_sampling(
     velocity: tuple[float, float], turn: float, seed: int, samples: int
 ) -> None:
     rng = np.random.default_rng(seed)

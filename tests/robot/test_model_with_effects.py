@@ -226,7 +226,7 @@ def stream_of(given_model: OdometryModel, log: WheelLog) -> OdometryStream:
 @pytest.mark.parametrize("integration", BOTH)
 @pytest.mark.parametrize("name", [*EVERY_MOTION, *SMOOTH_MOTION])
 @given(seed=seeds, data=st.data(), samples=st.integers(1, 60))
-def test_every_effect_streams_as_in_a_batch(
+def test_a_stream_equals_a_batch_with_every_effect(
     name: str, integration: Integration, seed: int, data: st.DataObject, samples: int
 ) -> None:
     robots = ROBOTS if name in SMOOTH_MOTION else [robot for applied, robot in APPLIED if applied == name]

@@ -172,7 +172,7 @@ def test_the_command_drives_a_recording_again(command: Command, prepared: Prepar
         (["CONFIG", "--effect", "heading_drft: {b: 1}"], "unknown effect 'heading_drft'"),
     ],
 )
-def test_contradicting_arguments_are_refused(
+def test_arguments_that_do_not_go_together_are_refused(
     arguments: list[str], words: str, command: Command, prepared: Prepared
 ) -> None:
     names = {"CONFIG": prepared.config, "DATA": prepared.data, "CALIBRATION": prepared.calibration}
@@ -495,7 +495,7 @@ def test_the_command_writes_it_apart_from_the_data(command: Command, tmp_path: P
     ],
     ids=lambda value: "" if isinstance(value, dict) else value[0],
 )
-def test_an_impossible_config_is_one_line(
+def test_a_config_that_cannot_be_is_one_line_that_names_it(
     command: Command, tmp_path: Path, changes: dict[str, Any], said: list[str]
 ) -> None:
     printed = command("simulate", file_of(tmp_path, **changes), "-o", "data")

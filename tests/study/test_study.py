@@ -89,7 +89,7 @@ def test_every_method_is_fitted_to_the_same_runs_and_judged_on_the_same_others(s
     assert of_cells["rows"].to_list() == [3] * len(of_cells)
 
 
-def test_a_calibration_on_arcs_beats_the_design_on_lines_and_the_design_is_one_times_itself(
+def test_a_calibration_on_arcs_is_better_than_the_design_on_lines_and_the_design_is_one_times_itself(
     studied: Studied,
 ) -> None:
     (row,) = studied.rows(robot="two", training="arc", judged="line", method="default", regime="as recorded").to_dicts()
@@ -165,7 +165,7 @@ def test_run_again_nothing_is_fitted_twice_and_the_table_is_the_same(studied: St
         ({"robots": {"one": {"format": "csv"}}}, "path"),
     ],
 )
-def test_a_mistake_in_the_config_is_one_line(
+def test_a_mistake_in_the_config_is_one_line_and_exit_code_2(
     change: dict[str, Any], words: str, command: Command, tmp_path: Path
 ) -> None:
     run = command("compare", write_study(tmp_path, lambda config: config.update(change)), "-o", tmp_path / "out")

@@ -469,7 +469,7 @@ def test_wheels_given_by_x_and_y_stand_there_along_their_rolling(robot: Robot) -
         (TRICYCLE, "front: steered, radius 0.0325 m, x 0.15 m, y 0 m; ", "x 0 m, y −0.08 m, not measured"),
     ],
 )
-def test_the_section_on_the_data_says_where_wheels_stand_and_which_are_passive(
+def test_the_section_on_the_data_says_where_wheels_stand_and_which_are_not_driven_or_not_measured(
     robot: Robot, first: str, last: str
 ) -> None:
     view = usual_view()

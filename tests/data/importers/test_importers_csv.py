@@ -562,7 +562,7 @@ def test_a_counter_that_is_set_to_zero_ends_a_run(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("left", "right"), [([40], [40]), ([40, 90], [60, 61])])
-def test_single_readings_of_0_are_left_out_and_said_also_at_rest(
+def test_single_readings_of_0_are_left_out_and_said_also_of_a_wheel_that_stands(
     tmp_path: Path, left: list[int], right: list[int]
 ) -> None:
     times = np.arange(0.0, 8.0, 0.05)

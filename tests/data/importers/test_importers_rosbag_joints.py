@@ -319,7 +319,7 @@ def test_repeated_messages_are_left_out_and_counted(tmp_path: Path) -> None:
         (SLAM, lambda each: changed(each, pose={"pose": {"orientation": TILTED}}), "with a wrong orientation, .*90 "),
     ],
 )
-def test_useless_messages_are_left_out_or_refused(
+def test_useless_messages_are_left_out_and_too_many_are_refused(
     tmp_path: Path, topic: str, edit: Callable[[Sent], Sent], message: str
 ) -> None:
     data = read(write_mcap(tmp_path / "some", edited(part(12.4), topic, edit, every=7)))

@@ -413,7 +413,7 @@ def test_messages_without_a_fix_are_left_out(tmp_path: Path) -> None:
         (compass(variance=0.0), "--set heading_sigma_deg=2, .*--set imu=gyro", {"heading_sigma_deg": 2}, np.radians(2)),
     ],
 )
-def test_sensors_need_a_covariance(
+def test_sensors_without_a_covariance_need_the_option(
     tmp_path: Path, sent: list[Sent], asked: str, option: dict[str, Any], sigma: float
 ) -> None:
     source = write_mcap(tmp_path / "drive", WITHOUT_POSES + sent)

@@ -154,7 +154,7 @@ def test_a_break_while_a_large_table_is_read_or_written_leaves_nothing_half_writ
     assert not list(temporary.iterdir())
 
 
-def test_a_data_set_whose_file_is_gone_says_so(
+def test_a_data_set_whose_temporary_file_is_gone_says_so(
     tmp_path: Path, temporary: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one_table(tmp_path)

@@ -39,7 +39,7 @@ def test_comments_and_blank_lines_are_skipped(tmp_path: Path) -> None:
 
 
 @given(arrays(float, 3, elements=st.floats(-0.1, 0.1)), st.floats(-3, 3))
-def test_roll_and_pitch_hardly_change_headings(
+def test_small_roll_and_pitch_hardly_change_the_heading(
     tmp_path_factory: pytest.TempPathFactory, angles: np.ndarray, heading: float
 ) -> None:
     roll, pitch = angles[0] / 2, angles[1] / 2

@@ -138,7 +138,7 @@ def test_a_small_table_that_unpacks_to_gigabytes_is_refused_before_it_is_read(fo
         ("data.xyz", pipe, "data.xyz: is a pipe"),
     ],
 )
-def test_special_files_in_bags_are_refused(
+def test_a_bag_with_special_files_is_refused(
     tmp_path: Path, name: str, made: Callable[[Path], object], message: str
 ) -> None:
     bag = tmp_path / "bag"

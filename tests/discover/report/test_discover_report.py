@@ -157,7 +157,7 @@ def test_the_paths_stand_in_the_first_900_pixels(make: Callable[[], Discovery], 
     assert_picture_comes_first(tmp_path / "report.html")
 
 
-def test_a_discovery_is_written_with_names_and_paths_for_data_and_models(
+def test_a_discovery_is_written_with_names_and_paths_in_the_place_of_data_and_models(
     snapshot: SnapshotAssertion,
 ) -> None:
     effect = incomplete().effects[0]

@@ -495,7 +495,7 @@ def test_effects_that_cancel_each_other_have_even_odds_at_most() -> None:
         (0.5, 0.5, True),  # the function is the name's own but for 0.0001
     ],
 )
-def test_a_name_has_even_odds_at_most_where_a_foreign_function_explains_more(
+def test_a_name_has_even_odds_at_most_where_one_function_that_is_not_its_own_explains_more(
     apart: float, along: float, credible: bool
 ) -> None:
     function, residual = (
@@ -561,7 +561,7 @@ def error(calibration: Calibration, dataset: Dataset, truth: Truth, found: Disco
     )
 
 
-def test_a_step_without_a_name_closes_most_of_the_gap_on_a_held_out_session(
+def test_most_of_the_gap_closes_on_a_held_out_session_by_a_step_without_a_name(
     grooved: tuple[Dataset, Truth, Discovery],
 ) -> None:
     dataset, truth, found = grooved
@@ -591,7 +591,7 @@ def test_no_term_is_tried_where_it_is_not_wanted_or_nothing_is_missing(make: Cal
     assert not any("unnamed" in note for note in found.notes)
 
 
-def test_functions_are_fitted_with_named_effects_and_follow_them(
+def test_functions_are_fitted_together_with_named_effects_and_stand_after_them(
     bare: Extended, screened_again: tuple[Screening, Selection]
 ) -> None:
     screening, selection = screened_again
@@ -617,7 +617,7 @@ def test_runs_of_few_kinds_of_motion_get_no_term(grooved: tuple[Dataset, Truth, 
     assert any("No unnamed term was tried: 9 kinds of motion" in note for note in found.notes)
 
 
-def test_nothing_is_added_where_a_model_leaves_nothing(
+def test_nothing_is_added_to_a_model_that_leaves_nothing_of_it(
     bare: Extended, screened_again: tuple[Screening, Selection]
 ) -> None:
     screening, selection = screened_again

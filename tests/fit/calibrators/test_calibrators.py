@@ -622,7 +622,7 @@ def test_the_population_is_200_above_five_variables_and_50_below_and_the_elite_n
         ("crs", {"tolerance": 1e-3, "population": 20}, {"tolerance": 1e-3, "population": 200}),
     ],
 )
-def test_wide_tolerances_and_small_populations_end_searches(
+def test_a_wider_tolerance_or_a_smaller_population_ends_the_search_earlier(
     name: str, shorter: dict[str, Any], longer: dict[str, Any]
 ) -> None:
     few, many = (run(name, make_problem(RUNS), **options).evaluations for options in (shorter, longer))

@@ -288,7 +288,7 @@ TAKEN_OFF = term("lidar_lever_arm", x=0.05, y=-0.03)
     ],
     ids=["late", "early", "late heading", "early heading", "lever arm", "all together"],
 )
-def test_poses_are_put_where_taken(
+def test_poses_are_put_where_and_when_they_were_taken(
     terms: tuple[EffectTerm, ...], tau: tuple[float, float], arm: Array | None, poses: int
 ) -> None:
     uncorrected, _ = seen(calibration(), tau, arm)

@@ -160,7 +160,7 @@ POSES = np.array([[1.0, 2.0, math.pi / 2], [1.0, 3.0, math.pi], [4.0, 2.0, 0.5]]
         ("reference_clock_drift", {"offset": 0.1, "slope": 0.01}, [0.11, 0.13], [0.11, 0.13]),
     ],
 )
-def test_poses_are_older_than_their_stamps(
+def test_a_pose_is_taken_earlier_than_its_stamp_says(
     name: str, values: dict[str, float], position: list[float], heading: list[float]
 ) -> None:
     effect, own = reference_term(name, **values)

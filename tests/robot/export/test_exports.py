@@ -535,7 +535,7 @@ STEERING = [{"name": "steering_gain", "parameters": {"g": 4.8}}, {"name": "steer
     ("robot", "effects"), [(TRICYCLE, []), (CAR, []), (SWERVE, []), (CAR, STEERING)], ids=lambda value: str(value)[:16]
 )
 @pytest.mark.parametrize("integration", ["euler", "arc"])
-def test_steering_drives_as_in_a_stream(
+def test_steered_wheels_drive_as_in_the_stream(
     tmp_path: Path, robot: Robot, effects: list[dict[str, Any]], integration: Integration
 ) -> None:
     """A fitted gain and zero of the steering are in the header, too."""

@@ -49,7 +49,7 @@ def to_the_walls(half: float, x: Array, y: Array, direction: Array) -> Array:
     x=st.floats(-3, 3), y=st.floats(-3, 3), heading=st.floats(-10, 10),
     forward=st.floats(-0.5, 0.5), left=st.floats(-0.5, 0.5), yaw=st.floats(-180, 180),
 )  # fmt: skip
-def test_ranges_in_a_square_are_exact(
+def test_ranges_in_a_square_room_are_exact(
     x: float, y: float, heading: float, forward: float, left: float, yaw: float
 ) -> None:
     lidar = EXACT.model_copy(update={"mount": LidarMount(x=forward, y=left, yaw_deg=yaw)})

@@ -283,7 +283,7 @@ def test_a_command_faster_than_the_motors_is_refused_with_the_greatest_speed_or_
         (MotionProfile, {"shape": "s_curve"}, "'trapezoid' or 'jerk_limited'"),
     ],
 )
-def test_impossible_motors_controllers_links_or_profiles_are_refused(
+def test_a_motor_controller_link_or_profile_that_cannot_be_is_refused(
     part: Any, settings: dict[str, float], named: str
 ) -> None:
     with pytest.raises(ConfigError, match=named):
