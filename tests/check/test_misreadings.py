@@ -210,7 +210,7 @@ def test_the_angle_of_a_turned_reference_is_told(degrees: float) -> None:
         assert abs(math.remainder(off, 360)) < 2.0
 
 
-@pytest.mark.parametrize("name", ["omni3", "diff", "tricyc", "omni4", "robotino"])
+@pytest.mark.parametrize("name", ["omni3", "tricyc", "omni4", "robotino", *slow("diff")])
 def test_real_recordings_are_misread_in_nothing(name: str, request: pytest.FixtureRequest) -> None:
     dataset = request.getfixturevalue(name)
     for part in (slice(0, None, 4), slice(0, len(dataset.trajectories) // 8), slice(-6, None)):

@@ -29,13 +29,6 @@ def every_design(candidates: int, runs: int) -> Iterator[d_optimality.Counts]:
         yield np.bincount(chosen, minlength=candidates)
 
 
-def quadratic(points: int = 21) -> Array:
-    """Information about a parabola's coefficients from one value at each of some points in [-1, 1]."""
-    x = np.linspace(-1, 1, points)
-    rows = np.stack([np.ones_like(x), x, x**2], axis=1)
-    return rows[:, :, None] * rows[:, None, :]
-
-
 @given(seed=seeds, runs=st.integers(1, 5))
 def test_no_exact_design_exceeds_the_bound(seed: int, runs: int) -> None:
     candidates = d_optimality.Candidates(information(seed), costs(seed))
@@ -62,14 +55,6 @@ def test_no_candidate_gains_more_than_the_gap_says(seed: int) -> None:
     assert optimum.shares.sum() == pytest.approx(1)
     assert optimum.gap <= 1e-5
     assert max(np.trace(inverse @ each) for each in per_cost) <= 3 * (1 + optimum.gap) * (1 + 1e-9)
-
-
-@pytest.mark.parametrize("runs", [3, 6, 9])
-def test_exact_designs_of_a_parabola_share_the_runs_out(runs: int) -> None:
-    candidates = d_optimality.Candidates(quadratic())
-    *_, last = d_optimality.exact_designs(candidates, d_optimality.continuous_optimum(candidates), runs)
-    assert dict(enumerate(last[last > 0])) == {0: runs // 3, 1: runs // 3, 2: runs // 3}
-    assert list(np.flatnonzero(last)) == [0, 10, 20]
 
 
 @given(seed=seeds, runs=st.integers(4, 7))

@@ -25,6 +25,7 @@ from extended_samples import FORWARD, run_of
 from hidden.sets import make_set
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from lanes import slow
 from outlier_study import EFFECT, TRUTH
 from outlier_study import simulated as with_directions
 from recording_samples import in_room
@@ -402,7 +403,7 @@ def fitted() -> Fit:
     return on_robot("three")
 
 
-@pytest.mark.parametrize("robot", ["three", *NAMES_OF_ROBOTS])
+@pytest.mark.parametrize("robot", ["three", "tricycle", *slow(*sorted({*NAMES_OF_ROBOTS} - {"tricycle"}))])
 def test_slopes_by_an_effect_are_the_models_own(robot: str) -> None:
     fit = on_robot(robot)
     applied = [name for name in NAMES if effects.create(name).applies(fit.model.robot)]
@@ -593,9 +594,7 @@ def test_without_absolute_angles_of_the_wheels_none_of_their_waves_are_looked_fo
     assert not any(group.name == "wheel angle" for group in groups)
 
 
-@pytest.mark.parametrize(
-    "commands", [pytest.param(3, marks=pytest.mark.slow), 6, pytest.param(12, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("commands", [6, *slow(3, 12)])
 def test_where_nothing_is_missing_no_fine_structure_is_surer_than_chance_however_few_runs(commands: int) -> None:
     dataset, _ = make_set("null", "", 0.0, 1003, design="small")
     kept = sorted({run.command or "" for run in dataset.trajectories})[:commands]

@@ -74,6 +74,7 @@ def judged(
     return judge(discover_effects(dataset, without=without), truth, seconds=0.0)
 
 
+@pytest.mark.slow
 def test_a_strong_effect_gets_its_name_and_no_other_and_its_size() -> None:
     found = judged("single", "thermal_radius_drift")
     assert (found.outcome, found.confident_wrong) == ("right", False)

@@ -64,6 +64,7 @@ def test_a_change_of_the_radii_closes_the_gap_to_the_held_out_session() -> None:
     assert document["sessions"]["differences"][0]["session"] == "s2"
 
 
+@pytest.mark.slow
 def test_sessions_that_both_train_give_tyre_wear_its_name() -> None:
     found = discover_effects(shorn(session_set("small", 3, change=0.02), split="train"))
     assert [effect.name for effect in found.effects] == ["tyre_wear"]

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import reference_coverage as study
 from fit_samples import noisy_trajectories
+from lanes import slow
 from sample_robots import APR_02
 
 import omnibench.robot.stored_odometry as odometry_of_stored
@@ -408,7 +409,7 @@ def reduced(robot: str, seed: int, kinds: str) -> Dataset:
     return study.reduced(exact, kinds, np.random.default_rng(seed))
 
 
-@pytest.mark.parametrize("calibrator", ["trajectory_ml", "closed_form", "least_squares"])
+@pytest.mark.parametrize("calibrator", ["trajectory_ml", *slow("closed_form", "least_squares")])
 def test_exact_references_give_the_true_matrix(calibrator: str, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("TAPE", "ANGLE"):
         monkeypatch.setattr(study, name, 1e-7)
@@ -426,7 +427,7 @@ def test_intervals_hold_the_truth(kind: str) -> None:
     assert (np.abs(errors) < 1).mean() > 0.75  # the study of 300 sets is tests/studies/reference_coverage.py
 
 
-@pytest.mark.parametrize("loss", ["squares", "huber"])
+@pytest.mark.parametrize("loss", ["squares", *slow("huber")])
 def test_intervals_of_final_errors_hold_the_truth(loss: str) -> None:
     away = []
     for seed in range(3):

@@ -65,6 +65,7 @@ class TestRecordings:
         session = import_dataset("optiodom", OMNI3 / "square" / "221220201953")
         assert (len(session.split("train")), len(session.split("validation"))) == (8, 4)
 
+    @pytest.mark.slow
     def test_groups_can_be_chosen(self) -> None:
         swapped = import_dataset("optiodom", OMNI3, {"train": "square", "log": False})
         assert len(swapped.split("train")) == 23

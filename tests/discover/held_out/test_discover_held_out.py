@@ -22,7 +22,6 @@ from omnibench.discover.held_out import (
     is_confirmed,
     kinds_of_runs,
     random_folds_of_repetitions,
-    training_domain,
     training_gap,
     values_of_other_folds,
 )
@@ -81,11 +80,6 @@ def test_out_and_back_is_one_kind_of_motion_however_its_mean_scatters() -> None:
     for recorded in (runs, apart):
         fit = extended_of(recorded, [np.zeros((2, 3))] * 20).fit
         assert set(kinds_of_runs(fit).tolist()) == {0}
-
-
-def test_a_run_is_predicted_by_the_mean_of_the_other_folds() -> None:
-    values = values_of_other_folds(constants(1.0, 2.0, 6.0), [0], np.array([0, 1, 2]))
-    assert values[:, 0].tolist() == pytest.approx([4.0, 3.5, 1.5])
 
 
 def test_runs_of_one_fold_never_predict_each_other() -> None:
@@ -193,10 +187,6 @@ TRAINING = [run_of(FORWARD, "go", f"go {number}") for number in (1, 2)]
 NOTHING = [np.zeros((2, 3)) for _ in TRAINING]
 TURNED = [run_of(TURN, "turn", "turn 1", split="validation")]
 RADIUS_95 = 2.45 / np.sqrt(2)  # of the circle that holds 95 % of errors whose mean square is 1
-
-
-def test_the_training_domain_is_what_the_training_runs_drove() -> None:
-    np.testing.assert_allclose(training_domain(extended_of(TRAINING, NOTHING)), [[0.2, 0.0, 0.0]], atol=1e-12)
 
 
 def test_a_command_that_the_training_drove_is_no_extrapolation() -> None:

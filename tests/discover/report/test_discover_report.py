@@ -22,6 +22,7 @@ from discovery_samples import (
     shorn,
     simulated,
 )
+from lanes import slow
 from pydantic_core import to_json
 from report_page import NUMBER, Page
 from sample_robots import LEVER_MECANUM
@@ -74,7 +75,7 @@ def test_the_report_reads_as_before(make: Callable[[], Discovery], snapshot: Sna
     assert whole(make).words() == snapshot
 
 
-@pytest.mark.parametrize("make", [named, nothing, nameless, incomplete, poor_named, poor_nothing])
+@pytest.mark.parametrize("make", [named, nothing, incomplete, poor_named, poor_nothing, *slow(nameless)])
 def test_no_plot_is_empty_and_every_axis_has_a_title(make: Callable[[], Discovery]) -> None:
     drawn = plots(whole(make))
     assert len(drawn) > 8

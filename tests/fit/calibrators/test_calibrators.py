@@ -15,7 +15,6 @@ from contamination import with_jumps
 from fit_samples import Worst, box_between, make_problem, noisy_trajectories
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from lanes import slow
 from motions import RING, TURNS, driven
 from numpy.testing import assert_array_equal
 from posterior_coverage import ratios_of
@@ -470,7 +469,8 @@ def test_headings_that_jump_cost_five_percent_at_most(loss: LossName) -> None:
     assert error(run, judged) <= 1.05 * on_clean(TRICYCLE, "least_squares", "trajectory")
 
 
-@pytest.mark.parametrize("calibrator", ["closed_form", *slow("least_squares", "trajectory_ml")])
+@pytest.mark.slow
+@pytest.mark.parametrize("calibrator", ["closed_form", "least_squares", "trajectory_ml"])
 def test_real_recordings_with_jumps_are_calibrated_as_without(calibrator: str) -> None:
     if not RECORDINGS.exists():
         pytest.skip(f"no real recordings: {RECORDINGS} is not there")
@@ -823,6 +823,7 @@ def test_runs_without_poses_are_not_for_it() -> None:
     assert "trajectory_ml" in result.reason
 
 
+@pytest.mark.slow
 def test_trained_on_circles_it_predicts_the_squares_of_a_real_robot() -> None:
     """OptiOdom's omni robot: the best matrix alone errs by 0.10 m there, and discover's named effect by 0.035 m."""
     dataset = omni3()
