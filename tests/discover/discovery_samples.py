@@ -8,16 +8,9 @@ from sample_robots import APR02
 from shared_results import made_once
 
 from omnibench.data.dataset import Dataset, Trajectory
+from omnibench.discover import result
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.fitting import Fit, fit_matrix
-from omnibench.discover.result import (
-    CovariateDependence,
-    Discovery,
-    Experiment,
-    ExperimentCommand,
-    Extrapolation,
-    HeldOut,
-)
 from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.source import simulate_dataset
@@ -62,46 +55,46 @@ def shorn(dataset: Dataset, **values: Any) -> Dataset:
 
 
 @made_once
-def named() -> Discovery:
+def named() -> result.Discovery:
     """A strong effect that the catalogue has."""
     return discover_effects(simulated())
 
 
 @made_once
-def repeated() -> Discovery:
+def repeated() -> result.Discovery:
     """The same effect in twice as many repetitions."""
     return discover_effects(simulated(repetitions=4))
 
 
 @made_once
-def nothing() -> Discovery:
+def nothing() -> result.Discovery:
     """Noise alone."""
     return discover_effects(simulated(()))
 
 
 @made_once
-def nameless() -> Discovery:
+def nameless() -> result.Discovery:
     """A strong effect that is left out of the catalogue."""
     return discover_effects(simulated(), without=("rotation_translation_coupling",))
 
 
 @made_once
-def lagging() -> Discovery:
+def lagging() -> result.Discovery:
     """Motors that lag behind their targets by 0.15 s."""
     return discover_effects(simulated(({"name": "motor_lag", "parameters": {"tau": 0.15}},)))
 
 
 @made_once
-def look_alike() -> Discovery:
+def look_alike() -> result.Discovery:
     """Wheels that lose a constant rate: at one speed they look like wheels that creep."""
     return discover_effects(simulated(DEAD_ZONE, validation=None))
 
 
-def incomplete() -> Discovery:
+def incomplete() -> result.Discovery:
     """Named, with more of whatever a discovery may hold than these data give rise to."""
     found = named()
     description = "what is left depends on how fast the wheels turn"
-    dependence = CovariateDependence("wheel rate", "wheel", 2e-11, 90.0, 24, description)
+    dependence = result.CovariateDependence("wheel rate", "wheel", 2e-11, 90.0, 24, description)
     return replace(
         found,
         verdict="incomplete",
@@ -113,7 +106,7 @@ def incomplete() -> Discovery:
     )
 
 
-def poor(found: Discovery) -> Discovery:
+def poor(found: result.Discovery) -> result.Discovery:
     """The discovery as of recordings that lack wheel angles, order, commands and held-out runs."""
     dataset = shorn(
         found.dataset, angles=None, session=None, started_at=None, command=None, v=None, alpha=None, omega=None,
@@ -122,17 +115,19 @@ def poor(found: Discovery) -> Discovery:
     return replace(found, dataset=dataset, held_out=())
 
 
-def held_out(found: Discovery, data: str) -> HeldOut:
+def held_out(found: result.Discovery, data: str) -> result.HeldOut:
     """Its figures on one kind of held-out runs."""
     return next(each for each in found.held_out if each.data == data)
 
 
-EXTRAPOLATION = Extrapolation("v0.4_a90_w1", "turns at 1.0 rad/s, where training had at most 0.35 rad/s", 0.041, 0.152)
-EXPERIMENT = Experiment(
+EXTRAPOLATION = result.Extrapolation(
+    "v0.4_a90_w1", "turns at 1.0 rad/s, where training had at most 0.35 rad/s", 0.041, 0.152
+)
+EXPERIMENT = result.Experiment(
     ("acceleration_slip", "reference_time_offset"),
     "Drive 4 runs, 1.8 minutes with 15 s before each to place the robot.",
     "generator: flower\ncommands: {speeds: [0.0], directions_deg: [0], turn_rates: [-1.0, 1.0]}\n",
-    (ExperimentCommand("turning left on the spot at 1 rad/s", 4, 12.5),),
+    (result.ExperimentCommand("turning left on the spot at 1 rad/s", 4, 12.5),),
     runs=4,
     minutes=1.83,
     chance=0.97,

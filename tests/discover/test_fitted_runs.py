@@ -36,18 +36,9 @@ from wheeled_samples import DIFF, SWERVE, TRICYCLE, driven
 from omnibench.config import validate
 from omnibench.data.dataset import Trajectory
 from omnibench.data.splits import joined
+from omnibench.discover import fitting
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.experiments import Choice, Members, Separation, candidate_runs, choose_runs, description_of
-from omnibench.discover.fitting import (
-    Extended,
-    Fit,
-    InlierWhitener,
-    extend,
-    in_windows,
-    inliers_of,
-    paths_of,
-    with_noise,
-)
 from omnibench.discover.regressors.fine_structure import fine_structure
 from omnibench.discover.regressors.paths import slopes_by
 from omnibench.discover.regressors.significance import Family, Group, Significance, significance_of, together
@@ -82,7 +73,7 @@ def drive(seed: int, seconds: float = 60.0) -> Trajectory:
 
 @given(seed=st.integers(0, 2**32 - 1))
 def test_the_odometry_of_every_window_ends_where_the_drive_does(seed: int) -> None:
-    windows = in_windows([drive(seed)])
+    windows = fitting.in_windows([drive(seed)])
     assert len(windows) == 15  # of 4 s
     model = OdometryModel.of_design(ROBOT_MODEL, "arc")
     for window, poses in zip(windows, model.poses([window.reference_log for window in windows]), strict=True):
@@ -92,9 +83,9 @@ def test_the_odometry_of_every_window_ends_where_the_drive_does(seed: int) -> No
 
 def test_repetitions_and_many_runs_are_not_cut() -> None:
     repeated = [replace(drive(seed), id=str(seed), command="c") for seed in (1, 2)]
-    assert in_windows(repeated) == tuple(repeated)
+    assert fitting.in_windows(repeated) == tuple(repeated)
     many = [replace(drive(1, 9.0), id=str(number)) for number in range(30)]
-    assert in_windows(many) == tuple(many)
+    assert fitting.in_windows(many) == tuple(many)
 
 
 # Outliers
@@ -114,7 +105,7 @@ def runs_of(*commands: str | None, poses: int = POSES) -> list[Trajectory]:
 
 
 def outliers(runs: list[Trajectory], residuals: np.ndarray | list[np.ndarray], noise: Noise = UNIT) -> list[list[int]]:
-    return [np.flatnonzero(~mask).tolist() for mask in inliers_of(runs, list(residuals), noise)]
+    return [np.flatnonzero(~mask).tolist() for mask in fitting.inliers_of(runs, list(residuals), noise)]
 
 
 @pytest.mark.parametrize(("size", "left_out"), [(4.3, []), (4.7, [7])])
@@ -179,7 +170,7 @@ def test_outliers_are_whitened_as_if_they_had_not_been_seen() -> None:
     stamps, residuals = 0.4 * np.arange(1, 9), np.random.default_rng(0).standard_normal((8, 3))
     inliers = np.array([True, False, True, True, False, False, True, False])
     noise = Noise(pose_position=0.4, walk_position=0.3, pose_heading=0.2, bias_heading=0.1)
-    whiten, alone = InlierWhitener(noise, stamps, inliers), Whitener(noise, stamps[inliers])
+    whiten, alone = fitting.InlierWhitener(noise, stamps, inliers), Whitener(noise, stamps[inliers])
     white = whiten(residuals)
     np.testing.assert_array_equal(white, alone(residuals[inliers]))
     np.testing.assert_allclose(whiten.of_differences(np.diff(residuals, axis=0, prepend=0.0)), white)
@@ -188,10 +179,10 @@ def test_outliers_are_whitened_as_if_they_had_not_been_seen() -> None:
     np.testing.assert_allclose(whiten.weighted(white).ravel(), precision @ residuals.ravel(), atol=1e-12)
 
 
-def extended_by(name: str, plain: Fit) -> Extended:
+def extended_by(name: str, plain: fitting.Fit) -> fitting.Extended:
     effect = effects.create(name)
     linear = tuple(each for each in effect.parameters(plain.model.robot) if not each.choices)
-    return extend(plain, [Group("effect", name, (), effect, linear)])
+    return fitting.extend(plain, [Group("effect", name, (), effect, linear)])
 
 
 def test_an_effect_that_looks_like_outliers_is_estimated_without_bias() -> None:
@@ -210,7 +201,7 @@ def test_poses_come_back_and_jumps_stay_out_once_the_model_holds_the_effect() ->
             run.poses[1 + thrown[run.id], :2] += 0.2
     model = extended_by(EFFECT, plain_fit(replace(dataset, trajectories=tuple(runs))))
     strict = replace(model.fit, inliers=tuple(np.arange(len(mask)) % 3 > 0 for mask in model.fit.masks))
-    again = with_noise(strict)
+    again = fitting.with_noise(strict)
     assert {run.id: np.flatnonzero(~mask).tolist() for run, mask in zip(again.runs, again.masks, strict=True)} == {
         run.id: [thrown[run.id]] if run.id in thrown else [] for run in again.runs
     }
@@ -237,7 +228,7 @@ def test_the_fit_ends_where_neither_outliers_nor_noise_change() -> None:
             run.poses[int(rng.integers(1, len(run.poses))), :2] += rng.choice([-0.08, 0.08], 2)
     plain = plain_fit(replace(dataset, trajectories=tuple(runs)))
     assert plain.jumps > 10
-    np.testing.assert_array_equal(np.concatenate(with_noise(plain).masks), np.concatenate(plain.masks))
+    np.testing.assert_array_equal(np.concatenate(fitting.with_noise(plain).masks), np.concatenate(plain.masks))
 
 
 # What residuals depend on: slopes along paths, covariates and their significance.
@@ -382,7 +373,7 @@ NAMELESS = [
 ]
 
 
-def on_robot(robot: str) -> Fit:
+def on_robot(robot: str) -> fitting.Fit:
     """The plain matrix fitted to a few runs of the APR-02 or of a config's robot, the tracked point off its centre."""
     if robot == "three":
         dataset = simulated((), start="random")
@@ -399,7 +390,7 @@ def on_robot(robot: str) -> Fit:
 
 
 @pytest.fixture(scope="module")
-def fitted() -> Fit:
+def fitted() -> fitting.Fit:
     return on_robot("three")
 
 
@@ -412,12 +403,12 @@ def test_slopes_by_an_effect_are_the_models_own(robot: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMELESS)
-def test_slopes_by_an_effect_without_a_name_are_the_models_own(fitted: Fit, name: str) -> None:
+def test_slopes_by_an_effect_without_a_name_are_the_models_own(fitted: fitting.Fit, name: str) -> None:
     check_slopes(fitted, name)
 
 
-def check_slopes(fitted: Fit, name: str) -> None:
-    paths = paths_of(fitted)
+def check_slopes(fitted: fitting.Fit, name: str) -> None:
+    paths = fitting.paths_of(fitted)
     effect = effects.create(name)
     parameters = effect.parameters(paths.robot, ("earlier", "train"))
     for parameter in (each for each in parameters if not each.choices):
@@ -437,9 +428,11 @@ def check_slopes(fitted: Fit, name: str) -> None:
         assert np.abs(slopes - expected).max() <= tolerance * np.abs(expected).max(), f"{name}, {parameter.name}"
 
 
-def test_samples_put_together_give_the_same_slopes_of_what_varies_slowly(fitted: Fit) -> None:
+def test_samples_put_together_give_the_same_slopes_of_what_varies_slowly(fitted: fitting.Fit) -> None:
     effect = effects.create("heading_drift")
-    fine, coarse = (slopes_by(paths_of(fitted, together), effect, ["b"], {"b": 0.0}) for together in (0.0, 0.12))
+    fine, coarse = (
+        slopes_by(fitting.paths_of(fitted, together), effect, ["b"], {"b": 0.0}) for together in (0.0, 0.12)
+    )
     assert np.abs(fine - coarse).max() < 2e-3 * np.abs(fine).max()
 
 
@@ -543,7 +536,7 @@ def test_the_surplus_is_that_of_the_group_that_stands_out_most_beyond_what_usual
 CHANCE = 0.002
 
 
-def found_in(fit: Fit) -> Significance:
+def found_in(fit: fitting.Fit) -> Significance:
     return fine_structure(fit, np.random.default_rng(0))
 
 
@@ -610,7 +603,7 @@ def test_few_runs_have_no_fine_structure() -> None:
 def test_a_wave_scores_as_its_slopes_do_where_the_tracked_point_is_off_the_robots_centre() -> None:
     dataset = simulated(robot=APR02 | {"mount": {"x": 0.2, "y": -0.1, "yaw": 0.3}})
     fit = plain_fit(dataset)
-    found, paths = found_in(fit), paths_of(fit, 0.0)
+    found, paths = found_in(fit), fitting.paths_of(fit, 0.0)
     number = next(row for row, group in enumerate(found.groups) if group.name == "heading")  # once a turn
     heading = paths.middle[:, 2]
     shares = np.column_stack([np.cos(heading), np.sin(heading)])
@@ -674,7 +667,7 @@ def test_candidates_are_no_faster_and_steer_no_farther_than_what_was_recorded(ro
         assert not asked or max(asked) <= max(done) * 1.0001
 
 
-def steered_half(fit: Fit) -> Fit:
+def steered_half(fit: fitting.Fit) -> fitting.Fit:
     """The fit at runs that were steered half as far."""
     runs = (run if run.steering is None else replace(run, steering=run.steering / 2) for run in fit.runs)
     return replace(fit, runs=tuple(runs))

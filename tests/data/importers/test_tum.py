@@ -10,15 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from sample_robots import APR_02, WHEELED
 
-from omnibench.data.counters import (
-    POWERS_OF_TWO,
-    about_zero,
-    counted_on,
-    counter_range,
-    lost_register,
-    repeated_readings,
-    turns_restored,
-)
+from omnibench.data import counters
 from omnibench.data.dataset import Trajectory, make_dataset
 from omnibench.data.importers.copied_reference import follows_the_wheels
 from omnibench.data.importers.tum import planar_headings, read_tum, write_tum
@@ -130,7 +122,7 @@ def drive(seed: int, longest: float) -> Array:
 
 def recognised(counts: Array) -> float | None:
     """The range of a counter of ticks whose wheel's turn is far longer."""
-    return counter_range([counts], 1e300, True)
+    return counters.counter_range([counts], 1e300, True)
 
 
 @given(st.integers(0, 10**6), st.integers(8, 48), st.floats(0.01, 0.24), st.booleans(), st.floats(0, 1))
@@ -140,7 +132,7 @@ def test_a_counter_of_any_bits_is_counted_on(seed: int, bits: int, longest: floa
     shown = counts % wrap - (wrap / 2 if signed else 0)
     wrapped = bool((np.abs(np.diff(shown)) > wrap / 2).any())
     assert recognised(shown) == (wrap if wrapped else None)
-    np.testing.assert_array_equal(np.diff(counted_on(shown, wrap)), np.diff(counts))
+    np.testing.assert_array_equal(np.diff(counters.counted_on(shown, wrap)), np.diff(counts))
 
 
 def late_drive(seed: int, late: int) -> tuple[Array, Array, Array]:
@@ -162,14 +154,14 @@ def late_drive(seed: int, late: int) -> tuple[Array, Array, Array]:
 def test_turns_that_a_register_lost_are_restored(seed: int, late: int) -> None:
     times, counts, shown = late_drive(seed, late)
     lost = not np.array_equal(counts, shown)
-    assert lost_register(shown, times, POWERS_OF_TWO) == (2**16 if lost else None)
-    np.testing.assert_array_equal(turns_restored(shown, times, 2**16), counts)
+    assert counters.lost_register(shown, times, counters.POWERS_OF_TWO) == (2**16 if lost else None)
+    np.testing.assert_array_equal(counters.turns_restored(shown, times, 2**16), counts)
 
 
 @given(st.integers(0, 10**6), st.integers(8, 20), st.floats(0.01, 0.24))
 def test_a_wheel_that_turns_back_has_lost_no_turns(seed: int, bits: int, longest: float) -> None:
     counts = drive(seed, longest * 2.0**bits)
-    assert lost_register(counts, 0.05 * np.arange(len(counts)), POWERS_OF_TWO) is None
+    assert counters.lost_register(counts, 0.05 * np.arange(len(counts)), counters.POWERS_OF_TWO) is None
 
 
 @given(st.integers(0, 10**6), st.integers(300, 10**6))
@@ -187,7 +179,7 @@ def power_near(number: int) -> float | None:
 @pytest.mark.parametrize("before", [8_000, 8_100])
 def test_a_counter_that_is_set_to_zero_while_its_wheel_turns_has_lost_no_turn(before: int) -> None:
     counts = np.append(np.arange(0, before, 290), np.arange(0, 30_000, 290)).astype(float)
-    assert lost_register(counts, 0.03 * np.arange(len(counts)), POWERS_OF_TWO) is None
+    assert counters.lost_register(counts, 0.03 * np.arange(len(counts)), counters.POWERS_OF_TWO) is None
 
 
 def test_steps_of_a_third_of_the_range_are_not_unambiguous() -> None:
@@ -197,34 +189,34 @@ def test_steps_of_a_third_of_the_range_are_not_unambiguous() -> None:
 @pytest.mark.parametrize("start", [0.0, 100.0, 8191.0])
 def test_an_absolute_encoder_that_counts_from_zero_is_read_about_zero(start: float) -> None:
     angle = 2000 * np.sin(np.linspace(0, 20, 300) + start)
-    np.testing.assert_allclose(about_zero(angle % 8192, 8192), angle, atol=1e-9)
+    np.testing.assert_allclose(counters.about_zero(angle % 8192, 8192), angle, atol=1e-9)
 
 
 def test_an_absolute_encoder_that_counts_both_ways_stays_as_it_is() -> None:
     angle = np.linspace(-3, 3.1, 50)
-    np.testing.assert_array_equal(about_zero(angle, 2 * np.pi), angle)
+    np.testing.assert_array_equal(counters.about_zero(angle, 2 * np.pi), angle)
 
 
 def test_a_potentiometer_that_passes_half_a_turn_makes_no_jump() -> None:
     shown = 512 + 400 * np.sin(np.linspace(0, 6, 100))
-    np.testing.assert_array_equal(about_zero(shown, 1229), shown)
+    np.testing.assert_array_equal(counters.about_zero(shown, 1229), shown)
 
 
 def test_only_readings_logged_again_in_the_middle_of_a_drive_are_repeated() -> None:
     steps = np.array([0, 0, 100, 120, 0, 110, 100, 0, 0, 100, 100, 0, 0])
     angles = np.append(0, np.cumsum(steps)).astype(float)[:, None]
     times = np.arange(len(angles), dtype=float)
-    assert np.flatnonzero(repeated_readings(times, angles, None)).tolist() == [5]
+    assert np.flatnonzero(counters.repeated_readings(times, angles, None)).tolist() == [5]
     steers = np.zeros_like(angles)
     steers[5:] = 0.1  # the steering encoder was read anew
-    assert not repeated_readings(times, angles, steers).any()
+    assert not counters.repeated_readings(times, angles, steers).any()
     rest = times + 3 * (times >= 5)
-    assert not repeated_readings(rest, angles, None).any()
+    assert not counters.repeated_readings(rest, angles, None).any()
 
 
 def test_a_wheel_that_creeps_from_tick_to_tick_repeats_nothing() -> None:
     angles = np.floor(np.arange(100) * 0.7)[:, None]
-    assert not repeated_readings(np.arange(100.0), angles, None).any()
+    assert not counters.repeated_readings(np.arange(100.0), angles, None).any()
 
 
 PERIOD, SAMPLES = 0.02, 3000  # s: a minute of driving

@@ -24,6 +24,7 @@ from omnibench.discover.held_out import group_counts, step_name
 from omnibench.discover.regressors.covariate_bases import Basis
 from omnibench.discover.regressors.significance import Family, Group, Significance, together
 from omnibench.discover.result import Discovery
+from omnibench.discover.selection import model_selection
 from omnibench.discover.selection.competing_models import (
     CompetingModels,
     Detectability,
@@ -39,18 +40,6 @@ from omnibench.discover.selection.evidence import (
     effect_sets,
     log_evidence,
 )
-from omnibench.discover.selection.model_selection import (
-    EncoderQuantisation,
-    MotorEffects,
-    Screening,
-    Selection,
-    quantisation_steps,
-    screen_again,
-    screen_extended,
-    screen_plain,
-    select_effects,
-    select_motor_effects,
-)
 from omnibench.discover.selection.unknown_term import add_smooth_terms
 from omnibench.fit.noise import Whitener
 from omnibench.registry import effects
@@ -63,11 +52,11 @@ FLOOR, LATENCY = "floor_drift", "heading_latency"
 BASES = {"heading": (FIRST + SECOND) / np.sqrt(2), "place": THIRD, "elapsed time": FOURTH}
 
 
-def selected(given: Screening) -> Selection:
-    return select_effects(given, np.random.default_rng(0))
+def selected(given: model_selection.Screening) -> model_selection.Selection:
+    return model_selection.select_effects(given, np.random.default_rng(0))
 
 
-def names(selection: Selection) -> list[str]:
+def names(selection: model_selection.Selection) -> list[str]:
     return [group.name for group in selection.chosen]
 
 
@@ -149,7 +138,9 @@ def test_what_one_run_alone_shows_is_no_effect() -> None:
     given = screening({DRIFT: FIRST}, BASES, [0, 0, 0, 0, 0])
     residuals = (given.data.residuals[0] + 80 * FIRST, *given.data.residuals[1:])
     scores = np.array([each.T @ own for each, own in zip(given.data.columns, residuals, strict=True)])
-    again = Screening(given.groups, replace(given.data, residuals=residuals, scores=scores), given.folds)
+    again = model_selection.Screening(
+        given.groups, replace(given.data, residuals=residuals, scores=scores), given.folds
+    )
     assert again.beyond_matrix().chi_square((1,)) == pytest.approx(80**2 / 20)
     assert selected(again).chosen == ()
 
@@ -170,30 +161,30 @@ def plain() -> Fit:
 
 
 @pytest.fixture(scope="module")
-def screened(plain: Fit) -> Screening:
-    return screen_plain(plain, LEFT_OUT)
+def screened(plain: Fit) -> model_selection.Screening:
+    return model_selection.screen_plain(plain, LEFT_OUT)
 
 
 @pytest.fixture(scope="module")
-def extended(plain: Fit, screened: Screening) -> Extended:
+def extended(plain: Fit, screened: model_selection.Screening) -> Extended:
     (coupling,) = (group for group in screened.groups.effects if group.name == "rotation_translation_coupling")
     return extend(plain, [coupling])
 
 
 def test_an_extended_model_is_screened_with_its_effects_put_back(extended: Extended) -> None:
-    again = screen_extended(extended, LEFT_OUT)
+    again = model_selection.screen_extended(extended, LEFT_OUT)
     (coupling,) = (group for group in again.groups.effects if group.name == "rotation_translation_coupling")
     values, _ = again.beyond_matrix().estimate(coupling.index)
     np.testing.assert_allclose(values, extended.values, rtol=0.05)
     assert again.beyond_matrix().chi_square(coupling.index) > 10 * len(extended.values)
 
 
-def test_columns_are_made_once_for_both_screenings(screened: Screening, extended: Extended) -> None:
-    assert screen_again(extended, screened).groups is screened.groups
-    assert screen_extended(extended, LEFT_OUT).groups is not screened.groups
+def test_columns_are_made_once_for_both_screenings(screened: model_selection.Screening, extended: Extended) -> None:
+    assert model_selection.screen_again(extended, screened).groups is screened.groups
+    assert model_selection.screen_extended(extended, LEFT_OUT).groups is not screened.groups
 
 
-def test_effects_that_need_a_second_session_are_absorbed_in_a_single_one(screened: Screening) -> None:
+def test_effects_that_need_a_second_session_are_absorbed_in_a_single_one(screened: model_selection.Screening) -> None:
     limits = detectability_of(screened, selected(screened))
     of_sessions = {name for name, missing in limits.not_looked_for if missing is Missing.SECOND_SESSION}
     assert of_sessions
@@ -319,7 +310,7 @@ def test_wheels_with_gaussian_noise_have_no_ticks() -> None:
     rng = np.random.default_rng(5)
     for speed in (0.005, 0.03, 0.1):
         angles = speed * np.array([1.0, -0.3, 0.5]) + 3e-4 * rng.standard_normal((800, 3))
-        assert not quantisation_steps([turning(np.round(angles / 0.02, 6) * 0.02)]).any()
+        assert not model_selection.quantisation_steps([turning(np.round(angles / 0.02, 6) * 0.02)]).any()
 
 
 @pytest.mark.parametrize("tick", [1e-4, 1e-3])
@@ -327,7 +318,7 @@ def test_ticks_are_found_in_wheel_rates_that_are_written_with_six_digits(tick: f
     rng = np.random.default_rng(6)
     counts = np.floor(np.cumsum(0.03 + 3e-4 * rng.standard_normal((800, 3)), axis=0) / tick)
     angles = tick * np.diff(counts, axis=0, prepend=0.0)
-    steps = quantisation_steps([turning(np.round(angles / 0.02, 6) * 0.02)])
+    steps = model_selection.quantisation_steps([turning(np.round(angles / 0.02, 6) * 0.02)])
     assert steps == pytest.approx(tick, rel=1e-3)
 
 
@@ -335,13 +326,13 @@ def test_ticks_are_found_in_wheel_rates_that_are_written_with_six_digits(tick: f
 def test_the_size_of_a_tick_is_found(tick: float, seed: int, most: int) -> None:
     counts = np.random.default_rng(seed).integers(-most, most + 1, size=(400, 3))
     counts[:2] = [[most] * 3, [most - 1] * 3]
-    np.testing.assert_allclose(quantisation_steps([turning(tick * counts)]), tick, rtol=1e-9)
+    np.testing.assert_allclose(model_selection.quantisation_steps([turning(tick * counts)]), tick, rtol=1e-9)
 
 
 def bound(commands: Sequence[str], columns: Sequence[np.ndarray], beyond: Sequence[int] = ()) -> float:
     runs = [run_of(FORWARD, command, f"run {number}") for number, command in enumerate(commands)]
     fit = extended_of(runs, [np.zeros((2, 3)) for _ in runs]).fit
-    return EncoderQuantisation(fit, fit.whitened(columns)).chi_square([0], beyond)
+    return model_selection.EncoderQuantisation(fit, fit.whitened(columns)).chi_square([0], beyond)
 
 
 def test_a_column_explains_at_most_the_quarter_ticks_that_all_push_along_it() -> None:
@@ -544,10 +535,10 @@ def bare(grooved: tuple[Dataset, Truth, Discovery]) -> Extended:
 
 
 @pytest.fixture(scope="module")
-def screened_again(bare: Extended) -> tuple[Screening, Selection]:
+def screened_again(bare: Extended) -> tuple[model_selection.Screening, model_selection.Selection]:
     """Their screening, and what is selected after it."""
-    screening = screen_plain(bare.fit, ())
-    return screening, select_effects(screening, np.random.default_rng(0))
+    screening = model_selection.screen_plain(bare.fit, ())
+    return screening, model_selection.select_effects(screening, np.random.default_rng(0))
 
 
 def error(calibration: Calibration, dataset: Dataset, truth: Truth, found: Discovery) -> float:
@@ -592,7 +583,7 @@ def test_no_term_is_tried_where_it_is_not_wanted_or_nothing_is_missing(make: Cal
 
 
 def test_functions_are_fitted_together_with_named_effects_and_stand_after_them(
-    bare: Extended, screened_again: tuple[Screening, Selection]
+    bare: Extended, screened_again: tuple[model_selection.Screening, model_selection.Selection]
 ) -> None:
     screening, selection = screened_again
     models = with_names(bare, selection, group("heading_drift"))
@@ -618,7 +609,7 @@ def test_runs_of_few_kinds_of_motion_get_no_term(grooved: tuple[Dataset, Truth, 
 
 
 def test_nothing_is_added_to_a_model_that_leaves_nothing_of_it(
-    bare: Extended, screened_again: tuple[Screening, Selection]
+    bare: Extended, screened_again: tuple[model_selection.Screening, model_selection.Selection]
 ) -> None:
     screening, selection = screened_again
     models = with_names(bare, selection, group("smooth_heading"), group("smooth_course"))
@@ -637,7 +628,7 @@ def test_named_effects_come_one_by_one_and_what_has_no_name_at_once() -> None:
     assert step_name(nameless) == "unnamed, over place"
 
 
-def with_names(bare: Extended, selection: Selection, *groups: Group) -> CompetingModels:
+def with_names(bare: Extended, selection: model_selection.Selection, *groups: Group) -> CompetingModels:
     """A model with these effects, whatever was selected."""
     used = extend(bare.fit, groups)
     return CompetingModels(used, selection, ((1.0, used),), ())
@@ -657,7 +648,7 @@ def group(name: str, **shapes: float) -> Group:
 
 # Models that recordings cannot tell apart: which is used, and their average with its weights and how unsure it is.
 
-Fitted = tuple[Fit, Selection, dict[str, Group]]
+Fitted = tuple[Fit, model_selection.Selection, dict[str, Group]]
 RIGHT, WRONG = "rotation_translation_coupling", "acceleration_slip"
 
 
@@ -665,8 +656,12 @@ RIGHT, WRONG = "rotation_translation_coupling", "acceleration_slip"
 def fitted() -> Fitted:
     """The plain fit, the selection of the one effect that is there, and all effects."""
     plain = plain_fit(simulated(COUPLING, validation=None))
-    screening = screen_plain(plain, ())
-    return plain, select_effects(screening, np.random.default_rng(0)), {g.name: g for g in screening.groups.effects}
+    screening = model_selection.screen_plain(plain, ())
+    return (
+        plain,
+        model_selection.select_effects(screening, np.random.default_rng(0)),
+        {g.name: g for g in screening.groups.effects},
+    )
 
 
 def competing(fitted: Fitted, chosen: str, *others: str) -> CompetingModels:
@@ -783,8 +778,8 @@ def runs(name: str = "motor_gain", count: int = 12, **values: float) -> list[Tra
     return made
 
 
-def found(recorded: list[Trajectory], *without: str) -> MotorEffects | None:
-    return select_motor_effects(recorded, APR, without, np.random.default_rng(0))
+def found(recorded: list[Trajectory], *without: str) -> model_selection.MotorEffects | None:
+    return model_selection.select_motor_effects(recorded, APR, without, np.random.default_rng(0))
 
 
 @pytest.mark.parametrize(

@@ -11,15 +11,7 @@ from hypothesis import strategies as st
 from omnibench.live.estimation.health import Counts
 from omnibench.live.estimation.live_odometry import Motion
 from omnibench.live.estimation.tracker import RobotTracker
-from omnibench.live.fusion.pose_fusion import (
-    Entry,
-    Fusion,
-    FusionSettings,
-    PoseFilter,
-    PoseMeasurement,
-    Timeline,
-    innovation_of,
-)
+from omnibench.live.fusion import pose_fusion
 from omnibench.robot.calibration import Calibration, EffectTerm
 from omnibench.robot.kinematics import Array, compose, moved_to
 from omnibench.robot.odometry import advance
@@ -38,7 +30,7 @@ def test_the_predicted_covariance_is_that_of_finite_differences(moved: list[floa
             for shift in shifts
         ]
     )
-    pose_filter = PoseFilter(pose, COVARIANCE)
+    pose_filter = pose_fusion.PoseFilter(pose, COVARIANCE)
     pose_filter.predict(step)
     expected = jacobian @ COVARIANCE @ jacobian.T + VARIANCE * np.eye(3)
     np.testing.assert_allclose(pose_filter.covariance, expected, atol=1e-8)
@@ -52,13 +44,13 @@ def test_the_normalised_error_of_sparse_poses_is_that_of_three_degrees_of_freedo
     for _ in range(150):
         true = rng.uniform(-3, 3, 3)
         moved = np.array([0.06, rng.uniform(-0.03, 0.03), rng.uniform(-0.02, 0.02)])
-        pose_filter = PoseFilter(true + rng.multivariate_normal(np.zeros(3), slam), slam)
+        pose_filter = pose_fusion.PoseFilter(true + rng.multivariate_normal(np.zeros(3), slam), slam)
         for _ in range(2):
             for _ in range(50):  # 3 m from pose to pose
                 step = motion(0, moved, variance=1e-6)
                 true = advance(true, moved, "arc") + 1e-3 * rng.standard_normal(3)
                 pose_filter.predict(step)
-            error = innovation_of(true.copy(), pose_filter.pose)
+            error = pose_fusion.innovation_of(true.copy(), pose_filter.pose)
             normalised.append(error @ np.linalg.solve(pose_filter.covariance, error))
             pose_filter.correct(true + rng.multivariate_normal(np.zeros(3), slam), slam)
     assert np.mean(normalised) == pytest.approx(3.0, abs=0.5)
@@ -72,9 +64,9 @@ class Robot:
 
     def __init__(self, **settings: object) -> None:
         self.counts = Counts()
-        chosen = FusionSettings.model_validate(settings)
-        self.timeline = Timeline(chosen.history)
-        self.fusion = Fusion(chosen, self.timeline, self.counts)
+        chosen = pose_fusion.FusionSettings.model_validate(settings)
+        self.timeline = pose_fusion.Timeline(chosen.history)
+        self.fusion = pose_fusion.Fusion(chosen, self.timeline, self.counts)
         self.truth = [np.zeros(3)]
         self._append(motion(ORIGIN, np.zeros(3), 0.0))
 
@@ -87,7 +79,7 @@ class Robot:
 
     def _append(self, moved: Motion) -> None:
         pose, covariance = self.fusion.predict(moved)
-        self.timeline.append(Entry(moved.stamp, moved, self.truth[-1], pose, covariance))
+        self.timeline.append(pose_fusion.Entry(moved.stamp, moved, self.truth[-1], pose, covariance))
         self.fusion.take_waiting()
 
     def at(self, time: float) -> np.ndarray:
@@ -96,7 +88,7 @@ class Robot:
         return advance(self.truth[whole], (time / 0.01 - whole) * np.array([0.005, 0.0, 0.005]), "arc")
 
     def see(self, time: float, error: tuple[float, float, float] = (0, 0, 0), covariance: np.ndarray = R) -> str:
-        return self.fusion.correct(PoseMeasurement(stamp(time), self.at(time) + error, covariance))
+        return self.fusion.correct(pose_fusion.PoseMeasurement(stamp(time), self.at(time) + error, covariance))
 
 
 def stamp(time: float) -> int:
@@ -136,7 +128,7 @@ def test_a_pose_older_than_the_history_is_counted_and_changes_nothing() -> None:
 def test_a_pose_that_comes_before_its_wheel_sample_waits_for_it() -> None:
     robot = Robot().drive(10)
     robot.see(0.05)
-    ahead = PoseMeasurement(stamp(0.15), np.array([0.0749, 0.0028, 0.075]), R)
+    ahead = pose_fusion.PoseMeasurement(stamp(0.15), np.array([0.0749, 0.0028, 0.075]), R)
     assert robot.fusion.correct(ahead) == "waiting"
     before = robot.counts.poses
     robot.drive(4)
@@ -176,10 +168,10 @@ def test_four_poses_that_agree_are_believed(seen: list[tuple[float, float, float
 
 
 def test_a_sender_with_nonsense_for_stamps_does_not_fill_the_memory() -> None:
-    timeline = Timeline(2.0)
+    timeline = pose_fusion.Timeline(2.0)
     for number in range(20_000):
         moved = motion(ORIGIN + 1000 * number, np.zeros(3), 1e-6)
-        timeline.append(Entry(moved.stamp, moved, np.zeros(3), np.zeros(3), R))
+        timeline.append(pose_fusion.Entry(moved.stamp, moved, np.zeros(3), np.zeros(3), R))
     assert len(timeline.entries) <= 8000
 
 
@@ -256,7 +248,7 @@ def seen(using: Calibration, tau: tuple[float, float], arm: Array | None = None)
     path = drive(6.0, using=calibration())
     start = np.array([2.0, -1.0, 0.7])
     truth = moved_to(start, path.poses)
-    robot = RobotTracker("apr", using, fusion=FusionSettings(gate=0.999999))
+    robot = RobotTracker("apr", using, fusion=pose_fusion.FusionSettings(gate=0.999999))
     errors = []
     for index, payload in enumerate(path.payloads()):
         updates = robot.take_wheels(payload, 0.01 * index)
@@ -300,12 +292,12 @@ def test_poses_are_put_where_and_when_they_were_taken(
 
 def test_odom_does_not_know_of_them() -> None:
     path = drive(1.0)
-    updates = fed(RobotTracker("apr", with_effects(LATE), fusion=FusionSettings()), path.payloads())
+    updates = fed(RobotTracker("apr", with_effects(LATE), fusion=pose_fusion.FusionSettings()), path.payloads())
     np.testing.assert_allclose(odometry(updates), path.poses, atol=1e-9)
 
 
 def test_a_swap_brings_its_own() -> None:
-    robot = RobotTracker("apr", calibration(), fusion=FusionSettings())
+    robot = RobotTracker("apr", calibration(), fusion=pose_fusion.FusionSettings())
     path = drive(1.0)
     fed(robot, path.payloads()[:51])
     assert robot.take_pose(slam(path.stamps[50], path.poses[50]), 0.5) == "located"
@@ -316,7 +308,7 @@ def test_a_swap_brings_its_own() -> None:
 def test_the_floor_carries_the_robot_along_the_axes_of_the_map() -> None:
     using = with_effects(term("floor_drift", dx=0.02, dy=0.0))
     path = drive(2.0, using=using)
-    robot = RobotTracker("apr", using, fusion=FusionSettings())
+    robot = RobotTracker("apr", using, fusion=pose_fusion.FusionSettings())
     payloads = path.payloads()
     fed(robot, payloads[:1])
     robot.take_pose(slam(ORIGIN, [0.0, 0.0, 1.2]), 0.0)

@@ -39,13 +39,8 @@ from syrupy.assertion import SnapshotAssertion
 
 from omnibench.errors import ConfigError
 from omnibench.robot.calibration import Provenance, covariance_rows, matrix_rows
+from omnibench.robot.export import ros2_controllers
 from omnibench.robot.export.formats import EXPORT_FORMATS, Export, export_calibration
-from omnibench.robot.export.ros2_controllers import (
-    OmniWheelDrive,
-    RemainingError,
-    closest_omni_wheel_drive,
-    matrix_deviations,
-)
 from omnibench.robot.kinematics import Array, Mount, Robot, Wheel, published_matrix
 from omnibench.robot.odometry import Integration, OdometryStream
 
@@ -203,7 +198,7 @@ def test_what_is_said_to_remain_is_what_the_controller_computes_wrongly(name: st
     errors = driven_by(export, robot, units) - units @ true.T
     errors[1:] -= errors[0]
     straight, turn = errors[:-1], errors[-1]
-    remains = RemainingError(
+    remains = ros2_controllers.RemainingError(
         float(np.linalg.norm(straight[:, :2], 2)),
         float(np.linalg.norm(straight[:, 2])),
         float(np.linalg.norm(turn[:2])),
@@ -330,10 +325,10 @@ def test_the_controller_drives_a_design_robot_exactly(angles: tuple[float, ...])
 
 def test_no_other_parameters_are_closer_to_a_calibrated_matrix() -> None:
     matrix = published_matrix("palacin2023_eq8")
-    fitted = closest_omni_wheel_drive(APR_02, matrix)
+    fitted = ros2_controllers.closest_omni_wheel_drive(APR_02, matrix)
 
     def distance(vector: Array) -> float:
-        return float(np.square(OmniWheelDrive(fitted.order, *vector).matrix - matrix).sum())
+        return float(np.square(ros2_controllers.OmniWheelDrive(fitted.order, *vector).matrix - matrix).sum())
 
     start = (0.195, 0.148, math.pi / 3)
     search = minimize(distance, start, method="Nelder-Mead", options={"xatol": 1e-10, "fatol": 1e-18})
@@ -356,7 +351,7 @@ def test_a_wheel_that_turns_the_robot_clockwise_keeps_its_sign() -> None:
     assert parameters(export, NODE) == parameters(exported(APR_02), NODE)
     assert "reverse the joints' axes, but not of b" in " | ".join(export.warnings)
     matrix = machine.inverse_kinematic_matrix
-    np.testing.assert_allclose(closest_omni_wheel_drive(machine, matrix).matrix, matrix, atol=1e-12)
+    np.testing.assert_allclose(ros2_controllers.closest_omni_wheel_drive(machine, matrix).matrix, matrix, atol=1e-12)
 
 
 def test_an_unknown_format_is_refused_with_the_nearest_and_all() -> None:
@@ -455,7 +450,7 @@ def test_an_error_of_the_tracked_points_matrix_moves_the_centre_as_a_rigid_body(
     """With the covariance e e' the matrix errs by e times one number: the deviations are those of that one error."""
     error = 1e-3 * np.random.default_rng(3).standard_normal((3, 2))
     known = calibration(mounted(DIFF), covariance=covariance_rows(np.outer(error, error)))
-    deviations = matrix_deviations(known, Mount())
+    deviations = ros2_controllers.matrix_deviations(known, Mount())
     for stated, rates in zip(deviations, ([1 / 0.08, 1 / 0.08], [0.2 / 0.08, -0.2 / 0.08]), strict=True):  # 1 m, 1 rad
         along, aside, turned = error @ rates  # of the tracked point, along its own axes
         ahead = along * math.cos(MOUNT.yaw) - aside * math.sin(MOUNT.yaw) + turned * MOUNT.y

@@ -13,19 +13,8 @@ from omnibench.data.true_poses import TruePath
 from omnibench.robot.kinematics import Array, compose, relative
 from omnibench.simulate.floor_plan import RoomPlan, make_plan
 from omnibench.simulate.lidar import Lidar, measure_scans
+from omnibench.slam import scan_matching
 from omnibench.slam.motion_prior import MotionWithinScan
-from omnibench.slam.scan_matching import (
-    Correspondences,
-    Lines,
-    Match,
-    ScanMap,
-    ScanPoints,
-    fit_lines,
-    noise_factor,
-    refine,
-    scan_points,
-    search,
-)
 from omnibench.slam.slam_dataset import FLOOR, PoseErrors
 from omnibench.slam.slam_options import SlamOptions
 
@@ -51,21 +40,21 @@ def _along(twist: Array, time: float) -> Array:
     return np.array([way.real, way.imag, 2 * half])
 
 
-def points_of(ranges: Ranges, twist: Array | None = None) -> ScanPoints:
+def points_of(ranges: Ranges, twist: Array | None = None) -> scan_matching.ScanPoints:
     within = MotionWithinScan.steady(np.zeros(3) if twist is None else twist, float(SCANNER.delays[-1]))
-    return scan_points(ranges, SCANNER, 1.0, within)
+    return scan_matching.scan_points(ranges, SCANNER, 1.0, within)
 
 
 @cache
-def room_map() -> ScanMap:
-    surroundings = ScanMap(OPTIONS.spacing)
+def room_map() -> scan_matching.ScanMap:
+    surroundings = scan_matching.ScanMap(OPTIONS.spacing)
     surroundings.add(points_of(ranges_at(np.zeros(3))).lines, np.zeros(3), keyframe=0)
     return surroundings
 
 
 def test_the_noise_of_a_map_of_one_scan_counts_as_much_as_that_of_the_scan_that_is_matched() -> None:
     """Both see every wall with as many rays; the gradient's covariance is the information for one of them alone."""
-    pairs = Correspondences(room_map(), points_of(ranges_at(np.zeros(3))), np.zeros(3))
+    pairs = scan_matching.Correspondences(room_map(), points_of(ranges_at(np.zeros(3))), np.zeros(3))
     np.testing.assert_allclose(np.diag(pairs.scatter()), 2 * np.diag(pairs.information()), rtol=0.1)
 
 
@@ -88,15 +77,15 @@ def test_any_small_motion_is_found(x: float, y: float, heading: float, seed: int
     start = true + np.random.default_rng(seed).uniform(-1, 1, 3) * [0.1, 0.1, 0.05]
     if far:
         start = true + np.array([0.3, -0.25, 0.25])
-    found = search(room_map(), scan, start, OPTIONS)
+    found = scan_matching.search(room_map(), scan, start, OPTIONS)
     np.testing.assert_allclose(found, true, atol=0.015)  # corners pull at small_gicp's pose
-    match = refine(room_map(), scan, found, start, OPTIONS)
+    match = scan_matching.refine(room_map(), scan, found, start, OPTIONS)
     np.testing.assert_allclose(match.pose, true, atol=1e-3)
     np.testing.assert_allclose(match.gain, np.eye(3), atol=1e-3)  # of the start nothing remains
 
 
 def test_what_is_in_the_map_is_not_added_again() -> None:
-    surroundings = ScanMap(OPTIONS.spacing)
+    surroundings = scan_matching.ScanMap(OPTIONS.spacing)
     lines = points_of(ranges_at(np.zeros(3), lidar=Lidar())).lines
     assert surroundings.add(lines, np.zeros(3), keyframe=0) > 100
     again = points_of(ranges_at(np.zeros(3), seed=1, lidar=Lidar())).lines
@@ -104,7 +93,7 @@ def test_what_is_in_the_map_is_not_added_again() -> None:
 
 
 def test_what_a_turned_robot_sees_behind_it_is_new() -> None:
-    surroundings = ScanMap(OPTIONS.spacing)
+    surroundings = scan_matching.ScanMap(OPTIONS.spacing)
     surroundings.add(points_of(ranges_at(np.zeros(3))).lines, np.zeros(3), keyframe=0)
     before, turned = len(surroundings), np.array([0.0, 0.0, np.pi])
     assert surroundings.add(points_of(ranges_at(turned)).lines, turned, keyframe=1) > 0.2 * before
@@ -112,11 +101,13 @@ def test_what_a_turned_robot_sees_behind_it_is_new() -> None:
 
 
 def test_both_sides_of_a_thin_wall_are_kept_apart() -> None:
-    surroundings = ScanMap(OPTIONS.spacing)
+    surroundings = scan_matching.ScanMap(OPTIONS.spacing)
     scan = points_of(ranges_at(np.zeros(3)))
     surroundings.add(scan.lines, np.zeros(3), keyframe=0)
     behind = compose(np.zeros(3), np.array([0.0, 0.0, np.pi]))
-    pairs = Correspondences(surroundings, scan, behind)  # surfaces that face away from the scanner are not matched
+    pairs = scan_matching.Correspondences(
+        surroundings, scan, behind
+    )  # surfaces that face away from the scanner are not matched
     assert pairs.matched < 0.3
 
 
@@ -124,9 +115,9 @@ def test_both_sides_of_a_thin_wall_are_kept_apart() -> None:
 def test_a_scan_on_the_way_becomes_one_at_rest(x: float, y: float, turn: float, heading: float) -> None:
     twist, place = np.array([x, y, turn]), np.array([0.1, 0.2, heading])
     moving = points_of(ranges_at(place, twist), twist)
-    surroundings = ScanMap(OPTIONS.spacing)
+    surroundings = scan_matching.ScanMap(OPTIONS.spacing)
     surroundings.add(points_of(ranges_at(place)).lines, place, keyframe=0)
-    match = refine(surroundings, moving, place, place, OPTIONS)
+    match = scan_matching.refine(surroundings, moving, place, place, OPTIONS)
     # Corners cost half a millimetre; the motion within the scan, up to 7 mm and 1 deg, is gone.
     np.testing.assert_allclose(match.pose, place, atol=1e-3)
 
@@ -142,17 +133,17 @@ def test_a_twist_may_be_put_right_afterwards() -> None:
 
 def test_noise_beyond_what_the_scanner_says_is_measured() -> None:
     scans = np.array([ranges_at(np.zeros(3), seed=seed, lidar=Lidar(noise=0.03)) for seed in range(5)])
-    assert noise_factor(scans, SCANNER) == pytest.approx(3.0, rel=0.1)
+    assert scan_matching.noise_factor(scans, SCANNER) == pytest.approx(3.0, rel=0.1)
     quiet = np.array([ranges_at(np.zeros(3), seed=seed, lidar=Lidar(noise=0.003)) for seed in range(5)])
-    assert noise_factor(quiet, SCANNER) == 1.0
-    assert noise_factor(np.full((2, 1080), np.inf, dtype=np.float32), SCANNER) == 1.0
+    assert scan_matching.noise_factor(quiet, SCANNER) == 1.0
+    assert scan_matching.noise_factor(np.full((2, 1080), np.inf, dtype=np.float32), SCANNER) == 1.0
 
 
 class TestErrors:
     """A scan that tells nothing leaves the motion's error; one that tells all, the keyframe's."""
 
     @staticmethod
-    def match(pose: Array, gain: float, noise: float = 0.0) -> Match:
+    def match(pose: Array, gain: float, noise: float = 0.0) -> scan_matching.Match:
         return match_at(pose, gain * np.eye(3), {0: np.eye(3)}, noise**2 * np.eye(3))
 
     def test_a_match_to_an_exact_keyframe_has_the_noise_of_the_scans_alone(self) -> None:
@@ -182,7 +173,7 @@ class TestErrors:
         assert np.linalg.eigvalsh(covariance)[0] > 0.5e-10
 
     def test_the_oldest_keyframes_are_merged_into_the_next(self) -> None:
-        errors, surroundings = PoseErrors(np.zeros(3)), ScanMap(OPTIONS.spacing)
+        errors, surroundings = PoseErrors(np.zeros(3)), scan_matching.ScanMap(OPTIONS.spacing)
         for keyframe, heading in enumerate((0.0, 2.0, 4.0)):
             pose = np.array([0.0, 0.0, heading])
             surroundings.add(points_of(ranges_at(pose)).lines, pose, keyframe)
@@ -201,7 +192,9 @@ class TestErrors:
         first = errors.step(self.match(pose, 1.0, 0.003), np.zeros(3), np.zeros(3))
         errors.keep()
         again = self.match(pose, 1.0)
-        second = errors.step(Match(**{**again.__dict__, "by_keyframe": {1: np.eye(3)}}), np.zeros(3), np.zeros(3))
+        second = errors.step(
+            scan_matching.Match(**{**again.__dict__, "by_keyframe": {1: np.eye(3)}}), np.zeros(3), np.zeros(3)
+        )
         np.testing.assert_allclose(second, first, atol=1e-12)
         np.testing.assert_allclose(relative(pose, again.pose), np.zeros(3), atol=1e-12)
 
@@ -215,10 +208,10 @@ def wall(distance: float, direction: float, rays: int, first: float) -> tuple[Ar
     return distance / np.cos(angles - direction), angles
 
 
-def lines_of(ranges: Array, angles: Array, deviation: float = 0.01) -> Lines:
+def lines_of(ranges: Array, angles: Array, deviation: float = 0.01) -> scan_matching.Lines:
     points = ranges[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
     rays = np.arange(len(ranges))
-    return fit_lines(points, np.full(len(ranges), deviation), 1e-5 * rays, rays)[0]
+    return scan_matching.fit_lines(points, np.full(len(ranges), deviation), 1e-5 * rays, rays)[0]
 
 
 @given(
@@ -295,11 +288,13 @@ NONE: Array = np.zeros((3, 3))
 
 def match_at(
     pose: Array, gain: Array, by_keyframe: dict[int, Array], scatter: Array = NONE, delayed: Array = NONE
-) -> Match:
+) -> scan_matching.Match:
     """A match with a gain (3, 3) and the information of each keyframe's surfaces (3, 3)."""
     information = sum(by_keyframe.values(), np.zeros((3, 3)))
     weight = gain @ np.linalg.pinv(information)
-    return Match(pose, gain, np.ones(3), np.eye(3), weight, information, by_keyframe, scatter, delayed, 1.0)
+    return scan_matching.Match(
+        pose, gain, np.ones(3), np.eye(3), weight, information, by_keyframe, scatter, delayed, 1.0
+    )
 
 
 def test_errors_of_the_motion_are_the_same_in_every_step_and_add_up() -> None:
