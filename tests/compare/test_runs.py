@@ -160,7 +160,7 @@ def test_a_plugin_that_is_repaired_or_changed_is_run_again_and_the_others_are_no
     for factor, outcome in (("a_name_that_is_not_there", "failed"), ("1.0", "converged"), ("1.01", "converged")):
         plugins = write_plugin(tmp_path / "plugins", "mine", PLUGIN.format(factor=factor))
         with registries_restored():
-            ran, _ = ran_and_kept(tmp_path / "out", plugins=[str(plugins)], calibrators=["theoretical", "mine"])
+            ran, _ = ran_and_kept(tmp_path / "out", plugins=[plugins], calibrators=["theoretical", "mine"])
         assert ran == ({"mine 1"} if costs else {"mine 1", "theoretical 1"})
         theoretical, mine = summary(tmp_path / "out")["runs"]
         assert (theoretical["outcome"], mine["outcome"]) == ("converged", outcome)
@@ -294,9 +294,9 @@ def test_the_key_of_a_run_changes_with_the_plugin_that_does_the_search(tmp_path:
     body = '@calibrators.register("inner")\nclass Inner(Calibrator):\n    def calibrate(self, problem): ...\n'
     plugins = write_plugin(tmp_path / "plugins", "inner", body)
     entry = {"name": "parametric", "options": {"search": "inner"}}
-    before = planned(plugins=[str(plugins)], calibrators=[entry])[0].key
+    before = planned(plugins=[plugins], calibrators=[entry])[0].key
     write_plugin(plugins, "inner", body + "# changed\n")
-    assert planned(plugins=[str(plugins)], calibrators=[entry])[0].key != before
+    assert planned(plugins=[plugins], calibrators=[entry])[0].key != before
 
 
 # A comparison that was interrupted or killed goes on where it was, and keeps what had ended.
@@ -614,7 +614,7 @@ def test_when_every_search_fails_there_are_results_and_exit_code_1_and_a_long_me
 def test_an_unknown_name_beside_a_broken_plugin_names_both(changes: dict[str, Any], tmp_path: Path) -> None:
     plugins = write_plugin(tmp_path / "plugins", "broken", BROKEN)
     with refused(OmnibenchError, "'of_a_third_name'", "broken.py cannot be imported: ModuleNotFoundError"):
-        compared_here(tmp_path / "out", plugins=[str(plugins)], **changes)
+        compared_here(tmp_path / "out", plugins=[plugins], **changes)
 
 
 # The processes that runs are run in: what reaches them, what they inherit, and that scripts need no guard.

@@ -167,9 +167,7 @@ class RootMeanSquare(Cost):
 
 def test_a_cost_that_is_no_mean_over_trajectories_is_warned_of(tmp_path: Path) -> None:
     plugins = write_plugin(tmp_path / "plugins", "root_mean_square", ROOT_MEAN_SQUARE)
-    result = compared_here(
-        tmp_path / "out", plugins=[str(plugins)], cost="root_mean_square", calibrators=["theoretical"]
-    )
+    result = compared_here(tmp_path / "out", plugins=[plugins], cost="root_mean_square", calibrators=["theoretical"])
     assert [warning for warning in result.warnings if "the cost is no mean over trajectories" in warning]
 
 
@@ -224,9 +222,7 @@ def test_a_model_without_effects_has_the_score_of_its_matrix(name: str) -> None:
 
 def test_row_and_file_are_of_the_model_with_its_effects(tmp_path: Path) -> None:
     plugins = write_plugin(tmp_path / "plugins", "drifting", DRIFTING)
-    result = compared_here(
-        tmp_path / "out", plugins=[str(plugins)], calibrators=["theoretical", "closed_form", "drifting"]
-    )
+    result = compared_here(tmp_path / "out", plugins=[plugins], calibrators=["theoretical", "closed_form", "drifting"])
     rows = {run.record.label: run.record for run in result.runs}
     file = read_calibration(tmp_path / "out" / "calibrations" / "flower-drifting.yaml")
     (term,) = file.effects

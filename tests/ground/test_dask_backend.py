@@ -43,9 +43,8 @@ from omnibench.progress import Progress, Reporter
 def dask() -> Iterator[DaskBackend]:
     said: list[Progress] = []
     with open_backend(BackendChoice(name="dask", workers=2), report=said.append) as backend:
-        assert [event.result.partition(" http://")[0] for event in said if event.result] == [
-            "2 workers of Dask, dashboard"
-        ]
+        (result,) = (event.result for event in said if event.result)
+        assert result.startswith("2 workers of Dask, dashboard http://")
         assert isinstance(backend, DaskBackend)
         yield backend
 

@@ -427,11 +427,6 @@ def test_the_benchmark_stays_what_it_was() -> None:
 # Effects
 
 
-def test_motors_with_a_wrong_gain_turn_wheels_by_as_much_faster() -> None:
-    for run in runs({"motor_gain": {"g": 0.04}}):
-        np.testing.assert_allclose(run.rates, 1.04 * run.targets, rtol=1e-12)
-
-
 def test_what_motors_lag_behind_is_seen_by_encoders_and_reference() -> None:
     for lagging, plain in zip(runs({"motor_lag": {"tau": 0.2}}), runs(), strict=True):
         missing = (plain.rates - lagging.rates).sum(axis=0) * 0.01

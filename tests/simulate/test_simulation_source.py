@@ -1,5 +1,6 @@
 """Simulated data sets of a YAML: which is meant, what may be asked of it, and robots simulated from command to SLAM."""
 
+import json
 import math
 from dataclasses import fields, replace
 from itertools import pairwise
@@ -534,7 +535,9 @@ def test_floor_and_slip_of_the_shipped_config_leave_about_the_papers_calibrated_
 
 
 def test_the_schema_for_editors_knows_a_robot(command: Command) -> None:
-    assert "RobotConfig" in command("schema", "simulate").stdout
+    schema = json.loads(command("schema", "simulate").stdout)
+    assert (schema["title"], schema["required"]) == ("SimulationConfig", ["datasets"])
+    assert {"RobotConfig", "FlowerConfig", "EffectTerm"} <= {*schema["$defs"]}
 
 
 def steered_runs(name: str, **changes: Any) -> Simulation:

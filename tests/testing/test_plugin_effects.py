@@ -101,9 +101,3 @@ def test_export_certify_and_swap_say_what_becomes_of_the_effect(command: Command
     assert_refused(command("certify", extended, work / "data", *known), "has effects (drag)")
     # swap knows it before it asks for a node
     assert_refused(command("swap", "apr", extended, "--connect", "tcp/127.0.0.1:1", *known), "nothing listens there")
-
-
-def test_the_schema_of_a_simulations_config_is_printed(command: Command) -> None:
-    schema = json.loads(succeeded(command("schema", "simulate")).stdout)
-    assert (schema["title"], schema["required"]) == ("SimulationConfig", ["datasets"])
-    assert {"FlowerConfig", "EffectTerm"} <= {*schema["$defs"]}

@@ -102,14 +102,6 @@ def test_a_swapped_calibration_moves_the_next_sample_and_not_the_pose(scale: flo
     assert np.linalg.norm(live.pose[:2] - before[:2]) == pytest.approx(np.linalg.norm(moved[:2]), rel=1e-9)
 
 
-def test_the_twist_is_the_matrix_times_the_rates_in_the_robots_frame() -> None:
-    live = LiveOdometry(calibration())
-    for _ in range(3):
-        live.step(step(0.01, [0.01, -0.02, 0.005]))
-    np.testing.assert_allclose(live.twist, calibration().matrix_array @ [1.0, -2.0, 0.5], atol=1e-12)
-    assert np.linalg.eigvalsh(live.twist_covariance)[0] > 0
-
-
 def step(duration: float, angles: list[float], blind: float = 0.0) -> WheelStep:
     return WheelStep(0, duration, np.array(angles), np.array(angles) / duration, blind)
 
@@ -232,15 +224,6 @@ def test_the_covariance_of_the_matrix_is_used_though_that_of_effects_follows_it(
     np.testing.assert_allclose(last_with_effect.covariance, last.covariance, rtol=1e-9)
 
 
-def test_odom_fades_outside_the_training_domain_as_the_batch_does() -> None:
-    using = fading(term("heading_drift", b=0.05), deviation=0.02)
-    path = drive(1.0, using=using)
-    whole = using.model_copy(update={"plain": None})
-    updates = fed(RobotTracker("apr", using), path.payloads())
-    np.testing.assert_allclose(odometry(updates)[1:], batch(path, using), atol=1e-9)
-    assert np.abs(batch(path, using) - batch(path, whole)).max() > 1e-3
-
-
 def test_the_covariance_grows_by_what_effects_extrapolate_and_only_there() -> None:
     """A heading that drifts by an unsure rate displaces the robot sideways of its way by half of what it turns."""
     using, speed, seconds = fading(term("heading_drift", b=0.05), deviation=0.02), 0.2, 2.0
@@ -336,8 +319,6 @@ def test_a_session_is_the_one_that_the_calibration_names() -> None:
 
 
 def test_a_node_that_starts_again_goes_on_in_its_session(tmp_path: Path) -> None:
-    from omnibench.live.estimation.robot_state import RobotMemory
-
     using = with_effects(term("thermal_radius_drift", k=1e-3))
     path = drive(4.0, using=using)
     memory = RobotMemory(tmp_path, "apr")
@@ -401,14 +382,6 @@ DRIVEN = [[20.0, 0.0, 0.0]]  # m/s, m/s, rad/s: so fast that all that is driven 
 
 def learned() -> Calibration:
     return a_learned_calibration(synthetic_robot(3), DRIVEN, PERIOD).model_copy(update={"noise": NOISE})
-
-
-def test_odometry_of_the_node_is_that_of_the_batch() -> None:
-    path = drive(3.0, using=learned())
-    poses = np.array([update.pose for update in fed(RobotTracker("apr", learned()), path.payloads())])
-    np.testing.assert_allclose(poses, path.poses, rtol=0, atol=1e-9)  # stamps are whole nanoseconds
-    design = drive(3.0, using=learned().model_copy(update={"effects": (), "covariance": None, "plain": None}))
-    assert np.abs(poses - design.poses).max() > 1e-4
 
 
 def test_the_largest_weights_with_many_motions_fit_in_a_request() -> None:
