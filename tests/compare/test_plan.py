@@ -188,6 +188,13 @@ def test_only_what_is_random_is_run_with_every_seed(tmp_path: Path) -> None:
     assert [(run.label, run.settings.seed) for run in runs] == [*once, *often]
 
 
+def test_every_data_set_is_met_by_every_calibrator(tmp_path: Path) -> None:
+    sets = {name: {"simulate": flower(sample_period=period)} for name, period in (("fine", 0.05), ("coarse", 0.1))}
+    runs = planned(tmp_path, datasets=sets, calibrators=["theoretical", "closed_form"])
+    labels = [(run.dataset_name, run.label) for run in runs]
+    assert labels == [(name, label) for name in sets for label in ("theoretical", "closed_form")]
+
+
 def test_labels_tell_boxes_and_parameterisations_apart(tmp_path: Path) -> None:
     entries = ["crs", {"name": "crs", "box": "paper"}, {"name": "crs", "parameterisation": "geometry"}]
     entries += [{"name": "crs", "label": "mine"}]
