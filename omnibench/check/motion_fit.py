@@ -141,7 +141,8 @@ def continuous(stamps: Array, poses: Array) -> Array:
 
     A data set has the steps that its wheels tell, which are whole turns off where these are misread.
     """
-    if len(stamps) < 2 or float(np.median(np.diff(stamps))) > _DENSE:
+    near = len(stamps) > 1 and float(np.median(np.diff(stamps))) <= _DENSE
+    if not near or np.abs(np.diff(poses[:, 2])).max() < np.pi:
         return poses
     return np.column_stack([poses[:, :2], np.unwrap(poses[:, 2])])
 
