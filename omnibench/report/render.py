@@ -56,7 +56,7 @@ _WORDS: tuple[tuple[str, str, str], ...] = (
     ("seed", r"seeds?", "the start of the random numbers; another seed is another try"),
     ("box", r"box(?!\))", "the range that a search may take the matrix from"),
     ("matrix", r"matrix", "the numbers that turn wheel rates into the robot's motion (inverse kinematic matrix)"),
-    ("command", r"commands?", "a motion that the robot is told to drive; its repetitions share it"),
+    ("command", r"(?<!follows its )commands?", "a motion that the robot is told to drive; its repetitions share it"),
     ("residual", r"residuals?", "reference minus odometry"),
     (
         "noise floor",

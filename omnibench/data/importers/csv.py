@@ -756,9 +756,9 @@ def _wheels(table: Table, options: CsvOptions, notes: list[str], *, shared: bool
     count = len(options.robot.wheel_names)
     times, values, names, _ = _stream(table, wheel_columns(options), "wheels", notes, shared=shared)
     steering = values[:, count:] if len(names) > count else None
-    return WheelReadings(
-        times, values[:, :count], options.wheel_unit, steering, tuple(names[:count]), tuple(names[count:])
-    )
+    unit, columns, axles = options.wheel_unit, tuple(names[:count]), tuple(names[count:])
+    place = "" if shared else str(table.file)
+    return WheelReadings(times, values[:, :count], unit, steering, columns, axles, place=place)
 
 
 def _poses(table: Table, options: CsvOptions, notes: list[str], *, shared: bool) -> PoseReadings:
