@@ -151,7 +151,7 @@ def test_a_small_zero_of_a_cars_steering_is_warned_of_with_its_option(degrees: f
 
 @pytest.mark.skipif(not (RECORDINGS / "dart").is_dir(), reason="the recordings of the car DART are not at hand")
 @pytest.mark.parametrize("drives", ["dart", *slow("dart/free_driving")])
-def test_a_command_that_a_real_car_steers_by_is_told_with_its_scale_and_lag_and_no_other_design(
+def test_a_command_that_a_real_car_steers_by_is_told_with_its_scale_and_lag_and_nothing_else(
     drives: str, tmp_path: Path
 ) -> None:
     wheels = [
@@ -171,4 +171,4 @@ def test_a_command_that_a_real_car_steers_by_is_told_with_its_scale_and_lag_and_
     assert 0.06 <= typed["steering_lag"] <= 0.14
     mended = check(RECORDINGS / drives, options=options | typed, robot=robot)
     kinds = {finding.kind for finding in (*report.findings, *mended.findings)}
-    assert not [kind for kind in kinds if kind.startswith("design")]
+    assert not [kind for kind in kinds if kind.startswith("design") or kind == "clock_drift"]
