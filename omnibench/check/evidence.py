@@ -45,10 +45,10 @@ class Evidence:
         aligned = []
         for run, clock in zip(self.runs, self.clocks, strict=True):
             times = run.pose_times if clock is None else clock.corrected(run.pose_times)
-            used = np.flatnonzero((times >= 0) & (times <= run.times[-1]))
-            if clock is not None and len(used) >= max(3, len(times) // 2):
-                poses = run.poses if len(used) == len(times) else run.poses[used]
-                run = replace(run, pose_times=times[used], poses=poses, pose_covariances=None)
+            first, last = int(np.searchsorted(times, 0.0)), int(np.searchsorted(times, run.times[-1], side="right"))
+            if clock is not None and last - first >= max(3, len(times) // 2):
+                poses = run.poses[first:last]
+                run = replace(run, pose_times=times[first:last], poses=poses, pose_covariances=None)
             aligned.append(run)
         return aligned
 

@@ -9,8 +9,8 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import ndtr, stdtrit
-from xxhash import xxh3_64_intdigest
 
 from omnibench.check.evidence import Evidence
 from omnibench.check.hypotheses import another_zero, wheels_in_words
@@ -52,7 +52,8 @@ _USUAL = 500
 # Poses in a row that two runs must share, changes among them, and share of the later run's rows (chosen: a reference
 # scatters, so that no two drives share any; wheel rates as commanded are alike in all repetitions).
 _ROWS, _CHANGES, _SHARED = 12, 8, 0.3
-_MOST_KEYS = 2_000_000  # stretches of poses that are kept, some 0.2 GB; of more every second, or third... (chosen)
+_MOST_KEYS = 500_000  # stretches of poses that are kept, some 50 MB; of more every second, or third... (chosen)
+_MULTIPLIERS = np.array([0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB], dtype=np.uint64)  # SplitMix64's
 _DIGIT = 1e-7  # m, to which positions are compared; below the noise of any reference
 
 
@@ -297,7 +298,8 @@ def copied_runs(evidence: Evidence) -> Iterator[Finding]:
     seen: dict[int, str] = {}
     copies: dict[str, str] = {}
     for run in runs:
-        keys = {key for key in _keys(run) if key % every == 0}
+        digests = _digests(run)
+        keys = set(digests[digests % every == 0].tolist())
         shared = [seen[key] for key in keys if key in seen]
         if keys and len(shared) > _SHARED * len(keys):
             copies[run.id] = max(set(shared), key=shared.count)
@@ -310,10 +312,22 @@ def copied_runs(evidence: Evidence) -> Iterator[Finding]:
         yield error("copies", what, runs_in_words(list(copies), len(runs)), {"leave_out": list(copies)})
 
 
-def _keys(run: Trajectory) -> Iterator[int]:
-    """Digests of every stretch of reference positions that change often enough."""
+def _digests(run: Trajectory) -> NDArray[np.uint64]:
+    """Digests (n,) of every stretch of reference positions that change often enough: polynomials modulo 2^64.
+
+    Each row is mixed first, by the finaliser of SplitMix64 (Steele et al. 2014), as changes of the last digit are few.
+    """
     rounded = np.round(run.poses[:, :2] / _DIGIT).astype(np.int64)
+    count = len(rounded) - _ROWS + 1
+    if count <= 0:
+        return np.empty(0, dtype=np.uint64)
     changes = np.append(0, np.cumsum(np.any(np.diff(rounded, axis=0) != 0, axis=1)))
-    for row in range(len(rounded) - _ROWS + 1):
-        if changes[row + _ROWS - 1] - changes[row] >= _CHANGES:
-            yield xxh3_64_intdigest(rounded[row : row + _ROWS].tobytes())
+    values = rounded.view(np.uint64)
+    mixed = values[:, 0] * _MULTIPLIERS[0] + values[:, 1]
+    for shift, multiplier in zip((30, 27), _MULTIPLIERS[1:], strict=True):
+        mixed = (mixed ^ (mixed >> np.uint64(shift))) * multiplier
+    digests = np.zeros(count, dtype=np.uint64)
+    for row in range(_ROWS):
+        digests = digests * _MULTIPLIERS[0] + mixed[row : row + count]
+    digests ^= digests >> np.uint64(31)
+    return digests[changes[_ROWS - 1 :] - changes[:count] >= _CHANGES]

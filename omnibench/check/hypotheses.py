@@ -378,27 +378,30 @@ def _fitted_steering(robot: Robot, logs: Sequence[WheelLog], poses: Sequence[Arr
     def reading(values: Array, lag: float) -> Reading:
         return Reading((), gain, factors=np.where(group > 0, values[0], 1.0), offsets=group * values[1], lag=lag)
 
-    def turned(values: Array, lag: float) -> tuple[Array, Array]:
+    def windows_by(values: Array, lag: float) -> Windows | None:
         meant = reading(values, lag)
-        windows = Windows.of([meant.of(log) for log in logs], poses, _STEERING_WINDOW)
-        if windows is None:
-            return np.zeros(0), np.zeros(0)
-        gentle = windows.gentle()
-        return gentle.turned, gentle.driven @ row_3
+        return Windows.of([meant.of(log) for log in logs], poses, _STEERING_WINDOW)
 
-    wanted, _ = turned(np.array([1.0, 0.0]), 0.0)
-    if len(wanted) < 8 or not np.abs(wanted).max():
+    windows = windows_by(np.array([1.0, 0.0]), 0.0)
+    if windows is None or (chosen := windows.gentle()).sum() < 8 or not windows.turned[chosen].any():
         return None
+    wanted = windows.turned
     widest = max(float(np.abs(log.steering[:, group > 0]).max()) for log in logs if log.steering is not None)
     if not widest:
         return None
     from scipy.optimize import least_squares  # slow to import, and needed by robots that steer alone
 
-    deviation = 1.4826 * float(np.median(np.abs(wanted))) + 1e-6
+    deviation = 1.4826 * float(np.median(np.abs(wanted[chosen]))) + 1e-6
+
+    def left(values: Array, lag: float) -> Array:
+        windows = windows_by(values, lag)
+        assert windows is not None  # the poses are the same
+        missing: Array = (wanted - windows.driven @ row_3) / deviation
+        return missing[chosen]
 
     def solved(start: Array, lag: float) -> tuple[float, float, Array]:
         solution = least_squares(
-            lambda values: (wanted - turned(values, lag)[1]) / deviation, start, loss="soft_l1", max_nfev=15,
+            left, start, args=(lag,), loss="soft_l1", max_nfev=15,
             x_scale=[max(abs(start[0]), 1e-3), 0.1], diff_step=1e-4,
         )  # fmt: skip
         return float(solution.cost), lag, solution.x

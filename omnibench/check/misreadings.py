@@ -96,7 +96,7 @@ class Recorded:
         """The matrix that fits freely; None where poses are too sparse."""
         windows = Windows.of(self.logs, self.poses)
         if windows is not None and isinstance(self.robot.drive, CarDrive):
-            windows = windows.gentle()  # its matrix holds no slip of the tyres
+            windows = windows.only(windows.gentle())  # its matrix holds no slip of the tyres
         return None if windows is None else windows.fit(self.robot.reach)
 
     def meant(self, hypothesis: Hypothesis) -> Recorded:

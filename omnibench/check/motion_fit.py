@@ -90,12 +90,18 @@ class Windows:
             return None
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
 
-    def gentle(self) -> Windows:
-        """The windows of little lateral acceleration, in which tyres hardly slip; all windows where these are few."""
+    def gentle(self) -> NDArray[np.bool_]:
+        """True (W,) for windows of little lateral acceleration, in which tyres hardly slip; for all where few are.
+
+        The turns are those that the signals tell: chosen by the reference's own, windows would make slopes too small.
+        """
         seconds = self.times[:, 1] - self.times[:, 0]
-        chosen = np.abs(self.moved) * np.abs(self.turned) < _GENTLE * seconds**2
-        if 5 * chosen.sum() <= len(chosen):
-            return self
+        turned = self.driven @ np.linalg.lstsq(self.driven, self.turned)[0]
+        chosen: NDArray[np.bool_] = np.abs(self.moved) * np.abs(turned) < _GENTLE * seconds**2
+        return chosen if 5 * chosen.sum() > len(chosen) else np.ones(len(chosen), dtype=bool)
+
+    def only(self, chosen: NDArray[np.bool_]) -> Windows:
+        """Some of the windows."""
         return Windows(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
 
     def fit(self, reach: float) -> FreeFit | None:
@@ -141,7 +147,8 @@ def continuous(stamps: Array, poses: Array) -> Array:
 
     A data set has the steps that its wheels tell, which are whole turns off where these are misread.
     """
-    if len(stamps) < 2 or float(np.median(np.diff(stamps))) > _DENSE:
+    near = len(stamps) > 1 and float(np.median(np.diff(stamps))) <= _DENSE
+    if not near or np.abs(np.diff(poses[:, 2])).max() < np.pi:
         return poses
     return np.column_stack([poses[:, :2], np.unwrap(poses[:, 2])])
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -13,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from omnibench.check.hypotheses import RATE_UNITS
+from omnibench.check.hypotheses import FEWEST_TICKS, RATE_UNITS
 from omnibench.check.misreadings import Recorded
 from omnibench.config import as_yaml, validate
 from omnibench.data.dataset import Dataset
@@ -306,14 +307,14 @@ def _changed(read: RecordingSource, options: Mapping[str, Any], key: str, value:
         case "heading_offset_deg" | "steering_lag":
             return {key: round(float(present or 0.0) + value, 3)}
         case "rate_factors":
-            return _geared(options, value)
+            return _geared(read, options, value)
         case "wheel_quantity":
             return {"wheel_unit": value}
         case "wheel_unit":
-            unit = str(present or (read.reading[0][0].wheels.unit if read.reading else "rad/s"))
+            unit = _unit_of_wheels(read, options)
             if unit.startswith("rad") and (unit == "rad/s" or value != "rpm"):  # the same quantity in another unit
                 return {key: value if unit == "rad/s" else value.replace("/s", unit.removeprefix("rad"))}
-            return _geared(options, [float(f"{RATE_UNITS[value]:.6g}")] * len(read.dataset.robot.wheel_names))
+            return _geared(read, options, [float(f"{RATE_UNITS[value]:.6g}")] * len(read.dataset.robot.wheel_names))
         case "leave_out":
             before = [present] if isinstance(present, str) else list(present or ())
             return {key: [*before, *(name for name in map(escape, value) if name not in before)]}
@@ -337,10 +338,18 @@ def _reordered(read: RecordingSource, options: Mapping[str, Any], key: str, orde
     return changed
 
 
-def _geared(options: Mapping[str, Any], factors: Sequence[float]) -> dict[str, Any]:
+def _geared(read: RecordingSource, options: Mapping[str, Any], factors: Sequence[float]) -> dict[str, Any]:
     """The option of the ticks, or of the gears, by which the wheels' rates become those divided by factors."""
+    unit, turns = _unit_of_wheels(read, options), [2 * math.pi * factor for factor in factors]
+    if unit.startswith("rad") and not options.get("gear_ratio") and min(turns) > FEWEST_TICKS:
+        ticks = _one_or_all(_product(None, [float(f"{turn:.3g}") for turn in turns]))
+        return {"wheel_unit": unit.replace("rad", "ticks"), "ticks_per_turn": ticks}
     option = "ticks_per_turn" if options.get("ticks_per_turn") else "gear_ratio"
     return {option: _one_or_all(_product(options.get(option), factors))}
+
+
+def _unit_of_wheels(read: RecordingSource, options: Mapping[str, Any]) -> str:
+    return str(options.get("wheel_unit") or (read.reading[0][0].wheels.unit if read.reading else "rad/s"))
 
 
 def other_quantities(read: RecordingSource) -> Iterator[Finding]:

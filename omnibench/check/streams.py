@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from omnibench.data.dataset import Trajectory
-from omnibench.data.stored import median_period
+from omnibench.data.stored import median_period, median_step
 from omnibench.jobs.job import gathered
 from omnibench.progress import Reporter
 from omnibench.robot.kinematics import Array, Robot, rotated, wheel_equations
@@ -63,7 +63,7 @@ def looks_of(robot: Robot, runs: Sequence[Trajectory]) -> list[Look]:
 
 def pose_period(runs: Sequence[Trajectory]) -> float:
     """The usual time between the poses of runs, s; infinite if there are no runs."""
-    return float(np.median(np.concatenate([np.diff(run.pose_times) for run in runs]))) if runs else np.inf
+    return median_step(run.pose_times for run in runs) if runs else np.inf
 
 
 def looks_at(task: tuple[Robot, Sequence[Trajectory], float, float], _: Reporter) -> list[Look]:

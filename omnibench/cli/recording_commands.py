@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from omnibench.check.check import CheckReport
-    from omnibench.check.source import RecordingSource
     from omnibench.report.blocks import Document
 
 
@@ -87,7 +86,6 @@ def import_(
     robot), rosbag, dataset (a data set again, with other options), table1, optiodom and plug-ins. Recordings with laser
     scans but without reference poses get these by SLAM.
     """
-    from omnibench.check.source import RecordingSource
     from omnibench.config import parse_settings
     from omnibench.data.dataset import Imported
     from omnibench.data.finding import UNITS
@@ -131,12 +129,12 @@ def import_(
         options.setdefault("name", folder)
     with ProgressDisplay() as watch, reading_told_to(watch):
         dataset = omnibench.import_dataset(importer, source, options)
-        read = RecordingSource(dataset, importer, source, given, output)
         report: CheckReport | None = None
         if not no_check:
             from omnibench.check.check import check_recording  # slow to import
+            from omnibench.check.source import RecordingSource
 
-            report = check_recording(read)
+            report = check_recording(RecordingSource(dataset, importer, source, given, output))
     if not accept_units and report is not None:
         # Units that cannot be right are refused, with what to type.
         wrong = [finding.what for finding in report.findings if finding.severity == "error" and finding.kind in UNITS]
@@ -153,18 +151,18 @@ def import_(
     if report is not None:
         make_console(error=True).print(f"check: {report.sentence}.", soft_wrap=True)
     holds = f"{output} holds {plural(len(dataset.trajectories), 'run')} of {dataset.robot.name}"
-    return print_ending(holds, *_next_step(read, report))
+    return print_ending(holds, *_next_step(output, report))
 
 
-def _next_step(read: "RecordingSource", report: "CheckReport | None") -> tuple[Any, ...]:
+def _next_step(folder: Path, report: "CheckReport | None") -> tuple[Any, ...]:
     """The next step after an import in words, then the words to type."""
     if report is None:
-        return "see what they tell", "omnibench", "inspect", read.folder
+        return "see what they tell", "omnibench", "inspect", folder
     if report.command:
         return "mend what it warns of" if report.verdict == "ready" else "mend it", *shlex.split(report.command)
     if report.verdict == "ready":
-        return "calibrate it", "omnibench", "calibrate", read.folder, "-o", "calibration.yaml"
-    return "see what is missing", "omnibench", "check", read.folder
+        return "calibrate it", "omnibench", "calibrate", folder, "-o", "calibration.yaml"
+    return "see what is missing", "omnibench", "check", folder
 
 
 _NAMES = 12  # columns of the list's names, with the spaces around them

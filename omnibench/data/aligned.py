@@ -216,7 +216,8 @@ def _wheel_samples(
     position that changes faster than ``fastest`` has started again. DataError: so many samples are faster that the unit
     must be another, or there are too few.
     """
-    readings, place, quantity = recording.wheels, recording.place, quantity_of(recording.wheels.unit)
+    readings, quantity = recording.wheels, quantity_of(recording.wheels.unit)
+    place = readings.place or recording.place
     rows, second = np.flatnonzero(used), SECONDS[options.wheel_time_unit]
     times, values = readings.times[rows] * second, values[rows]
     if len(times) < 2 and quantity != "rates":

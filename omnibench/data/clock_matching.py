@@ -20,7 +20,8 @@ values. They are common to all runs that are given: a run that drives one comman
 Eq. (2) and (3) are solved by Gauss-Newton with Huber's weights; a step that does not lower Huber's loss is halved, as
 without that clocks that hardly show step to and fro for ever. Standard errors are of the sandwich kind, of scores
 that are summed over blocks, as slip lasts; or of independent residuals where those are larger, since few blocks scatter
-too little by chance (Angrist and Pischke 2009, section 8.2.3, take the larger of the two as well).
+too little by chance (Angrist and Pischke 2009, section 8.2.3, take the larger of the two as well). Lags that change
+with the speed, as those of slow encoders, feign a drift: its error is that of a few long blocks where that is larger.
 """
 
 from __future__ import annotations
@@ -37,6 +38,9 @@ from omnibench.robot.kinematics import Array, Robot
 
 _WINDOW = 1.0  # s between the stamps of Eq. (2): long beside a pose's noise, short beside the drift by slip; chosen
 _BIN = 0.2  # s: poses within are averaged, so that dense ones cost no more than sparse ones; chosen
+# Long blocks of a run, and Student's t of 7 degrees of freedom over the normal quantile at 4 standard deviations, by
+# which so few tell an error (Ibragimov and Mueller 2010). Chosen: few enough to hold a change of speed, enough for t.
+_LONG_BLOCKS, _FEW = 8, 2.3
 _BLOCK = 2.0  # s: residuals that are nearer count as correlated; chosen, twice the window
 SEARCH = 2.0  # s: offsets are looked for within this on either side, unless the caller says more; chosen
 _COARSE = 0.1  # s between the offsets that are tried first, a tenth of the window
@@ -349,15 +353,21 @@ class Windows:
             return None
         residuals, weights, derivatives = self._system(fitted, clock)
         design = derivatives.reshape(len(derivatives), -1)
-        blocks = np.floor((self.stamps[self.starts][self.first] - self.stamps[0]) / _BLOCK)
-        scores = derivatives * (weights * residuals)
-        sums = np.add.reduceat(scores, np.flatnonzero(np.diff(blocks, prepend=-1.0)), axis=2).reshape(len(design), -1)
-        inverse = np.linalg.pinv((design * weights.ravel()) @ design.T)
+        scores, inverse = derivatives * (weights * residuals), np.linalg.pinv((design * weights.ravel()) @ design.T)
+        since = self.stamps[self.starts][self.first] - self.stamps[0]
+
+        def sandwich(block: float) -> Array:
+            """Variances (P,) by scores that are summed over blocks of some s."""
+            begins = np.flatnonzero(np.diff(np.floor(since / block), prepend=-1.0))
+            sums = np.add.reduceat(scores, begins, axis=2).reshape(len(design), -1)
+            return np.asarray(np.diag(inverse @ (sums @ sums.T) @ inverse))
+
         free = max(float(weights.sum()) - len(design), 1.0)
         alike = inverse * float((weights * residuals**2).sum()) / free  # as if the residuals were independent
         # Chords, and the ticks of coarse counters, which scatter less than they are long, but in a pattern.
         least = _CHORDS * np.array([1, np.sqrt(12.0) / self.length]) + self.tick * np.array([0.25, 1 / self.length])
-        variances = np.maximum(np.diag(inverse @ (sums @ sums.T) @ inverse), np.diag(alike))[2:]
+        variances = np.maximum(sandwich(_BLOCK), np.diag(alike))[2:]
+        variances[1:] = np.maximum(variances[1:], _FEW**2 * sandwich(max(_BLOCK, self.length / _LONG_BLOCKS))[3:])
         errors = np.sqrt(variances + least[: len(design) - 2] ** 2)
         told = len(errors) > 1 and abs(clock[1]) < _LARGEST_DRIFT
         drift_error = float(errors[1]) if told else np.inf

@@ -114,12 +114,13 @@ def jumping_readings(counts: Array, times: Array) -> NDArray[np.bool_]:
     around = np.pad(steps, ((1, 1), (0, 0)), mode="edge")  # steps before and after each reading
     for lone in (1, 2):
         before, after = counts[: -lone - 1], counts[lone + 1 :]  # (F - lone - 1, N)
-        slow, fast = np.sort([around[: -lone - 2], around[lone + 2 :]], axis=0) * (lone + 1)
-        jumps = (after - before >= slow - near) & (after - before <= fast + near)
         lowest, highest = np.minimum(before, after) - least, np.maximum(before, after) + least
         rows = [slice(row, row + len(before)) for row in range(1, lone + 1)]
-        for row in rows:
-            jumps &= (counts[row] < lowest) | (counts[row] > highest)
+        jumps = np.logical_and.reduce([(counts[row] < lowest) | (counts[row] > highest) for row in rows])
+        if not jumps.any():
+            continue
+        steps_beside, way = np.array([around[: -lone - 2], around[lone + 2 :]]) * (lone + 1), after - before
+        jumps &= (way >= steps_beside.min(axis=0) - near) & (way <= steps_beside.max(axis=0) + near)
         for row in rows:
             jumping[row] |= jumps
     return jumping

@@ -71,7 +71,8 @@ class WheelReadings:
     ``steering_unit``. columns, steering_columns: names in the source, in the same order. begin: of the first sample of
     rates or increments; None: a usual period before the first reading. longest_gap: s; a longer one between readings of
     a robot that drives ends a stretch. read_at (F, N + S): when each value was read, if not at the times, which it is
-    interpolated at. others: further columns (F, n) that runs keep: angles, targets, odometry.
+    interpolated at. others: further columns (F, n) that runs keep: angles, targets, odometry. place: their file, if it
+    is not the recording's.
     """
 
     times: Array
@@ -84,6 +85,7 @@ class WheelReadings:
     longest_gap: float = math.inf
     read_at: Array | None = None
     others: Mapping[str, Array] = field(default_factory=dict)
+    place: str = ""
 
     def at_the_rows(self, values: Array, columns: slice) -> Array:
         """Values (F, n) of some columns at the times of the readings, where they were read at times of their own."""

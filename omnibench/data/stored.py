@@ -7,6 +7,7 @@ every block once.
 
 from __future__ import annotations
 
+from array import array
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -405,11 +406,19 @@ def median_period(runs: Sequence[Sampled]) -> float:
     """
     counts = np.array([run.samples.count for run in runs])
     if counts.sum() <= MOST_IN_MEMORY:
-        return float(np.median(np.concatenate([np.diff(run.samples.array("times"), prepend=0.0) for run in runs])))
+        return median_step(np.append(0.0, run.samples.array("times")) for run in runs)
     medians = np.array([run.samples.period for run in runs])
     order = np.argsort(medians, kind="stable")
     passed = np.cumsum(counts[order])
     return float(medians[order][np.searchsorted(passed, passed[-1] / 2)])
+
+
+def median_step(times: Iterable[Array]) -> float:
+    """The median time between stamps that follow each other in one of several arrays, s."""
+    steps = array("d")  # of which there may be very many
+    for stamps in times:
+        steps.frombytes(np.diff(stamps).tobytes())
+    return float(np.median(np.frombuffer(steps), overwrite_input=True))
 
 
 def drawn_runs(runs: Sequence[Run], most: int = MOST_DRAWN) -> list[Run]:

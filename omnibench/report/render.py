@@ -56,7 +56,7 @@ _WORDS: tuple[tuple[str, str, str], ...] = (
     ("seed", r"seeds?", "the start of the random numbers; another seed is another try"),
     ("box", r"box(?!\))", "the range that a search may take the matrix from"),
     ("matrix", r"matrix", "the numbers that turn wheel rates into the robot's motion (inverse kinematic matrix)"),
-    ("command", r"commands?", "a motion that the robot is told to drive; its repetitions share it"),
+    ("command", r"(?<!follows its )commands?", "a motion that the robot is told to drive; its repetitions share it"),
     ("residual", r"residuals?", "reference minus odometry"),
     (
         "noise floor",
@@ -108,15 +108,20 @@ class Glossary:
             self._known.add(word)
             self._fresh.append(word)
             title = html.escape(_MEANINGS[word])
-            parts.append(html.escape(text[end : match.start()]))
+            parts.append(_escaped(text[end : match.start()]))
             parts.append(f'<dfn title="{title}" tabindex="0">{html.escape(match.group())}</dfn>')
             end = match.end()
-        return Markup("".join([*parts, html.escape(text[end:])]))
+        return Markup("".join([*parts, _escaped(text[end:])]))
 
     def fresh(self) -> list[tuple[str, str]]:
         """The words marked since the last call, with their meanings."""
         words, self._fresh = self._fresh, []
         return [(word, _MEANINGS[word]) for word in words]
+
+
+def _escaped(text: str) -> str:
+    """A text as HTML, in which the name of an option is not broken at its dashes."""
+    return re.sub(r"(?<!\S)--[a-z][a-z-]+", r'<span class="option">\g<0></span>', html.escape(text))
 
 
 _PLOT_OPTIONS = {

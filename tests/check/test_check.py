@@ -138,6 +138,15 @@ def test_a_fault_is_found_and_what_is_typed_for_it_mends_it(kind: str) -> None:
     assert kind not in kinds(check("log_mended"))
 
 
+def test_ticks_without_their_unit_are_told_and_typed_as_ticks() -> None:
+    save_dataset(changed(lambda run: replace(run, rates=run.rates * 4096 / (2 * np.pi))), "log")
+    command = check("log").command
+    (ticks,) = re.findall(r"--set wheel_unit=ticks/s --set ticks_per_turn=(\d+)", command)
+    assert float(ticks) == pytest.approx(4096, rel=0.03)
+    typed(command)
+    assert check("log_mended").verdict == "ready"
+
+
 def ends(run: Trajectory) -> Trajectory:
     """The run with its first and its last pose alone."""
     return replace(run, pose_times=run.pose_times[[0, -1]], poses=run.poses[[0, -1]])

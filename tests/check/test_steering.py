@@ -1,6 +1,7 @@
 """Mistakes of robots that steer are named, with the option that mends them; so are wheels that count backward."""
 
 import math
+import re
 import shlex
 from collections.abc import Callable
 from dataclasses import replace
@@ -17,7 +18,7 @@ from lanes import slow, slow_cases
 from omnibench import check
 from omnibench.check.misreadings import search
 from omnibench.check.source import recorded as recorded_of
-from omnibench.config import validate
+from omnibench.config import parse_settings, validate
 from omnibench.data.dataset import Dataset, make_dataset
 from omnibench.data.finding import Finding
 from omnibench.robot.kinematics import Array
@@ -146,7 +147,10 @@ def test_a_small_zero_of_a_cars_steering_is_warned_of_with_its_option(degrees: f
 
 
 @pytest.mark.skipif(not (RECORDINGS / "dart").is_dir(), reason="the recordings of the car DART are not at hand")
-def test_a_command_that_a_real_car_steers_by_is_told_with_its_scale_and_lag_and_no_other_design(tmp_path: Path) -> None:
+@pytest.mark.parametrize("drives", ["dart", *slow("dart/free_driving")])
+def test_a_command_that_a_real_car_steers_by_is_told_with_its_scale_and_lag_and_nothing_else(
+    drives: str, tmp_path: Path
+) -> None:
     wheels = [
         {"name": "rear", "type": "fixed", "radius": 0.0325, "x": 0, "y": 0},
         {"name": "front", "type": "steered", "driven": False, "radius": 0.0325, "x": 0.175, "y": 0},
@@ -157,8 +161,11 @@ def test_a_command_that_a_real_car_steers_by_is_told_with_its_scale_and_lag_and_
         "t": "vicon time", "rear": "vel encoder", "steer_front": "steering",
         "x": "vicon x", "y": "vicon y", "theta": "vicon yaw",
     }  # fmt: skip
-    report = check(RECORDINGS / "dart", options={"columns": columns, "wheel_unit": "m/s"}, robot=robot)
-    typed = dict(word.split("=", 1) for word in shlex.split(report.command) if word.startswith("steering_"))
-    assert 0.36 <= float(typed["steering_scale"]) <= 0.44
-    assert 0.06 <= float(typed["steering_lag"]) <= 0.14
-    assert "design_unknown" not in {finding.kind for finding in report.findings}
+    options: dict[str, Any] = {"columns": columns, "wheel_unit": "m/s"}
+    report = check(RECORDINGS / drives, options=options, robot=robot)
+    typed = parse_settings([word for word in shlex.split(report.command) if re.match("steering_|clocks", word)])
+    assert 0.36 <= typed["steering_scale"] <= 0.44
+    assert 0.06 <= typed["steering_lag"] <= 0.14
+    mended = check(RECORDINGS / drives, options=options | typed, robot=robot)
+    kinds = {finding.kind for finding in (*report.findings, *mended.findings)}
+    assert not [kind for kind in kinds if kind.startswith("design") or kind == "clock_drift"]

@@ -37,14 +37,14 @@ def follows_the_wheels(runs: Sequence[Trajectory]) -> float | None:
     runs = [run for run in runs if run.has_poses]
     if not runs:
         return None
-    headings = np.concatenate([_increments(run, run.poses[:, 2:]) for run in runs])[:, 0]
+    headings = np.concatenate([np.diff(run.poses[_about_a_second(run), 2]) for run in runs])
     if float(np.abs(headings).max(initial=0.0)) < _COPIED:  # of a reference that stands still
         return None
     residuals = []
     readings = [_readings(run) for run in runs]
     for reading, behind in product(range(len(readings[0])), (None, *range(_MOST_BEHIND + 1))):
         counted = [_counted(run, signals[reading], behind) for run, signals in zip(runs, readings, strict=True)]
-        design = np.concatenate([_increments(*pair) for pair in zip(runs, counted, strict=True)])
+        design = np.concatenate([np.diff(counts, axis=0) for counts in counted])
         driven = np.abs(design[:, : design.shape[1] // 2]).max(axis=1) > _DRIVEN
         row, _, rank, _ = np.linalg.lstsq(design[driven], headings[driven])
         if driven.sum() - rank >= _FEWEST:
@@ -54,24 +54,22 @@ def follows_the_wheels(runs: Sequence[Trajectory]) -> float | None:
     return least if least < _COPIED else None
 
 
-def _increments(run: Trajectory, values: Array) -> Array:
-    """Increments (I, n) of values (K, n) at the reference poses, from one to another about an interval later."""
-    every = max(1, round(_INTERVAL / float(np.median(np.diff(run.pose_times)))))
-    increments: Array = np.diff(values[::every], axis=0)
-    return increments
+def _about_a_second(run: Trajectory) -> slice:
+    """Reference poses of a run, from one to another about an interval later."""
+    return slice(None, None, max(1, round(_INTERVAL / float(np.median(np.diff(run.pose_times))))))
 
 
 def _counted(run: Trajectory, signals: Array, behind: int | None) -> Array:
-    """Integrals of signals (F, Q) up to each reference pose, and rates (K, 2 Q).
+    """Integrals of signals (F, Q) up to reference poses about a second apart, and rates (K, 2 Q).
 
     behind: up to the last sample before the pose, or so many samples earlier.
     """
-    edges = np.append(0.0, run.times)
+    edges, stamps = np.append(0.0, run.times), run.pose_times[_about_a_second(run)]
     counted = np.vstack([np.zeros(signals.shape[1]), np.cumsum(signals * np.diff(edges)[:, None], axis=0)])
-    last = np.searchsorted(edges, run.pose_times + 1e-6, side="right") - 1
+    last = np.searchsorted(edges, stamps + 1e-6, side="right") - 1
     rates = signals[np.minimum(last, len(signals) - 1)]
     if behind is None:
-        return np.hstack([interpolated(run.pose_times, edges, counted), rates])
+        return np.hstack([interpolated(stamps, edges, counted), rates])
     return np.hstack([counted[np.maximum(last - behind, 0)], rates])
 
 

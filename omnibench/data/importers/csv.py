@@ -235,6 +235,7 @@ _UNITS: dict[str, tuple[str, dict[str, str]]] = {
 }
 """Options of the units of columns by their keys, and the words that say these units; others are wheels."""
 _NEEDS = {"wheel_unit=ticks": "ticks_per_turn=N", "steering_unit=ticks": "steering_ticks_per_turn=N"}
+_FIRST_ROWS = 1000  # by whose times it is told whether they count from 1970
 _EPOCHS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))  # of unix time, which is 1.8e9 s
 
 
@@ -258,7 +259,7 @@ def unit_options(
                 rate = option == "wheel_unit" and word != "rpm" and after in _PER_SECOND
                 unit = units[word] + ("/s" if rate else "")
         if "time" in option and not unit:
-            numbers = table.numbers([name])
+            numbers = table.only(np.arange(min(len(table), _FIRST_ROWS))).numbers([name])
             largest = float(np.abs(numbers[np.isfinite(numbers)]).max(initial=0.0))
             unit = next((word for least, word in _EPOCHS if largest > least), "")
         read = getattr(options, option) or (options.wheel_time_unit if shared else "s")
@@ -755,9 +756,9 @@ def _wheels(table: Table, options: CsvOptions, notes: list[str], *, shared: bool
     count = len(options.robot.wheel_names)
     times, values, names, _ = _stream(table, wheel_columns(options), "wheels", notes, shared=shared)
     steering = values[:, count:] if len(names) > count else None
-    return WheelReadings(
-        times, values[:, :count], options.wheel_unit, steering, tuple(names[:count]), tuple(names[count:])
-    )
+    unit, columns, axles = options.wheel_unit, tuple(names[:count]), tuple(names[count:])
+    place = "" if shared else str(table.file)
+    return WheelReadings(times, values[:, :count], unit, steering, columns, axles, place=place)
 
 
 def _poses(table: Table, options: CsvOptions, notes: list[str], *, shared: bool) -> PoseReadings:
