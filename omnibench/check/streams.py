@@ -14,6 +14,9 @@ from omnibench.progress import Reporter
 from omnibench.robot.kinematics import Array, Robot, rotated, wheel_equations
 from omnibench.robot.stored_odometry import together, workers
 
+# Of a wheel's steps of half a second, those above so many times this quantile are jumps of the reference; chosen: a
+# wheel that turns for less than a fifth of a run is not told to be dead.
+_STEADY, _MOSTLY = 2.0, 0.8
 # The shortest gap, s, and in usual periods (chosen: a sound Robotino's log has gaps of 0.24 s at 31 ms).
 _LEAST_GAP, _PERIODS = 0.4, 6.0
 _DRIVEN = 0.05  # m that the wheels drive in a gap or while the reference stands, less than which does no harm; chosen
@@ -149,6 +152,7 @@ def _expected_angles(robot: Robot, run: Trajectory) -> Array:
             moved = np.hypot(twists[:, 0] - y * twists[:, 2], twists[:, 1] + x * twists[:, 2]) / wheel.radius
         else:
             moved = np.abs(twists @ wheel_equations([wheel])[0])
+        moved = np.minimum(moved, _STEADY * np.quantile(moved, _MOSTLY)) if len(moved) else moved
         angles.append(float(moved[moved >= 0.1].sum()))  # rad in a step: less is noise of the reference
     return np.array(angles)
 
