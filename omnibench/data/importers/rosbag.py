@@ -102,7 +102,7 @@ class RosbagOptions(SensorOptions):
     scanner_mount: Mount | None = Field(None, description="of the scanner, m, rad; default: by /tf_static, else 0")
     slam: dict[str, Any] = Field({}, description="options of omnibench slam, for bags with scans and without poses")
     recorded_stamps: Names = Field((), description="topics of which the times of recording count, not the headers'")
-    message_definitions: tuple[Path, ...] = Field((), description=".msg files, or folders, of types that bags lack")
+    message_definitions: Names = Field((), description=".msg files, or folders, of types that bags lack")
     cut: Literal["rests", "topic", "windows", "none"] = Field("rests", description="where runs end and begin")
     cut_topic: str | None = Field(None, min_length=1, description="its messages begin runs; a String names the command")
 
@@ -302,7 +302,7 @@ class _WheelClock:
 
 def read_bag(path: Path, name: str, options: RosbagOptions, notes: list[str]) -> Recording:
     """The recording of a bag; what is left out is added to ``notes``. DataError, ConfigError."""
-    with open_bag(path, options.recorded_stamps, options.message_definitions) as bag:
+    with open_bag(path, options.recorded_stamps, [*map(Path, options.message_definitions)]) as bag:
         topics = wheel_topics(bag, options)
         steering: list[Topic] = []
         if options.robot.drive.steered:

@@ -620,7 +620,7 @@ def test_definitions_may_be_given_of_types_that_a_bag_does_not_define(tmp_path: 
     folder.mkdir(parents=True)
     for name in ("Motor", "Status"):
         (folder / f"{name}.msg").write_text(DEFINITIONS[f"base_msgs/msg/{name}"])
-    assert odometry_error(read(source, message_definitions=[str(tmp_path / "share")], **options)) < 1e-9
+    assert odometry_error(read(source, message_definitions=str(tmp_path / "share"), **options)) < 1e-9
     files = [str(file) for file in folder.iterdir()]
     assert odometry_error(read(source, message_definitions=files, **options)) < 1e-9
     (folder / "Motor.msg").write_text("int32 !\n")
