@@ -160,7 +160,8 @@ def _misread_wheels(robot: Robot) -> Iterator[tuple[Reading, float, Finding]]:
     drive, names = robot.drive, robot.wheel_names
     for order, signs in _arrangements(len(names), orders=drive.direct):
         moved, negative = sum(wheel != column for wheel, column in enumerate(order)), sum(sign < 0 for sign in signs)
-        cost = _WHEEL * (moved / 2 + (1 if negative == len(signs) else negative))
+        # Positions alone do not tell ahead from back: of readings alike to them those that keep it come first.
+        cost = _WHEEL * (moved / 2 + (1.05 if negative == len(signs) else negative))
         yield Reading(order, signs), cost, _arrangement(names, order, signs)
     for unit, factor in RATE_UNITS.items():
         words = f"wheel rates look like {'turns a second' if unit == 'rev/s' else unit}; omega_* must be rad/s"

@@ -210,7 +210,7 @@ def _other_kinds(best: Sequence[Finding], others: Sequence[tuple[Finding, ...]])
     classes: dict[frozenset[str], tuple[Finding, ...]] = {}
     for mistakes in others:
         kinds = frozenset(mistake.kind for mistake in mistakes)
-        if kinds != {mistake.kind for mistake in best} and len(mistakes) <= len(best):
+        if kinds != {mistake.kind for mistake in best} and len(mistakes) <= max(len(best), 2):
             classes.setdefault(kinds, mistakes)
     return tuple(classes.values())
 
