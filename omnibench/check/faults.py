@@ -161,6 +161,7 @@ def _dead_wheels(evidence: Evidence) -> Iterator[Finding]:
     # Shares of the wheel that moves most, so that units which are misread do not matter.
     still = counted <= _DEAD * counted.max(axis=1, keepdims=True)
     asked = expected > np.maximum(_EXPECTED, _ASKED * expected.max(axis=1, keepdims=True))
+    idle = still.all(axis=1) & ~still.all()  # runs in which no wheel turns, beside others
     lost = np.zeros(len(looks))
     if windows is not None and fit is not None:
         off = np.abs(windows.moved - windows.bent @ (fit.matrix[0] + 1j * fit.matrix[1]))
@@ -170,8 +171,8 @@ def _dead_wheels(evidence: Evidence) -> Iterator[Finding]:
         lost = sums[0] / np.maximum(sums[1], 1e-9)
     why = "though the reference shows that it must: its encoder or column is dead"
     for index, name in enumerate(robot.wheel_names):
-        where, dead = wheels_in_words([name]), still[:, index] & asked[:, index] & ~still.all(axis=1)
-        if still[~still.all(axis=1), index].all() and dead.mean() > 0.5:
+        where, dead = wheels_in_words([name]), still[:, index] & asked[:, index] & ~idle
+        if still[~idle, index].all() and dead.mean() > 0.5:
             fix = "check its cable and the column that is read, and record again"
             yield error("wheel_dead", f"{where} never turns, {why}", where, fix=fix)
         elif (dead := dead & (lost > _UNEXPLAINED) & (lost > 2 * np.median(lost))).any():
