@@ -30,7 +30,9 @@ _RARE = 0.02  # share of the samples: more that are too fast are another unit
 # Share of the angle of the wheel that turns most, up to which one is dead; angle, rad, and share of the largest, that
 # the reference must ask of it (chosen).
 _DEAD, _EXPECTED, _ASKED = 0.002, 3.0, 0.25
-_UNEXPLAINED = 0.3  # share of a run's motion that the matrix of all runs leaves where an encoder is dead; chosen
+# Share of a run's motion that the matrix of other runs leaves where an encoder is dead, and times what it usually
+# leaves; chosen: one of four dead wheels leaves 0.23 of a real run, of which 0.03 is usual.
+_UNEXPLAINED, _UNUSUAL = 0.15, 4.0
 # Counts that never fall: share of the windows in which they may, and in which the reference must ask for either sense;
 # correlation of their sizes; chosen.
 _HARDLY, _BOTH, _ALIKE = 0.005, 0.08, 0.9
@@ -153,32 +155,30 @@ def dead_sensors(evidence: Evidence) -> Iterator[Finding]:
 def _dead_wheels(evidence: Evidence) -> Iterator[Finding]:
     """Wheels that count nothing though the reference shows that they turn: in the whole recording, or in some runs.
 
-    A run in which a wheel counts nothing has a dead encoder if the matrix of all runs does not explain its motion.
+    A run in which a wheel counts nothing has a dead encoder if the matrix of the others does not explain its motion.
     """
-    robot, looks, windows, fit = evidence.dataset.robot, evidence.looks, evidence.windows, evidence.fit
+    robot, looks, windows = evidence.dataset.robot, evidence.looks, evidence.windows
     counted = np.array([look.counted for look in looks])  # (R, N), rad
     expected = np.array([look.expected for look in looks])
     # Shares of the wheel that moves most, so that units which are misread do not matter.
     still = counted <= _DEAD * counted.max(axis=1, keepdims=True)
     asked = expected > np.maximum(_EXPECTED, _ASKED * expected.max(axis=1, keepdims=True))
-    idle = still.all(axis=1) & ~still.all()  # runs in which no wheel turns, beside others
-    lost = np.zeros(len(looks))
-    if windows is not None and fit is not None:
-        off = np.abs(windows.moved - windows.bent @ (fit.matrix[0] + 1j * fit.matrix[1]))
-        off = off + robot.reach * np.abs(windows.turned - windows.driven @ fit.matrix[2])
-        whole = np.abs(windows.moved) + robot.reach * np.abs(windows.turned)
-        sums = [np.bincount(windows.run, each, len(looks)) for each in (off, whole)]
-        lost = sums[0] / np.maximum(sums[1], 1e-9)
+    # Runs in which none of several wheels turns, beside others.
+    idle = still.all(axis=1) & ~still.all() & (len(robot.wheel_names) > 1)
     why = "though the reference shows that it must: its encoder or column is dead"
     for index, name in enumerate(robot.wheel_names):
         where, dead = wheels_in_words([name]), still[:, index] & asked[:, index] & ~idle
         if still[~idle, index].all() and dead.mean() > 0.5:
             fix = "check its cable and the column that is read, and record again"
             yield error("wheel_dead", f"{where} never turns, {why}", where, fix=fix)
-        elif (dead := dead & (lost > _UNEXPLAINED) & (lost > 2 * np.median(lost))).any():
-            runs = [look.run for look, is_dead in zip(looks, dead.tolist(), strict=True) if is_dead]
-            at = runs_in_words(runs, len(looks))
-            yield error("wheel_dead", f"{where} never turns in {at}, {why}", f"{where} in {at}", {"leave_out": runs})
+        elif dead.any() and windows is not None:
+            lost = windows.unexplained(windows.only(~dead[windows.run]).fit(robot.reach), robot.reach, len(looks))
+            if (dead := dead & (lost > np.maximum(_UNEXPLAINED, _UNUSUAL * np.median(lost)))).any():
+                runs = [look.run for look, is_dead in zip(looks, dead.tolist(), strict=True) if is_dead]
+                at = runs_in_words(runs, len(looks))
+                yield error(
+                    "wheel_dead", f"{where} never turns in {at}, {why}", f"{where} in {at}", {"leave_out": runs}
+                )
 
 
 def _frozen_steering(evidence: Evidence) -> Iterator[Finding]:

@@ -128,6 +128,17 @@ class Windows:
         share = float(np.sqrt(np.square(unexplained) @ wholes / max(sum(wholes), 1e-300)))
         return FreeFit(matrix, covariance, np.array(unexplained), share, count, self.driven.T @ self.driven)
 
+    def unexplained(self, fit: FreeFit | None, reach: float, runs: int) -> Array:
+        """Shares (R,) of the motion of each of some runs that a fit leaves; a turn counts at the robot's size, m."""
+        if fit is None:
+            return np.zeros(runs)
+        off = np.abs(self.moved - self.bent @ (fit.matrix[0] + 1j * fit.matrix[1]))
+        off = off + reach * np.abs(self.turned - self.driven @ fit.matrix[2])
+        whole = np.abs(self.moved) + reach * np.abs(self.turned)
+        left, every = (np.bincount(self.run, each, runs) for each in (off, whole))
+        shares: Array = left / np.maximum(every, 1e-9)
+        return shares
+
     def steering_zero(self) -> tuple[float, float]:
         """The angle, rad, that a car's steering angles lack, and its standard error.
 
