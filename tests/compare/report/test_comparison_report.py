@@ -537,11 +537,6 @@ def with_published(two_entries: ComparisonResult, *published: dict[str, Any], **
     return view
 
 
-def recorded(view: DatasetView) -> DatasetView:
-    """The view with its data set called a recording."""
-    return replace(view, dataset=replace(view.dataset, simulated=False))
-
-
 def scaled(two_entries: ComparisonResult, before: float, after: float) -> dict[str, float]:
     """Published costs that are multiples of ours: of the design values, and of the calibrated matrix."""
     record = two_entries.runs[0].record
@@ -579,7 +574,8 @@ def test_figures_equal_to_ours_are_alike(two_entries: ComparisonResult) -> None:
     view = with_published(two_entries, remarked, remarked)
     assert not figures(view, alike=False)
     assert len(compared_figures(view)) == 8
-    table, _, remarks = published_blocks(recorded(view))
+    recorded = replace(view, dataset=replace(view.dataset, simulated=False))
+    table, _, remarks = published_blocks(recorded)
     assert remarks.items == ("A misprint.",)
     assert [row.cells[-1].text for row in table.rows] == ["as published"] * 8
     assert table.rows[0].cells[3].text == "0.0 %"
