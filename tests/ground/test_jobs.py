@@ -130,11 +130,9 @@ class Interrupts(Notes):
         raise KeyboardInterrupt
 
 
-BACKENDS = [InPlace(), Processes(2)]
+class EveryBackend:
+    """What every backend promises."""
 
-
-@pytest.mark.parametrize("backend", BACKENDS, ids=("in place", "processes"))
-class TestEveryBackend:
     def test_gives_the_result_of_every_job(self, backend: Backend, tmp_path: Path) -> None:
         notes = run(tmp_path, jobs_of(squared, range(7)), backend)
         assert notes.answers() == {number: number**2 for number in range(7)}
@@ -184,6 +182,11 @@ class TestEveryBackend:
         run(tmp_path, jobs_of(squared, range(3)), backend)
         assert os.environ["OMP_NUM_THREADS"] == "7"
         assert "OPENBLAS_NUM_THREADS" not in os.environ
+
+
+@pytest.mark.parametrize("backend", [InPlace(), Processes(2)], ids=("in place", "processes"))
+class TestLocalBackends(EveryBackend):
+    """Without Dask."""
 
 
 def test_a_job_may_change_its_working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

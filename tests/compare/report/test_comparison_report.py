@@ -42,7 +42,6 @@ from omnibench.fit.ratio_intervals import Interval
 from omnibench.report.blocks import Callout, Figure, FigureGrid, Row, Table
 from omnibench.report.figures import motion_system, parameters
 from omnibench.report.numbers import fixed
-from omnibench.report.recording.recording_figures import describe
 from omnibench.report.render import write_document
 from omnibench.robot.kinematics import Array, Robot, relative_deviations, wheel_equations
 from omnibench.simulate.config import FlowerConfig
@@ -345,11 +344,6 @@ def test_other_commands_are_shown_as_a_spread_of_the_strongest_turns() -> None:
     chosen = chosen_trajectories(trajectories(commands=commands))
     assert len({t.command for t in chosen}) == 4
     assert {t.omega for t in chosen} == {0.6}
-
-
-def test_a_command_is_described_as_the_paper_writes_it() -> None:
-    trajectory = next(t for t in trajectories() if t.command == "v0.2_a30_w0.35")
-    assert describe(trajectory) == f"(0.2 m/s, 30°, 0.35 rad/s), {trajectory.id}"
 
 
 def test_the_design_values_are_no_search() -> None:
