@@ -53,7 +53,7 @@ def random_log(rng: np.random.Generator, wheels: int, samples: int, stamps: int,
 
 def design_box(wheels: int, width: float) -> ElementBox:
     """All matrices within a share of the design's largest elements."""
-    matrix = synthetic_robot(4 if wheels == 4 else 3).inverse_kinematic_matrix
+    matrix = synthetic_robot(wheels).inverse_kinematic_matrix
     reach = width * np.abs(matrix).max(axis=1, keepdims=True)
     return ElementBox(matrix - reach, matrix + reach)
 
@@ -73,7 +73,7 @@ def long_runs(wheels: int = 3) -> list[Trajectory]:
             times=run.times[0] / finer * np.arange(1, finer * len(run.times) + 1),
             rates=np.repeat(run.rates, finer, axis=0),
         )
-        for run in noisy_trajectories(4 if wheels == 4 else 3)
+        for run in noisy_trajectories(wheels)
     ]
 
 
@@ -441,29 +441,16 @@ def test_ends_stay_where_the_cost_uses_other_poses_too_or_runs_or_poses_are_few(
 # What is certified holds for every matrix of the box, and so does every step of a lower bound by itself.
 
 
-def random_box(wheels: int, rng: np.random.Generator) -> Box:
-    """A box about the design, of random widths, some of them none."""
-    matrix = synthetic_robot(4 if wheels == 4 else 3).inverse_kinematic_matrix
+def random_problem(seed: int, cost: str, integration: Integration, wheels: int) -> CalibrationProblem:
+    """Few noisy runs, some of them alone, in a box about the design of random widths, some of them none."""
+    rng = np.random.default_rng(seed)
+    runs = noisy_trajectories(wheels, noise=float(10 ** rng.uniform(-4, -1)), seed=seed, integration=integration)
+    chosen = [runs[index] for index in rng.permutation(len(runs))[: rng.integers(1, 8)]]
+    matrix = synthetic_robot(wheels).inverse_kinematic_matrix
     size = np.abs(matrix).max(axis=1, keepdims=True)
     below, above = (rng.uniform(0, 0.3, matrix.shape) * size * (rng.random(matrix.shape) > 0.15) for _ in range(2))
-    return box_between(matrix - below, matrix + above)
-
-
-def random_problem(seed: int, cost: str, integration: Integration, wheels: int) -> CalibrationProblem:
-    """Few noisy runs, some of them alone, in a random box."""
-    rng = np.random.default_rng(seed)
-    runs = noisy_trajectories(
-        4 if wheels == 4 else 3, noise=float(10 ** rng.uniform(-4, -1)), seed=seed, integration=integration
-    )
-    chosen = rng.permutation(len(runs))[: rng.integers(1, 8)]
-    return make_problem(
-        [runs[index] for index in chosen],
-        wheels=4 if wheels == 4 else 3,
-        cost=cost,
-        integration=integration,
-        box=random_box(wheels, rng),
-        evaluations=10**6,
-    )
+    box = box_between(matrix - below, matrix + above)
+    return make_problem(chosen, wheels=wheels, cost=cost, integration=integration, box=box, evaluations=10**6)
 
 
 def best_found(problem: CalibrationProblem, rng: np.random.Generator) -> float:

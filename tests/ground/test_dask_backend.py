@@ -42,6 +42,8 @@ def dask() -> Iterator[DaskBackend]:
 
 
 class TestDask(EveryBackend):
+    ahead = 4  # two for each worker
+
     @pytest.fixture
     def backend(self, dask: DaskBackend) -> DaskBackend:
         return dask
