@@ -14,7 +14,7 @@ import polars as pl
 import pytest
 import yaml
 from commands import refused
-from sample_robots import APR_02, DIFFERENTIAL
+from sample_robots import APR_02, CAR, DIFFERENTIAL, TRICYCLE
 from storage_samples import (
     FORMATS,
     Change,
@@ -31,7 +31,7 @@ from storage_samples import (
     set_cell,
     with_frame,
 )
-from wheeled_samples import CAR, DIFF, TRICYCLE, driven
+from wheeled_samples import driven
 
 from omnibench.check.check import check
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
@@ -90,8 +90,8 @@ def test_names_made_of_digits_headings_of_many_turns_and_steering_angles_come_ba
 def test_the_tables_have_a_column_for_every_measured_rate_and_angle(tmp_path: Path) -> None:
     for robot, columns in (
         (TRICYCLE, ["omega_front", "steer_front"]),
-        (CAR, ["omega_rl", "omega_rr", "steer_fl", "steer_fr"]),
-        (DIFF, ["omega_right", "omega_left"]),
+        (CAR, ["omega_left", "omega_right", "steer_front_left", "steer_front_right"]),
+        (DIFFERENTIAL, ["omega_left", "omega_right"]),
     ):
         folder = tmp_path / robot.name
         save_dataset(driven(robot, runs=1, samples=5), folder)

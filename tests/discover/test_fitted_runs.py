@@ -29,9 +29,10 @@ from lanes import slow
 from outlier_study import EFFECT, TRUTH
 from outlier_study import simulated as with_directions
 from recording_samples import in_room
+from sample_robots import DIFFERENTIAL, SWERVE, TRICYCLE
 from scipy.stats import binomtest, chi2
 from screening_samples import FIRST, SECOND, THIRD, screening
-from wheeled_samples import DIFF, SWERVE, TRICYCLE, driven
+from wheeled_samples import driven
 
 from omnibench.config import validate
 from omnibench.data.dataset import Trajectory
@@ -636,7 +637,7 @@ def test_whichever_of_the_look_alikes_is_right_is_named_after_the_proposed_runs(
     assert found.effects[0].weight >= 0.95
 
 
-@pytest.mark.parametrize("robot", [DIFF, TRICYCLE, SWERVE], ids=lambda robot: robot.name)
+@pytest.mark.parametrize("robot", [DIFFERENTIAL, TRICYCLE, SWERVE], ids=lambda robot: robot.name)
 def test_candidates_are_no_faster_and_steer_no_farther_than_what_was_recorded(robot: Robot) -> None:
     fit = steered_half(plain_fit(driven(robot)))
     candidates = candidate_runs(fit, [effects.create("heading_drift")])
@@ -657,7 +658,7 @@ def steered_half(fit: fitting.Fit) -> fitting.Fit:
 
 
 def test_headings_matter_only_to_effects_that_depend_on_them() -> None:
-    fit = plain_fit(driven(DIFF))
+    fit = plain_fit(driven(DIFFERENTIAL))
     headings = {
         name: {candidate.run.start[2] for candidate in candidate_runs(fit, [effects.create(name)])}
         for name in ("heading_drift", "floor_drift")

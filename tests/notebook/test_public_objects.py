@@ -13,9 +13,9 @@ import pytest
 from commands import CONFIGS, compared_here, prepare
 from pydantic import BaseModel
 from recording_samples import with_a_tape
+from sample_robots import CAR, DIFFERENTIAL, SWERVE, TRICYCLE
 from shared_results import shared_folder
 from timing import PATIENCE
-from wheeled_samples import CAR, DIFF, SWERVE, TRICYCLE
 
 import omnibench
 from omnibench.cli.handbook_topics import HANDBOOK
@@ -110,7 +110,7 @@ def test_an_unknown_table_or_option_of_a_plot_is_refused_with_the_nearest() -> N
         result("calibration").plot(data=result("dataset"))
 
 
-@pytest.mark.parametrize("robot", [DIFF, TRICYCLE, CAR, SWERVE], ids=lambda robot: robot.name)
+@pytest.mark.parametrize("robot", [DIFFERENTIAL, TRICYCLE, CAR, SWERVE], ids=lambda robot: robot.name)
 def test_every_kind_of_robot_is_drawn_and_described(robot: Robot) -> None:
     assert len(repr(robot).splitlines()) == len(robot.wheels) + 1
     assert len(robot.plot().data) > 0

@@ -14,8 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from recording_samples import COMMANDS, NOISE, PERIOD, TICK, Sample, sample
 from report_page import Page
+from sample_robots import DIFFERENTIAL
 from syrupy.assertion import SnapshotAssertion
-from wheeled_samples import DIFF, ROBOTS, driven
+from wheeled_samples import ROBOTS, driven
 
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.scans import Mount, Scanner, ScansInMemory, TrajectoryScans
@@ -457,7 +458,7 @@ def test_time_at_rest_is_no_motion() -> None:
     shares = {motion.name: motion.share for motion in found}
     assert shares["straight"] == pytest.approx(0.5) == shares["on the spot to the left"]
     assert "×" not in repr(inspection_report.motion_table(found).rows)  # a speed that is rounding is zero
-    on_two_wheels = inspection_report.driven_motions(driving(DIFF, (0.2, 0.0, 0.0)), DIFF)
+    on_two_wheels = inspection_report.driven_motions(driving(DIFFERENTIAL, (0.2, 0.0, 0.0)), DIFFERENTIAL)
     assert not [motion for motion in on_two_wheels if motion.name.startswith("sideways")]
 
 

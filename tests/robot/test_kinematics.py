@@ -13,7 +13,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from sample_robots import APR_02, CAR, DIFFERENTIAL, SKID, SWERVE, TRICYCLE, WHEELED, fixed, steered
-from wheeled_samples import DIFF, driven
+from wheeled_samples import driven
 
 import omnibench
 from omnibench.config import read_model, to_yaml, validate
@@ -512,8 +512,8 @@ def test_it_is_the_odometry_of_data_sets() -> None:
 
 
 def test_a_calibration_brings_its_matrix_and_integration() -> None:
-    run = driven(DIFF).trajectories[0]
-    calibration = omnibench.calibrate(driven(DIFF), integration="euler").calibration
+    run = driven(DIFFERENTIAL).trajectories[0]
+    calibration = omnibench.calibrate(driven(DIFFERENTIAL), integration="euler").calibration
     (wanted,) = calibration.model.poses([run.log(run.times)])
     np.testing.assert_array_equal(omnibench.odometry(calibration, run.times, run.rates, start=run.start), wanted)
 
@@ -521,7 +521,7 @@ def test_a_calibration_brings_its_matrix_and_integration() -> None:
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"rates": np.ones((50, 3))}, r"rates .*\(50, 2\): .*right, left"),
+        ({"rates": np.ones((50, 3))}, r"rates .*\(50, 2\): .*left, right"),
         ({"rates": np.ones(50)}, r"rates .*\(50,\)"),
         ({"rates": [["fast"] * 2] * 50}, "rates"),
         ({"rates": np.r_[np.ones((3, 2)), np.full((47, 2), np.nan)]}, "rates, row 4"),
@@ -534,7 +534,7 @@ def test_a_calibration_brings_its_matrix_and_integration() -> None:
     ],
 )
 def test_what_does_not_fit_is_named(given: dict[str, Any], message: str) -> None:
-    call: dict[str, Any] = {"robot": DIFF, "times": T, "rates": np.ones((50, 2))} | given
+    call: dict[str, Any] = {"robot": DIFFERENTIAL, "times": T, "rates": np.ones((50, 2))} | given
     with pytest.raises(OmnibenchError, match=message):
         omnibench.odometry(**call)
 

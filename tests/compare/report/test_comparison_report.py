@@ -14,9 +14,9 @@ from browser import assert_picture_comes_first, opened
 from recording_samples import sample, with_a_tape
 from report_page import NUMBER, Page
 from report_samples import config, flower, page, run, statistics, usual
-from sample_robots import APR02, LEVER_MECANUM
+from sample_robots import APR02, CAR, LEVER_MECANUM, TRICYCLE
 from syrupy.assertion import SnapshotAssertion
-from wheeled_samples import CAR, ROBOTS, TRICYCLE
+from wheeled_samples import ROBOTS
 
 from omnibench.compare.plan import load_datasets
 from omnibench.compare.report.comparison_report import comparison_document, data_section, robot_section
@@ -457,8 +457,8 @@ def test_wheels_given_by_x_and_y_stand_there_along_their_rolling(robot: Robot) -
 @pytest.mark.parametrize(
     ("robot", "first", "last"),
     [
-        (CAR, "rl: fixed, radius 0.03 m, x 0 m, y 0.1 m; ", "steered, radius 0.03 m, x 0.3 m, y −0.1 m, not driven"),
-        (TRICYCLE, "front: steered, radius 0.0325 m, x 0.15 m, y 0 m; ", "x 0 m, y −0.08 m, not measured"),
+        (CAR, "left: fixed, radius 0.05 m, x 0 m, y 0.2 m; ", "steered, radius 0.05 m, x 0.5 m, y −0.2 m, not driven"),
+        (TRICYCLE, "front: steered, radius 0.05 m, x 0.5 m, y 0 m; ", "x 0 m, y −0.2 m, not measured"),
     ],
 )
 def test_the_section_on_the_data_says_where_wheels_stand_and_which_are_not_driven_or_not_measured(

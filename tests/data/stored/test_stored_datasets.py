@@ -12,8 +12,8 @@ import numpy as np
 import polars as pl
 import pytest
 from lanes import slow
-from sample_robots import APR_02, MECANUM
-from wheeled_samples import CAR, DIFF, SWERVE, driven
+from sample_robots import APR_02, CAR, DIFFERENTIAL, MECANUM, SWERVE
+from wheeled_samples import driven
 
 import omnibench.data.stored as stored_samples
 import omnibench.robot.stored_odometry as odometry_of_stored
@@ -63,7 +63,7 @@ def nothing_held(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(odometry_of_stored, "_TOGETHER", 200)
 
 
-@pytest.mark.parametrize("robot", [APR_02, MECANUM, DIFF, CAR, SWERVE], ids=lambda robot: robot.name)
+@pytest.mark.parametrize("robot", [APR_02, MECANUM, DIFFERENTIAL, CAR, SWERVE], ids=lambda robot: robot.name)
 def test_what_stays_in_its_file_is_the_data_set_that_was_saved(robot: Robot, tmp_path: Path) -> None:
     save_dataset(recorded(robot), tmp_path / "saved")
     held, stored = load_dataset(tmp_path / "saved"), load_dataset(tmp_path / "saved", most_in_memory=0)
@@ -90,7 +90,7 @@ def test_a_run_gives_arrays_and_is_replaced_without_reading_them(folder: Path, t
 
 
 @pytest.mark.usefixtures("nothing_held")
-@pytest.mark.parametrize("robot", [SWERVE, *slow(APR_02, MECANUM, DIFF, CAR)], ids=lambda robot: robot.name)
+@pytest.mark.parametrize("robot", [SWERVE, *slow(APR_02, MECANUM, DIFFERENTIAL, CAR)], ids=lambda robot: robot.name)
 def test_fits_errors_and_checks_are_as_in_memory(robot: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     save_dataset(recorded(robot), tmp_path / "saved")
     stored = load_dataset(tmp_path / "saved", most_in_memory=0)

@@ -16,8 +16,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from learned_samples import a_learned_calibration
 from nodes import asked, config_of, running, write_node
+from sample_robots import CAR, DIFFERENTIAL, TRICYCLE
 from samples import messages_of
-from steered import CAR, DIFFERENTIAL, SKID, SWERVE, TRICYCLE, only, recording, steered_calibration, steered_drive
+from steered import SKID, SWERVE, only, recording, steered_calibration, steered_drive
 
 from omnibench.config import to_yaml, validate
 from omnibench.data.dataset import Dataset, Trajectory
@@ -577,7 +578,7 @@ def test_a_matrix_row_without_design_is_compared_with_the_size_of_the_other() ->
     slid[1] = 0.1 * slid[0]
     robot.swap(steered_calibration(DIFFERENTIAL, matrix=matrix_rows(slid)))
     slid[1] = slid[0]
-    with pytest.raises(DataError, match=r"row 2 of the matrix is 10.% off the design of robot 'differential'"):
+    with pytest.raises(DataError, match=r"row 2 of the matrix is 10.% off the design of robot 'diff'"):
         robot.swap(steered_calibration(DIFFERENTIAL, matrix=matrix_rows(slid)))
 
 
@@ -724,7 +725,7 @@ def test_a_replay_shows_the_batch_odometry_of_the_tracked_point_and_is_recorded(
 def test_a_replay_counts_every_turn_by_which_the_odometry_is_off(tmp_path: Path) -> None:
     design = DIFFERENTIAL.inverse_kinematic_matrix
     using = steered_calibration(DIFFERENTIAL, matrix=matrix_rows(design * [[1.0], [1.0], [0.4]]))
-    times, rates = PERIOD * np.arange(1, 401), np.tile([-4.0, 4.0], (400, 1))
+    times, rates = PERIOD * np.arange(1, 401), np.tile([-6.0, 6.0], (400, 1))
     log = WheelLog(times, rates, np.zeros(3), np.append(0.0, times[9::10]))
     poses = using.model.poses([log])[0]
     run = Trajectory("turn", "train", times, rates, log.stamps, poses)
