@@ -19,7 +19,6 @@ from timing import PATIENCE
 
 import omnibench
 from omnibench.cli.handbook_topics import HANDBOOK
-from omnibench.data.dataset import Dataset
 from omnibench.robot.calibration import read_calibration
 from omnibench.robot.kinematics import Robot
 from omnibench.views import Shown, brief
@@ -114,13 +113,6 @@ def test_an_unknown_table_or_option_of_a_plot_is_refused_with_the_nearest() -> N
 def test_every_kind_of_robot_is_drawn_and_described(robot: Robot) -> None:
     assert len(repr(robot).splitlines()) == len(robot.wheels) + 1
     assert len(robot.plot().data) > 0
-
-
-def test_a_data_set_is_the_same_after_it_was_made_of_its_own_tables() -> None:
-    dataset: Dataset = result("dataset")
-    tables = {name: dataset.to_frame(name) for name in ("trajectories", "wheels", "poses")}
-    again = omnibench.make_dataset(dataset.name, dataset.robot, dataset.sample_period, **tables, simulated=True)
-    assert again.hash == dataset.hash
 
 
 def test_long_values_are_shortened_and_many_fields_are_counted() -> None:

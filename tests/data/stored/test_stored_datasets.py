@@ -5,8 +5,10 @@ import os
 import pickle
 import shutil
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -281,21 +283,16 @@ def test_a_file_that_changes_under_the_data_set_is_not_read_on(tmp_path: Path) -
         _ = pickled.rates
 
 
-@dataclass
-class Sampled:
+def sampled(times: np.ndarray) -> Any:
     """A run of which only the times matter."""
-
-    samples: Samples
-
-    def __init__(self, times: np.ndarray) -> None:
-        self.samples = Samples({"times": times})
+    return SimpleNamespace(samples=Samples({"times": times}))
 
 
 def test_the_usual_period_of_many_samples_is_that_of_the_run_in_their_middle(monkeypatch: pytest.MonkeyPatch) -> None:
-    runs = [Sampled(np.arange(1, 1 + count) * period) for count, period in ((400, 0.1), (900, 0.01), (600, 0.02))]
+    runs = [sampled(np.arange(1, 1 + count) * period) for count, period in ((400, 0.1), (900, 0.01), (600, 0.02))]
     monkeypatch.setattr(stored_samples, "MOST_IN_MEMORY", 0)
     assert median_period(runs) == pytest.approx(0.02)
-    assert median_period([*runs, Sampled(np.array([5.0, 99.0]))]) == pytest.approx(0.02)
+    assert median_period([*runs, sampled(np.array([5.0, 99.0]))]) == pytest.approx(0.02)
 
 
 def test_some_runs_are_drawn_always_the_same_and_into_memory(folder: Path) -> None:

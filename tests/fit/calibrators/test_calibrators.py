@@ -19,7 +19,7 @@ from motions import RING, TURNS, driven
 from numpy.testing import assert_array_equal
 from posterior_coverage import ratios_of
 from real_recordings import omni3
-from sample_robots import APR02, DIFFERENTIAL, TRICYCLE, WHEELED
+from sample_robots import APR02, DIFFERENTIAL, TRICYCLE, WHEELED, fixed, make_robot
 from scipy.optimize import lsq_linear
 from wheeled_recordings import recorded
 
@@ -414,6 +414,7 @@ ROBUST: tuple[LossName, ...] = ("huber", "student_t")
 
 
 # Simulated sets of which the mean error is compared: one alone is 5 % better or worse by chance.
+DIFF = make_robot("diff", fixed("right", 0, -0.1, radius=0.042), fixed("left", 0, 0.1, radius=0.042))
 SETS = {"least_squares": 16, "trajectory_ml": 3, "closed_form": 3, "crs": 2}
 
 
@@ -446,10 +447,10 @@ def on_clean(robot: Robot, calibrator: str, cost: str, seed: int = 1) -> float:
     ("calibrator", "cost", "robot"),
     [
         pytest.param("least_squares", "trajectory", TRICYCLE, id="least_squares", marks=pytest.mark.slow),
-        pytest.param("trajectory_ml", "trajectory", DIFFERENTIAL, id="trajectory_ml of diff", marks=pytest.mark.slow),
+        pytest.param("trajectory_ml", "trajectory", DIFF, id="trajectory_ml of diff", marks=pytest.mark.slow),
         pytest.param("trajectory_ml", "trajectory", TRICYCLE, id="trajectory_ml of tricycle", marks=pytest.mark.slow),
         pytest.param("closed_form", "final_pose", TRICYCLE, id="closed_form"),
-        pytest.param("crs", "trajectory", DIFFERENTIAL, id="crs", marks=pytest.mark.slow),
+        pytest.param("crs", "trajectory", DIFF, id="crs", marks=pytest.mark.slow),
     ],
 )
 def test_bad_poses_cost_at_most_their_share(robot: Robot, calibrator: str, cost: str, loss: LossName) -> None:
@@ -463,9 +464,9 @@ def test_bad_poses_cost_at_most_their_share(robot: Robot, calibrator: str, cost:
 
 
 def test_without_a_robust_loss_the_same_poses_spoil_least_squares() -> None:
-    _, jumping, judged = recording(DIFFERENTIAL)
+    _, jumping, judged = recording(DIFF)
     spoilt = error(calibrate(jumping, "least_squares", cost="trajectory"), judged)
-    assert spoilt > 1.1 * on_clean(DIFFERENTIAL, "least_squares", "trajectory")
+    assert spoilt > 1.1 * on_clean(DIFF, "least_squares", "trajectory")
 
 
 @pytest.mark.parametrize("loss", ROBUST)
@@ -511,7 +512,7 @@ def test_closed_form_reaches_what_a_long_search_finds(loss: LossName) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("loss", ["huber", "student_t"])
 def test_intervals_of_a_robust_fit_are_about_as_wide_as_those_of_squares_on_normal_errors(loss: LossName) -> None:
-    clean, jumping, _ = recording(DIFFERENTIAL)
+    clean, jumping, _ = recording(DIFF)
     usual = calibrate(clean, "trajectory_ml", unidentified="keep").uncertainty
     for dataset in (clean, jumping):
         for calibrator in ("closed_form", "trajectory_ml"):
@@ -522,7 +523,7 @@ def test_intervals_of_a_robust_fit_are_about_as_wide_as_those_of_squares_on_norm
 
 
 def test_starts_that_were_taken_from_other_poses_are_named() -> None:
-    _, jumping, _ = recording(DIFFERENTIAL)
+    _, jumping, _ = recording(DIFF)
     run = calibrate(jumping, "least_squares", cost="trajectory", loss="huber")
     (warning,) = [words for words in run.warnings if "at the start is far" in words]
     assert re.match("[1-4] runs? of 36", warning)
@@ -532,7 +533,7 @@ def test_what_does_not_go_with_a_robust_loss_is_refused() -> None:
     with pytest.raises(ConfigError, match="sum of norms"):
         with_loss(Worst(Options()), "huber")
     assert isinstance(with_loss(costs.create("trajectory"), "huber"), RobustCost)
-    clean, _, _ = recording(DIFFERENTIAL)
+    clean, _, _ = recording(DIFF)
     with pytest.raises(ConfigError, match="huber"):
         calibrate(clean, "closed_form", loss="huber", intervals=True, unidentified="keep")
     calibration = calibrate(clean, "least_squares", loss="student_t").calibration
@@ -541,7 +542,7 @@ def test_what_does_not_go_with_a_robust_loss_is_refused() -> None:
 
 
 def test_only_a_robust_loss_is_in_the_calibration_file_and_what_evaluate_says(tmp_path: Path) -> None:
-    clean, _, _ = recording(DIFFERENTIAL)
+    clean, _, _ = recording(DIFF)
     written = {}
     for loss in ("squares", "huber"):
         calibration = calibrate(clean, "least_squares", loss=loss).calibration
