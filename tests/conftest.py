@@ -21,8 +21,6 @@ import shared_results
 from commands import Command, Prepared, commands_of_this_process, prepare, registries_restored
 from hypothesis import settings
 
-from omnibench.data.dataset import Dataset
-
 # The machine may be busy. What does not land shall be at fault itself, and not an example that this run alone drew:
 # new ones are looked for with --hypothesis-profile explore.
 settings.register_profile("omnibench", deadline=None, derandomize=True, max_examples=40)
@@ -89,31 +87,9 @@ def prepared() -> Prepared:
     return prepare()
 
 
-@pytest.fixture(scope="session")
-def omni3() -> Dataset:
-    """OptiOdom's recordings of a robot on three wheels."""
-    return real_recordings.omni3()
-
-
-@pytest.fixture(scope="session")
-def diff() -> Dataset:
-    """OptiOdom's recordings of a differential drive."""
-    return real_recordings.diff()
-
-
-@pytest.fixture(scope="session")
-def tricyc() -> Dataset:
-    """OptiOdom's recordings of a tricycle."""
-    return real_recordings.tricyc()
-
-
-@pytest.fixture(scope="session")
-def omni4() -> Dataset:
-    """OptiOdom's recordings of a mecanum base."""
-    return real_recordings.omni4()
-
-
-@pytest.fixture(scope="session")
-def robotino() -> Dataset:
-    """Recordings of a Robotino."""
-    return real_recordings.robotino()
+# Recordings of real robots, where they are at hand.
+omni3 = pytest.fixture(scope="session")(real_recordings.omni3)
+diff = pytest.fixture(scope="session")(real_recordings.diff)
+tricyc = pytest.fixture(scope="session")(real_recordings.tricyc)
+omni4 = pytest.fixture(scope="session")(real_recordings.omni4)
+robotino = pytest.fixture(scope="session")(real_recordings.robotino)

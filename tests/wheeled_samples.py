@@ -1,29 +1,17 @@
-"""Robots on fixed and steered wheels, and their runs as designed."""
+"""Runs of robots on fixed and steered wheels."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from sample_robots import fixed, make_robot, steered
+from sample_robots import CAR, DIFFERENTIAL, SWERVE, TRICYCLE
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
 
-DIFF = make_robot("diff", *(fixed(name, 0, y, radius=0.042) for name, y in (("right", -0.1), ("left", 0.1))))
-TRICYCLE = make_robot(
-    "tricycle",
-    steered("front", 0.15, 0, radius=0.0325),
-    *(fixed(name, 0, y, radius=0.0325, measured=False) for name, y in (("left", 0.08), ("right", -0.08))),
-)
-CAR = make_robot(
-    "car",
-    *(fixed(name, 0, y, radius=0.03) for name, y in (("rl", 0.1), ("rr", -0.1))),
-    *(steered(name, 0.3, y, radius=0.03, driven=False) for name, y in (("fl", 0.1), ("fr", -0.1))),
-)
-SWERVE = make_robot("swerve", steered("fl", 0.2, 0.2), steered("fr", 0.2, -0.2), steered("rear", -0.2, 0.0))
-ROBOTS = (DIFF, TRICYCLE, CAR, SWERVE)
+ROBOTS = (DIFFERENTIAL, TRICYCLE, CAR, SWERVE)
 _PERIOD = 0.1  # s
 
 

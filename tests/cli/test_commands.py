@@ -173,10 +173,6 @@ def test_list_names_everything_that_a_config_can_name(command: Command) -> None:
     assert found["failures"] == []
 
 
-def test_the_schema_of_a_nodes_config_is_printed(command: Command) -> None:
-    assert "robots" in document(command("schema", "live"))["properties"]
-
-
 def test_list_takes_the_plugins_of_the_folder_one_is_in(command: Command, tmp_path: Path) -> None:
     write_plugin(tmp_path / "plugins", "chatty", CHATTY)
     printed = command("list")
@@ -215,12 +211,6 @@ def test_export_writes_to_standard_output_or_to_a_file(command: Command, prepare
     warning, ending = written.stderr.splitlines()
     assert warning.startswith("warning: simulated")
     assert ending.startswith(f"{tmp_path / 'm.h'} ")
-
-
-def test_export_to_ros2_says_what_its_parameters_cannot_hold(command: Command, prepared: Prepared) -> None:
-    printed = command("export", prepared.calibration, "--to", "ros2_controllers")
-    assert "wheel_radius" in str(yaml.safe_load(printed.stdout))
-    assert printed.stderr.startswith("warning: ")
 
 
 def test_a_data_set_has_the_name_of_its_folder_unless_another_is_given(command: Command, tmp_path: Path) -> None:

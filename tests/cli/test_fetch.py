@@ -10,7 +10,6 @@ import polars as pl
 import pytest
 from commands import COMMAND, ENVIRONMENT, RECORDINGS, ROOT, Command, Prepared, Printed, succeeded
 from corelli import CORELLI
-from newcomer import PAGES, lines_of
 from real_recordings import OMNI3, ROBOTINO
 from timing import PATIENCE, until
 
@@ -337,7 +336,3 @@ def test_the_handbook_has_the_catalogue_word_for_word() -> None:
         for each in recording.datasets:
             row = f"| {each.robot} | {each.runs} | {recording.licence} |"
             assert f"| `omnibench fetch {each.name}` {row}" in page
-
-
-def test_no_page_is_run_that_would_need_the_network() -> None:
-    assert [line for page in PAGES.values() for line in lines_of(page) if "omnibench fetch" in line] == []

@@ -16,7 +16,6 @@ from commands import COMMAND, ENVIRONMENT, Command, Prepared, assert_refused, di
     [
         (["compre"], ["'compre'", "'compare'", "--help"]),
         (["compare"], ["CONFIG|DATASET", "omnibench compare --help"]),
-        (["compare", "nowhere.yaml"], ["nowhere.yaml: no such file"]),
         (["compare", "CONFIG", "--outptu", "x"], ["--output"]),
         (["compare", "CONFIG", "--data", "flower=nowhere"], ["--data flower=nowhere"]),
         (["compare", "CONFIG", "--data", "flwer=DATA"], ["'flwer'", "'flower'"]),
@@ -42,7 +41,6 @@ from commands import COMMAND, ENVIRONMENT, Command, Prepared, assert_refused, di
         (["evaluate", "CONFIG", "DATA"], ["omnibench-calibration/1"]),
         (["evaluate", "CALIBRATION", "nowhere"], ["nowhere: no such folder"]),
         (["export", "CALIBRATION", "--to", "c_heder"], ["'c_heder'", "'c_header'"]),
-        (["simulate", "CONFIG", "-o", "CONFIG"], ["is a file"]),
         (["simulate", "CONFIG", "-o", "x", "--truth", "x"], ["--truth"]),
         (["simulate", "CONFIG", "-o", "x", "--dataset", "flour"], ["'flour'", "flower"]),
         (["simulate", "CONFIG", "-o", "x", "--format", "xml"], ["'xml'", "'parquet', 'csv'"]),
@@ -53,11 +51,9 @@ from commands import COMMAND, ENVIRONMENT, Command, Prepared, assert_refused, di
         (["import", "csv", "DATA", "-o", "x", "--references"], ["--references is for --template DIR"]),
         (["import", "csv", "DATA", "-o", "x", "--robot-type", "diff"], ["--set robot=FILE"]),
         (["compare", "CONFIG", "--plugins", "CONFIG"], ["is a file; name the folder"]),
-        (["inspect", "CONFIG"], ["is a file", "dataset.yaml"]),
         (["plugin", "check", "DATA"], ["is a folder"]),
         (["plugin", "new", "My-Search"], ["'My-Search'"]),
         (["plugin", "new", "mine", "--kind", "costt"], ["'costt'", "'cost'"]),
-        (["plugin", "check", "nowhere.py"], ["nowhere.py: no such file"]),
     ],
     ids=lambda value: " ".join(value)[:50],
 )

@@ -14,9 +14,10 @@ import pytest
 from commands import COMMAND, ENVIRONMENT, Command, compared_here, search, succeeded, write_config
 from report_page import Page, on_terminal
 from rich.console import Console
+from sample_robots import TRICYCLE
 from syrupy.assertion import SnapshotAssertion
 from timing import PATIENCE
-from wheeled_samples import TRICYCLE, driven
+from wheeled_samples import driven
 
 from omnibench.cli.terminal.calibration_tables import print_calibration
 from omnibench.cli.terminal.comparison_tables import print_result

@@ -217,18 +217,11 @@ def test_dense_headings_are_right_even_if_the_odometry_is_far_off() -> None:
 
 
 @given(seed=st.integers(0, 2**16), gap=st.sampled_from([0.1, 0.5, 3.0]))
-def test_continuous_headings_stay_as_they_are_to_the_bit(seed: int, gap: float) -> None:
+def test_continuous_headings_stay_as_they_are_to_the_bit_and_whole_turns_change_nothing(seed: int, gap: float) -> None:
     rng = np.random.default_rng(seed)
     log = driven(rng.normal(0, 2, 100), np.arange(0, 10, gap))
     headings = true_headings(log) + rng.normal(0, 0.05, len(log.stamps))
     assert unwrapped(log, headings).tobytes() == headings.tobytes()
-
-
-@given(seed=st.integers(0, 2**16), gap=st.sampled_from([0.1, 0.5, 3.0]))
-def test_whole_turns_in_a_recording_change_nothing(seed: int, gap: float) -> None:
-    rng = np.random.default_rng(seed)
-    log = driven(rng.normal(0, 2, 100), np.arange(0, 10, gap))
-    headings = true_headings(log) + rng.normal(0, 0.05, len(log.stamps))
     whole_turns = TURN * rng.integers(-3, 4, len(headings))
     found = unwrapped(log, headings + whole_turns)
     np.testing.assert_allclose(found - found[0], headings - headings[0], atol=1e-9)

@@ -29,9 +29,10 @@ from lanes import slow
 from outlier_study import EFFECT, TRUTH
 from outlier_study import simulated as with_directions
 from recording_samples import in_room
+from sample_robots import DIFFERENTIAL, SWERVE, TRICYCLE
 from scipy.stats import binomtest, chi2
 from screening_samples import FIRST, SECOND, THIRD, screening
-from wheeled_samples import DIFF, SWERVE, TRICYCLE, driven
+from wheeled_samples import driven
 
 from omnibench.config import validate
 from omnibench.data.dataset import Trajectory
@@ -219,18 +220,6 @@ def test_a_heading_that_is_thrown_at_the_end_of_runs_loses_no_final_pose() -> No
     assert all(mask[-1] for mask in plain.masks)
 
 
-def test_the_fit_ends_where_neither_outliers_nor_noise_change() -> None:
-    dataset = simulated((), repetitions=4)
-    rng = np.random.default_rng(4)
-    runs = [replace(run, poses=run.poses.copy()) for run in dataset.split("train")]
-    for run in runs:
-        if rng.random() < 0.3:
-            run.poses[int(rng.integers(1, len(run.poses))), :2] += rng.choice([-0.08, 0.08], 2)
-    plain = plain_fit(replace(dataset, trajectories=tuple(runs)))
-    assert plain.jumps > 10
-    np.testing.assert_array_equal(np.concatenate(fitting.with_noise(plain).masks), np.concatenate(plain.masks))
-
-
 # What residuals depend on: slopes along paths, covariates and their significance.
 
 
@@ -240,17 +229,12 @@ def eccentric() -> Residuals:
     return Residuals(discover_effects(simulated(ECCENTRICITY + DELAY)))
 
 
-def rate_errors(residuals: Residuals, wheel: int, harmonic: float) -> tuple[np.ndarray, np.ndarray]:
-    """Amplitudes of cosine and sine (2, before and after) in a wheel's rate, and their errors."""
-    paths = residuals.paths
-    angle, rate = paths.signals.wheel_angles[:, wheel], paths.signals.rates[:, wheel]
-    columns = np.column_stack([rate * np.cos(harmonic * angle), rate * np.sin(harmonic * angle)])
-    fitted = residuals.fit(paths.of_wheel(wheel, columns))
-    return fitted.values, fitted.errors
-
-
 def test_an_eccentric_wheel_shows_its_amplitude_before_and_nothing_after(eccentric: Residuals) -> None:
-    values, errors = rate_errors(eccentric, 0, 1)
+    signals = eccentric.paths.signals
+    angle, rate = signals.wheel_angles[:, 0], signals.rates[:, 0]
+    columns = np.column_stack([rate * np.cos(angle), rate * np.sin(angle)])
+    fitted = eccentric.fit(eccentric.paths.of_wheel(0, columns))
+    values, errors = fitted.values, fitted.errors  # (2, before and after)
     noise = errors[0, EXTENDED.index]
     assert 0.012 < values[0, PLAIN.index] < 0.022  # some of 0.02 is in the matrix, and in the start headings
     assert abs(values[1, PLAIN.index]) < 4 * errors[1, PLAIN.index]
@@ -653,7 +637,7 @@ def test_whichever_of_the_look_alikes_is_right_is_named_after_the_proposed_runs(
     assert found.effects[0].weight >= 0.95
 
 
-@pytest.mark.parametrize("robot", [DIFF, TRICYCLE, SWERVE], ids=lambda robot: robot.name)
+@pytest.mark.parametrize("robot", [DIFFERENTIAL, TRICYCLE, SWERVE], ids=lambda robot: robot.name)
 def test_candidates_are_no_faster_and_steer_no_farther_than_what_was_recorded(robot: Robot) -> None:
     fit = steered_half(plain_fit(driven(robot)))
     candidates = candidate_runs(fit, [effects.create("heading_drift")])
@@ -674,7 +658,7 @@ def steered_half(fit: fitting.Fit) -> fitting.Fit:
 
 
 def test_headings_matter_only_to_effects_that_depend_on_them() -> None:
-    fit = plain_fit(driven(DIFF))
+    fit = plain_fit(driven(DIFFERENTIAL))
     headings = {
         name: {candidate.run.start[2] for candidate in candidate_runs(fit, [effects.create(name)])}
         for name in ("heading_drift", "floor_drift")

@@ -53,14 +53,19 @@ def dataset() -> Dataset:
     return make_dataset("synthetic", ROBOT, 0.2, [*runs[:8], *held_out], simulated=True)
 
 
-def test_the_provenance_tells_where_a_calibration_comes_from(dataset: Dataset) -> None:
-    run = calibrate(dataset, "crs", options={"tolerance": 1e-3}, cost="trajectory", box="paper", seed=7)
+def test_a_calibration_has_the_robot_and_the_matrix_found_and_its_provenance_tells_where_it_comes_from(
+    dataset: Dataset,
+) -> None:
+    choices = {"options": {"tolerance": 1e-3}, "cost": "trajectory", "box": "paper", "integration": "euler", "seed": 7}
+    run = calibrate(dataset, "crs", **choices)
     origin = run.calibration.provenance
     assert (origin.dataset, origin.dataset_hash, origin.simulated) == ("synthetic", dataset.hash, True)
     assert (origin.calibrator, origin.seed, origin.cost, origin.box) == ("crs", 7, "trajectory", "paper")
     assert origin.options == {"population": None, "tolerance": 1e-3, "step": 1e-8}
     assert origin.versions == package_versions()
     assert (origin.outcome, origin.reason) == ("converged", run.result.reason)
+    assert (run.calibration.robot, run.calibration.sample_period, run.calibration.integration) == (ROBOT, 0.2, "euler")
+    np.testing.assert_array_equal(run.calibration.matrix_array, run.result.matrix)
 
 
 @pytest.mark.parametrize("cost", ["final_pose", "final_position", "final_heading", "trajectory"])
@@ -81,13 +86,6 @@ def test_eq_6_of_the_provenance_is_that_of_evaluate_and_its_file_comes_back(data
     assert calibration.provenance.validation_cost == pytest.approx(splits["validation"].cost, rel=1e-12)
     write_calibration(calibration, tmp_path / "calibration.yaml")
     assert read_calibration(tmp_path / "calibration.yaml") == calibration
-
-
-def test_the_calibration_has_the_robot_the_matrix_and_the_integration(dataset: Dataset) -> None:
-    run = calibrate(dataset, integration="euler")
-    assert (run.calibration.robot, run.calibration.sample_period) == (ROBOT, 0.2)
-    assert run.calibration.integration == "euler"
-    np.testing.assert_array_equal(run.calibration.matrix_array, run.result.matrix)
 
 
 def test_values_that_no_robot_has_lead_back_to_the_recordings(dataset: Dataset) -> None:

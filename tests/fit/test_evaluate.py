@@ -146,13 +146,6 @@ def errors(sizes: Sequence[float]) -> Array:
     return np.outer(sizes, [0.6, 0.8, 0.1])
 
 
-def errors_on(dataset: Dataset, calibration: Calibration) -> tuple[Array, Array]:
-    """Final errors (Z, 3) of the validation runs, by the design values and by a calibration."""
-    models = (OdometryModel.of_design(ROBOT, "arc"), calibration.model)
-    before, after = (final_errors(model, dataset.split("validation")) for model in models)
-    return before, after
-
-
 def verdict(calibration: Calibration) -> HeldOutVerdict:
     """The verdict in a calibration file."""
     return calibration.provenance.held_out
@@ -217,8 +210,9 @@ def test_check_calibrate_and_evaluate_end_with_the_same_verdict(validating: int,
 
 def test_cross_validation_decides_where_three_runs_are_held_out_and_both_are_said() -> None:
     dataset = recordings(validating=3)
-    found = verdict(calibrate(dataset).calibration)
-    alone = judge(*errors_on(dataset, calibrate(dataset).calibration), dataset.split("validation"))
+    calibration, held_out = calibrate(dataset).calibration, dataset.split("validation")
+    found, design = verdict(calibration), OdometryModel.of_design(ROBOT, "arc")
+    alone = judge(final_errors(design, held_out), final_errors(calibration.model, held_out), held_out)
     assert (alone.verdict, found.verdict, found.units) == ("undecided", "better", 12)
     assert found.sentence.startswith("cross-validated (12 runs): ")
     assert f"too little was held out to decide: {alone.sentence}" in found.detail

@@ -19,19 +19,11 @@ import pytest
 from commands import ENVIRONMENT, Command, assert_refused, python, refused, write_config
 from dask_samples import certificates, refusal
 from distributed.protocol import Serialize
-from job_samples import Answer, Notes, jobs_of, squared, tried
-from test_jobs import (
-    asleep,
-    killed,
-    killed_once,
-    many_small_objects,
-    two_is_wrong,
-    with_jobs_of_its_own,
-    wrong_in_two_parts,
-)
+from job_samples import Answer, Notes, jobs_of, run, squared, tried
+from test_jobs import EveryBackend, asleep, killed, killed_once, many_small_objects, with_jobs_of_its_own
 from timing import until
 
-from omnibench.errors import ConfigError, DataError
+from omnibench.errors import ConfigError
 from omnibench.jobs.backend_choice import BackendChoice, check_backend, open_backend
 from omnibench.jobs.dask_backend import DaskBackend
 from omnibench.jobs.job import Failure, Job, ResultStore, TlsFiles, gathered, run_jobs
@@ -49,28 +41,17 @@ def dask() -> Iterator[DaskBackend]:
         yield backend
 
 
-def run(folder: Path, jobs: list[Job[Answer]], backend: DaskBackend) -> Notes:
-    notes = Notes()
-    run_jobs(jobs, ResultStore(folder, Answer), backend, notes)
-    return notes
+class TestDask(EveryBackend):
+    ahead = 4  # two for each worker
+
+    @pytest.fixture
+    def backend(self, dask: DaskBackend) -> DaskBackend:
+        return dask
 
 
-def test_every_job_has_its_result_and_its_progress(dask: DaskBackend, tmp_path: Path) -> None:
-    notes = run(tmp_path, jobs_of(squared, range(7)), dask)
-    assert notes.answers() == {number: number**2 for number in range(7)}
-    assert sorted(notes.began_numbers) == list(range(7))
-    assert dict(notes.moves) == {number: Progress("squaring", number) for number in range(7)}
-    assert {file.name for file in tmp_path.iterdir()} == {f"job-{number}.json" for number in range(7)}
-    assert {answer.threads for answer in notes.endings.values() if isinstance(answer, Answer)} == {"1"}
-    assert run(tmp_path, jobs_of(squared, [0] * 7), dask).reused == set(range(7))
-
-
-def test_what_a_job_raised_comes_back(dask: DaskBackend, tmp_path: Path) -> None:
-    notes = run(tmp_path, [*jobs_of(two_is_wrong, range(4)), Job("two", wrong_in_two_parts, 0)], dask)
-    failure = notes.endings[2]
-    assert isinstance(failure.error, DataError)
-    assert (notes.reason(2), notes.reason(4)) == ("DataError: two is wrong", "TwoPartError: one and another")
-    assert [notes.answers()[number] for number in (0, 1, 3)] == [0, 1, 3]
+def test_a_job_has_one_thread(dask: DaskBackend, tmp_path: Path) -> None:
+    (answer,) = run(tmp_path, jobs_of(squared, [3]), dask).endings.values()
+    assert answer.threads == "1"
 
 
 def test_limits_hold_on_workers(dask: DaskBackend, tmp_path: Path) -> None:

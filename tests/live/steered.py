@@ -14,17 +14,8 @@ from omnibench.robot.calibration import Calibration, covariance_rows, matrix_row
 from omnibench.robot.kinematics import Robot
 
 _CORNERS = {"fl": (0.2, 0.15), "fr": (0.2, -0.15), "rl": (-0.2, 0.15), "rr": (-0.2, -0.15)}
-
-
 SWERVE: Final = make_robot("swerve", *(steered(name, *place) for name, place in _CORNERS.items()))
-TRICYCLE: Final = make_robot("tricycle", steered("front", 0.4, 0.0), fixed("back", 0.0, 0.2, measured=False))
-CAR: Final = make_robot(
-    "car",
-    *(fixed(f"rear_{side}", 0.0, y) for side, y in (("left", 0.2), ("right", -0.2))),
-    *(steered(f"front_{side}", 0.5, y, driven=False) for side, y in (("left", 0.2), ("right", -0.2))),
-)
 SKID: Final = make_robot("skid", *(fixed(name, *place) for name, place in _CORNERS.items()), skid=True)
-DIFFERENTIAL: Final = make_robot("differential", fixed("left", 0.0, 0.1), fixed("right", 0.0, -0.1))
 
 
 def steered_calibration(robot: Robot = SWERVE, **changes: Any) -> Calibration:

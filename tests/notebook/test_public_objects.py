@@ -13,13 +13,12 @@ import pytest
 from commands import CONFIGS, compared_here, prepare
 from pydantic import BaseModel
 from recording_samples import with_a_tape
+from sample_robots import CAR, DIFFERENTIAL, SWERVE, TRICYCLE
 from shared_results import shared_folder
 from timing import PATIENCE
-from wheeled_samples import CAR, DIFF, SWERVE, TRICYCLE
 
 import omnibench
 from omnibench.cli.handbook_topics import HANDBOOK
-from omnibench.data.dataset import Dataset
 from omnibench.robot.calibration import read_calibration
 from omnibench.robot.kinematics import Robot
 from omnibench.views import Shown, brief
@@ -110,17 +109,10 @@ def test_an_unknown_table_or_option_of_a_plot_is_refused_with_the_nearest() -> N
         result("calibration").plot(data=result("dataset"))
 
 
-@pytest.mark.parametrize("robot", [DIFF, TRICYCLE, CAR, SWERVE], ids=lambda robot: robot.name)
+@pytest.mark.parametrize("robot", [DIFFERENTIAL, TRICYCLE, CAR, SWERVE], ids=lambda robot: robot.name)
 def test_every_kind_of_robot_is_drawn_and_described(robot: Robot) -> None:
     assert len(repr(robot).splitlines()) == len(robot.wheels) + 1
     assert len(robot.plot().data) > 0
-
-
-def test_a_data_set_is_the_same_after_it_was_made_of_its_own_tables() -> None:
-    dataset: Dataset = result("dataset")
-    tables = {name: dataset.to_frame(name) for name in ("trajectories", "wheels", "poses")}
-    again = omnibench.make_dataset(dataset.name, dataset.robot, dataset.sample_period, **tables, simulated=True)
-    assert again.hash == dataset.hash
 
 
 def test_long_values_are_shortened_and_many_fields_are_counted() -> None:

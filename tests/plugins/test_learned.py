@@ -34,11 +34,10 @@ class TestLearned(CalibratorConformance):
     options = SMALL | {"epochs": 5}
 
 
-class TestLearnedAlone(CalibratorConformance):
-    """The cases of every calibrator."""
+class TestLearnedAlone(TestLearned):
+    """The same without the matrix."""
 
     name = "learned_alone"
-    options = SMALL | {"epochs": 5}
 
 
 @cache

@@ -74,21 +74,21 @@ def a_drive(seed: int, samples: int = 40, robot: Robot = APR_02, stamps: int = 7
     )
 
 
-def a_term(name: str, robot: Robot, seed: int = 0, scale: float = 1.0) -> Term:
-    """An effect with parameters anywhere in their plausible range, times a factor for those without choices."""
+def a_term(name: str, robot: Robot, seed: int = 0) -> Term:
+    """An effect with parameters anywhere in their plausible range."""
     rng = np.random.default_rng(seed)
     values = {
-        each.name: float(rng.choice(each.choices)) if each.choices else scale * float(rng.uniform(each.low, each.high))
+        each.name: float(rng.choice(each.choices)) if each.choices else float(rng.uniform(each.low, each.high))
         for each in effects.create(name).parameters(robot, SESSIONS)
     }
     return make_term(name, values, robot, sessions=SESSIONS)
 
 
-def mixture(seed: int, robot: Robot, scale: float = 1.0) -> list[Term]:
+def mixture(seed: int, robot: Robot) -> list[Term]:
     """Several effects of any motion stage, some of them twice."""
     rng = np.random.default_rng(seed)
     names = rng.choice(that_apply(EVERY_MOTION, robot), size=int(rng.integers(2, 8)))
-    return [a_term(str(name), robot, seed + place, scale) for place, name in enumerate(names)]
+    return [a_term(str(name), robot, seed + place) for place, name in enumerate(names)]
 
 
 def term(name: str, **values: float) -> Term:

@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -290,25 +290,17 @@ def test_a_scanner_that_is_tilted_to_the_floor_is_located_as_well_as_a_horizonta
 TIMES = np.array([1.0, 1.25, 1.5])
 
 
-class TwistPath:
+def circle(speed: float, turn_rate: float, start: Sequence[float] = (0.0, 0.0, 0.0)) -> Callable[[Array], Array]:
     """Odometry of a constant twist."""
-
-    def __init__(self, twist: Array, start: Array) -> None:
-        self._twist, self._start = twist, start
-
-    def __call__(self, times: Array) -> Array:
-        return np.array([advance(self._start, self._twist * time, "arc") for time in times])
-
-
-def circle(speed: float, turn_rate: float, start: Array | None = None) -> TwistPath:
-    return TwistPath(np.array([speed, 0.0, turn_rate]), np.zeros(3) if start is None else start)
+    twist = np.array([speed, 0.0, turn_rate])
+    return lambda times: np.array([advance(np.array(start), twist * time, "arc") for time in times])
 
 
 @given(
     speed=st.floats(-1, 1), turn_rate=st.floats(-2, 2), heading=st.floats(-4, 4), duration=st.sampled_from([0.02, 0.2])
 )
 def test_a_steady_twist_is_found(speed: float, turn_rate: float, heading: float, duration: float) -> None:
-    path = circle(speed, turn_rate, np.array([1.0, 2.0, heading]))
+    path = circle(speed, turn_rate, (1.0, 2.0, heading))
     (_, within, _), coarse = smoothed(path, TIMES, duration)
     np.testing.assert_allclose(within.mean, [speed, 0.0, turn_rate], atol=1e-6)
     np.testing.assert_allclose(within.at(np.array([duration])), [duration * within.mean], atol=1e-9)

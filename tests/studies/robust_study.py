@@ -25,8 +25,8 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from commands import RECORDINGS, ROOT
 from contamination import with_jumps
+from sample_robots import fixed, make_robot, steered
 from wheeled_recordings import recorded
-from wheeled_samples import DIFF, SWERVE, TRICYCLE
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.errors import OmnibenchError
@@ -42,6 +42,13 @@ from omnibench.slam.import_dataset import import_dataset
 
 CALIBRATORS = ("least_squares", "closed_form", "trajectory_ml", "crs")
 LOSSES: tuple[LossName, ...] = ("squares", "huber", "student_t")
+DIFF = make_robot("diff", *(fixed(name, 0, y, radius=0.042) for name, y in (("right", -0.1), ("left", 0.1))))
+TRICYCLE = make_robot(
+    "tricycle",
+    steered("front", 0.15, 0, radius=0.0325),
+    *(fixed(name, 0, y, radius=0.0325, measured=False) for name, y in (("left", 0.08), ("right", -0.08))),
+)
+SWERVE = make_robot("swerve", steered("fl", 0.2, 0.2), steered("fr", 0.2, -0.2), steered("rear", -0.2, 0.0))
 SHARE, OFF = 0.05, 1.0  # of the poses, and by how much they are moved, m
 
 

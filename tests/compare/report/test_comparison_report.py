@@ -14,9 +14,9 @@ from browser import assert_picture_comes_first, opened
 from recording_samples import sample, with_a_tape
 from report_page import NUMBER, Page
 from report_samples import config, flower, page, run, statistics, usual
-from sample_robots import APR02, LEVER_MECANUM
+from sample_robots import APR02, CAR, LEVER_MECANUM, TRICYCLE
 from syrupy.assertion import SnapshotAssertion
-from wheeled_samples import CAR, ROBOTS, TRICYCLE
+from wheeled_samples import ROBOTS
 
 from omnibench.compare.plan import load_datasets
 from omnibench.compare.report.comparison_report import comparison_document, data_section, robot_section
@@ -42,7 +42,6 @@ from omnibench.fit.ratio_intervals import Interval
 from omnibench.report.blocks import Callout, Figure, FigureGrid, Row, Table
 from omnibench.report.figures import motion_system, parameters
 from omnibench.report.numbers import fixed
-from omnibench.report.recording.recording_figures import describe
 from omnibench.report.render import write_document
 from omnibench.robot.kinematics import Array, Robot, relative_deviations, wheel_equations
 from omnibench.simulate.config import FlowerConfig
@@ -347,11 +346,6 @@ def test_other_commands_are_shown_as_a_spread_of_the_strongest_turns() -> None:
     assert {t.omega for t in chosen} == {0.6}
 
 
-def test_a_command_is_described_as_the_paper_writes_it() -> None:
-    trajectory = next(t for t in trajectories() if t.command == "v0.2_a30_w0.35")
-    assert describe(trajectory) == f"(0.2 m/s, 30°, 0.35 rad/s), {trajectory.id}"
-
-
 def test_the_design_values_are_no_search() -> None:
     assert {course.run.record.label for course in courses(usual_view())} == {"closed_form", "random_search"}
 
@@ -463,8 +457,8 @@ def test_wheels_given_by_x_and_y_stand_there_along_their_rolling(robot: Robot) -
 @pytest.mark.parametrize(
     ("robot", "first", "last"),
     [
-        (CAR, "rl: fixed, radius 0.03 m, x 0 m, y 0.1 m; ", "steered, radius 0.03 m, x 0.3 m, y −0.1 m, not driven"),
-        (TRICYCLE, "front: steered, radius 0.0325 m, x 0.15 m, y 0 m; ", "x 0 m, y −0.08 m, not measured"),
+        (CAR, "left: fixed, radius 0.05 m, x 0 m, y 0.2 m; ", "steered, radius 0.05 m, x 0.5 m, y −0.2 m, not driven"),
+        (TRICYCLE, "front: steered, radius 0.05 m, x 0.5 m, y 0 m; ", "x 0 m, y −0.2 m, not measured"),
     ],
 )
 def test_the_section_on_the_data_says_where_wheels_stand_and_which_are_not_driven_or_not_measured(
@@ -537,11 +531,6 @@ def with_published(two_entries: ComparisonResult, *published: dict[str, Any], **
     return view
 
 
-def recorded(view: DatasetView) -> DatasetView:
-    """The view with its data set called a recording."""
-    return replace(view, dataset=replace(view.dataset, simulated=False))
-
-
 def scaled(two_entries: ComparisonResult, before: float, after: float) -> dict[str, float]:
     """Published costs that are multiples of ours: of the design values, and of the calibrated matrix."""
     record = two_entries.runs[0].record
@@ -579,7 +568,8 @@ def test_figures_equal_to_ours_are_alike(two_entries: ComparisonResult) -> None:
     view = with_published(two_entries, remarked, remarked)
     assert not figures(view, alike=False)
     assert len(compared_figures(view)) == 8
-    table, _, remarks = published_blocks(recorded(view))
+    recorded = replace(view, dataset=replace(view.dataset, simulated=False))
+    table, _, remarks = published_blocks(recorded)
     assert remarks.items == ("A misprint.",)
     assert [row.cells[-1].text for row in table.rows] == ["as published"] * 8
     assert table.rows[0].cells[3].text == "0.0 %"

@@ -56,13 +56,9 @@ def poses(seed: int, noise: float = 1.0, **names: str) -> pl.DataFrame:
 
 def both(seed: int) -> pl.DataFrame:
     """Wheels and poses in one table, blank where a stream has no sample."""
-    joined = pl.concat([_stamped(wheels(seed)), _stamped(poses(seed))], how="diagonal")
+    joined = pl.concat([make(seed).with_columns(pl.col("t").round(6)) for make in (wheels, poses)], how="diagonal")
     columns = [pl.col(name).drop_nulls().first() for name in joined.columns if name != "t"]
     return joined.group_by("t", maintain_order=True).agg(columns).sort("t")
-
-
-def _stamped(frame: pl.DataFrame) -> pl.DataFrame:
-    return frame.with_columns(pl.col("t").round(6))
 
 
 def ids(data: Dataset) -> list[str]:
@@ -740,12 +736,6 @@ def test_a_run_with_references_needs_no_poses_and_one_table_holds_those_of_all_r
     assert [[kind for kind, *_ in measured(run)] for run in runs] == [["distance"], ["turn", "turn"]]
 
 
-def test_references_may_stand_beside_one_table_of_the_wheels_of_all_runs(tmp_path: Path) -> None:
-    told = "run,kind,value,sigma\na,distance,1.0,0.003\nb,distance,1.1,0.003\n"
-    runs = read(write(tmp_path, log=of_two_runs("run"), references=told)).trajectories
-    assert [(run.id, measured(run)[0][3]) for run in runs] == [("a", 1.0), ("b", 1.1)]
-
-
 def test_references_that_do_not_name_their_run_are_not_taken_for_those_of_every_run(tmp_path: Path) -> None:
     told = "Name,Kind,Value,Sigma\na,distance,1.0,0.003\nb,distance,1.1,0.003\n"
     source = write(tmp_path, log=of_two_runs("Lauf"), references=told)
@@ -755,7 +745,7 @@ def test_references_that_do_not_name_their_run_are_not_taken_for_those_of_every_
     with pytest.raises(DataError, match=r"references\.csv: column 'run' is missing, .*; --set run_column=NAME"):
         read(source)
     runs = read(write(tmp_path, references=told.replace("Name", "Run"))).trajectories
-    assert [measured(run)[0][3] for run in runs] == [1.0, 1.1]
+    assert [(run.id, measured(run)[0][3]) for run in runs] == [("a", 1.0), ("b", 1.1)]
 
 
 def test_some_runs_have_poses_and_others_references(tmp_path: Path) -> None:
@@ -878,9 +868,8 @@ def test_a_data_set_read_in_other_units_has_its_references_in_them_too(tmp_path:
 
 
 def test_a_run_of_a_data_set_that_is_cut_keeps_the_references_of_each_part(tmp_path: Path) -> None:
-    with_gap = (
-        "\n".join(line for line in wheel_table().splitlines() if not line.startswith(("2.1", "2.2", "2.3"))) + "\n"
-    )
+    rows = wheel_table().splitlines(keepends=True)
+    with_gap = "".join(row for row in rows if not row.startswith(("2.1", "2.2", "2.3")))
     table = "kind,t0,t1,value,sigma\ndistance,0.5,2,0.3,0.003\ndistance,3,4.5,0.3,0.003\ndistance,,,1,0.003\n"
     save_dataset(read(write(tmp_path / "log", a_wheels=with_gap, a_references=table)), tmp_path / "old")
     runs = reread(tmp_path / "old", longest_gap=0.2).trajectories
@@ -889,9 +878,7 @@ def test_a_run_of_a_data_set_that_is_cut_keeps_the_references_of_each_part(tmp_p
 
 def test_a_data_set_with_times_in_ms_has_its_references_in_seconds_too(tmp_path: Path) -> None:
     table = "kind,t0,t1,value,sigma\ndistance,500,2000,0.3,0.003\ndistance,,,1,0.003\n"
-    rows = [f"{0.05 * k:.3f},4,4" for k in range(1, 101)]
-    source = write(tmp_path / "log", a_wheels="\n".join(["t,omega_left,omega_right", *rows]), a_references=table)
-    run = the_run(source, pose_time_unit="ms")
+    run = the_run(write(tmp_path / "log", a_wheels=wheel_table(), a_references=table), pose_time_unit="ms")
     slow = replace(run, references=replace(run.references, t0=run.references.t0 * 1e3, t1=run.references.t1 * 1e3))
     options = DatasetOptions(robot=ROBOT, wheel_time_unit="ms", pose_time_unit="ms")
     recordings = recordings_of([replace(slow, times=run.times * 1e3)], options.robot, None, options)

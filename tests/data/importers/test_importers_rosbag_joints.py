@@ -3,6 +3,7 @@
 import math
 import random
 import re
+import sqlite3
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -217,7 +218,6 @@ def no_steering(each: Sent) -> Sent:
     ("sent", "options", "message"),
     [
         (steering(lambda _: math.nan), {}, "steering_joints or steering_topic .*found: front_steering_joint, front_wh"),
-        (steering(lambda _: math.inf), {}, "steering_joints or steering_topic .*found: front_steering_joint, front_wh"),
         (edited(BOTH, WHEELS, only_speeds), {}, "steering_joints or steering_topic .*found: front_steering_joint"),
         (edited(BOTH, WHEELS, no_wheel), {"use": "positions"}, "every wheel .*use=positions"),
         (edited(BOTH, WHEELS, no_steering), {}, "--set steering_joints.*found: front_wheel_joint"),
@@ -230,11 +230,6 @@ def no_steering(each: Sent) -> Sent:
 def test_missing_joints_are_refused(tmp_path: Path, sent: list[Sent], options: dict[str, Any], message: str) -> None:
     with pytest.raises((ConfigError, DataError), match=message):
         read_steered(tmp_path, sent, **options)
-
-
-def test_a_steering_joint_that_a_driver_fills_in_is_found(tmp_path: Path) -> None:
-    findings = check(read_steered(tmp_path, steering(lambda _: 0.0))).findings
-    assert "steering_frozen" in {finding.kind for finding in findings}
 
 
 def unstamped(sent: list[Sent], topic: str) -> list[Sent]:
@@ -342,10 +337,6 @@ def in_degrees(each: Sent) -> Sent:
             [*part(12), *(replace(each, logged=each.logged + 20 * 10**9) for each in part(12))],
             r"message \d+: the stamps go back by 12 s",
         ),
-        (
-            edited(part(12.4), SLAM, lambda each: changed(each, header=header(each.logged - EPOCH))),
-            "no two messages of /robot/slam_pose while the wheels were recorded",
-        ),
         (edited(part(5), WHEELS, in_degrees), r"wheels, read in rad, turn at up to \d+ rad/s; --set wheel_unit"),
         (part(1.4), "the wheels rest all the time"),
         (
@@ -353,7 +344,7 @@ def in_degrees(each: Sent) -> Sent:
             "1 with fewer than two poses",
         ),
     ],
-    ids=["no stamps", "clock set back", "two clocks", "degrees", "no motion", "no poses"],
+    ids=["no stamps", "clock set back", "degrees", "no motion", "no poses"],
 )
 def test_a_recording_without_one_sound_run_is_refused(tmp_path: Path, sent: list[Sent], message: str) -> None:
     with pytest.raises(DataError, match=message):
@@ -470,20 +461,16 @@ def test_transforms_between_are_composed_at_the_stamps_of_the_rarest(tmp_path: P
     mount = np.array([0.1, 0.0, 0.0])
     base = compose(noisy(DRIVE.poses), -mount)
     drifting = np.cumsum(np.random.default_rng(2).normal(0, 0.01, DRIVE.poses.shape), axis=0)
+    correcting = compose(base, relative(drifting, np.zeros(3)))
     sent: Sequence[Sent] = [
         *WHEELS_ONLY,
         *transforms("odom", "base", DRIVE.pose_stamps, drifting),
-        *transforms("map", "odom", DRIVE.pose_stamps[::2], inverse_of(base, drifting)[::2]),
+        *transforms("map", "odom", DRIVE.pose_stamps[::2], correcting[::2]),
         *transforms("base", "body", DRIVE.pose_stamps[:1], mount[None], "/tf_static"),
     ]
     data = read(write_mcap(tmp_path / "drive", sent), pose_topic="/tf", pose_frames=["map", "body"])
     assert odometry_error(data) < 0.05
     assert np.median(np.diff(data.trajectories[0].pose_times)) == pytest.approx(0.5)
-
-
-def inverse_of(whole: Array, second: Array) -> Array:
-    """Poses with which compose(first, second) is the whole."""
-    return compose(whole, relative(second, np.zeros(3)))
 
 
 def test_transforms_that_the_robot_made_of_its_wheels_are_refused(tmp_path: Path) -> None:
@@ -612,7 +599,9 @@ def test_a_field_that_is_not_there_is_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("inside", ["msg", ""])
 def test_definitions_may_be_given_of_types_that_a_bag_does_not_define(tmp_path: Path, inside: str) -> None:
-    source = without_definitions(write_rosbag2(tmp_path / "drive", [*TRACKER, *status()]))
+    source = write_rosbag2(tmp_path / "drive", [*TRACKER, *status()])
+    with sqlite3.connect(source / "drive.db3") as connection:  # as recorders before ROS 2 Iron write it
+        connection.execute("DELETE FROM message_definitions")
     options: dict[str, Any] = {"wheel_topic": "/status", "joints": BY_PATH}
     with refused(ConfigError, match=r"the bag does not define its messages; .*--set message_definitions=FOLDER"):
         read(source, **options)
@@ -626,16 +615,6 @@ def test_definitions_may_be_given_of_types_that_a_bag_does_not_define(tmp_path: 
     (folder / "Motor.msg").write_text("int32 !\n")
     with refused(DataError, match=r"Motor\.msg: cannot be read as the definition of a message"):
         read(source, message_definitions=[str(tmp_path / "share")], **options)
-
-
-def without_definitions(bag: Path) -> Path:
-    """A rosbag2 folder as recorders before ROS 2 Iron write it."""
-    import sqlite3
-
-    (database,) = bag.glob("*.db3")
-    with sqlite3.connect(database) as connection:
-        connection.execute("DELETE FROM message_definitions")
-    return bag
 
 
 def twists(
@@ -706,6 +685,5 @@ def test_poses_of_another_epoch_are_matched_or_moved(tmp_path: Path) -> None:
     source = write_mcap(tmp_path / "drive", other)
     with pytest.raises(DataError, match="no two messages of /robot/slam_pose while the wheels were recorded"):
         read(source)
-    matched = read(source, clocks="match")
-    assert odometry_error(matched) < 0.05
+    assert odometry_error(read(source, clocks="match")) < 0.05
     assert odometry_error(read(source, pose_time_offset=EPOCH / 1e9 - 1)) < 1e-6

@@ -2,21 +2,17 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
+from sample_robots import fixed, make_robot, steered
 
 from omnibench.robot.kinematics import Array
 
-REAR = {"type": "fixed", "radius": 0.1, "x": 0, "measured": False}
-TRICYCLE: dict[str, Any] = {
-    "name": "tricycle",
-    "wheels": [
-        {"name": "front", "type": "steered", "radius": 0.1, "x": 1.2, "y": 0},
-        {"name": "left", "y": 0.3, **REAR},
-        {"name": "right", "y": -0.3, **REAR},
-    ],
-}
+TRICYCLE = make_robot(
+    "tricycle",
+    steered("front", 1.2, 0, radius=0.1),
+    *(fixed(name, 0, y, radius=0.1, measured=False) for name, y in (("left", 0.3), ("right", -0.3))),
+).model_dump(mode="json")
 PERIOD = 0.05  # s
 
 

@@ -5,15 +5,17 @@ import os
 import pickle
 import shutil
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import polars as pl
 import pytest
 from lanes import slow
-from sample_robots import APR_02, MECANUM
-from wheeled_samples import CAR, DIFF, SWERVE, driven
+from sample_robots import APR_02, CAR, DIFFERENTIAL, MECANUM, SWERVE
+from wheeled_samples import driven
 
 import omnibench.data.stored as stored_samples
 import omnibench.robot.stored_odometry as odometry_of_stored
@@ -63,7 +65,7 @@ def nothing_held(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(odometry_of_stored, "_TOGETHER", 200)
 
 
-@pytest.mark.parametrize("robot", [APR_02, MECANUM, DIFF, CAR, SWERVE], ids=lambda robot: robot.name)
+@pytest.mark.parametrize("robot", [APR_02, MECANUM, DIFFERENTIAL, CAR, SWERVE], ids=lambda robot: robot.name)
 def test_what_stays_in_its_file_is_the_data_set_that_was_saved(robot: Robot, tmp_path: Path) -> None:
     save_dataset(recorded(robot), tmp_path / "saved")
     held, stored = load_dataset(tmp_path / "saved"), load_dataset(tmp_path / "saved", most_in_memory=0)
@@ -90,7 +92,7 @@ def test_a_run_gives_arrays_and_is_replaced_without_reading_them(folder: Path, t
 
 
 @pytest.mark.usefixtures("nothing_held")
-@pytest.mark.parametrize("robot", [SWERVE, *slow(APR_02, MECANUM, DIFF, CAR)], ids=lambda robot: robot.name)
+@pytest.mark.parametrize("robot", [SWERVE, *slow(APR_02, MECANUM, DIFFERENTIAL, CAR)], ids=lambda robot: robot.name)
 def test_fits_errors_and_checks_are_as_in_memory(robot: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     save_dataset(recorded(robot), tmp_path / "saved")
     stored = load_dataset(tmp_path / "saved", most_in_memory=0)
@@ -281,21 +283,16 @@ def test_a_file_that_changes_under_the_data_set_is_not_read_on(tmp_path: Path) -
         _ = pickled.rates
 
 
-@dataclass
-class Sampled:
+def sampled(times: np.ndarray) -> Any:
     """A run of which only the times matter."""
-
-    samples: Samples
-
-    def __init__(self, times: np.ndarray) -> None:
-        self.samples = Samples({"times": times})
+    return SimpleNamespace(samples=Samples({"times": times}))
 
 
 def test_the_usual_period_of_many_samples_is_that_of_the_run_in_their_middle(monkeypatch: pytest.MonkeyPatch) -> None:
-    runs = [Sampled(np.arange(1, 1 + count) * period) for count, period in ((400, 0.1), (900, 0.01), (600, 0.02))]
+    runs = [sampled(np.arange(1, 1 + count) * period) for count, period in ((400, 0.1), (900, 0.01), (600, 0.02))]
     monkeypatch.setattr(stored_samples, "MOST_IN_MEMORY", 0)
     assert median_period(runs) == pytest.approx(0.02)
-    assert median_period([*runs, Sampled(np.array([5.0, 99.0]))]) == pytest.approx(0.02)
+    assert median_period([*runs, sampled(np.array([5.0, 99.0]))]) == pytest.approx(0.02)
 
 
 def test_some_runs_are_drawn_always_the_same_and_into_memory(folder: Path) -> None:

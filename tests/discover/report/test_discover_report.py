@@ -57,14 +57,6 @@ def is_empty(trace: dict[str, Any]) -> bool:
     return not any(value is not None for value in flat)
 
 
-def poor_named() -> Discovery:
-    return poor(named())
-
-
-def poor_nothing() -> Discovery:
-    return poor(nothing())
-
-
 @pytest.fixture(scope="module")
 def report() -> Page:
     return whole(named)
@@ -75,7 +67,9 @@ def test_the_report_reads_as_before(make: Callable[[], Discovery], snapshot: Sna
     assert whole(make).words() == snapshot
 
 
-@pytest.mark.parametrize("make", [named, nothing, incomplete, poor_named, poor_nothing, *slow(nameless)])
+@pytest.mark.parametrize(
+    "make", [named, nothing, incomplete, lambda: poor(named()), lambda: poor(nothing()), *slow(nameless)]
+)
 def test_no_plot_is_empty_and_every_axis_has_a_title(make: Callable[[], Discovery]) -> None:
     drawn = plots(whole(make))
     assert len(drawn) > 8

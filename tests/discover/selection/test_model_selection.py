@@ -593,7 +593,7 @@ def test_functions_are_fitted_together_with_named_effects_and_stand_after_them(
     assert {each.name for each in used.groups[1:]} <= {"smooth_heading", "smooth_course", "smooth_heading_wave"}
     assert smooth.models.weighted[0][1] is used
     assert "unnamed" in smooth.notes[0]
-    calibrated = calibration_terms(used)
+    calibrated = {term.name: term.values for term in used.fit.model.terms}
     assert calibrated["heading_drift"]["b"] == used.values[0]
 
 
@@ -632,10 +632,6 @@ def with_names(bare: Extended, selection: model_selection.Selection, *groups: Gr
     """A model with these effects, whatever was selected."""
     used = extend(bare.fit, groups)
     return CompetingModels(used, selection, ((1.0, used),), ())
-
-
-def calibration_terms(extended: Extended) -> dict[str, dict[str, float]]:
-    return {term.name: dict(term.values) for term in extended.fit.model.terms}
 
 
 def group(name: str, **shapes: float) -> Group:
@@ -678,26 +674,16 @@ def used(models: CompetingModels) -> list[str]:
     return [group.name for group in models.used.groups]
 
 
-def test_an_effect_that_predicts_held_out_commands_better_takes_the_place_of_the_likelier_one(fitted: Fitted) -> None:
-    models = competing(fitted, WRONG, RIGHT)
-    assert used(models) == [RIGHT]
-    assert [group.name for group in models.selection.chosen] == [RIGHT]
+@pytest.mark.parametrize("likelier_first", [(WRONG, RIGHT), (RIGHT, WRONG)])
+def test_the_effect_that_predicts_held_out_commands_better_is_used_and_all_models_keep_their_weights(
+    fitted: Fitted, likelier_first: tuple[str, str]
+) -> None:
+    models = competing(fitted, *likelier_first)
+    assert used(models) == [group.name for group in models.selection.chosen] == [RIGHT]
     assert models.selection.confusable == ((WRONG,),)
     assert models.preferred[0].startswith(f"{RIGHT} is used: it predicts commands that were held out better")
-
-
-def test_an_effect_that_predicts_held_out_commands_better_stays(fitted: Fitted) -> None:
-    models = competing(fitted, RIGHT, WRONG)
-    assert used(models) == [RIGHT]
-    assert models.selection.confusable == ((WRONG,),)
-    assert models.preferred[0].startswith(f"{RIGHT} is used")
-
-
-def test_all_competing_models_keep_the_weights_of_their_names_the_used_one_first(fitted: Fitted) -> None:
-    for models in (competing(fitted, WRONG, RIGHT), competing(fitted, RIGHT, WRONG)):
-        assert models.weighted[0][1] is models.used
-        of_names = {model.groups[0].name: weight for weight, model in models.weighted}
-        assert of_names == models.selection.weights
+    assert models.weighted[0][1] is models.used
+    assert {model.groups[0].name: weight for weight, model in models.weighted} == models.selection.weights
 
 
 def test_an_effect_without_a_stand_in_has_no_competitor_and_needs_no_reason(fitted: Fitted) -> None:

@@ -19,10 +19,9 @@ from motions import RING, TURNS, driven
 from numpy.testing import assert_array_equal
 from posterior_coverage import ratios_of
 from real_recordings import omni3
-from sample_robots import APR02, DIFFERENTIAL, WHEELED
+from sample_robots import APR02, DIFFERENTIAL, TRICYCLE, WHEELED, fixed, make_robot
 from scipy.optimize import lsq_linear
 from wheeled_recordings import recorded
-from wheeled_samples import DIFF, TRICYCLE
 
 from omnibench.config import read_yaml
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
@@ -212,6 +211,7 @@ def test_too_few_programs_are_not_called_converged() -> None:
         ("closed_form", {"parameterisation": "geometry"}, "matrix parameterisation"),
         ("closed_form", {"cost": "worst"}, "worst"),
         ("parametric", {}, "geometry parameterisation"),
+        ("published", {"wheels": 4}, "12 values"),
     ],
 )
 def test_a_problem_that_is_not_for_a_calibrator_is_refused_in_words(name: str, changes: Any, reason: str) -> None:
@@ -219,6 +219,27 @@ def test_a_problem_that_is_not_for_a_calibrator_is_refused_in_words(name: str, c
     result = run(name, make_problem(**changes))
     assert (result.outcome, result.vector) == (Outcome.FAILED, None)
     assert reason in result.reason
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "error", "named"),
+    [
+        ("trajectory_ml", {"covariance": "model", "weights": "cost"}, ConfigError, "robust"),
+        ("trajectory_ml", {"clock": "offse"}, ConfigError, "clock"),
+        ("parametric", {"search": "parametric"}, ConfigError, "search"),
+        ("parametric", {"search": "csr"}, UnknownNameError, "'csr'; did you mean 'crs'"),
+        ("parametric", {"search_options": {"populaton": 5}}, ConfigError, "'populaton'; did you mean 'population'"),
+        ("published", {"matrix": [[1.0, 2.0, 3.0]] * 2}, ConfigError, r"\[3, 3\]"),
+        ("published", {"matrix": [[1.0, 2.0], [1.0, 2.0, 3.0], [1.0]]}, ConfigError, r"\[2, 3, 1\]"),
+        ("published", {"matrix": [[1.0] * 9]}, ConfigError, r"\[9\]"),
+        ("published", {"matrix": "palacin2023_eq7"}, ConfigError, "palacin2023_eq8, palacin2023_eq9"),
+    ],
+)
+def test_options_that_are_unknown_or_do_not_go_together_are_refused(
+    name: str, options: Any, error: type[Exception], named: str
+) -> None:
+    with pytest.raises(error, match=named):
+        calibrators.create(name, options)
 
 
 def test_five_runs_that_hardly_scatter_have_an_answer_and_say_why_the_solver_stopped() -> None:
@@ -379,14 +400,6 @@ def test_intervals_of_as_few_runs_as_the_numbers_take_are_wide_or_refused() -> N
     assert "use covariance: model" in refused.reason
 
 
-@pytest.mark.parametrize(
-    ("options", "named"), [({"covariance": "model", "weights": "cost"}, "robust"), ({"clock": "offse"}, "clock")]
-)
-def test_options_that_do_not_go_together_or_are_unknown_are_refused(options: dict[str, str], named: str) -> None:
-    with pytest.raises(ConfigError, match=named):
-        calibrators.create("trajectory_ml", options)
-
-
 def test_the_box_and_the_design_along_directions_that_are_not_driven_are_kept() -> None:
     boxed = make_problem(box="paper")
     assert boxed.inside(solved(boxed).vector[None])[0]
@@ -401,6 +414,7 @@ ROBUST: tuple[LossName, ...] = ("huber", "student_t")
 
 
 # Simulated sets of which the mean error is compared: one alone is 5 % better or worse by chance.
+DIFF = make_robot("diff", fixed("right", 0, -0.1, radius=0.042), fixed("left", 0, 0.1, radius=0.042))
 SETS = {"least_squares": 16, "trajectory_ml": 3, "closed_form": 3, "crs": 2}
 
 
@@ -658,19 +672,6 @@ def test_options_reach_the_search_and_its_name_the_reason() -> None:
     assert result.reason == "random_search: 30 candidates tried"
 
 
-@pytest.mark.parametrize(
-    ("options", "error", "named"),
-    [
-        ({"search": "parametric"}, ConfigError, "search"),
-        ({"search": "csr"}, UnknownNameError, "'csr'; did you mean 'crs'"),
-        ({"search_options": {"populaton": 5}}, ConfigError, "'populaton'; did you mean 'population'"),
-    ],
-)
-def test_a_search_that_is_itself_or_unknown_is_refused(options: Any, error: Any, named: str) -> None:
-    with pytest.raises(error, match=named):
-        calibrators.create("parametric", options)
-
-
 # Baselines, which the others are measured against.
 
 
@@ -692,26 +693,6 @@ def test_published_is_the_matrix_as_printed_even_outside_the_box(matrix: Any) ->
     result = run("published", make_problem(RUNS, box="paper"), matrix=matrix)
     assert (result.outcome, result.at_bounds) == (Outcome.CONVERGED, ())
     np.testing.assert_array_equal(result.matrix, published_matrix(matrix) if isinstance(matrix, str) else matrix)
-
-
-def test_a_published_matrix_for_other_wheels_fails_in_words() -> None:
-    result = run("published", make_problem(wheels=4))
-    assert result.outcome is Outcome.FAILED
-    assert "12 values" in result.reason
-
-
-@pytest.mark.parametrize(
-    ("matrix", "named"),
-    [
-        ([[1.0, 2.0, 3.0]] * 2, r"\[3, 3\]"),
-        ([[1.0, 2.0], [1.0, 2.0, 3.0], [1.0]], r"\[2, 3, 1\]"),
-        ([[1.0] * 9], r"\[9\]"),
-        ("palacin2023_eq7", "palacin2023_eq8, palacin2023_eq9"),
-    ],
-)
-def test_rows_that_are_no_matrix_and_unknown_matrices_are_refused(matrix: Any, named: str) -> None:
-    with pytest.raises(ConfigError, match=named):
-        calibrators.create("published", {"matrix": matrix})
 
 
 def test_a_published_matrix_is_not_kept_to_the_design_where_nothing_was_driven() -> None:

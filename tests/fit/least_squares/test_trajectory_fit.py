@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from omnibench.data.dataset import Trajectory
-from omnibench.discover.fitting import fit_matrix
+from omnibench.discover.fitting import fit_matrix, with_noise
 from omnibench.errors import DataError
 from omnibench.fit.calibrators.trajectory_ml import robust_noise
 from omnibench.fit.gauss_newton import BoxedFit, bounded_step, first_fit
@@ -140,7 +140,7 @@ def fit_of(runs, dataset):
     return fit_matrix(usable_runs(runs), dataset.robot, dataset.sample_period, dataset.robot.inverse_kinematic_matrix)
 
 
-def test_poses_that_contradict_their_neighbours_are_left_out_and_no_others() -> None:
+def test_poses_that_contradict_their_neighbours_are_left_out_and_no_others_and_noise_found_again_changes_none() -> None:
     dataset = simulated((), repetitions=4)
     rng = np.random.default_rng(4)
     runs, moved = [], set()
@@ -157,6 +157,7 @@ def test_poses_that_contradict_their_neighbours_are_left_out_and_no_others() -> 
     assert gone >= moved
     assert len(gone - moved) <= 1
     assert fit.jumps == len(gone)
+    np.testing.assert_array_equal(np.concatenate(with_noise(fit).masks), np.concatenate(fit.masks))
 
 
 def test_dense_references_are_thinned_and_keep_their_ends() -> None:

@@ -14,8 +14,8 @@ from fit_samples import make_problem, noisy_trajectories
 from hypothesis import given
 from hypothesis import strategies as st
 from motions import FLOWER, RING, SPEED, TURNS, Twist, driven
+from sample_robots import CAR, DIFFERENTIAL
 from scipy import stats
-from wheeled_samples import CAR, DIFF
 from wheeled_samples import driven as curves
 
 from omnibench.data.dataset import Dataset, Trajectory
@@ -651,13 +651,6 @@ def untold(found: Identifiability) -> tuple[str, ...]:
 # Information matrices of two or three wheels, whose inverses are known.
 
 
-def test_independent_elements_have_the_inverse_root_of_their_information() -> None:
-    information = np.diag([1.0, 4.0, 16.0, 25.0, 100.0, 0.25])
-    np.testing.assert_allclose(
-        deviations_along(information, np.eye(2)), [[1.0, 0.25, 0.1], [0.5, 0.2, 2.0]], rtol=1e-12
-    )
-
-
 def test_directions_that_are_fitted_together_share_their_information_and_kept_ones_take_none() -> None:
     correlated = np.kron(np.eye(3), [[2.0, 1.0], [1.0, 2.0]])  # its inverse is [[2, -1], [-1, 2]] / 3
     together = deviations_along(correlated, np.eye(2))
@@ -825,15 +818,15 @@ KNOWN = np.empty((0, 2))  # no direction of wheel rates is unknown
 
 
 def test_the_track_of_two_wheels_and_an_unknown_tracked_point_between_them_cannot_be_told_apart() -> None:
-    geometry = WheelGeometry(DIFF, fitted_mount=True)
-    assert inseparable_parameters(geometry, KNOWN) == (("distance_right", "distance_left", "mount_y"),)
-    assert inseparable_parameters(WheelGeometry(DIFF), KNOWN) == ()
-    of_the_right_wheel = np.array([[1.0, 0.0]])  # nothing is known of it
-    sentences = inseparable_in_words(WheelGeometry(DIFF), of_the_right_wheel)
+    geometry = WheelGeometry(DIFFERENTIAL, fitted_mount=True)
+    assert inseparable_parameters(geometry, KNOWN) == (("distance_left", "distance_right", "mount_y"),)
+    assert inseparable_parameters(WheelGeometry(DIFFERENTIAL), KNOWN) == ()
+    of_the_left_wheel = np.array([[1.0, 0.0]])  # nothing is known of it
+    sentences = inseparable_in_words(WheelGeometry(DIFFERENTIAL), of_the_left_wheel)
     assert any(sentence.startswith("these data say nothing of ") for sentence in sentences)
 
 
-@pytest.mark.parametrize("robot", [DIFF, CAR], ids=lambda robot: robot.name)
+@pytest.mark.parametrize("robot", [DIFFERENTIAL, CAR], ids=lambda robot: robot.name)
 @pytest.mark.parametrize("fitted_mount", [False, True])
 def test_the_groups_hold_the_numbers_that_are_not_identified(robot: Robot, fitted_mount: bool) -> None:
     geometry = WheelGeometry(robot, fitted_mount=fitted_mount)
@@ -844,6 +837,8 @@ def test_the_groups_hold_the_numbers_that_are_not_identified(robot: Robot, fitte
 
 
 def test_calibrate_says_which_numbers_cannot_be_told_apart() -> None:
-    run = calibrate(curves(DIFF), "crs", parameterisation="geometry", mount="fit", budget=Budget(evaluations=300))
+    run = calibrate(
+        curves(DIFFERENTIAL), "crs", parameterisation="geometry", mount="fit", budget=Budget(evaluations=300)
+    )
     (warning,) = [each for each in run.warnings if "apart" in each]
-    assert "distance_right, distance_left and mount_y" in warning
+    assert "distance_left, distance_right and mount_y" in warning

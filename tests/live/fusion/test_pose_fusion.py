@@ -56,9 +56,6 @@ def test_the_normalised_error_of_sparse_poses_is_that_of_three_degrees_of_freedo
     assert np.mean(normalised) == pytest.approx(3.0, abs=0.5)
 
 
-R = np.diag([1e-4, 1e-4, 1e-4])
-
-
 class Robot:
     """A robot that drives a bend of radius 1 m at 0.5 m/s, 100 samples a second, and its filter."""
 
@@ -87,7 +84,7 @@ class Robot:
         whole = int(time / 0.01 + 1e-9)
         return advance(self.truth[whole], (time / 0.01 - whole) * np.array([0.005, 0.0, 0.005]), "arc")
 
-    def see(self, time: float, error: tuple[float, float, float] = (0, 0, 0), covariance: np.ndarray = R) -> str:
+    def see(self, time: float, error: tuple[float, float, float] = (0, 0, 0), covariance: np.ndarray = EXACT) -> str:
         return self.fusion.correct(pose_fusion.PoseMeasurement(stamp(time), self.at(time) + error, covariance))
 
 
@@ -128,7 +125,7 @@ def test_a_pose_older_than_the_history_is_counted_and_changes_nothing() -> None:
 def test_a_pose_that_comes_before_its_wheel_sample_waits_for_it() -> None:
     robot = Robot().drive(10)
     robot.see(0.05)
-    ahead = pose_fusion.PoseMeasurement(stamp(0.15), np.array([0.0749, 0.0028, 0.075]), R)
+    ahead = pose_fusion.PoseMeasurement(stamp(0.15), np.array([0.0749, 0.0028, 0.075]), EXACT)
     assert robot.fusion.correct(ahead) == "waiting"
     before = robot.counts.poses
     robot.drive(4)
@@ -171,14 +168,14 @@ def test_a_sender_with_nonsense_for_stamps_does_not_fill_the_memory() -> None:
     timeline = pose_fusion.Timeline(2.0)
     for number in range(20_000):
         moved = motion(ORIGIN + 1000 * number, np.zeros(3), 1e-6)
-        timeline.append(pose_fusion.Entry(moved.stamp, moved, np.zeros(3), np.zeros(3), R))
+        timeline.append(pose_fusion.Entry(moved.stamp, moved, np.zeros(3), np.zeros(3), EXACT))
     assert len(timeline.entries) <= 8000
 
 
 def test_a_pose_that_was_set_holds_against_poses_measured_before() -> None:
     robot = Robot().drive(50)
     robot.see(0.2)
-    robot.fusion.set_pose(np.array([7.0, 8.0, 1.0]), R)
+    robot.fusion.set_pose(np.array([7.0, 8.0, 1.0]), EXACT)
     np.testing.assert_allclose(robot.fusion.pose, [7.0, 8.0, 1.0])
     assert robot.see(0.4) == "too late"
     robot.drive(10)

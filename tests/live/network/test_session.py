@@ -229,7 +229,6 @@ def test_settings_of_zenoh_reach_it(address: str) -> None:
     ("data", "named"),
     [
         ({"listen": "127.0.0.1:7447"}, "'127.0.0.1:7447' is not an endpoint"),
-        ({"listen": "tcp:127.0.0.1:7447"}, "endpoint"),
         ({"listen": ["tcp/127.0.0.1"]}, "endpoint"),
         ({"connect": "tcp/127.0.0.1:70000"}, "endpoint"),
         ({"connect": "http/127.0.0.1:80"}, "endpoint"),
@@ -287,21 +286,17 @@ def test_a_certificate_carries_its_name_and_its_hosts(tmp_path: Path) -> None:
     assert names.get_values_for_type(x509.IPAddress) == addresses
 
 
-def purposes(folder: Path, name: str) -> list[str]:
-    """What OpenSSL lets a certificate be used for."""
-    verify, file = ["openssl", "verify", "-x509_strict", "-CAfile", "ca.pem", "-purpose"], f"{name}.pem"
-    runs = {each: subprocess.run([*verify, each, file], cwd=folder, check=False) for each in ("sslserver", "sslclient")}
-    return [purpose for purpose, run in runs.items() if run.returncode == 0]
-
-
 @pytest.mark.parametrize(
     ("names", "router", "server"),
     [(["node", "apr02"], None, "node"), (["base", "node"], "base", "base"), (["apr02", "screen"], None, None)],
 )
 def test_only_the_router_may_serve(tmp_path: Path, names: list[str], router: str | None, server: str | None) -> None:
     make_keys(tmp_path, names, router=router)
+    verify = ["openssl", "verify", "-x509_strict", "-CAfile", "ca.pem", "-purpose"]
     for name in names:
-        assert purposes(tmp_path, name) == (["sslserver", "sslclient"] if name == server else ["sslclient"])
+        for purpose in ("sslserver", "sslclient"):
+            done = subprocess.run([*verify, purpose, f"{name}.pem"], cwd=tmp_path, check=False)
+            assert (done.returncode == 0) == (purpose == "sslclient" or name == server)
         extensions = read_certificate(tmp_path / f"{name}.pem").extensions
         hosts = [each for each in extensions if isinstance(each.value, x509.SubjectAlternativeName)]
         assert bool(hosts) == (name == server)

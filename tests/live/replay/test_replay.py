@@ -436,26 +436,17 @@ def long_player(session: zenoh.Session, **changes: Any) -> Player:
     return Player(GraphNode(session, KeySpace(), "replay"), "apr", LONG, config(speed="max", **changes))
 
 
-class Gate:
-    """Lets a part of a recording pass, and the rest once it is open."""
-
-    def __init__(self) -> None:
-        self.open = threading.Event()
-        self._passed = 0
-
-    def holds(self) -> bool:
-        self._passed += 1
-        return self._passed > PART and not self.open.is_set()
-
-
 class Replay:
     """A replay that runs beside the test, which lets all but a part of it pass by ``go_on``."""
 
     def __init__(self, session: zenoh.Session, pool: ThreadPoolExecutor, **changes: Any) -> None:
-        self._gate, self.stop = Gate(), threading.Event()
-        self._report = pool.submit(long_player(session, **changes).play, self.stop, hold=self._gate.holds)
-        self.done, self.report = self._report.done, self._report.result
-        self.go_on = self._gate.open.set
+        self.stop, self._open, self._passed = threading.Event(), threading.Event(), 0
+        self._report = pool.submit(long_player(session, **changes).play, self.stop, hold=self._holds)
+        self.done, self.report, self.go_on = self._report.done, self._report.result, self._open.set
+
+    def _holds(self) -> bool:
+        self._passed += 1
+        return self._passed > PART and not self._open.is_set()
 
 
 @contextmanager

@@ -9,7 +9,8 @@ import pytest
 from drives import ORIGIN, PERIOD, SECOND, Drive, drive
 from hypothesis import given
 from hypothesis import strategies as st
-from steered import CAR, SWERVE, TRICYCLE, only, steered_calibration, steered_drive
+from sample_robots import CAR, TRICYCLE
+from steered import SWERVE, only, steered_calibration, steered_drive
 
 from omnibench.errors import ConfigError
 from omnibench.live.estimation.health import Counts
@@ -490,7 +491,7 @@ def test_an_angle_that_wraps_at_a_turn_goes_on_the_shorter_way() -> None:
 
 @pytest.mark.parametrize("angle", [30.0, -1.6])
 def test_a_car_that_steers_in_degrees_is_told(angle: float) -> None:
-    receiver, rear = SteeringReceiver(CAR), {"rear_left": 0.0, "rear_right": 0.0}
+    receiver, rear = SteeringReceiver(CAR), {"left": 0.0, "right": 0.0}
     assert receiver.take(at_joints(0.0, **rear, front_left_steering=angle, front_right_steering=0.1)) == []
     assert f"'front_left_steering' says {angle:g} rad" in receiver.input.last_refusal
     assert "degrees" in receiver.input.last_refusal
@@ -524,7 +525,7 @@ def test_what_ros2_control_does_not_tell_is_nan_and_is_not_taken_for_a_reading()
 
 def test_joints_are_called_like_the_wheels_unless_they_are_named() -> None:
     assert joints_of(TRICYCLE).names == ("front", "front_steering")
-    assert joints_of(CAR).names == (*("rear_left", "rear_right"), *("front_left_steering", "front_right_steering"))
+    assert joints_of(CAR).names == ("left", "right", "front_left_steering", "front_right_steering")
     named = WheelSettings(joints=("traction",), steering_joints=("fork",))
     assert joints_of(TRICYCLE, named).names == ("traction", "fork")
     steps = SteeringReceiver(TRICYCLE, joints=["traction"], steering_joints=["fork"]).take(

@@ -4,7 +4,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-import small_gicp
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -56,18 +55,6 @@ def test_the_noise_of_a_map_of_one_scan_counts_as_much_as_that_of_the_scan_that_
     """Both see every wall with as many rays; the gradient's covariance is the information for one of them alone."""
     pairs = scan_matching.Correspondences(room_map(), points_of(ranges_at(np.zeros(3))), np.zeros(3))
     np.testing.assert_allclose(np.diag(pairs.scatter()), 2 * np.diag(pairs.information()), rtol=0.1)
-
-
-def test_a_planar_cloud_alone_would_keep_it_where_it_began() -> None:
-    """Why the map is made of crosses; when this fails, small_gicp has learnt to do without."""
-    points = points_of(ranges_at(np.zeros(3))).points
-    flat = small_gicp.PointCloud(np.column_stack([points, np.zeros(len(points))]))
-    tree = small_gicp.KdTree(flat)
-    small_gicp.estimate_normals(flat, tree, 10)
-    moved = small_gicp.PointCloud(np.column_stack([points + np.array([0.05, 0.0]), np.zeros(len(points))]))
-    found = small_gicp.align(flat, moved, tree, registration_type="PLANE_ICP")
-    np.testing.assert_allclose(found.T_target_source, np.eye(4), atol=1e-9)
-    assert found.converged
 
 
 @given(x=metres, y=metres, heading=radians, seed=st.integers(0, 50), far=st.booleans())
