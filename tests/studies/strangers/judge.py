@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[3]
 LONGEST = 600  # s, of a command
 MOST_FOLLOWED = 2  # commands that check prints and a stranger types; with the two checks before, four in all
 _STRAIGHT = 0.3  # rad: runs that turn by less tell lengths
-_LACKS, _SPLIT = r"\b(only|none|never|without|not all|lacks?|alone)\b", r"(train|valid)"
+_LACKS, _SPLIT = r"\b(only|no|0|none|never|without|not all|lacks?|alone)\b", r"(train|valid)"
 _WARNS_OF_SPLIT = rf"{_LACKS}[^.\n]*{_SPLIT}|{_SPLIT}[^.\n]*{_LACKS}"
 
 
