@@ -247,10 +247,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "negative noise": ({"noise": {"encoder": -0.1}}, "noise.encoder: "),
     "noise that is NaN": ({"noise": {"walk_heading": math.nan}}, "noise.walk_heading: "),
     "no truth": ({"truth": {}}, "given: none"),
-    "two truths": (
-        {"truth": {"published": PUBLISHED, "tolerances": {"radius": 0.1}}},
-        "given: published, tolerances",
-    ),
+    "two truths": ({"truth": {"published": PUBLISHED, "tolerances": {"radius": 0.1}}}, "given: published, tolerances"),
     "an unknown truth": ({"truth": {"published": "palacin2023_eq7"}}, "'palacin2023_eq"),
     "a truth of another shape": ({"truth": {"matrix": [[1.0, 2.0]] * 3}}, "truth.matrix"),
     "no commands that move": (commands_with(speeds=[0], turn_rates=[0]), "commands: "),
