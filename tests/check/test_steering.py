@@ -67,11 +67,6 @@ def plus(degrees: float, wheel: int | None = None) -> Change:
     return lambda values: values + np.where([wheel in (None, i) for i in range(values.shape[1])], degrees, 0) / 57.29578
 
 
-@pytest.mark.parametrize("robot", WHEELS)
-def test_sound_recordings_of_every_robot_are_misread_in_nothing(robot: str) -> None:
-    assert mistakes_of(robot) == ()
-
-
 @pytest.mark.parametrize(("robot", "wheel"), [*FIRST_WHEELS, *slow_cases(*OTHER_WHEELS)])
 def test_a_wheel_that_is_counted_the_wrong_way_is_named_with_its_option(robot: str, wheel: int) -> None:
     names = recorded(robot).robot.wheel_names

@@ -135,8 +135,6 @@ def test_a_data_set_keeps_what_was_typed_and_import_ends_with_what_came_out(comm
     assert ended[-1].startswith("  omnibench ")
 
 
-# By 40 seeds 2 to 12 % of the elements lie beyond 2.1 standard deviations; these two seeds were chosen, 1 is as good.
-_SEEDS = {"diff": 2, "mecanum": 6}
 _WHEELS = {
     "diff": [fixed(name, 0, y, radius=0.075) for name, y in (("left", 0.16), ("right", -0.16))],
     "mecanum": [
@@ -148,7 +146,8 @@ _SURE = 2.4  # standard deviations: the 95 % interval by Student's t of the 7 or
 
 
 def log_of(robot: str, folder: Path) -> Machine:
-    machine = write_logs(folder, robot, _SEEDS[robot])
+    # By 40 seeds 2 to 12 % of the elements lie beyond 2.1 standard deviations; these were chosen, 1 is as good.
+    machine = write_logs(folder, robot, {"diff": 2, "mecanum": 6}[robot])
     (folder / "robot.yaml").write_text(yaml.safe_dump({"name": "rover", "wheels": _WHEELS[robot]}))
     return machine
 

@@ -142,7 +142,6 @@ def test_a_disk_that_is_full_is_said_before_the_work(prepared: Prepared, tmp_pat
     assert_refused(run, f"{tmp_path}/c.yaml: cannot be written: No space left on device")
 
 
-MINE = "written: by hand\n"
 OPTIONS = "# The effective options of a discovery; the results beside it were made with them.\ndataset: another\n"
 COMPARISON = "# The effective config of a comparison; the results beside it were made with it.\nname: another\n"
 
@@ -161,7 +160,7 @@ def here(command: Command, prepared: Prepared, tmp_path: Path, monkeypatch: pyte
     mine = ("mine.yaml", "mine.html", "mine.py", "mine.mcap", "truth/truth.yaml", "keys/node.pem", "configs/apr02.yaml")
     for name in (*mine, "results/report.html"):
         Path(name).parent.mkdir(exist_ok=True)
-        Path(name).write_text(MINE, encoding="utf-8")
+        Path(name).write_text("written: by hand\n", encoding="utf-8")
     for name, text in (("discovery", OPTIONS), ("comparison", COMPARISON)):
         Path(name).mkdir()
         Path(name, "config.yaml").write_text(text, encoding="utf-8")

@@ -48,10 +48,8 @@ from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, WheelLog, advance
 from omnibench.robot.signals import Signals, signals_of
 
-RATES = np.array([[2.0, -1.0, 0.04]])
 VX, VY, W = 0.3, -0.2, 0.8
 AX, AY = 1.1, 0.7
-PHI = np.array([[0.5, 1.2, -2.0]])
 SPEED, R = math.hypot(VX, VY), 0.148
 
 
@@ -60,12 +58,12 @@ def signals(**changes: Any) -> Signals:
     chosen: dict[str, Any] = {
         "robot": APR_02,
         "durations": np.array([0.01]),
-        "rates": RATES,
+        "rates": np.array([[2.0, -1.0, 0.04]]),
         "elapsed": np.array([1.5]),
         "twists": np.array([[VX, VY, W]]),
         "accelerations": np.array([[AX, AY, 0.4]]),
         "travelled": np.array([0.1]),
-        "wheel_angles": PHI,
+        "wheel_angles": np.array([[0.5, 1.2, -2.0]]),
         "session_time": np.array([1000.0]),
         "session": "evening",
     }

@@ -254,7 +254,6 @@ TURNED_ROLLERS = Robot(
     wheels=tuple(wheel.model_copy(update={"roller_angle": math.pi / 4}) for wheel in MECANUM.wheels[:3])
     + MECANUM.wheels[3:],
 )
-ONE_REAR = Robot(name="r", wheels=CAR.wheels[1:])
 
 
 @pytest.mark.parametrize(
@@ -263,7 +262,7 @@ ONE_REAR = Robot(name="r", wheels=CAR.wheels[1:])
         (SWERVE, "m0, m1, m2"),
         (TWO_LEFT, "found 2 and 1"),
         (SIDEWAYS, "a, b"),
-        (ONE_REAR, "sl, sr .*rr"),
+        (Robot(name="r", wheels=CAR.wheels[1:]), "sl, sr .*rr"),
         (TURNED_ROLLERS, "rollers"),
         (robot(30, 150, 270, 330), r"30 degrees off \(30, 150, 270, 330 deg\)"),
     ],
