@@ -260,6 +260,7 @@ def unit_options(
                 unit = units[word] + ("/s" if rate else "")
         if "time" in option and not unit:
             numbers = table.only(np.arange(min(len(table), _FIRST_ROWS))).numbers([name])
+            numbers = numbers if np.isfinite(numbers).any() else table.numbers([name])
             largest = float(np.abs(numbers[np.isfinite(numbers)]).max(initial=0.0))
             unit = next((word for least, word in _EPOCHS if largest > least), "")
         read = getattr(options, option) or (options.wheel_time_unit if shared else "s")
