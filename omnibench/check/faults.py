@@ -21,7 +21,6 @@ from omnibench.data.importers.copied_reference import follows_the_wheels
 from omnibench.data.jumps import reference_jumps
 from omnibench.data.stored import count_drawn, drawn_runs, median_period
 from omnibench.robot.kinematics import CarDrive
-from omnibench.robot.model import OdometryModel
 from omnibench.words import plural, some
 
 _MOST_NOTES = 3  # notes on restarts of counters that are shown one by one; chosen
@@ -239,10 +238,7 @@ def jumps(evidence: Evidence) -> Iterator[Finding]:
     """Poses that jump off the motion that wheels tell and return, and shifts of the reference that last."""
     robot, standing = evidence.dataset.robot, {look.run for look in evidence.looks if look.standing}
     runs = [run for run in evidence.aligned if run.id not in standing]
-    model, found = OdometryModel.of_design(robot, "arc"), {}
-    for run in runs:  # one by one, so that the odometry of a single run is in memory
-        (driven,) = model.poses([run.log(run.pose_times)])
-        found[run.id] = reference_jumps(robot, driven, run.poses)
+    found = {run.id: reference_jumps(robot, run.log(run.pose_times), run.poses) for run in runs}
     lone, shifts = ([run for run, each in found.items() if len(getattr(each, kind))] for kind in ("lone", "shifts"))
     poses = sum(len(each.lone) for each in found.values())
     if shifts:

@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.robot.kinematics import Array, Robot, relative, wrapped
+from omnibench.robot.model import OdometryModel
+from omnibench.robot.odometry import WheelLog
 
 # A step is a jump if it differs from the odometry's by more than this, m and rad, and by more than the share of the
 # way; chosen: above the scatter of motion capture and of matched scans, and the errors of a design.
@@ -37,18 +39,24 @@ class Jumps:
         return len(self.lone) + len(self.shifts)
 
 
-def reference_jumps(robot: Robot, odometry: Array, poses: Array) -> Jumps:
-    """The jumps of reference poses (K, 3), m, m, rad. odometry (K, 3): of the design at their times."""
+def reference_jumps(robot: Robot, log: WheelLog, poses: Array) -> Jumps:
+    """The jumps of reference poses (K, 3), m, m, rad, at the stamps of a log of the wheels."""
     none = np.empty(0, dtype=np.intp)
     if len(poses) <= _FEWEST:
         return Jumps(none, none)
+    (odometry,) = OdometryModel.of_design(robot, "arc").poses([log])
+    # The odometry of coarse counters is late by up to a tick of every wheel.
+    angles = np.abs(log.signals) * np.diff(log.times, prepend=0.0)[:, None]
+    ticks = np.where(angles > 1e-9 * angles.max(axis=0, initial=0.0), angles, np.inf).min(axis=0, initial=np.inf)
+    x, y, turn = np.abs(robot.inverse_kinematic_matrix) @ np.where(np.isfinite(ticks), ticks, 0.0)
+    least = _LEAST + np.array([np.hypot(x, y), turn])
     steps = np.arange(len(poses) - 1)
     usual = _PER_QUANTILE * np.quantile(_misfits(odometry, poses, steps, steps + 1), _QUANTILE, axis=0)
 
     def agree(first: NDArray[np.intp], last: NDArray[np.intp]) -> NDArray[np.bool_]:
         driven = np.abs(relative(odometry[first], odometry[last]))
         way = np.hypot(driven[:, 0], driven[:, 1]) + robot.reach * driven[:, 2]
-        allowed = _LEAST + _SHARE * np.column_stack([way, driven[:, 2]])
+        allowed = least + _SHARE * np.column_stack([way, driven[:, 2]])
         within = _misfits(odometry, poses, first, last) <= np.maximum(allowed, _DEVIATIONS * usual)
         return np.asarray(within.all(axis=1))
 

@@ -283,8 +283,7 @@ def _without_lone_jumps(
             inside = (poses.times >= samples.begins[part][0]) & (poses.times <= samples.ends[part][-1])
             if (seen := np.flatnonzero(inside)).size:
                 log = samples.log(options.robot, part, poses.times[seen])
-                (driven,) = OdometryModel.of_design(options.robot, "arc").poses([log])
-                jumps = reference_jumps(options.robot, driven, poses.poses[seen])
+                jumps = reference_jumps(options.robot, log, poses.poses[seen])
                 lone[seen[jumps.lone]] = True
                 broken[seen[jumps.shifts]] = options.jumps == "cut"
         if lone.any():
