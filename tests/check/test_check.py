@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 import pytest
+from clean_logs import checked
 from commands import run_here
 from config_robots import experiment
 from hypothesis import example, given
@@ -133,6 +134,10 @@ def test_a_fault_is_found_and_what_is_typed_for_it_mends_it(kind: str) -> None:
     assert fix.split(" --set ")[0] in shlex.split(report.command)
     typed(report.command)
     assert kind not in kinds(check("log_mended"))
+
+
+def test_no_pose_jumps_beside_counters_of_few_ticks(tmp_path: Path) -> None:
+    assert checked("diff", 4, 2, tmp_path).said == ()  # 19 ticks a turn
 
 
 def test_ticks_without_their_unit_are_told_and_typed_as_ticks() -> None:
