@@ -9,6 +9,8 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
+import polars as pl
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.special import ndtr, stdtrit
 
@@ -54,7 +56,6 @@ _USUAL = 500
 # scatters, so that no two drives share any; wheel rates as commanded are alike in all repetitions).
 _ROWS, _CHANGES, _SHARED = 12, 8, 0.3
 _MOST_KEYS = 500_000  # stretches of poses that are kept, some 50 MB; of more every second, or third... (chosen)
-_MULTIPLIERS = np.array([0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB], dtype=np.uint64)  # SplitMix64's
 _DIGIT = 1e-7  # m, to which positions are compared; below the noise of any reference
 
 
@@ -310,21 +311,11 @@ def copied_runs(evidence: Evidence) -> Iterator[Finding]:
 
 
 def _digests(run: Trajectory) -> NDArray[np.uint64]:
-    """Digests (n,) of every stretch of reference positions that change often enough: polynomials modulo 2^64.
-
-    Each row is mixed first, by the finaliser of SplitMix64 (Steele et al. 2014), as changes of the last digit are few.
-    """
+    """Digests (n,) of every stretch of reference positions that change often enough."""
     rounded = np.round(run.poses[:, :2] / _DIGIT).astype(np.int64)
-    count = len(rounded) - _ROWS + 1
-    if count <= 0:
+    if len(rounded) < _ROWS:
         return np.empty(0, dtype=np.uint64)
+    stretches = sliding_window_view(rounded, _ROWS, axis=0).reshape(-1, 2 * _ROWS)
     changes = np.append(0, np.cumsum(np.any(np.diff(rounded, axis=0) != 0, axis=1)))
-    values = rounded.view(np.uint64)
-    mixed = values[:, 0] * _MULTIPLIERS[0] + values[:, 1]
-    for shift, multiplier in zip((30, 27), _MULTIPLIERS[1:], strict=True):
-        mixed = (mixed ^ (mixed >> np.uint64(shift))) * multiplier
-    digests = np.zeros(count, dtype=np.uint64)
-    for row in range(_ROWS):
-        digests = digests * _MULTIPLIERS[0] + mixed[row : row + count]
-    digests ^= digests >> np.uint64(31)
-    return digests[changes[_ROWS - 1 :] - changes[:count] >= _CHANGES]
+    often = changes[_ROWS - 1 :] - changes[: len(stretches)] >= _CHANGES
+    return pl.from_numpy(stretches[often]).hash_rows().to_numpy()

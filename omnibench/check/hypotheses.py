@@ -386,18 +386,17 @@ def _fitted_steering(robot: Robot, logs: Sequence[WheelLog], poses: Sequence[Arr
     windows = windows_by(np.array([1.0, 0.0]), 0.0)
     if windows is None or (chosen := windows.gentle()).sum() < 8 or not windows.turned[chosen].any():
         return None
-    wanted = windows.turned
     widest = max(float(np.abs(log.steering[:, group > 0]).max()) for log in logs if log.steering is not None)
     if not widest:
         return None
     from scipy.optimize import least_squares  # slow to import, and needed by robots that steer alone
 
-    deviation = 1.4826 * float(np.median(np.abs(wanted[chosen]))) + 1e-6
+    deviation = 1.4826 * float(np.median(np.abs(windows.turned[chosen]))) + 1e-6
 
     def left(values: Array, lag: float) -> Array:
         windows = windows_by(values, lag)
         assert windows is not None  # the poses are the same
-        missing: Array = (wanted - windows.driven @ row_3) / deviation
+        missing: Array = (windows.turned - windows.driven @ row_3) / deviation
         return missing[chosen]
 
     def solved(start: Array, lag: float) -> tuple[float, float, Array]:

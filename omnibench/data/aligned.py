@@ -122,11 +122,7 @@ def _ranges(recordings: Sequence[Recording], options: ReferenceOptions, notes: l
     for wheels in (each.wheels for each in recordings if options.wraps_at == "auto"):
         if quantity_of(wheels.unit) == "positions":
             unit = wheels.unit
-            # No step of a counter that begins again, or jumps far, is short beside its span.
-            longest = np.abs(np.diff(wheels.values, axis=0)).max(axis=0, initial=0.0)
-            far = (longest > counters.LONGEST_STEP * np.ptp(wheels.values, axis=0)).any()
-            lone = np.zeros(wheels.values.shape, dtype=bool)
-            lone = counters.jumping_readings(wheels.values, wheels.times) if far else lone
+            lone = counters.jumping_readings(wheels.values, wheels.times)
             for counts, column, jumping in zip(by_wheel, wheels.values.T, lone.T, strict=True):
                 counts.append(column[~jumping])
     if isinstance(options.wraps_at, float):

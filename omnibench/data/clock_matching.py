@@ -38,8 +38,9 @@ from omnibench.robot.kinematics import Array, Robot
 
 _WINDOW = 1.0  # s between the stamps of Eq. (2): long beside a pose's noise, short beside the drift by slip; chosen
 _BIN = 0.2  # s: poses within are averaged, so that dense ones cost no more than sparse ones; chosen
-# Long blocks of a run, and Student's t of 7 degrees of freedom over the normal quantile at 4 standard deviations, by
-# which so few tell an error (Ibragimov and Mueller 2010). Chosen: few enough to hold a change of speed, enough for t.
+# A drift's error is told by so many long blocks of a run, few enough that a change of speed lasts through one (chosen).
+# So few scatter too little by chance: _FEW is the quantile of Student's t with 7 degrees of freedom over that of the
+# normal distribution at 4 standard deviations (Ibragimov and Mueller 2010).
 _LONG_BLOCKS, _FEW = 8, 2.3
 _BLOCK = 2.0  # s: residuals that are nearer count as correlated; chosen, twice the window
 SEARCH = 2.0  # s: offsets are looked for within this on either side, unless the caller says more; chosen

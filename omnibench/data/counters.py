@@ -15,7 +15,7 @@ from omnibench.robot.kinematics import Array
 POWERS_OF_TWO = tuple(2.0**bits for bits in range(8, 65))  # where counters of 8 to 64 bits begin again
 # A counter is taken to begin again where its steps are short beside its range, and where the step across its end is
 # not longer than the others are (chosen): that of a counter that was set to 0 is, but for one case in some thousands.
-LONGEST_STEP = 0.25  # of the range
+_LONGEST_STEP = 0.25  # share of a counter's range that its steps are at most where it is taken to begin again
 _LONGER, _ROUNDING = 2.0, 1e-4  # times the longest other step, and of the range
 _FEWEST_CROSSINGS = 3  # at one place, of a range that is no power of two and no turn; chosen
 # A step that lost one turn of a shorter register is one whole turn off what the wheel does before and after; all others
@@ -54,7 +54,7 @@ def begins_again(counts: Array, wrap: float) -> bool:
         return False
     usual = float(steps[~across].max(initial=0.0))
     over = float(np.abs(steps[across] - wrap).max())
-    return usual <= LONGEST_STEP * wrap and over <= max(_LONGER * usual, _ROUNDING * wrap)
+    return usual <= _LONGEST_STEP * wrap and over <= max(_LONGER * usual, _ROUNDING * wrap)
 
 
 def _agreed_range(runs: Sequence[Array], spread: float, turn: float) -> float | None:
@@ -65,7 +65,7 @@ def _agreed_range(runs: Sequence[Array], spread: float, turn: float) -> float | 
         crossing = np.flatnonzero(np.abs(steps) > spread / 2)
         around = steps[crossing[:, None] + np.array([-1, 1])]  # the steps before and after
         jumps = np.isnan(around).all(axis=1) | (np.abs(around) > spread / 2).any(axis=1)  # and returns
-        if np.nan_to_num(np.abs(np.delete(steps, crossing))).max() > LONGEST_STEP * spread or jumps.any():
+        if np.nan_to_num(np.abs(np.delete(steps, crossing))).max() > _LONGEST_STEP * spread or jumps.any():
             return None
         across = np.append(across, np.abs(steps[crossing]))
         local = np.append(local, np.abs(np.nanmean(around, axis=1)))
@@ -85,7 +85,7 @@ def counted_on(counts: Array, wrap: float) -> Array:
     """
     steps = np.diff(counts, prepend=counts[0])
     short = steps - wrap * np.round(steps / wrap)
-    if np.abs(short).max() > LONGEST_STEP * wrap:
+    if np.abs(short).max() > _LONGEST_STEP * wrap:
         before = 0.0
         for index, step in enumerate(short.tolist()):
             before = short[index] = step + wrap * round((before - step) / wrap)
@@ -142,7 +142,7 @@ def lost_register(counts: Array, times: Array, ranges: Sequence[float]) -> float
     for wrap in possible:
         if farthest <= _LOST * wrap:  # no step lost a turn of this register, or of a longer one
             return None
-        if np.median(np.abs(steps)) > LONGEST_STEP * wrap:
+        if np.median(np.abs(steps)) > _LONGEST_STEP * wrap:
             continue
         restored = turns_restored(counts, times, wrap)
         turned = np.diff(restored)

@@ -415,7 +415,7 @@ def median_period(runs: Sequence[Sampled]) -> float:
 
 def median_step(times: Iterable[Array]) -> float:
     """The median time between stamps that follow each other in one of several arrays, s."""
-    steps = array("d")  # of which there may be very many
+    steps = array("d")  # without a list of arrays beside it: 10^7 steps take 80 MB
     for stamps in times:
         steps.frombytes(np.diff(stamps).tobytes())
     return float(np.median(np.frombuffer(steps), overwrite_input=True))

@@ -28,7 +28,7 @@ from omnibench.robot.stored_odometry import odometry_of
 _SPARSE = 1.0  # s between poses, from which on headings do not lie on lines between them; chosen
 _REWEIGHTED = 10  # steps, of which the best counts; chosen: on README's log the cost is within 1 % of closed_form's
 _VANISHING = 1e-3  # of the mean norm: smaller ones have no larger weight; chosen
-_MOST_POSES = 100_000  # of a quick fit, twice which it takes; of more it takes every second, or third... (chosen)
+_MOST_POSES = 100_000  # a quick fit takes every n-th pose of n times as many: fewer than twice this number; chosen
 _STEPS = 3  # Gauss-Newton steps by references, chosen: the design is so near that two settle
 
 
