@@ -378,7 +378,7 @@ def calibrate(
 
 def default_calibrator(training: Sequence[Trajectory]) -> str:
     """The calibrator where none is given: the one that weighs references by their uncertainty, if there are some."""
-    return "closed_form" if all(run.references is None for run in training) else "trajectory_ml"
+    return "map"
 
 
 def _with_choices(settings: FitSettings | str | None, choices: dict[str, Any]) -> FitSettings:

@@ -60,7 +60,8 @@ class Calibrator(ABC):
 
     parameterisation: the one it searches unless the config names another.
     bounded: False if the answer does not depend on the box (a published matrix, a closed form of an article).
-    as_is: True if its answer stands as it is, as an article's: neither shrunk nor kept to the design.
+    as_is: True if its answer stands as it is, as an article's, and is not kept to the design along any motion.
+    weighs_design: True if it weighs what the runs say of every motion against the design by itself.
     fitted: False if the answer does not depend on the runs (the design values, a published matrix).
     per_session: True if its article calibrates from the runs of one session, so that it refuses those of several.
     only_for: the robots that it is for, in words, where these are not all; then override ``applies``.
@@ -77,6 +78,7 @@ class Calibrator(ABC):
     parameterisation: ClassVar[ParameterisationName] = "matrix"
     bounded: ClassVar[bool] = True
     as_is: ClassVar[bool] = False
+    weighs_design: ClassVar[bool] = False
     fitted: ClassVar[bool] = True
     per_session: ClassVar[bool] = False
     only_for: ClassVar[str] = ""
@@ -112,8 +114,10 @@ calibrators.contract = Calibrator
 def as_answered(
     calibrator: type[Calibrator] | Calibrator, unidentified: Unidentified, mount: MountChoice | None
 ) -> tuple[Unidentified, MountChoice | None]:
-    """How answers are treated: as asked for, unless they stand as they are."""
-    return ("fit", "fit") if calibrator.as_is else (unidentified, mount)
+    """How answers are treated: as asked for, unless they stand as they are or weigh the design by themselves."""
+    if calibrator.as_is:
+        return "fit", "fit"
+    return "fit" if calibrator.weighs_design else unidentified, mount
 
 
 @dataclass(frozen=True)

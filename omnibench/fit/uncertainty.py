@@ -148,7 +148,7 @@ def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertaint
     """
     if result.matrix is None or result.vector is None:
         raise NoCovarianceError(f"no covariance without an answer: {result.reason}")
-    if result.extension is not None:
+    if result.extension is not None and result.covariance is None:
         names = ", ".join(dict.fromkeys(term.name for term in result.extension.effects))
         raise NoCovarianceError(f"no intervals: those of a matrix do not hold beside {names}, by which it is corrected")
     answer = covariance_of_answer(problem, result)
@@ -195,7 +195,7 @@ def covariance_of_answer(problem: CalibrationProblem, result: RunResult) -> Answ
         estimated = EstimatedCovariance(scatter.covariance, scatter.effective_freedom)
         return AnswerCovariance(estimated, scatter.steadied, noise, "scatter", scatter.words)
     freedom = np.inf if result.degrees_of_freedom is None else result.degrees_of_freedom
-    basis: Basis = "likelihood" if result.shrinkage is None else "posterior"
+    basis: Basis = "likelihood" if result.shrinkage is None and result.extension is None else "posterior"
     source = "the calibrator's own (see its reason)" if result.shrinkage is None else result.shrinkage.source
     estimated = EstimatedCovariance(result.covariance, freedom)
     return AnswerCovariance(estimated, result.covariance, noise, basis, source)

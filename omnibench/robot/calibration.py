@@ -202,7 +202,7 @@ class Calibration(Shown, config.Model):
     )
     plain: tuple[Row, Row, Row] | None = Field(
         None,
-        description="matrix without effects, to which these fade beyond such motions as far as they are not sure",
+        description="matrix without effects; these fade to it beyond driven motions, as far as they are not sure",
         exclude_if=_is_none,
     )
     provenance: Provenance | None = None
@@ -238,8 +238,6 @@ class Calibration(Shown, config.Model):
                 raise ValueError(
                     "covariance is not positive semi-definite: it has a negative variance in some direction"
                 )
-        if self.plain is not None and not (self.covariance and self.driven):
-            raise ValueError("plain is the matrix to which effects fade; for that, covariance and driven are needed")
         return self
 
     @model_serializer(mode="wrap")
