@@ -7,7 +7,7 @@ offsets of gyros, one a session:
     K = K0 + L z,    b = s e,    u = (z, e, o).                                                            (1)
 
 Everything that was observed is a row of errors r of x, y and heading (or of a length, or an angle), predicted less
-observed, which has the standard deviation sigma by what measured it. A run's poses are cut into eight stretches of its
+observed, which has the standard deviation sigma by what measured it. A run's poses are cut into five stretches of its
 path and its end; a stretch is one row, the medians of its errors, sigma 0, which single poses that have jumped do not
 move. What the model misses, such as slip, is the same along a run, however often it is measured: with T rows of one
 kind in a run, a row counts with the variance
@@ -54,7 +54,7 @@ from omnibench.robot.signals import signals_of
 from omnibench.robot.stored_odometry import together
 
 # Half and twice of the stretches change the mean error of a robot by 7 % at most (tests/studies/prior_study.py).
-_STRETCHES = 8  # stretches that a run's path is cut into; chosen
+_STRETCHES = 5  # stretches that a run's path is cut into; chosen
 _POSES = 12  # most reference poses of a stretch that are looked at: their median is as steady; chosen
 _FIRST, _FIRST_STEPS = 0.01, 4  # m and rad, and steps: see the module's docstring
 _LEAST = 0.003  # m and rad: smaller errors along a path are those of motion capture, not of the model; chosen

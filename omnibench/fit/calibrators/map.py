@@ -40,7 +40,7 @@ class MapOptions(Options):
         0.005, description="standard deviation of the runs' start headings, rad; 0: they are exact"
     )
     clock: Literal["none", "offset", "offset_and_slope"] = Field(
-        "none", description="of the reference, estimated for each run"
+        "offset", description="of the reference, estimated for each run; none: it is exact"
     )
     clock_offset: Positive = Field(0.1, description="its expected size, s")
     clock_slope: Positive = Field(0.003, description="its expected size, s per s")
