@@ -13,8 +13,8 @@ point's place and what the distances of three omni wheels. There z keeps the des
 
     z = V y,    y <- y + (W J V)^+ W (K - K(z))                                                            (2)
 
-find the least-squares point. The weights W'W are the inverse covariance of K, the elements' C and the tolerance of a
-class for all that no geometry has. Elements that scatter by C, and the tolerance along changes that K does not show,
+find the least-squares point. The weights W'W are the inverse covariance of K: the elements' C, and the tolerance of a
+class for what no geometry has, such as slip that shortens one row. Elements that scatter by C, and the tolerance along changes that K does not show,
 make parameters scatter by
 
     cov p = R A C A' R' + R (1 - V V') R',    A = V (W J V)^+ W.                                           (3)
@@ -46,7 +46,7 @@ MANY = 1e9
 _RANK = 1e-6  # share of the strongest change of z: less is rounding, and the matrix does not show it
 _UNSEEN = 1e-3  # share of a parameter's variance by tolerance: from it on it depends on what the data do not tell
 _NO_VARIANCE = 1e-9  # share of a parameter's deviation by tolerance: less is rounding
-_RESTING, _MOST_STEPS = 1e-10, 50  # of y, in deviations of the tolerance
+_RESTING, _MOST_STEPS = 1e-8, 50  # of y, in deviations of the tolerance
 _FARTHEST = 1e3  # the same, of numbers that no robot has
 _LEAST = 0.01  # share of the design: no wheel and no wheelbase is smaller
 _MISFIT = 1e-3  # probability that the matrix of a geometry misses the one that was fitted by more; chosen
@@ -164,7 +164,11 @@ def read_matrix(
 
     # The least-squares point, Eq. (2).
     of_elements = np.zeros((size, size)) if covariance is None else covariance[:size, :size]
-    scatter = seen @ of_elements @ seen.T + physical_tolerance(robot).elements ** 2 * np.eye(len(seen))
+    tolerance, motions = physical_tolerance(robot), robot.inverse_kinematic_matrix
+    slipping = np.array(
+        [share * (np.eye(3)[row][:, None] * motions).ravel() for row, share in enumerate(tolerance.rows)]
+    )
+    scatter = seen @ (of_elements + slipping.T @ slipping) @ seen.T + tolerance.elements**2 * np.eye(len(seen))
     weighted = np.linalg.solve(np.linalg.cholesky(scatter), seen)
     try:
         change, slopes = _least_squares(model, matrix, weighted, shown)
@@ -197,7 +201,7 @@ def read_matrix(
     for (name, design), value, half in zip(model.design.items(), values.tolist(), reach.tolist(), strict=True):
         low, high = (None, None) if math.isnan(half) else (value - half, value + half)
         each = PhysicalParameter(name=name, design=design, value=value, unit=unit_of(name), low=low, high=high)
-        if fitted_mount or not _is_known(robot, each):
+        if not _is_known(robot, each):
             parameters.append(each)
     return PhysicalReading(tuple(parameters), _doubt(robot, parameters, fitted_mount))
 
