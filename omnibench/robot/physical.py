@@ -14,8 +14,8 @@ point's place and what the distances of three omni wheels. There z keeps the des
     z = V y,    y <- y + (W J V)^+ W (K - K(z))                                                            (2)
 
 find the least-squares point. The weights W'W are the inverse covariance of K: the elements' C, and the tolerance of a
-class for what no geometry has, such as slip that shortens one row. Elements that scatter by C, and the tolerance along changes that K does not show,
-make parameters scatter by
+class for what no geometry has, such as slip that shortens one row. Elements that scatter by C, and the tolerance along
+changes that K does not show, make parameters scatter by
 
     cov p = R A C A' R' + R (1 - V V') R',    A = V (W J V)^+ W.                                           (3)
 """
