@@ -83,7 +83,7 @@ class Shown:
         """One of the object's tables as a Polars data frame, in SI units; default: the first.
 
         Of a data set: trajectories, wheels, poses, references. A trajectory: wheels, poses, references. A robot:
-        wheels. A calibration: matrix; a run of ``calibrate`` also parameters. An evaluation: splits, references. A
+        wheels. A calibration and a run of ``calibrate``: matrix, parameters. An evaluation: splits, references. A
         comparison: statistics, runs, errors, history. A discovery: effects, residuals. UnknownNameError lists those
         that there are.
         """

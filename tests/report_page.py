@@ -71,8 +71,8 @@ class Page(HTMLParser):
         return "\n".join(NUMBER.sub("#", line) for line in lines if line)
 
 
-def on_terminal(write: Callable[..., object], *shown: Any, width: int = 80) -> str:
+def on_terminal(write: Callable[..., object], *shown: Any, width: int = 80, **options: Any) -> str:
     """What a function prints of something on a terminal of so many columns."""
     console = Console(file=StringIO(), width=width, markup=False, emoji=False, highlight=False)
-    write(console, *shown)
+    write(console, *shown, **options)
     return console.file.getvalue()

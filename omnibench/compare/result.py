@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import BeforeValidator, PlainSerializer
 
 from omnibench.compare.config import CompareConfig
 from omnibench.compare.plan import SearchSpace
@@ -15,7 +16,6 @@ from omnibench.config import Model
 from omnibench.data.dataset import Dataset, Split
 from omnibench.environment import Environment
 from omnibench.fit.calibrator import Outcome
-from omnibench.fit.geometry import FittedParameter
 from omnibench.fit.parameterisation import ParameterisationName
 from omnibench.fit.problem import Improvement
 from omnibench.fit.ratio_intervals import Interval, Units
@@ -23,9 +23,26 @@ from omnibench.fit.uncertainty import Uncertainty
 from omnibench.registry import calibrators
 from omnibench.robot.calibration import HeldOutVerdict, ModelExtension, Noise, Row
 from omnibench.robot.kinematics import Array
+from omnibench.robot.physical import PhysicalParameter
 from omnibench.views import Shown
 
 THEORETICAL_NAME = "theoretical"  # the calibrator that leaves the design values
+
+
+_DEVIATIONS = ("deviation", "deviation_percent")  # which a row of summary.json has beside value and design
+
+
+def _row(parameter: PhysicalParameter) -> dict[str, Any]:
+    """A number of a searched geometry as summary.json has it."""
+    of_search = parameter.model_dump(exclude={"low", "high"})
+    return of_search | {name: getattr(parameter, name) for name in _DEVIATIONS}
+
+
+def _from_row(row: Any) -> Any:
+    return {name: row[name] for name in row if name not in _DEVIATIONS} if isinstance(row, dict) else row
+
+
+SearchedParameter = Annotated[PhysicalParameter, BeforeValidator(_from_row), PlainSerializer(_row)]
 
 
 class RunRecord(Model):
@@ -61,7 +78,7 @@ class RunRecord(Model):
     reference_seconds: float | None = None
     machine: str | None = None
     matrix: tuple[Row, Row, Row] | None
-    parameters: tuple[FittedParameter, ...] | None
+    parameters: tuple[SearchedParameter, ...] | None
     at_bounds: tuple[str, ...]
     held: tuple[str, ...]
     gap: float | None

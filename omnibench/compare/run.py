@@ -37,7 +37,7 @@ from omnibench.fit.calibrator import Outcome, RunResult, describe_error
 from omnibench.fit.certify import prove, proven_gap
 from omnibench.fit.cost import Cost, SumOfNorms
 from omnibench.fit.evaluate import final_errors, positions_and_headings
-from omnibench.fit.geometry import FittedParameter, WheelGeometry, fitted_parameters
+from omnibench.fit.geometry import WheelGeometry, searched_parameters
 from omnibench.fit.identifiability import warnings_of_calibration
 from omnibench.fit.parameterisation import make_bounds
 from omnibench.fit.ratio_intervals import UnitName, units_of
@@ -54,6 +54,7 @@ from omnibench.robot.calibration import extended_model, matrix_rows
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, OdometryBatch
+from omnibench.robot.physical import PhysicalParameter
 from omnibench.robot.stored_odometry import odometry_of
 from omnibench.simulate.robot_config import RobotConfig
 from omnibench.slam.slam_options import PRELOAD as SLAM_PRELOAD
@@ -230,11 +231,11 @@ def _improvement(score: SplitScore | None, theoretical: SplitScore | None) -> fl
     return 1 - score.cost / theoretical.cost
 
 
-def _parameters(run: PlannedRun, result: RunResult) -> tuple[FittedParameter, ...] | None:
+def _parameters(run: PlannedRun, result: RunResult) -> tuple[PhysicalParameter, ...] | None:
     if run.settings.parameterisation != "geometry" or result.vector is None:
         return None
     geometry = WheelGeometry(run.dataset.robot, fitted_mount=run.settings.mount == "fit")
-    return fitted_parameters(geometry, result.vector)
+    return searched_parameters(geometry, result.vector)
 
 
 def _is_exact(run: PlannedRun, scored: ScoredRun) -> bool:

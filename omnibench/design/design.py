@@ -21,11 +21,10 @@ from omnibench.design import d_optimality
 from omnibench.design.candidates import CandidatePool, CandidateRun, Per, Use, read_candidates
 from omnibench.errors import ConfigError, require_choice, require_range
 from omnibench.fit.geometry import WheelGeometry
-from omnibench.fit.identifiability import is_invertible
 from omnibench.fit.span import direction_in_words, driven_span
 from omnibench.fit.trajectory_fit import information_of_runs
 from omnibench.robot.calibration import Noise
-from omnibench.robot.kinematics import Array, Robot, relative
+from omnibench.robot.kinematics import Array, Robot, class_of, relative
 from omnibench.robot.odometry import Integration
 from omnibench.words import plural
 
@@ -192,8 +191,8 @@ class DesignProblem:
         self._everything: dict[Use, d_optimality.Candidates] = {}
         # Of three omni wheels the derivatives (9, 9) of the physical parameters by the matrix elements.
         self._physical: Array | None = None
-        if len(directions) == 3 and is_invertible(pool.robot):
-            geometry = WheelGeometry(pool.robot)
+        geometry = WheelGeometry(pool.robot)
+        if len(directions) == 3 and class_of(pool.robot) == "omni" and len(geometry.names) == self.basis.shape[1]:
             self._physical = np.linalg.inv(geometry.slopes(geometry.start))
 
     def _information(self, use: Use) -> Array:

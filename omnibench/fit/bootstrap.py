@@ -26,7 +26,8 @@ from omnibench.fit.cost import SumOfNorms
 from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.fit.ratio_intervals import BOOTSTRAPPED, FEWEST, Units, units_of
-from omnibench.fit.trajectory_fit import INTERVAL, depending
+from omnibench.fit.jackknife import depending
+from omnibench.robot.physical import INTERVAL
 from omnibench.jobs.job import Backend, gathered
 from omnibench.progress import Reporter
 from omnibench.robot.kinematics import Array

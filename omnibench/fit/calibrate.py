@@ -31,7 +31,7 @@ from omnibench.errors import ConfigError, computable, require_type
 from omnibench.fit.bootstrap import ElementIntervals, bootstrap_intervals
 from omnibench.fit.calibrator import Calibrator, RunResult, as_answered, calibration_of_fit, run_calibrator
 from omnibench.fit.evaluate import verdict_on
-from omnibench.fit.geometry import FittedParameter, WheelGeometry, fitted_parameters
+from omnibench.fit.geometry import WheelGeometry
 from omnibench.fit.identifiability import inseparable_in_words, kept_motions, warnings_of_calibration
 from omnibench.fit.loss import RobustCost, norms_of, with_ends_from_others, with_loss
 from omnibench.fit.open_combinations import open_sentences
@@ -41,7 +41,7 @@ from omnibench.fit.ratio_intervals import FEWEST, Units, units_of
 from omnibench.fit.settings import CompleteSettings, CostChoice, FitSettings
 from omnibench.fit.shrinkage import shrunk
 from omnibench.fit.span import WheelDirection
-from omnibench.fit.uncertainty import NoCovarianceError, Uncertainty, uncertainty_of
+from omnibench.fit.uncertainty import NoCovarianceError, Uncertainty, physical_parameters, uncertainty_of
 from omnibench.jobs.job import Backend
 from omnibench.progress import Progress, Reporter, no_progress, renamed
 from omnibench.registry import calibrators, costs, effects
@@ -49,6 +49,7 @@ from omnibench.robot.calibration import Calibration, EffectTerm, ModelExtension,
 from omnibench.robot.corrections import corrected, needs_of
 from omnibench.robot.effects.effect import Parameter, Term
 from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.physical import PhysicalParameter, PhysicalReading
 from omnibench.robot.signals import signals_of
 from omnibench.views import Shown
 
@@ -267,16 +268,16 @@ def words_of(terms: Sequence[Term]) -> str:
 class CalibrationRun(Shown):
     """A calibration, the calibrator's result and, where asked for, resampled 95 % intervals of the elements.
 
-    parameters: radius, distance and angle of each wheel, if these were searched. uncertainty: covariance of the
-    elements and of the physical parameters; None if there is none, then a warning says why. warnings: one sentence for
-    every part of the calibration that the data do not determine. kept: motions that keep the design values; intervals
-    hold only if these are right. units: what these resample.
+    parameters: radii, track or wheelbase or distances, angles, ..., which the matrix and its effects mean; none where
+    it has no such reading. uncertainty: covariance of the elements; None if there is none, then a warning says why.
+    warnings: one sentence for every part of the calibration that the data do not determine. kept: motions that keep the
+    design values; intervals hold only if these are right. units: what these resample.
     """
 
     calibration: Calibration
     result: RunResult
     intervals: ElementIntervals | None
-    parameters: tuple[FittedParameter, ...] | None
+    parameters: tuple[PhysicalParameter, ...]
     uncertainty: Uncertainty | None
     warnings: tuple[str, ...]
     kept: tuple[WheelDirection, ...]
@@ -319,8 +320,10 @@ def calibrate(
     run's warnings name. ``keep``: the matrix has the design values there; ``fit``: it is fitted there, too (see
     make_parameterisation); ``shrink``: as ``keep``, and the other elements move towards the design, the more the less
     the data determine them (see shrinkage.py). tolerance: how far a design may be off, for ``shrink``.
-    mount: pose of the tracked point of a robot that cannot slide: ``known``, as the robot's file says, or ``fit``.
-    Cost, unidentified and mount have defaults that depend on the robot (see prior.py).
+    mount: pose of the tracked point: ``known``, as the robot's file says, or ``fit``. Of a robot that slides the matrix
+    is the same, and its place is told from the distances of the wheels as far as these are as designed.
+    Cost, unidentified and mount have defaults that depend on the robot: on few runs the whole trajectory is the cost;
+    wheels that say their type shrink, but omni wheels; the tracked point of tricycles and cars is fitted.
     steering: ``fit``: gain, play and coupling of the steering, and a car's zero, are fitted before the matrix (see
     SteeringFit) and are effects of the calibration; ``known``: the measured angles are right.
 
@@ -362,15 +365,18 @@ def calibrate(
     if chosen.intervals and units.count >= FEWEST and uncertainty:
         drawn = bootstrap_intervals(problem, result.vector, units=units, rng=problem.rng, backend=backend)
 
-    # The calibration file, and what the data leave open.
+    # The physical parameters, the calibration file, and what the data leave open.
     searched = problem.parameterisation
+    extension = result.extension or ModelExtension(effects=tuple(map(EffectTerm.of, terms)))
+    fitted_mount = chosen.mount == "fit"
+    reading = physical_parameters(problem, result, uncertainty, extension.effects, fitted_mount=fitted_mount)
     return CalibrationRun(
-        calibration=_calibration(dataset, chosen, problem, result, terms, uncertainty),
+        calibration=_calibration(dataset, chosen, problem, result, extension, uncertainty, reading),
         result=result,
         intervals=drawn,
-        parameters=fitted_parameters(searched, result.vector) if isinstance(searched, WheelGeometry) else None,
+        parameters=reading.parameters,
         uncertainty=uncertainty,
-        warnings=tuple(_warnings(chosen, calibrator, problem, runs, terms, units, without_covariance)),
+        warnings=tuple(_warnings(chosen, calibrator, problem, runs, terms, units, without_covariance, reading.doubt)),
         kept=kept_motions(robot, problem.span, searched.name, chosen.unidentified),
         units=units,
     )
@@ -406,6 +412,8 @@ def complete_settings(
     costs.create(choice.name, choice.options)
     unidentified = settings.unidentified or default_unidentified(robot)
     unidentified, mount = as_answered(calibrator, unidentified, settings.mount)
+    if robot.slides:  # the matrix may be any, and where the tracked point stands is read from it
+        mount = settings.mount
     if settings.intervals and not calibrator.exact:
         raise ConfigError("intervals are drawn about a minimum to rounding: use the calibrator closed_form")
     if settings.intervals and settings.loss != "squares":
@@ -438,14 +446,14 @@ def _calibration(
     settings: CompleteSettings,
     problem: CalibrationProblem,
     result: RunResult,
-    terms: tuple[Term, ...],
+    extension: ModelExtension,
     uncertainty: Uncertainty | None,
+    reading: PhysicalReading,
 ) -> Calibration:
     """The calibration of an answer, with how it came about. The costs in the file are without a loss."""
     assert result.matrix is not None  # there is an answer
     robot, training, validation = dataset.robot, dataset.split("train"), dataset.split("validation")
-    extension = result.extension or ModelExtension(effects=tuple(map(EffectTerm.of, terms)))
-    covariance = covariance_rows(uncertainty.covariance) if uncertainty and not terms else None
+    covariance = covariance_rows(uncertainty.covariance) if uncertainty and not extension.effects else None
     model = extended_model(robot, result.matrix, problem.integration, dataset.sample_period, extension)
     noise = uncertainty.noise if uncertainty else result.noise
     squares = settings.loss == "squares"
@@ -454,7 +462,7 @@ def _calibration(
         "box": problem.box,
         "unidentified": settings.unidentified,
         "tolerance": settings.tolerance,
-        "mount": None if robot.slides else settings.mount or default_mount(robot),
+        "mount": settings.mount or (None if robot.slides else default_mount(robot)),
         "unshrunk_cost": result.shrinkage.unshrunk_cost if result.shrinkage and squares else None,
         "on_bounds": result.at_bounds,
         "versions": package_versions(),
@@ -471,6 +479,7 @@ def _calibration(
         provenance,
         integration=problem.integration,
         noise=noise if any(run.has_poses for run in problem.trajectories) else None,
+        parameters={each.name: each for each in reading.parameters},
         **dict(extension) | {"covariance": extension.covariance or covariance},
     )
 
@@ -483,10 +492,11 @@ def _warnings(
     terms: Sequence[Term],
     units: Units,
     without_covariance: str,
+    doubt: str,
 ) -> Iterator[str]:
     """Sentences on what the data leave open, and on what the fit assumes.
 
-    without_covariance: why the calibration has no covariance; empty for one that has.
+    without_covariance: why the calibration has no covariance; empty for one that has. doubt: of the parameters.
     """
     robot, searched = problem.robot, problem.parameterisation
     yield from warnings_of_calibration(robot, problem.span, searched.name, settings.unidentified)
@@ -496,6 +506,8 @@ def _warnings(
     yield from problem.moved_ends
     if without_covariance:
         yield without_covariance
+    if doubt:
+        yield doubt
     if terms:
         yield (
             f"the steering was fitted first ({words_of(terms)}); the matrix's intervals take these numbers for exact, "

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,7 +10,7 @@ from omnibench.config import Model
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
 from omnibench.fit import span as spans
-from omnibench.fit.geometry import WheelGeometry, unit_of
+from omnibench.fit.geometry import WheelGeometry
 from omnibench.fit.linear_fit import linear_fit
 from omnibench.fit.noise import GIVEN, NoiseEstimate, roots_of
 from omnibench.fit.open_combinations import information_of_references, open_sentences, with_open_combinations
@@ -21,6 +20,7 @@ from omnibench.fit.trajectory_fit import information_of_runs, noise_of_matrix
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import Integration
+from omnibench.robot.physical import unit_of
 from omnibench.robot.stored_odometry import odometry_of
 
 # Both are far above the rounding of derivatives (1e-10) and below any share that a direction of wheel rates can have;
@@ -38,47 +38,6 @@ ROWS = ("x", "y", "heading")
 LARGEST_DEVIATION = 0.10
 UNTOLD = 10.0  # the same share from which on references other than poses tell nothing, as other sentences say
 _OPEN = 1e-14  # share of the largest eigenvalue of the information: less is rounding, and the direction is open
-
-
-@dataclass(frozen=True)
-class ParameterEstimate:
-    """A physical parameter of a wheel: value, standard deviation and 95 % interval, m, or rad for angles.
-
-    standard_deviation, low and high are None where ``untold`` says why: the data do not identify the parameter, or it
-    depends on a number that the box holds, or on a bound of it.
-    """
-
-    name: str
-    value: float
-    unit: str
-    standard_deviation: float | None
-    low: float | None
-    high: float | None
-    untold: str = ""
-
-
-def is_invertible(robot: Robot) -> bool:
-    """True if the matrix determines the geometry: three omni wheels, nine elements for nine parameters."""
-    return len(robot.wheels) == 3 and all(wheel.kind == "omni" and wheel.measured for wheel in robot.wheels)
-
-
-def geometry_of(matrix: Array, robot: Robot) -> Array:
-    """Geometry (9,) of the three omni wheels that have a matrix (3, 3): the inverse of Eq. (3).
-
-    The wheel equations (-sin d, cos d, R)/r are the rows of the matrix's inverse. Angles come out within half a turn of
-    the design. DataError for other wheels and for a matrix that no wheels have.
-    """
-    if not is_invertible(robot):
-        raise DataError("only the matrix of three omni wheels means one geometry")
-    try:
-        across, along, turn = np.linalg.inv(matrix).T
-    except np.linalg.LinAlgError:
-        raise DataError("the matrix is singular: no wheels have it") from None
-    radius = 1 / np.hypot(across, along)
-    design = np.array([wheel.axle for wheel in robot.wheels])
-    angle = np.arctan2(-across, along)
-    angle += 2 * np.pi * np.round((design - angle) / (2 * np.pi))
-    return np.concatenate([radius, turn * radius, angle])
 
 
 def known_slopes(geometry: WheelGeometry, kept: Array, left_open: Array | None = None) -> Array:

@@ -40,6 +40,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from omnibench.robot.geometry import STEERING_ZERO, TRACKED_POINT, TRACKED_YAW, PhysicalTolerance
+from omnibench.robot.geometry import physical_tolerance as physical_tolerance
 from omnibench.robot.kinematics import Array, Robot, RobotClass, class_of
 
 MountChoice = Literal["known", "fit"]
@@ -47,8 +49,6 @@ _NUMBERS_EACH = 2  # measured ones for each that is fitted; chosen
 # The tracked point of these stands in front of the rear axle, which is the robot's centre, and is seldom known as well
 # as the middle of a body is.
 _UNKNOWN_MOUNTS: frozenset[RobotClass] = frozenset({"tricycle", "car"})
-_OFFSET = 0.1  # rad, of a steering angle's zero: a mounted encoder is trued to some degrees
-_POINT, _YAW = 0.05, 0.035  # m, rad: a tracker that is not on the axle's middle; of the corelli tricycle by 0.1 m
 
 
 @dataclass(frozen=True)
@@ -135,40 +135,6 @@ def default_mount(robot: Robot) -> MountChoice:
     return "fit" if class_of(robot) in _UNKNOWN_MOUNTS else "known"
 
 
-@dataclass(frozen=True)
-class PhysicalTolerance:
-    """Standard deviations: of radii, each row's factor and elements, Eq. (3), as shares; of the lost rate, rad/s."""
-
-    radius: float
-    rows: tuple[float, float, float]
-    elements: float
-    lost_rate: float
-
-
-# Tolerances were chosen once, while looking at the recordings of configs/real_robots.yaml: half and twice of each make
-# 0.90 to 1.15 times the error of a robot (tests/studies/prior_study.py). The lost rate of omni wheels, whose rollers
-# creep, is ten times that of tyres.
-_TYRES = PhysicalTolerance(0.01, (0.02, 0.02, 0.05), 0.002, 0.004)
-_STEERED = PhysicalTolerance(0.02, (0.02, 0.02, 0.05), 0.005, 0.01)
-_TOLERANCES: Mapping[RobotClass, PhysicalTolerance] = MappingProxyType(
-    {
-        "differential": _TYRES,
-        "skid": PhysicalTolerance(0.02, (0.05, 0.05, 0.2), 0.005, 0.004),
-        "tricycle": _STEERED,
-        "car": _STEERED,
-        "swerve": _STEERED,
-        "omni": PhysicalTolerance(0.02, (0.05, 0.05, 0.05), 0.01, 0.03),
-        "mecanum": PhysicalTolerance(0.02, (0.06, 0.06, 0.06), 0.01, 0.01),
-        "mixed": PhysicalTolerance(0.02, (0.05, 0.05, 0.05), 0.01, 0.01),
-    }
-)
-
-
-def physical_tolerance(robot: Robot) -> PhysicalTolerance:
-    """The tolerance of a robot's class."""
-    return _TOLERANCES[class_of(robot)]
-
-
 def physical_prior_root(robot: Robot, tolerance: PhysicalTolerance) -> Array:
     """A root (3M, k) of the covariance of the matrix elements, row by row, about the design: Eq. (3) to (5).
 
@@ -188,10 +154,10 @@ def physical_prior_root(robot: Robot, tolerance: PhysicalTolerance) -> Array:
         if len(pair) == 2:  # the wheel steers: an offset of 1 rad turns its columns
             turned = np.zeros_like(design)
             turned[:, pair] = design[:, pair] @ np.array([[0.0, -1.0], [1.0, 0.0]])
-            roots.append(turned * _OFFSET)
+            roots.append(turned * STEERING_ZERO)
     if default_mount(robot) == "fit" and not robot.slides:
         x, y, _ = design
-        roots += [*(_POINT * changes_by_centre(robot)), _YAW * np.array([y, -x, np.zeros_like(x)])]
+        roots += [*(TRACKED_POINT * changes_by_centre(robot)), TRACKED_YAW * np.array([y, -x, np.zeros_like(x)])]
     return np.array([root.ravel() for root in roots]).T
 
 

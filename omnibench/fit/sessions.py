@@ -410,7 +410,7 @@ def _differences(data: SessionScores) -> Iterator[SessionDifference]:
         total, scatter, freedom = contrast.scatter(roots)
         change, inverse = roots @ total, np.linalg.pinv(directions)
         values, deviations = inverse @ change, np.sqrt(np.diag(inverse @ roots @ scatter @ roots.T @ inverse.T))
-        reach = float(stdtrit(freedom, (1 + trajectory_fit.INTERVAL) / 2)) * deviations
+        reach = float(stdtrit(freedom, (1 + INTERVAL) / 2)) * deviations
         count = contrast.sessions.count(session)
         share = count / len(contrast.sessions)
         radii = []

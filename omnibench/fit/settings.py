@@ -76,7 +76,7 @@ class FitSettings(Model):
         None, description="Of the design, for shrink: share of each row's largest element. Default: by class."
     )
     mount: MountChoice | None = Field(
-        None, description="Tracked point of a robot that cannot slide. Default: fit for tricycles and cars."
+        None, description="fit: where the tracked point stands. Default: known, but for tricycles and cars."
     )
     steering: SteeringChoice = Field(
         "known", description="fit: first find its gain, play and coupling, and a car's zero."

@@ -23,7 +23,8 @@ from omnibench.fit.noise import GIVEN
 from omnibench.fit.open_combinations import information_of_references
 from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.problem import CalibrationProblem
-from omnibench.fit.trajectory_fit import MANY, information_of_runs, noise_of_matrix
+from omnibench.fit.trajectory_fit import information_of_runs, noise_of_matrix
+from omnibench.robot.physical import MANY
 from omnibench.fit.uncertainty import NoCovarianceError, covariance_of_answer, runs_without_heading
 from omnibench.registry import calibrators
 from omnibench.robot.calibration import Noise

@@ -46,7 +46,7 @@ from typing import Any, Literal, Self
 import numpy as np
 import scipy
 from numpy.typing import NDArray
-from scipy.special import chdtri, stdtrit
+from scipy.special import chdtri
 
 from omnibench.data.dataset import Trajectory
 from omnibench.data.stored import median_period
@@ -59,11 +59,7 @@ from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog, split_by
 from omnibench.robot.stored_odometry import of_runs, poses_of_runs
 
-INTERVAL = 0.95  # probability of the intervals, by convention; every table of the program says 95 %
-# Degrees of freedom that stand for infinity: the quantile of Student's t differs from the normal one by 2e-9 there.
-MANY = 1e9
 Stamps = Literal["reference", "final"]
-_ROUNDING = 1e-12  # share of the largest derivative: a smaller one is rounding
 
 
 def noise_of_matrix(

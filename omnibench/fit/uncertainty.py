@@ -1,4 +1,4 @@
-"""Uncertainty of a calibration: covariance of the matrix elements and of the wheels' physical parameters.
+"""Uncertainty of a calibration: covariance of the matrix elements, and of the physical parameters that they mean.
 
 Under a robust loss the sandwich takes these score vectors of the runs. With the ratios x = r / s of the norms r_i of
 weighted errors e_i to their scale s, psi(x) = x w(x) and u = e / |e|, a run's share of the loss sum_i p_i s^2 rho(x_i)
@@ -28,18 +28,20 @@ from omnibench.errors import DataError
 from omnibench.fit.bootstrap import ElementIntervals
 from omnibench.fit.calibrator import RunResult
 from omnibench.fit.cost import SumOfNorms
-from omnibench.fit.geometry import WheelGeometry, unit_of
-from omnibench.fit.identifiability import ParameterEstimate, geometry_of, identified_parameters, is_invertible
 from omnibench.fit.loss import RobustCost, loss_of, norms_of
 from omnibench.fit.noise import GIVEN, covariance_of_sums, roots_of
 from omnibench.fit.open_combinations import elements_open
 from omnibench.fit.problem import CalibrationProblem
+from omnibench.fit.ratio_intervals import units_of
 from omnibench.fit.reference_rows import ReferenceBatch
 from omnibench.fit.sandwich import Sandwich, Scores, covariance_of_rows, sandwich, scores_of_references, scores_of_runs
-from omnibench.fit.trajectory_fit import EstimatedCovariance, depending, noise_of_matrix
-from omnibench.robot.calibration import Noise
+from omnibench.fit.jackknife import depending
+from omnibench.fit.trajectory_fit import noise_of_matrix
+from omnibench.robot.physical import EstimatedCovariance
+from omnibench.robot.calibration import EffectTerm, Noise
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import OdometryBatch
+from omnibench.robot.physical import PhysicalReading, read_matrix
 from omnibench.views import Brief
 from omnibench.words import plural
 
@@ -116,20 +118,19 @@ class Uncertainty(Brief):
     """Uncertainty of a calibration, given that the values it kept are right.
 
     covariance (3N, 3N): the elements' covariance, row by row, m and rad per rad of wheel. Rows and columns of elements
-    that are held at their start are zero, with scatter as the basis also of those on a bound, and so is the variance
+    that are held at their start are zero, with scatter as the basis also those on a bound, and so is the variance
     along directions of wheel rates that were kept at the design values. standard_deviations (3, N). intervals: 95 %, by
     Student's t; nan where an element depends on a number that the box holds or that lies on a bound of it, about which
     the answers of other recordings do not scatter evenly, or on a combination that references other than poses leave
-    open. parameters: the wheels' geometry, if it was searched or
-    follows from the matrix (three omni wheels); without standard deviation where the data do not identify a parameter,
-    or it depends on such a number. noise: the reference poses'. basis: likelihood (the calibrator's own covariance),
-    scatter of the runs, or posterior of either and the design. source: the data behind it, in words.
+    open. degrees_of_freedom (3N,): of the elements' variances. noise: the reference poses'. basis: likelihood (the
+    calibrator's own covariance), scatter of the runs, or posterior of either and the design. source: the data behind
+    it, in words.
     """
 
     covariance: Array
     standard_deviations: Array
     intervals: ElementIntervals
-    parameters: tuple[ParameterEstimate, ...] | None
+    degrees_of_freedom: Array
     noise: Noise
     basis: Basis
     source: str
@@ -139,9 +140,8 @@ def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertaint
     """The uncertainty of a calibrator's answer.
 
     The covariance is the calibrator's own if it gives one (trajectory_ml), otherwise the sandwich of an estimate that
-    minimises a sum of norms (sandwich.py). Physical parameters that need directions of wheel rates which the data do
-    not identify have no standard deviation, whether or not these directions were fitted. Neither has an element or
-    parameter that depends on a number that the box holds, or that lies on a bound of it.
+    minimises a sum of norms (sandwich.py). An element that depends on a number that the box holds, or that lies on a
+    bound of it, has no interval.
 
     NoCovarianceError, with the reason, when there is no answer, the cost is no sum of norms, the answer is no minimum
     (a published matrix, a search that stopped too early), has effects beside the matrix, or the runs are too few.
@@ -162,7 +162,7 @@ def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertaint
         covariance=of_elements.matrix,
         standard_deviations=of_elements.standard_deviations.reshape(result.matrix.shape),
         intervals=ElementIntervals(result.matrix - reach, result.matrix + reach),
-        parameters=_parameters(problem, result, of_vector, of_elements, bounded),
+        degrees_of_freedom=np.broadcast_to(of_elements.degrees_of_freedom, bounded.shape),
         noise=answer.noise,
         basis=answer.basis,
         source=answer.source,
@@ -298,54 +298,40 @@ def _check_minimum(
         )
 
 
-def _parameters(
+def physical_parameters(
     problem: CalibrationProblem,
     result: RunResult,
-    of_vector: EstimatedCovariance,
-    of_elements: EstimatedCovariance,
-    bounded: NDArray[np.bool_],
-) -> tuple[ParameterEstimate, ...] | None:
-    """The physical parameters with their intervals; None where the matrix does not determine them.
+    uncertainty: Uncertainty | None,
+    effects: Sequence[EffectTerm] = (),
+    *,
+    fitted_mount: bool = False,
+) -> PhysicalReading:
+    """The physical parameters of a calibrator's answer with its effects.
 
-    of_vector, of_elements: covariances of the searched vector and of the matrix elements. bounded (3N,): the elements
-    that depend on a number that the box holds, or on a bound of it.
+    Those that need directions of wheel rates which the data do not identify have no interval, whether or not these
+    directions were fitted, nor have those that depend on a number that the box holds, or that lies on a bound of it.
     """
-    robot = problem.robot
-    assert result.vector is not None and result.matrix is not None  # noqa: PT018 (uncertainty_of has checked)
-    geometry = WheelGeometry(robot)
-    if isinstance(problem.parameterisation, WheelGeometry):
-        geometry, values, covariance = problem.parameterisation, result.vector, of_vector
-        bounded = problem.without_interval(result.at_bounds)
-    elif is_invertible(robot):
-        try:
-            values = geometry_of(result.matrix, robot)
-            inverse = np.linalg.inv(geometry.slopes(values))
-            covariance, bounded = of_elements.of(inverse), depending(inverse, bounded)
-        except (DataError, np.linalg.LinAlgError):
-            return None
-    else:
-        return None
-    identified = identified_parameters(geometry, problem.unidentified, problem.left_open)
-    untold = [
-        "no interval" if touching else "" if told else "not identified by these data"
-        for told, touching in zip(identified, bounded, strict=True)
+    assert result.vector is not None and result.matrix is not None  # noqa: PT018 (callers have checked)
+    covariance: Array | None = None
+    freedom: Array | float = np.inf
+    if uncertainty is not None:
+        covariance, freedom = uncertainty.covariance, uncertainty.degrees_of_freedom
+    elif result.extension is not None and result.extension.covariance is not None:
+        covariance = np.array(result.extension.covariance)
+        freedom = max(units_of(problem.trajectories).count - 1, 1)  # it scatters as they do
+    held = problem.without_interval(result.at_bounds)
+    unknown = [
+        np.kron(np.eye(3), problem.unidentified),
+        problem.parameterisation.slopes(result.vector)[:, held].T,
     ]
-    return tuple(
-        ParameterEstimate(
-            name=name,
-            value=float(value),
-            unit=unit_of(name),
-            standard_deviation=None if untold else float(deviation),
-            low=None if untold else float(value - reach),
-            high=None if untold else float(value + reach),
-            untold=untold,
-        )
-        for name, value, deviation, reach, untold in zip(
-            geometry.names,
-            values,
-            covariance.standard_deviations,
-            covariance.reach,
-            untold,
-            strict=True,
-        )
+    if problem.left_open is not None:
+        unknown.append(problem.left_open * np.repeat(problem.robot.row_scales, result.matrix.shape[1]))
+    return read_matrix(
+        problem.robot,
+        result.matrix,
+        covariance,
+        freedom,
+        effects,
+        fitted_mount=fitted_mount,
+        unknown=np.concatenate(unknown),
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -67,14 +66,20 @@ class CalibrationView(View):
         return np.sqrt(np.where(variances > 0, variances, np.nan))
 
     def tables(self) -> Mapping[str, Callable[[], pl.DataFrame]]:
-        return {"matrix": self._matrix}
+        return {"matrix": self._matrix, "parameters": self._parameters}
+
+    def _parameters(self) -> pl.DataFrame:
+        """The physical parameters, a row for each."""
+        schema = {"name": pl.String, "design": pl.Float64, "value": pl.Float64, "unit": pl.String}
+        rows = [each.model_dump() for each in self.calibration.physical_parameters.values()]
+        return pl.DataFrame(rows, {**schema, "low": pl.Float64, "high": pl.Float64})
 
     def _matrix(self) -> pl.DataFrame:
         calibration = self.calibration
         columns: dict[str, Array | None] = {
             "value": calibration.matrix_array,
             "design": calibration.robot.inverse_kinematic_matrix,
-            "deviation": self.deviations(),
+            "standard_deviation": self.deviations(),
         }
         if (ends := self.intervals()) is not None:
             columns |= dict(zip(("low", "high"), ends, strict=True))
@@ -96,7 +101,7 @@ class CalibrationView(View):
         frame = self._matrix()
         scales = np.repeat(self.calibration.robot.row_scales, len(self.calibration.robot.drive.names)) / 100
         told = "low" in frame.columns
-        value, deviation = frame["value"], frame["deviation"]
+        value, deviation = frame["value"], frame["standard_deviation"]
         ends = (frame["low"], frame["high"]) if told else (value - deviation, value + deviation)
         scaled = {
             name: (column - frame["design"]) / scales
@@ -150,16 +155,6 @@ class CalibrationRunView(CalibrationView):
         if self.shown.uncertainty is None:
             return None
         return self.shown.uncertainty.intervals.low, self.shown.uncertainty.intervals.high
-
-    def tables(self) -> Mapping[str, Callable[[], pl.DataFrame]]:
-        known = self.shown.uncertainty is not None and self.shown.uncertainty.parameters
-        return {**super().tables(), **({"parameters": self._parameters} if known else {})}
-
-    def _parameters(self) -> pl.DataFrame:
-        assert self.shown.uncertainty is not None  # else there is no such table
-        return pl.DataFrame(
-            [asdict(each) for each in self.shown.uncertainty.parameters or ()], infer_schema_length=None
-        )
 
 
 class EvaluationView(View):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -11,8 +11,10 @@ from typing import Annotated, Any, Final, Literal
 import numpy as np
 from pydantic import (
     AfterValidator,
+    BeforeValidator,
     Field,
     FiniteFloat,
+    PlainSerializer,
     SerializerFunctionWrapHandler,
     model_serializer,
     model_validator,
@@ -23,9 +25,10 @@ from omnibench.errors import ConfigError, DataError, require_type, shown
 from omnibench.files import write_text
 from omnibench.robot.corrections import Fade
 from omnibench.robot.effects.effect import Term, make_term
-from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.kinematics import Array, Mount, Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
+from omnibench.robot.physical import PhysicalParameter, read_matrix
 from omnibench.views import Shown
 from omnibench.words import plural
 
@@ -39,6 +42,21 @@ Deviation = Annotated[config.NonNegative, Field(le=1e3)]
 
 def _is_none(value: object) -> bool:
     return value is None
+
+
+def _with_names(content: Any) -> Any:
+    """Parameters with the names under which they stand."""
+    if not isinstance(content, dict):
+        return content
+    return {name: {"name": name} | each if isinstance(each, dict) else each for name, each in content.items()}
+
+
+# Physical parameters by their names, as a file holds them: design, value, unit, low, high.
+_Parameters = Annotated[
+    dict[config.Name, PhysicalParameter],
+    BeforeValidator(_with_names),
+    PlainSerializer(lambda named: {name: each.model_dump(exclude={"name"}) for name, each in named.items()}),
+]
 
 
 class EffectTerm(config.Model):
@@ -194,6 +212,9 @@ class Calibration(Shown, config.Model):
     )
     integration: Integration
     effects: tuple[EffectTerm, ...] = ()
+    parameters: _Parameters | None = Field(
+        None, description="radii, track, ... that matrix and effects mean, with 95 % intervals", exclude_if=_is_none
+    )
     noise: Noise | None = None
     covariance: tuple[Row, ...] | None = Field(None, description="of the matrix, row by row, then of the effects")
     session: config.Name | None = Field(None, description="what drift terms are measured from")
@@ -264,6 +285,67 @@ class Calibration(Shown, config.Model):
     def matrix_without_effects(self) -> Array:
         """The matrix (3, M) for whoever holds no effects: the plain one, where the file has it."""
         return self.matrix_array if self.plain is None else np.array(self.plain)
+
+    @property
+    def physical_parameters(self) -> Mapping[str, PhysicalParameter]:
+        """The physical parameters by their names; without intervals if the file is older than they are.
+
+        DataError: no wheels near the design have the matrix.
+        """
+        if self.parameters is not None:
+            return self.parameters
+        fitted_mount = self.provenance is not None and self.provenance.mount == "fit"
+        reading = read_matrix(self.robot, self.matrix_array, effects=self.effects, fitted_mount=fitted_mount)
+        if not reading.parameters:
+            raise DataError(f"calibration {self.name!r}: {reading.doubt}")
+        return {each.name: each for each in reading.parameters}
+
+    @property
+    def radius(self) -> Mapping[str, float]:
+        """Radii of the wheels, m, by their names."""
+        return self._of_wheels("radius")
+
+    @property
+    def distance(self) -> Mapping[str, float]:
+        """Lever arms of wheels on rollers about the robot's centre, m, by the wheels' names."""
+        return self._of_wheels("distance")
+
+    @property
+    def angle(self) -> Mapping[str, float]:
+        """Directions of the axles of wheels on rollers, rad, by the wheels' names."""
+        return self._of_wheels("angle")
+
+    @property
+    def track(self) -> float:
+        """Effective distance between the wheels of both sides, m. DataError: the robot has no track."""
+        return self._single("track")
+
+    @property
+    def wheelbase(self) -> float:
+        """Distance from the rear axle to the steered wheels, m. DataError: the robot has no wheelbase."""
+        return self._single("wheelbase")
+
+    @property
+    def mount(self) -> Mount:
+        """Pose of the tracked point in the robot's frame: fitted, or else as the robot's file says."""
+        known = (self.robot.mount or Mount()).model_dump()
+        fitted = {name: each.value for name, each in self.physical_parameters.items() if name.startswith("mount_")}
+        return Mount(**known | {name.removeprefix("mount_"): value for name, value in fitted.items()})
+
+    def _of_wheels(self, kind: str) -> Mapping[str, float]:
+        """The parameters of one kind by the names of the wheels. DataError: the robot has none."""
+        named = self.physical_parameters
+        of_wheels = {name.partition("_")[2]: named[name].value for name in named if name.startswith(f"{kind}_")}
+        if not of_wheels:
+            raise DataError(f"robot {self.robot.name} has no {kind}; it has {', '.join(named)}")
+        return of_wheels
+
+    def _single(self, name: str) -> float:
+        """The value of a parameter. DataError: the robot has none."""
+        named = self.physical_parameters
+        if name not in named:
+            raise DataError(f"robot {self.robot.name} has no {name}; it has {', '.join(named)}")
+        return named[name].value
 
     @property
     def effects_in_words(self) -> str:

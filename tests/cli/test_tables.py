@@ -198,7 +198,7 @@ def calibration_lines(dataset: Dataset, *arguments: Any, **options: Any) -> list
 
 def test_a_matrix_has_a_column_for_each_drive_signal() -> None:
     lines = calibration_lines(driven(TRICYCLE))
-    assert any(line.split() == ["front_cos", "front_sin"] for line in lines)
+    assert any(line.split() == ["matrix", "front_cos", "front_sin"] for line in lines)
     assert any(line.startswith("directions of drive signals driven: 2 of 2") for line in lines)
     assert not any("wheel front" in line for line in lines)
 

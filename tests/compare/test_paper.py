@@ -13,10 +13,10 @@ from commands import CONFIGS
 from omnibench.cli.handbook_topics import find_topic
 from omnibench.compare.config import CompareConfig, PublishedResult, read_compare_config
 from omnibench.data.importers.table1 import APR_02
-from omnibench.fit.identifiability import geometry_of
 from omnibench.fit.parameterisation import make_bounds
 from omnibench.robot.calibration import read_calibration
 from omnibench.robot.kinematics import Array, published_matrix, relative_deviations
+from omnibench.robot.physical import read_matrix
 
 EQ_8 = """
 -0.0892930568372762 -0.0005606566978203 0.0867466159313470
@@ -90,9 +90,8 @@ def test_m12_of_eq_11_contradicts_the_papers_own_text_and_this_is_said() -> None
 
 
 def test_no_geometry_of_eq_8_has_the_deviations_of_section_4_2_and_this_is_said() -> None:
-    geometry = geometry_of(published_matrix("palacin2023_eq8"), APR_02)
-    design = geometry_of(APR_02.inverse_kinematic_matrix, APR_02)
-    deviations = 100 * (geometry / design - 1)
+    geometry = read_matrix(APR_02, published_matrix("palacin2023_eq8")).parameters
+    deviations = np.array([each.deviation_percent for each in geometry])
     assert np.abs(np.abs(deviations) - SECTION_4_2).max() > 4
     radii, distances, angles = np.split(deviations, 3)
     words = (

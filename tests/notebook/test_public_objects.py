@@ -135,7 +135,7 @@ def test_a_calibration_file_states_deviations_and_no_intervals_that_its_runs_do_
     run = result("run")
     kept, told = run.calibration.to_frame(), run.to_frame()
     assert "low" not in kept.columns
-    assert ((told["high"] - told["low"]) > 2 * 1.95 * kept["deviation"]).all()
+    assert ((told["high"] - told["low"]) > 2 * 1.95 * kept["standard_deviation"]).all()
 
 
 NOTEBOOKS = sorted((HANDBOOK / "notebooks").glob("*.ipynb"))

@@ -38,6 +38,7 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
+from scipy.special import stdtrit
 from scipy.stats import binomtest
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
@@ -209,13 +210,14 @@ def calibrated(dataset: Dataset, calibrator: str, seed: int) -> Found | str:
     uncertainty = run.uncertainty
     if uncertainty is None:
         return "; ".join(run.warnings)
-    assert uncertainty.parameters is not None
-    wheels = np.array([(each.value, each.standard_deviation, each.high) for each in uncertainty.parameters])
+    wheels = np.array([(each.value, each.high) for each in run.parameters], dtype=float)
+    reach = wheels[:, 1] - wheels[:, 0]
+    quantile = stdtrit(np.min(uncertainty.degrees_of_freedom), 0.975)
     matrix, intervals = run.calibration.matrix_array, uncertainty.intervals
     return Found(
         np.append(matrix, wheels[:, 0]),
-        np.append(uncertainty.standard_deviations, wheels[:, 1]),
-        np.append(intervals.high - matrix, wheels[:, 2] - wheels[:, 0]),
+        np.append(uncertainty.standard_deviations, reach / quantile),
+        np.append(intervals.high - matrix, reach),
         f"{uncertainty.source}; {run.result.reason}"[:160],
     )
 

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.stats import binomtest
 
 from omnibench.fit.calibrate import calibrate
-from omnibench.fit.identifiability import geometry_of
+from omnibench.robot.physical import read_matrix
 from omnibench.simulate.source import read_simulation, simulate_dataset
 
 CONFIG = Path(__file__).parents[2] / "configs" / "apr02.yaml"
@@ -48,11 +48,10 @@ def covered(seed: int, calibrator: str = "closed_form", repetitions: int = 5) ->
     run = calibrate(simulation.dataset, calibrator, integration=flower.integration, seed=seed)
     found = run.uncertainty
     assert found is not None, run.warnings
-    assert found.parameters is not None
     truth = np.array(simulation.truth.matrix)
-    geometry = geometry_of(truth, simulation.dataset.robot)
+    geometry = [each.value for each in read_matrix(simulation.dataset.robot, truth).parameters]
     inside = (truth >= found.intervals.low) & (truth <= found.intervals.high)
-    held = [each.low <= value <= each.high for each, value in zip(found.parameters, geometry, strict=True)]
+    held = [each.low <= value <= each.high for each, value in zip(run.parameters, geometry, strict=True)]
     errors = (run.calibration.matrix_array - truth).ravel()
     return Coverage(inside.ravel(), np.array(held), errors, found.standard_deviations.ravel(), found.source)
 

@@ -11,13 +11,12 @@ import numpy.typing as npt
 from rich.console import Console
 
 from omnibench.cli.terminal.console import print_ending
-from omnibench.cli.terminal.tables import print_table
+from omnibench.cli.terminal.tables import print_table, render_table
 from omnibench.errors import ConfigError
 from omnibench.fit.bootstrap import ElementIntervals
 from omnibench.fit.calibrate import CalibrationRun
 from omnibench.fit.certify import QUADRATURE, CertifiedCalibration
 from omnibench.fit.evaluate import Evaluation
-from omnibench.fit.geometry import WheelGeometry
 from omnibench.report.blocks import Cell, Column, Row, Table
 from omnibench.report.numbers import noise_in_words
 from omnibench.robot.calibration import Calibration, HeldOutVerdict
@@ -27,6 +26,8 @@ from omnibench.robot.kinematics import relative_deviations
 from omnibench.words import plural
 
 _NONE = "no interval"
+_SCREEN = 25  # lines that a command prints at most, so that a terminal shows all
+_ENDING = 4  # lines of ``calibrate`` after the tables: file, verdict, and what to do next
 _NOTHING_TO_GAIN = 0.01  # share of the cost that is not worth another search; chosen
 _COLUMNS = 3  # columns with an interval each that 80 columns of a terminal hold
 _TOUCHED = 1e-6  # share of a direction of drive signals: a smaller one is rounding
@@ -62,52 +63,73 @@ def print_certificate(console: Console, certified: CertifiedCalibration) -> None
     )
 
 
-def print_calibration(console: Console, run: CalibrationRun) -> None:
-    """Print the matrix beside its deviation from the design, its intervals, if any, and how the search ended."""
-    calibration, result = run.calibration, run.result
-    print_table(console, _matrix_table(run))
-    if run.uncertainty is not None and run.uncertainty.parameters is not None:
-        rows = []
-        geometry = WheelGeometry(calibration.robot, fitted_mount=True)
-        design = dict(zip(geometry.names, geometry.start, strict=True))
-        for parameter in run.uncertainty.parameters:
-            start = design[parameter.name]
-            factor, decimals, unit = (math.degrees(1.0), 3, "deg") if parameter.unit == "rad" else (1.0, 5, "m")
-            interval = Cell("", parameter.untold)
-            if parameter.low is not None and parameter.high is not None:
-                low, high = (f"{factor * bound:.{decimals}f}" for bound in (parameter.low, parameter.high))
-                interval = Cell("", f"{low} to {high} {unit}")
-            values = (f"{factor * value:.{decimals}f} {unit}" for value in (start, parameter.value))
-            deviation = _deviation(float(relative_deviations(np.array(parameter.value), np.array(start))))
-            if parameter.unit == "rad":  # an angle's zero is a convention, so that no share of it means anything
-                deviation = f"{math.degrees(parameter.value - start):+.3f} deg"
-            rows.append(Row.of(parameter.name, *values, deviation, interval))
-        columns = (Column("parameter", numeric=False), *map(Column, ("design", "fitted", "deviation", "95 %")))
-        print_table(console, Table("physical parameters", columns, tuple(rows)))
+def print_calibration(console: Console, run: CalibrationRun, others: int = _ENDING) -> bool:
+    """Print the physical parameters, then the matrix, then what the intervals rest on, as far as a screen holds it.
+
+    others: lines that the command prints as well. Returns whether there is room for one more.
+    """
+    lines = [f"{run.result.outcome}: {run.result.reason}; {plural(run.result.evaluations, 'evaluation')}"]
+    lines[0] += f", {run.result.seconds:.2f} s"
+    if run.intervals is not None:
+        lines.append(f"95 % intervals, resampled: {run.units.words}")
     if run.uncertainty is not None:
-        console.print(f"95 % intervals: {run.uncertainty.source}", soft_wrap=True)
-        if run.intervals is not None:
-            console.print(f"95 % intervals, resampled: {run.units.words}", soft_wrap=True)
-        if calibration.noise is not None:
-            console.print(f"noise of the reference: {'; '.join(noise_in_words(calibration.noise))}", soft_wrap=True)
-    console.print(
-        f"{result.outcome}: {result.reason}; {plural(result.evaluations, 'evaluation')}, {result.seconds:.2f} s",
-        soft_wrap=True,
-    )
+        lines.insert(0, f"95 % intervals: {run.uncertainty.source}")
+        if run.calibration.noise is not None:
+            lines.append(f"noise of the reference: {'; '.join(noise_in_words(run.calibration.noise))}")
+    heights = [-(-len(line) // console.width) if console.is_terminal else 1 for line in lines]
+
+    tables = [_parameter_table(run)] if run.parameters else []
+    room = _SCREEN - others - sum(_height(console, table) for table in tables)
+    wide, narrow = _matrix_table(run, intervals=True), _matrix_table(run, intervals=False)
+    chosen = wide if run.intervals is not None or _height(console, wide) + sum(heights) <= room else narrow
+    room -= _height(console, chosen)
+    for table in (*tables, chosen):
+        print_table(console, table)
+    for line, height in zip(lines, heights, strict=True):
+        if height <= room:
+            console.print(line, soft_wrap=True)
+            room -= height
+    return room > 0
 
 
-def _matrix_table(run: CalibrationRun) -> Table:
-    """The matrix with its deviation from the design values, each row followed by its intervals.
+def _height(console: Console, table: Table) -> int:
+    """Lines of a table on a console."""
+    return len(console.render_lines(render_table(table, console.width)))
+
+
+def _parameter_table(run: CalibrationRun) -> Table:
+    """The physical parameters beside the design: angles in degrees, and differences from the design in % or degrees."""
+    rows = []
+    for each in run.parameters:
+        factor, decimals, unit = {"rad": (math.degrees(1.0), 3, "deg"), "1": (1.0, 4, "")}.get(
+            each.unit, (1.0, 5, each.unit)
+        )
+        percent = None if each.unit == "rad" else each.deviation_percent
+        change = f"{factor * each.deviation:+.{decimals}f} {unit}" if percent is None else f"{percent:+.2f} %"
+        ends = [] if each.low is None or each.high is None else [each.low, each.high]
+        interval = " to ".join(f"{factor * end:.{decimals}f}" for end in ends) or _NONE
+        values = (f"{factor * value:.{decimals}f}" for value in (each.design, each.value))
+        rows.append(Row.of(each.name, *values, unit, change, interval))
+    headings = (Column("design"), Column("value"), Column("", numeric=False), Column("change"), Column("95 %"))
+    return Table(_title(run), (Column("parameter", numeric=False), *headings), tuple(rows))
+
+
+def _title(run: CalibrationRun) -> str:
+    provenance = run.calibration.provenance
+    return f"{run.calibration.name}{' (simulated data)' if provenance is not None and provenance.simulated else ''}"
+
+
+def _matrix_table(run: CalibrationRun, intervals: bool) -> Table:
+    """The matrix with its deviation from the design values, each row perhaps followed by its intervals.
 
     It has a column for each drive signal; of more than three it is turned, so that a terminal shows all.
     """
     calibration = run.calibration
-    simulated = calibration.provenance is not None and calibration.provenance.simulated
     labels = ("x (m/rad)", "y (m/rad)", "w (rad/rad)")
     touched = np.any([np.abs(each.rates) > _TOUCHED for each in run.kept], axis=0) if run.kept else []
     marks = ["*" if touch else "" for touch in touched] or [""] * len(calibration.matrix[0])
     notes, listed = [], list[tuple[str, ElementIntervals]]()
-    if run.uncertainty is not None:
+    if run.uncertainty is not None and intervals:
         listed.append(("95 %", run.uncertainty.intervals))
     if run.intervals is not None:
         listed.append(("95 %, resampled", run.intervals))
@@ -136,9 +158,8 @@ def _matrix_table(run: CalibrationRun) -> Table:
     for number, label in enumerate(lines):
         rows.append(Row.of(label, *(values.T if turned else values)[number]))
         rows += [Row.of(f"  {name}", *(cells.T if turned else cells)[number]) for name, cells in bounds]
-    caption = f"{calibration.name}{' (simulated data)' if simulated else ''}"
-    columns = (Column("", numeric=False), *map(Column, headings))
-    return Table(caption, columns, tuple(rows), "; ".join(notes))
+    columns = (Column("matrix", numeric=False), *map(Column, headings))
+    return Table("" if run.parameters else _title(run), columns, tuple(rows), "; ".join(notes))
 
 
 def _cells(rows: Sequence[Sequence[Cell]]) -> npt.NDArray[np.object_]:

@@ -18,7 +18,6 @@ from omnibench.compare.report.search_figures import search_section
 from omnibench.compare.result import ComparisonResult
 from omnibench.data.dataset import SPLITS, Trajectory
 from omnibench.errors import DataError
-from omnibench.fit.identifiability import geometry_of
 from omnibench.report import blocks as page
 from omnibench.report.figures import DESIGN, START, is_drawn, joined, line, marks, motion_system, parameters
 from omnibench.report.numbers import MOST_MOTIONS, NOTHING, count, fixed, listing, motion_items, motion_of, significant
@@ -26,7 +25,8 @@ from omnibench.report.recording.recording_figures import evenly
 from omnibench.report.recording.section import has_recording, recording_section
 from omnibench.report.render import reproduction_section
 from omnibench.report.style import INK, PALETTE, plan
-from omnibench.robot.kinematics import Array, Robot, Wheel, seen_from
+from omnibench.robot.kinematics import Array, Robot, Wheel, class_of, seen_from
+from omnibench.robot.physical import read_matrix
 from omnibench.words import plural
 
 
@@ -116,17 +116,16 @@ def _fitted(view: sets.DatasetView) -> list[tuple[page.LegendItem, Robot]]:
     if best is None or best.typical is None or best.typical.matrix is None or best.label not in view.styles:
         return []
     robot = view.dataset.robot
-    try:
-        radii, distances, angles = geometry_of(best.typical.matrix, robot).reshape(3, -1).tolist()
-        wheels = tuple(
-            wheel.model_copy(update={"radius": radius, "distance": distance, "angle": angle, "x": None, "y": None})
-            for wheel, radius, distance, angle in zip(robot.wheels, radii, distances, angles, strict=True)
-        )
-    except DataError:
+    fitted = {each.name: each.value for each in read_matrix(robot, best.typical.matrix).parameters}
+    if not fitted or class_of(robot) != "omni" or len(robot.wheels) != 3:  # of others it is no one geometry
         return []
+    wheels = []
+    for wheel in robot.wheels:
+        of_wheel = {kind: fitted[f"{kind}_{wheel.name}"] for kind in ("radius", "distance", "angle")}
+        wheels.append(wheel.model_copy(update={**of_wheel, "x": None, "y": None}))
     style = view.styles[best.label]
     item = replace(style, key="fitted", colour=style.colour if style.colour != DESIGN.colour else INK, dash="dash")
-    return [(item, robot.model_copy(update={"wheels": wheels}))]
+    return [(item, robot.model_copy(update={"wheels": tuple(wheels)}))]
 
 
 def _tracks(view: sets.DatasetView) -> page.FigureGrid:

@@ -8,12 +8,12 @@ from collections.abc import Sequence
 
 from omnibench.compare.report import view as views
 from omnibench.compare.result import BoxCertificate, EntryStatistics, RunRecord
-from omnibench.fit.geometry import FittedParameter
 from omnibench.fit.span import driven_span
 from omnibench.registry import calibrators
 from omnibench.report.blocks import Block, Cell, Code, Column, Details, Paragraph, Row, Section, Table
 from omnibench.report.numbers import NOTHING, count, decimals_for, fixed, listing, percent, seconds, significant
 from omnibench.robot.kinematics import Array, relative_deviations
+from omnibench.robot.physical import PhysicalParameter
 
 
 def matrix_section(view: views.DatasetView) -> Section:
@@ -163,7 +163,7 @@ def _marks(record: RunRecord) -> dict[str, str]:
     return {**dict.fromkeys(views.on_bounds(record), "†"), **dict.fromkeys(record.held, "‡")}
 
 
-def _parameter_cell(parameter: FittedParameter | None, mark: str) -> Cell:
+def _parameter_cell(parameter: PhysicalParameter | None, mark: str) -> Cell:
     if parameter is None:
         return Cell(NOTHING)
     percent = parameter.deviation_percent

@@ -59,7 +59,8 @@ from omnibench.discover.regressors.significance import Group, best_shapes
 from omnibench.discover.result import Absorbed, Candidate, EstimatedParameter, Hidden, NamedEffect
 from omnibench.discover.selection.evidence import Missing
 from omnibench.discover.selection.model_selection import ABSORBED, SURE, MotorEffects, Screening, Selection
-from omnibench.fit.trajectory_fit import EstimatedCovariance, Given, given
+from omnibench.fit.trajectory_fit import Given, given
+from omnibench.robot.physical import EstimatedCovariance
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import form_in_words
 from omnibench.robot.kinematics import Array, Robot

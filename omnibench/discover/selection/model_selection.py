@@ -52,7 +52,8 @@ from omnibench.discover.regressors.significance import ColumnStore, Group, Signi
 from omnibench.discover.selection import evidence as odds
 from omnibench.discover.selection.evidence import Groups, catalogue, make_groups
 from omnibench.fit.noise import grouped
-from omnibench.fit.trajectory_fit import EstimatedCovariance, Given, Whitened, given
+from omnibench.fit.trajectory_fit import Given, Whitened, given
+from omnibench.robot.physical import EstimatedCovariance
 from omnibench.robot.effects.effect import ActuatorEffect, Parameter
 from omnibench.robot.kinematics import Array, Robot, in_the_middle, rotated
 

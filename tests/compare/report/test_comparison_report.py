@@ -36,7 +36,6 @@ from omnibench.compare.result import ComparisonResult
 from omnibench.data.dataset import Dataset, make_dataset
 from omnibench.data.importers.table1 import APR_02
 from omnibench.data.storage import load_dataset, save_dataset
-from omnibench.fit.identifiability import geometry_of
 from omnibench.fit.problem import Improvement
 from omnibench.fit.ratio_intervals import Interval
 from omnibench.report.blocks import Callout, Figure, FigureGrid, Row, Table
@@ -44,6 +43,7 @@ from omnibench.report.figures import motion_system, parameters
 from omnibench.report.numbers import fixed
 from omnibench.report.render import write_document
 from omnibench.robot.kinematics import Array, Robot, relative_deviations, wheel_equations
+from omnibench.robot.physical import read_matrix
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.source import simulate_dataset
 
@@ -485,7 +485,8 @@ def test_the_best_entrys_geometry_is_drawn_over_the_design() -> None:
     view = usual_view()
     _, figure = grids(view)[0].figures
     (fitted,) = (trace for trace in figure.plot.data if trace.legendgroup == "fitted")
-    radii, distances, angles = geometry_of(view.best.typical.matrix, view.dataset.robot).reshape(3, 3)
+    reading = read_matrix(view.dataset.robot, view.best.typical.matrix)
+    radii, distances, angles = np.array([each.value for each in reading.parameters]).reshape(3, 3)
     places = (distances * np.array([np.cos(angles), np.sin(angles)])).T
     drawn = rectangles(fitted)
     np.testing.assert_allclose([corners.mean(axis=0) for corners in drawn], places, atol=1e-4)

@@ -1,0 +1,387 @@
+"""Physical parameters of a robot by its matrix: radii, track, wheelbase, distances, angles, zeros, tracked point.
+
+``Geometry`` maps the numbers v of a robot's geometry to its matrix K (3, M); this is the way back. Robots of a class
+lie about their design as
+
+    v = v0 + B z,    p = p0 + R z,    z ~ N(0, 1),                                                        (1)
+
+p being the parameters that are reported, such as the track, which is the distance between wheels that each have a
+lever arm. Of K counts what a robot's motions show: four wheels drive three motions. With J = dK/dz at the design, in
+units of the largest element of each row, the changes of z fall into those that K shows, with the orthonormal basis V,
+and those that it does not, J w = 0: radii of single wheels where four drive three motions, or what is the tracked
+point's place and what the distances of three omni wheels. There z keeps the design. Gauss-Newton steps
+
+    z = V y,    y <- y + (W J V)^+ W (K - K(z))                                                            (2)
+
+find the least-squares point. The weights W'W are the inverse covariance of K: the elements' C, and the tolerance of a
+class for what no geometry has, such as slip that shortens one row. Elements that scatter by C, and the tolerance along
+changes that K does not show, make parameters scatter by
+
+    cov p = R A C A' R' + R (1 - V V') R',    A = V (W J V)^+ W.                                           (3)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from pydantic import FiniteFloat
+from scipy.special import chdtri, stdtrit
+
+from omnibench.config import Model, Name
+from omnibench.errors import DataError
+from omnibench.robot.geometry import STEERING_ZERO, TRACKED_POINT, TRACKED_YAW, Geometry, physical_tolerance
+from omnibench.robot.kinematics import Array, CarDrive, Robot, relative_deviations
+
+if TYPE_CHECKING:
+    from omnibench.robot.calibration import EffectTerm
+
+INTERVAL = 0.95  # probability of the intervals, by convention; every table of the program says 95 %
+# Degrees of freedom that stand for infinity: the quantile of Student's t differs from the normal one by 2e-9 there.
+MANY = 1e9
+
+_RANK = 1e-6  # share of the strongest change of z: less is rounding, and the matrix does not show it
+_UNSEEN = 1e-3  # share of a parameter's variance by tolerance: from it on it depends on what the data do not tell
+_NO_VARIANCE = 1e-9  # share of a parameter's deviation by tolerance: less is rounding
+_RESTING, _MOST_STEPS = 1e-8, 50  # of y, in deviations of the tolerance
+_FARTHEST = 1e3  # the same, of numbers that no robot has
+_LEAST = 0.01  # share of the design: no wheel and no wheelbase is smaller
+_MISFIT = 1e-3  # probability that the matrix of a geometry misses the one that was fitted by more; chosen
+# Share of the design: "too high to be justified as being caused by assembling or manufacturing errors" (Palacin et al.
+# 2023, section 4.2, of the parameters of their Eq. (8)).
+_IMPLAUSIBLE = 0.10
+_NO_LENGTH = 1e-6  # m: a shorter track or wheelbase is none
+
+
+@dataclass(frozen=True, eq=False)
+class EstimatedCovariance:
+    """Covariance (n, n) of n numbers, and degrees of freedom (n,) of their variances, or one for all."""
+
+    matrix: Array
+    degrees_of_freedom: Array | float = np.inf
+
+    def of(self, slopes: Array) -> EstimatedCovariance:
+        """Covariance of q functions of the numbers, with derivatives (q, n), and degrees of freedom of their variances.
+
+        The reciprocal of a function's degrees of freedom is the mean of those of the numbers, weighted by their shares
+        in its variance: what depends on one number has that number's, and numbers that agree give theirs.
+        """
+        weights = np.abs(slopes * (slopes @ self.matrix))
+        freedom = np.broadcast_to(np.minimum(self.degrees_of_freedom, MANY), len(self.matrix))
+        reciprocals = (weights / freedom).sum(axis=1) / np.maximum(weights.sum(axis=1), 1e-300)
+        return EstimatedCovariance(slopes @ self.matrix @ slopes.T, 1 / np.maximum(reciprocals, 1 / MANY))
+
+    @property
+    def standard_deviations(self) -> Array:
+        """Standard deviations (n,)."""
+        return np.sqrt(np.maximum(np.diag(self.matrix), 0.0))
+
+    @property
+    def reach(self) -> Array:
+        """Half-widths (n,) of the 95 % intervals."""
+        quantile = stdtrit(np.minimum(self.degrees_of_freedom, MANY), (1 + INTERVAL) / 2)
+        return np.asarray(quantile * self.standard_deviations)
+
+
+Unit = Literal["m", "rad", "rad/s", "1"]
+
+
+class PhysicalParameter(Model):
+    """A physical parameter: design, value and 95 % interval, in ``unit`` (m, rad, rad/s; 1 for a factor).
+
+    low, high: None where there is no interval.
+    """
+
+    name: Name
+    design: FiniteFloat
+    value: FiniteFloat
+    unit: Unit
+    low: FiniteFloat | None = None
+    high: FiniteFloat | None = None
+
+    @property
+    def deviation(self) -> float:
+        """The difference from the design value, in the parameter's unit."""
+        return self.value - self.design
+
+    @property
+    def deviation_percent(self) -> float | None:
+        """The difference as % of the design value, None where that is 0; of an angle it means nothing."""
+        share = float(relative_deviations(np.array(self.value), np.array(self.design)))
+        return None if math.isnan(share) else 100 * share
+
+
+def unit_of(name: str) -> Unit:
+    """The unit of a physical parameter, or of a number of the geometry, by its name."""
+    if name.startswith("steering_gain"):
+        return "1"
+    if name == "lost_rate":
+        return "rad/s"
+    return "rad" if name.startswith(("angle", "offset", "steering_zero", "mount_yaw")) else "m"
+
+
+@dataclass(frozen=True, eq=False)
+class PhysicalReading:
+    """The physical parameters of a matrix; none, where no geometry has such a matrix.
+
+    doubt: one sentence on why there are none, or why they can hardly be the robot's; else empty.
+    """
+
+    parameters: tuple[PhysicalParameter, ...]
+    doubt: str = ""
+
+
+def read_matrix(
+    robot: Robot,
+    matrix: Array,
+    covariance: Array | None = None,
+    degrees_of_freedom: Array | float = np.inf,
+    effects: Sequence[EffectTerm] = (),
+    *,
+    fitted_mount: bool = False,
+    unknown: Array | None = None,
+) -> PhysicalReading:
+    """The physical parameters of a robot by its matrix (3, M) and its effects, Eq. (2) and (3).
+
+    covariance: of the elements, row by row, and of the effects' parameters, or of the elements alone; intervals are by
+    Student's t with these degrees of freedom of the variances, one for all or one for each. fitted_mount: the tracked
+    point of a robot that slides may stand elsewhere than its file says; of others it always may. unknown (q, 3M):
+    changes of the matrix of which the data say nothing; parameters that depend on them have no interval.
+    """
+    factors = _factors_of_effects(robot, effects)
+    model = _class_model(robot, fitted_mount, [name for factor in factors for name in factor])
+    geometry, size = model.geometry, matrix.size
+
+    # What the robot's motions show of a matrix, and which changes of z that shows.
+    _, _, signals = np.linalg.svd(robot.inverse_kinematic_matrix)
+    units = np.repeat(robot.row_scales, len(robot.drive.names))
+    seen = np.kron(np.eye(3), signals[: len(robot.motions)]) / units  # (3D, 3M)
+    at_design = seen @ geometry.slopes(geometry.design) @ model.spread
+    shown, hidden = _split(at_design)
+
+    # The least-squares point, Eq. (2).
+    of_elements = np.zeros((size, size)) if covariance is None else covariance[:size, :size]
+    tolerance, motions = physical_tolerance(robot), robot.inverse_kinematic_matrix
+    slipping = np.array(
+        [share * (np.eye(3)[row][:, None] * motions).ravel() for row, share in enumerate(tolerance.rows)]
+    )
+    scatter = seen @ (of_elements + slipping.T @ slipping) @ seen.T + tolerance.elements**2 * np.eye(len(seen))
+    weighted = np.linalg.solve(np.linalg.cholesky(scatter), seen)
+    try:
+        change, slopes = _least_squares(model, matrix, weighted, shown)
+    except DataError as error:
+        return PhysicalReading((), f"the matrix has no reading in physical parameters: {error}")
+
+    # What effects add to it.
+    by_effects = np.array([[factor.get(name, 0.0) for factor in factors] for name in model.design])
+    of_effects = np.array([value for term in effects for value in term.parameters.values()])
+    values = np.array(list(model.design.values())) + model.reported @ shown @ change + by_effects @ of_effects
+
+    # The intervals, Eq. (3); none of what the covariance says nothing of, or of what depends on unknown changes.
+    reach = np.full(len(values), np.nan)
+    if covariance is not None:
+        by_elements = model.reported @ shown @ np.linalg.pinv(slopes) @ weighted
+        known = len(covariance)  # elements, perhaps with effects
+        scattering = EstimatedCovariance(covariance, degrees_of_freedom)
+        scattering = scattering.of(np.hstack([by_elements, by_effects])[:, :known])
+        untold = scattering.standard_deviations <= _NO_VARIANCE * model.deviations(np.eye(len(model.spread.T)))
+        untold |= by_effects.any(axis=1) & (known == size)
+        if unknown is not None and len(unknown):
+            lost, strengths, _ = np.linalg.svd(seen @ unknown.T, full_matrices=False)
+            lost = lost[:, strengths > _RANK * strengths[0]]
+            _, unseen = _split(at_design - lost @ lost.T @ at_design)
+            more = model.deviations(unseen) ** 2 - model.deviations(hidden) ** 2
+            untold |= more > _UNSEEN * model.deviations(np.eye(len(model.spread.T))) ** 2
+        by_tolerance = EstimatedCovariance(np.diag(model.deviations(hidden) ** 2))
+        reach = np.where(untold, np.nan, np.hypot(scattering.reach, by_tolerance.reach))
+    parameters = []
+    for (name, design), value, half in zip(model.design.items(), values.tolist(), reach.tolist(), strict=True):
+        low, high = (None, None) if math.isnan(half) else (value - half, value + half)
+        each = PhysicalParameter(name=name, design=design, value=value, unit=unit_of(name), low=low, high=high)
+        if not _is_known(robot, each):
+            parameters.append(each)
+    return PhysicalReading(tuple(parameters), _doubt(robot, parameters, fitted_mount))
+
+
+def _is_known(robot: Robot, parameter: PhysicalParameter) -> bool:
+    """True for the pose of a tracked point that is the robot's centre, and that the matrix was not free to move."""
+    here = robot.mount is None and parameter.low is None and abs(parameter.deviation) <= _NO_VARIANCE
+    return here and parameter.name.startswith("mount")
+
+
+def _split(slopes: Array) -> tuple[Array, Array]:
+    """Orthonormal changes (k, r) and (k, k - r) that slopes (q, k) show and do not show."""
+    _, strengths, directions = np.linalg.svd(slopes)
+    rank = int((strengths > _RANK * strengths[0]).sum())
+    return directions[:rank].T, directions[rank:].T
+
+
+def _least_squares(model: _ClassModel, matrix: Array, weighted: Array, shown: Array) -> tuple[Array, Array]:
+    """Eq. (2): the changes y (r,), and the weighted slopes (3D, r) there.
+
+    weighted (3D, 3M): what is seen of a matrix, weighted. DataError says why no geometry has such a matrix.
+    """
+    geometry = model.geometry
+    change, step = np.zeros(shown.shape[1]), np.inf
+    with np.errstate(all="ignore"):
+        for _ in range(_MOST_STEPS):
+            numbers = geometry.design + model.spread @ shown @ change
+            try:
+                misfit = weighted @ (matrix - geometry.matrices(numbers[None])[0]).ravel()
+                slopes = weighted @ geometry.slopes(numbers) @ model.spread @ shown
+                moved = np.linalg.lstsq(slopes, misfit)[0]
+            except np.linalg.LinAlgError:
+                break
+            if step < _RESTING:
+                break
+            change, step = change + moved, float(np.abs(moved).max())
+            if not np.abs(change).max() < _FARTHEST:
+                break
+    if not step < _RESTING:
+        raise DataError("no wheels near the design have it")
+    values = np.array(list(model.design.values())) + model.reported @ shown @ change
+    for (name, design), value in zip(model.design.items(), values.tolist(), strict=True):
+        if name.startswith(_LENGTHS) and value < _LEAST * design:
+            raise DataError(f"{name} would be {value:.4g} m")
+    freedom = len(weighted) - shown.shape[1]
+    if freedom and float(misfit @ misfit) > chdtri(freedom, _MISFIT):
+        raise DataError("what it does differs from what wheels can do by more than its uncertainty")
+    return change, slopes
+
+
+def _doubt(robot: Robot, parameters: Sequence[PhysicalParameter], fitted_mount: bool) -> str:
+    """A sentence on lengths that are farther off their design than wheels are; empty if none is."""
+    doubted = []
+    for each in parameters:
+        ends = (each.low, each.high) if each.low is not None and each.high is not None else (each.value, each.value)
+        nearest = min(max(each.design, ends[0]), ends[1])
+        effective = each.name == "track" and robot.skid  # of wheels that slide
+        if each.name.startswith(_LENGTHS) and not effective and abs(nearest / each.design - 1) > _IMPLAUSIBLE:
+            doubted.append(f"{each.name} {each.deviation_percent:+.1f} %")
+    if not doubted:
+        return ""
+    point = ", or the tracked point stands off the centre (mount: fit)" if robot.slides and not fitted_mount else ""
+    return (
+        f"{', '.join(doubted)}: wheels are seldom off by more than {_IMPLAUSIBLE:.0%} (Palacin et al. 2023, section "
+        f"4.2); measure them: if they are as designed, the matrix has no physical reading and makes up for something "
+        f"else, such as slip{point}"
+    )
+
+
+_LENGTHS = ("radius", "track", "wheelbase", "distance")
+
+
+@dataclass(frozen=True, eq=False)
+class _ClassModel:
+    """Eq. (1): B (n, k), R (p, k), and the design values of the p parameters that are reported."""
+
+    geometry: Geometry
+    spread: Array
+    design: Mapping[str, float]
+    reported: Array
+
+    def deviations(self, changes: Array) -> Array:
+        """Standard deviations (p,) of the parameters by orthonormal changes (k, q) of z."""
+        return np.asarray(np.linalg.norm(self.reported @ changes, axis=1))
+
+
+def _class_model(robot: Robot, fitted_mount: bool, of_effects: Collection[str]) -> _ClassModel:
+    """How robots of a class lie about their design. of_effects: parameters that effects change."""
+    geometry, tolerance = Geometry(robot), physical_tolerance(robot)
+    at_design: dict[str, float] = dict(zip(geometry.names, geometry.design.tolist(), strict=True))
+    car = isinstance(robot.drive, CarDrive)
+    steered = [wheel for wheel in robot.measured if wheel.has_steering]
+    design: dict[str, float] = {}
+    columns: list[tuple[Mapping[str, float], Mapping[str, float]]] = []  # of B and of R
+
+    # Radii. The matrix of a car has the mean of its rear wheels'.
+    for wheel in robot.measured:
+        name, deviation = f"radius_{wheel.name}", tolerance.radius * wheel.radius
+        design[name] = wheel.radius
+        changes: Mapping[str, float] = {"radius": deviation / len(robot.measured)} if car else {name: deviation}
+        columns.append((changes, {name: deviation}))
+
+    # Track and wheelbase: wheels stand farther from the middle between them, or from the axle of fixed wheels.
+    fixed = {f"distance_{wheel.name}": wheel.lever for wheel in robot.measured if wheel.kind == "fixed" and not car}
+    along, across = ({f"{axis}_{wheel.name}": wheel.position[i] for wheel in steered} for i, axis in enumerate("xy"))
+    stretched: list[tuple[str, Mapping[str, float], float, float]] = []
+    if car:
+        wheelbase = at_design["wheelbase"]
+        stretched.append(("wheelbase", {"wheelbase": wheelbase}, 0.0, abs(wheelbase)))
+    if fixed:
+        stretched.append(("track", fixed, *_middle(fixed)))
+    if steered and not robot.slides:
+        _, turning = robot.motions
+        axle = -float(turning[1] / turning[2])
+        stretched.append(("wheelbase", along, axle, float(np.mean([abs(x - axle) for x in along.values()]))))
+    elif steered:
+        stretched += [] if fixed else [("track", across, *_middle(across))]
+        stretched.append(("wheelbase", along, *_middle(along)))
+        columns += [({number: tolerance.elements * robot.reach}, {}) for number in (*along, *across)]
+    for name, numbers, origin, length in stretched:
+        if length > _NO_LENGTH:
+            design[name] = length
+            share = tolerance.rows[2]  # as turning is off
+            columns.append(
+                ({each: share * (value - origin) for each, value in numbers.items()}, {name: share * length})
+            )
+
+    # Distances and angles of wheels on rollers.
+    on_rollers = [wheel for wheel in robot.measured if wheel.kind in ("omni", "mecanum")]
+    for wheel in on_rollers:
+        name, length = f"distance_{wheel.name}", abs(wheel.lever)
+        design[name] = length
+        deviation = tolerance.radius * (length or robot.reach)
+        columns.append(({name: math.copysign(deviation, wheel.lever)}, {name: deviation}))
+    for wheel in on_rollers:
+        name = f"angle_{wheel.name}"
+        design[name] = wheel.axle
+        columns.append(({name: tolerance.elements}, {name: tolerance.elements}))
+
+    # Zeros of steering angles: the matrix of a car has their mean.
+    for owner in robot.drive.steered:
+        name = f"steering_zero_{owner}"
+        design[name] = 0.0
+        changes = {"offset": STEERING_ZERO / len(robot.drive.steered)} if car else {f"offset_{owner}": STEERING_ZERO}
+        columns.append((changes, {name: STEERING_ZERO}))
+
+    # The tracked point. If all wheels slide, it stands where the file says or is fitted, and its yaw is their angles'.
+    mount = {"mount_x": TRACKED_POINT, "mount_y": TRACKED_POINT, "mount_yaw": TRACKED_YAW}
+    if robot.slides and not robot.skid:
+        mount = {name: TRACKED_POINT for name in ("mount_x", "mount_y") if fitted_mount}
+    for name, deviation in mount.items():
+        design[name] = at_design[name]
+        columns.append(({name: deviation}, {name: deviation}))
+
+    for name in of_effects:
+        design.setdefault(name, 1.0 if name.startswith("steering_gain") else at_design.get(name, 0.0))
+
+    spread, reported = np.zeros((len(at_design), len(columns))), np.zeros((len(design), len(columns)))
+    for column, (changes, shown) in enumerate(columns):
+        for rows, named, table in ((list(at_design), changes, spread), (list(design), shown, reported)):
+            for name, change in named.items():
+                table[rows.index(name), column] = change
+    return _ClassModel(geometry, spread, design, reported)
+
+
+def _middle(values: Mapping[str, float]) -> tuple[float, float]:
+    """The middle between the least and the largest value, and the distance between them."""
+    low, high = min(values.values()), max(values.values())
+    return (low + high) / 2, high - low
+
+
+def _factors_of_effects(robot: Robot, effects: Sequence[EffectTerm]) -> list[Mapping[str, float]]:
+    """By how much each parameter of the effects changes the physical parameters of a robot, by their names."""
+    every = robot.drive.steered
+    known = {
+        ("wheel_dead_zone", "c"): {"lost_rate": -1.0},  # c is gained
+        ("steering_gain", "g"): {f"steering_gain_{name}": 1.0 for name in every},
+        ("steering_offset", "c"): {f"steering_zero_{name}": 1.0 for name in every},
+        ("lidar_lever_arm", "x"): {"mount_x": 1.0},
+        ("lidar_lever_arm", "y"): {"mount_y": 1.0},
+        **{("driven_steering_offset", f"c_{name}"): {f"steering_zero_{name}": 1.0} for name in every},
+    }
+    return [known.get((term.name, name), {}) for term in effects for name in term.parameters]
