@@ -59,7 +59,7 @@ _POSES = 12  # most reference poses of a stretch that are looked at: their media
 _FIRST, _FIRST_STEPS = 0.01, 4  # m and rad, and steps: see the module's docstring
 _LEAST = 0.003  # m and rad: smaller errors along a path are those of motion capture, not of the model; chosen
 _STEP = 0.1  # prior deviations by which a parameter of an effect is moved for its derivative
-_MOST_STEPS, _RESTING = 40, 1e-5  # steps, and the largest step, in prior deviations, that counts as none
+_MOST_STEPS, _RESTING = 40, 1e-4  # steps, and the largest step, in prior deviations, that counts as none
 _UNTOLD = 1e3  # times its sigma: weight of a position of a run that hardly leaves its place, and tells no heading
 PLACE, HEADING = "pose position", "pose heading"  # kinds of error of poses
 
