@@ -85,10 +85,11 @@ def print_calibration(console: Console, run: CalibrationRun, others: Sequence[st
 
     # The matrix with its intervals, if all else has room then; without; or its elements alone.
     forms: list[RenderableType] = [
-        render_table(_matrix_table(run, intervals=True), console.width),
-        render_table(_matrix_table(run, intervals=False), console.width),
-        "\n".join(_elements(run.calibration)),
+        render_table(_matrix_table(run, intervals=intervals), console.width) for intervals in (True, False)
     ]
+    elements = list(_elements(run.calibration))
+    if max(map(len, elements)) <= console.width:
+        forms.append("\n".join(elements))
     heights = [_height(console, forms[0], *lines), *(_height(console, form) for form in forms[1:])]
     fitting = [form for form, height in zip(forms, heights, strict=True) if height <= room]
     matrix = forms[0] if run.intervals is not None else next(iter(fitting), forms[int(np.argmin(heights))])
