@@ -83,16 +83,17 @@ def print_calibration(console: Console, run: CalibrationRun, others: Sequence[st
         console.print(parameters)
         room -= _height(console, parameters)
 
-    # The matrix with its intervals, if all else has room then; without; or its elements alone.
+    # The matrix with its intervals, if all else has room then; without; its elements alone; or where it is.
     forms: list[RenderableType] = [
         render_table(_matrix_table(run, intervals=intervals), console.width) for intervals in (True, False)
     ]
     elements = list(_elements(run.calibration))
     if max(map(len, elements)) <= console.width:
         forms.append("\n".join(elements))
+    forms.append(f"matrix (3 x {len(run.calibration.matrix[0])}): not on this screen; --json shows it, -o writes it")
     heights = [_height(console, forms[0], *lines), *(_height(console, form) for form in forms[1:])]
     fitting = [form for form, height in zip(forms, heights, strict=True) if height <= room]
-    matrix = forms[0] if run.intervals is not None else next(iter(fitting), forms[int(np.argmin(heights))])
+    matrix = forms[0] if run.intervals is not None else next(iter(fitting), forms[-1])
     console.print(matrix, soft_wrap=isinstance(matrix, str))
     room -= _height(console, matrix)
     for line in lines:
