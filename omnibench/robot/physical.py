@@ -25,7 +25,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from pydantic import FiniteFloat
@@ -35,9 +35,6 @@ from omnibench.config import Model, Name
 from omnibench.errors import DataError
 from omnibench.robot.geometry import STEERING_ZERO, TRACKED_POINT, TRACKED_YAW, Geometry, physical_tolerance
 from omnibench.robot.kinematics import Array, CarDrive, Robot, relative_deviations
-
-if TYPE_CHECKING:
-    from omnibench.robot.calibration import EffectTerm
 
 INTERVAL = 0.95  # probability of the intervals, by convention; every table of the program says 95 %
 # Degrees of freedom that stand for infinity: the quantile of Student's t differs from the normal one by 2e-9 there.
@@ -90,6 +87,15 @@ class EstimatedCovariance:
 Unit = Literal["m", "rad", "rad/s", "1"]
 
 
+class NamedEffect(Protocol):
+    """An effect by its name, with the values of its parameters, as a calibration file holds it."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def parameters(self) -> Mapping[str, float]: ...
+
+
 class PhysicalParameter(Model):
     """A physical parameter: design, value and 95 % interval, in ``unit`` (m, rad, rad/s; 1 for a factor).
 
@@ -140,7 +146,7 @@ def read_matrix(
     matrix: Array,
     covariance: Array | None = None,
     degrees_of_freedom: Array | float = np.inf,
-    effects: Sequence[EffectTerm] = (),
+    effects: Sequence[NamedEffect] = (),
     *,
     fitted_mount: bool = False,
     unknown: Array | None = None,
@@ -384,7 +390,7 @@ def _middle(places: Sequence[float]) -> tuple[float, float]:
     return (min(places) + max(places)) / 2, max(places) - min(places)
 
 
-def _factors_of_effects(robot: Robot, effects: Sequence[EffectTerm]) -> list[Mapping[str, float]]:
+def _factors_of_effects(robot: Robot, effects: Sequence[NamedEffect]) -> list[Mapping[str, float]]:
     """By how much each parameter of the effects changes the physical parameters of a robot, by their names."""
     every = robot.drive.steered
     known = {
