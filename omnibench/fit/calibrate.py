@@ -312,20 +312,21 @@ def calibrate(
 
     calibrator: default closed_form, or trajectory_ml where training runs have references other than poses, each of
     which it weighs by its own uncertainty.
-    loss: how pose errors are weighted in the fit (see fit/loss.py). squares: as the calibrator weights them; huber,
+    loss: how pose errors are weighted in the fit. squares: as the calibrator weights them; huber,
     student_t: poses that are far off have a bounded influence.
     intervals: also draw resampled intervals about the optimum (closed_form only). A warning says so if there are fewer
     than three commands to draw from (runs, where none is repeated).
     unidentified: what is done about motions that the data drive so little that slip alone may explain them, which the
-    run's warnings name. ``keep``: the matrix has the design values there; ``fit``: it is fitted there, too (see
-    make_parameterisation); ``shrink``: as ``keep``, and the other elements move towards the design, the more the less
-    the data determine them (see shrinkage.py). tolerance: how far a design may be off, for ``shrink``.
-    mount: pose of the tracked point: ``known``, as the robot's file says, or ``fit``. Of a robot that slides the matrix
-    is the same, and its place is told from the distances of the wheels as far as these are as designed.
-    Cost, unidentified and mount have defaults that depend on the robot: on few runs the whole trajectory is the cost;
-    wheels that say their type shrink, but omni wheels; the tracked point of tricycles and cars is fitted.
-    steering: ``fit``: gain, play and coupling of the steering, and a car's zero, are fitted before the matrix (see
-    SteeringFit) and are effects of the calibration; ``known``: the measured angles are right.
+    run's warnings name. ``keep``: the matrix has the design values there; ``fit``: it is fitted there, too; ``shrink``:
+    as ``keep``, and the other elements move towards the design, the more the less the data determine them. tolerance:
+    how far a design may be off, for ``shrink``, as a share of each row's largest element.
+    mount: pose of the tracked point: ``known``, as the robot's file says, or ``fit``. The matrix of a robot that slides
+    is the same either way, and the place is told from the distances of its wheels, as far as these are as designed.
+    Cost, unidentified and mount have defaults that depend on the robot: of few runs the whole trajectory is the cost;
+    robots whose wheels say their type shrink, but those on omni wheels; the tracked point of tricycles and cars is
+    fitted.
+    steering: ``fit``: gain, play and coupling of the steering, and a car's zero, are fitted before the matrix
+    and are effects of the calibration; ``known``: the measured angles are right.
 
     Raises UnknownNameError or ConfigError for wrong choices, DataError for an empty training split, and ConfigError
     when the calibrator gives no answer.

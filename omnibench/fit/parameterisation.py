@@ -60,7 +60,7 @@ class Parameterisation(Protocol):
     def bounds(self) -> Bounds: ...
     @property
     def prior_root(self) -> Array:
-        """A root (n, k) of the covariance that the numbers of such robots have about the design (prior.py)."""
+        """A root (n, k) of the covariance that the numbers of such robots have about the design."""
 
     @property
     def projection(self) -> Array:
@@ -79,9 +79,10 @@ class MatrixElements:
 
     null (q, M): orthonormal directions of drive signals that the data do not identify; along them the matrix keeps its
     start values. known_mount: the matrix gives a robot that cannot slide only twists in which its fixed wheels do not,
-    the tracked point being where the robot says; False: it may be elsewhere. tolerance: see prior.py. open (q, 3M):
-    orthonormal combinations of elements, in units of their rows' largest, that references other than poses leave open;
-    along them the matrix keeps its start values, too.
+    the tracked point being where the robot says; False: it may be elsewhere. tolerance: how far designs are
+    off, as a share of each row's largest element; None: that of the class. open (q, 3M): orthonormal combinations of
+    elements, in units of their rows' largest, that references other than poses leave open; along them the matrix keeps
+    its start values, too.
     """
 
     robot: Robot

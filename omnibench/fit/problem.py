@@ -174,14 +174,14 @@ class CalibrationProblem(SearchBox):
     """Training trajectories, a start, a box, a budget and a cost to be minimised.
 
     trajectories: the training runs; a calibrator cannot reach the validation runs. ends_moved: names of those whose
-    start (or end) has jumped, and is taken from the poses beside it, as a robust loss does (fit/loss.py).
+    start (or end) has jumped, and is taken from the poses beside it, as a robust loss does.
     start (n,): the vector of the design values; lower, upper (n,): its box; names: of its n elements.
     objective: the Cost. cost(candidates): its values, counted against the budget and recorded; a search calls this.
     values(candidates): the same values, neither counted nor recorded; for judging an answer, not for searching.
     rng: the only source of randomness that a calibrator may use.
     span: what the runs drive; default: computed when it is first asked for.
     watch: told the evaluations and the best cost so far, at most every 0.1 s.
-    shrinks: True if the answer is shrunk to the design afterwards (shrinkage.py).
+    shrinks: True if the answer is shrunk to the design afterwards.
     """
 
     def __init__(
@@ -467,8 +467,8 @@ def make_parameterisation(
     unidentified: for directions of wheel rates that the trajectories drive so little that slip alone may explain it,
     ``keep`` and ``shrink`` hold the matrix at the design values along them, ``fit`` fits it. The geometry always fits
     them: it cannot hold values along a direction. mount: whether the tracked point of a robot that cannot slide is
-    where the robot says, or fitted; default: see ``default_mount``. tolerance: of the design, see prior.py. span: what
-    the trajectories drive; default: computed here.
+    where the robot says, or fitted; default: see ``default_mount``. tolerance: how far designs are off, as a share of
+    each row's largest element; default: that of the class. span: what the trajectories drive; default: computed here.
     """
     mount = mount or default_mount(robot)
     if name == "geometry":

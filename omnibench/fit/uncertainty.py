@@ -138,7 +138,7 @@ def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertaint
     """The uncertainty of a calibrator's answer.
 
     The covariance is the calibrator's own if it gives one (trajectory_ml), otherwise the sandwich of an estimate that
-    minimises a sum of norms (sandwich.py). An element that depends on a number that the box holds, or that lies on a
+    minimises a sum of norms. An element that depends on a number that the box holds, or that lies on a
     bound of it, has no interval.
 
     NoCovarianceError, with the reason, when there is no answer, the cost is no sum of norms, the answer is no minimum
