@@ -194,26 +194,35 @@ def calibrate(
     calibration, result = run.calibration, run.result
     if output is not None:
         write_text(output, to_yaml(calibration))
-    warn([*recordings.warnings, *run.warnings])
+    warnings = [*recordings.warnings, *run.warnings]
     if result.at_bounds:
-        warn([f"on a bound of the box {chosen.box!r}: {', '.join(result.at_bounds)}; a wider box may fit better"])
+        bounds = f"on a bound of the box {chosen.box!r}: {', '.join(result.at_bounds)}"
+        warnings.append(f"{bounds}; a wider box may fit better")
     if run.untouched:
-        warn([f"not fitted, kept at the start value by the box {chosen.box!r} or the cost: {', '.join(run.untouched)}"])
+        held = f"kept at the start value by the box {chosen.box!r} or the cost: {', '.join(run.untouched)}"
+        warnings.append(f"not fitted, {held}")
+    warn(warnings)
     if as_json:
         return print_json(calibration)
-    print_calibration(make_console(), run)
-    if output is not None:
-        typer.echo(f"calibration: {output}")
     assert calibration.provenance is not None  # a fit has one, with its verdict
     assert calibration.provenance.held_out is not None
-    print_verdict(calibration.provenance.held_out)
+    verdict = calibration.provenance.held_out
+    file = [] if output is None else [f"calibration: {output}"]
+    ending = [
+        "whether it is better, and what to do next, in a line that is longer than many terminals are wide",
+        "COMMAND",
+    ]
+    room = print_calibration(make_console(), run, [*warnings, *file, verdict.sentence, *ending], verdict.detail)
+    for line in file:
+        typer.echo(line)
+    print_verdict(verdict if room else verdict.model_copy(update={"detail": ""}))
     if result.at_bounds and output is not None:
         what = f"{output} lies on a bound of what was searched: robot.yaml may be wrong, do not use it"
         return print_ending(what, "see what is", "omnibench", "check", *dataset)
     if output is None:
         again = ("omnibench", *sys.argv[1:], "-o", "calibration.yaml")
         return print_ending("the calibration above is written nowhere", "write it to a file", *again)
-    return print_verdict_ending(calibration.provenance.held_out, calibration, output, dataset)
+    return print_verdict_ending(verdict, calibration, output, dataset)
 
 
 @calibration_app.command()
