@@ -10,9 +10,10 @@ hold a digest of the simulation, but none of the calibrators: take another folde
 
 **Errors.** A robot is trained on one or two kinds of path and judged on all others by Eq. (6) of Palacin et al. 2023:
 the mean norm of the final poses' errors, m and rad alike, against final poses without slip. The table has, by class,
-the ratio of the mean error to that of the truth's form (the same fit given the true effect, see ``fitted``), with a
-95 % interval over robots (bootstrap), the same where the judged commands slip, too (not their runs), and the ratio by
-effect.
+the ratio of the mean error to that of the truth's form (the same fit given the true effect, Form.by_path), with a 95 %
+interval over robots (bootstrap), and to that of the true likelihood (Form.by_likelihood), which knows how much slips;
+then the first ratio where the judged commands slip, too (not their runs), the geometric mean of the robots' ratios, and
+the ratio by effect.
 
 **Coverage** (--coverage). All kinds of path are trained on, and the effects are those that posterior knows, none and a
 lost rate, unless --effects names others. Slip is 0 in the mean, so the truth is the geometry, and with --sessions the
@@ -32,7 +33,7 @@ import re
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -53,7 +54,7 @@ from omnibench.processes import one_thread
 Array = NDArray[np.float64]
 Intervals = Mapping[str, tuple[float, float, float]]  # value, low and high by name
 
-TRUTH = "truth's form"
+TRUTH, LIKELIHOOD = "truth's form", "true likelihood"
 LEVEL, LEAST, MOST = 0.95, 0.93, 0.97
 RESAMPLES = 4000
 _NORMAL = 1.959964  # deviations of a 95 % interval
@@ -124,8 +125,8 @@ def judged(cell: Cell, seed: int, stated: Callable[[CalibrationRun], Intervals] 
     begin = time.perf_counter()
     elements: dict[str, float | None] = {}
     parameters: dict[str, float | None] = {}
-    if cell.calibrator == TRUTH:
-        poses = case.truth_final_poses
+    if cell.calibrator in (TRUTH, LIKELIHOOD):
+        poses = case.ends(*(case.truth_fit if cell.calibrator == TRUTH else case.likelihood_fit))
     else:
         try:
             run = calibrate(case.dataset, cell.calibrator, options=json.loads(cell.options or "{}"))
@@ -242,47 +243,54 @@ class Ratio:
 
 def error_table(results: Mapping[Cell, list[Row]]) -> Iterator[str]:
     """A line for every class and calibrator, then one for each calibrator over all classes."""
-    truths = {cell.base: {row.seed: row for row in rows} for cell, rows in results.items() if cell.calibrator == TRUTH}
     yield (
-        f"{'class':13s}{'calibrator':24s}sets  failed  1000 x error  truth's form  error / truth's form    "
-        "commands slip   geometric  s"
+        f"{'class':13s}{'calibrator':24s}sets  failed  1000 x error  {TRUTH}  likelihood   error / {TRUTH}    "
+        "error / likelihood     commands slip  geometric  s"
     )
-    ratios: dict[str, list[float]] = {}
+    ratios: dict[str, list[tuple[float, float]]] = {}
     for cell, rows in results.items():
-        if cell.calibrator == TRUTH:
+        pairs = [(row, *both) for row, both in paired(cell, rows, results) if row.errors]
+        if cell.calibrator in (TRUTH, LIKELIHOOD) or not pairs:
             continue
-        pairs = [(row, truths[cell.base][row.seed]) for row in rows if row.errors and row.seed in truths[cell.base]]
-        if not pairs:
-            yield f"{cell.base:13s}{cell.label:24s}   0  {len(rows):6d}  {rows[0].failure if rows else ''}"
-            continue
-        errors = np.array([[np.mean(row.errors), np.mean(true.errors)] for row, true in pairs]).T
-        slipped = np.array([[np.mean(row.with_slip), np.mean(true.with_slip)] for row, true in pairs]).T
-        ratio = Ratio.of(*errors)
-        ratios.setdefault(cell.label, []).append(ratio.value)
-        geometric = float(np.exp(np.log(errors[0] / errors[1]).mean()))
-        seconds = np.mean([row.seconds for row in rows])
+        means, slipped = (
+            np.array([[np.mean(getattr(row, name)) for row in three] for three in pairs]).T
+            for name in ("errors", "with_slip")
+        )
+        ratio, to_likelihood = Ratio.of(means[0], means[1]), Ratio.of(means[0], means[2])
+        ratios.setdefault(cell.label, []).append((ratio.value, to_likelihood.value))
+        own, truth, likelihood = 1000 * means.mean(axis=1)
         yield (
-            f"{cell.base:13s}{cell.label:24s}{len(pairs):4d}  {len(rows) - len(pairs):6d}  "
-            f"{1000 * errors[0].mean():12.1f}  {1000 * errors[1].mean():12.1f}  {ratio!s:22s}  "
-            f"{slipped[0].mean() / slipped[1].mean():13.2f}   {geometric:9.2f}  {seconds:.1f}"
+            f"{cell.base:13s}{cell.label:24s}{len(pairs):4d}  {len(rows) - len(pairs):6d}  {own:12.1f}  "
+            f"{truth:12.1f}  {likelihood:10.1f}   {ratio!s:22s} {to_likelihood!s:22s} "
+            f"{slipped[0].mean() / slipped[1].mean():13.2f}  {np.exp(np.log(means[0] / means[1]).mean()):9.2f}  "
+            f"{np.mean([row.seconds for row in rows]):.1f}"
         )
     for label, of_classes in ratios.items():
-        yield f"{'geometric mean of ' + str(len(of_classes)):37s}{label:30s}{np.exp(np.log(of_classes).mean()):23.2f}"
+        both = np.exp(np.log(of_classes).mean(axis=0))
+        yield f"{label}, geometric mean of {len(of_classes)} classes: {both[0]:.2f} and {both[1]:.2f}"
+
+
+def paired(cell: Cell, rows: Sequence[Row], results: Mapping[Cell, list[Row]]) -> Iterator[tuple[Row, tuple[Row, Row]]]:
+    """Rows of a cell with those of the truth's form and of the true likelihood for the same robots."""
+    by = {name: replace(cell, calibrator=name, options="") for name in (TRUTH, LIKELIHOOD)}
+    of_truth, of_likelihood = ({row.seed: row for row in results.get(each, [])} for each in by.values())
+    for row in rows:
+        if row.seed in of_truth and row.seed in of_likelihood:
+            yield row, (of_truth[row.seed], of_likelihood[row.seed])
 
 
 def effect_table(results: Mapping[Cell, list[Row]]) -> Iterator[str]:
-    """Error over that of the truth's form by effect: geometric mean over the classes of the ratios of means."""
-    truths = {cell.base: {row.seed: row for row in rows} for cell, rows in results.items() if cell.calibrator == TRUTH}
-    yield f"{'error / truth' + chr(39) + 's form, by effect':37s}" + "".join(f"{effect:>13s}" for effect in EFFECTS)
+    """Mean error over that of the truth's form by effect, with the number of robots."""
+    yield f"{'error / ' + TRUTH + ', by effect':37s}" + "".join(f"{effect:>13s}" for effect in EFFECTS)
     for cell, rows in results.items():
-        if cell.calibrator == TRUTH:
+        if cell.calibrator in (TRUTH, LIKELIHOOD):
             continue
         words = []
         for effect in EFFECTS:
             pairs = [
-                (np.mean(row.errors), np.mean(truths[cell.base][row.seed].errors))
-                for row in rows
-                if row.errors and row.effect == effect and row.seed in truths[cell.base]
+                (np.mean(row.errors), np.mean(both[0].errors))
+                for row, both in paired(cell, rows, results)
+                if row.errors and row.effect == effect
             ]
             found, true = np.sum(pairs, axis=0) if pairs else (np.nan, np.nan)
             words.append(f"{found / true:7.2f} ({len(pairs):3d})")
@@ -363,7 +371,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--calibrator", action="append", help="NAME[:options as JSON]; may be given several times")
     parser.add_argument("--classes", nargs="+", choices=CLASSES, default=CLASSES)
     parser.add_argument("--sets", type=int, default=16, help="robots a class")
-    parser.add_argument("--commands", type=int, nargs="+", default=[6], help="of the training runs")
+    parser.add_argument("--commands", type=int, nargs="+", default=[12], help="of the training runs")
     parser.add_argument("--repetitions", type=int, default=3, help="runs of each command, in each session")
     parser.add_argument("--sessions", type=int, default=1)
     parser.add_argument("--effects", nargs="+", choices=EFFECTS, help="that are drawn from; default: see above")
@@ -375,7 +383,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     effects = tuple(given.effects or (EFFECTS[:2] if given.coverage else EFFECTS))
     chosen = [each.partition(":")[::2] for each in given.calibrator or ["posterior"]]
     if not given.coverage:
-        chosen.insert(0, (TRUTH, ""))
+        chosen = [(TRUTH, ""), (LIKELIHOOD, ""), *chosen]
     cells = [
         Cell(base, name, options, commands, given.repetitions, given.sessions, effects, given.coverage)
         for base, commands, (name, options) in product(given.classes, given.commands, chosen)
@@ -383,7 +391,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     results: dict[Cell, list[Row]] = {}
     with one_thread():
         for cell in cells:
-            fresh = given.fresh and cell.calibrator != TRUTH
+            fresh = given.fresh and cell.calibrator not in (TRUTH, LIKELIHOOD)
             results[cell] = rows_of(cell, given.out, given.sets, given.table, fresh)
     tables: list[Iterable[str]] = [error_table(results), effect_table(results)]
     if given.coverage:

@@ -14,11 +14,10 @@ recorded at 20 Hz, poses at 5 Hz with noise, errors of the start heading and of 
 
 Tolerances, one standard deviation, with their sources:
 
-- radius 1 % a wheel: tyres and treads under load (Borenstein and Feng, IEEE T-RA 12:869, 1996: radii of nominally equal
-  wheels differ by up to 1 %, which wears and loads change); places of wheels 1.5 % of their distance: the contact point
-  of a tyre wanders by some mm over its width (the same, section 2: "uncertainty about the wheelbase").
+- radius 1 % a wheel, for tyres and treads under load; places of wheels 1.5 % of their distance, since the contact of a
+  tyre wanders by some mm over its width (both after Borenstein and Feng, IEEE T-RA 12:869, 1996, section 2).
 - direction of an omni wheel's axle 0.5 degrees, zero of a steering angle 1 degree (one that is set with a jig or by
-  eye; a car's, which is aligned by driving straight, 0.3 degrees). The gain of a steering encoder is exact: it is a gear.
+  eye; a car's, which is aligned by driving straight, 0.3 degrees). The gain of a steering encoder is exact, a gear's.
 - rollers: forward and turning 2 %, half-normal, sideways 2 % (omni) and 5 % (mecanum), which strafes at 0.9 or so of
   its command.
 - skid: track times U(1.2, 2), and a centre of turning that is off by 2 cm in x and 1 cm in y (Mandow et al., IROS 2007:
@@ -41,6 +40,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import least_squares
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
@@ -226,7 +226,7 @@ class Base:
 
 
 def car_curvature(places: Array, angles: Array) -> Array:
-    """Mean curvature (...), 1/m, at which the front wheels at places (S, 2) roll without sliding, at angles (..., S)."""
+    """Mean curvature (...), 1/m, of front wheels at places (S, 2) that roll without sliding, at angles (..., S)."""
     tangents = np.tan(angles)
     mean: Array = (tangents / (places[:, 0] + places[:, 1] * tangents)).mean(axis=-1)
     return mean
@@ -489,7 +489,8 @@ class Case:
     """A simulated robot: training runs, judged paths, and its truth.
 
     judged: runs whose last pose is exact, as the robot drives without slip. with_slip: their final poses (J, 3) with
-    the slip of their commands, but not of their runs. matrix (3, M), parameters: the truth.
+    the slip of their commands, but not of their runs. slip: scales of that of commands and of that of runs.
+    matrix (3, M), parameters: the truth.
     """
 
     base: Base
@@ -500,6 +501,7 @@ class Case:
     dataset: Dataset
     judged: tuple[Trajectory, ...]
     with_slip: Array
+    slip: tuple[float, float]
 
     @property
     def final_poses(self) -> Array:
@@ -518,25 +520,34 @@ class Case:
         return self.base.parameters(self.geometry) | lost
 
     def errors(self, final_poses: Array, with_slip: bool = False) -> Array:
-        """Norms (J,) of the errors of final poses (J, 3) of the judged paths, m and rad alike: Eq. (6) is their mean."""
+        """Norms (J,) of the errors of final poses (J, 3) of the judged paths, m and rad: Eq. (6) is their mean."""
         truth = self.with_slip if with_slip else self.final_poses
         norms: Array = np.linalg.norm(final_poses - truth, axis=1)
         return norms
 
     @cached_property
-    def truth_fit(self) -> tuple[Geometry, Effect]:
-        """The fit of the truth's form to the training runs, see fitted."""
-        return fitted(self.base, self.effect, self.dataset.trajectories)
+    def form(self) -> Form:
+        """The fit of the truth's form to the training runs."""
+        return Form(self.base, self.effect.name, self.dataset.trajectories)
 
     @cached_property
-    def truth_final_poses(self) -> Array:
-        """The judged paths' final poses (J, 3) by the fit of the truth's form."""
-        return np.array([path[-1] for path in model_poses(self.base, *self.truth_fit, self.judged)])
+    def truth_fit(self) -> tuple[Geometry, Effect]:
+        """Its answer by the errors along the path, Eq. (2)."""
+        return self.form.model(self.form.by_path())
+
+    @cached_property
+    def likelihood_fit(self) -> tuple[Geometry, Effect]:
+        """Its answer by the true likelihood, Eq. (3): hardly any fit can be better in the mean."""
+        return self.form.model(self.form.by_likelihood(self.slip))
+
+    def ends(self, geometry: Geometry, effect: Effect) -> Array:
+        """The judged paths' final poses (J, 3) by a model."""
+        return np.array([path[-1] for path in model_poses(self.base, geometry, effect, self.judged)])
 
     @property
     def truth_error(self) -> float:
         """Eq. (6) of the fit of the truth's form on the judged paths."""
-        return float(self.errors(self.truth_final_poses).mean())
+        return float(self.errors(self.ends(*self.truth_fit)).mean())
 
 
 def model_poses(base: Base, geometry: Geometry, effect: Effect, runs: Sequence[Trajectory]) -> list[Array]:
@@ -560,47 +571,129 @@ def _at_stamps(
     ]
 
 
-def fitted(
-    base: Base, form: Effect, runs: Sequence[Trajectory], poses_each: int = 9, rounds: int = 4
-) -> tuple[Geometry, Effect]:
-    """The most probable geometry and size of an effect whose form is known (form.name), by the path's errors.
+@dataclass(frozen=True, eq=False)
+class Form:
+    """A fit to runs by the truth's form: unknowns z (n,) are geometry and sizes of an effect, in standard deviations.
 
-    With poses of every run spread along it, and its end, minimised is
-
-        sum_runs 1/T sum_poses ((e_x^2 + e_y^2) / p^2 + e_h^2 / q^2) + |z|^2,
-
-    z being the numbers in the standard deviations that they are drawn with, and p and q the deviations of the errors,
-    taken anew in every round: the form of the calibrator posterior, without its loss.
+    chosen: the poses of each run that are looked at, spread along it, with its end.
     """
-    drives = Drives.of([_recorded(run) for run in runs])
-    chosen = [np.unique(np.round(np.linspace(1, len(run.pose_times) - 1, poses_each)).astype(int)) for run in runs]
-    references = np.concatenate([run.poses[which] for run, which in zip(runs, chosen, strict=True)])
-    shares = np.concatenate([np.full(len(which), 1 / len(which)) for which in chosen])
-    free, design, widths = base.free, base.design.vector, base.widths.vector
-    width = size_unit(base.name, form.name) * math.sqrt(13 / 3) if form.numbers else 0.0  # of U(1, 3)
 
-    def model(unknowns: Array) -> tuple[Geometry, Effect]:
-        vector = design.copy()
-        vector[free] += widths[free] * unknowns[: len(free)]
-        sizes = width * unknowns[len(free) :]
-        return base.design.with_vector(vector), Effect(form.name, tuple(np.append(sizes, [0.0, 0.0])[:2].tolist()))
+    base: Base
+    effect: str
+    runs: tuple[Trajectory, ...]
+    poses_each: int = 9
 
-    def errors(unknowns: Array) -> Array:
-        paths = _at_stamps(base, *model(unknowns), drives, runs)
-        return np.concatenate([path[which] for path, which in zip(paths, chosen, strict=True)]) - references
+    @cached_property
+    def drives(self) -> Drives:
+        """The recorded wheels."""
+        return Drives.of([_recorded(run) for run in self.runs])
 
-    unknowns, deviations = np.zeros(len(free) + form.numbers), np.array([0.01, 0.01, 0.01])
-    for _ in range(rounds):
-        scales = np.sqrt(shares)[:, None] / deviations
+    @cached_property
+    def chosen(self) -> list[NDArray[np.intp]]:
+        """Indices of poses by run."""
+        counts = [len(run.pose_times) - 1 for run in self.runs]
+        return [np.unique(np.round(np.linspace(1, count, self.poses_each)).astype(np.intp)) for count in counts]
 
-        def residuals(numbers: Array, scales: Array = scales) -> Array:
-            return np.concatenate([(errors(numbers) * scales).ravel(), numbers])
+    @cached_property
+    def references(self) -> Array:
+        """The chosen reference poses (S, 3)."""
+        return np.concatenate([run.poses[which] for run, which in zip(self.runs, self.chosen, strict=True)])
 
-        unknowns = least_squares(residuals, unknowns, xtol=1e-5, ftol=1e-7).x
-        squares = shares @ errors(unknowns) ** 2 / max(len(runs) - 1, 1)
-        place = (squares[0] + squares[1]) / 2
-        deviations = np.maximum(np.sqrt([place, place, squares[2]]), 0.003)
-    return model(unknowns)
+    @property
+    def unknowns(self) -> int:
+        """Their number."""
+        return len(self.base.free) + Effect(self.effect).numbers
+
+    def model(self, unknowns: Array) -> tuple[Geometry, Effect]:
+        """The geometry and the effect of unknowns."""
+        free, vector = self.base.free, self.base.design.vector
+        vector[free] += self.base.widths.vector[free] * unknowns[: len(free)]
+        width = size_unit(self.base.name, self.effect) * math.sqrt(13 / 3) if self.effect != "none" else 0.0  # U(1, 3)
+        sizes = np.append(width * unknowns[len(free) :], [0.0, 0.0])[:2]
+        return self.base.design.with_vector(vector), Effect(self.effect, (float(sizes[0]), float(sizes[1])))
+
+    def errors(self, unknowns: Array, of_runs: Array | None = None) -> Array:
+        """Errors (S, 3) of the chosen poses. of_runs (R, 13): slip (9, in units of SLIP_SHAPE), start, clock (s)."""
+        starts, slips, clocks = np.array([run.start for run in self.runs]), None, np.zeros(len(self.runs))
+        if of_runs is not None:
+            slips, clocks = of_runs[:, :9].reshape(-1, 3, 3) * SLIP_SHAPE, of_runs[:, 12]
+            starts = starts + of_runs[:, 9:12]
+        drives = self.drives
+        paths = driven(self.base, *self.model(unknowns), drives.rates, drives.middles, SAMPLE, starts, slips)
+        grid = SAMPLE * np.arange(paths.shape[1])
+        made = [
+            np.column_stack([np.interp(run.pose_times[which] + clock, grid, part) for part in path.T])
+            for run, which, path, clock in zip(self.runs, self.chosen, paths, clocks, strict=True)
+        ]
+        return np.asarray(np.concatenate(made) - self.references)
+
+    def by_path(self, rounds: int = 4) -> Array:
+        """The unknowns that minimise
+
+            sum_runs 1/T sum_poses ((e_x^2 + e_y^2) / p^2 + e_h^2 / q^2) + |z|^2                       (2)
+
+        with the deviations p and q of the errors, taken anew in every round: posterior's form, without its loss.
+        """
+        shares = np.concatenate([np.full(len(which), 1 / len(which)) for which in self.chosen])
+        unknowns, deviations = np.zeros(self.unknowns), np.full(3, 0.01)
+        for _ in range(rounds):
+            scales = np.sqrt(shares)[:, None] / deviations
+
+            def residuals(numbers: Array, scales: Array = scales) -> Array:
+                return np.concatenate([(self.errors(numbers) * scales).ravel(), numbers])
+
+            unknowns = least_squares(residuals, unknowns, xtol=1e-5, ftol=1e-7).x
+            squares = shares @ self.errors(unknowns) ** 2 / max(len(self.runs) - 1, 1)
+            place = (squares[0] + squares[1]) / 2
+            deviations = np.maximum(np.sqrt([place, place, squares[2]]), 0.003)
+        return unknowns
+
+    def by_likelihood(self, slip: tuple[float, float], most: int = 12) -> Array:
+        """The most probable unknowns z by the true likelihood, slip, starts and clocks n being unknown, too.
+
+        Gauss-Newton steps: with errors y + A z + B n, n ~ N(0, P), noise R and C = B P B' + R,
+
+            z = -(A' C^-1 A + 1)^-1 A' C^-1 y,    n = -P B' C^-1 (y + A z).                            (3)
+        """
+        unknowns, of_runs, step = self.by_path(2), np.zeros((len(self.runs), 13)), 1e-4
+        prior, noise = self._prior_of_runs(slip), np.tile(np.square(NOISE), len(self.references))
+        owner = np.repeat(np.arange(len(self.runs)), [3 * len(which) for which in self.chosen])
+        for _ in range(most):
+            errors = self.errors(unknowns, of_runs).ravel()
+            by_unknowns = np.column_stack(
+                [(self.errors(unknowns + step * one, of_runs).ravel() - errors) / step for one in np.eye(len(unknowns))]
+            )
+            by_runs = np.zeros((len(errors), *of_runs.shape))
+            for number, one in enumerate(np.eye(13)):
+                slopes = (self.errors(unknowns, of_runs + step * one).ravel() - errors) / step
+                by_runs[np.arange(len(errors)), owner, number] = slopes
+            by_runs = by_runs.reshape(len(errors), -1)
+            offset = errors - by_unknowns @ unknowns - by_runs @ of_runs.ravel()
+            factor = cho_factor(by_runs @ prior @ by_runs.T + np.diag(noise))
+            solved = cho_solve(factor, np.column_stack([by_unknowns, offset]))
+            information = by_unknowns.T @ solved[:, :-1] + np.eye(len(unknowns))
+            found = -np.linalg.solve(information, by_unknowns.T @ solved[:, -1])
+            moved = float(np.abs(found - unknowns).max())
+            unknowns = found
+            of_runs = -(prior @ by_runs.T @ (solved[:, -1] + solved[:, :-1] @ unknowns)).reshape(of_runs.shape)
+            if moved < 1e-3:
+                break
+        return unknowns
+
+    def _prior_of_runs(self, slip: tuple[float, float]) -> Array:
+        """P of Eq. (3)."""
+        own = np.square([*[slip[1]] * 9, *NOISE[:2], np.hypot(START_HEADING, NOISE[2]), CLOCK])
+        of_command = np.square([*[slip[0]] * 9, *[0.0] * 4])
+        of_session = np.zeros(13)
+        of_session[:9:4] = np.square(SESSION / np.diag(SLIP_SHAPE))
+        commands, sessions = [run.command for run in self.runs], [run.session for run in self.runs]
+        same_command = np.equal.outer(commands, commands).astype(float)
+        same_session = np.equal.outer(sessions, sessions).astype(float) * (len(set(sessions)) > 1)
+        return np.asarray(
+            np.kron(np.eye(len(self.runs)), np.diag(own))
+            + np.kron(same_command, np.diag(of_command))
+            + np.kron(same_session, np.diag(of_session))
+        )
 
 
 @lru_cache(maxsize=64)
@@ -639,7 +732,7 @@ def simulated_case(
     name: str,
     seed: int,
     *,
-    commands: int = 6,
+    commands: int = 12,
     repetitions: int = 3,
     sessions: int = 1,
     effects: Sequence[str] = EFFECTS,
@@ -704,7 +797,17 @@ def simulated_case(
         for number, path in enumerate(paths)
     ]
     checked = make_dataset(f"{name} {seed} judged", base.robot, SAMPLE, judged, simulated=True).trajectories
-    return Case(base, seed, geometry, true, tuple(trained), dataset, checked, slipped[:, -1])
+    return Case(
+        base,
+        seed,
+        geometry,
+        true,
+        tuple(trained),
+        dataset,
+        checked,
+        slipped[:, -1],
+        (float(slip_of_command), float(slip_of_run)),
+    )
 
 
 def _recording(
@@ -717,7 +820,7 @@ def _recording(
     session: str,
     started_at: float,
 ) -> Trajectory:
-    """A run as it is recorded, from its wheels (F, N), (F, S) and path (F' + 1, 3) in steps of FINE; rng None: exact."""
+    """A run as it is recorded, from its wheels (F, N), (F, S) and path (F' + 1, 3) at FINE; rng None: exact."""
     (rates, steering), each = wheels, round(SAMPLE / FINE)
     count = len(rates) // each
     stamps = np.arange(0.0, len(rates) * FINE + 1e-9, POSE)
