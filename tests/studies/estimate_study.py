@@ -27,6 +27,7 @@ In a Python shell: ``for case in simulated_cases("omni", 16): case.dataset, case
 from __future__ import annotations
 
 import argparse
+import ast
 import hashlib
 import json
 import re
@@ -58,7 +59,22 @@ TRUTH, LIKELIHOOD = "truth's form", "true likelihood"
 LEVEL, LEAST, MOST = 0.95, 0.93, 0.97
 RESAMPLES = 4000
 _NORMAL = 1.959964  # deviations of a 95 % interval
-_ROUNDING = 1e-12  # m and rad: smaller elements are 0
+_ROUNDING = 1e-12  # m/rad and rad/rad: smaller elements are 0
+
+
+def code_digest(path: Path) -> str:
+    """Digest of a file's code, without its comments and docstrings."""
+    tree = ast.parse(path.read_text())
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(body, list):  # a text alone in a line does nothing
+            node.body = [  # type: ignore[attr-defined]
+                each for each in body if not (isinstance(each, ast.Expr) and isinstance(each.value, ast.Constant))
+            ]
+    return hashlib.sha256(ast.dump(tree).encode()).hexdigest()
+
+
+SIMULATION = code_digest(Path(simulated_robots.__file__))
 
 
 @dataclass(frozen=True)
@@ -93,8 +109,7 @@ class Cell:
 
     def path(self, folder: Path) -> Path:
         """The file of its results."""
-        source = Path(simulated_robots.__file__).read_bytes()
-        choices = json.dumps([asdict(self), hashlib.sha256(source).hexdigest()])
+        choices = json.dumps([asdict(self), SIMULATION])
         digest = hashlib.sha256(choices.encode()).hexdigest()[:8]
         return folder / f"{re.sub(r'[^a-z_]', '', self.calibrator)}-{self.base}-{self.commands}-{digest}.jsonl"
 
@@ -168,27 +183,21 @@ def stated_elements(run: CalibrationRun) -> Intervals:
 
 
 def stated_parameters(run: CalibrationRun) -> Intervals:
-    """The physical parameters of a calibration with their 95 % intervals, by their names in DESIGN.md.
+    """The physical parameters of a calibration that have a 95 % interval, by their names in DESIGN.md.
 
-    From ``parameters`` of the calibration, where it has them, as calibrate's --json prints them; else from its
-    uncertainty, which has those of robots whose matrix tells the geometry.
+    Exchange this function where they are found elsewhere; ``judged`` takes another one.
     """
-    stated: Any = getattr(run.calibration, "parameters", None)
-    if isinstance(stated, Mapping):
-        content = {name: value if isinstance(value, Mapping) else vars(value) for name, value in stated.items()}
-        found = {name: (each["value"], each["low"], each["high"]) for name, each in content.items()}
-    else:
-        estimates = run.uncertainty.parameters if run.uncertainty else None
-        found = {each.name: (each.value, each.low, each.high) for each in estimates or ()}
+    stated: Iterable[Any] = run.parameters or getattr(run.uncertainty, "parameters", None) or ()
+    ends = {each.name: (each.value, getattr(each, "low", None), getattr(each, "high", None)) for each in stated}
     return {
         name: (float(value), float(low), float(high))
-        for name, (value, low, high) in found.items()
+        for name, (value, low, high) in ends.items()
         if low is not None and high is not None
     }
 
 
 def places_of_truth(truth: Mapping[str, float], stated: Intervals) -> dict[str, float | None]:
-    """Where true values lie in their intervals, -1 and 1 being the ends; None where no interval is stated."""
+    """Where true values lie in their intervals, -1 and 1 being the ends; None where there is none, or one of width 0."""
     places: dict[str, float | None] = {}
     for name, true in truth.items():
         value, low, high = stated.get(name, (np.nan,) * 3)
@@ -196,11 +205,7 @@ def places_of_truth(truth: Mapping[str, float], stated: Intervals) -> dict[str, 
         if name.startswith(("angle", "steering_zero", "mount_yaw")):
             error = float(np.angle(np.exp(1j * error)))
         reach = high - value if error > 0 else value - low
-        if np.isnan(reach):
-            places[name] = None
-        else:
-            outside = np.sign(error) * 1e3 if abs(error) > _ROUNDING else 0.0
-            places[name] = round(float(np.clip(error / reach, -1e3, 1e3)), 4) if reach > 0 else float(outside)
+        places[name] = round(float(np.clip(error / reach, -1e3, 1e3)), 4) if reach > 0 else None
     return places
 
 
@@ -336,7 +341,7 @@ def holm(p_values: Sequence[float], alpha: float = 1 - LEVEL) -> list[bool]:
 
 def coverage_table(results: Mapping[Cell, list[Row]], of: str) -> Iterator[str]:
     """A line for every cell. of: elements or parameters."""
-    lines, shares = [], []
+    lines: list[tuple[str, Share | None, str, int]] = []
     for cell, rows in results.items():
         stated: list[dict[str, float | None]] = [getattr(row, of) for row in rows]
         places = [{name: abs(place) for name, place in each.items() if place is not None} for each in stated]
@@ -345,7 +350,7 @@ def coverage_table(results: Mapping[Cell, list[Row]], of: str) -> Iterator[str]:
             f"{cell.base:13s}{cell.label:24s}{cell.commands:8d}{cell.sessions:9d}{len(own):6d}{len(rows) - len(own):8d}"
         )
         if not own:
-            yield f"{head}  none stated"
+            lines.append((head, None, "none stated", 0))
             continue
         share = Share.of([float(np.mean([place <= 1 for place in each.values()])) for each in own])
         names = sorted({name for each in own for name in each})
@@ -353,15 +358,18 @@ def coverage_table(results: Mapping[Cell, list[Row]], of: str) -> Iterator[str]:
         worst = min(by_name, key=lambda name: by_name[name])
         without = sum(place is None for each in stated for place in each.values())
         lines.append((head, share, f"{worst} {100 * by_name[worst]:.1f}", without))
-        shares.append(share.p_value)
     yield (
         f"{of:13s}{'calibrator':24s}commands sessions  sets without  held, % (exact 95 %)     verdict    "
         "least               not stated"
     )
-    for (head, share, worst, without), stands in zip(lines, holm(shares), strict=True):
-        low, high = share.interval()
-        held = f"{100 * share.hits / share.sets:5.1f} ({100 * low:.1f} to {100 * high:.1f})"
-        yield f"{head}  {held:24s} {'holds' if stands else 'FAILS':9s}  {worst:20s}{without:10d}"
+    verdicts = iter(holm([share.p_value for _, share, _, _ in lines if share]))
+    for head, each, worst, without in lines:
+        if each is None:
+            yield f"{head}  {worst}"
+            continue
+        low, high = each.interval()
+        held = f"{100 * each.hits / each.sets:5.1f} ({100 * low:.1f} to {100 * high:.1f})"
+        yield f"{head}  {held:24s} {'holds' if next(verdicts) else 'FAILS':9s}  {worst:20s}{without:10d}"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -372,8 +380,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--classes", nargs="+", choices=CLASSES, default=CLASSES)
     parser.add_argument("--sets", type=int, default=16, help="robots a class")
     parser.add_argument("--commands", type=int, nargs="+", default=[12], help="of the training runs")
-    parser.add_argument("--repetitions", type=int, default=3, help="runs of each command, in each session")
-    parser.add_argument("--sessions", type=int, default=1)
+    parser.add_argument("--repetitions", type=int, help="runs of a command, in each session; default 3, of coverage 2")
+    parser.add_argument("--sessions", type=int, nargs="+", default=[1], help="more than one differ")
     parser.add_argument("--effects", nargs="+", choices=EFFECTS, help="that are drawn from; default: see above")
     parser.add_argument("--coverage", action="store_true", help="judge intervals, not errors")
     parser.add_argument("--table", action="store_true", help="only print what is there")
@@ -384,9 +392,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     chosen = [each.partition(":")[::2] for each in given.calibrator or ["posterior"]]
     if not given.coverage:
         chosen = [(TRUTH, ""), (LIKELIHOOD, ""), *chosen]
+    repetitions = given.repetitions or (2 if given.coverage else 3)
     cells = [
-        Cell(base, name, options, commands, given.repetitions, given.sessions, effects, given.coverage)
-        for base, commands, (name, options) in product(given.classes, given.commands, chosen)
+        Cell(base, name, options, commands, repetitions, sessions, effects, given.coverage)
+        for base, commands, sessions, (name, options) in product(given.classes, given.commands, given.sessions, chosen)
     ]
     results: dict[Cell, list[Row]] = {}
     with one_thread():

@@ -173,13 +173,19 @@ class Base:
         return made
 
     def matrix(self, geometry: Geometry) -> Array:
-        """The matrix (3, M) by the robot's drive signals, as omnibench counts them; of a car for small zeros."""
+        """The matrix (3, M) by the robot's drive signals, as omnibench counts them; of a car the best one.
+
+        A car's curvature is a bent function of its measured angles; the line through it is for tangents up to 0.5.
+        """
         solution, radii = self.solution(geometry), geometry.radii
         if self.name == "car":
-            (left, right), zero = radii, geometry.zeros.mean()
-            length = geometry.places[2:, 0].mean()
+            (left, right), design = radii, self.design.places[2:]
+            tangents = np.linspace(-0.5, 0.5, 21)
+            nominal = (tangents / design[:, 0].mean())[:, None]
+            angles = np.arctan(design[:, 0] * nominal / (1 - design[:, 1] * nominal))
+            turning, straight = np.polyfit(tangents, car_curvature(geometry.places[2:], angles + geometry.zeros), 1)
             mean, skew = (left + right) / 2, (right - left) / 4
-            centre = np.array([[mean, 0.0, skew], [0.0] * 3, [mean * zero / length, mean / length, 0.0]])
+            centre = np.array([[mean, 0.0, skew], [0.0] * 3, [mean * straight, mean * turning, 0.0]])
             return np.asarray(solution @ centre)
         if not self.steers:
             return np.asarray(solution[:, : len(radii)] * radii)
@@ -194,26 +200,37 @@ class Base:
     def parameters(self, geometry: Geometry) -> dict[str, float]:
         """Physical parameters by their names in DESIGN.md, as far as motion can tell them.
 
-        A radius is the effective one, with the rollers' loss ahead, and so is the track of a skid-steered base.
+        They are effective: wheels on rollers are those that would move as these do without loss, the track of a
+        skid-steered base is the one by which it turns, and the tracked point takes in where the wheels' middle is.
         """
-        names, lost = self.robot.wheel_names, 1 - geometry.losses[0]
-        made = {f"radius_{name}": float(r * lost) for name, r in zip(names, geometry.radii, strict=True)}
+        names, radii, mount = self.robot.wheel_names, geometry.radii, geometry.mount
         x, y = geometry.places.T
-        if self.name in ("differential", "skid"):
-            made["track"] = float(geometry.skid[0] * (y[y > 0].mean() - y[y < 0].mean()))
+        if self.name in ("omni", "mecanum"):
+            slant = np.tan(self.rollers)
+            by_x, by_y, by_turn = (self.rows(geometry) / (1 - geometry.losses) / radii[:, None]).T
+            radii = np.hypot(1.0, slant) / np.hypot(by_x, by_y)
+            made = {f"distance_{n}": float(d) for n, d in zip(names, by_turn * radii, strict=True)}
+            axles = np.arctan2(by_y, by_x) - np.arctan2(1.0, slant)
+            made |= {f"angle_{n}": float(a) for n, a in zip(names, axles, strict=True)}
+            return made | {f"radius_{n}": float(r) for n, r in zip(names, radii, strict=True)}
+        made = {f"radius_{n}": float(r) for n, r in zip(names, radii, strict=True)}
+        made |= {f"steering_zero_{n}": float(z) for n, z in zip(self.robot.drive.steered, geometry.zeros, strict=True)}
         if self.name == "car":
-            made |= {"track": float(y[0] - y[1]), "wheelbase": float(x[2:].mean())}
-        if self.name == "tricycle":
+            made["wheelbase"] = float(x[2:].mean())
+            mount = mount - [0.0, y[:2].mean(), 0.0]
+        elif self.name == "tricycle":
             made["wheelbase"] = float(x[0])
-        if self.name == "omni":
-            turning = lost / (1 - geometry.losses[2])  # the matrix says radius / distance
-            made |= {f"distance_{n}": float(turning * d) for n, d in zip(names, np.hypot(x, y), strict=True)}
-            made |= {f"angle_{n}": float(a - math.pi / 2) for n, a in zip(names, geometry.rolling, strict=True)}
-        if self.name in ("tricycle", "swerve"):
-            made |= {f"steering_zero_{n}": float(z) for n, z in zip(names, geometry.zeros, strict=True)}
-        if self.name in ("tricycle", "car"):
-            made |= dict(zip(("mount_x", "mount_y", "mount_yaw"), geometry.mount.tolist(), strict=True))
-        return made
+            mount = mount - [0.0, y[0], 0.0]
+        elif self.name == "swerve":
+            made["wheelbase"] = float(x[:2].mean() - x[2:].mean())
+            made["track"] = float(y[[0, 2]].mean() - y[[1, 3]].mean())
+            return made
+        else:
+            factor, centre_x, centre_y = geometry.skid
+            made["track"] = float(factor * (y[y > 0].mean() - y[y < 0].mean()))
+            middle = factor * y.mean() - (factor - 1) * centre_y  # at w = 1 the mean wheel rolls at minus this
+            mount = mount - [centre_x, middle, 0.0]
+        return made | dict(zip(("mount_x", "mount_y", "mount_yaw"), mount.tolist(), strict=True))
 
     def drawn(self, rng: np.random.Generator) -> Geometry:
         """A robot of the class."""
@@ -648,7 +665,7 @@ class Form:
             deviations = np.maximum(np.sqrt([place, place, squares[2]]), 0.003)
         return unknowns
 
-    def by_likelihood(self, slip: tuple[float, float], most: int = 12) -> Array:
+    def by_likelihood(self, slip: tuple[float, float], most: int = 8) -> Array:
         """The most probable unknowns z by the true likelihood, slip, starts and clocks n being unknown, too.
 
         Gauss-Newton steps: with errors y + A z + B n, n ~ N(0, P), noise R and C = B P B' + R,
@@ -676,7 +693,7 @@ class Form:
             moved = float(np.abs(found - unknowns).max())
             unknowns = found
             of_runs = -(prior @ by_runs.T @ (solved[:, -1] + solved[:, :-1] @ unknowns)).reshape(of_runs.shape)
-            if moved < 1e-3:
+            if moved < 0.01:
                 break
         return unknowns
 
@@ -741,10 +758,11 @@ def simulated_case(
     """The simulated robot of a class and a seed.
 
     commands, repetitions: of the training runs, the latter in each session. sessions: more than one differ by SESSION.
-    effects: one of them is drawn. all_kinds: train on all kinds of path in turn, else on some, and judge the others.
+    effects: that of the robot is one of them, in turn by its seed. all_kinds: train on all kinds of path in turn, else
+    on some, and judge the others.
     """
     base, rng = base_of(name), np.random.default_rng([zlib.crc32(name.encode()), seed])
-    geometry, effect = base.drawn(rng), str(rng.choice(list(effects)))
+    geometry, effect = base.drawn(rng), effects[(seed + CLASSES.index(name)) % len(effects)]
     size, direction = rng.uniform(1.0, 3.0), rng.uniform(0.0, 2 * math.pi)
     sign = 1.0 if effect == "lost_rate" or rng.random() < 0.5 else -1.0
     if effect == "none":
