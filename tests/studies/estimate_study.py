@@ -197,7 +197,7 @@ def stated_parameters(run: CalibrationRun) -> Intervals:
 
 
 def places_of_truth(truth: Mapping[str, float], stated: Intervals) -> dict[str, float | None]:
-    """Where true values lie in their intervals, -1 and 1 being the ends; None where there is none, or one of width 0."""
+    """Where true values lie in their intervals, -1 and 1 being the ends; None where there is none with a width."""
     places: dict[str, float | None] = {}
     for name, true in truth.items():
         value, low, high = stated.get(name, (np.nan,) * 3)
