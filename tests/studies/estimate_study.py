@@ -13,7 +13,7 @@ the mean norm of the final poses' errors, m and rad alike, against final poses w
 the ratio of the mean error to that of the truth's form (the same fit given the true effect, Form.by_path), with a 95 %
 interval over robots (bootstrap), and to that of the true likelihood (Form.by_likelihood), which knows how much slips;
 then the first ratio where the judged commands slip, too (not their runs), the geometric mean of the robots' ratios, and
-the ratio by effect.
+the ratio by effect. Calibrators are compared with the first one, too, robot by robot.
 
 **Coverage** (--coverage). All kinds of path are trained on, and the effects are those that posterior knows, none and a
 lost rate, unless --effects names others. Slip is 0 in the mean, so the truth is the geometry, and with --sessions the
@@ -302,6 +302,30 @@ def effect_table(results: Mapping[Cell, list[Row]]) -> Iterator[str]:
         yield f"{cell.base:13s}{cell.label:24s}" + "".join(f"{word:>13s}" for word in words)
 
 
+def comparison_table(results: Mapping[Cell, list[Row]]) -> Iterator[str]:
+    """Mean error of every calibrator over that of the first one on the same robots, by class."""
+    fitted = [cell for cell in results if cell.calibrator not in (TRUTH, LIKELIHOOD)]
+    labels = list(dict.fromkeys(cell.label for cell in fitted))
+    yield f"error / that of {labels[0]}"
+    for label in labels[1:]:
+        ratios = []
+        for cell in fitted:
+            if cell.label != label:
+                continue
+            first = replace(cell, calibrator=fitted[0].calibrator, options=fitted[0].options)
+            of_first = {row.seed: np.mean(row.errors) for row in results[first] if row.errors}
+            pairs = [
+                (np.mean(row.errors), of_first[row.seed])
+                for row in results[cell]
+                if row.errors and row.seed in of_first
+            ]
+            if pairs:
+                ratios.append(Ratio.of(*np.array(pairs).T))
+                yield f"{cell.base:13s}{label:24s}{len(pairs):4d}  {ratios[-1]}"
+        mean = np.exp(np.mean([np.log(ratio.value) for ratio in ratios])) if ratios else np.nan
+        yield f"{label}, geometric mean of {len(ratios)} classes: {mean:.2f}"
+
+
 @dataclass(frozen=True)
 class Share:
     """A share of intervals that hold the truth, over sets (n,) of the set's own share: exact, a set as one trial."""
@@ -402,7 +426,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for cell in cells:
             fresh = given.fresh and cell.calibrator not in (TRUTH, LIKELIHOOD)
             results[cell] = rows_of(cell, given.out, given.sets, given.table, fresh)
-    tables: list[Iterable[str]] = [error_table(results), effect_table(results)]
+    tables: list[Iterable[str]] = [error_table(results), effect_table(results), comparison_table(results)]
     if given.coverage:
         tables = [coverage_table(results, "elements"), coverage_table(results, "parameters")]
     print("\n\n".join("\n".join(table) for table in tables))

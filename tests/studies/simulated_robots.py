@@ -665,16 +665,23 @@ class Form:
             deviations = np.maximum(np.sqrt([place, place, squares[2]]), 0.003)
         return unknowns
 
-    def by_likelihood(self, slip: tuple[float, float], most: int = 8) -> Array:
+    def by_likelihood(self, slip: tuple[float, float], most: int = 10) -> Array:
         """The most probable unknowns z by the true likelihood, slip, starts and clocks n being unknown, too.
 
-        Gauss-Newton steps: with errors y + A z + B n, n ~ N(0, P), noise R and C = B P B' + R,
+        Gauss-Newton steps, halved where they lead up. With errors y + A z + B n, n ~ N(0, P), and noise of covariance
+        R, C = B P B' + R,
 
             z = -(A' C^-1 A + 1)^-1 A' C^-1 y,    n = -P B' C^-1 (y + A z).                            (3)
         """
         unknowns, of_runs, step = self.by_path(2), np.zeros((len(self.runs), 13)), 1e-4
         prior, noise = self._prior_of_runs(slip), np.tile(np.square(NOISE), len(self.references))
+        of_prior = cho_factor(prior)
         owner = np.repeat(np.arange(len(self.runs)), [3 * len(which) for which in self.chosen])
+
+        def loss(unknowns: Array, of_runs: Array) -> float:
+            errors, flat = self.errors(unknowns, of_runs).ravel(), of_runs.ravel()
+            return float((errors**2 / noise).sum() + flat @ cho_solve(of_prior, flat) + unknowns @ unknowns)
+
         for _ in range(most):
             errors = self.errors(unknowns, of_runs).ravel()
             by_unknowns = np.column_stack(
@@ -690,10 +697,13 @@ class Form:
             solved = cho_solve(factor, np.column_stack([by_unknowns, offset]))
             information = by_unknowns.T @ solved[:, :-1] + np.eye(len(unknowns))
             found = -np.linalg.solve(information, by_unknowns.T @ solved[:, -1])
-            moved = float(np.abs(found - unknowns).max())
-            unknowns = found
-            of_runs = -(prior @ by_runs.T @ (solved[:, -1] + solved[:, :-1] @ unknowns)).reshape(of_runs.shape)
-            if moved < 0.01:
+            found_runs = -(prior @ by_runs.T @ (solved[:, -1] + solved[:, :-1] @ found)).reshape(of_runs.shape)
+            before, share = loss(unknowns, of_runs), 1.0
+            change, change_of_runs = found - unknowns, found_runs - of_runs
+            while share > 1e-3 and not loss(unknowns + share * change, of_runs + share * change_of_runs) < before:
+                share /= 2
+            unknowns, of_runs = unknowns + share * change, of_runs + share * change_of_runs
+            if np.abs(change).max() < 0.01 or share <= 1e-3:
                 break
         return unknowns
 
