@@ -19,6 +19,7 @@ from omnibench.fit.certify import QUADRATURE, CertifiedCalibration
 from omnibench.fit.evaluate import Evaluation
 from omnibench.fit.uncertainty import ElementIntervals
 from omnibench.report.blocks import Cell, Column, Row, Table
+from omnibench.report.calibration_report import parameter_table
 from omnibench.report.numbers import noise_in_words
 from omnibench.robot.calibration import Calibration, HeldOutVerdict
 from omnibench.robot.export.c_header import left_out
@@ -81,7 +82,7 @@ def print_calibration(console: Console, run: CalibrationRun, others: Sequence[st
             lines.append(f"noise of the reference: {'; '.join(noise_in_words(run.calibration.noise))}")
     room = _SCREEN - _height(console, *others)
     if run.parameters:
-        parameters = render_table(_parameter_table(run), console.width)
+        parameters = render_table(parameter_table(run.calibration, _title(run).replace(" ", _NO_BREAK)), console.width)
         console.print(parameters)
         room -= _height(console, parameters)
 
@@ -120,23 +121,6 @@ def _height(console: Console, *shown: RenderableType) -> int:
     tables = [len(console.render_lines(each)) for each in shown if not isinstance(each, str)]
     width = console.width if console.is_terminal else sys.maxsize
     return sum(tables) + sum(-(-max(len(line), 1) // width) for text in texts for line in text)
-
-
-def _parameter_table(run: CalibrationRun) -> Table:
-    """The physical parameters beside the design: angles in degrees, and differences from the design in % or degrees."""
-    rows = []
-    for each in run.parameters:
-        factor, decimals, unit = {"rad": (math.degrees(1.0), 3, "deg"), "1": (1.0, 4, "")}.get(
-            each.unit, (1.0, 5, each.unit)
-        )
-        percent = None if each.unit == "rad" else each.deviation_percent
-        change = f"{factor * each.deviation:+.{decimals}f} {unit}" if percent is None else f"{percent:+.2f} %"
-        ends = [] if each.low is None or each.high is None else [each.low, each.high]
-        interval = " to ".join(f"{factor * end:.{decimals}f}" for end in ends) or _NONE
-        values = (f"{factor * value:.{decimals}f}" for value in (each.design, each.value))
-        rows.append(Row.of(each.name, *values, unit, change, interval))
-    headings = (Column("design"), Column("value"), Column("", numeric=False), Column("change"), Column("95 %"))
-    return Table("", (Column(_title(run).replace(" ", _NO_BREAK), numeric=False), *headings), tuple(rows))
 
 
 def _title(run: CalibrationRun) -> str:
