@@ -5,7 +5,7 @@ from pathlib import Path
 from commands import assert_refused, run_here, succeeded
 
 import omnibench
-from omnibench.data.storage import write_dataset
+from omnibench.data.storage import save_dataset
 from omnibench.data.storage import save_dataset
 from omnibench.report import blocks as page
 from omnibench.report.calibration_report import calibration_document
