@@ -6,11 +6,10 @@ from commands import assert_refused, run_here, succeeded
 
 import omnibench
 from omnibench.data.storage import save_dataset
-from omnibench.data.storage import save_dataset
 from omnibench.report import blocks as page
 from omnibench.report.calibration_report import calibration_document
 from omnibench.report.render import render
-from omnibench.testing import synthetic_dataset
+from omnibench.testing.synthetic import synthetic_dataset
 
 
 def test_the_report_answers_first_and_shows_paths_parameters_and_errors_by_motion() -> None:
