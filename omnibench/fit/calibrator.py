@@ -17,7 +17,7 @@ from omnibench.errors import ConfigError, DataError, NotApplicableError, Omniben
 from omnibench.fit.parameterisation import ParameterisationName
 from omnibench.fit.prior import MountChoice
 from omnibench.fit.problem import BudgetSpent, CalibrationProblem, Improvement
-from omnibench.fit.span import Unidentified
+from omnibench.fit.span import Treatment, Unidentified
 from omnibench.jobs.job_process import memory_limit
 from omnibench.registry import AnyOptions, Options, PluginFailure, calibrators
 from omnibench.robot import calibration as saved
@@ -114,12 +114,12 @@ calibrators.contract = Calibrator
 
 def as_answered(
     calibrator: type[Calibrator] | Calibrator, unidentified: Unidentified, mount: MountChoice | None
-) -> tuple[Unidentified, MountChoice | None]:
+) -> tuple[Treatment, MountChoice | None]:
     """How answers are treated: as asked for, unless they stand as they are or weigh the design by themselves."""
     if calibrator.as_is:
         return "fit", "fit"
     if calibrator.weighs_design:
-        return "fit", mount
+        return "weigh", mount
     if unidentified == "shrink":
         warnings.warn(
             f"unidentified: shrink is what calibrator map does by itself; {calibrator.name} keeps the design instead",

@@ -82,7 +82,7 @@ def quick_fit(robot: Robot, runs: Sequence[Trajectory], integration: Integration
         ]
     odometry = odometry_of([run.reference_log for run in posed], integration)
     observed = np.concatenate([run.poses[1:] for run in posed])
-    held = directions_kept(robot, driven_span(posed), "shrink")
+    held = directions_kept(robot, driven_span(posed), "keep")
     _, _, directions = np.linalg.svd(np.vstack([held, np.zeros((1, len(robot.drive.names)))]))
     directions = directions[len(held) :]
     matrix = linear_fit(odometry, posed, observed, robot.inverse_kinematic_matrix, directions)

@@ -145,8 +145,8 @@ class Provenance(config.Model):
         None, description="of the cost's norms; None: as the calibrator takes them", exclude_if=_is_none
     )
     box: str
-    unidentified: Literal["keep", "fit", "shrink"] = Field("keep", description="what the data hardly tell")
-    tolerance: float | None = Field(None, description="of the design, for shrink; None: that of the robot's class")
+    unidentified: Literal["keep", "fit", "shrink", "weigh"] = Field("keep", description="what the data hardly tell")
+    tolerance: float | None = Field(None, description="of the design, for map; None: that of the robot's class")
     mount: Literal["known", "fit"] | None = Field(None, description="tracked point of a robot that cannot slide")
     unshrunk_cost: float | None = Field(None, description="training cost before it was shrunk to the design")
     on_bounds: tuple[str, ...] = Field((), description="fitted numbers on a bound of the box")
