@@ -28,6 +28,7 @@ from omnibench.words import plural
 
 _NONE = "no interval"
 _NO_BREAK = "\u00a0"
+_HEADING = 24  # columns: a longer title stands above its table; chosen
 _SCREEN = 25  # lines that a command prints at most, so that a terminal shows all
 _ROWS = ("x (m/rad)", "y (m/rad)", "w (rad/rad)")
 _NOTHING_TO_GAIN = 0.01  # share of the cost that is not worth another search; chosen
@@ -135,7 +136,9 @@ def _parameter_table(run: CalibrationRun) -> Table:
         values = (f"{factor * value:.{decimals}f}" for value in (each.design, each.value))
         rows.append(Row.of(each.name, *values, unit, change, interval))
     headings = (Column("design"), Column("value"), Column("", numeric=False), Column("change"), Column("95 %"))
-    return Table("", (Column(_title(run).replace(" ", _NO_BREAK), numeric=False), *headings), tuple(rows))
+    title = _title(run)
+    caption, first = ("", title.replace(" ", _NO_BREAK)) if len(title) <= _HEADING else (title, "parameter")
+    return Table(caption, (Column(first, numeric=False), *headings), tuple(rows))
 
 
 def _title(run: CalibrationRun) -> str:
