@@ -26,6 +26,7 @@ from omnibench.words import plural
 _CALIBRATED = page.LegendItem("calibrated", "calibration", CALIBRATED)
 _TURNS = 0.35  # rad: a run that turns less in all is straight; chosen
 _ON_THE_SPOT = 0.5  # m a radian: a run that drives less turns on the spot, as seen from the wheels' reach; chosen
+_HEADING = 24  # letters of a title that is the heading of a column
 _INTERVAL_WIDTH = 22  # px that the plot of a parameter takes
 
 
@@ -93,7 +94,9 @@ def parameter_table(calibration: Calibration, title: str = "") -> page.Table:
         page.Column("change"),
         page.Column("95 %"),
     )
-    return page.Table("", (page.Column(title or "parameter", numeric=False), *headings), tuple(rows))
+    heading = title.replace(" ", "\N{NO-BREAK SPACE}") if 0 < len(title) <= _HEADING else "parameter"
+    caption = title if len(title) > _HEADING else ""
+    return page.Table(caption, (page.Column(heading, numeric=False), *headings), tuple(rows))
 
 
 def _tiles(errors: Sequence[Array], verdict: HeldOutVerdict) -> tuple[page.Fact, ...]:

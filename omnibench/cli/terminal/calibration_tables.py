@@ -82,7 +82,7 @@ def print_calibration(console: Console, run: CalibrationRun, others: Sequence[st
             lines.append(f"noise of the reference: {'; '.join(noise_in_words(run.calibration.noise))}")
     room = _SCREEN - _height(console, *others)
     if run.parameters:
-        parameters = render_table(parameter_table(run.calibration, _title(run).replace(" ", _NO_BREAK)), console.width)
+        parameters = render_table(parameter_table(run.calibration, _title(run)), console.width)
         console.print(parameters)
         room -= _height(console, parameters)
 
