@@ -78,7 +78,7 @@ class Map(Calibrator):
         clock = (options.clock_offset * (options.clock != "none"), options.clock_slope * options.clock.count("slope"))
         loss = loss_of(problem.objective)
 
-        def most_probable(unknowns: tuple[Unknown, ...]) -> Estimate:
+        def most_probable(unknowns: tuple[Unknown, ...], near: Estimate | None = None) -> Estimate:
             of_runs = EstimateProblem(
                 robot,
                 problem.trajectories,
@@ -89,7 +89,7 @@ class Map(Calibrator):
                 Nuisances(options.start_heading, *clock),
                 "huber" if loss == "squares" else loss,
             )
-            return estimate(of_runs, may_go_on)
+            return estimate(of_runs, may_go_on, near)
 
         def may_go_on(steps: int) -> bool:
             problem.report(steps, _MOST_STEPS, "step")
@@ -110,7 +110,7 @@ class Map(Calibrator):
             extension = ModelExtension(
                 effects=tuple(map(EffectTerm.of, found.terms)),
                 covariance=covariance_rows(covariance.matrix),
-                plain=matrix_rows(most_probable(()).matrix),
+                plain=matrix_rows(most_probable((), found).matrix),
             )
         if lost:
             rate = float(found.terms[0].values[_PARAMETER])
