@@ -42,14 +42,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
-from omnibench.data.stored import count_drawn, drawn_runs
+from omnibench.data.stored import count_drawn, drawn_runs, median_period
 from omnibench.errors import ConfigError, DataError
 from omnibench.fit.loss import Loss, LossName, Squares, make_loss
+from omnibench.fit.prior import physical_prior_root, physical_tolerance
 from omnibench.fit.reference_rows import ReferenceBatch, reference_rows
 from omnibench.registry import effects
 from omnibench.robot.corrections import corrected, needs_of
 from omnibench.robot.effects.effect import Term, make_term
 from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog
 from omnibench.robot.signals import signals_of
 from omnibench.robot.stored_odometry import together
@@ -63,6 +65,8 @@ _STEP = 0.1  # prior deviations by which a parameter of an effect is moved for i
 _RESTING_OF_MANY = 0.03  # prior deviations: the same where a step reads very many samples; chosen
 _MOST_STEPS, _RESTING = 40, 1e-4  # steps, and the largest step, in prior deviations, that counts as none
 _UNTOLD = 1e3  # times its sigma: weight of a position of a run that hardly leaves its place, and tells no heading
+LOST_RATE = ("wheel_dead_zone", "c")  # the effect that every robot has, and its parameter
+USUAL_NUISANCES = (0.005, 0.1)  # rad and s, of start headings and of clocks: see calibrators/map.py
 PLACE, HEADING = "pose position", "pose heading"  # kinds of error of poses
 
 
@@ -118,6 +122,10 @@ class Estimate:
         """The product of the excess errors: the smaller, the better the runs are explained."""
         return float(np.prod(list(self.excess.values())))
 
+    def model(self, problem: EstimateProblem) -> OdometryModel:
+        """The odometry model that was estimated for a problem."""
+        return OdometryModel(problem.robot, self.matrix, problem.integration, self.terms, problem.sample_period)
+
 
 @dataclass(frozen=True, eq=False)
 class EstimateProblem:
@@ -150,6 +158,14 @@ class EstimateProblem:
             by_effect.setdefault(unknown.effect, {})[unknown.parameter] = value
         terms = tuple(make_term(name, parameters, self.robot) for name, parameters in by_effect.items())
         return design + (self.root @ unknowns[:count]).reshape(design.shape), terms
+
+
+def usual_problem(robot: Robot, runs: Sequence[Trajectory], integration: Integration = "arc") -> EstimateProblem:
+    """What the calibrator map estimates by its default options: matrix, lost rate, start headings and clocks."""
+    tolerance = physical_tolerance(robot)
+    root = physical_prior_root(robot, tolerance)
+    lost = (Unknown(*LOST_RATE, tolerance.lost_rate),)
+    return EstimateProblem(robot, runs, root, integration, median_period(runs), lost, Nuisances(*USUAL_NUISANCES))
 
 
 STEERING = ("steering_gain", "steering_play", "steering_offset", "steering_coupling")
