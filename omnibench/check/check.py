@@ -219,16 +219,15 @@ def _mended(evidence: Evidence) -> RecordingSource | None:
 
 
 def expected_gain(dataset: Dataset, errors: Set[str] = frozenset()) -> tuple[bool | None, str]:
-    """The verdict on the default estimate from the training runs, as ``calibrate`` judges its own: is it needed, and in words.
+    """The verdict on the default estimate from the training runs, as ``calibrate`` has it: is it needed, and in words.
 
     errors: kinds of the errors that were found; clocks that are off, and jumps, hide whether there is a gain.
     """
     robot, held_out = dataset.robot, dataset.split("validation")
     training = looked_at(dataset.split("train") or held_out)
     problem = usual_problem(robot, training)
-    verdict = verdict_on(
-        estimate(problem).model(problem), training, looked_at(held_out) if dataset.split("train") else ()
-    )
+    model = estimate(problem).model(problem)
+    verdict = verdict_on(model, training, looked_at(held_out) if dataset.split("train") else ())
     needed = {"better": True, "worse": False}.get(verdict.verdict)
     small = verdict.improvement is not None and abs(verdict.improvement) < _SMALL
     if verdict.verdict == "undecided" and small and verdict.units >= _ENOUGH:

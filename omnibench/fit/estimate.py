@@ -42,7 +42,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
-from omnibench.data.stored import count_drawn, drawn_runs, median_period
+from omnibench.data.stored import median_period
 from omnibench.errors import ConfigError, DataError
 from omnibench.fit.loss import Loss, LossName, Squares, make_loss
 from omnibench.fit.prior import physical_prior_root, physical_tolerance
@@ -62,7 +62,6 @@ _POSES = 12  # most reference poses of a stretch that are looked at: their media
 _FIRST, _FIRST_STEPS = 0.01, 4  # m and rad, and steps: see the module's docstring
 _LEAST = 0.003  # m and rad: smaller errors along a path are those of motion capture, not of the model; chosen
 _STEP = 0.1  # prior deviations by which a parameter of an effect is moved for its derivative
-_RESTING_OF_MANY = 0.03  # prior deviations: the same where a step reads very many samples; chosen
 _MOST_STEPS, _RESTING = 40, 1e-4  # steps, and the largest step, in prior deviations, that counts as none
 _UNTOLD = 1e3  # times its sigma: weight of a position of a run that hardly leaves its place, and tells no heading
 LOST_RATE = ("wheel_dead_zone", "c")  # the effect that every robot has, and its parameter
@@ -203,11 +202,8 @@ def estimate(
     """The minimum of Eq. (3) by Gauss-Newton steps. DataError: no run has a reference after its start.
 
     may_go_on: asked before each step but the first, with the number of those that were made. near: where the steps
-    begin, in the place of the design; of very many runs at the estimate from some that chance has drawn.
+    begin, in the place of the design.
     """
-    many = count_drawn(problem.runs) < len(problem.runs)
-    if many and near is None:
-        near = estimate(replace(problem, runs=drawn_runs(problem.runs)), may_go_on)
     rows, loss = _Rows(problem), make_loss(problem.loss, 3) or Squares(3)
     unknowns = np.zeros(problem.root.shape[1] + len(problem.unknowns) + rows.gyros)
     if near is not None:
@@ -215,7 +211,7 @@ def estimate(
         unknowns[:common] = near.unknowns[:common]
     excess: Array = np.full(len(rows.kinds), _FIRST)
     weights: Array = np.ones(len(rows.run))
-    first, resting = 0 if near is None else _FIRST_STEPS, _RESTING_OF_MANY if many else _RESTING
+    first = 0 if near is None else _FIRST_STEPS
     steps, at_rest = first, False
     while steps < _MOST_STEPS and not at_rest and (steps == first or may_go_on(steps)):
         errors, slopes, drifts = rows.linearised(unknowns)
@@ -227,7 +223,7 @@ def estimate(
         information, scores = rows.normal_equations(errors, slopes, drifts, weights[:, None] * rows.precisions(excess))
         step = -np.linalg.solve(information.sum(axis=0) + np.eye(len(unknowns)), scores.sum(axis=0) + unknowns)
         unknowns, steps = unknowns + step, steps + 1
-        at_rest = steps > _FIRST_STEPS and bool(np.abs(step).max() < resting)
+        at_rest = steps > _FIRST_STEPS and bool(np.abs(step).max() < _RESTING)
     matrix, terms = problem.answer(unknowns)
     root = np.zeros((matrix.size + len(problem.unknowns), len(unknowns)))
     root[: matrix.size, : problem.root.shape[1]] = problem.root

@@ -328,7 +328,7 @@ def verdict_on(model: OdometryModel, training: Sequence[Trajectory], held_out: S
 
 
 def _gains_as_much(model: OdometryModel, whole: Estimate, runs: Sequence[Trajectory]) -> bool:
-    """True if the default estimate from the runs says how a model does: the model gains at least nine tenths as much."""
+    """True if the default estimate says how a model does: the model gains at least nine tenths as much."""
     estimated = replace(model, matrix=whole.matrix, terms=whole.terms, fade=None)
     models = (OdometryModel.of_design(model.robot, model.integration), estimated, model)
     design, usual, fitted = (float(np.linalg.norm(final_errors(each, runs), axis=1).mean()) for each in models)

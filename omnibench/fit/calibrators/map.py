@@ -14,6 +14,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from omnibench.config import NonNegative, Positive
+from omnibench.data.stored import drawn_runs
 from omnibench.errors import DataError
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.estimate import (
@@ -82,6 +83,7 @@ class Map(Calibrator):
         tolerance = physical_tolerance(robot)
         if problem.tolerance is not None:  # of the elements, and nothing else
             tolerance = replace(tolerance, radius=0.0, rows=(0.0, 0.0, 0.0), elements=problem.tolerance)
+        runs = drawn_runs(problem.trajectories)  # of very many some, which say as much as slip lets them
         lost = tolerance.lost_rate if options.lost_rate is None else options.lost_rate
         clock = (options.clock_offset * (options.clock != "none"), options.clock_slope * options.clock.count("slope"))
         loss = loss_of(problem.objective)
@@ -89,7 +91,7 @@ class Map(Calibrator):
         def most_probable(unknowns: tuple[Unknown, ...], near: Estimate | None = None) -> Estimate:
             of_runs = EstimateProblem(
                 robot,
-                problem.trajectories,
+                runs,
                 problem.parameterisation.projection @ physical_prior_root(robot, tolerance),
                 problem.integration,
                 problem.sample_period,
@@ -109,7 +111,7 @@ class Map(Calibrator):
             found = min((most_probable((*of_wheels, *unknowns)) for unknowns in steered), key=lambda tried: tried.error)
         else:
             found = most_probable(of_wheels)
-        clusters = Clusters.of(problem.trajectories)
+        clusters = Clusters.of(runs)
         unit = np.eye(found.root.shape[1])
         covariance = jackknife(found.information, found.scores, clusters, unit).of(found.root)
         end = f"{'' if found.at_rest else 'not '}at rest after {found.steps} steps"
@@ -120,6 +122,8 @@ class Map(Calibrator):
                 covariance=covariance_rows(covariance.matrix),
                 plain=matrix_rows(most_probable((), found).matrix),
             )
+        if len(runs) < len(problem.trajectories):
+            end += f" with {len(runs):,} of {len(problem.trajectories):,} runs, which chance has drawn"
         if lost:
             rate = float(found.terms[0].values[LOST_RATE[1]])
             end += f"; turning wheels {'gain' if rate > 0 else 'lose'} {abs(rate):.4f} rad/s"
