@@ -71,7 +71,7 @@ class Calibrator(ABC):
     uses: files or rooms of omnibench (``discover``) and packages whose change may change its answers, beside
     those that all calibrators share; stored runs are then not taken for new ones.
     exact: True if a converged answer is a minimum to rounding, against which others are measured; that it is the
-    optimum of the box is not said by this but by a proof (certify.py).
+    optimum of the box is not said by this but by a proof, that of ``certify``.
     """
 
     Options: ClassVar[type[BaseModel]] = Options

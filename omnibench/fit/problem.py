@@ -174,7 +174,7 @@ class CalibrationProblem(SearchBox):
     """Training trajectories, a start, a box, a budget and a cost to be minimised.
 
     trajectories: the training runs; a calibrator cannot reach the validation runs. ends_moved: names of those whose
-    start (or end) has jumped, and is taken from the poses beside it, as a robust loss does (fit/loss.py).
+    start (or end) has jumped, and is taken from the poses beside it, as a robust loss does.
     start (n,): the vector of the design values; lower, upper (n,): its box; names: of its n elements.
     objective: the Cost. cost(candidates): its values, counted against the budget and recorded; a search calls this.
     values(candidates): the same values, neither counted nor recorded; for judging an answer, not for searching.

@@ -267,11 +267,10 @@ def physical_parameters(
         covariance = np.array(result.extension.covariance)
         freedom = max(len(Clusters.of(problem.trajectories).members) - 1, 1)
     held = problem.without_interval(result.at_bounds)
-    unknown = [
-        np.kron(np.eye(3), problem.unidentified),
-        problem.parameterisation.slopes(result.vector)[:, held].T,
-    ]
-    if problem.left_open is not None:
+    unknown = [problem.parameterisation.slopes(result.vector)[:, held].T]
+    if uncertainty is None or uncertainty.basis != "posterior":  # which the design tells, too
+        unknown.append(np.kron(np.eye(3), problem.unidentified))
+    if problem.left_open is not None and (uncertainty is None or uncertainty.basis != "posterior"):
         unknown.append(problem.left_open * np.repeat(problem.robot.row_scales, result.matrix.shape[1]))
     return read_matrix(
         problem.robot,

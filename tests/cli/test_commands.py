@@ -68,6 +68,10 @@ def test_evaluate_shows_the_design_values_and_how_many_runs_were_held_out(comman
 def test_calibrate_prints_what_it_would_write(command: Command, prepared: Prepared, tmp_path: Path) -> None:
     found = document(command("calibrate", prepared.data, "--json", "-o", tmp_path / "c.yaml"))
     assert found == json.loads(read_calibration(tmp_path / "c.yaml").model_dump_json())
+    assert list(found["parameters"]) == [
+        f"{kind}_{wheel}" for kind in ("radius", "distance", "angle") for wheel in "abc"
+    ]
+    assert list(found["parameters"]["radius_a"]) == ["design", "value", "unit", "low", "high"]
     assert found["format"] == "omnibench-calibration/1"
     assert np.shape(found["matrix"]) == (3, 3)
 

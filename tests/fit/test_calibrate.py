@@ -197,7 +197,7 @@ def test_an_empty_training_split_is_refused() -> None:
 
 
 def test_intervals_that_hold_only_if_kept_values_are_right_are_marked_on_their_row() -> None:
-    told = on_terminal(print_calibration, calibrate(straight(), "closed_form"), others=-5, width=160)
+    told = on_terminal(print_calibration, calibrate(straight(), "closed_form"), width=160)
     row = next(line for line in told.splitlines() if line.startswith("  95 %"))
     assert row.count("*") == 3
     assert "* only if the design values are right along a + b + c" in told
