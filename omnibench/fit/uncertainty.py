@@ -112,7 +112,8 @@ def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertaint
         noise = noise_of_matrix(problem.trajectories, result.matrix, problem.integration, loss).noise
     slopes = problem.parameterisation.slopes(result.vector)
     of_elements = of_vector.of(slopes)
-    untold = depending(slopes, problem.without_interval(result.at_bounds)) | elements_open(problem.parameterisation)
+    untold = depending(slopes, _not_moved(problem, result)) | elements_open(problem.parameterisation)
+    untold |= ~slopes.any(axis=1)  # such as the row sideways of a robot that cannot slide
     reach = np.where(untold, np.nan, of_elements.reach).reshape(result.matrix.shape)
     return Uncertainty(
         covariance=of_elements.matrix,
@@ -123,6 +124,11 @@ def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertaint
         basis=basis,
         source="the calibrator's own (see its reason)" if basis == "likelihood" else clusters.words,
     )
+
+
+def _not_moved(problem: CalibrationProblem, result: RunResult) -> NDArray[np.bool_]:
+    """True (n,) for the numbers that the fit could not move both ways: on a bound of the box, or held."""
+    return np.asarray(np.isin(problem.names, (*result.at_bounds, *result.held)))
 
 
 def _by_scatter(problem: CalibrationProblem, result: RunResult, clusters: Clusters) -> EstimatedCovariance:
@@ -271,7 +277,7 @@ def physical_parameters(
     if result.extension is not None and result.extension.covariance is not None:
         covariance = np.array(result.extension.covariance)
         freedom = max(len(Clusters.of(problem.trajectories).members) - 1, 1)
-    held = problem.without_interval(result.at_bounds)
+    held = _not_moved(problem, result)
     unknown = [problem.parameterisation.slopes(result.vector)[:, held].T]
     if uncertainty is None or uncertainty.basis != "posterior":  # which the design tells, too
         unknown.append(np.kron(np.eye(3), problem.unidentified))
