@@ -34,6 +34,9 @@ from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
 from omnibench.robot.calibration import EffectTerm, ModelExtension, covariance_rows, matrix_rows
 
+# Wheel samples of the runs that are looked at, 3 hours at 100 Hz: more runs say no more of a robot than slip lets them,
+# and take minutes; chosen.
+_MOST_SAMPLES = 1_000_000
 _MOST_STEPS = 40  # of the estimate, for its progress
 _FORMER = ("start", "weights", "covariance", "tolerance")  # options of trajectory_ml
 
@@ -83,7 +86,7 @@ class Map(Calibrator):
         tolerance = physical_tolerance(robot)
         if problem.tolerance is not None:  # of the elements, and nothing else
             tolerance = replace(tolerance, radius=0.0, rows=(0.0, 0.0, 0.0), elements=problem.tolerance)
-        runs = drawn_runs(problem.trajectories)  # of very many some, which say as much as slip lets them
+        runs = drawn_runs(problem.trajectories, _MOST_SAMPLES)
         lost = tolerance.lost_rate if options.lost_rate is None else options.lost_rate
         clock = (options.clock_offset * (options.clock != "none"), options.clock_slope * options.clock.count("slope"))
         loss = loss_of(problem.objective)
