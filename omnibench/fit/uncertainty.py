@@ -40,6 +40,7 @@ from omnibench.words import plural
 # (tests/studies/constants_fit.py).
 _MOST_STEPS = 20  # steps
 _NO_GAIN = 1e-4  # relative decrease of the cost that ends the steps
+_SHARES = (1.0, 0.5, 0.2, 0.1)  # of a Newton step that are tried: far from a minimum of norms whole ones lead too far
 _INTERPOLATED = 1e-6  # share of the median error: smaller ones were made zero by the fit, up to rounding
 # Width of the kernel, in medians of the errors times the number of runs to the power -1/5 (the rate of density
 # estimates: Silverman, Density Estimation, 1986, section 3.3). Stated deviations of medians then are 0.78 to 1.19 times
@@ -153,7 +154,7 @@ def _by_scatter(problem: CalibrationProblem, result: RunResult, clusters: Cluste
         )
     slope, hessian = _of_runs(problem, result.vector, free)
     answer = jackknife(hessian, slope, clusters)
-    _check_minimum(problem, result.vector, free, np.sqrt(np.maximum(np.diag(answer.matrix), 0.0)))
+    _check_minimum(problem, result.vector, free, clusters)
     covariance, freedom = np.zeros((problem.size, problem.size)), np.ones(problem.size)
     covariance[np.ix_(free, free)], freedom[free] = answer.matrix, answer.degrees_of_freedom
     return EstimatedCovariance(covariance, freedom)
@@ -220,19 +221,22 @@ def sum_of_norms(objective: Cost, run: NDArray[np.intp], errors: Array, slopes: 
     return slope, hessian
 
 
-def _check_minimum(problem: CalibrationProblem, vector: Array, free: NDArray[np.bool_], deviations: Array) -> None:
-    """NoCovarianceError: Newton's steps to a lower cost lead farther than a standard deviation (n,)."""
+def _check_minimum(problem: CalibrationProblem, vector: Array, free: NDArray[np.bool_], clusters: Clusters) -> None:
+    """NoCovarianceError: Newton's steps to a lower cost lead farther than a standard deviation there."""
     better, cost = vector, float(problem.values(vector[None])[0])
     for _ in range(_MOST_STEPS):
         slope, hessian = _of_runs(problem, better, free)
         roots = roots_of(hessian.sum(axis=0))
-        moved = better.copy()
-        moved[free] -= roots @ roots.T @ slope.sum(axis=0)
-        value = float(problem.values(moved[None])[0])
-        if not value < cost * (1 - _NO_GAIN):
+        tries = np.repeat(better[None], len(_SHARES), axis=0)
+        tries[:, free] -= np.outer(_SHARES, roots @ roots.T @ slope.sum(axis=0))
+        values = problem.values(tries)
+        if not values.min() < cost * (1 - _NO_GAIN):
             break
-        better, cost = moved, value
+        better, cost = tries[values.argmin()], float(values.min())
     away = np.abs(better - vector)[free]
+    if not away.any():
+        return
+    deviations = np.sqrt(np.maximum(np.diag(jackknife(hessian, slope, clusters).matrix), 0.0))
     count = float(np.max(away[deviations > 0] / deviations[deviations > 0], initial=0.0))
     if count > 1.0:
         raise NoCovarianceError(

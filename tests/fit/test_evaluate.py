@@ -11,7 +11,6 @@ import pytest
 import reference_coverage as study
 from fit_samples import noisy_trajectories
 from lanes import slow
-from omnibench.fit.reference_fit import ReferenceFit, covariance_root
 from sample_robots import APR_02
 
 import omnibench.robot.stored_odometry as odometry_of_stored
@@ -403,7 +402,7 @@ def reduced(robot: str, seed: int, kinds: str) -> Dataset:
     return study.reduced(exact, kinds, np.random.default_rng(seed))
 
 
-@pytest.mark.parametrize("calibrator", ["trajectory_ml", *slow("closed_form", "least_squares")])
+@pytest.mark.parametrize("calibrator", ["closed_form", *slow("least_squares")])
 def test_exact_references_give_the_true_matrix(calibrator: str, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("TAPE", "ANGLE"):
         monkeypatch.setattr(study, name, 1e-7)
@@ -454,12 +453,12 @@ def test_turns_that_share_the_offset_of_a_gyro_have_errors_within_their_interval
     assert np.sqrt(np.mean(np.square(away))) < 2
 
 
-def test_only_trajectory_ml_has_intervals_where_positions_do_not_tell_how_runs_start() -> None:
+def test_only_map_has_intervals_where_positions_do_not_tell_how_runs_start() -> None:
     dataset = reduced("diff", 6, "position")
     assert calibrate(dataset).uncertainty is not None
     run = calibrate(dataset, "closed_form")
     assert run.uncertainty is None
-    assert any("positions of 8 runs" in warning and "trajectory_ml" in warning for warning in run.warnings)
+    assert any("positions of 8 runs" in warning and "map does not" in warning for warning in run.warnings)
 
 
 @pytest.mark.parametrize(
@@ -474,7 +473,7 @@ def test_distances_alone_leave_turning_open_and_turns_alone_lengths(kind: str, o
 
 def test_what_is_left_open_keeps_the_design_and_has_no_interval() -> None:
     dataset = reduced("omni", 2, "distance")
-    run = calibrate(dataset)
+    run = calibrate(dataset, "closed_form")
     assert np.isnan(run.uncertainty.intervals.low[2]).all()
     np.testing.assert_array_equal(run.calibration.matrix_array[2], dataset.robot.inverse_kinematic_matrix[2])
     assert any("of turning: row 3 (heading) of the matrix keeps the design" in warning for warning in run.warnings)
@@ -502,7 +501,7 @@ def test_a_mixed_set_uses_poses_and_references() -> None:
     part = study.reduced(exact, "distance and turn", np.random.default_rng(4))
     mixed = [*exact.trajectories[::2], *part.trajectories[1::2]]
     dataset = make_dataset("mixed", exact.robot, exact.sample_period, mixed)
-    for calibrator in ("trajectory_ml", "closed_form"):
+    for calibrator in ("map", "closed_form"):
         found = calibrate(dataset, calibrator).calibration.matrix_array
         np.testing.assert_allclose(found, truth, atol=2e-3 * np.abs(truth).max())
 
@@ -513,40 +512,6 @@ def test_what_needs_poses_says_so() -> None:
         certify_optimum(calibrate(dataset).calibration, dataset)
     with pytest.raises(DataError, match="final_position"):
         calibrate(dataset, cost="final_position")
-    with pytest.raises(ConfigError, match="sigma"):
-        calibrate(dataset, "trajectory_ml", loss="huber")
-
-
-@pytest.mark.parametrize("later", [0.0, 0.01])
-def test_a_compass_has_its_weight_beside_positions_that_tell_no_heading_of_the_same_time(later: float) -> None:
-    """Runs that turn on the spot; their positions count for nothing, whenever they were taken."""
-    rates = np.tile(APR_02.signal_equations @ np.array([0.0, 0.0, 0.3]), (100, 1))
-    runs = []
-    for seed in range(6):
-        noise = np.random.default_rng(seed).normal(0.0, 0.05, 8)
-        measured = [Reference("position", (0.0, 0.0), 0.5, t1=float(t)) for t in range(1, 9)]
-        measured += [Reference("heading", 0.3 * t + noise[t - 1], 0.05, t1=t + later) for t in range(1, 9)]
-        given = References.of(measured, 10.0)
-        runs.append(Trajectory(f"spot-{seed}", "train", TIMES, rates, np.zeros(1), np.zeros((1, 3)), references=given))
-    fit = ReferenceFit.of(runs, APR_02.inverse_kinematic_matrix, "arc")
-    design = APR_02.inverse_kinematic_matrix
-    _, columns = fit.whitened(design, np.eye(design.size))
-    information = sum(of_run.T @ of_run for of_run in columns)[-1, -1]  # of the last wheel's share of turning
-    # Of 8 headings that count from a heading of their own: the sum of squares of their turns about the mean turn.
-    moments = np.arange(1, 9) + later
-    turned = (0.3 / APR_02.inverse_kinematic_matrix[2].sum()) * (moments - moments.mean())
-    assert information == pytest.approx(6 * np.square(turned).sum() / 0.05**2, rel=0.02)
-
-
-def test_references_nearly_without_noise_have_a_root_beside_a_long_walk() -> None:
-    steps = np.minimum.outer(np.arange(1.0, 121.0), np.arange(1.0, 121.0))  # of a random walk, which has 120 steps
-    walk = np.kron(np.ones((4, 4)), steps)  # and is seen four times at each
-    covariances = np.array([1e-18 * np.eye(480) + share * walk for share in (1e-12, 1.0, 1e6)])
-    with pytest.raises(np.linalg.LinAlgError):
-        np.linalg.cholesky(covariances)
-    roots = covariance_root(covariances)
-    for root, covariance in zip(roots, covariances, strict=True):
-        np.testing.assert_allclose(root @ root.T, covariance, rtol=1e-11)
 
 
 RADIUS, TURN = 2.0, 0.5  # m, rad/s

@@ -1,6 +1,6 @@
-"""Study of the constants of fit, design and data/checks: what would change if each were half or twice as large.
+"""Study of the constants of fit and design: what would change if each were half or twice as large.
 
-    python tests/studies/constants_fit.py --out constants_fit.jsonl [--part fit] [--only sandwich] [--table]
+    python tests/studies/constants_fit.py --out constants_fit.jsonl [--part fit] [--only jackknife] [--table]
 
 Small simulated recordings; constant_study.py says what the table holds.
 """
@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from constant_study import Answer, Part, Value, carry_out, estimates, stated, words, work
 from interval_coverage import simulated, wheel_equations
-from omnibench.data.checks.implausible import implausible
 
 from omnibench.data.dataset import Dataset
 from omnibench.design.candidates import candidates_of_dataset
@@ -123,8 +122,8 @@ def of_calibration(run: CalibrationRun, usual: Array | None = None) -> Answer:
     if said:
         answer["deviations"] = stated(said.standard_deviations)
         answer["noise"] = stated(np.array([*said.noise.model_dump().values()]))
-    if said and said.parameters:
-        answer["parameters"] = stated(np.array([each.standard_deviation or 0.0 for each in said.parameters]))
+    if run.parameters:
+        answer["parameters"] = stated(np.array([(each.high or 0.0) - (each.low or 0.0) for each in run.parameters]))
     return answer
 
 
@@ -141,11 +140,11 @@ def answers_of_fit() -> Answer:
         "closed_form of headings": of_calibration(calibrate(plain, "closed_form", cost="final_heading")),
         "closed_form of four wheels": of_calibration(calibrate(four, "closed_form")),
         "closed_form, misfit": of_calibration(calibrate(hard, "closed_form", cost="trajectory")),
-        "trajectory_ml": of_calibration(calibrate(plain, "trajectory_ml")),
-        "trajectory_ml, clocks": of_calibration(calibrate(plain, "trajectory_ml", options=clocks)),
-        "trajectory_ml, misfit": of_calibration(calibrate(hard, "trajectory_ml")),
-        "trajectory_ml, starts": of_calibration(calibrate(loose, "trajectory_ml")),
-        "trajectory_ml of four wheels": of_calibration(calibrate(four, "trajectory_ml")),
+        "map": of_calibration(calibrate(plain)),
+        "map, clocks": of_calibration(calibrate(plain, options=clocks)),
+        "map, misfit": of_calibration(calibrate(hard)),
+        "map, starts": of_calibration(calibrate(loose)),
+        "map of four wheels": of_calibration(calibrate(four)),
         "genetic": of_calibration(calibrate(plain, "genetic", options={"generations": 20}, budget=short), usual),
         "crs": of_calibration(calibrate(plain, "crs", budget=short), usual),
     }
@@ -247,29 +246,6 @@ def answers_of_few_runs() -> Answer:
     return answer
 
 
-def answers_of_checks() -> Answer:
-    """Warnings of recordings in other units, with swapped wheels, and of good ones."""
-    answer = {}
-    for wheels in (3, 4):
-        dataset = recorded(wheels)
-        logs = [run.log(run.pose_times) for run in dataset.trajectories]
-        poses = [run.poses for run in dataset.trajectories]
-        order = [1, 0, *range(2, wheels)]
-        variants = {
-            "good": (logs, poses),
-            "rpm": ([replace(log, rates=log.rates * 60 / (2 * np.pi)) for log in logs], poses),
-            "deg/s": ([replace(log, rates=np.degrees(log.rates)) for log in logs], poses),
-            "degrees": (logs, [pose * [1, 1, np.degrees(1)] for pose in poses]),
-            "mm": (logs, [pose * [1000, 1000, 1] for pose in poses]),
-            "cm": (logs, [pose * [100, 100, 1] for pose in poses]),
-            "swapped": ([replace(log, rates=log.rates[:, order]) for log in logs], poses),
-            "sign": ([replace(log, rates=log.rates * ([-1.0] + [1.0] * (wheels - 1))) for log in logs], poses),
-        }
-        for name, (changed, seen) in variants.items():
-            answer[f"{wheels} wheels, {name}"] = words(*implausible(dataset.robot, changed, seen))
-    return answer
-
-
 PARTS = {
     "fit": Part("omnibench.fit", answers_of_fit, ("omnibench.fit.certify", "omnibench.fit.evaluator")),
     "bounds": Part("omnibench.fit.certify", answers_of_bounds),
@@ -277,7 +253,6 @@ PARTS = {
     "design": Part("omnibench.design", answers_of_design, ("omnibench.design.report",)),
     "design_report": Part("omnibench.design.report", answers_of_design_report),
     "few_runs": Part("omnibench.fit.uncertainty", answers_of_few_runs),
-    "checks": Part("omnibench.data.checks", answers_of_checks),
 }
 
 if __name__ == "__main__":

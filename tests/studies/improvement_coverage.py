@@ -159,7 +159,8 @@ def whole_way(commands: int, seed: int) -> tuple[Interval, float]:
     design = np.concatenate([np.full(3, 0.148), np.full(3, 0.195), np.radians([60.0, 180.0, 300.0])])
     geometry = design + np.repeat([0.002, 0.004, math.radians(1)], 3) * rng.standard_normal(9)
     runs = [*recorded(geometry, TRAINING, "train", rng), *recorded(geometry, commands, "validation", rng)]
-    calibration = calibrate(make_dataset("improvement", ROBOT, float(TIMES[0]), runs, simulated=True)).calibration
+    dataset = make_dataset("improvement", ROBOT, float(TIMES[0]), runs, simulated=True)
+    calibration = calibrate(dataset, "closed_form").calibration
     assert calibration.provenance is not None
     found = calibration.provenance.held_out
     assert found is not None

@@ -1,10 +1,9 @@
-"""Coverage of the 95 % intervals that ship, over simulated recordings of few commands or sessions.
+"""Coverage of the 95 % intervals of a model that discover has extended, over simulated recordings of few commands.
 
-    python tests/studies/interval_coverage.py --out coverage.jsonl --sets 1000 [--only "closed_form start"] [--table]
+    python tests/studies/interval_coverage.py --out coverage.jsonl --sets 1000 [--only "start 5"] [--table]
 
 One line of JSON a set, added as it comes: run again with the same file, and it goes on where it was. With --table the
-table is printed from what is there. --doubt sets another level for the test by which closed_form's intervals rest on
-commands or sessions.
+table is printed from what is there. Those of calibrators: estimate_study.py.
 
 The truth shares nothing with what fits: every run is one exact arc of constant twist, in closed form, and the robot's
 wheel equations (Eq. 3) stand here. Kinds of noise, beside white noise of 5 mm and 5 mrad of every pose:
@@ -15,14 +14,14 @@ wheel equations (Eq. 3) stand here. Kinds of noise, beside white noise of 5 mm a
 - bias: an error of the whole run of 1 cm and 0.01 rad.
 - commands: the path of every command is pulled by 1 cm / s and 0.01 rad / s, alike in all its repetitions, so that no
   matrix fits.
-- slight: that of commands, an eighth as strong: the test for it misses it in most sets of five commands.
+- slight: that of commands, an eighth as strong.
 - once: that of walk, in runs without repetition.
 - turn: that of bias, in straight runs without repetition beside a single run that turns on the spot.
 - sessions: the reference of every session has a scale that is off by 2 %, as with a wheel or a map that changes by day.
 
 Clusters are commands, each driven three times in one session, but once where there are no repetitions; for ``sessions``
-they are sessions of four commands that are driven twice. ``discover`` stands for the intervals of a model that discover
-has extended, by the effect that is there: a drift of the heading.
+they are sessions of four commands that are driven twice. The model is extended by the effect that is there, a drift of
+the heading.
 """
 
 from __future__ import annotations
@@ -38,21 +37,16 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
-from scipy.special import stdtrit
 from scipy.stats import binomtest
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.discover.fitting import extend, fit_matrix
 from omnibench.discover.regressors.significance import Group
-from omnibench.fit import sandwich
-from omnibench.fit.calibrate import calibrate
-from omnibench.fit.problem import Budget
 from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.processes import one_thread
 from omnibench.registry import effects
 from omnibench.robot.kinematics import Array, Robot, Wheel
 
-METHODS = ("closed_form", "trajectory_ml", "discover")
 KINDS = ("white", "start", "walk", "bias", "once", "turn", "slight", "commands", "sessions")
 CLUSTERS = (5, 8, 12)
 SPEED, TURNS = 0.25, (0.5, -0.5, 0.0)  # m/s, rad/s
@@ -75,20 +69,18 @@ ROBOT = Robot(
 class Case:
     """One cell of the table."""
 
-    method: str
     kind: str
     clusters: int
 
     def __str__(self) -> str:
-        return f"{self.method} {self.kind} {self.clusters}"
+        return f"{self.kind} {self.clusters}"
 
 
 @dataclass(frozen=True)
 class Row:
-    """Intervals of one set: of the nine elements of the matrix, then of the wheels' geometry, or of the effect.
+    """Intervals of one set: of the nine elements of the matrix, then of the effect.
 
     errors: about the truth, in the standard deviations that are stated. reach: half-widths of the intervals, likewise.
-    Both are empty where no interval is stated, with the reason in source.
     """
 
     case: str
@@ -180,61 +172,23 @@ def noise_of(kind: str, rng: np.random.Generator) -> Array:
 
 
 def covered(case: Case, seed: int) -> Row:
-    """Fit one set and compare the intervals with the truth."""
-    drift = DRIFT if case.method == "discover" else 0.0
-    dataset, geometry = simulated(case.kind, case.clusters, seed, drift)
-    elements = np.linalg.inv(wheel_equations(geometry)).ravel()
-    if case.method == "discover":
-        found, truth = extended_by_drift(dataset), np.append(elements, drift)
-    else:
-        found, truth = calibrated(dataset, case.method, seed), np.append(elements, geometry)
-    if isinstance(found, str):
-        return Row(str(case), seed, (), (), found)
-    errors, reach = (found.values - truth) / found.deviations, found.reach / found.deviations
-    return Row(str(case), seed, tuple(errors.round(4).tolist()), tuple(reach.round(4).tolist()), found.source)
-
-
-@dataclass(frozen=True, eq=False)
-class Found:
-    """Values (n,), their standard deviations and the half-widths of their intervals, and what these rest on."""
-
-    values: Array
-    deviations: Array
-    reach: Array
-    source: str
-
-
-def calibrated(dataset: Dataset, calibrator: str, seed: int) -> Found | str:
-    """The elements of the matrix and the wheels' geometry, by ``calibrate``, or why there are no intervals."""
-    run = calibrate(dataset, calibrator, seed=seed, budget=Budget(seconds=math.inf))
-    uncertainty = run.uncertainty
-    if uncertainty is None:
-        return "; ".join(run.warnings)
-    wheels = np.array([(each.value, each.high) for each in run.parameters], dtype=float)
-    reach = wheels[:, 1] - wheels[:, 0]
-    quantile = stdtrit(np.min(uncertainty.degrees_of_freedom), 0.975)
-    matrix, intervals = run.calibration.matrix_array, uncertainty.intervals
-    return Found(
-        np.append(matrix, wheels[:, 0]),
-        np.append(uncertainty.standard_deviations, reach / quantile),
-        np.append(intervals.high - matrix, reach),
-        f"{uncertainty.source}; {run.result.reason}"[:160],
-    )
-
-
-def extended_by_drift(dataset: Dataset) -> Found:
-    """The elements of the matrix and the drift of the heading, fitted together as discover does."""
+    """Extend the model of one set by the drift of the heading, and compare the intervals with the truth."""
+    dataset, geometry = simulated(case.kind, case.clusters, seed, DRIFT)
     start = dataset.robot.inverse_kinematic_matrix
     plain = fit_matrix(usable_runs(dataset.split("train")), dataset.robot, dataset.sample_period, start)
     effect = effects.create("heading_drift")
     model = extend(plain, [Group("effect", effect.name, (), effect, effect.parameters(dataset.robot))])
-    values = np.append(model.fit.model.matrix, model.values)
-    return Found(values, model.covariance.standard_deviations, model.covariance.reach, model.fit.noise.description)
+    truth = np.append(np.linalg.inv(wheel_equations(geometry)), DRIFT)
+    deviations = model.covariance.standard_deviations
+    errors = (np.append(model.fit.model.matrix, model.values) - truth) / deviations
+    reach = model.covariance.reach / deviations
+    source = model.fit.noise.description
+    return Row(str(case), seed, tuple(errors.round(4).tolist()), tuple(reach.round(4).tolist()), source)
 
 
 def cases(only: Sequence[str] = ()) -> list[Case]:
     """All cells of the table, or those whose names hold one of some texts."""
-    every = [Case(*each) for each in product(METHODS, KINDS, CLUSTERS)]
+    every = [Case(*each) for each in product(KINDS, CLUSTERS)]
     return [case for case in every if not only or any(text in str(case) for text in only)]
 
 
@@ -244,13 +198,12 @@ def read_rows(path: Path) -> list[Row]:
     return [Row(**json.loads(line)) for line in lines]
 
 
-def carry_out(missing: Sequence[tuple[Case, int]], path: Path, jobs: int, doubt: float) -> Iterator[Row]:
+def carry_out(missing: Sequence[tuple[Case, int]], path: Path, jobs: int) -> Iterator[Row]:
     """Fit sets and add each row to the file at once."""
     written = path.read_bytes() if path.exists() else b""
     with path.open("wb") as file:
         file.write(written[: written.rfind(b"\n") + 1])
-    pool = ProcessPoolExecutor(jobs, initializer=setattr, initargs=(sandwich, "DOUBT", doubt))
-    with one_thread(), pool, path.open("a") as file:
+    with one_thread(), ProcessPoolExecutor(jobs) as pool, path.open("a") as file:
         for done in as_completed([pool.submit(covered, case, seed) for case, seed in missing]):
             row = done.result()
             file.write(json.dumps(asdict(row)) + "\n")
@@ -259,21 +212,17 @@ def carry_out(missing: Sequence[tuple[Case, int]], path: Path, jobs: int, doubt:
 
 
 def table(rows: Iterable[Row], chosen: Iterable[Case]) -> Iterator[str]:
-    """A line for every cell: coverage with its 95 % interval (Wilson), each set counted as one trial.
-
-    without: number of sets for which no interval is stated.
-    """
+    """A line for every cell: coverage with its 95 % interval (Wilson), each set counted as one trial."""
     rows = list(rows)
-    yield f"{'':28s} sets   elements, %              geometry or effect, %    least   stated / seen   without"
+    yield f"{'':28s} sets   elements, %              effect, %                least   stated / seen"
     for case in chosen:
-        every = [row for row in rows if row.case == str(case)]
-        own = [row for row in every if row.errors]
+        own = [row for row in rows if row.case == str(case)]
         if own:
             hits = np.array([row.covered for row in own])
             seen = np.sqrt(np.mean(np.square([row.errors for row in own]), axis=0))
             yield (
                 f"{case!s:28s} {len(own):4d}   {share(hits[:, :9])}    {share(hits[:, 9:])}    "
-                f"{100 * hits.mean(axis=0).min():4.1f}    {np.mean(1 / seen):.2f}            {len(every) - len(own):4d}"
+                f"{100 * hits.mean(axis=0).min():4.1f}    {np.mean(1 / seen):.2f}"
             )
 
 
@@ -290,17 +239,14 @@ def main() -> None:
     parser.add_argument("--sets", type=int, default=1000)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--only", action="append", default=[], help="part of a cell's name; may be given several times")
-    parser.add_argument("--doubt", type=float, default=sandwich.DOUBT)
     parser.add_argument("--table", action="store_true", help="only print the table")
     arguments = parser.parse_args()
-    if arguments.doubt != sandwich.DOUBT and any(case.method != "closed_form" for case in cases(arguments.only)):
-        parser.error('--doubt is closed_form\'s alone: add --only closed_form, or --only "closed_form sessions"')
     chosen, rows = cases(arguments.only), read_rows(arguments.out)
     if not arguments.table:
         done = {(row.case, row.seed) for row in rows}
         wanted = [(case, seed) for seed in range(arguments.sets) for case in chosen]
         missing = [(case, seed) for case, seed in wanted if (str(case), seed) not in done]
-        rows += carry_out(missing, arguments.out, arguments.jobs, arguments.doubt)
+        rows += carry_out(missing, arguments.out, arguments.jobs)
     print("\n".join(table(rows, chosen)))
 
 

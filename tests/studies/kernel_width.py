@@ -1,4 +1,4 @@
-"""Study of the kernel of fit/sandwich.py: the stated deviation of a median, divided by the true one.
+"""Study of the kernel of fit/uncertainty.py: the stated deviation of a median, divided by the true one.
 
     python tests/studies/kernel_width.py [--draws 1000]
 
@@ -15,12 +15,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-import omnibench.fit.sandwich as module
-from omnibench.data.dataset import Trajectory
+import omnibench.fit.uncertainty as module
 from omnibench.registry import costs
-from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
-from omnibench.robot.odometry import OdometryBatch
 
 WIDTHS = (0.35, 0.7, 1.4)
 RNG = np.random.default_rng(0)
@@ -35,18 +32,13 @@ ERRORS: dict[str, tuple[Callable[[int], Array], float]] = {
 
 def ratios(draw: Callable[[int], Array], density: float, count: int, draws: int) -> Array:
     """Ratios (draws,) of the stated to the true standard deviation of the median of ``count`` headings."""
-    times, poses = np.array([1.0]), np.zeros((2, 3))
-    stamps = np.array([0.0, 1.0])
-    runs = [Trajectory(str(n), "train", times, np.zeros((1, 3)), stamps, poses) for n in range(count)]
-    odometry, objective = OdometryBatch([run.final_log for run in runs], "arc"), costs.create("final_heading")
+    objective, run = costs.create("final_heading"), np.arange(count)
     found = []
     for _ in range(draws):
         errors, jacobian = np.zeros((count, 3)), np.zeros((count, 3, 1))
         errors[:, 2], jacobian[:, 2] = draw(count), 1.0
         errors[:, 2] -= np.median(errors[:, 2])
-        hessian = module.scores_of_runs(
-            objective, odometry, errors, jacobian, runs, Noise(pose_heading=1.0)
-        ).hessians.sum()
+        hessian = module.sum_of_norms(objective, run, errors, jacobian)[1].sum()
         found.append(2 * density / hessian)  # the Hessian is twice the density that the kernel estimates
     return np.array(found)
 

@@ -1,4 +1,4 @@
-"""How much the constants of the calibrator posterior matter on the real robots: each halved and doubled.
+"""How much the constants of the calibrator map matter on the real robots: each halved and doubled.
 
 ``python tests/studies/prior_study.py [--data DIR] [ROBOT ...]`` prints, for every variant and robot, the geometric
 mean over the cells of configs/real_robots.yaml of the error of runs that did not train, as a share of that with the
@@ -11,15 +11,17 @@ import argparse
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from omnibench.fit import prior
+from omnibench.fit import estimate, loss
 from omnibench.fit.calibrator import run_calibrator
-from omnibench.fit.calibrators import posterior
+from omnibench.fit.calibrators import map as module
 from omnibench.registry import calibrators, load_plugins
+from omnibench.robot import geometry
 from omnibench.robot.kinematics import class_of
 from omnibench.study.config import MethodChoice, TrainingChoice
 from omnibench.study.study import read_study_config
@@ -27,13 +29,23 @@ from omnibench.study.study_plan import StudiedRobot, judge_fits, load_robots, pl
 from omnibench.study.study_result import make_cells
 
 CONFIG = Path(__file__).parents[2] / "configs" / "real_robots.yaml"
-TOLERANCES: dict[str, Callable[[prior.PhysicalTolerance, float], prior.PhysicalTolerance]] = {
+TOLERANCES: dict[str, Callable[[geometry.PhysicalTolerance, float], geometry.PhysicalTolerance]] = {
     "radius": lambda given, factor: replace(given, radius=factor * given.radius),
     "rows": lambda given, factor: replace(given, rows=tuple(factor * share for share in given.rows)),  # type: ignore[arg-type]
     "elements": lambda given, factor: replace(given, elements=factor * given.elements),
     "lost rate": lambda given, factor: replace(given, lost_rate=factor * given.lost_rate),
 }
-CONSTANTS = {"stretches": "_STRETCHES", "Huber's constant": "_HUBER", "least deviation": "_LEAST"}
+CONSTANTS: dict[str, Callable[[float], tuple[Any, str, Any]]] = {  # what is set where, by a factor
+    "stretches": lambda factor: (
+        module,
+        "EstimateProblem",
+        partial(estimate.EstimateProblem, stretches=round(factor * estimate._STRETCHES)),
+    ),
+    "poses of a stretch": lambda factor: (estimate, "_POSES", round(factor * estimate._POSES)),
+    "first deviation": lambda factor: (estimate, "_FIRST", factor * estimate._FIRST),
+    "least deviation": lambda factor: (estimate, "_LEAST", factor * estimate._LEAST),
+    "Huber's corner": lambda factor: (loss, "CORNERS", {key: factor * value for key, value in loss.CORNERS.items()}),
+}
 
 
 def main() -> None:
@@ -52,7 +64,7 @@ def main() -> None:
         update={
             "robots": {n: robot.model_copy(update={"trainings": rules[n]}) for n, robot in chosen.items()},
             "regimes": {},
-            "methods": (MethodChoice(name="posterior"),),
+            "methods": (MethodChoice(name="map"),),
             "reference": None,
         }
     )
@@ -72,11 +84,11 @@ def main() -> None:
 def errors(config: Any, robot: StudiedRobot) -> list[float]:
     """Mean error of each cell of a robot."""
     fits = plan_fits(config, (robot,))
-    calibrator = calibrators.create("posterior")
-    results = {i: run_calibrator(calibrator, fit.run.task.problem()) for i, fit in enumerate(fits) if fit.run}
+    calibrator = calibrators.create("map")
+    results = {i: run_calibrator(calibrator, fit.run.problem()) for i, fit in enumerate(fits) if fit.run}
     judged, design = judge_fits(fits, results, config.integration, lambda _: None)
     cells = [cell for cell in make_cells(judged, design) if not cell.key.fitted]
-    return [cell.methods["posterior"].mean("cost") or np.nan for cell in cells]
+    return [cell.methods["map"].mean("cost") or np.nan for cell in cells]
 
 
 def variants() -> Iterator[tuple[str, Callable[[StudiedRobot], Any]]]:
@@ -84,28 +96,28 @@ def variants() -> Iterator[tuple[str, Callable[[StudiedRobot], Any]]]:
     for factor in (0.5, 2.0):
         for name, change in TOLERANCES.items():
             yield f"{name} x {factor:g}", lambda robot, change=change, factor=factor: _tolerance(robot, change, factor)
-        for name, constant in CONSTANTS.items():
-            yield f"{name} x {factor:g}", lambda _, constant=constant, factor=factor: _constant(constant, factor)
+        for name, change in CONSTANTS.items():
+            yield f"{name} x {factor:g}", lambda _, change=change, factor=factor: _constant(*change(factor))
 
 
 @contextmanager
 def _tolerance(robot: StudiedRobot, change: Callable[..., Any], factor: float) -> Iterator[None]:
-    kind, before = class_of(robot.dataset.robot), dict(prior._TOLERANCES)
-    prior._TOLERANCES = before | {kind: change(before[kind], factor)}  # type: ignore[misc]
+    kind, before = class_of(robot.dataset.robot), dict(geometry._TOLERANCES)
+    geometry._TOLERANCES = before | {kind: change(before[kind], factor)}  # type: ignore[misc]
     try:
         yield
     finally:
-        prior._TOLERANCES = before  # type: ignore[misc]
+        geometry._TOLERANCES = before  # type: ignore[misc]
 
 
 @contextmanager
-def _constant(name: str, factor: float) -> Iterator[None]:
-    before = getattr(posterior, name)
-    setattr(posterior, name, type(before)(before * factor))
+def _constant(holder: Any, name: str, value: Any) -> Iterator[None]:
+    before = getattr(holder, name)
+    setattr(holder, name, value)
     try:
         yield
     finally:
-        setattr(posterior, name, before)
+        setattr(holder, name, before)
 
 
 if __name__ == "__main__":

@@ -37,7 +37,6 @@ from omnibench.fit.problem import Budget
 from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.registry import load_plugin_file
 from omnibench.robot.kinematics import Array
-from omnibench.robot.model import OdometryModel
 from omnibench.slam.import_dataset import import_dataset
 
 CALIBRATORS = ("least_squares", "closed_form", "map", "crs")
@@ -75,7 +74,7 @@ def errors(
     run = calibrate(
         replace(dataset, trajectories=tuple(train)), integration="arc", budget=Budget(evaluations=20_000), **choice
     )
-    return final_errors(OdometryModel(dataset.robot, run.calibration.matrix_array, "arc"), judged), run.result.reason
+    return final_errors(run.calibration.model, judged), run.result.reason
 
 
 def main() -> None:
