@@ -35,6 +35,7 @@ from omnibench.fit.geometry import WheelGeometry
 from omnibench.fit.identifiability import inseparable_in_words, kept_motions, warnings_of_calibration
 from omnibench.fit.loss import RobustCost, norms_of, with_ends_from_others, with_loss
 from omnibench.fit.open_combinations import open_sentences
+from omnibench.fit.paths import slip_of
 from omnibench.fit.prior import default_cost, default_mount, default_unidentified
 from omnibench.fit.problem import Budget, CalibrationProblem, make_problem
 from omnibench.fit.ratio_intervals import FEWEST, Units, units_of
@@ -472,7 +473,7 @@ def _calibration(
         "reason": result.reason,
         "held_out": verdict_on(model, training, validation),
     }
-    return calibration_of_fit(
+    calibration = calibration_of_fit(
         f"{dataset.name} {settings.calibrator}",
         dataset,
         result.matrix,
@@ -482,6 +483,7 @@ def _calibration(
         parameters={each.name: each for each in reading.parameters},
         **dict(extension) | {"covariance": extension.covariance or covariance},
     )
+    return calibration.model_copy(update={"slip": slip_of(calibration, training)})
 
 
 def _warnings(
