@@ -220,7 +220,19 @@ def calibrate(
 @calibration_app.command()
 def evaluate(
     calibration: shared.CalibrationFile,
-    dataset: shared.DatasetFolders,
+    dataset: Annotated[
+        list[Path] | None,
+        typer.Argument(help="Data set folder; several of one robot, or a glob, count as one.", metavar="DATASET..."),
+    ] = None,
+    paths: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--path",
+            metavar="PATH",
+            help='Path to predict errors for: "straight 1.0" (m), "turn 360" (deg), "circle 1.0 left" (its radius), '
+            '"square 1.0 right" (its side); may be repeated.',
+        ),
+    ] = None,
     backend: shared.BackendName = None,
     workers: shared.Workers = None,
     tls_ca: shared.TlsAuthority = None,
@@ -229,23 +241,34 @@ def evaluate(
     plugins: shared.Plugins = None,
     as_json: shared.Json = False,
 ) -> None:
-    """Show the cost and the errors of a calibration on a data set.
+    """Show the errors of a calibration on a data set, and those to expect on paths.
 
-    On each split: the cost, and the errors of the final pose, beside those of the robot's design values.
+    On each split: the cost, and the errors of the final pose, beside those of the robot's design values. On each path:
+    the expected error at its end and the region that holds 95 % of errors. Without DATASET the paths alone.
     """
-    from omnibench.cli.terminal.calibration_tables import print_evaluation, print_verdict_ending
+    from omnibench.cli.terminal.calibration_tables import print_evaluation, print_path_errors, print_verdict_ending
+    from omnibench.fit.paths import predicted_errors, regions_lack
 
     shared.load_given_plugins(plugins)
     tls = shared.tls_files(tls_ca, tls_cert, tls_key)
     with ProgressDisplay() as watch, shared.asked_backend(backend, workers, tls, (), watch):
-        recordings = omnibench.load_dataset(dataset)
         evaluated = omnibench.read_calibration(calibration)
-        evaluation = omnibench.evaluate(evaluated, recordings)
-    warnings = [*recordings.warnings, *evaluation.warnings]
+        predicted = predicted_errors(evaluated, paths or ())
+        recordings = omnibench.load_dataset(dataset) if dataset else None
+        evaluation = None if recordings is None else omnibench.evaluate(evaluated, recordings)
+    warnings = [lack] if (lack := regions_lack(evaluated)) else []
+    if recordings is not None and evaluation is not None:
+        warnings = [*recordings.warnings, *evaluation.warnings, *warnings]
     warn(warnings)
     if as_json:
-        return print_json(evaluation.model_dump() | {"warnings": warnings})
-    print_evaluation(make_console(), evaluation)
+        document = {} if evaluation is None else evaluation.model_dump()
+        return print_json(document | {"paths": [error.model_dump() for error in predicted], "warnings": warnings})
+    if evaluation is not None:
+        print_evaluation(make_console(), evaluation)
+    print_path_errors(make_console(), predicted, evaluated)
+    if evaluation is None or dataset is None:
+        other = ("omnibench", "evaluate", str(calibration), "DATASET")
+        return print_ending("these errors are predicted", "see those on recordings", *other)
     print_verdict(evaluation.held_out, sessions=evaluation.sessions)
     return print_verdict_ending(evaluation.held_out, evaluated, calibration, dataset)
 

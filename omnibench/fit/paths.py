@@ -12,19 +12,18 @@ turns the way, and p of the place beside that, it has the covariance
 
     W = p^2 m diag(1, 1, 0)  +  a^2 sum_k m_k v_k v_k'  +  (h^2 - a^2) m diag(0, 0, 1).                    (2)
 
-The training runs tell how large it is. A fit to errors with the covariance W leaves errors e with W - S, and what a
-run's start and its reference's poses err by, R, adds to them; so that, in sums over the runs,
+The training runs tell how large it is. Beside slip, their errors e after the fit hold what a run's start and its
+reference's poses err by, R; so that, in sums over the runs,
 
-    h^2 = sum (e_h^2 + S_hh - R_hh) / sum m,                                                               (3)
+    h^2 = sum (e_h^2 - R_hh) / sum m,                                                                      (3)
     a^2 = min(h^2, P/2 / sum_runs tr V),  p^2 = (P - a^2 sum_runs tr V) / (2 sum m),                       (4)
 
 where P are the squares of the places as in (3), and V the sum of (2) for the places: slip of the heading explains at
-most half of what the places show, as robots that turn on the spot show something, too. Of n runs, errors scatter as
-Student's t with n degrees of freedom.
+most half of what the places show, as robots that turn on the spot show something, too. After n runs all scatters as
+Student's t with n - 1 degrees of freedom.
 
-Held-out runs of six real robots lie in these regions in 89 to 100 % of cases by place and in 91 to 100 % by
-heading, without any factor on them (tests/studies/region_coverage.py); a fit to runs of a single session that has two
-of them, or to one kind of path and judged on another, the least.
+No factor stands on these regions. Of held-out runs of six real robots COVERAGE
+(tests/studies/region_coverage.py).
 
 The design errs by the same, and by the bias of its end against the calibration's.
 """
@@ -295,7 +294,7 @@ def slip_of(calibration: Calibration, runs: Sequence[Trajectory]) -> Slip | None
         return None
     of_runs = EndErrors.of(calibration, [run.final_log for run in posed])
     errors = of_runs.ends - np.array([run.final_pose for run in posed])
-    squares = (np.square(errors) + np.diagonal(of_runs.calibrated, axis1=1, axis2=2)).sum(axis=0)
+    squares = np.square(errors).sum(axis=0)
     explained = np.diagonal(of_runs.of_reference, axis1=1, axis2=2).sum(axis=0)
     metres = max(float(of_runs.rolled.sum()), 1e-9)
     heading = max(squares[2] - explained[2], _LEAST_SLIP * squares[2]) / metres  # Eq. (3)
@@ -309,11 +308,12 @@ def slip_of(calibration: Calibration, runs: Sequence[Trajectory]) -> Slip | None
 def error_region(covariance: Array, bias: Array, runs: int | None) -> tuple[float, float, float, float]:
     """Expected size and 95 % radius of place errors, m, and of heading errors, rad.
 
-    covariance (3, 3), bias (3,): of the errors. runs: degrees of freedom of Student's t; None: the normal distribution.
+    covariance (3, 3), bias (3,): of the errors. runs: that slip is told from, one more than the degrees of freedom of Student's t;
+    None: it is not known, and the distribution is normal.
     """
     sides = norm.ppf((np.arange(_GRID) + 0.5) / _GRID)
     grid = np.stack(np.meshgrid(sides, sides), axis=-1).reshape(-1, 2)
-    wider = 1.0 if runs is None else float(t.ppf((1 + _REGION) / 2, runs) / norm.ppf((1 + _REGION) / 2))
+    wider = 1.0 if runs is None else float(t.ppf((1 + _REGION) / 2, max(runs - 1, 1)) / norm.ppf((1 + _REGION) / 2))
     values, vectors = np.linalg.eigh(covariance[:2, :2])
     places = grid @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
     turns = sides * math.sqrt(max(covariance[2, 2], 0.0))
